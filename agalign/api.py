@@ -1,0 +1,129 @@
+"""The Python API: arrays, one capture, a folder."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agalign import geometry
+from agalign.batch import CaptureReport, rig_seed, run_flight, write_summary
+from agalign.config import Interpolation, Settings
+from agalign.discover import DiscoverOptions, discover
+from agalign.errors import InputError
+from agalign.masks import data_mask, learnable, undeclared_fill
+from agalign.pair import View, align_views
+from agalign.pipeline import CaptureOutcome, process_capture, quiet
+from agalign.records import Alignment, Capture, Mask, Raster, SeedKind
+from agalign.warp import Mapping, Tile, resample, source_positions
+
+_LEAST_SIDE_PX = 48
+_MOST_CHANNELS = 16
+
+
+def align(
+    fixed: ArrayLike,
+    moving: ArrayLike,
+    *,
+    seed: ArrayLike | None = None,
+    fixed_valid: ArrayLike | None = None,
+    moving_valid: ArrayLike | None = None,
+    settings: Settings | None = None,
+) -> Alignment:
+    """Find the homography from one image to another of the same scene, whatever their modalities.
+
+    fixed, moving: (H, W), (H, W, C) or (C, H, W) arrays of any numeric type; their sizes may differ. Integer images
+        are taken as saturated at their type's largest value; constant fill that runs in from the border, and nan,
+        is left aside.
+    seed: 3x3 fixed_to_moving to start from, good to some 10 % of the image; None starts from the images themselves.
+    fixed_valid, moving_valid: (H, W), False where pixels must not be used.
+
+    Returns an Alignment whose `fixed_to_moving` (3x3) maps a pixel of `fixed` to a pixel of `moving`: x right, y down,
+    (0, 0) the centre of the top-left pixel. Look at its `status`: only `aligned` has passed the checks; `seed_only`
+    and `failed` carry the seed and say why in `reason`.
+    Raises InputError for arrays that are no images, GeometryError for a seed that is no homography.
+    """
+    settings = settings or Settings()
+    one = _view(fixed, fixed_valid, "fixed")
+    other = _view(moving, moving_valid, "moving")
+    candidates: dict[SeedKind, geometry.Matrix] = {}
+    if seed is not None:
+        candidates["user"] = geometry.normalised(seed)
+    else:
+        scale = np.divide(other.raw.size_px, one.raw.size_px)
+        candidates["identity"] = geometry.resolution_change(float(scale[0]), float(scale[1]))
+    return align_views(one, other, candidates, settings, quiet)
+
+
+def warp_onto(
+    moving: ArrayLike,
+    fixed_to_moving: ArrayLike,
+    fixed_size_px: tuple[int, int],
+    *,
+    valid: ArrayLike | None = None,
+    interpolation: Interpolation = "cubic",
+) -> tuple[NDArray[np.generic], Mask]:
+    """Resample a single-band image (H, W) onto a fixed grid of (width, height) pixels; its type is kept.
+
+    Returns the pixels and their mask, (height, width) each. Raises InputError and GeometryError.
+    """
+    pixels = np.asarray(moving)
+    if pixels.ndim != 2:
+        raise InputError(f"moving must be (H, W), not {pixels.shape}; warp several bands one by one")
+    mask = np.ones(pixels.shape, bool) if valid is None else np.asarray(valid, bool)
+    mapping = Mapping(geometry.normalised(fixed_to_moving))
+    positions = source_positions(mapping, Tile(0, 0, *fixed_size_px))
+    end = pixels.shape[1], pixels.shape[0]
+    return resample(pixels, mask, positions, end, (0, 0), interpolation)
+
+
+def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureOutcome:
+    """Align one capture, as `discover` returns them, and write its stack and sidecar below `out`.
+
+    Raises UnreadableFileError where its reference band cannot be read, and OutputError.
+    """
+    return process_capture(capture, Path(out), rig_seed, settings or Settings())
+
+
+def align_folder(
+    folder: str | Path,
+    out: str | Path,
+    *,
+    settings: Settings | None = None,
+    options: DiscoverOptions | None = None,
+    overwrite: bool = False,
+) -> list[CaptureReport]:
+    """Align every capture below `folder` into `out` and write the summary and the report.
+
+    Raises InputError where there is nothing to align, OutputError where `out` cannot be written.
+    """
+    from agalign.report import write_report
+
+    source, target = Path(folder), Path(out)
+    found = discover(source, options or DiscoverOptions(skip=(target,)))
+    reports = list(run_flight(found, target, settings or Settings(), overwrite=overwrite))
+    write_summary(target)
+    write_report(target)
+    return reports
+
+
+def _view(image: ArrayLike, valid: ArrayLike | None, name: str) -> View:
+    array = np.asarray(image)
+    if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
+        raise InputError(f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}")
+    if array.ndim == 3 and array.shape[-1] <= _MOST_CHANNELS < array.shape[0]:
+        array = np.moveaxis(array, -1, 0)
+    planes = array if array.ndim == 3 else array[None]
+    if len(planes) > _MOST_CHANNELS or min(planes.shape[1:]) < _LEAST_SIDE_PX:
+        raise InputError(f"{name} is {array.shape}: images need at least {_LEAST_SIDE_PX} px a side and at most {_MOST_CHANNELS} channels")
+    saturation = float(np.iinfo(array.dtype).max) if array.dtype.kind in "ui" and array.dtype.itemsize <= 2 else None
+    mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
+    if mask.shape != planes.shape[1:]:
+        raise InputError(f"{name}_valid is {mask.shape}, the image {planes.shape[1:]}")
+    for plane in planes:
+        mask &= data_mask(plane, None)
+    mask &= ~np.logical_and.reduce([undeclared_fill(plane) for plane in planes])
+    for plane in planes:
+        mask = learnable(mask, plane, saturation)
+    pixels = np.where(mask, planes, 0).astype(np.float32)
+    raster = Raster(pixels if len(planes) > 1 else pixels[0], mask)
+    return View(raster, raster, (1.0, 1.0))

@@ -1,0 +1,12 @@
+"""One module a vendor; the first that recognises a file has it, and `generic` takes the rest."""
+
+from agalign.cameras.base import Camera, default_reference
+from agalign.cameras.generic import Generic
+from agalign.cameras.micasense import MicaSense
+
+__all__ = ["Camera", "default_reference", "known_cameras"]
+
+
+def known_cameras(pattern: str | None = None) -> tuple[Camera, ...]:
+    """The cameras in the order they are asked. With a `pattern` the names of files decide, not their tags."""
+    return (Generic(pattern),) if pattern else (MicaSense(), Generic())

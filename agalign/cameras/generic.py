@@ -1,0 +1,83 @@
+"""Any other GeoTIFF: multiband files, and one file a band under any naming."""
+
+import re
+from pathlib import Path
+
+from agalign.cameras.base import largest_value
+from agalign.errors import ConfigurationError
+from agalign.geometry import Matrix
+from agalign.metadata import Tags
+from agalign.raster import RasterInfo
+from agalign.records import Band
+
+_BAND_WORDS = (
+    "coastal|blue|green|red ?edge|red_edge|red-edge|rededge|red|nir|swir|pan|panchro|lwir|thermal|"
+    "gre|reg|rgb|grn|blu|vis|ms"
+)
+_SUFFIX = re.compile(
+    rf"^(?P<capture>.*?)(?:(?P<gap>[_\-. ]+)(?P<band>(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|b?\d{{1,2}}|re|[bgrn])"
+    rf"|(?P<glued>(?:{_BAND_WORDS})|\d{{3,4}}nm))$",
+    re.IGNORECASE,
+)
+
+
+class Generic:
+    """Files that no vendor claims. `pattern` holds {capture} and {band}, as in '{capture}_{band}.tif'."""
+
+    name = "generic"
+
+    def __init__(self, pattern: str | None = None) -> None:
+        self._pattern = compile_pattern(pattern) if pattern else None
+
+    def recognises(self, tags: Tags) -> bool:
+        return True
+
+    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+        own_name = tags.text("Camera", "BandName") or self.split(path)[1]
+        indexes = [i for i in range(1, len(info.dtypes) + 1) if i != info.alpha_index]
+        return tuple(
+            Band(
+                name=info.descriptions[i - 1] or (own_name if len(indexes) == 1 else f"band_{i}") or f"band_{i}",
+                path=path,
+                band_index=i,
+                width_px=info.width_px,
+                height_px=info.height_px,
+                dtype=info.dtypes[i - 1],
+                nodata=info.nodata[i - 1],
+                wavelength_nm=info.wavelengths_nm[i - 1]
+                or tags.number("Camera", "CentralWavelength")
+                or _wavelength_in(own_name),
+                saturation_value=largest_value(info.dtypes[i - 1]),
+                georeference=info.georeference,
+            )
+            for i in indexes
+        )
+
+    def capture_key(self, path: Path, tags: Tags) -> str:
+        return self.split(path)[0]
+
+    def rig_seed(self, reference: Band, moving: Band) -> Matrix | None:
+        return None
+
+    def split(self, path: Path) -> tuple[str, str]:
+        """(capture, band) as the file's name has them; the band is empty where the name does not tell."""
+        if self._pattern is not None:
+            match = self._pattern.fullmatch(path.name)
+            return (match["capture"], match["band"]) if match else (path.stem, "")
+        match = _SUFFIX.fullmatch(path.stem)
+        if match and match["capture"].strip("_-. "):
+            return match["capture"].rstrip("_-. "), match["band"] or match["glued"]
+        return path.stem, ""
+
+
+def compile_pattern(pattern: str) -> re.Pattern[str]:
+    """A --pattern as a regular expression. Raises ConfigurationError where {capture} or {band} is missing."""
+    if pattern.count("{capture}") != 1 or pattern.count("{band}") != 1:
+        raise ConfigurationError(f"pattern '{pattern}' needs {{capture}} and {{band}} once each, as in '{{capture}}_{{band}}.tif'")
+    escaped = re.escape(pattern).replace(r"\{capture\}", "(?P<capture>.+?)").replace(r"\{band\}", "(?P<band>[^/]+?)")
+    return re.compile(escaped.replace(r"\*", ".*"), re.IGNORECASE)
+
+
+def _wavelength_in(name: str) -> float | None:
+    match = re.fullmatch(r"(\d{3,4}) ?nm", name, re.IGNORECASE)
+    return float(match.group(1)) if match else None

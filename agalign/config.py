@@ -1,0 +1,157 @@
+"""Settings, one frozen object a stage. Every number that decides something has its name and its reason here."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from agalign.records import ModelFamily, SeedKind
+
+Interpolation = Literal["nearest", "bilinear", "cubic", "lanczos"]
+Positive = Annotated[int, Field(gt=0)]
+
+
+class Stage(BaseModel):
+    """Base of the settings: immutable, and an unknown name is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class FastRecipe(Stage):
+    """In-batch negatives, Adam on theta, Gauss-Newton on psi. See docs/method.md for what each choice gained."""
+
+    learn_px: Positive = 640
+    """Longer side of the images on which theta is learnt, but at least half of the full resolution."""
+    coarsest_px: Positive = 160
+    """Longer side of the coarsest level, where an untrusted seed starts."""
+    batch: Positive = 128
+    temperature: float = 0.07
+    learning_rate: float = 2e-3
+    most_steps: Positive = 200
+    warm_up_steps: int = 50
+    """Steps on theta alone before psi may move."""
+    steps_between_updates: Positive = 25
+    step_gate: float = 0.2
+    """Held-out retrieval below which psi does not move."""
+    enough_retrieval: float = 0.6
+    """Held-out retrieval at which learning may stop once psi is at rest."""
+    rest_px: float = 0.3
+    """psi is at rest when a step moves no corner by more than this, in px of the level."""
+    least_negative_px: float = 8.0
+    """Keypoints closer than this are not negatives of each other."""
+    test_keypoints: Positive = 256
+    """Held-out keypoints among which retrieval is measured."""
+    octaves: float = 1.0
+    """Patch scales are drawn from [1, 2**octaves] px between samples."""
+    learn_patches: Positive = 400
+    """Patches in a Gauss-Newton step while learning."""
+    final_patches: Positive = 800
+    """Patches in a Gauss-Newton step at full resolution."""
+    final_steps: Positive = 4
+    final_rest_px: float = 0.1
+    longest_step_px: float = 4.0
+    difference_px: float = 0.75
+    """Half width of the central differences that give a descriptor's gradient."""
+    most_corner_std_px: float = 0.5
+    """A model family is rich enough only while its corners are known this well, px of the level."""
+
+
+class PaperRecipe(Stage):
+    """The hyperparameters of Dong et al. 2018, Sec. 5.3, and, said so, what the paper leaves open."""
+
+    keypoints: Positive = 4000
+    least_gradient: float = 0.05
+    octaves: float = 4.0
+    """log2 s is uniform in [0, octaves]."""
+    spacing_px: float = 0.25
+    """Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. The paper does not say."""
+    margin: float = 1.0
+    least_negative_px: float = 16.0
+    """tau: least distance of a negative from the true position. The paper does not say."""
+    batch: Positive = 64
+    momentum: float = 0.9
+    learning_rate: float = 1e-4
+    """Annealed by a cosine to 0 within each level."""
+    coarsest_px: Positive = 80
+    """Longer side of the coarsest level."""
+    epochs: Positive = 8
+    """Passes over the keypoints a level. The paper does not say."""
+
+
+class JointSettings(Stage):
+    """The joint aligner."""
+
+    recipe: Literal["fast", "paper"] = "fast"
+    sharing: Literal["siamese", "pseudo-siamese", "unshared"] = "pseudo-siamese"
+    model_family: ModelFamily | Literal["auto"] = "auto"
+    device: str = "auto"
+    rng_seed: int = 0
+    fast: FastRecipe = FastRecipe()
+    paper: PaperRecipe = PaperRecipe()
+    longest_side_px: Positive = 4096
+    """Larger images are reduced to this for estimation."""
+
+
+class SeedSettings(Stage):
+    """Coarse alignment."""
+
+    force: SeedKind | None = None
+    """Use this kind of seed whatever its score."""
+    working_px: Positive = 384
+    """Longer side of the images on which seeds are scored."""
+    smoothing_px: float = 1.0
+    trusted_sigma: float = 12.0
+    """Correlation peak, in standard deviations, of a seed that is good to a few pixels. Unrelated images reach 9."""
+    trusted_ratio: float = 1.5
+    """How far a trusted seed's peak must stand above the second highest."""
+    least_shift_px: float = 0.25
+    """Structure shifts below this, in working px, are noise and leave a candidate as it is."""
+
+
+
+
+class CheckSettings(Stage):
+    """What an alignment must show to be called `aligned`. docs/method.md has the figures behind the limits."""
+
+    tile_px: Positive = 112
+    """Side of the windows in which residual shifts are measured."""
+    smoothing_px: float = 1.0
+    least_strength: float = 0.05
+    """Mean structure below which a window holds nothing to measure."""
+    least_peak_sigma: float = 7.0
+    """Correlation peak, in standard deviations of its surface, from which a window's shift is believed."""
+    least_retrieval: float = 0.2
+    """Held-out retrieval; chance is below 0.01, unrelated images reach 0.05."""
+    most_residual_px: float = 1.0
+    """Median length of the windows' residual shifts."""
+    least_coverage: float = 0.6
+    """Share of the windows with structure in which a shift could be measured."""
+    least_windows: Positive = 4
+    most_corner_std_px: float = 2.0
+    """Standard deviation of the mapped corners."""
+    most_snap_px: float = 0.25
+    """An input already aligned is left untouched where the result is within three standard deviations of no change,
+    and within this."""
+
+
+class WriteSettings(Stage):
+    """The aligned stacks."""
+
+    interpolation: Interpolation = "cubic"
+    crop: Literal["common", "none"] = "common"
+    format: Literal["gtiff", "cog"] = "gtiff"
+    compression: Literal["zstd", "deflate", "none"] = "zstd"
+    tile_px: Positive = 256
+    """Side of the tiles within a TIFF."""
+    work_tile_px: Positive = 2048
+    """Side of the tiles in which moving bands are resampled: it bounds the memory."""
+    undistort: bool = False
+    """Write the lens-corrected grid of the reference instead of its own."""
+
+
+class Settings(Stage):
+    """Everything that a run depends on."""
+
+    seed: SeedSettings = SeedSettings()
+    joint: JointSettings = JointSettings()
+    check: CheckSettings = CheckSettings()
+    write: WriteSettings = WriteSettings()

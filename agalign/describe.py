@@ -1,0 +1,149 @@
+"""A capture's outcome as its sidecar."""
+
+import hashlib
+import math
+
+from numpy.typing import NDArray
+import numpy as np
+
+from agalign import geometry
+from agalign._version import __version__
+from agalign.config import Settings
+from agalign.geometry import Matrix
+from agalign.pair import mapping_of
+from agalign.records import Alignment, Band, Capture, CaptureStatus, JointResult, Residual
+from agalign.sidecar import (
+    BandPart,
+    CameraPart,
+    GridPart,
+    HomographyPart,
+    JointPart,
+    Matrix3x3,
+    MetricsPart,
+    OutputPart,
+    ReferencePart,
+    ResidualTile,
+    SeedPart,
+    Sidecar,
+    SimilarityPart,
+)
+from agalign.write import Stack
+
+_GRID_COLUMNS, _GRID_ROWS = 17, 13
+
+
+def fingerprint(capture: Capture, settings: Settings) -> str:
+    """Changes when the settings, the bands or the program's version do."""
+    bands = [(b.name, b.address, b.lens, b.georeference is not None) for b in capture.bands]
+    text = f"{__version__} {settings.model_dump_json()} {capture.reference_index} {bands}"
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def capture_status(statuses: list[str]) -> CaptureStatus:
+    """ok where every moving band is aligned, failed where none is of use, else degraded."""
+    moving = [s for s in statuses if s != "reference"]
+    if all(s == "aligned" for s in moving):
+        return "ok"
+    return "failed" if all(s == "failed" for s in moving) else "degraded"
+
+
+def describe_capture(
+    capture: Capture, alignments: dict[str, Alignment], stack: Stack | None, settings: Settings
+) -> Sidecar:
+    reference = capture.reference
+    parts = []
+    for band in capture.bands:
+        if band is reference:
+            parts.append(
+                BandPart(
+                    band=band.name, wavelength_nm=band.wavelength_nm, file=band.path.name,
+                    band_index=band.band_index, status="reference", reason=None, seconds=0.0,
+                )  # fmt: skip
+            )
+        else:
+            parts.append(_band_part(reference, band, alignments[band.name]))
+    status = capture_status([p.status for p in parts])
+    return Sidecar(
+        agalign=__version__,
+        capture=capture.name,
+        capture_id=capture.capture_id,
+        flight_id=capture.flight_id,
+        captured_at=capture.captured_at,
+        camera=CameraPart(make=capture.camera.make, model=capture.camera.model, serial=capture.camera.serial),
+        status="degraded" if status == "ok" and capture.missing_bands else status,
+        missing_bands=list(capture.missing_bands),
+        reference=ReferencePart(
+            band=reference.name, file=reference.path.name, band_index=reference.band_index,
+            width=reference.width_px, height=reference.height_px,
+        ),  # fmt: skip
+        bands=parts,
+        output=None if stack is None else _output_part(stack),
+        settings=fingerprint(capture, settings),
+    )
+
+
+def _output_part(stack: Stack) -> OutputPart:
+    nodata: float | str | None = stack.nodata
+    if isinstance(nodata, float) and math.isnan(nodata):
+        nodata = "nan"
+    crop = stack.crop
+    return OutputPart(file=stack.path.name, crop=(crop.x0, crop.y0, crop.width, crop.height), nodata=nodata)
+
+
+def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
+    joint, residual = alignment.joint, alignment.residual
+    grid_px = geometry.lattice(reference.width_px, reference.height_px, _GRID_COLUMNS, _GRID_ROWS)
+    there_px = mapping_of(reference, band, alignment)(grid_px)
+    after = dict(alignment.after)
+    if residual is not None and math.isfinite(residual.median_px):
+        after |= {"residual_px": residual.median_px, "residual_p95_px": residual.p95_px}
+    if residual is not None:
+        after["residual_coverage"] = residual.coverage
+    return BandPart(
+        band=band.name,
+        wavelength_nm=band.wavelength_nm,
+        file=band.path.name,
+        band_index=band.band_index,
+        status=alignment.status,
+        reason=alignment.reason,
+        homography=HomographyPart(fixed_to_moving=_rows(alignment.fixed_to_moving), space=alignment.space),
+        seed=SeedPart(
+            kind=alignment.seed.kind, fixed_to_moving=_rows(alignment.seed.fixed_to_moving),
+            peak_sigma=alignment.seed.peak_sigma, runner_up_sigma=alignment.seed.runner_up_sigma,
+        ),  # fmt: skip
+        grid=GridPart(reference_px=_points(grid_px), moving_px=_points(there_px)),
+        joint=None if joint is None else _joint_part(joint),
+        metrics=MetricsPart(
+            before=SimilarityPart(**alignment.before), after=SimilarityPart(**after), tiles=_tile_parts(residual)
+        ),
+        seconds=round(alignment.seconds, 3),
+    )
+
+
+def _joint_part(joint: JointResult) -> JointPart:
+    return JointPart(
+        loss=joint.loss if math.isfinite(joint.loss) else None, retrieval=joint.retrieval, chance=joint.chance,
+        iterations=joint.iterations, levels=list(joint.levels), recipe=joint.recipe, model_family=joint.model_family,
+        last_step_px=joint.last_step_px, corner_std_px=joint.corner_std_px,
+    )  # fmt: skip
+
+
+def _tile_parts(residual: Residual | None) -> list[ResidualTile]:
+    if residual is None:
+        return []
+    return [
+        ResidualTile(
+            centre_px=(round(c[0], 2), round(c[1], 2)),
+            shift_px=(round(s[0], 4), round(s[1], 4)) if math.isfinite(s[0]) else (None, None),
+        )
+        for c, s in zip(residual.centres_px.tolist(), residual.shifts_px.tolist(), strict=True)
+    ]
+
+
+def _rows(matrix: Matrix) -> Matrix3x3:
+    a, b, c = (tuple(row) for row in matrix.tolist())
+    return a, b, c
+
+
+def _points(points_px: NDArray[np.float64]) -> list[tuple[float, float]]:
+    return [(round(x, 4), round(y, 4)) for x, y in points_px.tolist()]

@@ -1,0 +1,206 @@
+"""From a folder to captures."""
+
+import os
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from agalign.cameras import Camera, default_reference, known_cameras
+from agalign.errors import ConfigurationError, InputError, UnreadableFileError
+from agalign.metadata import Tags, read_tags
+from agalign.raster import TIFF_SUFFIXES, probe
+from agalign.records import Band, CameraIdentity, Capture
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A file or capture that cannot take part, and why, in one line."""
+
+    path: Path
+    text: str
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Everything found below a folder."""
+
+    folder: Path
+    captures: tuple[Capture, ...]
+    problems: tuple[Problem, ...]
+
+
+@dataclass(frozen=True)
+class _File:
+    path: Path
+    camera: Camera
+    tags: Tags
+    bands: tuple[Band, ...]
+
+
+@dataclass(frozen=True)
+class DiscoverOptions:
+    """What to look for."""
+
+    pattern: str | None = None
+    """File names as '{capture}_{band}.tif', for files whose names follow no known scheme."""
+    reference: str | None = None
+    """Name of the reference band; None is the camera's default."""
+    ignore_metadata: bool = False
+    """Leave lens and rig tags aside."""
+    skip: tuple[Path, ...] = field(default=())
+    """Folders not to look into, such as the output's."""
+
+
+def discover(
+    folder: Path, options: DiscoverOptions | None = None, progress: Callable[[int, int], None] | None = None
+) -> Flight:
+    """All captures below `folder`, sorted by folder and name. `progress` gets (files done, files in all).
+
+    Raises InputError where the folder does not exist or holds no TIFF.
+    """
+    options = options or DiscoverOptions()
+    if not folder.is_dir():
+        what = "is a file; give the folder it is in" if folder.exists() else "does not exist"
+        raise InputError(f"{folder}: {what}")
+    cameras = known_cameras(options.pattern)
+    problems: list[Problem] = []
+    files: list[_File] = []
+    paths = _tiffs(folder, options.skip)
+    if not paths:
+        raise InputError(f"{folder}: no .tif or .tiff file in it or below it")
+    for number, path in enumerate(paths, start=1):
+        try:
+            files.append(_examine(path, cameras))
+        except UnreadableFileError as error:
+            problems.append(Problem(path, str(error)))
+        if progress is not None:
+            progress(number, len(paths))
+    captures: list[Capture] = []
+    for group in _groups(files):
+        found = _capture(folder, group, options)
+        if isinstance(found, Problem):
+            problems.append(found)
+        else:
+            captures.append(found)
+    captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
+    captures = _with_missing_bands(_with_unique_names(captures))
+    return Flight(folder, tuple(captures), tuple(problems))
+
+
+def _tiffs(folder: Path, skip: Sequence[Path]) -> list[Path]:
+    skipped = {p.resolve() for p in skip}
+    found: list[Path] = []
+    for parent, folders, names in os.walk(folder):
+        here = Path(parent)
+        folders[:] = sorted(
+            d for d in folders
+            if not d.startswith(".") and (here / d).resolve() not in skipped and not _is_output(here / d)
+        )  # fmt: skip
+        tiffs = sorted(n for n in names if Path(n).suffix.lower() in TIFF_SUFFIXES and not n.startswith("."))
+        found.extend(here / n for n in tiffs)
+    return found
+
+
+def _is_output(folder: Path) -> bool:
+    """An earlier run's output folder lies below its input: its stacks are not captures."""
+    return (folder / "summary.csv").is_file() and (folder / "index.html").is_file()
+
+
+def _examine(path: Path, cameras: Iterable[Camera]) -> _File:
+    info = probe(path)
+    tags = read_tags(path)
+    camera = next(c for c in cameras if c.recognises(tags))
+    return _File(path, camera, tags, camera.bands(path, tags, info))
+
+
+def _groups(files: Iterable[_File]) -> list[list[_File]]:
+    """Files of one capture: same camera, same key; the folder counts where the key is only a name."""
+    groups: dict[tuple[str, ...], list[_File]] = defaultdict(list)
+    for file in files:
+        key = file.camera.capture_key(file.path, file.tags)
+        groups[(file.camera.name, str(file.path.parent), key)].append(file)
+    return list(groups.values())
+
+
+def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capture | Problem:
+    bands = [b for file in files for b in file.bands]
+    first = files[0]
+    if len(bands) < 2:
+        text = f"{first.path}: a band with no companion; name files '<capture>_<band>.tif' or give --pattern"
+        return Problem(first.path, text)
+    bands = _with_unique_band_names(bands)
+    if options.ignore_metadata:
+        bands = [replace(b, lens=None, rig_rotation=None) for b in bands]
+    try:
+        reference = _reference_index(bands, options.reference, first.path)
+    except ConfigurationError as error:
+        return Problem(first.path, str(error))
+    tags = first.tags
+    serials = sorted({f.tags.serial for f in files if f.tags.serial})
+    return Capture(
+        name=_shared_name(files),
+        folder=first.path.parent.relative_to(folder),
+        bands=tuple(bands),
+        reference_index=reference,
+        camera=CameraIdentity(tags.make, tags.model, "+".join(serials)),
+        capture_id=tags.text("MicaSense", "CaptureId") or tags.text("drone-dji", "CaptureUUID"),
+        flight_id=tags.text("MicaSense", "FlightId"),
+        captured_at=tags.captured_at,
+    )
+
+
+def _reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> int:
+    if wanted is None or wanted.lower() == "auto":
+        return default_reference(bands)
+    for index, band in enumerate(bands):
+        if band.name.lower() == wanted.lower():
+            return index
+    names = ", ".join(b.name for b in bands)
+    raise ConfigurationError(f"{path}: no band '{wanted}' for the reference; this capture has {names}")
+
+
+def _shared_name(files: Sequence[_File]) -> str:
+    """The part of the file names that the bands share; a multiband file's own stem."""
+    if len(files) == 1:
+        return files[0].path.stem
+    stems = [f.path.stem for f in files]
+    shared = os.path.commonprefix(stems)
+    # `IMG_0007_1` and `IMG_0007_10` share the digit, which is not part of the capture's name.
+    cut = max(shared.rfind(c) for c in "_-. ")
+    if cut > 0 and any(len(s) > len(shared) and s[len(shared)].isdigit() for s in stems) and shared[cut + 1 :].isdigit():
+        shared = shared[:cut] if all(s[: cut + 1] == shared[: cut + 1] for s in stems) else shared
+    return shared.rstrip("_-. ") or stems[0]
+
+
+def _with_unique_band_names(bands: Sequence[Band]) -> list[Band]:
+    seen: dict[str, int] = defaultdict(int)
+    unique = []
+    for band in bands:
+        seen[band.name] += 1
+        unique.append(band if seen[band.name] == 1 else replace(band, name=f"{band.name}-{seen[band.name]}"))
+    return unique
+
+
+def _with_unique_names(captures: Sequence[Capture]) -> list[Capture]:
+    """Two captures of one folder must not write the same file: the later one gets a number."""
+    seen: dict[str, int] = defaultdict(int)
+    unique = []
+    for capture in captures:
+        seen[capture.label.lower()] += 1
+        count = seen[capture.label.lower()]
+        unique.append(capture if count == 1 else replace(capture, name=f"{capture.name}-{count}"))
+    return unique
+
+
+def _with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
+    """What other captures of the same camera have and this one lacks."""
+    usual: dict[CameraIdentity, dict[str, None]] = defaultdict(dict)
+    for capture in captures:
+        usual[capture.camera].update(dict.fromkeys(b.name for b in capture.bands))
+    complete = []
+    for capture in captures:
+        known = {b.name for b in capture.bands}
+        missing = tuple(n for n in usual[capture.camera] if n not in known) if capture.camera.model else ()
+        complete.append(replace(capture, missing_bands=missing) if missing else capture)
+    return complete

@@ -1,0 +1,29 @@
+"""The exceptions that agalign raises on purpose. Each carries one line that a user can act on."""
+
+
+class AgalignError(Exception):
+    """Base of everything agalign raises on purpose; its text is one line fit to be shown to a user."""
+
+
+class InputError(AgalignError):
+    """A file, folder or array cannot be used. The text names it and says what to do."""
+
+
+class UnreadableFileError(InputError):
+    """A file exists but is not a raster that can be read."""
+
+
+class ConfigurationError(AgalignError):
+    """Options that contradict each other or name something that does not exist."""
+
+
+class GeometryError(AgalignError):
+    """A mapping cannot be inverted or estimated (singular homography, too few points)."""
+
+
+class SidecarError(InputError):
+    """A sidecar is missing, malformed or of another schema version."""
+
+
+class OutputError(AgalignError):
+    """A result cannot be written (no permission, disk full, a folder where a file should be)."""

@@ -1,0 +1,125 @@
+"""One second-order step on psi: minimise sum_i w_i || f(x_i) - f(w(x_i; psi)) ||^2 (the paper's L0, squared).
+
+A patch feels a small change of the homography as a shift of its centre, so the residual's Jacobian with respect to
+psi is the descriptor's gradient with respect to a shift, (256, 2), times the shift's with respect to psi, (2, 8).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from agalign.patches import ALPHA, FAMILY_PARAMETERS, Keypoints, homography_from_psi, transform
+from agalign.records import ModelFamily
+
+_REWEIGHTINGS = 4
+_DAMPING = 1e-4
+FAMILIES: tuple[ModelFamily, ...] = ("homography", "affine", "translation")
+
+
+@dataclass(frozen=True)
+class Step:
+    """An update of the mapping, to be composed on the fixed side: H <- H @ change."""
+
+    change: Tensor
+    """(3, 3) homography on fixed pixels, float64."""
+    length_px: float
+    """Largest movement of a corner, px of the level."""
+    corner_std_px: float
+    """Standard deviation of the mapped corners, px of the level (root mean square of the four, worst axis sum)."""
+    family: ModelFamily
+
+
+def shift_gradient(describe: Callable[[Keypoints], Tensor], keypoints: Keypoints, half_width_px: float) -> Tensor:
+    """Central differences of the descriptors over a shift of the keypoints, (N, 256, 2) per px."""
+    e = half_width_px
+    along_x = describe(keypoints.moved(e, 0)) - describe(keypoints.moved(-e, 0))
+    along_y = describe(keypoints.moved(0, e)) - describe(keypoints.moved(0, -e))
+    return torch.stack([along_x, along_y], dim=2) / (2 * e)
+
+
+def shift_over_psi(xy: Tensor, width_px: int, height_px: int) -> Tensor:
+    """Derivative of a warped position over psi at psi = 0, (N, 2, 8), float64."""
+    x, y = xy.double().unbind(dim=1)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    along_x = [x, y, zero, zero, one * width_px, zero, -x * x / width_px, -x * y / height_px]
+    along_y = [zero, zero, x, y, zero, one * height_px, -x * y / width_px, -y * y / height_px]
+    return torch.stack([torch.stack(along_x, dim=1), torch.stack(along_y, dim=1)], dim=1) / ALPHA
+
+
+def solve(
+    keypoints: Keypoints,
+    residual: Tensor,
+    gradient: Tensor,
+    size_px: tuple[int, int],
+    family: ModelFamily | None,
+    most_corner_std_px: float,
+    longest_step_px: float,
+) -> Step:
+    """The step that the patches agree on.
+
+    `residual` is f(x) - f'(w(x)), (N, 256), `gradient` that of f' (or the mean of both sides'), (N, 256, 2).
+    The residual's mean over the patches is what the two modalities disagree on everywhere: it is removed. With
+    `family` None the richest family is taken whose corners are known to `most_corner_std_px`.
+    """
+    centred = (residual - residual.mean(dim=0)).double()
+    g = gradient.double()
+    pull = torch.einsum("ndk,nd->nk", g, centred)
+    stiffness = torch.einsum("ndk,ndl->nkl", g, g)
+    energy = centred.square().sum(dim=1)
+    jacobian = shift_over_psi(keypoints.xy, *size_px)
+    families = FAMILIES if family is None else (family,)
+    step = _solve_family(jacobian, pull, stiffness, energy, families[0], size_px, longest_step_px)
+    for simpler in families[1:]:
+        if step.corner_std_px <= most_corner_std_px:
+            break
+        step = _solve_family(jacobian, pull, stiffness, energy, simpler, size_px, longest_step_px)
+    return step
+
+
+def _solve_family(
+    jacobian: Tensor,
+    pull: Tensor,
+    stiffness: Tensor,
+    energy: Tensor,
+    family: ModelFamily,
+    size_px: tuple[int, int],
+    longest_step_px: float,
+) -> Step:
+    parameters = list(FAMILY_PARAMETERS[family])
+    j = jacobian[:, :, parameters]
+    per_patch_normal = torch.einsum("nki,nkl,nlj->nij", j, stiffness, j)
+    per_patch_pull = torch.einsum("nki,nk->ni", j, pull)
+    delta = pull.new_zeros(len(parameters))
+    for _ in range(_REWEIGHTINGS):
+        shift = torch.einsum("nki,i->nk", j, delta)
+        left = energy - 2 * (shift * pull).sum(dim=1) + torch.einsum("nk,nkl,nl->n", shift, stiffness, shift)
+        weight = 1 / (1 + left.clamp_min(0) / left.median().clamp_min(1e-12))
+        normal = torch.einsum("n,nij->ij", weight, per_patch_normal)
+        normal = normal + torch.diag(_DAMPING * normal.diagonal() + 1e-12)
+        delta = torch.linalg.solve(normal, torch.einsum("n,ni->i", weight, per_patch_pull))
+
+    # Sandwich covariance: what the patches disagree by, not what a noise model says, sets the uncertainty.
+    score = weight[:, None] * (per_patch_pull - torch.einsum("nij,j->ni", per_patch_normal, delta))
+    inverse = torch.linalg.inv(normal)
+    covariance = inverse @ (score.T @ score) @ inverse
+    psi = pull.new_zeros(8)
+    psi[parameters] = delta
+    corner_points = pull.new_tensor(_corner_list(size_px))
+    corner_jacobian = shift_over_psi(corner_points, *size_px)[:, :, parameters]
+    variance = torch.einsum("cki,ij,ckj->c", corner_jacobian, covariance, corner_jacobian)
+
+    change = homography_from_psi(psi, *size_px)
+    length_px = float((transform(change, corner_points) - corner_points).norm(dim=1).max())
+    if not math.isfinite(length_px):
+        change, length_px = torch.eye(3, dtype=torch.float64, device=psi.device), math.inf
+    elif length_px > longest_step_px:
+        change = homography_from_psi(psi * (longest_step_px / length_px), *size_px)
+    return Step(change, length_px, float(variance.clamp_min(0).max().sqrt()), family)
+
+
+def _corner_list(size_px: tuple[int, int]) -> list[list[float]]:
+    right, bottom = size_px[0] - 1.0, size_px[1] - 1.0
+    return [[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]]

@@ -1,0 +1,94 @@
+"""One capture, start to end: its pairs aligned, its stack and sidecar written."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from agalign import geometry
+from agalign.config import Settings
+from agalign.describe import describe_capture
+from agalign.errors import AgalignError
+from agalign.pair import RigSeed, align_pair, load_view, mapping_of
+from agalign.records import Alignment, Band, Capture, Seed
+from agalign.seed import overlay
+from agalign.sidecar import Sidecar, write_sidecar
+from agalign.warp import Mapping, Tile, common_area
+from agalign.write import Layer, Stack, write_stack
+
+PairProgress = Callable[[str, str, float], None]
+"""Called with the band's name, the stage, and the share of the stage that is behind."""
+
+
+def quiet(*_: object) -> None:
+    """A progress callback that reports nothing."""
+
+
+@dataclass(frozen=True)
+class CaptureOutcome:
+    """A capture's sidecar and where it was written."""
+
+    sidecar: Sidecar
+    path: Path
+
+
+def output_paths(capture: Capture, out: Path) -> tuple[Path, Path]:
+    """(stack, sidecar) of a capture below the output folder."""
+    folder = out / capture.folder
+    return folder / f"{capture.name}.tif", folder / f"{capture.name}.json"
+
+
+def process_capture(
+    capture: Capture, out: Path, rig_seed: RigSeed, settings: Settings, progress: PairProgress = quiet
+) -> CaptureOutcome:
+    """Align a capture and write its stack and sidecar; a band that cannot be aligned does not stop the others.
+
+    Raises UnreadableFileError where the reference itself cannot be read, and OutputError.
+    """
+    reference = capture.reference
+    fixed = load_view(reference, settings.joint.longest_side_px)
+    alignments: dict[str, Alignment] = {}
+    for band in capture.moving:
+
+        def report(stage: str, share: float, band: Band = band) -> None:
+            progress(band.name, stage, share)
+
+        try:
+            alignments[band.name] = align_pair(reference, band, fixed, rig_seed, settings, report)
+        except AgalignError as error:
+            nothing = Seed("identity", overlay(reference, band), 0.0)
+            alignments[band.name] = Alignment(
+                nothing.fixed_to_moving, "pixel", "failed", str(error), nothing, None, None, 0.0
+            )
+    progress(reference.name, "writing", 0.0)
+    stack_path, sidecar_path = output_paths(capture, out)
+    stack = _write(capture, alignments, stack_path, settings)
+    sidecar = describe_capture(capture, alignments, stack, settings)
+    write_sidecar(sidecar_path, sidecar)
+    return CaptureOutcome(sidecar, sidecar_path)
+
+
+def _write(capture: Capture, alignments: dict[str, Alignment], path: Path, settings: Settings) -> Stack | None:
+    reference = capture.reference
+    undistort = settings.write.undistort and reference.lens is not None
+    layers = []
+    for band in capture.bands:
+        if band is reference:
+            own = Mapping(geometry.identity(), None, reference.lens) if undistort else None
+            layers.append(Layer(band, own, is_reference=True))
+            continue
+        alignment = alignments[band.name]
+        mapping = mapping_of(reference, band, alignment)
+        if undistort:
+            mapping = replace(mapping, fixed_lens=None)
+        layers.append(Layer(band, None if alignment.status == "failed" else mapping))
+    usable = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
+    if not usable:
+        return None
+    crop: Tile | None = Tile(0, 0, *reference.size_px)
+    if settings.write.crop == "common":
+        crop = common_area(usable, *reference.size_px)
+    if crop is None:
+        crop = Tile(0, 0, *reference.size_px)
+    return write_stack(capture, layers, crop, path, settings.write)
+
+

@@ -1,0 +1,202 @@
+"""The values that travel between the stages: frozen, typed, numpy only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+FloatImage = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+SeedKind = Literal["user", "model", "rig", "geo", "structure", "identity"]
+PairStatus = Literal["reference", "aligned", "seed_only", "failed"]
+CaptureStatus = Literal["ok", "degraded", "failed"]
+ModelFamily = Literal["homography", "affine", "translation"]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera's intrinsics in raw pixels: x_px = fx * x / z + cx, after Brown-Conrady distortion.
+
+    `distortion` is k1, k2, p1, p2, k3 in OpenCV's order and for normalised coordinates; empty means none.
+    """
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def matrix(self) -> Matrix:
+        """The 3x3 camera matrix K."""
+        return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Where a raster lies: `transform` maps (column, row, 1) with (0, 0) the CORNER of the top-left pixel,
+    as GDAL and rasterio have it, to map units of `crs_wkt`."""
+
+    transform: Matrix
+    crs_wkt: str
+
+
+@dataclass(frozen=True)
+class Band:
+    """One band of a capture: where its pixels are and what the camera says of them."""
+
+    name: str
+    path: Path
+    band_index: int
+    """Index within the file, from 1."""
+    width_px: int
+    height_px: int
+    dtype: str
+    nodata: float | None = None
+    wavelength_nm: float | None = None
+    bandwidth_nm: float | None = None
+    saturation_value: float | None = None
+    """Raw value at and above which a pixel is taken as saturated."""
+    lens: Lens | None = None
+    rig_rotation: Matrix | None = None
+    """Rotation of this camera in the rig, 3x3."""
+    rig_group: str = ""
+    """Bands whose rig rotations refer to the same camera share this."""
+    georeference: Georeference | None = None
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self.width_px, self.height_px
+
+    @property
+    def address(self) -> str:
+        """The file's name, with the band's index where the file has several."""
+        return self.path.name if self.band_index == 1 else f"{self.path.name}[{self.band_index}]"
+
+
+@dataclass(frozen=True)
+class CameraIdentity:
+    """What made the images, as far as their tags say."""
+
+    make: str = ""
+    model: str = ""
+    serial: str = ""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """All bands of one moment, of which one is the reference."""
+
+    name: str
+    folder: Path
+    """Folder below the input folder, relative to it: where the outputs go below the output folder."""
+    bands: tuple[Band, ...]
+    reference_index: int
+    camera: CameraIdentity = field(default_factory=CameraIdentity)
+    capture_id: str = ""
+    flight_id: str = ""
+    captured_at: str = ""
+    missing_bands: tuple[str, ...] = ()
+
+    @property
+    def reference(self) -> Band:
+        """The reference band."""
+        return self.bands[self.reference_index]
+
+    @property
+    def moving(self) -> tuple[Band, ...]:
+        """All bands but the reference."""
+        return tuple(b for i, b in enumerate(self.bands) if i != self.reference_index)
+
+    @property
+    def label(self) -> str:
+        """The capture's name below its folder, with forward slashes."""
+        return (self.folder / self.name).as_posix()
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Pixels with their validity, as the estimation sees them."""
+
+    pixels: FloatImage
+    """(height, width) float32, or (channels, height, width)."""
+    valid: Mask
+    """(height, width), False where a pixel is nodata, saturated or outside the sensor."""
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return int(self.valid.shape[1]), int(self.valid.shape[0])
+
+
+@dataclass(frozen=True)
+class Seed:
+    """A coarse mapping to start from and how well the images agree under it."""
+
+    kind: SeedKind
+    fixed_to_moving: Matrix
+    score: float
+    """Structure agreement in [-1, 1]: the coherence of gradient orientations on the common area."""
+    peak_sigma: float = 0.0
+    """Height of the correlation peak above its surroundings, in standard deviations."""
+    runner_up_sigma: float = 0.0
+    """The same for the second highest separate peak."""
+
+
+@dataclass(frozen=True)
+class JointResult:
+    """What the joint optimisation ended with."""
+
+    fixed_to_moving: Matrix
+    loss: float
+    retrieval: float
+    """Share of held-out patches whose nearest descriptor in the other image is the right one."""
+    chance: float
+    """The retrieval that guessing would give."""
+    iterations: int
+    levels: tuple[float, ...]
+    """Resolutions worked at, coarse to fine; 1 is full."""
+    recipe: str
+    model_family: ModelFamily
+    last_step_px: float
+    corner_std_px: float
+    """Standard deviation of the mapped image corners, px, from the curvature at the solution."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Local shifts that an alignment leaves, measured independently of how it was found."""
+
+    centres_px: NDArray[np.float64]
+    """(n, 2) tile centres on the reference grid."""
+    shifts_px: NDArray[np.float64]
+    """(n, 2) where the moving band's structure lies minus where the reference's does; nan where not measured."""
+    median_px: float
+    p95_px: float
+    coverage: float
+    """Share of the tiles with enough structure in which a shift could be measured."""
+    bias_px: float
+    """Length of the median shift vector."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The mapping found for one band pair and everything known about it."""
+
+    fixed_to_moving: Matrix
+    """Between undistorted pixels where both lenses are known, else between raw pixels."""
+    space: Literal["pixel", "undistorted"]
+    status: PairStatus
+    reason: str | None
+    seed: Seed
+    joint: JointResult | None
+    residual: Residual | None
+    seconds: float
+    before: Mapping[str, float] = field(default_factory=dict)
+    after: Mapping[str, float] = field(default_factory=dict)

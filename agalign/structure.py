@@ -1,0 +1,108 @@
+"""The structure of an image, blind to contrast: its gradient orientations, and shifts measured on them.
+
+The double-angle field z = a ((gx + i gy) / |g|)^2 is the same for an edge and its contrast-reversed twin; a is the
+gradient magnitude, clipped so that a few strong edges do not outvote the rest.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from agalign.records import Mask, Raster
+
+Field = NDArray[np.complex64]
+
+_AMPLITUDE_QUANTILE = 0.75
+"""Gradients above this quantile of the valid area count alike."""
+_WHITENING = 0.5
+"""Power of the cross spectrum's magnitude that is divided away: 0 correlates, 1 is pure phase correlation."""
+
+
+def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
+    """z of a single-band raster, (height, width) complex64 with |z| <= 1, and 0 at and next to invalid pixels."""
+    pixels = np.where(raster.valid, raster.pixels, 0).astype(np.float32)
+    weight = cv2.GaussianBlur(raster.valid.astype(np.float32), (0, 0), smoothing_px)
+    smooth = cv2.GaussianBlur(pixels, (0, 0), smoothing_px) / np.maximum(weight, 1e-3)
+    gx = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
+    gy = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
+    magnitude = np.hypot(gx, gy)
+    inside = cv2.erode(raster.valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    if not inside.any():
+        return np.zeros(magnitude.shape, np.complex64)
+    ceiling = float(np.quantile(magnitude[inside][::7], _AMPLITUDE_QUANTILE))
+    if ceiling <= 0:
+        return np.zeros(magnitude.shape, np.complex64)
+    amplitude = np.minimum(magnitude / ceiling, 1.0)
+    unit = (gx + 1j * gy) / np.maximum(magnitude, 1e-20)
+    return np.where(inside, amplitude * unit**2, 0).astype(np.complex64)
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A shift between two structure fields."""
+
+    shift_px: tuple[float, float]
+    """(dx, dy): what lies at p in the first field lies at p + shift in the second."""
+    sigma: float
+    """Height above the surface's mean, in standard deviations of the surface."""
+    runner_up_sigma: float
+    """The same for the highest value away from the peak."""
+    sigma_at_zero: float
+    """The same for the highest value within a pixel of no shift."""
+
+
+def correlation_surface(fixed: Field, moving: Field) -> NDArray[np.float32]:
+    """Circular correlation of two windowed fields of one shape, partly whitened; index [dy, dx] is the shift."""
+    height, width = fixed.shape[-2:]
+    window = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1]).astype(np.float32)
+    cross = np.conj(fft.fft2(fixed * window, workers=2)) * fft.fft2(moving * window, workers=2)
+    magnitude = np.abs(cross)
+    floor = np.maximum(magnitude.max(axis=(-2, -1), keepdims=True) * 1e-9, 1e-30)
+    return np.asarray(fft.ifft2(cross / np.maximum(magnitude, floor) ** _WHITENING, workers=2).real)
+
+
+def find_peak(surface: NDArray[np.float32], apart_px: int) -> Peak:
+    """The highest point of a correlation surface (height, width), to a fraction of a pixel.
+
+    `apart_px` is how far away the runner-up must lie.
+    """
+    height, width = surface.shape
+    spread = float(surface.std())
+    if spread <= 0:
+        return Peak((0.0, 0.0), 0.0, 0.0, 0.0)
+    z = np.fft.fftshift((surface - surface.mean()) / spread)
+    row, column = np.unravel_index(int(z.argmax()), z.shape)
+    zero_row, zero_column = height // 2, width // 2
+    dx = column - zero_column + _vertex(z[row, (column - 1) % width], z[row, column], z[row, (column + 1) % width])
+    dy = row - zero_row + _vertex(z[(row - 1) % height, column], z[row, column], z[(row + 1) % height, column])
+    sigma = float(z[row, column])
+    at_zero = float(z[zero_row - 1 : zero_row + 2, zero_column - 1 : zero_column + 2].max())
+    z[max(0, row - apart_px) : row + apart_px + 1, max(0, column - apart_px) : column + apart_px + 1] = -np.inf
+    runner_up = float(z.max())
+    return Peak((float(dx), float(dy)), sigma, runner_up if np.isfinite(runner_up) else 0.0, at_zero)
+
+
+def _vertex(before: float, at: float, after: float) -> float:
+    """Offset of the top of the parabola through three samples a pixel apart, in [-0.5, 0.5]."""
+    curvature = before - 2 * at + after
+    return 0.0 if curvature >= 0 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
+
+
+def textured(raster: Raster, least_share: float = 0.02) -> bool:
+    """False where the valid pixels are (nearly) all alike or too few for a structure to exist."""
+    return bool(raster.valid.mean() > least_share and raster.pixels[..., raster.valid].std() > 0)
+
+
+def shrink(raster: Raster, size_px: tuple[int, int]) -> Raster:
+    """Area-averaged copy of `size_px` (width, height); a pixel is valid where all of its source pixels are."""
+    if size_px == raster.size_px:
+        return raster
+    weight = cv2.resize(raster.valid.astype(np.float32), size_px, interpolation=cv2.INTER_AREA)
+    planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
+    shrunk = np.stack([cv2.resize(np.where(raster.valid, p, 0), size_px, interpolation=cv2.INTER_AREA) for p in planes])
+    shrunk = (shrunk / np.maximum(weight, 1e-6)).astype(np.float32)
+    valid: Mask = weight > 0.999
+    return Raster(shrunk if raster.pixels.ndim == 3 else shrunk[0], valid)

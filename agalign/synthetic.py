@@ -1,0 +1,398 @@
+"""A synthetic flight over a farm, written as a MicaSense-like camera would, with the truth beside it.
+
+The scene is a plane of parcels with crop rows of different directions and spacings, bare soil, tracks and trees. Each
+band sees it through its own lens (distortion, principal point), from its own place and angle in the rig, with its own
+spectrum: vegetation is darker than soil in the visible bands and far brighter in the near infra-red.
+"""
+
+import json
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from agalign import geometry, lens
+from agalign.geometry import Matrix
+from agalign.records import Lens
+
+Field = NDArray[np.float32]
+
+_PIXELS_PER_MM = 266.666667
+_FOCAL_LENGTH_MM = 5.45
+_BLACK_LEVEL = 4800.0
+_WHITE_LEVEL = 52000.0
+_MAP_PX_PER_IMAGE_PX = 1.25
+"""Resolution of the painted ground relative to the images, so that they do not show its pixels."""
+
+
+@dataclass(frozen=True)
+class BandSpec:
+    """One camera of the rig."""
+
+    name: str
+    wavelength_nm: float
+    bandwidth_nm: float
+    soil: float
+    crop: float
+    tree: float
+    """Reflectances, 0 to 1."""
+    rig_index: int
+    rig_degrees: tuple[float, float, float]
+    baseline_m: tuple[float, float]
+    """Place of the lens in the rig, metres right of and below the rig's centre."""
+    distortion: tuple[float, float, float, float, float]
+    """k1, k2, p1, p2, k3."""
+    centre_offset_px: tuple[float, float]
+    """Of the principal point from the middle of a 1280 x 960 sensor."""
+
+    def lens(self, width_px: int, height_px: int) -> Lens:
+        """This band's lens on a sensor of the given size; smaller sensors have larger pixels."""
+        scale = width_px / 1280
+        focal = _FOCAL_LENGTH_MM * _PIXELS_PER_MM * scale
+        cx = (width_px - 1) / 2 + self.centre_offset_px[0] * scale
+        cy = (height_px - 1) / 2 + self.centre_offset_px[1] * scale
+        return Lens(focal, focal, cx, cy, self.distortion)
+
+
+BANDS = (
+    BandSpec("Blue", 475, 20, 0.085, 0.042, 0.030, 0, (0.31, -0.22, 0.12), (-0.03, -0.021),
+             (-0.104, 0.150, -0.0003, 0.0006, -0.03), (11.2, -7.5)),
+    BandSpec("Green", 560, 20, 0.125, 0.105, 0.070, 1, (0.0, 0.0, 0.0), (0.0, -0.021),
+             (-0.101, 0.145, 0.0002, -0.0004, -0.02), (-6.3, 4.9)),
+    BandSpec("Red", 668, 10, 0.185, 0.055, 0.040, 2, (-0.42, 0.35, -0.18), (0.03, -0.021),
+             (-0.108, 0.158, -0.0001, 0.0003, -0.04), (3.7, 12.6)),
+    BandSpec("NIR", 840, 40, 0.265, 0.520, 0.430, 3, (0.55, -0.16, 0.21), (-0.03, 0.021),
+             (-0.110, 0.152, -0.0003, 0.0005, -0.05), (13.5, 9.1)),
+    BandSpec("Red edge", 717, 10, 0.225, 0.285, 0.220, 4, (-0.27, -0.31, -0.09), (0.03, 0.021),
+             (-0.106, 0.160, 0.0004, -0.0002, -0.06), (-9.4, -5.8)),
+)  # fmt: skip
+REFERENCE = 1
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the rig is at a capture, and its attitude."""
+
+    altitude_m: float
+    yaw_deg: float
+    roll_deg: float
+    pitch_deg: float
+    east_m: float
+    north_m: float
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The painted ground: shares of materials and textures on a square grid centred on the origin."""
+
+    crop: Field
+    tree: Field
+    brightness: Field
+    vigour: Field
+    metres_per_px: float
+
+
+def make_flight(
+    folder: Path, captures: int = 3, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0,
+    bands: Sequence[BandSpec] = BANDS,
+) -> Path:  # fmt: skip
+    """Write `captures` captures of all bands into folder/0000SET/000 and the truth into folder/truth.json.
+
+    The truth is {capture: {"reference": file, "bands": {file: {"ties": [[x_ref, y_ref, x_mov, y_mov], ...]}}}} in raw
+    pixels, centre of the top-left pixel (0, 0), exact to 0.001 px. Returns the path of truth.json.
+    """
+    rng = np.random.default_rng(rng_seed)
+    poses = [_pose(rng, number) for number in range(captures)]
+    ground = paint_ground(rng, poses, size_px)
+    images = folder / "0000SET" / "000"
+    images.mkdir(parents=True, exist_ok=True)
+    truth: dict[str, Any] = {}
+    reference = bands[REFERENCE]
+    for band in bands:
+        painted = reflectance(ground, band)
+        for number, pose in enumerate(poses, start=1):
+            pixels = render(painted, ground.metres_per_px, band, pose, size_px, rng)
+            _write_band(images / _file_name(number, band), pixels, band, pose, number, size_px)
+    for number, pose in enumerate(poses, start=1):
+        names = {b.name: _file_name(number, b) for b in bands}
+        truth[f"IMG_{number:04d}"] = {
+            "reference": names[reference.name],
+            "bands": {
+                names[b.name]: {"ties": true_ties(reference, b, pose, size_px)} for b in bands if b is not reference
+            },
+        }
+    path = folder / "truth.json"
+    path.write_text(json.dumps(truth))
+    return path
+
+
+def true_homography(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
+    """fixed_to_moving between undistorted pixels: both cameras' homographies to the ground plane, chained."""
+    return geometry.compose(
+        geometry.invert(_pixel_to_ground(band, pose, size_px)), _pixel_to_ground(reference, pose, size_px)
+    )
+
+
+def true_ties(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> list[list[float]]:
+    """[x_ref, y_ref, x_mov, y_mov] in raw pixels on a lattice, where both lie in their images."""
+    width, height = size_px
+    here = geometry.lattice(width, height, 25, 19)
+    straight = lens.undistort(reference.lens(*size_px), here)
+    moved = geometry.apply(true_homography(reference, band, pose, size_px), straight)
+    there = lens.distort(band.lens(*size_px), moved)
+    inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
+    rows: list[list[float]] = np.hstack([here, there])[inside].round(4).tolist()
+    return rows
+
+
+def _file_name(number: int, band: BandSpec) -> str:
+    return f"IMG_{number:04d}_{band.rig_index + 1}.tif"
+
+
+def render(
+    painted: Field, metres_per_px: float, band: BandSpec, pose: Pose, size_px: tuple[int, int], rng: np.random.Generator
+) -> NDArray[np.uint16]:
+    """What one camera records of the ground painted in its band: (height, width) uint16 with vignetting and noise."""
+    width, height = size_px
+    knots_x, knots_y = np.linspace(0, width - 1, width // 16), np.linspace(0, height - 1, height // 16)
+    raw = np.stack(np.meshgrid(knots_x, knots_y), axis=-1)
+    straight = lens.undistort(band.lens(*size_px), raw)
+    metres = geometry.apply(_pixel_to_ground(band, pose, size_px), straight)
+    on_map = metres / metres_per_px + (len(painted) - 1) / 2
+    splines = [RectBivariateSpline(knots_y, knots_x, on_map[..., k]) for k in (0, 1)]
+    y, x = np.arange(height), np.arange(width)
+    positions = np.stack([spline(y, x) for spline in splines], axis=-1).astype(np.float32)
+    scene = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    radius2 = ((x - width / 2) ** 2)[None, :] + ((y - height / 2) ** 2)[:, None]
+    vignetting = 1 - 0.35 * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
+    exposure = 0.55 / max(band.soil, band.crop)
+    signal = np.clip(scene * exposure * vignetting, 0, 1)
+    electrons = signal * 4000
+    noisy = electrons + rng.normal(size=signal.shape) * np.sqrt(electrons + 60)
+    levels = _BLACK_LEVEL + noisy / 4000 * (_WHITE_LEVEL - _BLACK_LEVEL)
+    return (np.clip(np.rint(levels / 16), 0, 4095) * 16).astype(np.uint16)
+
+
+def reflectance(ground: Ground, band: BandSpec) -> Field:
+    """The ground in one band: materials by their shares, crop by its vigour (the other way round in the visible)."""
+    bright = 1 if band.wavelength_nm > 700 else -0.5
+    crop = band.crop * (1 + 0.35 * bright * ground.vigour)
+    soil = band.soil * ground.brightness
+    bare = 1 - ground.crop - ground.tree
+    return np.asarray(soil * bare + crop * ground.crop + band.tree * (1 + 0.5 * ground.vigour) * ground.tree, np.float32)
+
+
+def paint_ground(rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int]) -> Ground:
+    """Parcels, rows, tracks and trees, large enough for all poses."""
+    focal = _FOCAL_LENGTH_MM * _PIXELS_PER_MM * size_px[0] / 1280
+    lowest, highest = min(p.altitude_m for p in poses), max(p.altitude_m for p in poses)
+    metres_per_px = lowest / focal / _MAP_PX_PER_IMAGE_PX
+    reach_m = max(np.hypot(p.east_m, p.north_m) for p in poses) + 0.62 * highest * np.hypot(*size_px) / focal
+    side = 2 * int(np.ceil(reach_m / metres_per_px))
+    metre = 1 / metres_per_px
+    count = max(6, round((side / metre / 9) ** 2))
+    parcel, edge = _parcels(rng, side, count)
+    angle, spacing = rng.uniform(0, np.pi, count), rng.uniform(0.45, 0.85, count) * metre
+    density = np.where(rng.random(count) < 0.15, -9.0, rng.uniform(-0.4, 0.4, count))
+    across_x = np.float32(2 * np.pi * np.cos(angle) / spacing)[parcel]
+    across_y = np.float32(2 * np.pi * np.sin(angle) / spacing)[parcel]
+    axis = np.arange(side, dtype=np.float32)
+    wobble = 0.06 * metre * _noise(rng, side, 1.5 * metre)
+    rows = np.cos(across_x * (axis[None, :] + wobble) + across_y * (axis[:, None] + wobble))
+    leaves = 0.7 * _noise(rng, side, 0.05 * metre) + 0.5 * _noise(rng, side, 0.25 * metre)
+    crop = 1 / (1 + np.exp(-6 * (rows + leaves + np.float32(density)[parcel])))
+    gaps = _noise(rng, side, 0.6 * metre) > 1.5
+    crop = np.where(gaps, crop * 0.15, crop)
+    crop = np.where(edge < 0.35 * metre, 0.03, crop)
+    tree = _trees(rng, side, metre)
+    crop = crop * (1 - tree)
+    ruts = np.clip(1.5 - np.abs(edge - 0.18 * metre) / (0.05 * metre), 0, 1)
+    brightness = 1 + 0.22 * _noise(rng, side, 2.5 * metre) + 0.16 * _noise(rng, side, 0.08 * metre)
+    brightness = np.clip(brightness + 0.25 * (edge < 0.35 * metre) - 0.3 * ruts, 0.3, 2.2)
+    vigour = 0.5 * _noise(rng, side, 3 * metre) + 0.45 * _noise(rng, side, 0.12 * metre)
+    fields = [f.astype(np.float32) for f in (crop, tree, brightness, np.clip(vigour, -1.5, 1.5))]
+    return Ground(*fields, metres_per_px=metres_per_px)
+
+
+def _parcels(rng: np.random.Generator, side: int, count: int) -> tuple[NDArray[np.int64], Field]:
+    """Index of each pixel's parcel, and its distance in px from the parcel's edge: a Voronoi division.
+
+    Worked out on every fourth pixel; the tracks along the edges hide the steps.
+    """
+    small = side // 4 + 1
+    axis = np.arange(small, dtype=np.float32) * 4
+    sites = rng.uniform(0, side, (count, 2)).astype(np.float32)
+    nearest = np.full((small, small), np.inf, np.float32)
+    second = nearest.copy()
+    index = np.zeros((small, small), np.int64)
+    for number, (site_x, site_y) in enumerate(sites):
+        distance = np.hypot(axis[None, :] - site_x, axis[:, None] - site_y)
+        closer = distance < nearest
+        second = np.where(closer, nearest, np.minimum(second, distance))
+        nearest = np.where(closer, distance, nearest)
+        index[closer] = number
+    edge = cv2.resize((second - nearest) / 2, (4 * small, 4 * small), interpolation=cv2.INTER_LINEAR)
+    full = np.repeat(np.repeat(index, 4, axis=0), 4, axis=1)
+    return full[:side, :side], np.asarray(edge[:side, :side], np.float32)
+
+
+def _trees(rng: np.random.Generator, side: int, metre: float) -> Field:
+    cover = np.zeros((side, side), np.float32)
+    ragged = 0.35 * _noise(rng, side, 0.3 * metre)
+    for _ in range(max(3, round((side / metre / 10) ** 2))):
+        radius = rng.uniform(0.5, 1.2) * metre
+        column, row = rng.uniform(0, side, 2)
+        reach = 2 * radius
+        x = np.arange(max(0, int(column - reach)), min(side, int(column + reach)))
+        y = np.arange(max(0, int(row - reach)), min(side, int(row + reach)))
+        window = np.ix_(y, x)
+        inside = 1.2 * (1 - np.hypot(x[None, :] - column, y[:, None] - row) / radius) + ragged[window]
+        cover[window] = np.maximum(cover[window], np.clip(4 * inside, 0, 1))
+    return cover
+
+
+def _noise(rng: np.random.Generator, side: int, grain_px: float) -> Field:
+    """Gaussian noise of mean 0 and standard deviation 1 whose blobs are `grain_px` wide."""
+    reduction = max(1.0, grain_px / 2)
+    small = max(8, int(np.ceil(side / reduction)))
+    coarse = cv2.GaussianBlur(rng.normal(size=(small, small)).astype(np.float32), (0, 0), max(0.5, grain_px / reduction / 2))
+    field = cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC)
+    return np.asarray((field - field.mean()) / field.std(), np.float32)
+
+
+def _pose(rng: np.random.Generator, number: int) -> Pose:
+    return Pose(
+        altitude_m=float(rng.uniform(22, 34)), yaw_deg=float(rng.uniform(-180, 180)),
+        roll_deg=float(rng.normal(0, 2)), pitch_deg=float(rng.normal(0, 2)),
+        east_m=4.0 * (number % 10), north_m=4.0 * (number // 10),
+    )  # fmt: skip
+
+
+def _pixel_to_ground(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
+    """Undistorted pixel -> metres east and south on the plane below: the ray from the lens, cut with the plane."""
+    attitude = _rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
+    rays = attitude @ _rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
+    place = attitude @ np.array([*band.baseline_m, 0.0]) + (pose.east_m, pose.north_m, -pose.altitude_m)
+    # ground = place + ray * (-place_z / ray_z): linear in the homogeneous pixel once multiplied by ray_z.
+    to_plane = np.array([[-place[2], 0.0, place[0]], [0.0, -place[2], place[1]], [0.0, 0.0, 1.0]])
+    return geometry.normalised(to_plane @ rays)
+
+
+def _rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
+    turns = [cv2.Rodrigues(np.radians(angle) * axis)[0] for angle, axis in zip((a_deg, b_deg, c_deg), np.eye(3), strict=True)]
+    return np.asarray(turns[0] @ turns[1] @ turns[2], np.float64)
+
+
+def _write_band(
+    path: Path, pixels: NDArray[np.uint16], band: BandSpec, pose: Pose, number: int, size_px: tuple[int, int]
+) -> None:
+    density = _PIXELS_PER_MM * size_px[0] / 1280
+    model = band.lens(*size_px)
+    moment = f"2026:06:21 10:{number // 60:02d}:{number % 60:02d}"
+    xmp = _XMP.format(
+        name=band.name, wavelength=band.wavelength_nm, fwhm=band.bandwidth_nm,
+        cx=model.cx_px / density, cy=model.cy_px / density, focal=_FOCAL_LENGTH_MM,
+        k1=band.distortion[0], k2=band.distortion[1], k3=band.distortion[4],
+        p1=band.distortion[2], p2=band.distortion[3],
+        rig=", ".join(f"{v:.6f}" for v in band.rig_degrees), index=band.rig_index, reference=REFERENCE,
+        capture=f"synthetic{number:011d}", altitude=pose.altitude_m,
+    ).encode()  # fmt: skip
+    extra = [(700, 7, len(xmp), xmp, True), *((code, 4, 1, 0, True) for code in _PLACEHOLDERS.values())]
+    tifffile.imwrite(
+        path, pixels, photometric="minisblack", rowsperstrip=100, software="agalign demo", datetime=moment,
+        metadata=None, extratags=[(271, 2, 0, "MicaSense", True), (272, 2, 0, "RedEdge-M", True), *extra],
+    )  # fmt: skip
+    latitude, longitude = 52.0 + pose.north_m / 111_320, 5.0 + pose.east_m / 68_500
+    exif = [
+        (0x829A, _rational(1.3e-3)), (0x9003, _ascii(moment)), (0x920A, _rational(5.5)), (0x9290, _ascii("000000")),
+        (0xA20E, _rational(density)), (0xA20F, _rational(density)), (0xA210, _short(4)), (0xA431, _ascii("SY01-0000001-AG")),
+    ]  # fmt: skip
+    gps = [
+        (1, _ascii("N")), (2, _degrees(latitude)), (3, _ascii("E")), (4, _degrees(longitude)),
+        (5, (1, 1, b"\0\0\0\0")), (6, _rational(pose.altitude_m)),
+    ]  # fmt: skip
+    _append_directory(path, 34665, exif)
+    _append_directory(path, 34853, gps)
+
+
+_PLACEHOLDERS = {34665: 65001, 34853: 65002}
+"""tifffile writes no Exif and GPS pointers, so private tags hold their places, in the same order."""
+
+Entry = tuple[int, int, bytes]
+"""TIFF type, count, and the value's bytes, little-endian."""
+
+
+def _short(value: int) -> Entry:
+    return 3, 1, struct.pack("<HH", value, 0)
+
+
+def _ascii(text: str) -> Entry:
+    data = text.encode("ascii") + b"\0"
+    return 2, len(data), data.ljust(4, b"\0")
+
+
+def _rational(*values: float) -> Entry:
+    return 5, len(values), b"".join(struct.pack("<II", round(v * 1_000_000), 1_000_000) for v in values)
+
+
+def _degrees(angle_deg: float) -> Entry:
+    minutes = angle_deg % 1 * 60
+    return _rational(int(angle_deg), int(minutes), minutes % 1 * 60)
+
+
+def _append_directory(path: Path, pointer_tag: int, entries: list[tuple[int, Entry]]) -> None:
+    """Append a sub-directory to a little-endian TIFF and turn the placeholder of `pointer_tag` into its pointer."""
+    with tifffile.TiffFile(path) as tiff:
+        placeholder = tiff.pages[0].tags[_PLACEHOLDERS[pointer_tag]]  # type: ignore[union-attr]
+    with path.open("r+b") as file:
+        start = file.seek(0, 2)
+        start += file.write(b"\0" * (start % 2))
+        values_at = start + 2 + 12 * len(entries) + 4
+        directory, values = struct.pack("<H", len(entries)), b""
+        for tag, (kind, count, data) in sorted(entries):
+            inline = len(data) <= 4
+            where = data if inline else struct.pack("<I", values_at + len(values))
+            directory += struct.pack("<HHI", tag, kind, count) + where
+            values += b"" if inline else data + b"\0" * (len(data) % 2)
+        file.write(directory + struct.pack("<I", 0) + values)
+        file.seek(placeholder.offset)
+        file.write(struct.pack("<HHII", pointer_tag, 4, 1, start))
+
+
+_XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/">
+ <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:Camera="http://pix4d.com/camera/1.0">
+   <Camera:RigName>RedEdge-M</Camera:RigName>
+   <Camera:BandName>{name}</Camera:BandName>
+   <Camera:CentralWavelength>{wavelength:g}</Camera:CentralWavelength>
+   <Camera:WavelengthFWHM>{fwhm:g}</Camera:WavelengthFWHM>
+   <Camera:ModelType>perspective</Camera:ModelType>
+   <Camera:PrincipalPoint>{cx:.8f},{cy:.8f}</Camera:PrincipalPoint>
+   <Camera:PerspectiveFocalLength>{focal}</Camera:PerspectiveFocalLength>
+   <Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>
+   <Camera:PerspectiveDistortion>
+    <rdf:Seq>
+     <rdf:li>{k1}</rdf:li><rdf:li>{k2}</rdf:li><rdf:li>{k3}</rdf:li><rdf:li>{p1}</rdf:li><rdf:li>{p2}</rdf:li>
+    </rdf:Seq>
+   </Camera:PerspectiveDistortion>
+   <Camera:RigRelatives>{rig}</Camera:RigRelatives>
+   <Camera:RigCameraIndex>{index}</Camera:RigCameraIndex>
+   <Camera:RigRelativesReferenceRigCameraIndex>{reference}</Camera:RigRelativesReferenceRigCameraIndex>
+  </rdf:Description>
+  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
+   <MicaSense:FlightId>syntheticflight00001</MicaSense:FlightId>
+   <MicaSense:CaptureId>{capture}</MicaSense:CaptureId>
+   <MicaSense:PressureAlt>{altitude:.3f}</MicaSense:PressureAlt>
+  </rdf:Description>
+ </rdf:RDF>
+</x:xmpmeta>
+<?xpacket end="w"?>
+"""
