@@ -1,8 +1,8 @@
 """Co-registers the bands of multispectral drone cameras by learning a descriptor on the images themselves.
 
-    import agalign
-    result = agalign.align(green, nir)                  # two arrays
-    flight = agalign.align_folder("flight/", "out/")    # everything below a folder
+import agalign
+result = agalign.align(green, nir)                  # two arrays
+flight = agalign.align_folder("flight/", "out/")    # everything below a folder
 """
 
 from importlib import import_module
@@ -26,7 +26,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """torch takes seconds to import, so nothing that needs it is imported before it is asked for (PEP 562)."""
+    """Torch takes seconds to import, so nothing that needs it is imported before it is asked for (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module 'agalign' has no attribute '{name}'")
     return getattr(import_module(_HOMES[name]), name)

@@ -109,12 +109,16 @@ def align_folder(
 def _view(image: ArrayLike, valid: ArrayLike | None, name: str) -> View:
     array = np.asarray(image)
     if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
-        raise InputError(f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}")
+        raise InputError(
+            f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"
+        )
     if array.ndim == 3 and array.shape[-1] <= _MOST_CHANNELS < array.shape[0]:
         array = np.moveaxis(array, -1, 0)
     planes = array if array.ndim == 3 else array[None]
     if len(planes) > _MOST_CHANNELS or min(planes.shape[1:]) < _LEAST_SIDE_PX:
-        raise InputError(f"{name} is {array.shape}: images need at least {_LEAST_SIDE_PX} px a side and at most {_MOST_CHANNELS} channels")
+        raise InputError(
+            f"{name} is {array.shape}: images need {_LEAST_SIDE_PX} px a side and at most {_MOST_CHANNELS} channels"
+        )
     saturation = float(np.iinfo(array.dtype).max) if array.dtype.kind in "ui" and array.dtype.itemsize <= 2 else None
     mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
     if mask.shape != planes.shape[1:]:

@@ -107,8 +107,6 @@ class SeedSettings(Stage):
     """Structure shifts below this, in working px, are noise and leave a candidate as it is."""
 
 
-
-
 class CheckSettings(Stage):
     """What an alignment must show to be called `aligned`. docs/method.md has the figures behind the limits."""
 

@@ -3,8 +3,8 @@
 import hashlib
 import math
 
-from numpy.typing import NDArray
 import numpy as np
+from numpy.typing import NDArray
 
 from agalign import geometry
 from agalign._version import __version__
@@ -40,7 +40,7 @@ def fingerprint(capture: Capture, settings: Settings) -> str:
 
 
 def capture_status(statuses: list[str]) -> CaptureStatus:
-    """ok where every moving band is aligned, failed where none is of use, else degraded."""
+    """Ok where every moving band is aligned, failed where none is of use, else degraded."""
     moving = [s for s in statuses if s != "reference"]
     if all(s == "aligned" for s in moving):
         return "ok"
@@ -50,15 +50,21 @@ def capture_status(statuses: list[str]) -> CaptureStatus:
 def describe_capture(
     capture: Capture, alignments: dict[str, Alignment], stack: Stack | None, settings: Settings
 ) -> Sidecar:
+    """The sidecar of a capture whose moving bands have the given alignments, by band name."""
     reference = capture.reference
     parts = []
     for band in capture.bands:
         if band is reference:
             parts.append(
                 BandPart(
-                    band=band.name, wavelength_nm=band.wavelength_nm, file=band.path.name,
-                    band_index=band.band_index, status="reference", reason=None, seconds=0.0,
-                )  # fmt: skip
+                    band=band.name,
+                    wavelength_nm=band.wavelength_nm,
+                    file=band.path.name,
+                    band_index=band.band_index,
+                    status="reference",
+                    reason=None,
+                    seconds=0.0,
+                )
             )
         else:
             parts.append(_band_part(reference, band, alignments[band.name]))
@@ -73,9 +79,12 @@ def describe_capture(
         status="degraded" if status == "ok" and capture.missing_bands else status,
         missing_bands=list(capture.missing_bands),
         reference=ReferencePart(
-            band=reference.name, file=reference.path.name, band_index=reference.band_index,
-            width=reference.width_px, height=reference.height_px,
-        ),  # fmt: skip
+            band=reference.name,
+            file=reference.path.name,
+            band_index=reference.band_index,
+            width=reference.width_px,
+            height=reference.height_px,
+        ),
         bands=parts,
         output=None if stack is None else _output_part(stack),
         settings=fingerprint(capture, settings),
@@ -108,9 +117,11 @@ def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
         reason=alignment.reason,
         homography=HomographyPart(fixed_to_moving=_rows(alignment.fixed_to_moving), space=alignment.space),
         seed=SeedPart(
-            kind=alignment.seed.kind, fixed_to_moving=_rows(alignment.seed.fixed_to_moving),
-            peak_sigma=alignment.seed.peak_sigma, runner_up_sigma=alignment.seed.runner_up_sigma,
-        ),  # fmt: skip
+            kind=alignment.seed.kind,
+            fixed_to_moving=_rows(alignment.seed.fixed_to_moving),
+            peak_sigma=alignment.seed.peak_sigma,
+            runner_up_sigma=alignment.seed.runner_up_sigma,
+        ),
         grid=GridPart(reference_px=_points(grid_px), moving_px=_points(there_px)),
         joint=None if joint is None else _joint_part(joint),
         metrics=MetricsPart(

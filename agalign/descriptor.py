@@ -15,22 +15,27 @@ PATCH_PX = 16
 DIMENSION = 256
 
 
-class HalfRectified(nn.Module):
-    """tanh on the first half of the channels, |.| of tanh on the second.
+class _FirstLayer(nn.Module):
+    """Conv - Tanh - MaxPool, computed as Conv - MaxPool - Tanh: tanh is increasing, so they are equal, and there
+    is a quarter as much of it.
 
-    An edge and its contrast-reversed twin then give the same response in half of the channels from the first
-    step on, which is what vegetation does between visible and near infra-red bands.
+    With `half_rectified`, |tanh| in the second half of the channels: an edge and its contrast-reversed twin then
+    give the same response there from the first step on, which is what vegetation does between visible and near
+    infra-red bands. |tanh(x)| = tanh(|x|), so the order does not matter here either.
     """
 
+    def __init__(self, channels: int, half_rectified: bool) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(channels, 32, 5)
+        self.half_rectified = half_rectified
+
     def forward(self, x: Tensor) -> Tensor:
-        """(N, C, H, W) -> the same shape."""
-        signed, folded = torch.tanh(x).chunk(2, dim=1)
-        return torch.cat([signed, folded.abs()], dim=1)
-
-
-def _first_layer(channels: int, half_rectified: bool) -> nn.Sequential:
-    activation = HalfRectified() if half_rectified else nn.Tanh()
-    return nn.Sequential(nn.Conv2d(channels, 32, 5), activation, nn.MaxPool2d(2))
+        """(N, C, 16, 16) -> (N, 32, 6, 6)."""
+        x = self.convolution(x)
+        if self.half_rectified:
+            signed, folded = x.chunk(2, dim=1)
+            x = torch.cat([signed, folded.abs()], dim=1)
+        return torch.tanh(nn.functional.max_pool2d(x, 2))
 
 
 def _trunk() -> nn.Sequential:
@@ -55,20 +60,19 @@ class Descriptor(nn.Module):
         super().__init__()
         self.sharing = sharing
         self.unit_length = unit_length
-        self.fixed_first = _first_layer(fixed_channels, half_rectified)
-        self.moving_first = (
-            self.fixed_first if sharing == "siamese" else _first_layer(moving_channels, half_rectified)
-        )
+        self.fixed_first = _FirstLayer(fixed_channels, half_rectified)
+        self.moving_first = self.fixed_first if sharing == "siamese" else _FirstLayer(moving_channels, half_rectified)
         self.fixed_trunk = _trunk()
         self.moving_trunk = _trunk() if sharing == "unshared" else self.fixed_trunk
         # The NHWC layout makes the small convolutions nearly twice as fast on a CPU.
-        self.to(memory_format=torch.channels_last)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, patches: Tensor, side: Side) -> Tensor:
         """(N, C, 16, 16) -> (N, 256)."""
         x = patches.contiguous(memory_format=torch.channels_last)
-        if side == "fixed":
-            f = self.fixed_trunk(self.fixed_first(x))
-        else:
-            f = self.moving_trunk(self.moving_first(x))
+        first, trunk = {
+            "fixed": (self.fixed_first, self.fixed_trunk),
+            "moving": (self.moving_first, self.moving_trunk),
+        }[side]
+        f: Tensor = trunk(first(x))
         return nn.functional.normalize(f, dim=1) if self.unit_length else f

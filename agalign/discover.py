@@ -1,6 +1,7 @@
 """From a folder to captures."""
 
 import os
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -97,9 +98,15 @@ def _tiffs(folder: Path, skip: Sequence[Path]) -> list[Path]:
             d for d in folders
             if not d.startswith(".") and (here / d).resolve() not in skipped and not _is_output(here / d)
         )  # fmt: skip
-        tiffs = sorted(n for n in names if Path(n).suffix.lower() in TIFF_SUFFIXES and not n.startswith("."))
+        tiffs = [n for n in names if Path(n).suffix.lower() in TIFF_SUFFIXES and not n.startswith(".")]
+        tiffs.sort(key=_natural)
         found.extend(here / n for n in tiffs)
     return found
+
+
+def _natural(name: str) -> list[tuple[bool, int, str]]:
+    """Sorts `_2` before `_10`."""
+    return [(part.isdigit(), int(part) if part.isdigit() else 0, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
 def _is_output(folder: Path) -> bool:
@@ -139,7 +146,7 @@ def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capt
     tags = first.tags
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
     return Capture(
-        name=_shared_name(files),
+        name=first.path.stem if len(files) == 1 else first.camera.capture_name(first.path),
         folder=first.path.parent.relative_to(folder),
         bands=tuple(bands),
         reference_index=reference,
@@ -158,19 +165,6 @@ def _reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> i
             return index
     names = ", ".join(b.name for b in bands)
     raise ConfigurationError(f"{path}: no band '{wanted}' for the reference; this capture has {names}")
-
-
-def _shared_name(files: Sequence[_File]) -> str:
-    """The part of the file names that the bands share; a multiband file's own stem."""
-    if len(files) == 1:
-        return files[0].path.stem
-    stems = [f.path.stem for f in files]
-    shared = os.path.commonprefix(stems)
-    # `IMG_0007_1` and `IMG_0007_10` share the digit, which is not part of the capture's name.
-    cut = max(shared.rfind(c) for c in "_-. ")
-    if cut > 0 and any(len(s) > len(shared) and s[len(shared)].isdigit() for s in stems) and shared[cut + 1 :].isdigit():
-        shared = shared[:cut] if all(s[: cut + 1] == shared[: cut + 1] for s in stems) else shared
-    return shared.rstrip("_-. ") or stems[0]
 
 
 def _with_unique_band_names(bands: Sequence[Band]) -> list[Band]:

@@ -21,6 +21,10 @@ class GeometryError(AgalignError):
     """A mapping cannot be inverted or estimated (singular homography, too few points)."""
 
 
+class NotEnoughTextureError(AgalignError):
+    """Too few keypoints lie on the common valid area to learn from."""
+
+
 class SidecarError(InputError):
     """A sidecar is missing, malformed or of another schema version."""
 

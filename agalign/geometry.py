@@ -70,7 +70,7 @@ def resolution_change(scale_x: float, scale_y: float) -> Matrix:
 
 def rescale(fixed_to_moving: Matrix, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> Matrix:
     """The same mapping between images resized by `fixed_scale` and `moving_scale` (each x, y; 0.5 halves)."""
-    to_full = np.linalg.inv(resolution_change(*fixed_scale))
+    to_full = invert(resolution_change(*fixed_scale))
     return compose(resolution_change(*moving_scale), fixed_to_moving, to_full)
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from agalign import geometry, losses
 from agalign.config import JointSettings
 from agalign.descriptor import Descriptor
-from agalign.errors import ConfigurationError
+from agalign.errors import ConfigurationError, NotEnoughTextureError
 from agalign.gauss_newton import Step, shift_gradient, solve
 from agalign.geometry import Matrix
 from agalign.levels import Level, Sampler, make_level
@@ -38,10 +38,6 @@ Progress = Callable[[str, float], None]
 """Called with the name of what is being done and the share of it that is behind, 0 to 1."""
 
 
-class NotEnoughTexture(Exception):
-    """Fewer keypoints than a batch needs lie on the common valid area. Never leaves this package's pipeline."""
-
-
 def choose_device(name: str) -> torch.device:
     """`auto` is CUDA where there is one, else the CPU. Raises ConfigurationError where `name` cannot be had."""
     if name == "auto":
@@ -59,7 +55,7 @@ def align_jointly(
 ) -> tuple[JointResult, Descriptor]:
     """Learn theta and psi on one pair, starting from `seed` (fixed_to_moving at full resolution).
 
-    A `trusted` seed is good to a few pixels, so recipe fast leaves the coarse levels out. Raises NotEnoughTexture
+    A `trusted` seed is good to a few pixels, so recipe fast leaves the coarse levels out. Raises NotEnoughTextureError
     where there is nothing to learn from.
     """
     aligner = JointAligner(fixed, moving, settings, progress)
@@ -89,16 +85,14 @@ class JointAligner:
         least_gradient = self.settings.paper.least_gradient
         level = make_level(fixed, moving, scale, moving_scale, least_gradient, self.device)
         if len(level.trainable) == 0:
-            raise NotEnoughTexture("no pixel of the reference band has contrast enough to learn from")
+            raise NotEnoughTextureError("no pixel of the reference band has contrast enough to learn from")
         return level
 
     def new_descriptor(self, channels: tuple[int, int], *, half_rectified: bool, unit_length: bool) -> Descriptor:
-        """f with random weights that depend on nothing but the settings' rng_seed."""
+        """F with random weights that depend on nothing but the settings' rng_seed."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.settings.rng_seed)
-            net = Descriptor(
-                self.settings.sharing, *channels, half_rectified=half_rectified, unit_length=unit_length
-            )
+            net = Descriptor(self.settings.sharing, *channels, half_rectified=half_rectified, unit_length=unit_length)
         return net.to(self.device)
 
     def to_level(self, matrix: Matrix, level: Level) -> Tensor:
@@ -152,7 +146,7 @@ class JointAligner:
     def descend(
         self, net: Descriptor, level: Level, start: Matrix, report: Callable[[float], None]
     ) -> tuple[Matrix, int, float, float]:
-        """argmin over theta and psi of sum L0(x; psi, theta) + sum L1(x, x'; theta) (paper, Eq. 5)."""
+        """Argmin over theta and psi of sum L0(x; psi, theta) + sum L1(x, x'; theta) (paper, Eq. 5)."""
         recipe = self.settings.paper
         width, height = level.fixed.size_px
         h = self.to_level(start, level)
@@ -162,7 +156,7 @@ class JointAligner:
 
         p = self.sampler.draw(level, level.trainable, h, recipe.keypoints, recipe.octaves, recipe.spacing_px)
         if len(p) < recipe.batch:
-            raise NotEnoughTexture(f"only {len(p)} keypoints lie on the common valid area")
+            raise NotEnoughTextureError(f"only {len(p)} keypoints lie on the common valid area")
         # The negatives are drawn once: each keypoint of I with a random other one's place in I'.
         order = torch.randperm(len(p), generator=self.sampler.generator).to(self.device)
         negatives = warp_keypoints(p[order], h)
@@ -175,7 +169,7 @@ class JointAligner:
         loss_value, before = float("nan"), psi.detach().clone()
         for _ in range(recipe.epochs):
             shuffled = torch.randperm(len(p), generator=self.sampler.generator).to(self.device)
-            for rows in shuffled[: batches * recipe.batch].split(recipe.batch):
+            for rows in torch.split(shuffled[: batches * recipe.batch], recipe.batch):
                 h = homography_from_psi(psi, width, height)
                 f = net(bilinear(level.fixed.image, patch_grid(p[rows])), "fixed")
                 f_true = net(bilinear(level.moving.image, patch_grid(warp_keypoints(p[rows], h))), "moving")
@@ -183,7 +177,7 @@ class JointAligner:
                 apart = losses.distance(f, f_false)[is_negative[rows]]
                 loss = losses.contrastive(losses.distance(f, f_true), apart, recipe.margin)
                 optimiser.zero_grad()
-                loss.backward()
+                torch.autograd.backward(loss)
                 assert psi.grad is not None
                 psi.grad *= movable
                 before = psi.detach().clone()
@@ -199,7 +193,7 @@ class JointAligner:
     # ---- recipe fast
 
     def fast(self, seed: Matrix, trusted: bool) -> tuple[JointResult, Descriptor]:
-        """theta is carried from level to level; at full resolution only psi moves."""
+        """Theta is carried from level to level; at full resolution only psi moves."""
         psi = seed
         net: Descriptor | None = None
         steps_taken, loss = 0, float("nan")
@@ -232,7 +226,7 @@ class JointAligner:
         return scales
 
     def learn(self, net: Descriptor, level: Level, seed: Matrix) -> tuple[Matrix, int, float]:
-        """theta by Adam; psi by Gauss-Newton once held-out patches are told apart."""
+        """Theta by Adam; psi by Gauss-Newton once held-out patches are told apart."""
         recipe = self.settings.fast
         optimiser = torch.optim.Adam(net.parameters(), recipe.learning_rate)
         h = self.to_level(seed, level)
@@ -240,11 +234,11 @@ class JointAligner:
         for step in range(1, recipe.most_steps + 1):
             p = self.sampler.draw(level, level.trainable, h, recipe.batch, recipe.octaves)
             if len(p) < recipe.batch // 4:
-                raise NotEnoughTexture(f"only {len(p)} keypoints lie on the common valid area")
+                raise NotEnoughTextureError(f"only {len(p)} keypoints lie on the common valid area")
             f, f_prime = self.describe(net, level, h, p)
             loss = losses.in_batch(f, f_prime, far_apart(p, recipe.least_negative_px), recipe.temperature)
             optimiser.zero_grad()
-            loss.backward()
+            torch.autograd.backward(loss)
             optimiser.step()
             if step < recipe.warm_up_steps or step % recipe.steps_between_updates:
                 continue
@@ -277,7 +271,7 @@ class JointAligner:
         recipe = self.settings.fast
         p = self.sampler.draw(level, level.anywhere, h, patches, recipe.octaves)
         if len(p) < 16:
-            raise NotEnoughTexture(f"only {len(p)} keypoints lie on the common valid area")
+            raise NotEnoughTextureError(f"only {len(p)} keypoints lie on the common valid area")
 
         def fixed_side(k: Keypoints) -> Tensor:
             return self.describe_fixed(net, level, k)

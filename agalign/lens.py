@@ -43,9 +43,7 @@ def undistort(lens: Lens | None, raw_px: ArrayLike) -> Points:
         return points
     flat = np.ascontiguousarray(points.reshape(-1, 1, 2))
     coefficients = np.array((*lens.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5])
-    undistorted = cv2.undistortPoints(
-        flat, lens.matrix, coefficients, P=lens.matrix, criteria=_UNDISTORT_CRITERIA
-    )
+    undistorted = cv2.undistortPoints(flat, lens.matrix, coefficients, P=lens.matrix, criteria=_UNDISTORT_CRITERIA)
     return np.asarray(undistorted, dtype=np.float64).reshape(points.shape)
 
 
@@ -57,7 +55,5 @@ def undistort_raster(raster: Raster, lens: Lens | None) -> Raster:
     x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     raw = distort(lens, np.stack([x, y], axis=-1)).astype(np.float32)
     pixels = cv2.remap(raster.pixels, raw, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    valid = cv2.remap(
-        raster.valid.astype(np.uint8) * 255, raw, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
-    )
+    valid = cv2.remap(raster.valid.astype(np.uint8) * 255, raw, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     return Raster(np.asarray(pixels, dtype=np.float32), np.asarray(valid == 255))

@@ -140,8 +140,8 @@ def _gradient_magnitude(planes: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _reserved_cells(width_px: int, height_px: int) -> Mask:
     cell = max(width_px, height_px) / _HELD_OUT_CELLS
-    row, column = np.mgrid[0:height_px, 0:width_px] // cell
-    return np.asarray((column + 2 * row) % 5 == 0)
+    column, row = np.arange(width_px) // cell, np.arange(height_px) // cell
+    return np.asarray((column[None, :] + 2 * row[:, None]) % 5 == 0)
 
 
 def _positions(mask: Mask, device: torch.device) -> Tensor:

@@ -79,7 +79,9 @@ def read_tags(path: Path) -> Tags:
             page = tiff.pages[0]
             values = {tag.code: tag.value for tag in page.tags.values()}  # type: ignore[union-attr]
     except (OSError, tifffile.TiffFileError, ValueError, IndexError, KeyError) as error:
-        raise UnreadableFileError(f"{path}: not a readable TIFF ({error or 'empty'}); copy it from the card again") from None
+        raise UnreadableFileError(
+            f"{path}: not a readable TIFF ({error or 'empty'}); copy it from the card again"
+        ) from None
     exif = values.get(34665)
     exif = exif if isinstance(exif, dict) else {}
     return Tags(

@@ -39,7 +39,7 @@ def similarity(fixed: FloatImage, moving: FloatImage, valid: Mask) -> dict[str, 
 
 
 def joint_histogram(fixed: NDArray[np.float32], moving: NDArray[np.float32]) -> NDArray[np.float64]:
-    """elastix's joint density of two samples (n,): (32, 32), sums to 1, fixed along rows.
+    """Elastix's joint density of two samples (n,): (32, 32), sums to 1, fixed along rows.
 
     Each range is widened by 1 % on both sides. The fixed kernel is of order 0 (a box), the moving one the cubic
     B-spline, whose support costs the moving axis a bin of padding at either end (Klein et al. 2010; Mattes 2003).
@@ -172,7 +172,9 @@ def _starts(length: int, side: int) -> list[int]:
     return [round(v) for v in np.linspace(0, max(0, length - side), count)]
 
 
-def _shift_of(fixed: NDArray[np.complex64], moving: NDArray[np.complex64], settings: CheckSettings) -> tuple[float, float]:
+def _shift_of(
+    fixed: NDArray[np.complex64], moving: NDArray[np.complex64], settings: CheckSettings
+) -> tuple[float, float]:
     """The shift of one window's content; nan, nan where no peak stands out."""
     # The mean orientation of a row crop is the same everywhere and tells no place from another.
     surface = correlation_surface(fixed - fixed.mean(), moving - moving.mean())
@@ -181,7 +183,9 @@ def _shift_of(fixed: NDArray[np.complex64], moving: NDArray[np.complex64], setti
     spread = float(surface.std())
     if spread <= 0 or surface[row, column] < settings.least_peak_sigma * spread:
         return np.nan, np.nan
-    patch = np.take(np.take(surface, range(row - 1, row + 2), 0, mode="wrap"), range(column - 1, column + 2), 1, mode="wrap")
+    patch = np.take(
+        np.take(surface, range(row - 1, row + 2), 0, mode="wrap"), range(column - 1, column + 2), 1, mode="wrap"
+    )
     dx, dy = _paraboloid_top(patch)
     x = (column + width // 2) % width - width // 2 + dx
     y = (row + height // 2) % height - height // 2 + dy

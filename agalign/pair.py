@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from agalign import geometry, lens
 from agalign.check import leaves_as_is, verdict
 from agalign.config import Settings
-from agalign.errors import GeometryError
+from agalign.errors import GeometryError, NotEnoughTextureError
 from agalign.geometry import Matrix
-from agalign.joint import NotEnoughTexture, align_jointly
+from agalign.joint import align_jointly
 from agalign.metrics import similarity, tile_residuals
 from agalign.raster import read_for_alignment
 from agalign.records import Alignment, Band, FloatImage, JointResult, Lens, PairStatus, Raster, Residual, Seed, SeedKind
@@ -49,12 +49,12 @@ def load_view(band: Band, longest_side_px: int) -> View:
 def align_views(
     fixed: View, moving: View, candidates: dict[SeedKind, Matrix], settings: Settings, progress: StageProgress
 ) -> Alignment:
-    """Align one pair. `candidates` and the result map undistorted pixels of the FILES; the work is done on the views."""
+    """Align one pair. `candidates` and the result map undistorted pixels of the FILES; the views may be reduced."""
     started = time.perf_counter()
     down = {kind: geometry.rescale(m, fixed.scale, moving.scale) for kind, m in candidates.items()}
     progress("seeding", 0.0)
     one, other = fixed.straight, moving.straight
-    before = _similarity_before(fixed, moving, candidates)
+    before = _similarity_before(fixed, moving)
     if not (textured(one) and textured(other)):
         blank = "reference" if not textured(one) else "moving"
         kind, matrix = next(iter(candidates.items()))
@@ -70,19 +70,21 @@ def align_views(
         matrix = joint.fixed_to_moving
     progress("checking", 0.0)
     residual, after = _measure(one, other, matrix, settings)
-    status, reason = verdict(seed, trusted, joint, why_not, residual, one.size_px, settings.check)
+    status, doubt = verdict(seed, trusted, joint, why_not, residual, one.size_px, settings.check)
     if status != "aligned" and joint is not None:
         matrix = seed.fixed_to_moving
         residual, after = _measure(one, other, matrix, settings)
     if status == "seed_only" and (residual is None or residual.coverage < 0.3):
-        status, reason = "failed", f"{reason}, but it does not fit either"
+        status, doubt = "failed", f"{doubt}, but it does not fit either"
     to_file = [(1 / s[0], 1 / s[1]) for s in (fixed.scale, moving.scale)]
     full = geometry.rescale(matrix, *to_file)
     seed = replace(seed, fixed_to_moving=geometry.rescale(seed.fixed_to_moving, *to_file))
     if joint is not None:
-        joint = replace(joint, corner_std_px=joint.corner_std_px * to_file[1][0], last_step_px=joint.last_step_px * to_file[0][0])
+        joint = replace(
+            joint, corner_std_px=joint.corner_std_px * to_file[1][0], last_step_px=joint.last_step_px * to_file[0][0]
+        )
     residual = _residual_in_file_px(residual, to_file[0])
-    return _outcome(full, status, reason, seed, joint, residual, started, before, after)
+    return _outcome(full, status, doubt, seed, joint, residual, started, before, after)
 
 
 def _joint(
@@ -92,7 +94,7 @@ def _joint(
         joint, _ = align_jointly(
             fixed, moving, seed.fixed_to_moving, settings.joint, trusted=trusted, progress=progress
         )
-    except NotEnoughTexture as reason:
+    except NotEnoughTextureError as reason:
         return None, str(reason)
     except GeometryError:
         return None, "the optimisation ended in a mapping that cannot be inverted"
@@ -107,7 +109,7 @@ def _outcome(
     return Alignment(matrix, "pixel", status, reason, seed, joint, residual, seconds, before, after)
 
 
-def _similarity_before(fixed: View, moving: View, candidates: dict[SeedKind, Matrix]) -> dict[str, float]:
+def _similarity_before(fixed: View, moving: View) -> dict[str, float]:
     """The files laid on each other as they are."""
     size = fixed.raw.size_px
     scale = moving.raw.size_px[0] / size[0], moving.raw.size_px[1] / size[1]
@@ -123,7 +125,9 @@ def _mean(pixels: NDArray[np.float32]) -> FloatImage:
     return pixels if pixels.ndim == 2 else np.asarray(pixels.mean(axis=0))
 
 
-def _measure(fixed: Raster, moving: Raster, matrix: Matrix, settings: Settings) -> tuple[Residual | None, dict[str, float]]:
+def _measure(
+    fixed: Raster, moving: Raster, matrix: Matrix, settings: Settings
+) -> tuple[Residual | None, dict[str, float]]:
     there = warped(moving, matrix, fixed.size_px, (1.0, 1.0))
     one, other = Raster(_mean(fixed.pixels), fixed.valid), Raster(_mean(there.pixels), there.valid)
     after = similarity(one.pixels, other.pixels, one.valid & other.valid)
@@ -145,7 +149,9 @@ def _rescaled(model: Lens | None, scale: tuple[float, float]) -> Lens | None:
         return model
     sx, sy = scale
     centre = geometry.apply(geometry.resolution_change(sx, sy), (model.cx_px, model.cy_px))
-    return replace(model, fx_px=model.fx_px * sx, fy_px=model.fy_px * sy, cx_px=float(centre[0]), cy_px=float(centre[1]))
+    return replace(
+        model, fx_px=model.fx_px * sx, fy_px=model.fy_px * sy, cx_px=float(centre[0]), cy_px=float(centre[1])
+    )
 
 
 def seed_candidates(reference: Band, moving: Band, rig_seed: RigSeed, settings: Settings) -> dict[SeedKind, Matrix]:
@@ -159,8 +165,8 @@ def seed_candidates(reference: Band, moving: Band, rig_seed: RigSeed, settings: 
         candidates["geo"] = geo
     candidates["identity"] = overlay(reference, moving)
     forced = settings.seed.force
-    if forced in candidates:
-        return {forced: candidates[forced]}  # type: ignore[index, dict-item]
+    if forced is not None and forced in candidates:
+        return {forced: candidates[forced]}
     return candidates
 
 
@@ -184,5 +190,3 @@ def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> Mapping:
     if alignment.space == "pixel":
         return Mapping(alignment.fixed_to_moving)
     return Mapping(alignment.fixed_to_moving, reference.lens, moving.lens)
-
-

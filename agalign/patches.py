@@ -25,7 +25,7 @@ FAMILY_PARAMETERS: dict[ModelFamily, tuple[int, ...]] = {
 
 
 def homography_from_psi(psi: Tensor, width_px: int, height_px: int) -> Tensor:
-    """psi (8,) -> H (3, 3), with psi = alpha [h11-1, h12, h21, h22-1, h13/w, h23/h, h31 w, h32 h]."""
+    """Psi (8,) -> H (3, 3), with psi = alpha [h11-1, h12, h21, h22-1, h13/w, h23/h, h31 w, h32 h]."""
     p = psi / ALPHA
     one = torch.ones_like(p[0])
     return torch.stack(
@@ -92,9 +92,7 @@ def warp_keypoints(keypoints: Keypoints, homography: Tensor) -> Keypoints:
     v = keypoints.scale[:, None] * torch.stack([keypoints.angle.cos(), keypoints.angle.sin()], dim=1)
     denominator = keypoints.xy @ h[2, :2] + 1
     v_prime = (v @ h[:2, :2].T) / denominator[:, None]
-    return Keypoints(
-        transform(h, keypoints.xy), torch.atan2(v_prime[:, 1], v_prime[:, 0]), v_prime.norm(dim=1)
-    )
+    return Keypoints(transform(h, keypoints.xy), torch.atan2(v_prime[:, 1], v_prime[:, 0]), v_prime.norm(dim=1))
 
 
 def patch_grid(keypoints: Keypoints) -> Tensor:

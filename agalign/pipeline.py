@@ -9,6 +9,7 @@ from agalign.config import Settings
 from agalign.describe import describe_capture
 from agalign.errors import AgalignError
 from agalign.pair import RigSeed, align_pair, load_view, mapping_of
+from agalign.picture import write_picture
 from agalign.records import Alignment, Band, Capture, Seed
 from agalign.seed import overlay
 from agalign.sidecar import Sidecar, write_sidecar
@@ -62,6 +63,10 @@ def process_capture(
     progress(reference.name, "writing", 0.0)
     stack_path, sidecar_path = output_paths(capture, out)
     stack = _write(capture, alignments, stack_path, settings)
+    if stack is not None:
+        usable = [b for b in capture.moving if alignments[b.name].status != "failed"]
+        crop = stack.crop.x0, stack.crop.y0, stack.crop.width, stack.crop.height
+        write_picture(capture, stack.path, crop, usable, stack_path.with_suffix(".png"))
     sidecar = describe_capture(capture, alignments, stack, settings)
     write_sidecar(sidecar_path, sidecar)
     return CaptureOutcome(sidecar, sidecar_path)
@@ -90,5 +95,3 @@ def _write(capture: Capture, alignments: dict[str, Alignment], path: Path, setti
     if crop is None:
         crop = Tile(0, 0, *reference.size_px)
     return write_stack(capture, layers, crop, path, settings.write)
-
-

@@ -1,6 +1,5 @@
 """Reading rasters: what a file holds, its pixels at any resolution, and its validity."""
 
-import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -93,12 +92,20 @@ def read_window(
     return pixels, valid
 
 
-def same_file_size(path: Path) -> int:
-    """Size in bytes, 0 where it cannot be had."""
-    try:
-        return os.path.getsize(path)
-    except OSError:
-        return 0
+def read_preview(
+    path: Path, index: int, window_px: tuple[int, int, int, int], size_px: tuple[int, int] | None = None
+) -> NDArray[np.float32]:
+    """A window (x0, y0, width, height) of a band as (height, width) float32, perhaps resized; nodata as nan."""
+    x0, y0, width, height = window_px
+    reduction = max(1.0, max(width, height) / 2048)
+    out = size_px or (round(width / reduction), round(height / reduction))
+    with open_raster(path) as dataset:
+        window = Window(x0, y0, width, height)
+        resampling = Resampling.average if out[0] < width else Resampling.bilinear
+        pixels = dataset.read(index, window=window, out_shape=(out[1], out[0]), resampling=resampling, boundless=False)
+        nodata = dataset.nodata
+    values = pixels.astype(np.float32)
+    return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))
 
 
 def _dataset_mask(dataset: rasterio.DatasetReader, index: int, shape: tuple[int, int]) -> Mask:

@@ -40,7 +40,8 @@ class Lens:
 @dataclass(frozen=True)
 class Georeference:
     """Where a raster lies: `transform` maps (column, row, 1) with (0, 0) the CORNER of the top-left pixel,
-    as GDAL and rasterio have it, to map units of `crs_wkt`."""
+    as GDAL and rasterio have it, to map units of `crs_wkt`.
+    """
 
     transform: Matrix
     crs_wkt: str

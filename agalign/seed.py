@@ -16,7 +16,9 @@ def best_seed(fixed: Raster, moving: Raster, candidates: dict[SeedKind, Matrix],
     `candidates` are fixed_to_moving homographies at full resolution, in order of trust. Each is scored at no shift
     and at its best shift; a candidate whose best shift is below `least_shift_px` stays as it is.
     """
-    scored = [seed for kind, matrix in candidates.items() for seed in scored_seeds(fixed, moving, kind, matrix, settings)]
+    scored = [
+        seed for kind, matrix in candidates.items() for seed in scored_seeds(fixed, moving, kind, matrix, settings)
+    ]
     if settings.force is not None and settings.force != "structure":
         return next(s for s in scored if s.kind == settings.force)
     if settings.force == "structure":
@@ -59,9 +61,7 @@ def geo_seed(reference: Band, moving: Band) -> Matrix | None:
     if here is None or there is None or here.crs_wkt != there.crs_wkt:
         return None
     to_corner = geometry.translation(0.5, 0.5)
-    return geometry.compose(
-        geometry.invert(to_corner), geometry.invert(there.transform), here.transform, to_corner
-    )
+    return geometry.compose(geometry.invert(to_corner), geometry.invert(there.transform), here.transform, to_corner)
 
 
 def overlay(reference: Band, moving: Band) -> Matrix:
@@ -70,7 +70,9 @@ def overlay(reference: Band, moving: Band) -> Matrix:
     return geometry.resolution_change(*scale)
 
 
-def warped(moving: Raster, fixed_to_moving: Matrix, size_px: tuple[int, int], fixed_scale: tuple[float, float]) -> Raster:
+def warped(
+    moving: Raster, fixed_to_moving: Matrix, size_px: tuple[int, int], fixed_scale: tuple[float, float]
+) -> Raster:
     """The moving raster resampled onto the fixed grid reduced by `fixed_scale`, without aliasing."""
     magnification = float(np.median(np.abs(geometry.local_scale(fixed_to_moving, *_full(size_px, fixed_scale)))))
     reduce = float(np.clip(fixed_scale[0] / magnification, 8 / min(moving.size_px), 1.0))

@@ -22,7 +22,7 @@ _WHITENING = 0.5
 
 
 def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
-    """z of a single-band raster, (height, width) complex64 with |z| <= 1, and 0 at and next to invalid pixels."""
+    """Z of a single-band raster, (height, width) complex64 with |z| <= 1, and 0 at and next to invalid pixels."""
     pixels = np.where(raster.valid, raster.pixels, 0).astype(np.float32)
     weight = cv2.GaussianBlur(raster.valid.astype(np.float32), (0, 0), smoothing_px)
     smooth = cv2.GaussianBlur(pixels, (0, 0), smoothing_px) / np.maximum(weight, 1e-3)

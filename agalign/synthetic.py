@@ -53,7 +53,7 @@ class BandSpec:
     """Of the principal point from the middle of a 1280 x 960 sensor."""
 
     def lens(self, width_px: int, height_px: int) -> Lens:
-        """This band's lens on a sensor of the given size; smaller sensors have larger pixels."""
+        """The lens on a sensor of the given size; smaller sensors have larger pixels."""
         scale = width_px / 1280
         focal = _FOCAL_LENGTH_MM * _PIXELS_PER_MM * scale
         cx = (width_px - 1) / 2 + self.centre_offset_px[0] * scale
@@ -177,7 +177,7 @@ def render(
     electrons = signal * 4000
     noisy = electrons + rng.normal(size=signal.shape) * np.sqrt(electrons + 60)
     levels = _BLACK_LEVEL + noisy / 4000 * (_WHITE_LEVEL - _BLACK_LEVEL)
-    return (np.clip(np.rint(levels / 16), 0, 4095) * 16).astype(np.uint16)
+    return np.asarray((np.clip(np.rint(levels / 16), 0, 4095) * 16).astype(np.uint16))
 
 
 def reflectance(ground: Ground, band: BandSpec) -> Field:
@@ -186,7 +186,9 @@ def reflectance(ground: Ground, band: BandSpec) -> Field:
     crop = band.crop * (1 + 0.35 * bright * ground.vigour)
     soil = band.soil * ground.brightness
     bare = 1 - ground.crop - ground.tree
-    return np.asarray(soil * bare + crop * ground.crop + band.tree * (1 + 0.5 * ground.vigour) * ground.tree, np.float32)
+    return np.asarray(
+        soil * bare + crop * ground.crop + band.tree * (1 + 0.5 * ground.vigour) * ground.tree, np.float32
+    )
 
 
 def paint_ground(rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int]) -> Ground:
@@ -201,13 +203,13 @@ def paint_ground(rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple
     parcel, edge = _parcels(rng, side, count)
     angle, spacing = rng.uniform(0, np.pi, count), rng.uniform(0.45, 0.85, count) * metre
     density = np.where(rng.random(count) < 0.15, -9.0, rng.uniform(-0.4, 0.4, count))
-    across_x = np.float32(2 * np.pi * np.cos(angle) / spacing)[parcel]
-    across_y = np.float32(2 * np.pi * np.sin(angle) / spacing)[parcel]
+    across_x = (2 * np.pi * np.cos(angle) / spacing).astype(np.float32)[parcel]
+    across_y = (2 * np.pi * np.sin(angle) / spacing).astype(np.float32)[parcel]
     axis = np.arange(side, dtype=np.float32)
     wobble = 0.06 * metre * _noise(rng, side, 1.5 * metre)
     rows = np.cos(across_x * (axis[None, :] + wobble) + across_y * (axis[:, None] + wobble))
     leaves = 0.7 * _noise(rng, side, 0.05 * metre) + 0.5 * _noise(rng, side, 0.25 * metre)
-    crop = 1 / (1 + np.exp(-6 * (rows + leaves + np.float32(density)[parcel])))
+    crop = 1 / (1 + np.exp(-6 * (rows + leaves + density.astype(np.float32)[parcel])))
     gaps = _noise(rng, side, 0.6 * metre) > 1.5
     crop = np.where(gaps, crop * 0.15, crop)
     crop = np.where(edge < 0.35 * metre, 0.03, crop)
@@ -217,8 +219,13 @@ def paint_ground(rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple
     brightness = 1 + 0.22 * _noise(rng, side, 2.5 * metre) + 0.16 * _noise(rng, side, 0.08 * metre)
     brightness = np.clip(brightness + 0.25 * (edge < 0.35 * metre) - 0.3 * ruts, 0.3, 2.2)
     vigour = 0.5 * _noise(rng, side, 3 * metre) + 0.45 * _noise(rng, side, 0.12 * metre)
-    fields = [f.astype(np.float32) for f in (crop, tree, brightness, np.clip(vigour, -1.5, 1.5))]
-    return Ground(*fields, metres_per_px=metres_per_px)
+    return Ground(
+        crop.astype(np.float32),
+        tree,
+        brightness.astype(np.float32),
+        np.clip(vigour, -1.5, 1.5).astype(np.float32),
+        metres_per_px,
+    )
 
 
 def _parcels(rng: np.random.Generator, side: int, count: int) -> tuple[NDArray[np.int64], Field]:
@@ -262,7 +269,9 @@ def _noise(rng: np.random.Generator, side: int, grain_px: float) -> Field:
     """Gaussian noise of mean 0 and standard deviation 1 whose blobs are `grain_px` wide."""
     reduction = max(1.0, grain_px / 2)
     small = max(8, int(np.ceil(side / reduction)))
-    coarse = cv2.GaussianBlur(rng.normal(size=(small, small)).astype(np.float32), (0, 0), max(0.5, grain_px / reduction / 2))
+    coarse = cv2.GaussianBlur(
+        rng.normal(size=(small, small)).astype(np.float32), (0, 0), max(0.5, grain_px / reduction / 2)
+    )
     field = cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC)
     return np.asarray((field - field.mean()) / field.std(), np.float32)
 
@@ -286,7 +295,9 @@ def _pixel_to_ground(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Ma
 
 
 def _rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
-    turns = [cv2.Rodrigues(np.radians(angle) * axis)[0] for angle, axis in zip((a_deg, b_deg, c_deg), np.eye(3), strict=True)]
+    turns = [
+        cv2.Rodrigues(np.radians(angle) * axis)[0] for angle, axis in zip((a_deg, b_deg, c_deg), np.eye(3), strict=True)
+    ]
     return np.asarray(turns[0] @ turns[1] @ turns[2], np.float64)
 
 
@@ -304,15 +315,17 @@ def _write_band(
         rig=", ".join(f"{v:.6f}" for v in band.rig_degrees), index=band.rig_index, reference=REFERENCE,
         capture=f"synthetic{number:011d}", altitude=pose.altitude_m,
     ).encode()  # fmt: skip
-    extra = [(700, 7, len(xmp), xmp, True), *((code, 4, 1, 0, True) for code in _PLACEHOLDERS.values())]
+    extra: list[Any] = [(271, 2, 0, "MicaSense", True), (272, 2, 0, "RedEdge-M", True), (700, 7, len(xmp), xmp, True)]
+    extra += [(code, 4, 1, 0, True) for code in _PLACEHOLDERS.values()]
     tifffile.imwrite(
         path, pixels, photometric="minisblack", rowsperstrip=100, software="agalign demo", datetime=moment,
-        metadata=None, extratags=[(271, 2, 0, "MicaSense", True), (272, 2, 0, "RedEdge-M", True), *extra],
+        metadata=None, extratags=extra,
     )  # fmt: skip
     latitude, longitude = 52.0 + pose.north_m / 111_320, 5.0 + pose.east_m / 68_500
     exif = [
         (0x829A, _rational(1.3e-3)), (0x9003, _ascii(moment)), (0x920A, _rational(5.5)), (0x9290, _ascii("000000")),
-        (0xA20E, _rational(density)), (0xA20F, _rational(density)), (0xA210, _short(4)), (0xA431, _ascii("SY01-0000001-AG")),
+        (0xA20E, _rational(density)), (0xA20F, _rational(density)), (0xA210, _short(4)),
+        (0xA431, _ascii("SY01-0000001-AG")),
     ]  # fmt: skip
     gps = [
         (1, _ascii("N")), (2, _degrees(latitude)), (3, _ascii("E")), (4, _degrees(longitude)),

@@ -107,7 +107,9 @@ def resample_tile(
         return np.zeros(shape, dtype=band.dtype), np.zeros(shape, dtype=bool)
     with open_raster(band.path) as dataset:
         pixels, valid = read_window(dataset, band, int(x0), int(y0), int(x1 - x0), int(y1 - y0))
-    return resample(pixels, valid, positions - (x0, y0), (band.width_px - x0, band.height_px - y0), (-x0, -y0), interpolation)
+    return resample(
+        pixels, valid, positions - (x0, y0), (band.width_px - x0, band.height_px - y0), (-x0, -y0), interpolation
+    )
 
 
 def resample(
@@ -118,7 +120,10 @@ def resample(
     sensor_start: tuple[int, int],
     interpolation: Interpolation,
 ) -> tuple[NDArray[np.generic], Mask]:
-    """Pixels (h, w) at positions (H, W, 2) in px of that window; the sensor spans `sensor_start` to `sensor_end` there."""
+    """Pixels (h, w) of a window at positions (H, W, 2) in px of that window.
+
+    `sensor_start` and `sensor_end` (x, y) say where the whole image begins and ends in the window's px.
+    """
     map_xy = positions.astype(np.float32)
     everything = bool(valid.all())
     source = _for_remap(pixels if everything else _filled(pixels, valid), interpolation)
@@ -130,7 +135,7 @@ def resample(
         flag = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
         weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)
         inside &= weight > 0.999
-    return _as_type(sampled, pixels.dtype), inside
+    return _as_type(sampled, pixels.dtype), np.asarray(inside)
 
 
 def _for_remap(pixels: NDArray[np.generic], interpolation: Interpolation) -> NDArray[np.generic]:
@@ -153,8 +158,8 @@ def _filled(pixels: NDArray[np.generic], valid: Mask) -> NDArray[np.generic]:
 def _as_type(values: NDArray[np.generic], dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
     if values.dtype == dtype or dtype.kind == "f":
         return values.astype(dtype, copy=False)
-    limits = np.iinfo(dtype)
-    return np.clip(np.rint(values), limits.min, limits.max).astype(dtype)
+    limits = np.iinfo(str(dtype))
+    return np.asarray(np.clip(np.rint(values), limits.min, limits.max).astype(dtype))
 
 
 def common_area(mappings: list[tuple[Mapping, Band]], width_px: int, height_px: int) -> Tile | None:
@@ -186,7 +191,8 @@ def _largest_rectangle(
     cells: Mask, widths: NDArray[np.int64], heights: NDArray[np.int64]
 ) -> tuple[int, int, int, int] | None:
     """(top, bottom, left, right) in cell edges of the all-True rectangle of the largest area: a histogram with a
-    stack, row by row."""
+    stack, row by row.
+    """
     best_area, best = 0, None
     left_edge = np.concatenate([[0], np.cumsum(widths)])
     tall = np.zeros(cells.shape[1], dtype=np.int64)

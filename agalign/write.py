@@ -90,7 +90,9 @@ def _write_layer(
 def _marked(pixels: NDArray[np.generic], valid: NDArray[np.bool_], nodata: float) -> NDArray[np.generic]:
     if not math.isnan(nodata):
         step = 1 if pixels.dtype.kind != "f" else np.spacing(np.abs(pixels.dtype.type(nodata)) + 1)
-        beside = nodata + step if pixels.dtype.kind == "f" or nodata < np.iinfo(pixels.dtype).max else nodata - step
+        beside = (
+            nodata + step if pixels.dtype.kind == "f" or nodata < np.iinfo(str(pixels.dtype)).max else nodata - step
+        )
         pixels = np.where(valid & (pixels == nodata), pixels.dtype.type(beside), pixels)
     return np.where(valid, pixels, pixels.dtype.type(nodata))
 
@@ -156,9 +158,7 @@ def _describe(dataset: Any, capture: Capture, layers: list[Layer]) -> None:
         dataset.set_band_description(index, layer.band.name)
         if layer.band.wavelength_nm is not None:
             width = {} if layer.band.bandwidth_nm is None else {"fwhm": f"{layer.band.bandwidth_nm:g}"}
-            dataset.update_tags(
-                index, wavelength=f"{layer.band.wavelength_nm:g}", wavelength_units="nm", **width
-            )
+            dataset.update_tags(index, wavelength=f"{layer.band.wavelength_nm:g}", wavelength_units="nm", **width)
             micrometres = f"{layer.band.wavelength_nm / 1000:g}"
             dataset.update_tags(index, ns="IMAGERY", CENTRAL_WAVELENGTH_UM=micrometres)
 

@@ -30,6 +30,10 @@ class Camera(Protocol):
         """Files with the same key (and the same camera) are one capture."""
         ...
 
+    def capture_name(self, path: Path) -> str:
+        """The part of a file's name that the bands of its capture share."""
+        ...
+
     def rig_seed(self, reference: Band, moving: Band) -> Matrix | None:
         """fixed_to_moving between undistorted pixels from metadata alone; None where it does not tell."""
         ...

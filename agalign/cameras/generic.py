@@ -56,6 +56,9 @@ class Generic:
     def capture_key(self, path: Path, tags: Tags) -> str:
         return self.split(path)[0]
 
+    def capture_name(self, path: Path) -> str:
+        return self.split(path)[0]
+
     def rig_seed(self, reference: Band, moving: Band) -> Matrix | None:
         return None
 
@@ -73,7 +76,9 @@ class Generic:
 def compile_pattern(pattern: str) -> re.Pattern[str]:
     """A --pattern as a regular expression. Raises ConfigurationError where {capture} or {band} is missing."""
     if pattern.count("{capture}") != 1 or pattern.count("{band}") != 1:
-        raise ConfigurationError(f"pattern '{pattern}' needs {{capture}} and {{band}} once each, as in '{{capture}}_{{band}}.tif'")
+        raise ConfigurationError(
+            f"pattern '{pattern}' needs {{capture}} and {{band}} once each, as in '{{capture}}_{{band}}.tif'"
+        )
     escaped = re.escape(pattern).replace(r"\{capture\}", "(?P<capture>.+?)").replace(r"\{band\}", "(?P<band>[^/]+?)")
     return re.compile(escaped.replace(r"\*", ".*"), re.IGNORECASE)
 

@@ -52,16 +52,19 @@ class MicaSense:
         return (replace(band, rig_rotation=rotation(*angles)),) if len(angles) == 3 else (band,)
 
     def capture_key(self, path: Path, tags: Tags) -> str:
-        return tags.text("MicaSense", "CaptureId") or re.sub(r"_\d+$", "", path.stem)
+        return tags.text("MicaSense", "CaptureId") or self.capture_name(path)
+
+    def capture_name(self, path: Path) -> str:
+        return re.sub(r"_\d+$", "", path.stem)
 
     def rig_seed(self, reference: Band, moving: Band) -> Matrix | None:
         if reference.lens is None or moving.lens is None:
             return None
         turn = np.eye(3)
-        both = reference.rig_rotation is not None and moving.rig_rotation is not None
-        if both and reference.rig_group == moving.rig_group:
-            turn = moving.rig_rotation.T @ reference.rig_rotation  # type: ignore[union-attr]
-        return geometry.compose(moving.lens.matrix, turn, np.linalg.inv(reference.lens.matrix))
+        here, there = reference.rig_rotation, moving.rig_rotation
+        if here is not None and there is not None and reference.rig_group == moving.rig_group:
+            turn = there.T @ here
+        return geometry.compose(moving.lens.matrix, turn, geometry.invert(reference.lens.matrix))
 
 
 def rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
