@@ -60,7 +60,7 @@ def warp_onto(
     fixed_size_px: tuple[int, int],
     *,
     valid: ArrayLike | None = None,
-    interpolation: Interpolation = "cubic",
+    interpolation: Interpolation = "lanczos",
 ) -> tuple[NDArray[np.generic], Mask]:
     """Resample a single-band image (H, W) onto a fixed grid of (width, height) pixels; its type is kept.
 

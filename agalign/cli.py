@@ -35,6 +35,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+_PLAIN_WIDTH = 160
 _COMMANDS = ("align", "demo", "info", "report")
 
 
@@ -108,8 +109,9 @@ class Voice:
 
     def __init__(self, *, quiet: bool, verbose: bool, log_json: bool) -> None:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
-        self.out = Console(soft_wrap=not sys.stdout.isatty(), highlight=False)
-        self.err = Console(stderr=True, soft_wrap=not sys.stderr.isatty(), highlight=False)
+        # Lines in a file or a pipe are not wrapped to a terminal's width.
+        self.out = Console(highlight=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
+        self.err = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
 
     def event(self, name: str, text: str = "", style: str = "", **fields: Any) -> None:
         """One line of progress: JSON with --log-json, else the text unless --quiet."""
@@ -174,7 +176,7 @@ def align(
     ] = FamilyChoice.auto,
     interpolation: Annotated[
         InterpolationChoice, typer.Option(help="Resampling of the moving bands.")
-    ] = InterpolationChoice.cubic,
+    ] = InterpolationChoice.lanczos,
     crop: Annotated[
         CropChoice, typer.Option(help="Cut to the area all bands share, or keep the reference's frame.")
     ] = CropChoice.common,

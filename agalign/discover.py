@@ -122,10 +122,10 @@ def _examine(path: Path, cameras: Iterable[Camera]) -> _File:
 
 
 def _groups(files: Iterable[_File]) -> list[list[_File]]:
-    """Files of one capture: same camera, same key; the folder counts where the key is only a name."""
+    """Files of one capture: same camera, folder and key. A file of several bands is a capture of its own."""
     groups: dict[tuple[str, ...], list[_File]] = defaultdict(list)
     for file in files:
-        key = file.camera.capture_key(file.path, file.tags)
+        key = file.camera.capture_key(file.path, file.tags) if len(file.bands) == 1 else file.path.name
         groups[(file.camera.name, str(file.path.parent), key)].append(file)
     return list(groups.values())
 

@@ -28,7 +28,7 @@ class Step:
     length_px: float
     """Largest movement of a corner, px of the level."""
     corner_std_px: float
-    """Standard deviation of the mapped corners, px of the level (root mean square of the four, worst axis sum)."""
+    """Root mean square distance of the least certain corner from where it is mapped to, px of the level."""
     family: ModelFamily
 
 

@@ -34,7 +34,8 @@ def normalised(matrix: ArrayLike) -> Matrix:
     h = np.asarray(matrix, dtype=np.float64)
     if h.shape != (3, 3) or not np.isfinite(h).all():
         raise GeometryError(f"a homography is a finite 3x3 matrix, not one of shape {h.shape}: {h.tolist()}")
-    if abs(h[2, 2]) < 1e-12 * np.abs(h).max() or abs(np.linalg.det(h / np.abs(h).max())) < 1e-15:
+    largest = np.abs(h).max()
+    if largest == 0 or abs(h[2, 2]) < 1e-12 * largest or abs(np.linalg.det(h / largest)) < 1e-15:
         raise GeometryError(f"the homography is singular: {h.tolist()}")
     return np.asarray(h / h[2, 2])
 

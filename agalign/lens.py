@@ -48,12 +48,12 @@ def undistort(lens: Lens | None, raw_px: ArrayLike) -> Points:
 
 
 def undistort_raster(raster: Raster, lens: Lens | None) -> Raster:
-    """The raster as a pinhole camera with the same K would have seen it (bicubic; for estimation only)."""
+    """The raster as a pinhole camera with the same K would have seen it (for estimation only)."""
     if lens is None or not is_distorting(lens):
         return raster
     width, height = raster.size_px
     x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     raw = distort(lens, np.stack([x, y], axis=-1)).astype(np.float32)
-    pixels = cv2.remap(raster.pixels, raw, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    pixels = cv2.remap(raster.pixels, raw, None, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     valid = cv2.remap(raster.valid.astype(np.uint8) * 255, raw, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     return Raster(np.asarray(pixels, dtype=np.float32), np.asarray(valid == 255))

@@ -78,7 +78,7 @@ def read_tags(path: Path) -> Tags:
         with tifffile.TiffFile(path) as tiff:
             page = tiff.pages[0]
             values = {tag.code: tag.value for tag in page.tags.values()}  # type: ignore[union-attr]
-    except (OSError, tifffile.TiffFileError, ValueError, IndexError, KeyError) as error:
+    except Exception as error:  # a damaged file makes tifffile fail in any way: struct.error, KeyError, MemoryError …
         raise UnreadableFileError(
             f"{path}: not a readable TIFF ({error or 'empty'}); copy it from the card again"
         ) from None

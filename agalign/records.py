@@ -167,7 +167,8 @@ class JointResult:
     model_family: ModelFamily
     last_step_px: float
     corner_std_px: float
-    """Standard deviation of the mapped image corners, px, from the curvature at the solution."""
+    """Root mean square distance, px, of the least certain corner from where it is mapped to: from the curvature at
+    the solution and what the patches disagree by."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import math
 import os
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from rasterio.shutil import copy as copy_dataset
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
+from agalign import geometry
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.raster import open_raster, read_window
@@ -62,11 +64,10 @@ def write_stack(capture: Capture, layers: list[Layer], crop: Tile, path: Path, s
                 _to_cog(partial, settings)
             partial.replace(path)
     except (OSError, RasterioError) as error:
-        partial.unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot be written ({error})") from None
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
     return Stack(path, crop, nodata)
 
 
@@ -141,8 +142,9 @@ def _profile(
 
 def _georeference(georeference: Georeference, crop: Tile) -> dict[str, Any]:
     # Only where the source has one: an identity transform would be an invented georeference.
-    transform = Affine(*georeference.transform[:2].ravel()) * Affine.translation(crop.x0, crop.y0)
-    return {"transform": transform, "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
+    # Whole pixels, so that corner and centre conventions move alike.
+    cropped = georeference.transform @ geometry.translation(crop.x0, crop.y0)
+    return {"transform": Affine(*cropped[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
 
 
 def _describe(dataset: Any, capture: Capture, layers: list[Layer]) -> None:

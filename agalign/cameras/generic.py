@@ -57,7 +57,8 @@ class Generic:
         return self.split(path)[0]
 
     def capture_name(self, path: Path) -> str:
-        return self.split(path)[0]
+        # `red.tif` and `nir.tif` alone in a folder are a capture that the folder names.
+        return self.split(path)[0] or path.absolute().parent.name
 
     def rig_seed(self, reference: Band, moving: Band) -> Matrix | None:
         return None
@@ -68,7 +69,7 @@ class Generic:
             match = self._pattern.fullmatch(path.name)
             return (match["capture"], match["band"]) if match else (path.stem, "")
         match = _SUFFIX.fullmatch(path.stem)
-        if match and match["capture"].strip("_-. "):
+        if match:
             return match["capture"].rstrip("_-. "), match["band"] or match["glued"]
         return path.stem, ""
 

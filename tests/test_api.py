@@ -1,0 +1,96 @@
+import numpy as np
+import pytest
+
+import agalign
+from agalign import geometry
+from agalign.errors import GeometryError, InputError
+
+from .conftest import textured_image, textured_pair
+
+TRUTH = np.array([[1.004, 0.006, 9.0], [-0.005, 0.998, -7.0], [4e-6, -6e-6, 1.0]])
+
+
+def as_uint8(image: np.ndarray) -> np.ndarray:
+    return np.clip(image * 35 + 128, 1, 254).astype(np.uint8)
+
+
+def test_two_arrays_without_any_hint() -> None:
+    fixed, moving = textured_pair(TRUTH)
+    found = agalign.align(as_uint8(fixed), as_uint8(moving))
+    assert found.status == "aligned"
+    assert found.reason is None
+    assert geometry.mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.1
+    assert found.after["mattes_mi"] < found.before["mattes_mi"]
+    assert found.residual is not None
+    assert found.residual.median_px < 0.2
+
+
+def test_a_seed_and_borders_filled_with_zeros() -> None:
+    fixed, moving = textured_pair(TRUTH)
+    moving = as_uint8(moving)
+    moving[:, :60] = 0
+    found = agalign.align(as_uint8(fixed), moving, seed=geometry.translation(14, -12))
+    assert found.status == "aligned"
+    assert geometry.mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
+
+
+def test_rgb_in_either_order_of_axes() -> None:
+    fixed, moving = textured_pair(TRUTH)
+    rgb = np.stack([as_uint8(fixed), as_uint8(0.5 * fixed), as_uint8(fixed**2)], axis=-1)
+    for image in (rgb, np.moveaxis(rgb, -1, 0)):
+        found = agalign.align(image, as_uint8(moving))
+        assert found.status == "aligned"
+        assert geometry.mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
+
+
+def test_what_is_aligned_stays_untouched() -> None:
+    fixed, moving = textured_pair(np.eye(3))
+    found = agalign.align(fixed, moving)
+    assert found.status == "aligned"
+    np.testing.assert_array_equal(found.fixed_to_moving, np.eye(3))
+
+
+@pytest.mark.parametrize(
+    "moving",
+    [
+        textured_image(400, 320, 77),
+        np.full((320, 400), 9, np.uint16),
+        np.random.default_rng(123).normal(size=(320, 400)),
+        np.full((320, 400), np.nan),
+        np.zeros((320, 400), np.uint8),
+    ],
+    ids=["unrelated", "constant", "noise", "nan", "zeros"],
+)
+def test_what_cannot_be_aligned_is_said_so(moving: np.ndarray) -> None:
+    found = agalign.align(textured_image(400, 320), moving)
+    assert found.status in ("failed", "seed_only")
+    assert found.reason
+
+
+def test_ten_per_cent_of_overlap() -> None:
+    wide, other = textured_pair(np.eye(3), width=760)
+    found = agalign.align(wide[:, :400], other[:, 360:])
+    assert found.status in ("failed", "seed_only")
+
+
+def test_bad_arguments_are_told() -> None:
+    image = textured_image(100, 80)
+    with pytest.raises(InputError, match="fixed"):
+        agalign.align(np.zeros(5), image)
+    with pytest.raises(InputError, match="moving"):
+        agalign.align(image, np.zeros((10, 10)))
+    with pytest.raises(InputError, match="moving_valid"):
+        agalign.align(image, image, moving_valid=np.ones((3, 3)))
+    with pytest.raises(GeometryError):
+        agalign.align(image, image, seed=np.zeros((3, 3)))
+    with pytest.raises(AttributeError, match="nothing"):
+        agalign.nothing  # noqa: B018
+
+
+def test_warp_onto() -> None:
+    fixed, moving = textured_pair(TRUTH)
+    pixels, valid = agalign.warp_onto(moving, TRUTH, (400, 320))
+    assert pixels.shape == valid.shape == (320, 400)
+    assert np.corrcoef(pixels[valid], fixed[valid])[0, 1] < -0.9
+    with pytest.raises(InputError):
+        agalign.warp_onto(np.zeros((3, 50, 50)), np.eye(3), (50, 50))

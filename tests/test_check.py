@@ -1,0 +1,63 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agalign import geometry
+from agalign.check import leaves_as_is, verdict
+from agalign.config import CheckSettings
+from agalign.records import JointResult, Residual, Seed
+
+SEED = Seed("rig", np.eye(3), 100.0, 100.0, 5.0)
+GOOD_JOINT = JointResult(np.eye(3), 0.1, 0.95, 0.004, 75, (0.5, 1.0), "fast", "homography", 0.05, 0.1)
+GOOD_RESIDUAL = Residual(np.zeros((50, 2)), np.zeros((50, 2)), 0.05, 0.2, 1.0, 0.01)
+SIZE = (1280, 960)
+
+
+def judge(
+    joint: JointResult | None = GOOD_JOINT, residual: Residual | None = GOOD_RESIDUAL, trusted: bool = True
+) -> tuple[str, str | None]:
+    return verdict(SEED, trusted, joint, "no texture", residual, SIZE, CheckSettings())
+
+
+def test_all_well() -> None:
+    assert judge() == ("aligned", None)
+
+
+@pytest.mark.parametrize(
+    ("joint", "residual", "word"),
+    [
+        (replace(GOOD_JOINT, retrieval=0.1), GOOD_RESIDUAL, "retrieval"),
+        (replace(GOOD_JOINT, corner_std_px=5.0), GOOD_RESIDUAL, "corners"),
+        (replace(GOOD_JOINT, fixed_to_moving=np.diag([-1.0, 1, 1])), GOOD_RESIDUAL, "folds"),
+        (
+            replace(GOOD_JOINT, fixed_to_moving=np.array([[1, 0, 0], [0, 1, 0], [-7e-4, 0, 1.0]])),
+            GOOD_RESIDUAL,
+            "folds",
+        ),
+        (GOOD_JOINT, None, "structure"),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, centres_px=np.zeros((2, 2))), "structure"),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, coverage=0.4), "40%"),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, median_px=2.5), "2.5 px"),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, median_px=float("inf")), "px"),
+        (None, GOOD_RESIDUAL, "no texture"),
+    ],
+)
+def test_any_doubt_is_enough(joint: JointResult | None, residual: Residual | None, word: str) -> None:
+    status, reason = judge(joint, residual)
+    assert status == "seed_only"
+    assert reason is not None
+    assert word in reason
+    assert "rig seed" in reason
+    assert judge(joint, residual, trusted=False)[0] == "failed"
+
+
+def test_an_aligned_input_is_left_as_it_is() -> None:
+    identity = Seed("identity", np.eye(3), 100.0)
+    within = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.1, 0.1))
+    beyond = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.4, 0.1))
+    precise = replace(within, corner_std_px=0.01)
+    assert leaves_as_is(identity, within, SIZE, CheckSettings())
+    assert not leaves_as_is(identity, beyond, SIZE, CheckSettings())
+    assert not leaves_as_is(identity, precise, SIZE, CheckSettings())
+    assert not leaves_as_is(SEED, within, SIZE, CheckSettings())

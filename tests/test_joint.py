@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+import torch
+
+from agalign import geometry
+from agalign.config import FastRecipe, JointSettings, PaperRecipe
+from agalign.errors import ConfigurationError, NotEnoughTextureError
+from agalign.joint import JointAligner, align_jointly, choose_device
+from agalign.records import JointResult, Raster
+
+from .conftest import textured_image, textured_pair
+
+TRUTH = np.array([[1.004, 0.006, 6.0], [-0.005, 0.998, -4.0], [4e-6, -6e-6, 1.0]])
+NEAR = geometry.translation(7.5, -5.5)
+
+
+def rasters(matrix: np.ndarray, seed: int = 0) -> tuple[Raster, Raster]:
+    fixed, moving = textured_pair(matrix, seed=seed)
+    valid = np.ones(fixed.shape, bool)
+    return Raster(fixed, valid), Raster(moving, valid)
+
+
+def run(settings: JointSettings, seed: np.ndarray = NEAR, **kwargs: int) -> JointResult:
+    result, _ = align_jointly(*rasters(TRUTH, **kwargs), seed, settings, trusted=True, progress=lambda *_: None)
+    return result
+
+
+def test_fast_recovers_a_homography_through_reversed_contrast() -> None:
+    result = run(JointSettings())
+    assert geometry.mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.08
+    assert result.retrieval > 0.8
+    assert result.chance < 0.01
+    assert result.model_family == "homography"
+
+
+def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> None:
+    short = FastRecipe(most_steps=50, final_steps=1)
+    one, same = (run(JointSettings(fast=short, rng_seed=4)) for _ in range(2))
+    other = run(JointSettings(fast=short, rng_seed=5))
+    np.testing.assert_array_equal(one.fixed_to_moving, same.fixed_to_moving)
+    assert one.loss == same.loss
+    assert not np.array_equal(one.fixed_to_moving, other.fixed_to_moving)
+
+
+def test_the_global_random_state_is_left_alone() -> None:
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    run(JointSettings(fast=FastRecipe(most_steps=50, final_steps=1)))
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_a_translation_stays_a_translation() -> None:
+    start = geometry.translation(4.0, -2.0)
+    fixed, moving = rasters(geometry.translation(6.0, -4.0))
+    settings = JointSettings(model_family="translation")
+    result, _ = align_jointly(fixed, moving, start, settings, trusted=True, progress=lambda *_: None)
+    np.testing.assert_allclose(result.fixed_to_moving[:2, :2], np.eye(2), atol=1e-6)
+    np.testing.assert_allclose(result.fixed_to_moving[2], [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(result.fixed_to_moving[:2, 2], [6, -4], atol=0.08)
+
+
+def test_unrelated_images_are_not_told_apart() -> None:
+    valid = np.ones((320, 400), bool)
+    pair = [Raster(textured_image(400, 320, s), valid) for s in (8, 9)]
+    result, _ = align_jointly(*pair, np.eye(3), JointSettings(), trusted=True, progress=lambda *_: None)
+    assert result.retrieval < 0.1
+
+
+def test_rgb_against_a_single_band() -> None:
+    fixed, moving = rasters(TRUTH)
+    rgb = np.stack([fixed.pixels, 0.5 * fixed.pixels + 1, textured_image(400, 320, 3)])
+    result, net = align_jointly(
+        Raster(rgb, fixed.valid), moving, NEAR, JointSettings(), trusted=True, progress=lambda *_: None
+    )
+    assert net.fixed_first.convolution.weight.shape[1] == 3
+    assert geometry.mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
+
+
+def test_nothing_to_learn_from() -> None:
+    fixed, moving = rasters(TRUTH)
+    flat = Raster(np.zeros_like(fixed.pixels), fixed.valid)
+    with pytest.raises(NotEnoughTextureError):
+        align_jointly(flat, moving, NEAR, JointSettings(), trusted=True, progress=lambda *_: None)
+    apart = geometry.translation(390, 0)
+    with pytest.raises(NotEnoughTextureError):
+        align_jointly(fixed, moving, apart, JointSettings(), trusted=True, progress=lambda *_: None)
+
+
+@pytest.mark.parametrize(("sharing", "left"), [("siamese", 0.35), ("pseudo-siamese", 0.35), ("unshared", 0.9)])
+def test_paper_recipe_lowers_the_error(sharing: str, left: float) -> None:
+    # Fully unshared networks learn slowest, as the paper expects; three epochs are few.
+    settings = JointSettings(recipe="paper", sharing=sharing, paper=PaperRecipe(epochs=3, keypoints=2000))
+    fixed, moving = textured_pair(TRUTH)
+    # The paper's siamese network is for one modality: give it the same contrast.
+    valid = np.ones(fixed.shape, bool)
+    moving = -moving if sharing == "siamese" else moving
+    result, _ = align_jointly(
+        Raster(fixed, valid), Raster(moving, valid), NEAR, settings, trusted=True, progress=lambda *_: None
+    )
+    assert result.recipe == "paper"
+    assert result.levels == (0.25, 0.5, 1.0)
+    start = geometry.mean_error_px(NEAR, TRUTH, 400, 320)
+    assert geometry.mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < left * start
+
+
+def test_levels_halve_down_to_the_coarsest() -> None:
+    valid = np.ones((960, 1280), bool)
+    big = Raster(np.zeros((960, 1280), np.float32), valid)
+    aligner = JointAligner(big, big, JointSettings(), lambda *_: None)
+    assert aligner.learn_scales() == [0.125, 0.25, 0.5]
+
+
+def test_a_device_that_is_not_there_is_a_configuration_error() -> None:
+    assert choose_device("cpu").type == "cpu"
+    for name in ("nonsense", "cuda:99"):
+        with pytest.raises(ConfigurationError, match=name):
+            choose_device(name)

@@ -1,0 +1,85 @@
+"""The real captures, where they are present: accuracy against reference ties."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.interpolate import CloughTocher2DInterpolator
+
+import agalign
+from agalign import geometry
+from agalign.batch import rig_seed
+from agalign.config import SeedSettings, Settings
+from agalign.discover import DiscoverOptions, discover
+from agalign.pipeline import process_capture
+
+pytestmark = pytest.mark.real
+
+
+def pair_medians(out: Path, ties_path: Path) -> dict[str, float]:
+    """Median tie error of each pair that was delivered as aligned, by moving file."""
+    truth = {f: e for c in json.loads(ties_path.read_text()).values() for f, e in c["bands"].items()}
+    medians = {}
+    for path in out.rglob("*.json"):
+        for band in json.loads(path.read_text())["bands"]:
+            if band["status"] != "aligned" or band["file"] not in truth:
+                continue
+            ties = np.array(truth[band["file"]]["ties"])
+            mapping = CloughTocher2DInterpolator(band["grid"]["reference_px"], band["grid"]["moving_px"])
+            medians[band["file"]] = float(np.nanmedian(np.linalg.norm(mapping(ties[:, :2]) - ties[:, 2:], axis=1)))
+    return medians
+
+
+@pytest.mark.parametrize(
+    ("folder", "pairs", "median", "worst"),
+    [
+        ("captures/rededge_orchard_no_rig", 4, 0.15, 0.25),
+        ("captures/rededge_mx_dual", 9, 0.15, 0.25),
+    ],
+)
+def test_captures(real_data: Path, tmp_path: Path, folder: str, pairs: int, median: float, worst: float) -> None:
+    agalign.align_folder(real_data / folder, tmp_path)
+    medians = pair_medians(tmp_path, real_data / folder / "ties.json")
+    assert len(medians) == pairs
+    assert np.median(list(medians.values())) < median
+    assert max(medians.values()) < worst
+
+
+def test_a_capture_of_the_row_crop_flight(real_data: Path, tmp_path: Path) -> None:
+    flight = discover(real_data / "flights/rededge_m_rowcrop")
+    process_capture(flight.captures[2], tmp_path, rig_seed, Settings())
+    medians = pair_medians(tmp_path, real_data / "flights/rededge_m_rowcrop/ties.json")
+    assert len(medians) == 4
+    assert np.median(list(medians.values())) < 0.12
+    assert max(medians.values()) < 0.3
+
+
+def test_without_metadata_and_from_identity_nothing_is_wrongly_aligned(real_data: Path, tmp_path: Path) -> None:
+    flight = discover(real_data / "flights/rededge_m_rowcrop", DiscoverOptions(ignore_metadata=True))
+    process_capture(flight.captures[0], tmp_path, rig_seed, Settings(seed=SeedSettings(force="identity")))
+    medians = pair_medians(tmp_path, real_data / "flights/rededge_m_rowcrop/ties.json")
+    assert all(m < 0.5 for m in medians.values())
+
+
+@pytest.mark.parametrize("number", [5, 25, 31])
+def test_aerial_rgb_nir_from_a_shifted_seed(real_data: Path, number: int) -> None:
+    folder = real_data / "pairs/aerial_rgb_nir"
+    visible = cv2.cvtColor(cv2.imread(str(folder / f"VIS_{number}.png")), cv2.COLOR_BGR2RGB)
+    infrared = cv2.imread(str(folder / f"NIR_TF_{number}.png"), cv2.IMREAD_GRAYSCALE)
+    truth = np.loadtxt(folder / f"GT_{number}.txt")
+    found = agalign.align(visible, infrared, seed=truth @ geometry.translation(18.1, -18.1))
+    points = geometry.lattice(512, 512, 40, 40)
+    there = geometry.apply(truth, points)
+    common = ((there >= 0) & (there <= 511)).all(axis=1)
+    error = np.linalg.norm(geometry.apply(found.fixed_to_moving, points) - there, axis=1)[common].mean()
+    assert found.status == "aligned"
+    assert error < 0.3
+
+
+def test_two_different_places_are_not_aligned(real_data: Path) -> None:
+    folder = real_data / "pairs/aerial_rgb_nir"
+    one = cv2.imread(str(folder / "VIS_5.png"), cv2.IMREAD_GRAYSCALE)
+    other = cv2.imread(str(folder / "NIR_TF_21.png"), cv2.IMREAD_GRAYSCALE)
+    assert agalign.align(one, other).status != "aligned"
