@@ -12,7 +12,7 @@ from agalign.cameras import known_cameras
 from agalign.config import Settings
 from agalign.describe import fingerprint
 from agalign.discover import Flight
-from agalign.errors import AgalignError, OutputError, SidecarError
+from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
 from agalign.geometry import Matrix
 from agalign.pipeline import PairProgress, output_paths, process_capture, quiet
 from agalign.records import Band, Capture
@@ -82,6 +82,7 @@ def run_flight(
     One capture's failure never stops the others. Raises OutputError where the output folder cannot be used.
     """
     prepare_output(out)
+    _refuse_to_overwrite_inputs(flight, out)
     for capture in flight.captures:
         on_start(capture)
         earlier = None if overwrite else finished_before(capture, out, settings)
@@ -96,6 +97,14 @@ def run_flight(
         yield CaptureReport(capture.label, "done", outcome.sidecar)
 
 
+def _refuse_to_overwrite_inputs(flight: Flight, out: Path) -> None:
+    sources = {band.path.resolve() for capture in flight.captures for band in capture.bands}
+    for capture in flight.captures:
+        stack, _ = output_paths(capture, out)
+        if stack.resolve() in sources:
+            raise ConfigurationError(f"{stack}: is an image to be aligned; choose another output folder with -o")
+
+
 def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar | None:
     """The sidecar of an earlier run with the same settings and bands whose outputs are still there."""
     stack, path = output_paths(capture, out)
@@ -105,8 +114,10 @@ def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar 
         sidecar = read_sidecar(path)
     except SidecarError:
         return None
-    complete = sidecar.output is None or stack.is_file()
-    return sidecar if complete and sidecar.settings == fingerprint(capture, settings) else None
+    if sidecar.settings != fingerprint(capture, settings):
+        return None
+    size = stack.stat().st_size if stack.is_file() else None
+    return sidecar if size == (sidecar.output.bytes if sidecar.output else None) else None
 
 
 def write_summary(out: Path) -> Path:

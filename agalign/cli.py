@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -110,20 +111,20 @@ class Voice:
     def __init__(self, *, quiet: bool, verbose: bool, log_json: bool) -> None:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
         # Lines in a file or a pipe are not wrapped to a terminal's width.
-        self.out = Console(highlight=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-        self.err = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
+        self.out = Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
+        self.err = Console(stderr=True, highlight=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 
     def event(self, name: str, text: str = "", style: str = "", **fields: Any) -> None:
         """One line of progress: JSON with --log-json, else the text unless --quiet."""
         if self.log_json:
-            self.err.print(json.dumps({"event": name, **fields}, default=str), markup=False, soft_wrap=True)
+            print(json.dumps({"event": name, **fields}, default=str), file=sys.stderr, flush=True)
         elif text and not self.quiet:
             self.err.print(f"[{style}]{escape(text)}[/]" if style else escape(text))
 
     def problem(self, text: str, **fields: Any) -> None:
         """A complaint: shown even with --quiet."""
         if self.log_json:
-            self.event("problem", text=text, **fields)
+            self.event("problem", message=text, **fields)
         else:
             self.err.print(f"[yellow]agalign: {escape(text)}[/]")
 
@@ -304,7 +305,7 @@ def report(
         if not out.is_dir() or not find_sidecars(out):
             raise InputError(f"{out}: no sidecars there; give the output folder of a run")
         summary = write_summary(out)
-        voice.result(f"{write_report(out)}\n{summary}")
+        voice.result(escape(f"{write_report(out)}\n{summary}"))
 
 
 def _facts(capture: "Capture") -> dict[str, Any]:
@@ -342,6 +343,8 @@ def main() -> None:
     arguments = sys.argv[1:]
     if arguments and arguments[0] not in _COMMANDS and not _is_root_option(arguments[0]):
         arguments = ["align", *arguments]
+    # Threads that spin while they wait cost a multiple of the time where another program wants the same cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.getLogger("rasterio").setLevel(logging.CRITICAL)
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     app(args=arguments, prog_name="agalign")
@@ -379,7 +382,7 @@ def _discover(folder: Path, options: "DiscoverOptions", voice: Voice, *, silent:
         for problem in flight.problems:
             voice.problem(problem.text, file=problem.path)
     if not flight.captures:
-        if options.reference and flight.problems:
+        if any("for the reference; this capture has" in p.text for p in flight.problems):
             raise ConfigurationError(f"{folder}: no capture has a band '{options.reference}'")
         raise InputError(
             f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' shows what was found"
@@ -484,7 +487,8 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
         if voice.verbose or voice.log_json:
             voice.event(
                 "pair", f"    {band.band}: {band.status}{shown}, {band.seconds:.1f} s",
-                capture=report.label, band=band.band, status=band.status, reason=band.reason, residual_px=residual, seconds=band.seconds,
+                capture=report.label, band=band.band, status=band.status, reason=band.reason,
+                residual_px=residual, seconds=band.seconds,
             )  # fmt: skip
         if band.status in ("seed_only", "failed"):
             voice.problem(
@@ -508,7 +512,7 @@ def _conclude(flight: "Flight", reports: "list[CaptureReport]", out: Path, voice
         worst = (f"{median(known):.3f}", f"{max(known):.3f}") if known else ("-", "-")
         table.add_row(escape(name), *counts, *worst, f"{median(b.seconds for b in mine):.1f}")
     voice.result(table)
-    voice.result(f"Report: {out / 'index.html'}")
+    voice.result(escape(f"Report: {out / 'index.html'}"))
     if not any(r.useful for r in reports):
         voice.problem("no band pair could be aligned")
         alone = all(r.sidecar is None for r in reports)

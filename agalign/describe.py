@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +34,19 @@ _GRID_COLUMNS, _GRID_ROWS = 17, 13
 
 
 def fingerprint(capture: Capture, settings: Settings) -> str:
-    """Changes when the settings, the bands or the program's version do."""
-    bands = [(b.name, b.address, b.lens, b.georeference is not None) for b in capture.bands]
+    """Changes when the settings, the files or the program's version do."""
+    bands = [(b.name, b.address, b.lens, b.georeference is not None, _state(b.path)) for b in capture.bands]
     text = f"{__version__} {settings.model_dump_json()} {capture.reference_index} {bands}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _state(path: Path) -> tuple[int, int]:
+    """Size and time of change: a file that was copied from the card again is another file."""
+    try:
+        state = path.stat()
+    except OSError:
+        return 0, 0
+    return state.st_size, state.st_mtime_ns
 
 
 def capture_status(statuses: list[str]) -> CaptureStatus:
@@ -96,7 +106,12 @@ def _output_part(stack: Stack) -> OutputPart:
     if isinstance(nodata, float) and math.isnan(nodata):
         nodata = "nan"
     crop = stack.crop
-    return OutputPart(file=stack.path.name, crop=(crop.x0, crop.y0, crop.width, crop.height), nodata=nodata)
+    return OutputPart(
+        file=stack.path.name,
+        bytes=stack.path.stat().st_size,
+        crop=(crop.x0, crop.y0, crop.width, crop.height),
+        nodata=nodata,
+    )
 
 
 def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:

@@ -127,6 +127,18 @@ def _groups(files: Iterable[_File]) -> list[list[_File]]:
     for file in files:
         key = file.camera.capture_key(file.path, file.tags) if len(file.bands) == 1 else file.path.name
         groups[(file.camera.name, str(file.path.parent), key)].append(file)
+    # A file whose tags are damaged lost its capture id, but not its name.
+    for group_key in list(groups):
+        camera, folder, key = group_key
+        stray = groups[group_key]
+        if len(stray[0].bands) > 1 or stray[0].camera.capture_name(stray[0].path) != key:
+            continue
+        for other_key, other in groups.items():
+            same_place = other_key[:2] == (camera, folder) and other_key != group_key and len(other[0].bands) == 1
+            if same_place and all(f.camera.capture_name(f.path) == key for f in other):
+                other.extend(groups.pop(group_key))
+                other.sort(key=lambda f: _natural(f.path.name))
+                break
     return list(groups.values())
 
 
@@ -188,13 +200,21 @@ def _with_unique_names(captures: Sequence[Capture]) -> list[Capture]:
 
 
 def _with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
-    """What other captures of the same camera have and this one lacks."""
-    usual: dict[CameraIdentity, dict[str, None]] = defaultdict(dict)
-    for capture in captures:
-        usual[capture.camera].update(dict.fromkeys(b.name for b in capture.bands))
+    """What other captures of the same kind have and this one lacks."""
+
+    # A dual camera that lost all bands of one half has lost a serial number too: so it is the model that counts, and
+    # where no tag names one, the folder. Multiband files are each complete in themselves.
+    def family(capture: Capture) -> tuple[str, ...]:
+        camera = capture.camera
+        return (camera.make, camera.model) if camera.model else (capture.folder.as_posix(),)
+
+    usual: dict[tuple[str, ...], dict[str, None]] = defaultdict(dict)
+    separate = [c for c in captures if len({b.path for b in c.bands}) > 1]
+    for capture in separate:
+        usual[family(capture)].update(dict.fromkeys(b.name for b in capture.bands))
     complete = []
     for capture in captures:
         known = {b.name for b in capture.bands}
-        missing = tuple(n for n in usual[capture.camera] if n not in known) if capture.camera.model else ()
+        missing = tuple(n for n in usual[family(capture)] if n not in known) if capture in separate else ()
         complete.append(replace(capture, missing_bands=missing) if missing else capture)
     return complete

@@ -47,7 +47,8 @@ class Tags:
 
     def numbers(self, namespace: Namespace, name: str) -> tuple[float, ...]:
         """The finite numbers in an XMP value, whether it is one text, a list in a text, or a sequence."""
-        return tuple(float(n) for n in _NUMBER.findall(self.text(namespace, name)))
+        numbers = (float(n) for n in _NUMBER.findall(self.text(namespace, name)))
+        return tuple(n for n in numbers if math.isfinite(n))
 
     def number(self, namespace: Namespace, name: str) -> float | None:
         """The first number in an XMP value."""
@@ -94,13 +95,15 @@ def read_tags(path: Path) -> Tags:
     )
 
 
-def parse_xmp(packet: bytes | str) -> dict[tuple[str, str], tuple[str, ...]]:
-    """An XMP packet as {(namespace, name): values}, from all rdf:Description blocks.
+def parse_xmp(packet: Any) -> dict[tuple[str, str], tuple[str, ...]]:
+    """An XMP packet (bytes or text) as {(namespace, name): values}, from all rdf:Description blocks.
 
     A value may be an attribute, an element's text, or an rdf:Seq or rdf:Bag. A malformed packet is an empty one:
     cameras do write them, and the images are still good.
     """
     text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
+    if not isinstance(text, str):
+        return {}
     start, end = text.find("<x:xmpmeta"), text.rfind("</x:xmpmeta>")
     if start < 0 or end < 0:
         return {}

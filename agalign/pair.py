@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -157,9 +158,10 @@ def _rescaled(model: Lens | None, scale: tuple[float, float]) -> Lens | None:
 def seed_candidates(reference: Band, moving: Band, rig_seed: RigSeed, settings: Settings) -> dict[SeedKind, Matrix]:
     """The coarse mappings that metadata offers, in order of trust; identity is always among them."""
     candidates: dict[SeedKind, Matrix] = {}
-    rig = rig_seed(reference, moving)
-    if rig is not None:
-        candidates["rig"] = rig
+    with suppress(GeometryError):  # numbers in the tags that make no camera
+        rig = rig_seed(reference, moving)
+        if rig is not None:
+            candidates["rig"] = rig
     geo = geo_seed(reference, moving)
     if geo is not None:
         candidates["geo"] = geo

@@ -1,13 +1,14 @@
 """One capture, start to end: its pairs aligned, its stack and sidecar written."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from agalign import geometry
 from agalign.config import Settings
 from agalign.describe import describe_capture
-from agalign.errors import AgalignError
+from agalign.errors import AgalignError, OutputError
 from agalign.pair import RigSeed, align_pair, load_view, mapping_of
 from agalign.picture import write_picture
 from agalign.records import Alignment, Band, Capture, Seed
@@ -66,32 +67,33 @@ def process_capture(
     if stack is not None:
         usable = [b for b in capture.moving if alignments[b.name].status != "failed"]
         crop = stack.crop.x0, stack.crop.y0, stack.crop.width, stack.crop.height
-        write_picture(capture, stack.path, crop, usable, stack_path.with_suffix(".png"))
+        # The picture is a convenience: a full disk must not cost the sidecar.
+        with suppress(OutputError):
+            write_picture(capture, stack.path, crop, usable, stack_path.with_suffix(".png"))
     sidecar = describe_capture(capture, alignments, stack, settings)
     write_sidecar(sidecar_path, sidecar)
     return CaptureOutcome(sidecar, sidecar_path)
 
 
 def _write(capture: Capture, alignments: dict[str, Alignment], path: Path, settings: Settings) -> Stack | None:
+    """The stack, or None where no moving band is of use: then an earlier run's stack does not stay either."""
     reference = capture.reference
-    undistort = settings.write.undistort and reference.lens is not None
-    layers = []
-    for band in capture.bands:
-        if band is reference:
-            own = Mapping(geometry.identity(), None, reference.lens) if undistort else None
-            layers.append(Layer(band, own, is_reference=True))
-            continue
-        alignment = alignments[band.name]
-        mapping = mapping_of(reference, band, alignment)
-        if undistort:
-            mapping = replace(mapping, fixed_lens=None)
-        layers.append(Layer(band, None if alignment.status == "failed" else mapping))
-    usable = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
-    if not usable:
+    mappings = {
+        b.name: mapping_of(reference, b, alignments[b.name])
+        for b in capture.moving
+        if alignments[b.name].status != "failed"
+    }
+    if not mappings:
+        for stale in (path, path.with_suffix(".png")):
+            stale.unlink(missing_ok=True)
         return None
-    crop: Tile | None = Tile(0, 0, *reference.size_px)
-    if settings.write.crop == "common":
-        crop = common_area(usable, *reference.size_px)
-    if crop is None:
-        crop = Tile(0, 0, *reference.size_px)
-    return write_stack(capture, layers, crop, path, settings.write)
+    own: Mapping | None = None
+    if settings.write.undistort and reference.lens is not None:
+        own = Mapping(geometry.identity(), None, reference.lens)
+        mappings = {name: mapping.from_undistorted(reference.lens) for name, mapping in mappings.items()}
+    layers = [
+        Layer(b, own, is_reference=True) if b is reference else Layer(b, mappings.get(b.name)) for b in capture.bands
+    ]
+    usable = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
+    crop = common_area(usable, *reference.size_px) if settings.write.crop == "common" else None
+    return write_stack(capture, layers, crop or Tile(0, 0, *reference.size_px), path, settings.write)

@@ -34,6 +34,7 @@ class RasterInfo:
     alpha_index: int | None
     """Index from 1 of an alpha band, which is no band of the scene."""
     georeference: Georeference | None
+    has_mask: bool = False
 
 
 @contextmanager
@@ -44,7 +45,7 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path) as dataset:
                 yield dataset
-    except (RasterioIOError, RasterioError) as error:
+    except (RasterioIOError, RasterioError, UnicodeEncodeError) as error:
         text = str(error).replace(str(path), "").strip(" :'").splitlines()[0]
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
 
@@ -57,9 +58,12 @@ def probe(path: Path) -> RasterInfo:
         georeference = None
         if dataset.crs is not None and not dataset.transform.is_identity:
             georeference = Georeference(np.array(dataset.transform, float).reshape(3, 3), dataset.crs.to_wkt())
+        if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
+            raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
         return RasterInfo(
             dataset.width, dataset.height, tuple(dataset.dtypes), tuple(dataset.nodatavals),
             tuple(dataset.descriptions), wavelengths, alpha[0] if alpha else None, georeference,
+            MaskFlags.per_dataset in dataset.mask_flag_enums[0],
         )  # fmt: skip
 
 

@@ -59,6 +59,8 @@ class Band:
     height_px: int
     dtype: str
     nodata: float | None = None
+    has_mask: bool = False
+    """True where the file has a mask or an alpha band beside the pixels."""
     wavelength_nm: float | None = None
     bandwidth_nm: float | None = None
     saturation_value: float | None = None

@@ -132,6 +132,7 @@ class OutputPart(_Part):
     """The stack beside the sidecar. `crop` is x0, y0, width, height on the reference's pixel grid."""
 
     file: str
+    bytes: int
     crop: tuple[int, int, int, int]
     nodata: float | str | None
 

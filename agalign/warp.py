@@ -5,7 +5,7 @@ raw reference px -> undistorted -> H -> undistorted -> raw moving px. Nothing is
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -37,16 +37,25 @@ class Mapping:
     fixed_to_moving: Matrix
     fixed_lens: Lens | None = None
     moving_lens: Lens | None = None
+    pre_distortion: Lens | None = None
+    """Lens through which the given pixels go first, where they are undistorted ones of the reference."""
 
     def __call__(self, reference_px: ArrayLike) -> Points:
         """(..., 2) raw reference pixels to raw moving pixels."""
-        undistorted = lens.undistort(self.fixed_lens, reference_px)
+        raw = lens.distort(self.pre_distortion, reference_px)
+        undistorted = lens.undistort(self.fixed_lens, raw)
         return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, undistorted))
+
+    def from_undistorted(self, reference_lens: Lens) -> "Mapping":
+        """The mapping for undistorted pixels of the reference instead of its raw ones."""
+        if self.fixed_lens is not None:
+            return replace(self, fixed_lens=None)
+        return replace(self, pre_distortion=reference_lens)
 
     @property
     def bends(self) -> bool:
         """True where a lens model takes part, so that the mapping is not just a homography."""
-        return lens.is_distorting(self.fixed_lens) or lens.is_distorting(self.moving_lens)
+        return any(map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion)))
 
 
 @dataclass(frozen=True)

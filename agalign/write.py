@@ -1,5 +1,6 @@
 """Aligned stacks: tiled GeoTIFF or COG on the reference's pixel grid."""
 
+import errno
 import math
 import os
 import warnings
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import rasterio
+import tifffile
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.shutil import copy as copy_dataset
@@ -62,8 +64,9 @@ def write_stack(capture: Capture, layers: list[Layer], crop: Tile, path: Path, s
                     _write_layer(dataset, index, layer, crop, nodata, settings)
             if settings.format == "cog":
                 _to_cog(partial, settings)
-            partial.replace(path)
-    except (OSError, RasterioError) as error:
+        _verify(partial)
+        partial.replace(path)
+    except (OSError, RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{path}: cannot be written ({error})") from None
     finally:
         with suppress(OSError):
@@ -107,7 +110,8 @@ def _nodata(
     gaps = any(layer.mapping is None and not layer.is_reference for layer in layers)
     whole = crop == Tile(0, 0, *capture.reference.size_px)
     moved = any(layer.mapping is not None for layer in layers)
-    masked = any(layer.band.nodata is not None for layer in layers)
+    masked = any(layer.band.nodata is not None or layer.band.has_mask for layer in layers)
+    masked |= dtype.kind == "f"  # nan needs no declaration in a source
     needed = gaps or masked or (moved and (whole or settings.crop == "none"))
     if not needed:
         return None
@@ -163,6 +167,16 @@ def _describe(dataset: Any, capture: Capture, layers: list[Layer]) -> None:
             dataset.update_tags(index, wavelength=f"{layer.band.wavelength_nm:g}", wavelength_units="nm", **width)
             micrometres = f"{layer.band.wavelength_nm / 1000:g}"
             dataset.update_tags(index, ns="IMAGERY", CENTRAL_WAVELENGTH_UM=micrometres)
+
+
+def _verify(path: Path) -> None:
+    """GDAL flushes when a file is closed, and what fails then (a full disk) is not raised: look at the result."""
+    size = path.stat().st_size
+    with tifffile.TiffFile(path) as tiff:
+        for page in tiff.pages:
+            ends = [o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True)]
+            if not ends or max(ends) > size or (min(page.databytecounts) == 0):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _to_cog(path: Path, settings: WriteSettings) -> None:

@@ -16,7 +16,7 @@ def example() -> Sidecar:
         agalign="0", capture="IMG_1", capture_id="x", flight_id="", captured_at="",
         camera=CameraPart(make="", model="", serial=""), status="ok", missing_bands=[],
         reference=ReferencePart(band="Green", file="g.tif", band_index=1, width=10, height=8),
-        bands=[], output=OutputPart(file="IMG_1.tif", crop=(0, 0, 10, 8), nodata=None), settings="0",
+        bands=[], output=OutputPart(file="IMG_1.tif", bytes=1, crop=(0, 0, 10, 8), nodata=None), settings="0",
     )  # fmt: skip
 
 

@@ -11,12 +11,12 @@ from agalign.raster import RasterInfo
 from agalign.records import Band
 
 _BAND_WORDS = (
-    "coastal|blue|green|red ?edge|red_edge|red-edge|rededge|red|nir|swir|pan|panchro|lwir|thermal|"
+    "coastal|blue|green|red[ _-]?edge|near[ _-]?infra[ _-]?red|infra[ _-]?red|red|nir|swir|pan|panchro|lwir|thermal|"
     "gre|reg|rgb|grn|blu|vis|ms"
 )
 _SUFFIX = re.compile(
     rf"^(?P<capture>.*?)(?:(?P<gap>[_\-. ]+)(?P<band>(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|b?\d{{1,2}}|re|[bgrn])"
-    rf"|(?P<glued>(?:{_BAND_WORDS})|\d{{3,4}}nm))$",
+    rf"|(?<=[0-9a-z])(?P<glued>(?-i:Blue|Green|RedEdge|Red|NIR|GRE|REG|RED|BLUE|GREEN)|\d{{3,4}}nm))$",
     re.IGNORECASE,
 )
 
@@ -44,6 +44,7 @@ class Generic:
                 height_px=info.height_px,
                 dtype=info.dtypes[i - 1],
                 nodata=info.nodata[i - 1],
+                has_mask=info.has_mask,
                 wavelength_nm=info.wavelengths_nm[i - 1]
                 or tags.number("Camera", "CentralWavelength")
                 or _wavelength_in(own_name),

@@ -42,6 +42,7 @@ class MicaSense:
             height_px=info.height_px,
             dtype=info.dtypes[0],
             nodata=info.nodata[0],
+            has_mask=info.has_mask,
             wavelength_nm=tags.number("Camera", "CentralWavelength"),
             bandwidth_nm=tags.number("Camera", "WavelengthFWHM"),
             saturation_value=_TWELVE_BIT_TOP if info.dtypes[0] == "uint16" else largest_value(info.dtypes[0]),
@@ -81,7 +82,7 @@ def _lens(tags: Tags) -> Lens | None:
     density = tags.pixels_per_mm
     focal = tags.number("Camera", "PerspectiveFocalLength")
     centre = tags.numbers("Camera", "PrincipalPoint")
-    if focal is None or len(centre) != 2:
+    if focal is None or focal <= 0 or len(centre) != 2:
         return None
     in_px = "px" in tags.text("Camera", "PerspectiveFocalLengthUnits").lower() or "pixel" in tags.text(
         "Camera", "PerspectiveFocalLengthUnits"

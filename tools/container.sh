@@ -1,0 +1,40 @@
+#!/usr/bin/env bash
+# Build the image and run the demo in it, with docker where an engine answers, else with buildah on a debootstrap base
+# (as root; apt-get install buildah debootstrap). Leaves nothing behind but the image `agalign`.
+#
+#     tools/container.sh [demo options]
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+if docker info > /dev/null 2>&1; then
+    docker build -t agalign .
+    docker run --rm --workdir /tmp agalign demo /tmp/agalign-demo "$@"
+    exit
+fi
+
+export STORAGE_DRIVER=vfs BUILDAH_ISOLATION=chroot
+suite=bookworm
+root=$(mktemp -d)
+trap 'rm -rf "$root"' EXIT
+if ! buildah inspect --type image "agalign-base:$suite" > /dev/null 2>&1; then
+    debootstrap --variant=minbase "$suite" "$root/$suite"
+    base=$(buildah from scratch)
+    buildah copy --quiet "$base" "$root/$suite" / > /dev/null
+    buildah commit --quiet "$base" "agalign-base:$suite" > /dev/null
+    buildah rm "$base" > /dev/null
+fi
+
+# The host's package sources, so that a mirror or proxy set up here serves the build too. Further folders that those
+# sources refer to can be named in EXTRA_MOUNTS, separated by spaces.
+mounts=()
+for path in /etc/apt/sources.list /etc/apt/sources.list.d /etc/pip.conf /etc/ssl/certs ${PIP_FIND_LINKS:-} ${EXTRA_MOUNTS:-}; do
+    if [ -e "$path" ]; then mounts+=(--volume "$path:$path:ro"); fi
+done
+pass=()
+for name in PIP_INDEX_URL PIP_EXTRA_INDEX_URL PIP_FIND_LINKS PIP_CERT SSL_CERT_FILE http_proxy https_proxy; do
+    if [ -n "${!name:-}" ]; then pass+=(--env "$name=${!name}"); fi
+done
+buildah build --quiet "${mounts[@]}" "${pass[@]}" --build-arg "BASE=localhost/agalign-base:$suite" -t agalign . > /dev/null
+container=$(buildah from --pull-never agalign)
+trap 'buildah rm "$container" > /dev/null; rm -rf "$root"' EXIT
+buildah run --user agalign --workingdir /tmp "$container" -- agalign demo /tmp/agalign-demo "$@"
