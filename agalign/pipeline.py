@@ -8,7 +8,7 @@ from pathlib import Path
 from agalign import geometry
 from agalign.config import Settings
 from agalign.describe import describe_capture
-from agalign.errors import AgalignError, OutputError
+from agalign.errors import AgalignError
 from agalign.pair import RigSeed, align_pair, load_view, mapping_of
 from agalign.picture import write_picture
 from agalign.records import Alignment, Band, Capture, Seed
@@ -68,7 +68,7 @@ def process_capture(
         usable = [b for b in capture.moving if alignments[b.name].status != "failed"]
         crop = stack.crop.x0, stack.crop.y0, stack.crop.width, stack.crop.height
         # The picture is a convenience: a full disk must not cost the sidecar.
-        with suppress(OutputError):
+        with suppress(AgalignError):
             write_picture(capture, stack.path, crop, usable, stack_path.with_suffix(".png"))
     sidecar = describe_capture(capture, alignments, stack, settings)
     write_sidecar(sidecar_path, sidecar)

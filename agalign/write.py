@@ -173,10 +173,9 @@ def _verify(path: Path) -> None:
     """GDAL flushes when a file is closed, and what fails then (a full disk) is not raised: look at the result."""
     size = path.stat().st_size
     with tifffile.TiffFile(path) as tiff:
-        for page in tiff.pages:
-            ends = [o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True)]
-            if not ends or max(ends) > size or (min(page.databytecounts) == 0):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        segments = [s for page in tiff.pages for s in zip(page.dataoffsets, page.databytecounts, strict=True)]
+    if not segments or any(count == 0 or offset + count > size for offset, count in segments):
+        raise OSError(errno.EIO, "the file came out incomplete; is the disk full?")
 
 
 def _to_cog(path: Path, settings: WriteSettings) -> None:

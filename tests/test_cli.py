@@ -153,6 +153,61 @@ def test_unrelated_bands_exit_with_3(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out" / "a.json").read_text())["status"] == "failed"
 
 
+def write_pair(folder: Path, seed: int = 1, second: int | None = None) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    fixed = textured_image(300, 240, seed)
+    moving = fixed if second is None else textured_image(300, 240, second)
+    for name, image in (("a_green", fixed), ("a_nir", -moving)):
+        tifffile.imwrite(folder / f"{name}.tif", (image * 4000 + 20000).astype(np.uint16))
+
+
+def test_an_input_is_never_overwritten(tmp_path: Path) -> None:
+    pixels = np.stack([textured_image(300, 240), textured_image(300, 240)])
+    tifffile.imwrite(tmp_path / "ortho.tif", pixels, planarconfig="separate", photometric="minisblack")
+    before = (tmp_path / "ortho.tif").read_bytes()
+    done = agalign(tmp_path, "-o", tmp_path)
+    assert done.returncode == 2
+    assert "ortho.tif" in done.stderr
+    assert (tmp_path / "ortho.tif").read_bytes() == before
+
+
+def test_a_repaired_input_and_a_damaged_output_are_done_again(tmp_path: Path) -> None:
+    write_pair(tmp_path / "in")
+    good = (tmp_path / "in" / "a_nir.tif").read_bytes()
+    (tmp_path / "in" / "a_nir.tif").write_bytes(good[: len(good) // 2])
+    first = agalign(tmp_path / "in", "-o", tmp_path / "out", "--log-json")
+    assert first.returncode == 3
+    problems = [json.loads(line) for line in first.stderr.splitlines()]
+    assert any("a_nir.tif" in p.get("message", "") for p in problems)
+    assert not (tmp_path / "out" / "a.tif").exists()
+    (tmp_path / "in" / "a_nir.tif").write_bytes(good)
+    assert agalign(tmp_path / "in", "-o", tmp_path / "out").returncode == 0
+    stack = tmp_path / "out" / "a.tif"
+    size = stack.stat().st_size
+    stack.write_bytes(b"")
+    again = agalign(tmp_path / "in", "-o", tmp_path / "out")
+    assert again.returncode == 0
+    assert "kept" not in again.stderr
+    assert stack.stat().st_size == size
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="file size limits are POSIX")
+def test_a_full_disk_is_said_and_leaves_no_half_file(tmp_path: Path) -> None:
+    import resource
+
+    write_pair(tmp_path / "in")
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
+
+    done = agalign(tmp_path / "in", "-o", tmp_path / "out", preexec_fn=limit)
+    assert done.returncode == 1
+    assert "a.tif: cannot be written" in done.stderr
+    assert not (tmp_path / "out" / "a.tif").exists()
+    assert not list((tmp_path / "out").glob(".*"))
+
+
 def test_info(flight: Path) -> None:
     done = agalign("info", flight, "--json")
     assert done.returncode == 0

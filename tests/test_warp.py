@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from agalign import geometry, synthetic
+from agalign import geometry, lens, synthetic
 from agalign.records import Band
 from agalign.warp import (
     Mapping,
@@ -42,6 +42,14 @@ def test_source_positions_are_the_mapping(flight: Path) -> None:
         positions = source_positions(mapping, tile)
         x, y = np.meshgrid(np.arange(100, 311), np.arange(40, 137))
         np.testing.assert_allclose(positions, mapping(np.stack([x, y], axis=-1)), atol=1e-3)
+
+
+def test_undistorted_pixels_of_the_reference_reach_the_same_place() -> None:
+    own, other = (synthetic.BANDS[k].lens(480, 360) for k in (1, 3))
+    straight = np.array([[50.0, 60.0], [400.0, 300.0]])
+    raw = lens.distort(own, straight)
+    for mapping in (Mapping(H, own, other), Mapping(H)):
+        np.testing.assert_allclose(mapping.from_undistorted(own)(straight), mapping(raw), atol=1e-4)
 
 
 def test_tiles_cover_the_area_once() -> None:

@@ -142,6 +142,21 @@ def test_a_gap_is_all_nodata(tmp_path: Path) -> None:
         assert written.read_masks(3).all()
 
 
+def test_undeclared_nan_stays_nan(tmp_path: Path) -> None:
+    capture = make_capture(tmp_path, "float32")
+    with rasterio.open(capture.bands[0].path, "r+") as dataset:
+        pixels = dataset.read(1)
+        pixels[50:70, 60:90] = np.nan
+        dataset.write(pixels, 1)
+    stack = write_stack(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())
+    with rasterio.open(stack.path) as written:
+        assert np.isnan(written.nodata)
+        hole = np.isnan(written.read(1))
+        assert hole[50:60, 60:80].all()
+        assert hole.sum() < 23 * 33
+        assert not np.isnan(written.read(3)).any()
+
+
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     capture = make_capture(tmp_path)
     (tmp_path / "out.tif").write_bytes(b"the earlier result")

@@ -24,14 +24,18 @@ if ! buildah inspect --type image "agalign-base:$suite" > /dev/null 2>&1; then
     buildah rm "$base" > /dev/null
 fi
 
-# The host's package sources, so that a mirror or proxy set up here serves the build too. Further folders that those
-# sources refer to can be named in EXTRA_MOUNTS, separated by spaces.
+# The host's Python package sources and certificate, so that a mirror or proxy set up here serves the build too. Further
+# folders that those sources refer to can be named in EXTRA_MOUNTS, separated by spaces.
 mounts=()
-for path in /etc/apt/sources.list /etc/apt/sources.list.d /etc/pip.conf /etc/ssl/certs ${PIP_FIND_LINKS:-} ${EXTRA_MOUNTS:-}; do
+for path in /etc/pip.conf ${PIP_FIND_LINKS:-} ${EXTRA_MOUNTS:-}; do
     if [ -e "$path" ]; then mounts+=(--volume "$path:$path:ro"); fi
 done
 pass=()
-for name in PIP_INDEX_URL PIP_EXTRA_INDEX_URL PIP_FIND_LINKS PIP_CERT SSL_CERT_FILE http_proxy https_proxy; do
+if [ -n "${SSL_CERT_FILE:-}" ]; then
+    mounts+=(--volume "$SSL_CERT_FILE:/run/host-certificates.pem:ro")
+    pass+=(--env PIP_CERT=/run/host-certificates.pem)
+fi
+for name in PIP_INDEX_URL PIP_EXTRA_INDEX_URL PIP_FIND_LINKS http_proxy https_proxy; do
     if [ -n "${!name:-}" ]; then pass+=(--env "$name=${!name}"); fi
 done
 buildah build --quiet "${mounts[@]}" "${pass[@]}" --build-arg "BASE=localhost/agalign-base:$suite" -t agalign . > /dev/null

@@ -15,7 +15,7 @@ _BAND_WORDS = (
     "gre|reg|rgb|grn|blu|vis|ms"
 )
 _SUFFIX = re.compile(
-    rf"^(?P<capture>.*?)(?:(?P<gap>[_\-. ]+)(?P<band>(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|b?\d{{1,2}}|re|[bgrn])"
+    rf"^(?P<capture>.*?)(?:(?:^|(?<=.)[_\-. ]+)(?P<band>(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|b?\d{{1,2}}|re|[bgrn])"
     rf"|(?<=[0-9a-z])(?P<glued>(?-i:Blue|Green|RedEdge|Red|NIR|GRE|REG|RED|BLUE|GREEN)|\d{{3,4}}nm))$",
     re.IGNORECASE,
 )
