@@ -2,6 +2,7 @@
 
 from agalign import geometry
 from agalign.config import CheckSettings
+from agalign.geometry import Matrix
 from agalign.records import JointResult, PairStatus, Residual, Seed
 
 
@@ -37,9 +38,7 @@ def _doubt(
     return None
 
 
-def leaves_as_is(seed: Seed, joint: JointResult, size_px: tuple[int, int], settings: CheckSettings) -> bool:
-    """True where the input was already aligned: the result cannot be told from its identity or geo seed."""
-    if seed.kind not in ("identity", "geo"):
-        return False
-    moved_px = geometry.corner_error_px(joint.fixed_to_moving, seed.fixed_to_moving, *size_px)
+def is_as_it_was(joint: JointResult, given: Matrix, size_px: tuple[int, int], settings: CheckSettings) -> bool:
+    """True where the result cannot be told from the mapping that the files came with: they were aligned already."""
+    moved_px = geometry.corner_error_px(joint.fixed_to_moving, given, *size_px)
     return moved_px <= min(settings.most_snap_px, 3 * joint.corner_std_px)

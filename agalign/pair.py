@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign import geometry, lens
-from agalign.check import leaves_as_is, verdict
+from agalign.check import is_as_it_was, verdict
 from agalign.config import Settings
 from agalign.errors import GeometryError, NotEnoughTextureError
 from agalign.geometry import Matrix
@@ -26,6 +26,10 @@ StageProgress = Callable[[str, float], None]
 
 RigSeed = Callable[[Band, Band], Matrix | None]
 """A camera's fixed_to_moving between undistorted pixels from metadata alone."""
+
+
+_AS_FILES_LIE: tuple[SeedKind, ...] = ("geo", "identity")
+"""Seeds that change nothing: an input aligned already is left untouched, not resampled by a hundredth of a pixel."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +70,10 @@ def align_views(
     joint, why_not = _joint(one, other, seed, trusted, settings, progress)
     matrix = seed.fixed_to_moving
     if joint is not None:
-        if leaves_as_is(seed, joint, one.size_px, settings.check):
-            joint = replace(joint, fixed_to_moving=matrix)
+        for given in (down[kind] for kind in _AS_FILES_LIE if kind in down):
+            if is_as_it_was(joint, given, one.size_px, settings.check):
+                joint = replace(joint, fixed_to_moving=given)
+                break
         matrix = joint.fixed_to_moving
     progress("checking", 0.0)
     residual, after = _measure(one, other, matrix, settings)

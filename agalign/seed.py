@@ -39,12 +39,14 @@ def scored_seeds(
     smoothing = settings.smoothing_px
     surface = correlation_surface(structure_field(small_fixed, smoothing), structure_field(small_moving, smoothing))
     peak = find_peak(surface, apart_px=max(size) // 16)
-    seeds = [Seed(kind, fixed_to_moving, peak.sigma_at_zero, peak.sigma_at_zero, peak.runner_up_sigma)]
-    if np.hypot(*peak.shift_px) >= settings.least_shift_px:
-        shift = geometry.translation(peak.shift_px[0] / scale_xy[0], peak.shift_px[1] / scale_xy[1])
-        matrix = geometry.compose(fixed_to_moving, shift)
-        seeds.append(Seed("structure", matrix, peak.sigma, peak.sigma, peak.runner_up_sigma))
-    return seeds
+    if np.hypot(*peak.shift_px) < settings.least_shift_px:
+        return [Seed(kind, fixed_to_moving, peak.sigma, peak.sigma, peak.runner_up_sigma)]
+    shift = geometry.translation(peak.shift_px[0] / scale_xy[0], peak.shift_px[1] / scale_xy[1])
+    shifted = geometry.compose(fixed_to_moving, shift)
+    return [
+        Seed(kind, fixed_to_moving, peak.sigma_at_zero, peak.sigma_at_zero, peak.runner_up_sigma),
+        Seed("structure", shifted, peak.sigma, peak.sigma, peak.runner_up_sigma),
+    ]
 
 
 def is_trusted(seed: Seed, settings: SeedSettings) -> bool:
@@ -61,7 +63,9 @@ def geo_seed(reference: Band, moving: Band) -> Matrix | None:
     if here is None or there is None or here.crs_wkt != there.crs_wkt:
         return None
     to_corner = geometry.translation(0.5, 0.5)
-    return geometry.compose(geometry.invert(to_corner), geometry.invert(there.transform), here.transform, to_corner)
+    # Not geometry.invert: metres in the millions beside pixels of centimetres look singular to it.
+    map_to_there = np.linalg.inv(there.transform)
+    return geometry.compose(geometry.invert(to_corner), map_to_there, here.transform, to_corner)
 
 
 def overlay(reference: Band, moving: Band) -> Matrix:

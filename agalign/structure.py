@@ -51,7 +51,7 @@ class Peak:
     runner_up_sigma: float
     """The same for the highest value away from the peak."""
     sigma_at_zero: float
-    """The same for the highest value within a pixel of no shift."""
+    """The same at no shift."""
 
 
 def correlation_surface(fixed: Field, moving: Field) -> NDArray[np.float32]:
@@ -79,7 +79,7 @@ def find_peak(surface: NDArray[np.float32], apart_px: int) -> Peak:
     dx = column - zero_column + _vertex(z[row, (column - 1) % width], z[row, column], z[row, (column + 1) % width])
     dy = row - zero_row + _vertex(z[(row - 1) % height, column], z[row, column], z[(row + 1) % height, column])
     sigma = float(z[row, column])
-    at_zero = float(z[zero_row - 1 : zero_row + 2, zero_column - 1 : zero_column + 2].max())
+    at_zero = float(z[zero_row, zero_column])
     z[max(0, row - apart_px) : row + apart_px + 1, max(0, column - apart_px) : column + apart_px + 1] = -np.inf
     runner_up = float(z.max())
     return Peak((float(dx), float(dy)), sigma, runner_up if np.isfinite(runner_up) else 0.0, at_zero)

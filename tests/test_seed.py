@@ -65,6 +65,11 @@ def test_geo_seed_maps_the_same_ground_to_the_same_ground() -> None:
     assert seed is not None
     # Pixel (20, 20) of the fine one has its centre at x = 502.05: (502.05 - 501) / 0.2 - 0.5 = 4.75.
     np.testing.assert_allclose(geometry.apply(seed, [20, 20]), [4.75, 4.75])
+    far = np.array([[1, 0, 499_500], [0, 1, 5_799_100], [0, 0, 1.0]])  # where UTM coordinates are
+    moved = [Georeference(far @ g.transform, "crs") for g in (fine, coarse)]
+    seed = geo_seed(band(100, 100, moved[0]), band(50, 50, moved[1]))
+    assert seed is not None
+    np.testing.assert_allclose(geometry.apply(seed, [20, 20]), [4.75, 4.75], atol=1e-6)
     other = Georeference(coarse.transform, "another crs")
     assert geo_seed(band(100, 100, fine), band(50, 50, other)) is None
 

@@ -27,18 +27,17 @@ fi
 # The host's Python package sources and certificate, so that a mirror or proxy set up here serves the build too. Further
 # folders that those sources refer to can be named in EXTRA_MOUNTS, separated by spaces.
 mounts=()
-for path in /etc/pip.conf ${PIP_FIND_LINKS:-} ${EXTRA_MOUNTS:-}; do
+for path in ${PIP_FIND_LINKS:-} ${EXTRA_MOUNTS:-}; do
     if [ -e "$path" ]; then mounts+=(--volume "$path:$path:ro"); fi
 done
-pass=()
+touch "$root/pip.conf"
+if [ -e /etc/pip.conf ]; then cp /etc/pip.conf "$root/pip.conf"; fi
 if [ -n "${SSL_CERT_FILE:-}" ]; then
+    sed -i "s|^cert *=.*|cert = /run/host-certificates.pem|" "$root/pip.conf"
     mounts+=(--volume "$SSL_CERT_FILE:/run/host-certificates.pem:ro")
-    pass+=(--env PIP_CERT=/run/host-certificates.pem)
 fi
-for name in PIP_INDEX_URL PIP_EXTRA_INDEX_URL PIP_FIND_LINKS http_proxy https_proxy; do
-    if [ -n "${!name:-}" ]; then pass+=(--env "$name=${!name}"); fi
-done
-buildah build --quiet "${mounts[@]}" "${pass[@]}" --build-arg "BASE=localhost/agalign-base:$suite" -t agalign . > /dev/null
+mounts+=(--volume "$root/pip.conf:/etc/pip.conf:ro")
+buildah build --quiet "${mounts[@]}" --build-arg "BASE=localhost/agalign-base:$suite" -t agalign . > /dev/null
 container=$(buildah from --pull-never agalign)
 trap 'buildah rm "$container" > /dev/null; rm -rf "$root"' EXIT
 buildah run --user agalign --workingdir /tmp "$container" -- agalign demo /tmp/agalign-demo "$@"
