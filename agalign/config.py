@@ -26,7 +26,7 @@ class FastRecipe(Stage):
     batch: Positive = 128
     temperature: float = 0.07
     learning_rate: float = 2e-3
-    most_steps: Positive = 200
+    most_steps: Positive = 150
     warm_up_steps: int = 50
     """Steps on theta alone before psi may move."""
     steps_between_updates: Positive = 25
@@ -42,9 +42,9 @@ class FastRecipe(Stage):
     """Held-out keypoints among which retrieval is measured."""
     octaves: float = 1.0
     """Patch scales are drawn from [1, 2**octaves] px between samples."""
-    learn_patches: Positive = 400
+    learn_patches: Positive = 300
     """Patches in a Gauss-Newton step while learning."""
-    final_patches: Positive = 800
+    final_patches: Positive = 600
     """Patches in a Gauss-Newton step at full resolution."""
     final_steps: Positive = 4
     final_rest_px: float = 0.1

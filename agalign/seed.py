@@ -64,7 +64,7 @@ def geo_seed(reference: Band, moving: Band) -> Matrix | None:
         return None
     to_corner = geometry.translation(0.5, 0.5)
     # Not geometry.invert: metres in the millions beside pixels of centimetres look singular to it.
-    map_to_there = np.linalg.inv(there.transform)
+    map_to_there: Matrix = np.linalg.inv(there.transform).astype(np.float64)
     return geometry.compose(geometry.invert(to_corner), map_to_there, here.transform, to_corner)
 
 
