@@ -34,7 +34,7 @@ class FastRecipe(Stage):
     """Held-out retrieval below which psi does not move."""
     enough_retrieval: float = 0.6
     """Held-out retrieval at which learning may stop once psi is at rest."""
-    rest_px: float = 0.3
+    rest_px: float = 0.5
     """psi is at rest when a step moves no corner by more than this, in px of the level."""
     least_negative_px: float = 8.0
     """Keypoints closer than this are not negatives of each other."""
