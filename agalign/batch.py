@@ -120,25 +120,28 @@ def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar 
     return sidecar if size == (sidecar.output.bytes if sidecar.output else None) else None
 
 
-def write_summary(out: Path) -> Path:
-    """OUT/summary.csv from all sidecars below OUT, a row per band pair. Raises OutputError."""
+def write_summary(out: Path, on_problem: Callable[[str], None] = quiet) -> Path:
+    """OUT/summary.csv from all sidecars below OUT, a row per band pair; unreadable ones are told to `on_problem`.
+
+    Raises OutputError.
+    """
     table = io.StringIO()
     writer = csv.DictWriter(table, SUMMARY_COLUMNS, lineterminator="\n")
     writer.writeheader()
-    for folder, sidecar in sidecars_below(out):
+    for folder, sidecar in sidecars_below(out, on_problem):
         writer.writerows(_row(folder, sidecar, band) for band in sidecar.bands if band.status != "reference")
     path = out / "summary.csv"
     write_text(path, table.getvalue())
     return path
 
 
-def sidecars_below(out: Path) -> Iterable[tuple[str, Sidecar]]:
-    """(folder relative to OUT, sidecar) of every readable sidecar."""
+def sidecars_below(out: Path, on_problem: Callable[[str], None] = quiet) -> Iterable[tuple[str, Sidecar]]:
+    """(folder relative to OUT, sidecar) of every readable sidecar; `on_problem` is told of the others."""
     for path in find_sidecars(out):
         try:
             yield path.parent.relative_to(out).as_posix(), read_sidecar(path)
-        except SidecarError:
-            continue
+        except SidecarError as error:
+            on_problem(str(error))
 
 
 def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:

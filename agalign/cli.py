@@ -304,8 +304,12 @@ def report(
 
         if not out.is_dir() or not find_sidecars(out):
             raise InputError(f"{out}: no sidecars there; give the output folder of a run")
-        summary = write_summary(out)
+        unreadable: list[str] = []
+        summary = write_summary(out, unreadable.append)
+        for text in unreadable:
+            voice.problem(text)
         voice.result(escape(f"{write_report(out)}\n{summary}"))
+        raise typer.Exit(EXIT_PARTIAL if unreadable else EXIT_OK)
 
 
 def _facts(capture: "Capture") -> dict[str, Any]:

@@ -96,6 +96,13 @@ def test_summary_and_report(aligned: tuple[Path, subprocess.CompletedProcess[str
     assert (out / "index.html").read_text() == before
 
 
+def test_report_tells_of_sidecars_it_cannot_read(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"schema": "agalign/1"}')
+    done = agalign("report", tmp_path)
+    assert done.returncode == 3
+    assert "a.json" in done.stderr
+
+
 def test_log_json_is_a_json_object_a_line(aligned: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     _, done = aligned
     events = [json.loads(line) for line in done.stderr.splitlines()]
