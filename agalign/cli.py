@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -410,15 +411,16 @@ def _run(flight: "Flight", out: Path, settings: "Settings", voice: Voice, *, ove
     reports: list[CaptureReport] = []
     done_pairs, all_pairs = 0, sum(len(c.moving) for c in flight.captures)
     started = time.monotonic()
-    with _progress(voice, all_pairs) as show:
+    with _progress(voice, all_pairs) as show, _interruptible() as check_interrupt:
         current: Capture | None = None
-        finished_in_capture = 0
 
         def on_start(capture: "Capture") -> None:
-            nonlocal current, finished_in_capture
-            current, finished_in_capture = capture, 0
+            nonlocal current
+            check_interrupt()
+            current = capture
 
         def on_pair(band: str, stage: str, share: float) -> None:
+            check_interrupt()
             assert current is not None
             names = [b.name for b in current.moving]
             place = names.index(band) if band in names else len(names)
@@ -449,6 +451,30 @@ def _write_pages(out: Path, reports: "list[CaptureReport]") -> None:
     if reports:
         write_summary(out)
         write_report(out)
+
+
+@contextmanager
+def _interruptible() -> Iterator[Callable[[], None]]:
+    """Yields a check that raises KeyboardInterrupt once SIGINT has come.
+
+    The exception that Python itself raises is lost where it falls into a callback from a C library.
+    """
+    came = False
+
+    def on_interrupt(_number: int, _frame: object) -> None:
+        nonlocal came
+        came = True
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if came:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
