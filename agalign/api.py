@@ -6,15 +6,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign import geometry
-from agalign.batch import CaptureReport, rig_seed, run_flight, write_summary
+from agalign.batch import CaptureReport, RunOptions, rig_seed, run_flight, write_summary
 from agalign.config import Interpolation, Settings
 from agalign.discover import DiscoverOptions, discover
 from agalign.errors import InputError
+from agalign.mapping import Mapping
 from agalign.masks import data_mask, learnable, undeclared_fill
-from agalign.pair import View, align_views
+from agalign.pair import align_images
 from agalign.pipeline import CaptureOutcome, process_capture, quiet
-from agalign.records import Alignment, Capture, Mask, Raster, SeedKind
-from agalign.warp import Mapping, Tile, resample, source_positions
+from agalign.records import Alignment, Capture, Mask, Raster, SeedKind, Tile
+from agalign.warp import resample
 
 _LEAST_SIDE_PX = 48
 _MOST_CHANNELS = 16
@@ -43,15 +44,15 @@ def align(
     Raises InputError for arrays that are no images, GeometryError for a seed that is no homography.
     """
     settings = settings or Settings()
-    one = _view(fixed, fixed_valid, "fixed")
-    other = _view(moving, moving_valid, "moving")
+    one = _raster(fixed, fixed_valid, "fixed")
+    other = _raster(moving, moving_valid, "moving")
     candidates: dict[SeedKind, geometry.Matrix] = {}
     if seed is not None:
         candidates["user"] = geometry.normalised(seed)
     else:
-        scale = np.divide(other.raw.size_px, one.raw.size_px)
+        scale = np.divide(other.size_px, one.size_px)
         candidates["identity"] = geometry.resolution_change(float(scale[0]), float(scale[1]))
-    return align_views(one, other, candidates, settings, quiet)
+    return align_images([("moving", one, other, candidates)], settings, quiet)["moving"]
 
 
 def warp_onto(
@@ -71,7 +72,7 @@ def warp_onto(
         raise InputError(f"moving must be (H, W), not {pixels.shape}; warp several bands one by one")
     mask = np.ones(pixels.shape, bool) if valid is None else np.asarray(valid, bool)
     mapping = Mapping(geometry.normalised(fixed_to_moving))
-    positions = source_positions(mapping, Tile(0, 0, *fixed_size_px))
+    positions = mapping.positions(Tile(0, 0, *fixed_size_px))
     end = pixels.shape[1], pixels.shape[0]
     return resample(pixels, mask, positions, end, (0, 0), interpolation)
 
@@ -90,23 +91,28 @@ def align_folder(
     *,
     settings: Settings | None = None,
     options: DiscoverOptions | None = None,
-    overwrite: bool = False,
+    run: RunOptions | None = None,
+    model: str | Path | None = None,
 ) -> list[CaptureReport]:
     """Align every capture below `folder` into `out` and write the summary and the report.
 
-    Raises InputError where there is nothing to align, OutputError where `out` cannot be written.
+    `run` says how: how many captures at a time, or on which executor; with several processes the calling script must
+    be importable (`if __name__ == "__main__":`). `model` is a file of an earlier run's `models` folder to start from.
+    Raises InputError where there is nothing to align, OutputError where `out` cannot be written, ConfigurationError
+    for a model of another camera.
     """
     from agalign.report import write_report
 
     source, target = Path(folder), Path(out)
     found = discover(source, options or DiscoverOptions(skip=(target,)))
-    reports = list(run_flight(found, target, settings or Settings(), overwrite=overwrite))
+    start = None if model is None else Path(model)
+    reports = list(run_flight(found, target, settings or Settings(), run, model=start))
     write_summary(target)
     write_report(target)
     return reports
 
 
-def _view(image: ArrayLike, valid: ArrayLike | None, name: str) -> View:
+def _raster(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     array = np.asarray(image)
     if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
         raise InputError(
@@ -129,5 +135,4 @@ def _view(image: ArrayLike, valid: ArrayLike | None, name: str) -> View:
     for plane in planes:
         mask = learnable(mask, plane, saturation)
     pixels = np.where(mask, planes, 0).astype(np.float32)
-    raster = Raster(pixels if len(planes) > 1 else pixels[0], mask)
-    return View(raster, raster, (1.0, 1.0))
+    return Raster(pixels if len(planes) > 1 else pixels[0], mask)

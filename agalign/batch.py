@@ -3,8 +3,22 @@
 import csv
 import io
 import os
-from collections.abc import Callable, Iterable, Iterator
+import signal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
@@ -12,9 +26,21 @@ from agalign.cameras import known_cameras
 from agalign.config import Settings
 from agalign.describe import fingerprint
 from agalign.discover import Flight
-from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
+from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError, WorkerError
+from agalign.flight import (
+    FlightModel,
+    camera_key,
+    flights_of,
+    learn_flight,
+    learning_fingerprint,
+    load_model,
+    model_names,
+    save_model,
+)
 from agalign.geometry import Matrix
-from agalign.pipeline import PairProgress, output_paths, process_capture, quiet
+from agalign.joint import choose_device, limit_threads, one_thread
+from agalign.pair import PairProgress
+from agalign.pipeline import output_paths, process_capture, quiet
 from agalign.records import Band, Capture
 from agalign.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar, write_text
 
@@ -24,6 +50,8 @@ SUMMARY_COLUMNS = (
     "nmi_after", "ncc_before", "ncc_after", "gradient_correlation_before", "gradient_correlation_after",
     "structure_ssim_before", "structure_ssim_after", "seconds",
 )  # fmt: skip
+
+_MOST_READ_AHEAD_BYTES = 64 << 20
 
 
 @dataclass(frozen=True)
@@ -68,33 +96,178 @@ def prepare_output(out: Path) -> None:
         raise OutputError(f"{out}: cannot be made ({error.strerror or error})") from None
 
 
-def run_flight(
-    flight: Flight,
-    out: Path,
-    settings: Settings,
-    *,
-    overwrite: bool = False,
-    on_pair: PairProgress = quiet,
-    on_start: Callable[[Capture], None] = quiet,
-) -> Iterator[CaptureReport]:
-    """Align the captures one after another, yielding each as it is done; those done before are kept.
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run goes about it: nothing here changes a result."""
 
-    One capture's failure never stops the others. Raises OutputError where the output folder cannot be used.
+    overwrite: bool = False
+    """Do captures again that an earlier run finished."""
+    jobs: int = 1
+    """Captures at a time, each in a process of its own where there are several."""
+    executor: Executor | None = None
+    """Where the captures are done instead: any executor whose workers see the same folders."""
+
+
+@dataclass(frozen=True)
+class Listener:
+    """What a run tells while it runs."""
+
+    on_start: Callable[[Capture], None] = quiet
+    on_pair: PairProgress = quiet
+    """Of captures in this process only."""
+    on_learning: Callable[[str, float], None] = quiet
+    """The camera whose network is learnt, and the share that is behind."""
+
+
+def run_flight(
+    flight: Flight, out: Path, settings: Settings, options: RunOptions | None = None,
+    listener: Listener | None = None, model: Path | None = None,
+) -> Iterator[CaptureReport]:  # fmt: skip
+    """Align the captures, yielding each as it is done; those done before are kept.
+
+    A network is learnt for every camera and flight first and saved below OUT/models; `model` is one to start from.
+    One capture's failure never stops the others, and no result depends on the order in which they are done.
+    Raises OutputError where the output folder cannot be used, InputError or ConfigurationError for `model`.
     """
+    options, listener = options or RunOptions(), listener or Listener()
     prepare_output(out)
     _refuse_to_overwrite_inputs(flight, out)
-    for capture in flight.captures:
-        on_start(capture)
-        earlier = None if overwrite else finished_before(capture, out, settings)
-        if earlier is not None:
-            yield CaptureReport(capture.label, "kept", earlier)
-            continue
-        try:
-            outcome = process_capture(capture, out, rig_seed, settings, on_pair)
-        except AgalignError as error:
-            yield CaptureReport(capture.label, "error", None, str(error))
-            continue
-        yield CaptureReport(capture.label, "done", outcome.sidecar)
+    known = None if model is None else _given_model(model, flight, settings)
+    waiting: list[Task] = []
+    groups = flights_of(flight.captures)
+    for group, name in zip(groups, model_names(groups), strict=True):
+        left = []
+        for capture in group:
+            earlier = None if options.overwrite else finished_before(capture, out, settings)
+            if earlier is None:
+                left.append(capture)
+            else:
+                yield CaptureReport(capture.label, "kept", earlier)
+        if left:
+            path = _learn(group, out / "models" / name, settings, listener, known)
+            waiting += [Task(c, out, settings, path) for c in left]
+    if options.executor is not None:
+        yield from _on_executor(waiting, options.executor, _most_in_flight(options.executor))
+    elif options.jobs > 1 and len(waiting) > 1:
+        jobs = min(options.jobs, len(waiting))
+        with ProcessPoolExecutor(jobs, get_context("spawn"), _start_worker, (jobs,)) as pool:
+            yield from _on_executor(waiting, pool, 2 * jobs)
+    else:
+        with ThreadPoolExecutor(1) as reader:
+            for number, task in enumerate(waiting, start=1):
+                listener.on_start(task.capture)
+                for following in waiting[number : number + 1]:
+                    reader.submit(_read_ahead, following.capture)
+                yield do_capture(task, listener.on_pair)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One capture to be done, as it travels to a worker."""
+
+    capture: Capture
+    out: Path
+    settings: Settings
+    model: Path | None
+
+
+def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
+    """Do one capture; what can go wrong with it is in the report."""
+    label = task.capture.label
+    try:
+        model = None if task.model is None else _loaded(task.model, task.settings.joint.device)
+        with one_thread():
+            outcome = process_capture(task.capture, task.out, rig_seed, task.settings, on_pair, model)
+    except AgalignError as error:
+        return CaptureReport(label, "error", None, str(error))
+    return CaptureReport(label, "done", outcome.sidecar)
+
+
+def _on_executor(tasks: Sequence[Task], executor: Executor, most: int) -> Iterator[CaptureReport]:
+    """Never more than `most` handed over at a time, so that a season's captures do not wait in memory."""
+    futures: dict[Future[CaptureReport], Task] = {}
+    remaining = iter(tasks)
+    try:
+        for task in islice(remaining, most):
+            futures[executor.submit(do_capture, task)] = task
+        while futures:
+            done, _ = wait(futures, return_when=FIRST_COMPLETED)
+            for future in done:
+                task = futures.pop(future)
+                yield _report_of(future, task)
+                for following in islice(remaining, 1):
+                    futures[executor.submit(do_capture, following)] = following
+    except BrokenExecutor:
+        raise WorkerError("a worker process ended without a word (out of memory?); try again with --jobs 1") from None
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _report_of(future: "Future[CaptureReport]", task: Task) -> CaptureReport:
+    try:
+        return future.result()
+    except BrokenExecutor:
+        raise
+    except MemoryError:
+        return CaptureReport(task.capture.label, "error", None, f"{task.capture.label}: out of memory")
+
+
+def _most_in_flight(executor: Executor) -> int:
+    workers = getattr(executor, "_max_workers", None)
+    return 2 * workers if isinstance(workers, int) else 64
+
+
+def _start_worker(jobs: int) -> None:
+    """The interrupt key is for the main process, which lets the workers finish what they have begun."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    limit_threads(max(1, (os.cpu_count() or 1) // jobs))
+
+
+def _read_ahead(capture: Capture) -> None:
+    """Bring the files of the capture to come into the system's cache."""
+    for path in {b.path for b in capture.bands}:
+        with suppress(OSError):
+            if path.stat().st_size <= _MOST_READ_AHEAD_BYTES:
+                path.read_bytes()
+
+
+def _given_model(path: Path, flight: Flight, settings: Settings) -> FlightModel:
+    """The model to start from. Raises ConfigurationError where no capture is of its camera."""
+    model = load_model(path, lambda: choose_device(settings.joint.device))
+    if not any(camera_key(c) == model.camera for c in flight.captures):
+        here = camera_key(flight.captures[0])
+        raise ConfigurationError(f"{path}: was learnt for {model.camera}; the images here are of {here}")
+    return model
+
+
+def _learn(
+    captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, known: FlightModel | None
+) -> Path | None:
+    """The path of the flight's model, learnt now or found from an earlier run; None where none could be learnt."""
+    if settings.joint.recipe != "fast" or not settings.flight.together:
+        return None
+    start = known if known is not None and known.camera == camera_key(captures[0]) else None
+    device = settings.joint.device
+    if path.is_file():
+        with suppress(AgalignError):
+            if _loaded(path, device).fingerprint == learning_fingerprint(captures, settings, start):
+                return path
+
+    def progress(_stage: str, share: float) -> None:
+        listener.on_learning(path.stem, share)
+
+    model = learn_flight(captures, rig_seed, settings, progress, start)
+    if model is None:
+        return None
+    _loaded.cache_clear()
+    save_model(model, path)
+    return path
+
+
+@lru_cache(maxsize=8)
+def _loaded(path: Path, device: str) -> FlightModel:
+    return load_model(path, lambda: choose_device(device))
 
 
 def _refuse_to_overwrite_inputs(flight: Flight, out: Path) -> None:

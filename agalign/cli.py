@@ -145,6 +145,9 @@ Pattern = Annotated[
     str | None, typer.Option(help="File names as '{capture}_{band}.tif', where agalign does not know them.")
 ]
 Reference = Annotated[str | None, typer.Option(help="Name of the reference band; by default green.")]
+Jobs = Annotated[
+    int, typer.Option("--jobs", "-j", min=0, show_default=False, help="Captures at a time; by default one a core.")
+]
 IgnoreMetadata = Annotated[bool, typer.Option("--ignore-metadata", help="Use no lens or rig tags.")]
 
 
@@ -193,6 +196,13 @@ def align(
     ] = CompressionChoice.zstd,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
     rng_seed: Annotated[int, typer.Option(help="Seed of all random numbers; the same seed gives the same result.")] = 0,
+    jobs: Jobs = 0,
+    model: Annotated[
+        Path | None, typer.Option(help="Start from what an earlier flight of the same camera learnt: OUT/models/….")
+    ] = None,
+    each_alone: Annotated[
+        bool, typer.Option("--each-alone", help="Learn every capture by itself instead of once a flight.")
+    ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Do captures again that an earlier run finished.")
     ] = False,
@@ -203,7 +213,7 @@ def align(
     """Align every capture below FOLDER."""
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
     with _exits(voice):
-        from agalign.config import JointSettings, SeedSettings, Settings, WriteSettings
+        from agalign.config import FlightSettings, JointSettings, SeedSettings, Settings, WriteSettings
         from agalign.discover import DiscoverOptions
 
         target = out or folder.absolute().parent / f"{folder.absolute().name}-aligned"
@@ -213,6 +223,7 @@ def align(
                 recipe=recipe.value, sharing=sharing.value, model_family=model_family.value,
                 device=device, rng_seed=rng_seed,
             ),
+            flight=FlightSettings(together=not each_alone),
             write=WriteSettings(
                 interpolation=interpolation.value, crop=crop.value, undistort=undistort,
                 format=format.value, compression=compression.value,
@@ -220,7 +231,7 @@ def align(
         )  # fmt: skip
         options = DiscoverOptions(pattern, reference, ignore_metadata, (target,))
         flight = _discover(folder, options, voice)
-        reports = _run(flight, target, settings, voice, overwrite=overwrite)
+        reports = _run(flight, target, settings, voice, overwrite=overwrite, jobs=jobs, model=model)
         raise typer.Exit(_conclude(flight, reports, target, voice))
 
 
@@ -228,6 +239,7 @@ def align(
 def demo(
     out: Annotated[Path, typer.Argument(help="Folder to make.")] = Path("agalign-demo"),
     captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
+    jobs: Jobs = 0,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
     rng_seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
     quiet: Quiet = False,
@@ -250,7 +262,7 @@ def demo(
         truth = make_flight(source, captures, rng_seed=rng_seed)
         flight = _discover(source, DiscoverOptions(), voice)
         settings = Settings(joint=JointSettings(device=device, rng_seed=rng_seed))
-        reports = _run(flight, target, settings, voice, overwrite=True)
+        reports = _run(flight, target, settings, voice, overwrite=True, jobs=jobs)
         table = Table("Capture", "Band", "Status", title="Error against the truth, px")
         for name in ("before", "median", "95 %"):
             table.add_column(name, justify="right")
@@ -403,13 +415,19 @@ def _discover(folder: Path, options: "DiscoverOptions", voice: Voice, *, silent:
     return flight
 
 
-def _run(flight: "Flight", out: Path, settings: "Settings", voice: Voice, *, overwrite: bool) -> "list[CaptureReport]":
-    from agalign.batch import run_flight
+def _run(
+    flight: "Flight", out: Path, settings: "Settings", voice: Voice, *,
+    overwrite: bool, jobs: int, model: Path | None = None,
+) -> "list[CaptureReport]":  # fmt: skip
+    from agalign.batch import Listener, RunOptions, run_flight
     from agalign.joint import choose_device
 
-    choose_device(settings.joint.device)
+    # One process feeds a GPU.
+    gpu = choose_device(settings.joint.device).type != "cpu"
+    options = RunOptions(overwrite, jobs or (1 if gpu else os.cpu_count() or 1))
     reports: list[CaptureReport] = []
     done_pairs, all_pairs = 0, sum(len(c.moving) for c in flight.captures)
+    pairs = {c.label: len(c.moving) for c in flight.captures}
     started = time.monotonic()
     with _progress(voice, all_pairs) as show, _interruptible() as check_interrupt:
         current: Capture | None = None
@@ -418,6 +436,10 @@ def _run(flight: "Flight", out: Path, settings: "Settings", voice: Voice, *, ove
             nonlocal current
             check_interrupt()
             current = capture
+
+        def on_learning(camera: str, share: float) -> None:
+            check_interrupt()
+            show(done_pairs, f"learning from {camera}: {share:.0%} at most")
 
         def on_pair(band: str, stage: str, share: float) -> None:
             check_interrupt()
@@ -430,15 +452,16 @@ def _run(flight: "Flight", out: Path, settings: "Settings", voice: Voice, *, ove
             )
 
         try:
-            for capture_report in run_flight(
-                flight, out, settings, overwrite=overwrite, on_pair=on_pair, on_start=on_start
-            ):
+            listener = Listener(on_start, on_pair, on_learning)
+            for capture_report in run_flight(flight, out, settings, options, listener, model):
+                check_interrupt()
                 reports.append(capture_report)
-                done_pairs += len(flight.captures[len(reports) - 1].moving)
+                done_pairs += pairs[capture_report.label]
                 show(done_pairs, capture_report.label)
                 _tell(capture_report, voice, len(reports), len(flight.captures))
         finally:
             _write_pages(out, reports)
+    reports.sort(key=lambda r: list(pairs).index(r.label))
     voice.event("finished", seconds=round(time.monotonic() - started, 1), captures=len(reports))
     return reports
 

@@ -46,8 +46,9 @@ class FastRecipe(Stage):
     """Patches in a Gauss-Newton step while learning."""
     final_patches: Positive = 600
     """Patches in a Gauss-Newton step at full resolution."""
-    final_steps: Positive = 4
-    final_rest_px: float = 0.1
+    final_steps: Positive = 10
+    final_rest_px: float = 0.01
+    """psi has converged when a step moves no corner by more than this."""
     longest_step_px: float = 4.0
     difference_px: float = 0.75
     """Half width of the central differences that give a descriptor's gradient."""
@@ -91,6 +92,15 @@ class JointSettings(Stage):
     """Larger images are reduced to this for estimation."""
 
 
+class FlightSettings(Stage):
+    """One network for many captures."""
+
+    together: bool = True
+    """False learns every capture alone."""
+    captures: Positive = 3
+    """How many the network is learnt on, spread over the flight."""
+
+
 class SeedSettings(Stage):
     """Coarse alignment."""
 
@@ -99,6 +109,8 @@ class SeedSettings(Stage):
     working_px: Positive = 384
     """Longer side of the images on which seeds are scored."""
     smoothing_px: float = 1.0
+    least_overlap: float = 0.2
+    """Share of the reference that the moving image must cover for a candidate to be scored."""
     trusted_sigma: float = 12.0
     """Correlation peak, in standard deviations, of a seed that is good to a few pixels. Unrelated images reach 9."""
     trusted_ratio: float = 1.5
@@ -124,6 +136,8 @@ class CheckSettings(Stage):
     least_coverage: float = 0.6
     """Share of the windows with structure in which a shift could be measured."""
     least_windows: Positive = 4
+    least_seed_coverage: float = 0.3
+    """The same as `least_coverage` for a seed that is used as it is."""
     most_corner_std_px: float = 2.0
     """Standard deviation of the mapped corners."""
     most_snap_px: float = 0.25
@@ -153,5 +167,6 @@ class Settings(Stage):
 
     seed: SeedSettings = SeedSettings()
     joint: JointSettings = JointSettings()
+    flight: FlightSettings = FlightSettings()
     check: CheckSettings = CheckSettings()
     write: WriteSettings = WriteSettings()

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,10 @@ _GRID_COLUMNS, _GRID_ROWS = 17, 13
 
 
 def fingerprint(capture: Capture, settings: Settings) -> str:
-    """Changes when the settings, the files or the program's version do."""
+    """Changes when the settings, the files or the program's version do.
+
+    What the other captures of the flight are does not count: a result stays good when the card holds more.
+    """
     bands = [(b.name, b.address, b.lens, b.georeference is not None, _state(b.path)) for b in capture.bands]
     text = f"{__version__} {settings.model_dump_json()} {capture.reference_index} {bands}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -140,7 +144,7 @@ def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
         grid=GridPart(reference_px=_points(grid_px), moving_px=_points(there_px)),
         joint=None if joint is None else _joint_part(joint),
         metrics=MetricsPart(
-            before=SimilarityPart(**alignment.before), after=SimilarityPart(**after), tiles=_tile_parts(residual)
+            before=_similarity_part(alignment.before), after=_similarity_part(after), tiles=_tile_parts(residual)
         ),
         seconds=round(alignment.seconds, 3),
     )
@@ -151,7 +155,13 @@ def _joint_part(joint: JointResult) -> JointPart:
         loss=joint.loss if math.isfinite(joint.loss) else None, retrieval=joint.retrieval, chance=joint.chance,
         iterations=joint.iterations, levels=list(joint.levels), recipe=joint.recipe, model_family=joint.model_family,
         last_step_px=joint.last_step_px, corner_std_px=joint.corner_std_px,
+        corner_std_xy_px=[(round(x, 4), round(y, 4)) for x, y in joint.corner_std_xy_px],
     )  # fmt: skip
+
+
+def _similarity_part(metrics: Mapping[str, float]) -> SimilarityPart:
+    # Digits beyond the sixth depend on how many threads added them up.
+    return SimilarityPart(**{k: round(v, 6) if math.isfinite(v) else v for k, v in metrics.items()})
 
 
 def _tile_parts(residual: Residual | None) -> list[ResidualTile]:

@@ -1,18 +1,22 @@
-"""The descriptor f(x; theta): a shallow CNN in siamese, pseudo-siamese or unshared form (paper, Sec. 4.4 and 5.3).
+"""The descriptor f(x; theta): a shallow CNN with one first layer a band (paper, Sec. 4.4 and 5.3).
 
 Conv(C, 32, 5) - Tanh - MaxPool(2) - Conv(32, 64, 3) - Tanh - FC(256) on 16 x 16 patches.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
+from agalign.errors import ConfigurationError
+
 Sharing = Literal["siamese", "pseudo-siamese", "unshared"]
-Side = Literal["fixed", "moving"]
 
 PATCH_PX = 16
 DIMENSION = 256
+REFERENCE = 0
+"""The side of the reference image; the moving bands follow from 1."""
 
 
 class _FirstLayer(nn.Module):
@@ -31,7 +35,7 @@ class _FirstLayer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, 16, 16) -> (N, 32, 6, 6)."""
-        x = self.convolution(x)
+        x = self.convolution(x.contiguous(memory_format=torch.channels_last))
         if self.half_rectified:
             signed, folded = x.chunk(2, dim=1)
             x = torch.cat([signed, folded.abs()], dim=1)
@@ -43,36 +47,44 @@ def _trunk() -> nn.Sequential:
 
 
 class Descriptor(nn.Module):
-    """Two networks, one a side, that share all, all but the first layer, or nothing.
+    """One network a side (the reference, and each moving band) that share all, all but the first layer, or nothing.
 
-    `unit_length` scales every descriptor to length 1, which the in-batch loss needs and the paper's does not.
+    `channels` has the number of channels of each side, the reference's first. `unit_length` scales every descriptor
+    to length 1, which the in-batch loss needs and the paper's does not. Raises ConfigurationError where a siamese
+    network is asked to take images of different channels.
     """
 
     def __init__(
         self,
         sharing: Sharing = "pseudo-siamese",
-        fixed_channels: int = 1,
-        moving_channels: int = 1,
+        channels: Sequence[int] = (1, 1),
         *,
         half_rectified: bool = False,
         unit_length: bool = False,
     ) -> None:
         super().__init__()
+        if sharing == "siamese" and len(set(channels)) > 1:
+            raise ConfigurationError(
+                f"siamese networks need images of the same channels, not {tuple(channels)}; use pseudo-siamese"
+            )
         self.sharing = sharing
         self.unit_length = unit_length
-        self.fixed_first = _FirstLayer(fixed_channels, half_rectified)
-        self.moving_first = self.fixed_first if sharing == "siamese" else _FirstLayer(moving_channels, half_rectified)
-        self.fixed_trunk = _trunk()
-        self.moving_trunk = _trunk() if sharing == "unshared" else self.fixed_trunk
+        own_first = channels if sharing != "siamese" else channels[:1]
+        self.first = nn.ModuleList(_FirstLayer(c, half_rectified) for c in own_first)
+        self.trunk = nn.ModuleList(_trunk() for _ in (channels if sharing == "unshared" else channels[:1]))
         # The NHWC layout makes the small convolutions nearly twice as fast on a CPU.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, patches: Tensor, side: Side) -> Tensor:
+    def forward(self, patches: Tensor, side: int) -> Tensor:
         """(N, C, 16, 16) -> (N, 256)."""
-        x = patches.contiguous(memory_format=torch.channels_last)
-        first, trunk = {
-            "fixed": (self.fixed_first, self.fixed_trunk),
-            "moving": (self.moving_first, self.moving_trunk),
-        }[side]
-        f: Tensor = trunk(first(x))
-        return nn.functional.normalize(f, dim=1) if self.unit_length else f
+        return self.describe([patches], [side])[0]
+
+    def describe(self, patches: Sequence[Tensor], sides: Sequence[int]) -> list[Tensor]:
+        """`forward` for several sides at once: what they share runs once."""
+        responses = [self.first[min(side, len(self.first) - 1)](x) for x, side in zip(patches, sides, strict=True)]
+        if len(self.trunk) == 1:
+            whole: Tensor = self.trunk[0](torch.cat(responses))
+            found = list(torch.split(whole, [len(x) for x in patches]))
+        else:
+            found = [self.trunk[side](x) for x, side in zip(responses, sides, strict=True)]
+        return [nn.functional.normalize(f, dim=1) for f in found] if self.unit_length else found

@@ -16,6 +16,8 @@ from agalign.records import ModelFamily
 
 _REWEIGHTINGS = 4
 _DAMPING = 1e-4
+_CELL_PX = 48
+"""Patches whose centres share a cell of this side count as one witness of the uncertainty."""
 FAMILIES: tuple[ModelFamily, ...] = ("homography", "affine", "translation")
 
 
@@ -27,9 +29,15 @@ class Step:
     """(3, 3) homography on fixed pixels, float64."""
     length_px: float
     """Largest movement of a corner, px of the level."""
-    corner_std_px: float
-    """Root mean square distance of the least certain corner from where it is mapped to, px of the level."""
+    corner_std_xy_px: tuple[tuple[float, float], ...]
+    """Standard deviations along x and y of where each corner is mapped to, clockwise from the top left, px of the
+    level."""
     family: ModelFamily
+
+    @property
+    def corner_std_px(self) -> float:
+        """Root mean square distance of the least certain corner from where it is mapped to, px of the level."""
+        return max(math.hypot(*std) for std in self.corner_std_xy_px)
 
 
 def shift_gradient(describe: Callable[[Keypoints], Tensor], keypoints: Keypoints, half_width_px: float) -> Tensor:
@@ -60,7 +68,7 @@ def solve(
 ) -> Step:
     """The step that the patches agree on.
 
-    `residual` is f(x) - f'(w(x)), (N, 256), `gradient` that of f' (or the mean of both sides'), (N, 256, 2).
+    `residual` is f(x) - f'(w(x)), (N, 256), `gradient` that of f over a shift of x, (N, 256, 2).
     The residual's mean over the patches is what the two modalities disagree on everywhere: it is removed. With
     `family` None the richest family is taken whose corners are known to `most_corner_std_px`.
     """
@@ -70,12 +78,14 @@ def solve(
     stiffness = torch.einsum("ndk,ndl->nkl", g, g)
     energy = centred.square().sum(dim=1)
     jacobian = shift_over_psi(keypoints.xy, *size_px)
+    column, row = (keypoints.xy / _CELL_PX).floor().long().clamp_min(0).unbind(dim=1)
+    cell = row * (size_px[0] // _CELL_PX + 2) + column
     families = FAMILIES if family is None else (family,)
-    step = _solve_family(jacobian, pull, stiffness, energy, families[0], size_px, longest_step_px)
+    step = _solve_family(jacobian, pull, stiffness, energy, cell, families[0], size_px, longest_step_px)
     for simpler in families[1:]:
         if step.corner_std_px <= most_corner_std_px:
             break
-        step = _solve_family(jacobian, pull, stiffness, energy, simpler, size_px, longest_step_px)
+        step = _solve_family(jacobian, pull, stiffness, energy, cell, simpler, size_px, longest_step_px)
     return step
 
 
@@ -84,6 +94,7 @@ def _solve_family(
     pull: Tensor,
     stiffness: Tensor,
     energy: Tensor,
+    cell: Tensor,
     family: ModelFamily,
     size_px: tuple[int, int],
     longest_step_px: float,
@@ -101,15 +112,18 @@ def _solve_family(
         normal = normal + torch.diag(_DAMPING * normal.diagonal() + 1e-12)
         delta = torch.linalg.solve(normal, torch.einsum("n,ni->i", weight, per_patch_pull))
 
-    # Sandwich covariance: what the patches disagree by, not what a noise model says, sets the uncertainty.
+    # Sandwich covariance: what the patches disagree by, not what a noise model says, sets the uncertainty. Patches
+    # that overlap see the same pixels, so cells of the image count as one witness each (Liang & Zeger 1986); where
+    # there are few cells the patches by themselves may say more.
     score = weight[:, None] * (per_patch_pull - torch.einsum("nij,j->ni", per_patch_normal, delta))
+    of_cells = score.new_zeros((int(cell.max()) + 1, len(parameters))).index_add_(0, cell, score)
     inverse = torch.linalg.inv(normal)
-    covariance = inverse @ (score.T @ score) @ inverse
+    covariances = torch.stack([inverse @ (s.T @ s) @ inverse for s in (score, of_cells)])
     psi = pull.new_zeros(8)
     psi[parameters] = delta
     corner_points = pull.new_tensor(_corner_list(size_px))
     corner_jacobian = shift_over_psi(corner_points, *size_px)[:, :, parameters]
-    variance = torch.einsum("cki,ij,ckj->c", corner_jacobian, covariance, corner_jacobian)
+    variance = torch.einsum("cki,mij,ckj->mck", corner_jacobian, covariances, corner_jacobian).amax(dim=0)
 
     change = homography_from_psi(psi, *size_px)
     length_px = float((transform(change, corner_points) - corner_points).norm(dim=1).max())
@@ -117,7 +131,8 @@ def _solve_family(
         change, length_px = torch.eye(3, dtype=torch.float64, device=psi.device), math.inf
     elif length_px > longest_step_px:
         change = homography_from_psi(psi * (longest_step_px / length_px), *size_px)
-    return Step(change, length_px, float(variance.clamp_min(0).max().sqrt()), family)
+    std_xy = tuple((float(x), float(y)) for x, y in variance.clamp_min(0).sqrt())
+    return Step(change, length_px, std_xy, family)
 
 
 def _corner_list(size_px: tuple[int, int]) -> list[list[float]]:

@@ -1,30 +1,30 @@
-"""The method: learn a descriptor on the very pair to be aligned while the homography is optimised (paper, Sec. 4).
+"""The method: learn a descriptor on the very images to be aligned while the homographies are optimised (paper, Sec. 4).
 
-Names follow the paper: I and I' are `fixed` and `moving`, theta the network's weights, psi the parameters of the
+Names follow the paper: I and I' are `fixed` and `moving`, theta the network's weights, psi the parameters of a
 homography, L0 and L1 the losses. Two recipes share the levels, the keypoints, the patches and the network:
 
-* `paper`: SGD on theta and psi together through the contrastive loss, coarse to fine.
+* `paper`: SGD on theta and psi together through the contrastive loss, coarse to fine, one pair at a time.
 * `fast`: Adam on theta through in-batch negatives; every few steps one Gauss-Newton step on psi minimises L0 squared.
+  One theta for as many captures as are given, each pair with its own psi (the paper's future work).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 
-import numpy as np
+import cv2
 import torch
 from torch import Tensor
 
 from agalign import geometry, losses
 from agalign.config import JointSettings
-from agalign.descriptor import Descriptor
-from agalign.errors import ConfigurationError, NotEnoughTextureError
-from agalign.gauss_newton import Step, shift_gradient, solve
+from agalign.descriptor import REFERENCE, Descriptor
+from agalign.errors import ConfigurationError, GeometryError, NotEnoughTextureError
 from agalign.geometry import Matrix
 from agalign.levels import Level, Sampler, make_level
 from agalign.patches import (
     FAMILY_PARAMETERS,
-    Keypoints,
-    bilinear,
     far_apart,
     homography_from_psi,
     patch_grid,
@@ -33,6 +33,15 @@ from agalign.patches import (
     warp_keypoints,
 )
 from agalign.records import JointResult, Raster
+from agalign.refine import (
+    LEAST_KEYPOINTS,
+    describe_fixed,
+    make_anchors,
+    moving_patches,
+    psi_step,
+    refine,
+    retrieval,
+)
 
 Progress = Callable[[str, float], None]
 """Called with the name of what is being done and the share of it that is behind, 0 to 1."""
@@ -50,25 +59,66 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
-def align_jointly(
-    fixed: Raster, moving: Raster, seed: Matrix, settings: JointSettings, *, trusted: bool, progress: Progress
-) -> tuple[JointResult, Descriptor]:
-    """Learn theta and psi on one pair, starting from `seed` (fixed_to_moving at full resolution).
+def limit_threads(count: int) -> None:
+    """Let torch and OpenCV use this many threads from now on."""
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)
 
-    A `trusted` seed is good to a few pixels, so recipe fast leaves the coarse levels out. Raises NotEnoughTextureError
-    where there is nothing to learn from.
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One torch thread inside: the networks are too small to gain from more, and sums do not depend on how many
+    processes share the machine.
     """
-    aligner = JointAligner(fixed, moving, settings, progress)
-    if settings.recipe == "paper":
-        return aligner.paper(seed)
-    return aligner.fast(seed, trusted)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@dataclass
+class Subject:
+    """The images of one capture and where their alignment stands."""
+
+    fixed: Raster
+    moving: Sequence[Raster]
+    mappings: list[Matrix]
+    """fixed_to_moving of each moving image, undistorted px; moved along by the optimisation."""
+    sides: Sequence[int]
+    """Which of the network's sides describes each moving image."""
+    trusted: Sequence[bool]
+    """Seeds that are good to a few pixels: recipe fast leaves the coarse levels out."""
+
+
+@dataclass
+class Pairs:
+    """Some moving images of a subject at one level, with their psi as homographies of that level."""
+
+    subject: Subject
+    bands: Sequence[int]
+    level: Level
+    h: list[Tensor] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.h = [self.level.homography(self.subject.mappings[b], i) for i, b in enumerate(self.bands)]
+
+    def side(self, index: int) -> int:
+        """The network's side of one of these images."""
+        return self.subject.sides[self.bands[index]]
+
+    def hand_on(self) -> None:
+        """Give what was found to the subject; a homography that cannot be inverted is not handed on."""
+        for i, b in enumerate(self.bands):
+            with suppress(GeometryError):
+                self.subject.mappings[b] = self.level.full_matrix(self.h[i], i)
 
 
 class JointAligner:
-    """The state of one joint optimisation: the two images, theta, and the current mapping."""
+    """The state of a joint optimisation: theta, and the random numbers."""
 
-    def __init__(self, fixed: Raster, moving: Raster, settings: JointSettings, progress: Progress) -> None:
-        self.images = fixed, moving
+    def __init__(self, settings: JointSettings, progress: Progress) -> None:
         self.settings = settings
         self.progress = progress
         self.device = choose_device(settings.device)
@@ -77,71 +127,54 @@ class JointAligner:
 
     # ---- what both recipes use
 
-    def level(self, scale: float, seed: Matrix) -> Level:
-        """Both images at a resolution; the moving one reduced so that the seed's magnification is near 1."""
-        fixed, moving = self.images
-        magnification = float(np.median(np.abs(geometry.local_scale(seed, *fixed.size_px))))
-        moving_scale = min(1.0, scale / magnification) if np.isfinite(magnification) and magnification > 0 else scale
-        least_gradient = self.settings.paper.least_gradient
-        level = make_level(fixed, moving, scale, moving_scale, least_gradient, self.device)
+    def level(self, subject: Subject, scale: float, bands: Sequence[int]) -> Level:
+        """The subject's reference and some of its moving images at a resolution."""
+        level = make_level(
+            subject.fixed, [subject.moving[b] for b in bands], [subject.mappings[b] for b in bands], scale,
+            self.settings.paper.least_gradient, self.sampler.generator, self.device,
+        )  # fmt: skip
         if len(level.trainable) == 0:
             raise NotEnoughTextureError("no pixel of the reference band has contrast enough to learn from")
         return level
 
-    def new_descriptor(self, channels: tuple[int, int], *, half_rectified: bool, unit_length: bool) -> Descriptor:
+    def new_descriptor(self, channels: Sequence[int], *, half_rectified: bool, unit_length: bool) -> Descriptor:
         """F with random weights that depend on nothing but the settings' rng_seed."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.settings.rng_seed)
-            net = Descriptor(self.settings.sharing, *channels, half_rectified=half_rectified, unit_length=unit_length)
+            net = Descriptor(self.settings.sharing, channels, half_rectified=half_rectified, unit_length=unit_length)
         return net.to(self.device)
-
-    def to_level(self, matrix: Matrix, level: Level) -> Tensor:
-        """A full-resolution fixed_to_moving matrix as one between the level's images, (3, 3) float32."""
-        scaled = geometry.rescale(matrix, *self._scales(level))
-        return torch.tensor(scaled, dtype=torch.float32, device=self.device)
-
-    def to_full(self, homography: Tensor, level: Level) -> Matrix:
-        """The inverse of `to_level`."""
-        fixed_scale, moving_scale = self._scales(level)
-        inverse = [(1 / s[0], 1 / s[1]) for s in (fixed_scale, moving_scale)]
-        return geometry.rescale(homography.double().cpu().numpy(), inverse[0], inverse[1])
-
-    def _scales(self, level: Level) -> tuple[tuple[float, float], tuple[float, float]]:
-        scales = [
-            (view.size_px[0] / image.size_px[0], view.size_px[1] / image.size_px[1])
-            for view, image in zip((level.fixed, level.moving), self.images, strict=True)
-        ]
-        return scales[0], scales[1]
 
     # ---- recipe paper
 
-    def paper(self, seed: Matrix) -> tuple[JointResult, Descriptor]:
+    def paper(self, fixed: Raster, moving: Raster, seed: Matrix) -> JointResult:
         """SGD on theta and psi through one loss, level by level; theta starts anew at each, psi is handed on."""
         recipe = self.settings.paper
-        mapping = seed
-        longer_side = max(self.images[0].size_px)
-        halvings = max(0, round(math.log2(longer_side / recipe.coarsest_px)))
+        subject = Subject(fixed, [moving], [seed], [1], [False])
+        halvings = max(0, round(math.log2(max(fixed.size_px) / recipe.coarsest_px)))
         scales = tuple(0.5**k for k in range(halvings, -1, -1))
         steps = 0
         for number, scale in enumerate(scales):
-            level = self.level(scale, mapping)
-            channels = len(level.fixed.image), len(level.moving.image)
+            level = self.level(subject, scale, [0])
+            channels = len(level.fixed.image), len(level.moving[0].image)
             net = self.new_descriptor(channels, half_rectified=False, unit_length=False)
 
             def report(share: float, number: int = number) -> None:
                 self.progress("learning", (number + share) / len(scales))
 
-            mapping, level_steps, loss, last_step_px = self.descend(net, level, mapping, report)
+            subject.mappings[0], level_steps, loss, last_step_px = self.descend(net, level, subject.mappings[0], report)
             steps += level_steps
-        h = self.to_level(mapping, level)
-        held_out, chance = self.held_out_retrieval(net, level, h)
+        h = level.homography(subject.mappings[0], 0)
+        p, _ = self.sampler.draw(level, level.anywhere, [h], self.settings.fast.final_patches, 1.0)
+        anchors = make_anchors(net, level, p, self.settings.fast.difference_px)
+        curvature = psi_step(net, level, 0, 1, h, anchors, self.family, self.settings.fast)
+        test, _ = self.sampler.draw(level, level.held_out, [h], self.settings.fast.test_keypoints, 1.0)
         with torch.no_grad():
-            curvature = self.gauss_newton(net, level, h, self.settings.fast.final_patches)
-        family = self.family or "homography"
-        result = JointResult(
-            mapping, loss, held_out, chance, steps, scales, "paper", family, last_step_px, curvature.corner_std_px
-        )
-        return result, net
+            f_test = describe_fixed(net, level, test)
+        held_out, chance = retrieval(net, level, 0, 1, h, test, f_test, self.settings.fast)
+        return JointResult(
+            subject.mappings[0], loss, held_out, chance, steps, scales, "paper", self.family or "homography",
+            last_step_px, curvature.corner_std_xy_px,
+        )  # fmt: skip
 
     def descend(
         self, net: Descriptor, level: Level, start: Matrix, report: Callable[[float], None]
@@ -149,12 +182,13 @@ class JointAligner:
         """Argmin over theta and psi of sum L0(x; psi, theta) + sum L1(x, x'; theta) (paper, Eq. 5)."""
         recipe = self.settings.paper
         width, height = level.fixed.size_px
-        h = self.to_level(start, level)
+        fixed, moving = level.fixed, level.moving[0]
+        h = level.homography(start, 0)
         psi = psi_from_homography(h.double(), width, height).float().requires_grad_()
         movable = torch.zeros(8, device=self.device)
         movable[list(FAMILY_PARAMETERS[self.family or "homography"])] = 1.0
 
-        p = self.sampler.draw(level, level.trainable, h, recipe.keypoints, recipe.octaves, recipe.spacing_px)
+        p, _ = self.sampler.draw(level, level.trainable, [h], recipe.keypoints, recipe.octaves, recipe.spacing_px)
         if len(p) < recipe.batch:
             raise NotEnoughTextureError(f"only {len(p)} keypoints lie on the common valid area")
         # The negatives are drawn once: each keypoint of I with a random other one's place in I'.
@@ -171,9 +205,9 @@ class JointAligner:
             shuffled = torch.randperm(len(p), generator=self.sampler.generator).to(self.device)
             for rows in torch.split(shuffled[: batches * recipe.batch], recipe.batch):
                 h = homography_from_psi(psi, width, height)
-                f = net(bilinear(level.fixed.image, patch_grid(p[rows])), "fixed")
-                f_true = net(bilinear(level.moving.image, patch_grid(warp_keypoints(p[rows], h))), "moving")
-                f_false = net(bilinear(level.moving.image, patch_grid(negatives[rows])), "moving")
+                f = net(fixed.patches(patch_grid(p[rows])), REFERENCE)
+                f_true = net(moving.patches(patch_grid(warp_keypoints(p[rows], h))), 1)
+                f_false = net(moving.patches(patch_grid(negatives[rows])), 1)
                 apart = losses.distance(f, f_false)[is_negative[rows]]
                 loss = losses.contrastive(losses.distance(f, f_true), apart, recipe.margin)
                 optimiser.zero_grad()
@@ -188,124 +222,132 @@ class JointAligner:
         h, h_before = (homography_from_psi(q, width, height).detach() for q in (psi, before))
         corner_points = torch.tensor(geometry.corners(width, height), dtype=h.dtype, device=self.device)
         last_step = (transform(h, corner_points) - transform(h_before, corner_points)).norm(dim=1).max()
-        return self.to_full(h, level), steps, loss_value, float(last_step)
+        return level.full_matrix(h, 0), steps, loss_value, float(last_step)
 
     # ---- recipe fast
 
-    def fast(self, seed: Matrix, trusted: bool) -> tuple[JointResult, Descriptor]:
-        """Theta is carried from level to level; at full resolution only psi moves."""
-        psi = seed
-        net: Descriptor | None = None
-        steps_taken, loss = 0, float("nan")
-        scales = self.learn_scales()
-        scales = scales[-1:] if trusted else scales
-        for scale in scales:
-            level = self.level(scale, psi)
-            if net is None:
-                channels = len(level.fixed.image), len(level.moving.image)
-                net = self.new_descriptor(channels, half_rectified=True, unit_length=True)
-            psi, steps, loss = self.learn(net, level, psi)
-            steps_taken += steps
-        assert net is not None
-        level = self.level(1.0, psi)
-        psi, step = self.refine(net, level, psi)
-        held_out, chance = self.held_out_retrieval(net, level, self.to_level(psi, level))
-        result = JointResult(
-            psi, loss, held_out, chance, steps_taken, (*scales, 1.0), "fast", step.family,
-            step.length_px, step.corner_std_px,
-        )  # fmt: skip
-        return result, net
+    def learn(self, subjects: Sequence[Subject], net: Descriptor, *, learnt: bool = False) -> tuple[int, float]:
+        """Theta and every psi of all subjects, coarse to fine; theta is carried from level to level.
 
-    def learn_scales(self) -> list[float]:
+        A network that is `learnt` may move psi from the first step on, and needs none where that is enough.
+        Returns the steps taken and the last loss. Raises NotEnoughTextureError where a reference has no contrast.
+        """
+        scales = self.learn_scales(max(max(s.fixed.size_px) for s in subjects))
+        steps, loss = 0, float("nan")
+        for number, scale in enumerate(scales):
+            last = number == len(scales) - 1
+            wanted = [(s, [b for b in range(len(s.moving)) if last or not s.trusted[b]]) for s in subjects]
+            pairs = [Pairs(s, bands, self.level(s, scale, bands)) for s, bands in wanted if bands]
+            if pairs:
+                taken, loss = self.learn_level(net, pairs, learnt)
+                steps += taken
+            for p in pairs:
+                p.hand_on()
+        return steps, loss
+
+    def learn_scales(self, longer_side_px: int) -> list[float]:
         """Resolutions at which theta is learnt, coarse to fine."""
         recipe = self.settings.fast
-        longer_side = max(self.images[0].size_px)
-        scales = [min(1.0, max(0.5, recipe.learn_px / longer_side))]
-        while scales[0] * longer_side >= 2 * recipe.coarsest_px:
+        scales = [min(1.0, max(0.5, recipe.learn_px / longer_side_px))]
+        while scales[0] * longer_side_px >= 2 * recipe.coarsest_px:
             scales.insert(0, scales[0] / 2)
         return scales
 
-    def learn(self, net: Descriptor, level: Level, seed: Matrix) -> tuple[Matrix, int, float]:
-        """Theta by Adam; psi by Gauss-Newton once held-out patches are told apart."""
+    def learn_level(self, net: Descriptor, pairs: Sequence[Pairs], learnt: bool) -> tuple[int, float]:
+        """Theta by Adam, a capture at a time; each psi by Gauss-Newton once held-out patches are told apart."""
         recipe = self.settings.fast
         optimiser = torch.optim.Adam(net.parameters(), recipe.learning_rate)
-        h = self.to_level(seed, level)
         loss_value = float("nan")
-        for step in range(1, recipe.most_steps + 1):
-            p = self.sampler.draw(level, level.trainable, h, recipe.batch, recipe.octaves)
-            if len(p) < recipe.batch // 4:
-                raise NotEnoughTextureError(f"only {len(p)} keypoints lie on the common valid area")
-            f, f_prime = self.describe(net, level, h, p)
-            loss = losses.in_batch(f, f_prime, far_apart(p, recipe.least_negative_px), recipe.temperature)
-            optimiser.zero_grad()
-            torch.autograd.backward(loss)
-            optimiser.step()
-            if step < recipe.warm_up_steps or step % recipe.steps_between_updates:
+        most_steps = recipe.most_steps * len(pairs)
+        between = recipe.steps_between_updates * len(pairs)
+        if learnt:
+            for _ in range(2):
+                at_rest = [self.move_psi(net, p) for p in pairs]
+            if all(at_rest):
+                return 0, loss_value
+        for step in range(1, most_steps + 1):
+            loss = self.loss(net, pairs[step % len(pairs)])
+            if loss is not None:
+                optimiser.zero_grad()
+                torch.autograd.backward(loss)
+                optimiser.step()
+                loss_value = float(loss.detach())
+            if step < recipe.warm_up_steps or step % between:
                 continue
-            self.progress("learning", step / recipe.most_steps)
-            loss_value = float(loss.detach())
-            retrieved, _ = self.held_out_retrieval(net, level, h)
+            self.progress("learning", step / most_steps)
+            at_rest = [self.move_psi(net, p) for p in pairs]
+            if all(at_rest):
+                break
+        return step, loss_value
+
+    def loss(self, net: Descriptor, pairs: Pairs) -> Tensor | None:
+        """The in-batch loss of one capture's pairs on keypoints that are drawn anew; None where none can be drawn."""
+        recipe, level = self.settings.fast, pairs.level
+        p, inside = self.sampler.draw(level, level.trainable, pairs.h, recipe.batch, recipe.octaves)
+        rows = [inside[:, b].nonzero()[:, 0] for b in range(len(pairs.h))]
+        taking_part = [b for b, r in enumerate(rows) if len(r) >= LEAST_KEYPOINTS]
+        if not taking_part:
+            return None
+        patches = [level.fixed.patches(patch_grid(p))]
+        patches += [moving_patches(level, b, pairs.h[b], p[rows[b]]) for b in taking_part]
+        f, *f_primes = net.describe(patches, [REFERENCE, *(pairs.side(b) for b in taking_part)])
+        apart = far_apart(p, recipe.least_negative_px)
+        terms = [
+            losses.in_batch(f[rows[b]], f_prime, apart[rows[b]][:, rows[b]], recipe.temperature)
+            for b, f_prime in zip(taking_part, f_primes, strict=True)
+        ]
+        return torch.stack(terms).mean()
+
+    @torch.no_grad()
+    def move_psi(self, net: Descriptor, pairs: Pairs) -> bool:
+        """One step on each psi of a capture whose held-out patches are retrieved; True where all are at rest."""
+        recipe, level = self.settings.fast, pairs.level
+        test, _ = self.sampler.draw(level, level.held_out, pairs.h, recipe.test_keypoints, recipe.octaves)
+        p, _ = self.sampler.draw(level, level.anywhere, pairs.h, recipe.learn_patches, recipe.octaves)
+        if len(p) < LEAST_KEYPOINTS:
+            return True
+        f_test = describe_fixed(net, level, test)
+        anchors = make_anchors(net, level, p, recipe.difference_px)
+        at_rest = True
+        for b, h in enumerate(pairs.h):
+            retrieved, _ = retrieval(net, level, b, pairs.side(b), h, test, f_test, recipe)
             if retrieved < recipe.step_gate:
+                at_rest = False
                 continue
-            update = self.gauss_newton(net, level, h, recipe.learn_patches)
-            h = (h.double() @ update.change).float()
-            if retrieved > recipe.enough_retrieval and update.length_px < recipe.rest_px:
-                break
-        return self.to_full(h, level), step, loss_value
-
-    def refine(self, net: Descriptor, level: Level, start: Matrix) -> tuple[Matrix, Step]:
-        """Gauss-Newton steps on psi with theta frozen, until they are short."""
-        recipe = self.settings.fast
-        h = self.to_level(start, level)
-        for number in range(recipe.final_steps):
-            self.progress("refining", number / recipe.final_steps)
-            step = self.gauss_newton(net, level, h, recipe.final_patches)
-            h = (h.double() @ step.change).float()
-            if step.length_px < recipe.final_rest_px:
-                break
-        return self.to_full(h, level), step
+            with suppress(NotEnoughTextureError):
+                step = psi_step(net, level, b, pairs.side(b), h, anchors, self.family, recipe)
+                pairs.h[b] = (h.double() @ step.change).float()
+                at_rest &= retrieved > recipe.enough_retrieval and step.length_px < recipe.rest_px
+        return at_rest
 
     @torch.no_grad()
-    def gauss_newton(self, net: Descriptor, level: Level, h: Tensor, patches: int) -> Step:
-        """One step on psi. The gradient is the mean of both sides', which makes the step second-order accurate."""
+    def refine(self, net: Descriptor, subject: Subject) -> list[JointResult | str]:
+        """Every psi of a capture at full resolution with theta frozen; a text says why a pair has none."""
         recipe = self.settings.fast
-        p = self.sampler.draw(level, level.anywhere, h, patches, recipe.octaves)
-        if len(p) < 16:
-            raise NotEnoughTextureError(f"only {len(p)} keypoints lie on the common valid area")
-
-        def fixed_side(k: Keypoints) -> Tensor:
-            return self.describe_fixed(net, level, k)
-
-        def moving_side(k: Keypoints) -> Tensor:
-            return self.describe_moving(net, level, h, k)
-
-        e = recipe.difference_px
-        gradient = 0.5 * (shift_gradient(fixed_side, p, e) + shift_gradient(moving_side, p, e))
-        residual = fixed_side(p) - moving_side(p)
-        return solve(
-            p, residual, gradient, level.fixed.size_px, self.family,
-            recipe.most_corner_std_px, recipe.longest_step_px,
-        )  # fmt: skip
-
-    def describe(self, net: Descriptor, level: Level, h: Tensor, p: Keypoints) -> tuple[Tensor, Tensor]:
-        """f(x) and f(w(x; psi)) for keypoints of I, (N, 256) each."""
-        return self.describe_fixed(net, level, p), self.describe_moving(net, level, h, p)
-
-    def describe_fixed(self, net: Descriptor, level: Level, p: Keypoints) -> Tensor:
-        out: Tensor = net(bilinear(level.fixed.image, patch_grid(p)), "fixed")
-        return out
-
-    def describe_moving(self, net: Descriptor, level: Level, h: Tensor, p: Keypoints) -> Tensor:
-        """Every sample of the patch goes through the homography, not only the keypoint's frame."""
-        out: Tensor = net(bilinear(level.moving.image, transform(h, patch_grid(p))), "moving")
-        return out
-
-    @torch.no_grad()
-    def held_out_retrieval(self, net: Descriptor, level: Level, h: Tensor) -> tuple[float, float]:
-        """Retrieval on keypoints of cells that theta never saw, and what guessing would give."""
-        recipe = self.settings.fast
-        p = self.sampler.draw(level, level.held_out, h, recipe.test_keypoints, recipe.octaves)
-        if len(p) < 16:
-            return 0.0, 1.0
-        f, f_prime = self.describe(net, level, h, p)
-        return losses.retrieval(f, f_prime, far_apart(p, recipe.least_negative_px)), 1 / len(p)
+        level = self.level(subject, 1.0, range(len(subject.moving)))
+        h = [level.homography(matrix, b) for b, matrix in enumerate(subject.mappings)]
+        p, _ = self.sampler.draw(level, level.anywhere, h, recipe.final_patches, recipe.octaves)
+        test, _ = self.sampler.draw(level, level.held_out, h, recipe.test_keypoints, recipe.octaves)
+        if len(p) < LEAST_KEYPOINTS:
+            return [f"only {len(p)} keypoints lie on the common valid area"] * len(h)
+        anchors = make_anchors(net, level, p, recipe.difference_px)
+        f_test = describe_fixed(net, level, test)
+        results: list[JointResult | str] = []
+        for b, side in enumerate(subject.sides):
+            try:
+                found, step = refine(net, level, b, side, h[b], anchors, self.family, recipe)
+                matrix = level.full_matrix(found, b)
+            except NotEnoughTextureError as why_not:
+                results.append(str(why_not))
+                continue
+            except GeometryError:
+                results.append("the optimisation ended in a mapping that cannot be inverted")
+                continue
+            held_out, chance = retrieval(net, level, b, side, found, test, f_test, recipe)
+            results.append(
+                JointResult(
+                    matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family,
+                    step.length_px, step.corner_std_xy_px,
+                )
+            )  # fmt: skip
+        return results

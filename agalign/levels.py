@@ -1,6 +1,7 @@
-"""A pair of images at one resolution, and the keypoints that may be drawn from it."""
+"""The images of one capture at one resolution, and the keypoints that may be drawn from them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,40 +10,63 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from agalign import geometry, lens
 from agalign.descriptor import PATCH_PX
-from agalign.patches import Keypoints, footprint_radius, transform
-from agalign.records import Mask, Raster
+from agalign.geometry import Matrix
+from agalign.patches import Keypoints, bilinear, footprint_radius, transform
+from agalign.records import FloatImage, Lens, Mask, Raster
 from agalign.structure import shrink
 
 _HELD_OUT_CELLS = 8
 """Cells along the longer side; every fifth cell, in a diagonal pattern, is kept from training."""
+_POOL = 16_384
+"""Positions kept of each kind: enough for any run, and each is undistorted only once."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One image at one level, standardised."""
+    """One image at one level, standardised. Positions are given undistorted: the image is sampled through its lens."""
 
     image: Tensor
     """(C, H, W), mean 0 and standard deviation 1 over the valid pixels, 0 elsewhere."""
     room_px: Tensor
     """(H, W) distance from each pixel to the nearest invalid one or to the border."""
+    scale: tuple[float, float] = (1.0, 1.0)
+    """Size (x, y) relative to the image that it was reduced from."""
+    lens: Lens | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:
         """(width, height)."""
         return int(self.image.shape[2]), int(self.image.shape[1])
 
+    def raw(self, points: Tensor) -> Tensor:
+        """Raw pixel positions of undistorted ones, (..., 2)."""
+        if self.lens is None or not lens.is_distorting(self.lens):
+            return points
+        return torch.stack(lens.distorted(self.lens, points[..., 0], points[..., 1]), dim=-1)
+
+    def patches(self, grid: Tensor) -> Tensor:
+        """Undistorted sample positions (N, 16, 16, 2) -> (N, C, 16, 16)."""
+        return bilinear(self.image, self.raw(grid))
+
+    def room_at(self, points: Tensor) -> Tensor:
+        """Distance to the nearest invalid pixel from undistorted positions (N, 2); 0 outside."""
+        width, height = self.size_px
+        column, row = self.raw(points).nan_to_num(-1.0).round().clamp(-2, 1e9).long().unbind(dim=1)
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        room = self.room_px[torch.where(inside, row, 0), torch.where(inside, column, 0)]
+        return torch.where(inside, room, 0.0)
+
 
 @dataclass(frozen=True)
 class Level:
-    """I and I' at one resolution, and where in I keypoints may lie."""
+    """I and one or more I' at one resolution, and where in I keypoints may lie."""
 
-    scale: float
-    """Size relative to the full resolution."""
     fixed: View
-    moving: View
+    moving: tuple[View, ...]
     trainable: Tensor
-    """(M, 2) integer positions in I with contrast enough, from which theta is learnt."""
+    """(M, 2) undistorted positions in I with contrast enough, from which theta is learnt."""
     held_out: Tensor
     """(K, 2) the same in cells of the image that theta never sees."""
 
@@ -51,33 +75,53 @@ class Level:
         """All positions with contrast enough."""
         return torch.cat([self.trainable, self.held_out])
 
+    def homography(self, matrix: Matrix, band: int) -> Tensor:
+        """A full-resolution fixed_to_moving matrix of a moving image as one between the level's, (3, 3) float32."""
+        scaled = geometry.rescale(matrix, self.fixed.scale, self.moving[band].scale)
+        return torch.tensor(scaled, dtype=torch.float32, device=self.fixed.image.device)
 
-def make_view(raster: Raster, device: torch.device) -> View:
-    """A raster as the networks see it."""
-    planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
-    inside = planes[:, raster.valid].astype(np.float64)
-    mean = inside.mean(axis=1) if inside.size else np.zeros(len(planes))
-    deviation = inside.std(axis=1) if inside.size else np.ones(len(planes))
-    standard = (planes - mean[:, None, None]) / np.maximum(deviation, 1e-12)[:, None, None]
-    image = np.where(raster.valid, standard, 0.0).astype(np.float32)
-    room = _room_px(raster.valid)
-    return View(torch.from_numpy(image).to(device), torch.from_numpy(room).to(device))
+    def full_matrix(self, homography: Tensor, band: int) -> Matrix:
+        """The inverse of `homography`."""
+        up = [(1 / x, 1 / y) for x, y in (self.fixed.scale, self.moving[band].scale)]
+        return geometry.rescale(homography.double().cpu().numpy(), up[0], up[1])
+
+
+def make_view(raster: Raster, scale: float, device: torch.device) -> View:
+    """A raster as the networks see it, reduced by `scale` (1 is its own resolution)."""
+    width, height = raster.size_px
+    small = shrink(raster, (max(1, round(width * scale)), max(1, round(height * scale))))
+    planes = small.pixels if small.pixels.ndim == 3 else small.pixels[None]
+    mask = small.valid.astype(np.uint8)
+    image = np.empty(planes.shape, np.float32)
+    for plane, standard in zip(planes, image, strict=True):
+        mean, deviation = (float(v.item()) for v in cv2.meanStdDev(plane, mask=mask))
+        np.multiply(plane - np.float32(mean), np.float32(1 / max(deviation, 1e-12)), out=standard)
+        standard[~small.valid] = 0
+    relative = small.size_px[0] / width, small.size_px[1] / height
+    room = torch.from_numpy(_room_px(small.valid)).to(device)
+    return View(torch.from_numpy(image).to(device), room, relative, small.lens)
 
 
 def make_level(
-    fixed: Raster, moving: Raster, scale: float, moving_scale: float, least_gradient: float, device: torch.device
-) -> Level:
-    """Both images reduced by their scales (1 is full resolution), with the candidate positions of keypoints."""
-    small_fixed, small_moving = _reduced(fixed, scale), _reduced(moving, moving_scale)
-    fixed_view, moving_view = make_view(small_fixed, device), make_view(small_moving, device)
+    fixed: Raster, moving: Sequence[Raster], mappings: Sequence[Matrix], scale: float, least_gradient: float,
+    generator: torch.Generator, device: torch.device,
+) -> Level:  # fmt: skip
+    """The images reduced by `scale`, a moving one so that its mapping's magnification becomes 1 where it is larger."""
+    fixed_view = make_view(fixed, scale, device)
+    views = []
+    for raster, matrix in zip(moving, mappings, strict=True):
+        magnification = float(np.median(np.abs(geometry.local_scale(matrix, *fixed.size_px))))
+        usable = np.isfinite(magnification) and magnification > 0
+        views.append(make_view(raster, min(1.0, scale / magnification) if usable else scale, device))
     gradient = _gradient_magnitude(fixed_view.image.cpu().numpy())
     room = fixed_view.room_px.cpu().numpy()
-    usable = (gradient > least_gradient) & (room > footprint_radius(torch.tensor(1.0)).item())
-    reserved = _reserved_cells(*small_fixed.size_px)
+    usable_px = (gradient > least_gradient) & (room > footprint_radius(torch.tensor(1.0)).item())
+    reserved = _reserved_cells(*fixed_view.size_px)
     inner = cv2.erode(reserved.astype(np.uint8), np.ones((PATCH_PX // 2 + 1,) * 2, np.uint8)) > 0
-    return Level(
-        scale, fixed_view, moving_view, _positions(usable & ~reserved, device), _positions(usable & inner, device)
+    trainable, held_out = (
+        _positions(usable_px & cells, fixed_view.lens, generator).to(device) for cells in (~reserved, inner)
     )
+    return Level(fixed_view, tuple(views), trainable, held_out)
 
 
 @dataclass
@@ -87,9 +131,11 @@ class Sampler:
     generator: torch.Generator
 
     def draw(
-        self, level: Level, pool: Tensor, fixed_to_moving: Tensor, count: int, octaves: float, spacing_px: float = 1.0
-    ) -> Keypoints:
-        """Up to `count` keypoints of I from `pool` whose patches lie in the valid area of both images.
+        self, level: Level, pool: Tensor, homographies: Sequence[Tensor], count: int, octaves: float,
+        spacing_px: float = 1.0,
+    ) -> tuple[Keypoints, Tensor]:  # fmt: skip
+        """Up to `count` keypoints of I from `pool` whose patches lie in the valid area of I and of some I', and in
+        which I' they do, (N, bands) bool. Those that lie in the most come first.
 
         Orientation is uniform in [0, 2 pi], log2 of the scale in units of `spacing_px` uniform in [0, octaves]
         (paper, Sec. 5.3).
@@ -98,30 +144,20 @@ class Sampler:
         rows = torch.randint(max(1, len(pool)), (tries,), generator=self.generator).to(pool.device)
         angle = torch.rand(tries, generator=self.generator) * (2 * math.pi)
         scale = spacing_px * 2 ** (torch.rand(tries, generator=self.generator) * octaves)
-        keypoints = Keypoints(pool[rows].float(), angle.to(pool.device), scale.to(pool.device))
-        inside = footprints_inside(level, keypoints, fixed_to_moving)
-        return keypoints[inside.nonzero()[:count, 0]]
+        keypoints = Keypoints(pool[rows], angle.to(pool.device), scale.to(pool.device))
+        inside = torch.stack([footprints_inside(level, b, keypoints, h) for b, h in enumerate(homographies)], dim=1)
+        bands = inside.sum(dim=1)
+        order = torch.argsort(bands, descending=True, stable=True)[:count]
+        order = order[bands[order] > 0]
+        return keypoints[order], inside[order]
 
 
-def footprints_inside(level: Level, keypoints: Keypoints, fixed_to_moving: Tensor) -> Tensor:
+def footprints_inside(level: Level, band: int, keypoints: Keypoints, homography: Tensor) -> Tensor:
     """(N,) True where a keypoint's patch touches only valid pixels in both images."""
     radius = footprint_radius(keypoints.scale) + 1
-    there = transform(fixed_to_moving, keypoints.xy)
-    jacobian_scale = fixed_to_moving[:2, :2].det().abs().sqrt()
-    return (_room_at(level.fixed, keypoints.xy) > radius) & (_room_at(level.moving, there) > radius * jacobian_scale)
-
-
-def _room_at(view: View, points: Tensor) -> Tensor:
-    width, height = view.size_px
-    column, row = points.nan_to_num(-1.0).round().clamp(-2, 1e9).long().unbind(dim=1)
-    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    room = view.room_px[torch.where(inside, row, 0), torch.where(inside, column, 0)]
-    return torch.where(inside, room, 0.0)
-
-
-def _reduced(raster: Raster, scale: float) -> Raster:
-    width, height = raster.size_px
-    return shrink(raster, (max(1, round(width * scale)), max(1, round(height * scale))))
+    there = transform(homography, keypoints.xy)
+    jacobian_scale = homography[:2, :2].det().abs().sqrt()
+    return (level.fixed.room_at(keypoints.xy) > radius) & (level.moving[band].room_at(there) > radius * jacobian_scale)
 
 
 def _room_px(valid: Mask) -> NDArray[np.float32]:
@@ -129,10 +165,10 @@ def _room_px(valid: Mask) -> NDArray[np.float32]:
     return np.asarray(cv2.distanceTransform(bordered, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1], np.float32)
 
 
-def _gradient_magnitude(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+def _gradient_magnitude(planes: FloatImage) -> FloatImage:
     """Largest gradient over the channels, per pixel of distance."""
     gradients = [
-        np.hypot(cv2.Sobel(p, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(p, cv2.CV_32F, 0, 1, scale=1 / 8))
+        cv2.magnitude(cv2.Sobel(p, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(p, cv2.CV_32F, 0, 1, scale=1 / 8))
         for p in planes
     ]
     return np.asarray(np.max(gradients, axis=0))
@@ -140,9 +176,15 @@ def _gradient_magnitude(planes: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _reserved_cells(width_px: int, height_px: int) -> Mask:
     cell = max(width_px, height_px) / _HELD_OUT_CELLS
-    column, row = np.arange(width_px) // cell, np.arange(height_px) // cell
-    return np.asarray((column[None, :] + 2 * row[:, None]) % 5 == 0)
+    column, row = (np.arange(n) // cell % 5 for n in (width_px, height_px))
+    # Within a row of cells, those of one column in five.
+    return np.asarray(column[None, :] == (-2 * row % 5)[:, None])
 
 
-def _positions(mask: Mask, device: torch.device) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(np.argwhere(mask)[:, ::-1])).to(device)
+def _positions(mask: Mask, model: Lens | None, generator: torch.Generator) -> Tensor:
+    """Up to _POOL of the True pixels, as undistorted positions (M, 2) float32."""
+    found = np.flatnonzero(mask)
+    if len(found) > _POOL:
+        found = found[torch.randint(len(found), (_POOL,), generator=generator).numpy()]
+    row, column = np.divmod(found, mask.shape[1])
+    return torch.from_numpy(lens.undistort(model, np.stack([column, row], axis=1)).astype(np.float32))

@@ -3,13 +3,16 @@
 All functions are deterministic and use every pixel of the common valid area.
 """
 
+import math
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.config import CheckSettings
 from agalign.records import FloatImage, Mask, Raster, Residual
-from agalign.structure import correlation_surface, structure_field
+from agalign.structure import Field, correlation_surfaces, structure_field, windowed_spectra
 
 _BINS = 32
 _RANGE_MARGIN = 0.01
@@ -25,15 +28,17 @@ def similarity(fixed: FloatImage, moving: FloatImage, valid: Mask) -> dict[str, 
     (higher is better), overlap (share of valid pixels). Only overlap where fewer than 256 pixels are valid.
     """
     overlap = float(valid.mean())
-    if valid.sum() < _LEAST_PIXELS:
+    if np.count_nonzero(valid) < _LEAST_PIXELS:
         return {"overlap": overlap}
-    joint = joint_histogram(fixed[valid], moving[valid])
+    one, other = fixed[valid], moving[valid]
+    joint = joint_histogram(one, other)
+    gradients = _gradient(fixed), _gradient(moving)
     return {
         "mattes_mi": -mutual_information(joint),
         "nmi": normalised_mutual_information(joint),
-        "ncc": correlation(fixed[valid], moving[valid]),
-        "gradient_correlation": gradient_correlation(fixed, moving, valid),
-        "structure_ssim": structure_ssim(fixed, moving, valid),
+        "ncc": correlation(one, other),
+        "gradient_correlation": _inner_correlation(*gradients, valid),
+        "structure_ssim": _ssim(_standardised(gradients[0], valid), _standardised(gradients[1], valid), valid),
         "overlap": overlap,
     }
 
@@ -44,8 +49,9 @@ def joint_histogram(fixed: NDArray[np.float32], moving: NDArray[np.float32]) -> 
     Each range is widened by 1 % on both sides. The fixed kernel is of order 0 (a box), the moving one the cubic
     B-spline, whose support costs the moving axis a bin of padding at either end (Klein et al. 2010; Mattes 2003).
     """
-    fixed_position = np.floor(_bin_position(fixed, padding=0) + 0.5).astype(np.int64)
-    moving_fine = np.floor(_bin_position(moving, padding=1) * _FINE).astype(np.int64)
+    # The values are positive: casting to an integer is floor.
+    fixed_position = (_bin_position(fixed, padding=0) + 0.5).astype(np.int32)
+    moving_fine = (_bin_position(moving, padding=1) * _FINE).astype(np.int32)
     counts = np.bincount(fixed_position * (_BINS * _FINE) + moving_fine, minlength=_BINS * _BINS * _FINE)
     counts = counts.reshape(_BINS, _BINS * _FINE)
     occupied = (np.arange(_BINS * _FINE) + 0.5) / _FINE
@@ -97,13 +103,21 @@ def correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
 
 def gradient_correlation(fixed: FloatImage, moving: FloatImage, valid: Mask) -> float:
     """Pearson's coefficient of the gradient magnitudes: contrast reversal does not lower it."""
-    inside = cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    return correlation(_gradient(fixed)[inside], _gradient(moving)[inside]) if inside.any() else 0.0
+    return _inner_correlation(_gradient(fixed), _gradient(moving), valid)
 
 
 def structure_ssim(fixed: FloatImage, moving: FloatImage, valid: Mask) -> float:
     """SSIM (Wang et al. 2004, 11 px Gaussian window) of the standardised gradient magnitudes."""
-    a, b = (_standardised(_gradient(image), valid) for image in (fixed, moving))
+    return _ssim(_standardised(_gradient(fixed), valid), _standardised(_gradient(moving), valid), valid)
+
+
+def _inner_correlation(a: FloatImage, b: FloatImage, valid: Mask) -> float:
+    """Where no gradient reaches over an invalid pixel."""
+    inside = cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    return correlation(a[inside], b[inside]) if inside.any() else 0.0
+
+
+def _ssim(a: FloatImage, b: FloatImage, valid: Mask) -> float:
     mean_a, mean_b = _blur(a), _blur(b)
     variance_a, variance_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
     covariance = _blur(a * b) - mean_a * mean_b
@@ -130,59 +144,84 @@ def _blur(image: FloatImage) -> FloatImage:
 
 
 def tile_residuals(fixed: Raster, moving: Raster, settings: CheckSettings) -> Residual:
-    """Local shifts between two single-band rasters on one grid, by structure correlation in overlapping windows.
+    """Local shifts between two single-band rasters on one grid, by structure correlation in windows side by side.
 
-    A window counts as measured where its correlation peak stands out from the second highest. The residual is of
-    the moving band's content: positive x means that it lies to the right of the reference's.
+    The residual is of the moving band's content: positive x means that it lies to the right of the reference's.
     """
-    side = settings.tile_px
-    width, height = fixed.size_px
-    side = max(32, min(side, width // 4, height // 4))
-    both = fixed.valid & moving.valid
-    fields = [structure_field(Raster(r.pixels, both), settings.smoothing_px) for r in (fixed, moving)]
-    starts_x, starts_y = _starts(width, side), _starts(height, side)
-    centres, shifts = [], []
-    tried = 0
-    if min(width, height) >= side:
-        origins = [(x, y) for y in starts_y for x in starts_x if both[y : y + side, x : x + side].mean() > 0.9]
-        for x, y in origins:
-            window = np.s_[y : y + side, x : x + side]
-            strength = min(float(np.abs(f[window]).mean()) for f in fields)
-            if strength < settings.least_strength:
-                continue
-            tried += 1
-            centres.append((x + (side - 1) / 2, y + (side - 1) / 2))
-            shifts.append(_shift_of(fields[0][window], fields[1][window], settings))
-    found = np.array(shifts, dtype=np.float64).reshape(-1, 2)
-    measured = np.isfinite(found[:, 0])
-    length = np.linalg.norm(found[measured], axis=1)
-    some = bool(measured.any())
-    return Residual(
-        centres_px=np.array(centres, dtype=np.float64).reshape(-1, 2),
-        shifts_px=found,
-        median_px=float(np.median(length)) if some else float("inf"),
-        p95_px=float(np.percentile(length, 95)) if some else float("inf"),
-        coverage=float(measured.mean()) if tried else 0.0,
-        bias_px=float(np.linalg.norm(np.median(found[measured], axis=0))) if some else float("inf"),
-    )
+    return FixedWindows(fixed, settings).residuals(moving)
+
+
+class FixedWindows:
+    """The reference cut into windows, ready to be compared with any number of moving bands."""
+
+    def __init__(self, fixed: Raster, settings: CheckSettings) -> None:
+        self.settings = settings
+        self.valid = fixed.valid
+        width, height = fixed.size_px
+        self.side = max(32, min(settings.tile_px, width // 4, height // 4))
+        field = structure_field(fixed, settings.smoothing_px)
+        origins = [(x, y) for y in _starts(height, self.side) for x in _starts(width, self.side)]
+        fits = min(width, height) >= self.side
+        strengths = [_strength(self._cut(field, o)) for o in origins] if fits else []
+        self.origins = [o for o, s in zip(origins, strengths, strict=False) if s >= settings.least_strength]
+        self.spectra = windowed_spectra(self._windows(field, self.origins))
+
+    def residuals(self, moving: Raster) -> Residual:
+        """The shift of each window's content; a window counts as measured where its peak stands out."""
+        both = self.valid & moving.valid
+        field = structure_field(moving, self.settings.smoothing_px)
+        tried = [
+            i for i, o in enumerate(self.origins)
+            if self._cut(both, o).mean() > 0.9 and _strength(self._cut(field, o)) >= self.settings.least_strength
+        ]  # fmt: skip
+        origins = [self.origins[i] for i in tried]
+        surfaces = correlation_surfaces(self.spectra[tried], windowed_spectra(self._windows(field, origins)))
+        shifts = [_shift_at_peak(surface, self.settings) for surface in surfaces]
+        found = np.array(shifts, dtype=np.float64).reshape(-1, 2)
+        measured = np.isfinite(found[:, 0])
+        length = np.linalg.norm(found[measured], axis=1)
+        some = bool(measured.any())
+        return Residual(
+            centres_px=np.array(origins, dtype=np.float64).reshape(-1, 2) + (self.side - 1) / 2,
+            shifts_px=found,
+            median_px=float(np.median(length)) if some else float("inf"),
+            p95_px=float(np.percentile(length, 95)) if some else float("inf"),
+            coverage=float(measured.mean()) if tried else 0.0,
+            bias_px=float(np.linalg.norm(np.median(found[measured], axis=0))) if some else float("inf"),
+        )
+
+    def _cut(self, image: NDArray[Any], origin: tuple[int, int]) -> NDArray[Any]:
+        x, y = origin
+        return image[y : y + self.side, x : x + self.side]
+
+    def _windows(self, field: Field, origins: list[tuple[int, int]]) -> Field:
+        """(n, side, side), each without its mean: the mean orientation of a row crop is the same everywhere and tells
+        no place from another.
+        """
+        cut = np.empty((len(origins), self.side, self.side), np.complex64)
+        for window, origin in zip(cut, origins, strict=True):
+            piece = self._cut(field, origin)
+            np.subtract(piece, piece.mean(), out=window)
+        return cut
+
+
+def _strength(window: Field) -> float:
+    return float(np.abs(window[::2, ::2]).mean())
 
 
 def _starts(length: int, side: int) -> list[int]:
-    count = max(1, round((length - side) / (0.75 * side)) + 1)
+    count = max(1, math.ceil(length / side))
     return [round(v) for v in np.linspace(0, max(0, length - side), count)]
 
 
-def _shift_of(
-    fixed: NDArray[np.complex64], moving: NDArray[np.complex64], settings: CheckSettings
-) -> tuple[float, float]:
-    """The shift of one window's content; nan, nan where no peak stands out."""
-    # The mean orientation of a row crop is the same everywhere and tells no place from another.
-    surface = correlation_surface(fixed - fixed.mean(), moving - moving.mean())
+def _shift_at_peak(surface: NDArray[np.float32], settings: CheckSettings) -> tuple[float, float]:
+    """The shift that a correlation surface shows; nan, nan where no peak stands out."""
     height, width = surface.shape
-    row, column = np.unravel_index(int(surface.argmax()), surface.shape)
-    spread = float(surface.std())
+    row, column = divmod(int(surface.argmax()), width)
+    # Its mean is 0: the windows have none.
+    spread = math.sqrt(float(np.vdot(surface, surface)) / surface.size)
     if spread <= 0 or surface[row, column] < settings.least_peak_sigma * spread:
-        return np.nan, np.nan
+        return math.nan, math.nan
     patch = np.take(
         np.take(surface, range(row - 1, row + 2), 0, mode="wrap"), range(column - 1, column + 2), 1, mode="wrap"
     )

@@ -1,200 +1,254 @@
-"""One band pair, start to end: read, seed, align, check."""
+"""The band pairs of one capture: seeded, aligned together, each one checked."""
 
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agalign import geometry, lens
+from agalign import geometry
 from agalign.check import is_as_it_was, verdict
-from agalign.config import Settings
-from agalign.errors import GeometryError, NotEnoughTextureError
+from agalign.config import CheckSettings, Settings
+from agalign.errors import AgalignError
+from agalign.flight import FlightModel, align_from_scratch, refine_with
 from agalign.geometry import Matrix
-from agalign.joint import align_jointly
-from agalign.metrics import similarity, tile_residuals
+from agalign.joint import Subject
+from agalign.mapping import Mapping as PixelMapping
+from agalign.metrics import FixedWindows, similarity
 from agalign.raster import read_for_alignment
-from agalign.records import Alignment, Band, FloatImage, JointResult, Lens, PairStatus, Raster, Residual, Seed, SeedKind
-from agalign.seed import best_seed, geo_seed, is_trusted, overlay, warped
+from agalign.records import Alignment, Band, Capture, JointResult, Raster, Residual, Seed, SeedKind
+from agalign.seed import RigSeed, best_seed, is_trusted, overlay, seed_candidates, single, warped
 from agalign.structure import textured
-from agalign.warp import Mapping
 
-StageProgress = Callable[[str, float], None]
-"""Called with the stage and the share of it that is behind, 0 to 1."""
+PairProgress = Callable[[str, str, float], None]
+"""Called with the band's name, the stage, and the share of the stage that is behind."""
 
-RigSeed = Callable[[Band, Band], Matrix | None]
-"""A camera's fixed_to_moving between undistorted pixels from metadata alone."""
-
+Candidates = Mapping[SeedKind, Matrix]
 
 _AS_FILES_LIE: tuple[SeedKind, ...] = ("geo", "identity")
 """Seeds that change nothing: an input aligned already is left untouched, not resampled by a hundredth of a pixel."""
 
 
 @dataclass(frozen=True)
-class View:
-    """A band as the alignment sees it."""
+class Pair:
+    """A moving image beside the reference, and where to start."""
 
-    raw: Raster
-    """As in the file, perhaps reduced."""
-    straight: Raster
-    """Lens-corrected where a model is known, else the same."""
-    scale: tuple[float, float]
-    """Size relative to the file."""
+    name: str
+    fixed: Raster
+    moving: Raster
+    candidates: Candidates
+    """fixed_to_moving homographies between undistorted pixels, in order of trust."""
+    seed: Seed
+    trusted: bool
+
+    @property
+    def space(self) -> Literal["pixel", "undistorted"]:
+        """What the homographies are between."""
+        return "pixel" if self.fixed.lens is None else "undistorted"
 
 
-def load_view(band: Band, longest_side_px: int) -> View:
-    """Read a band for alignment. Raises UnreadableFileError."""
-    raw = read_for_alignment(band, longest_side_px)
-    scale = raw.size_px[0] / band.width_px, raw.size_px[1] / band.height_px
-    return View(raw, lens.undistort_raster(raw, _rescaled(band.lens, scale)), scale)
+def align_capture_bands(
+    capture: Capture, rig_seed: RigSeed, settings: Settings, model: FlightModel | None, progress: PairProgress
+) -> dict[str, Alignment]:
+    """Align every moving band of a capture, by name; a band that cannot be read is `failed` and stops no other.
+
+    Raises UnreadableFileError where the reference cannot be read.
+    """
+    reference = capture.reference
+    progress(reference.name, "reading", 0.0)
+    whole = read_for_alignment(reference, settings.joint.longest_side_px)
+    found: dict[str, Alignment] = {}
+    images: list[tuple[str, Raster, Raster, Candidates]] = []
+    for band in capture.moving:
+        try:
+            moving = read_for_alignment(band, settings.joint.longest_side_px)
+        except AgalignError as error:
+            nothing = Seed("identity", overlay(reference, band), 0.0)
+            found[band.name] = _failed(nothing, str(error))
+            continue
+        candidates = dict(seed_candidates(reference, band, rig_seed, settings.seed))
+        if model is not None and band.name in model.mappings and settings.seed.force is None:
+            candidates = {"model": model.mappings[band.name], **candidates}
+        # Without both lenses nothing can be undistorted.
+        lenses = whole.lens is not None and moving.lens is not None
+        fixed, moving = (r if lenses else replace(r, lens=None) for r in (whole, moving))
+        down = {k: geometry.rescale(m, _scale(fixed, reference), _scale(moving, band)) for k, m in candidates.items()}
+        images.append((band.name, fixed, moving, down))
+    for name, alignment in align_images(images, settings, progress, model).items():
+        band = next(b for b in capture.moving if b.name == name)
+        moving = next(m for n, _, m, _ in images if n == name)
+        found[name] = _in_file_px(alignment, _scale(whole, reference), _scale(moving, band))
+    return {band.name: found[band.name] for band in capture.moving}
 
 
-def align_views(
-    fixed: View, moving: View, candidates: dict[SeedKind, Matrix], settings: Settings, progress: StageProgress
-) -> Alignment:
-    """Align one pair. `candidates` and the result map undistorted pixels of the FILES; the views may be reduced."""
-    started = time.perf_counter()
-    down = {kind: geometry.rescale(m, fixed.scale, moving.scale) for kind, m in candidates.items()}
-    progress("seeding", 0.0)
-    one, other = fixed.straight, moving.straight
-    before = _similarity_before(fixed, moving)
-    if not (textured(one) and textured(other)):
-        blank = "reference" if not textured(one) else "moving"
+def align_images(
+    images: Sequence[tuple[str, Raster, Raster, Candidates]], settings: Settings, progress: PairProgress,
+    model: FlightModel | None = None,
+) -> dict[str, Alignment]:  # fmt: skip
+    """Align images (name, fixed, moving, candidates) of one capture, which share the pixels of the reference.
+
+    Those that the flight's network cannot align are learnt from scratch, together.
+    """
+    if not images:
+        return {}
+    found: dict[str, Alignment] = {}
+    windows = FixedWindows(single(images[0][1]), settings.check)
+    clock = time.perf_counter()
+
+    def spent(count: int) -> float:
+        nonlocal clock
+        seconds, clock = (time.perf_counter() - clock) / max(count, 1), time.perf_counter()
+        return seconds
+
+    pairs: list[Pair] = []
+    for name, fixed, moving, candidates in images:
+        progress(name, "seeding", 0.0)
+        pair = _seeded(name, fixed, moving, candidates, settings)
+        if isinstance(pair, Pair):
+            pairs.append(pair)
+        else:
+            found[name] = pair
+    seeding = spent(len(images))
+    seconds = dict.fromkeys((p.name for p in pairs), seeding)
+    remaining = pairs
+    if model is not None and settings.joint.recipe == "fast":
+        known = [p for p in pairs if model.side(p.name) is not None]
+        results = _frozen(known, model, settings, progress)
+        share = spent(len(known))
+        for pair in known:
+            progress(pair.name, "checking", 0.0)
+            alignment = _checked(pair, results[pair.name], windows, settings)
+            seconds[pair.name] += share + spent(1)
+            if alignment.status == "aligned":
+                found[pair.name] = replace(alignment, seconds=seconds[pair.name])
+        remaining = [p for p in pairs if p.name not in found]
+    results = _from_scratch(remaining, settings, progress)
+    share = spent(len(remaining))
+    for pair in remaining:
+        progress(pair.name, "checking", 0.0)
+        alignment = _checked(pair, results[pair.name], windows, settings)
+        found[pair.name] = replace(alignment, seconds=seconds[pair.name] + share + spent(1))
+    return found
+
+
+def _seeded(name: str, fixed: Raster, moving: Raster, candidates: Candidates, settings: Settings) -> Pair | Alignment:
+    if not (textured(fixed) and textured(moving)):
+        blank = "reference" if not textured(fixed) else "moving"
         kind, matrix = next(iter(candidates.items()))
-        reason = f"the {blank} band is constant or all invalid"
-        return _outcome(matrix, "failed", reason, Seed(kind, matrix, 0.0), None, None, started, before, {})
-    seed = best_seed(one, other, down, settings.seed)
-    trusted = is_trusted(seed, settings.seed)
-    joint, why_not = _joint(one, other, seed, trusted, settings, progress)
-    matrix = seed.fixed_to_moving
-    if joint is not None:
-        for given in (down[kind] for kind in _AS_FILES_LIE if kind in down):
-            if is_as_it_was(joint, given, one.size_px, settings.check):
-                joint = replace(joint, fixed_to_moving=given)
-                break
-        matrix = joint.fixed_to_moving
-    progress("checking", 0.0)
-    residual, after = _measure(one, other, matrix, settings)
-    status, doubt = verdict(seed, trusted, joint, why_not, residual, one.size_px, settings.check)
-    if status != "aligned" and joint is not None:
-        matrix = seed.fixed_to_moving
-        residual, after = _measure(one, other, matrix, settings)
-    if status == "seed_only" and (residual is None or residual.coverage < 0.3):
-        status, doubt = "failed", f"{doubt}, but it does not fit either"
-    to_file = [(1 / s[0], 1 / s[1]) for s in (fixed.scale, moving.scale)]
-    full = geometry.rescale(matrix, *to_file)
-    seed = replace(seed, fixed_to_moving=geometry.rescale(seed.fixed_to_moving, *to_file))
-    if joint is not None:
-        joint = replace(
-            joint, corner_std_px=joint.corner_std_px * to_file[1][0], last_step_px=joint.last_step_px * to_file[0][0]
-        )
-    residual = _residual_in_file_px(residual, to_file[0])
-    return _outcome(full, status, doubt, seed, joint, residual, started, before, after)
+        return _failed(Seed(kind, matrix, 0.0), f"the {blank} band is constant or all invalid")
+    seed = best_seed(fixed, moving, candidates, settings.seed)
+    return Pair(name, fixed, moving, candidates, seed, is_trusted(seed, settings.seed))
 
 
-def _joint(
-    fixed: Raster, moving: Raster, seed: Seed, trusted: bool, settings: Settings, progress: StageProgress
-) -> tuple[JointResult | None, str]:
-    try:
-        joint, _ = align_jointly(
-            fixed, moving, seed.fixed_to_moving, settings.joint, trusted=trusted, progress=progress
-        )
-    except NotEnoughTextureError as reason:
-        return None, str(reason)
-    except GeometryError:
-        return None, "the optimisation ended in a mapping that cannot be inverted"
-    return joint, ""
+def _failed(seed: Seed, reason: str) -> Alignment:
+    return Alignment(seed.fixed_to_moving, "pixel", "failed", reason, seed, None, None, 0.0)
 
 
-def _outcome(
-    matrix: Matrix, status: PairStatus, reason: str | None, seed: Seed, joint: JointResult | None,
-    residual: Residual | None, started: float, before: dict[str, float], after: dict[str, float],
-) -> Alignment:  # fmt: skip
-    seconds = time.perf_counter() - started
-    return Alignment(matrix, "pixel", status, reason, seed, joint, residual, seconds, before, after)
+def _frozen(
+    pairs: Sequence[Pair], model: FlightModel, settings: Settings, progress: PairProgress
+) -> dict[str, JointResult | str]:
+    results: dict[str, JointResult | str] = {}
+    for group in _by_lens(pairs):
+        sides = [model.side(p.name) or 0 for p in group]
+        found = refine_with(model, _subject(group, sides), settings.joint, _of(group, progress))
+        results |= dict(zip((p.name for p in group), found, strict=True))
+    return results
 
 
-def _similarity_before(fixed: View, moving: View) -> dict[str, float]:
-    """The files laid on each other as they are."""
-    size = fixed.raw.size_px
-    scale = moving.raw.size_px[0] / size[0], moving.raw.size_px[1] / size[1]
-    return _similarity_of(fixed.raw, moving.raw, geometry.resolution_change(*scale))
+def _from_scratch(pairs: Sequence[Pair], settings: Settings, progress: PairProgress) -> dict[str, JointResult | str]:
+    results: dict[str, JointResult | str] = {}
+    for group in _by_lens(pairs):
+        subject = _subject(group, list(range(1, len(group) + 1)))
+        found = align_from_scratch(subject, settings.joint, _of(group, progress))
+        results |= dict(zip((p.name for p in group), found, strict=True))
+    return results
 
 
-def _similarity_of(fixed: Raster, moving: Raster, fixed_to_moving: Matrix) -> dict[str, float]:
-    there = warped(moving, fixed_to_moving, fixed.size_px, (1.0, 1.0))
-    return similarity(_mean(fixed.pixels), _mean(there.pixels), fixed.valid & there.valid)
+def _by_lens(pairs: Sequence[Pair]) -> list[list[Pair]]:
+    """Pairs that share the reference's undistorted pixels, and those that share its raw ones."""
+    groups = [[p for p in pairs if (p.fixed.lens is None) == raw] for raw in (False, True)]
+    return [g for g in groups if g]
 
 
-def _mean(pixels: NDArray[np.float32]) -> FloatImage:
-    return pixels if pixels.ndim == 2 else np.asarray(pixels.mean(axis=0))
-
-
-def _measure(
-    fixed: Raster, moving: Raster, matrix: Matrix, settings: Settings
-) -> tuple[Residual | None, dict[str, float]]:
-    there = warped(moving, matrix, fixed.size_px, (1.0, 1.0))
-    one, other = Raster(_mean(fixed.pixels), fixed.valid), Raster(_mean(there.pixels), there.valid)
-    after = similarity(one.pixels, other.pixels, one.valid & other.valid)
-    return tile_residuals(one, other, settings.check), after
-
-
-def _residual_in_file_px(residual: Residual | None, scale: tuple[float, float]) -> Residual | None:
-    if residual is None or scale == (1.0, 1.0):
-        return residual
-    factor = np.array(scale)
-    return replace(
-        residual, centres_px=(residual.centres_px + 0.5) * factor - 0.5, shifts_px=residual.shifts_px * factor,
-        median_px=residual.median_px * scale[0], p95_px=residual.p95_px * scale[0], bias_px=residual.bias_px * scale[0],
+def _subject(pairs: Sequence[Pair], sides: Sequence[int]) -> Subject:
+    return Subject(
+        pairs[0].fixed, [p.moving for p in pairs], [p.seed.fixed_to_moving for p in pairs], sides,
+        [p.trusted for p in pairs],
     )  # fmt: skip
 
 
-def _rescaled(model: Lens | None, scale: tuple[float, float]) -> Lens | None:
-    if model is None or scale == (1.0, 1.0):
-        return model
-    sx, sy = scale
-    centre = geometry.apply(geometry.resolution_change(sx, sy), (model.cx_px, model.cy_px))
-    return replace(
-        model, fx_px=model.fx_px * sx, fy_px=model.fy_px * sy, cx_px=float(centre[0]), cy_px=float(centre[1])
-    )
+def _of(pairs: Sequence[Pair], progress: PairProgress) -> Callable[[str, float], None]:
+    """Progress of pairs that advance together, told as the first one's."""
+    return lambda stage, share: progress(pairs[0].name, stage, share)
 
 
-def seed_candidates(reference: Band, moving: Band, rig_seed: RigSeed, settings: Settings) -> dict[SeedKind, Matrix]:
-    """The coarse mappings that metadata offers, in order of trust; identity is always among them."""
-    candidates: dict[SeedKind, Matrix] = {}
-    with suppress(GeometryError):  # numbers in the tags that make no camera
-        rig = rig_seed(reference, moving)
-        if rig is not None:
-            candidates["rig"] = rig
-    geo = geo_seed(reference, moving)
-    if geo is not None:
-        candidates["geo"] = geo
-    candidates["identity"] = overlay(reference, moving)
-    forced = settings.seed.force
-    if forced is not None and forced in candidates:
-        return {forced: candidates[forced]}
-    return candidates
+def _checked(pair: Pair, joint: JointResult | str, windows: FixedWindows, settings: Settings) -> Alignment:
+    """The alignment with its verdict and metrics, in px of the images."""
+    why_not = joint if isinstance(joint, str) else ""
+    found = None if isinstance(joint, str) else _snapped(joint, pair, settings.check)
+    matrix = pair.seed.fixed_to_moving if found is None else found.fixed_to_moving
+    residual, after = _measure(pair, matrix, windows)
+    size = pair.fixed.size_px
+    status, doubt = verdict(pair.seed, pair.trusted, found, why_not, residual, size, settings.check)
+    if status != "aligned" and found is not None:
+        matrix = pair.seed.fixed_to_moving
+        residual, after = _measure(pair, matrix, windows)
+    if status == "seed_only" and (residual is None or residual.coverage < settings.check.least_seed_coverage):
+        status, doubt = "failed", f"{doubt}, but it does not fit either"
+    before = _similarity_as_they_lie(pair)
+    return Alignment(matrix, pair.space, status, doubt, pair.seed, found, residual, 0.0, before, after)
 
 
-def align_pair(
-    reference: Band, moving: Band, fixed: View, rig_seed: RigSeed, settings: Settings, progress: StageProgress
-) -> Alignment:
-    """Align one band of a capture to its reference, whose view is read already."""
-    straight = reference.lens is not None and moving.lens is not None
-    if not straight:
-        reference, moving = replace(reference, lens=None), replace(moving, lens=None)
-        fixed = View(fixed.raw, fixed.raw, fixed.scale)
-    progress("reading", 0.0)
-    view = load_view(moving, settings.joint.longest_side_px)
-    candidates = seed_candidates(reference, moving, rig_seed, settings)
-    found = align_views(fixed, view, candidates, settings, progress)
-    return replace(found, space="undistorted" if straight else "pixel")
+def _snapped(joint: JointResult, pair: Pair, settings: CheckSettings) -> JointResult:
+    for given in (pair.candidates[kind] for kind in _AS_FILES_LIE if kind in pair.candidates):
+        if is_as_it_was(joint, given, pair.fixed.size_px, settings):
+            return replace(joint, fixed_to_moving=given)
+    return joint
 
 
-def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> Mapping:
+def _similarity_as_they_lie(pair: Pair) -> dict[str, float]:
+    """The files laid on each other as they are."""
+    scale = np.divide(pair.moving.size_px, pair.fixed.size_px)
+    lying = PixelMapping(geometry.resolution_change(float(scale[0]), float(scale[1])))
+    there = warped(single(pair.moving), lying, pair.fixed.size_px)
+    return similarity(single(pair.fixed).pixels, there.pixels, pair.fixed.valid & there.valid)
+
+
+def _measure(pair: Pair, matrix: Matrix, windows: FixedWindows) -> tuple[Residual | None, dict[str, float]]:
+    """On the reference's own pixel grid, where the result is written."""
+    fixed = single(pair.fixed)
+    mapping = PixelMapping(matrix, pair.fixed.lens, pair.moving.lens)
+    there = warped(single(pair.moving), mapping, fixed.size_px)
+    after = similarity(fixed.pixels, there.pixels, fixed.valid & there.valid)
+    return windows.residuals(there), after
+
+
+def _scale(raster: Raster, band: Band) -> tuple[float, float]:
+    return raster.size_px[0] / band.width_px, raster.size_px[1] / band.height_px
+
+
+def _in_file_px(alignment: Alignment, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> Alignment:
+    """An alignment of reduced images as one of their files."""
+    if fixed_scale == moving_scale == (1.0, 1.0):
+        return alignment
+    up, there = ((1 / x, 1 / y) for x, y in (fixed_scale, moving_scale))
+    joint, residual, seed = alignment.joint, alignment.residual, alignment.seed
+    if joint is not None:
+        std = tuple((x * up[0], y * up[1]) for x, y in joint.corner_std_xy_px)
+        joint = replace(joint, corner_std_xy_px=std, last_step_px=joint.last_step_px * up[0])
+    if residual is not None:
+        residual = replace(
+            residual, centres_px=(residual.centres_px + 0.5) * up - 0.5, shifts_px=residual.shifts_px * up,
+            median_px=residual.median_px * up[0], p95_px=residual.p95_px * up[0], bias_px=residual.bias_px * up[0],
+        )  # fmt: skip
+    seed = replace(seed, fixed_to_moving=geometry.rescale(seed.fixed_to_moving, up, there))
+    matrix = geometry.rescale(alignment.fixed_to_moving, up, there)
+    return replace(alignment, fixed_to_moving=matrix, seed=seed, joint=joint, residual=residual)
+
+
+def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> PixelMapping:
     """The complete mapping between the raw pixels of the two files."""
     if alignment.space == "pixel":
-        return Mapping(alignment.fixed_to_moving)
-    return Mapping(alignment.fixed_to_moving, reference.lens, moving.lens)
+        return PixelMapping(alignment.fixed_to_moving)
+    return PixelMapping(alignment.fixed_to_moving, reference.lens, moving.lens)

@@ -1,6 +1,5 @@
 """One capture, start to end: its pairs aligned, its stack and sidecar written."""
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,16 +8,15 @@ from agalign import geometry
 from agalign.config import Settings
 from agalign.describe import describe_capture
 from agalign.errors import AgalignError
-from agalign.pair import RigSeed, align_pair, load_view, mapping_of
+from agalign.flight import FlightModel
+from agalign.mapping import Mapping
+from agalign.pair import PairProgress, align_capture_bands, mapping_of
 from agalign.picture import write_picture
-from agalign.records import Alignment, Band, Capture, Seed
-from agalign.seed import overlay
+from agalign.records import Alignment, Capture, Tile
+from agalign.seed import RigSeed
 from agalign.sidecar import Sidecar, write_sidecar
-from agalign.warp import Mapping, Tile, common_area
+from agalign.warp import common_area
 from agalign.write import Layer, Stack, write_stack
-
-PairProgress = Callable[[str, str, float], None]
-"""Called with the band's name, the stage, and the share of the stage that is behind."""
 
 
 def quiet(*_: object) -> None:
@@ -40,27 +38,16 @@ def output_paths(capture: Capture, out: Path) -> tuple[Path, Path]:
 
 
 def process_capture(
-    capture: Capture, out: Path, rig_seed: RigSeed, settings: Settings, progress: PairProgress = quiet
-) -> CaptureOutcome:
+    capture: Capture, out: Path, rig_seed: RigSeed, settings: Settings, progress: PairProgress = quiet,
+    model: FlightModel | None = None,
+) -> CaptureOutcome:  # fmt: skip
     """Align a capture and write its stack and sidecar; a band that cannot be aligned does not stop the others.
 
+    With the flight's `model` only what it cannot align is learnt anew.
     Raises UnreadableFileError where the reference itself cannot be read, and OutputError.
     """
     reference = capture.reference
-    fixed = load_view(reference, settings.joint.longest_side_px)
-    alignments: dict[str, Alignment] = {}
-    for band in capture.moving:
-
-        def report(stage: str, share: float, band: Band = band) -> None:
-            progress(band.name, stage, share)
-
-        try:
-            alignments[band.name] = align_pair(reference, band, fixed, rig_seed, settings, report)
-        except AgalignError as error:
-            nothing = Seed("identity", overlay(reference, band), 0.0)
-            alignments[band.name] = Alignment(
-                nothing.fixed_to_moving, "pixel", "failed", str(error), nothing, None, None, 0.0
-            )
+    alignments = align_capture_bands(capture, rig_seed, settings, model, progress)
     progress(reference.name, "writing", 0.0)
     stack_path, sidecar_path = output_paths(capture, out)
     stack = _write(capture, alignments, stack_path, settings)

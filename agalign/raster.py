@@ -13,6 +13,7 @@ from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
 from rasterio.windows import Window
 
+from agalign import lens
 from agalign.errors import UnreadableFileError
 from agalign.masks import data_mask, learnable, undeclared_fill
 from agalign.records import Band, Georeference, Mask, Raster
@@ -81,7 +82,10 @@ def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
     if band.nodata is None:
         valid &= ~undeclared_fill(pixels)
     valid = learnable(valid, pixels, band.saturation_value)
-    return Raster(np.where(valid, pixels, 0).astype(np.float32), valid)
+    scale = shape[1] / band.width_px, shape[0] / band.height_px
+    pixels = pixels.astype(np.float32)
+    pixels[~valid] = 0
+    return Raster(pixels, valid, lens.rescaled(band.lens, scale))
 
 
 def read_window(

@@ -1,5 +1,6 @@
 """The values that travel between the stages: frozen, typed, numpy only."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -131,11 +132,23 @@ class Raster:
     """(height, width) float32, or (channels, height, width)."""
     valid: Mask
     """(height, width), False where a pixel is nodata, saturated or outside the sensor."""
+    lens: Lens | None = None
+    """Of the camera that took it, in these pixels; None where positions are not to be corrected."""
 
     @property
     def size_px(self) -> tuple[int, int]:
         """(width, height) in pixels."""
         return int(self.valid.shape[1]), int(self.valid.shape[0])
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A rectangle of a pixel grid."""
+
+    x0: int
+    y0: int
+    width: int
+    height: int
 
 
 @dataclass(frozen=True)
@@ -168,9 +181,14 @@ class JointResult:
     recipe: str
     model_family: ModelFamily
     last_step_px: float
-    corner_std_px: float
-    """Root mean square distance, px, of the least certain corner from where it is mapped to: from the curvature at
-    the solution and what the patches disagree by."""
+    corner_std_xy_px: tuple[tuple[float, float], ...]
+    """Standard deviations along x and y of the mapping at the corners of the reference, clockwise from the top left,
+    px of the reference: from the curvature at the solution and what the patches disagree by."""
+
+    @property
+    def corner_std_px(self) -> float:
+        """Root mean square distance of the least certain corner from where it is mapped to."""
+        return max(math.hypot(*std) for std in self.corner_std_xy_px)
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,53 @@
 """Coarse alignments to start from, each scored on the images, the best kept."""
 
+from collections.abc import Callable
+from collections.abc import Mapping as MappingType
+from contextlib import suppress
+
 import cv2
 import numpy as np
 
 from agalign import geometry
 from agalign.config import SeedSettings
+from agalign.errors import GeometryError
 from agalign.geometry import Matrix
-from agalign.records import Band, Raster, Seed, SeedKind
+from agalign.mapping import Mapping
+from agalign.records import Band, Raster, Seed, SeedKind, Tile
 from agalign.structure import correlation_surface, find_peak, shrink, structure_field
 
+RigSeed = Callable[[Band, Band], Matrix | None]
+"""A camera's fixed_to_moving between undistorted pixels from metadata alone."""
 
-def best_seed(fixed: Raster, moving: Raster, candidates: dict[SeedKind, Matrix], settings: SeedSettings) -> Seed:
+
+def seed_candidates(reference: Band, moving: Band, rig_seed: RigSeed, settings: SeedSettings) -> dict[SeedKind, Matrix]:
+    """The coarse mappings that metadata offers, in order of trust; identity is always among them."""
+    candidates: dict[SeedKind, Matrix] = {}
+    with suppress(GeometryError):  # numbers in the tags that make no camera
+        rig = rig_seed(reference, moving)
+        if rig is not None:
+            candidates["rig"] = rig
+    geo = geo_seed(reference, moving)
+    if geo is not None:
+        candidates["geo"] = geo
+    candidates["identity"] = overlay(reference, moving)
+    if settings.force is not None and settings.force in candidates:
+        return {settings.force: candidates[settings.force]}
+    return candidates
+
+
+def best_seed(fixed: Raster, moving: Raster, candidates: MappingType[SeedKind, Matrix], settings: SeedSettings) -> Seed:
     """The candidate under which the structures agree best, or one shifted onto the peak of their correlation.
 
     `candidates` are fixed_to_moving homographies at full resolution, in order of trust. Each is scored at no shift
-    and at its best shift; a candidate whose best shift is below `least_shift_px` stays as it is.
+    and at its best shift; a candidate whose best shift is below `least_shift_px` stays as it is. Where the flight's
+    own mapping leaves no doubt, the others are not looked at.
     """
-    scored = [
-        seed for kind, matrix in candidates.items() for seed in scored_seeds(fixed, moving, kind, matrix, settings)
-    ]
+    scored: list[Seed] = []
+    for kind, matrix in candidates.items():
+        scored += scored_seeds(fixed, moving, kind, matrix, settings)
+        best = max(scored, key=lambda seed: seed.score)
+        if kind == "model" and is_trusted(best, settings):
+            return best
     if settings.force is not None and settings.force != "structure":
         return next(s for s in scored if s.kind == settings.force)
     if settings.force == "structure":
@@ -29,13 +58,19 @@ def best_seed(fixed: Raster, moving: Raster, candidates: dict[SeedKind, Matrix],
 def scored_seeds(
     fixed: Raster, moving: Raster, kind: SeedKind, fixed_to_moving: Matrix, settings: SeedSettings
 ) -> list[Seed]:
-    """The candidate itself and, where the structures agree better a shift away, its `structure` variant."""
+    """The candidate itself and, where the structures agree better a shift away, its `structure` variant.
+
+    On a sliver of common area the peak of the correlation means nothing: such a candidate scores 0.
+    """
     width, height = fixed.size_px
     scale = min(1.0, settings.working_px / max(width, height))
     size = max(8, round(width * scale)), max(8, round(height * scale))
     scale_xy = size[0] / width, size[1] / height
-    small_fixed = _single(shrink(fixed, size))
-    small_moving = warped(_single(moving), fixed_to_moving, size, scale_xy)
+    small_fixed = single(shrink(fixed, size))
+    mapping = Mapping(fixed_to_moving, fixed.lens, moving.lens)
+    small_moving = warped(single(moving), mapping, size, scale_xy)
+    if small_moving.valid.mean() < settings.least_overlap:
+        return [Seed(kind, fixed_to_moving, 0.0)]
     smoothing = settings.smoothing_px
     surface = correlation_surface(structure_field(small_fixed, smoothing), structure_field(small_moving, smoothing))
     peak = find_peak(surface, apart_px=max(size) // 16)
@@ -43,10 +78,12 @@ def scored_seeds(
         return [Seed(kind, fixed_to_moving, peak.sigma, peak.sigma, peak.runner_up_sigma)]
     shift = geometry.translation(peak.shift_px[0] / scale_xy[0], peak.shift_px[1] / scale_xy[1])
     shifted = geometry.compose(fixed_to_moving, shift)
-    return [
-        Seed(kind, fixed_to_moving, peak.sigma_at_zero, peak.sigma_at_zero, peak.runner_up_sigma),
-        Seed("structure", shifted, peak.sigma, peak.sigma, peak.runner_up_sigma),
-    ]
+    unmoved = Seed(kind, fixed_to_moving, peak.sigma_at_zero, peak.sigma_at_zero, peak.runner_up_sigma)
+    # The correlation is circular: its peak may lay the images beside each other.
+    points = Mapping(shifted, fixed.lens, moving.lens)(geometry.lattice(width, height, 16, 12))
+    if ((points >= 0) & (points <= np.subtract(moving.size_px, 1))).all(axis=1).mean() < settings.least_overlap:
+        return [unmoved]
+    return [unmoved, Seed("structure", shifted, peak.sigma, peak.sigma, peak.runner_up_sigma)]
 
 
 def is_trusted(seed: Seed, settings: SeedSettings) -> bool:
@@ -75,25 +112,28 @@ def overlay(reference: Band, moving: Band) -> Matrix:
 
 
 def warped(
-    moving: Raster, fixed_to_moving: Matrix, size_px: tuple[int, int], fixed_scale: tuple[float, float]
+    moving: Raster, mapping: Mapping, size_px: tuple[int, int], fixed_scale: tuple[float, float] = (1.0, 1.0)
 ) -> Raster:
-    """The moving raster resampled onto the fixed grid reduced by `fixed_scale`, without aliasing."""
-    magnification = float(np.median(np.abs(geometry.local_scale(fixed_to_moving, *_full(size_px, fixed_scale)))))
+    """The moving raster resampled onto the fixed grid reduced by `fixed_scale` to `size_px`, without aliasing.
+
+    `mapping` is between the raw pixels of the two images at their full size.
+    """
+    if size_px == moving.size_px and not mapping.bends and np.array_equal(mapping.fixed_to_moving, np.eye(3)):
+        return moving
+    full = round(size_px[0] / fixed_scale[0]), round(size_px[1] / fixed_scale[1])
+    magnification = float(np.median(np.abs(geometry.local_scale(mapping.fixed_to_moving, *full))))
     reduce = float(np.clip(fixed_scale[0] / magnification, 8 / min(moving.size_px), 1.0))
     moving_size = max(8, round(moving.size_px[0] * reduce)), max(8, round(moving.size_px[1] * reduce))
     moving_scale = moving_size[0] / moving.size_px[0], moving_size[1] / moving.size_px[1]
     small = shrink(moving, moving_size)
-    matrix = geometry.rescale(fixed_to_moving, fixed_scale, moving_scale)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    pixels = cv2.warpPerspective(small.pixels, matrix, size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    valid = cv2.warpPerspective(small.valid.astype(np.float32), matrix, size_px, flags=flags, borderValue=0.0)
-    return Raster(np.asarray(pixels, np.float32), np.asarray(valid > 0.99))
+    positions = mapping.rescaled(fixed_scale, moving_scale).positions(Tile(0, 0, *size_px)).astype(np.float32)
+    positions = np.nan_to_num(positions, nan=-1e6)
+    pixels = cv2.remap(small.pixels, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    known = small.valid.astype(np.uint8) * 255
+    valid = cv2.remap(known, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return Raster(np.asarray(pixels, np.float32), np.asarray(valid == 255))
 
 
-def _full(size_px: tuple[int, int], scale: tuple[float, float]) -> tuple[int, int]:
-    return round(size_px[0] / scale[0]), round(size_px[1] / scale[1])
-
-
-def _single(raster: Raster) -> Raster:
+def single(raster: Raster) -> Raster:
     """One channel: the mean of several."""
-    return raster if raster.pixels.ndim == 2 else Raster(raster.pixels.mean(axis=0), raster.valid)
+    return raster if raster.pixels.ndim == 2 else Raster(raster.pixels.mean(axis=0), raster.valid, raster.lens)

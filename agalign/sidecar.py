@@ -79,6 +79,9 @@ class JointPart(_Part):
     model_family: Literal["homography", "affine", "translation"]
     last_step_px: float
     corner_std_px: float
+    """Root mean square distance of the least certain corner from where it is mapped to."""
+    corner_std_xy_px: list[PointPx]
+    """Standard deviations along x and y at the corners of the reference, clockwise from the top left."""
 
 
 class SimilarityPart(_Part):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from agalign import lens
 from agalign.records import Mask, Raster
 
 Field = NDArray[np.complex64]
@@ -23,21 +24,25 @@ _WHITENING = 0.5
 
 def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
     """Z of a single-band raster, (height, width) complex64 with |z| <= 1, and 0 at and next to invalid pixels."""
-    pixels = np.where(raster.valid, raster.pixels, 0).astype(np.float32)
-    weight = cv2.GaussianBlur(raster.valid.astype(np.float32), (0, 0), smoothing_px)
-    smooth = cv2.GaussianBlur(pixels, (0, 0), smoothing_px) / np.maximum(weight, 1e-3)
+    field = np.zeros((*raster.valid.shape, 2), np.float32)
+    complete = bool(raster.valid.all())
+    pixels = raster.pixels if complete else np.where(raster.valid, raster.pixels, np.float32(0))
+    smooth = cv2.GaussianBlur(np.asarray(pixels, np.float32), (0, 0), smoothing_px)
+    if not complete:
+        smooth /= np.maximum(cv2.GaussianBlur(raster.valid.astype(np.float32), (0, 0), smoothing_px), 1e-3)
     gx = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
     gy = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
-    magnitude = np.hypot(gx, gy)
+    xx, yy = gx * gx, gy * gy
+    magnitude = np.sqrt(xx + yy)
     inside = cv2.erode(raster.valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    if not inside.any():
-        return np.zeros(magnitude.shape, np.complex64)
-    ceiling = float(np.quantile(magnitude[inside][::7], _AMPLITUDE_QUANTILE))
-    if ceiling <= 0:
-        return np.zeros(magnitude.shape, np.complex64)
-    amplitude = np.minimum(magnitude / ceiling, 1.0)
-    unit = (gx + 1j * gy) / np.maximum(magnitude, 1e-20)
-    return np.where(inside, amplitude * unit**2, 0).astype(np.complex64)
+    some = magnitude[inside][::7]
+    ceiling = float(np.quantile(some, _AMPLITUDE_QUANTILE)) if some.size else 0.0
+    if ceiling > 0:
+        # a ((gx + i gy) / |g|)^2 with a = min(|g| / ceiling, 1)
+        weight = np.minimum(magnitude / ceiling, 1) / np.maximum(xx + yy, 1e-30) * inside
+        field[..., 0] = (xx - yy) * weight
+        field[..., 1] = 2 * gx * gy * weight
+    return np.asarray(field.view(np.complex64)[..., 0])
 
 
 @dataclass(frozen=True)
@@ -55,13 +60,25 @@ class Peak:
 
 
 def correlation_surface(fixed: Field, moving: Field) -> NDArray[np.float32]:
-    """Circular correlation of two windowed fields of one shape, partly whitened; index [dy, dx] is the shift."""
-    height, width = fixed.shape[-2:]
+    """Circular correlation of two windowed fields (height, width), partly whitened; index [dy, dx] is the shift."""
+    return correlation_surfaces(windowed_spectra(fixed), windowed_spectra(moving))
+
+
+def windowed_spectra(fields: Field) -> Field:
+    """Fourier transform of fields (..., height, width) under a Hann window."""
+    height, width = fields.shape[-2:]
     window = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1]).astype(np.float32)
-    cross = np.conj(fft.fft2(fixed * window, workers=2)) * fft.fft2(moving * window, workers=2)
-    magnitude = np.abs(cross)
-    floor = np.maximum(magnitude.max(axis=(-2, -1), keepdims=True) * 1e-9, 1e-30)
-    return np.asarray(fft.ifft2(cross / np.maximum(magnitude, floor) ** _WHITENING, workers=2).real)
+    return np.asarray(fft.fft2(fields * window))
+
+
+def correlation_surfaces(fixed: Field, moving: Field) -> NDArray[np.float32]:
+    """`correlation_surface` of fields given by their `windowed_spectra`, (..., height, width)."""
+    cross = np.conj(fixed)
+    cross *= moving
+    power = cross.real**2 + cross.imag**2
+    floor = np.maximum(power.max(axis=(-2, -1), keepdims=True) * 1e-18, 1e-30)
+    cross *= np.maximum(power, floor) ** np.float32(-_WHITENING / 2)
+    return np.asarray(fft.ifft2(cross, overwrite_x=True).real)
 
 
 def find_peak(surface: NDArray[np.float32], apart_px: int) -> Peak:
@@ -93,16 +110,21 @@ def _vertex(before: float, at: float, after: float) -> float:
 
 def textured(raster: Raster, least_share: float = 0.02) -> bool:
     """False where the valid pixels are (nearly) all alike or too few for a structure to exist."""
-    return bool(raster.valid.mean() > least_share and raster.pixels[..., raster.valid].std() > 0)
+    if np.count_nonzero(raster.valid) <= least_share * raster.valid.size:
+        return False
+    planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
+    mask = raster.valid.astype(np.uint8)
+    return any(float(cv2.meanStdDev(plane, mask=mask)[1].item()) > 0 for plane in planes)
 
 
 def shrink(raster: Raster, size_px: tuple[int, int]) -> Raster:
     """Area-averaged copy of `size_px` (width, height); a pixel is valid where all of its source pixels are."""
     if size_px == raster.size_px:
         return raster
+    scale = size_px[0] / raster.size_px[0], size_px[1] / raster.size_px[1]
     weight = cv2.resize(raster.valid.astype(np.float32), size_px, interpolation=cv2.INTER_AREA)
     planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
     shrunk = np.stack([cv2.resize(np.where(raster.valid, p, 0), size_px, interpolation=cv2.INTER_AREA) for p in planes])
     shrunk = (shrunk / np.maximum(weight, 1e-6)).astype(np.float32)
     valid: Mask = weight > 0.999
-    return Raster(shrunk if raster.pixels.ndim == 3 else shrunk[0], valid)
+    return Raster(shrunk if raster.pixels.ndim == 3 else shrunk[0], valid, lens.rescaled(raster.lens, scale))

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
 
 from agalign import geometry, lens
-from agalign.geometry import Matrix
-from agalign.records import Lens
+from agalign.geometry import Matrix, Points
+from agalign.mapping import splined
+from agalign.records import Lens, Tile
 
 Field = NDArray[np.float32]
 
@@ -161,14 +161,13 @@ def render(
 ) -> NDArray[np.uint16]:
     """What one camera records of the ground painted in its band: (height, width) uint16 with vignetting and noise."""
     width, height = size_px
-    knots_x, knots_y = np.linspace(0, width - 1, width // 16), np.linspace(0, height - 1, height // 16)
-    raw = np.stack(np.meshgrid(knots_x, knots_y), axis=-1)
-    straight = lens.undistort(band.lens(*size_px), raw)
-    metres = geometry.apply(_pixel_to_ground(band, pose, size_px), straight)
-    on_map = metres / metres_per_px + (len(painted) - 1) / 2
-    splines = [RectBivariateSpline(knots_y, knots_x, on_map[..., k]) for k in (0, 1)]
+    to_ground, middle = _pixel_to_ground(band, pose, size_px), (len(painted) - 1) / 2
+
+    def on_map(raw_px: Points) -> Points:
+        return geometry.apply(to_ground, lens.undistort(band.lens(*size_px), raw_px)) / metres_per_px + middle
+
+    positions = splined(on_map, Tile(0, 0, width, height)).astype(np.float32)
     y, x = np.arange(height), np.arange(width)
-    positions = np.stack([spline(y, x) for spline in splines], axis=-1).astype(np.float32)
     scene = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     radius2 = ((x - width / 2) ** 2)[None, :] + ((y - height / 2) ** 2)[:, None]
     vignetting = 1 - 0.35 * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)

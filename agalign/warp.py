@@ -5,18 +5,16 @@ raw reference px -> undistorted -> H -> undistorted -> raw moving px. Nothing is
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import RectBivariateSpline
+from numpy.typing import NDArray
 
-from agalign import geometry, lens
 from agalign.config import Interpolation
-from agalign.geometry import Matrix, Points
+from agalign.geometry import Points
+from agalign.mapping import Mapping
 from agalign.raster import open_raster, read_window
-from agalign.records import Band, Lens, Mask
+from agalign.records import Band, Mask, Tile
 
 _FLAGS: dict[str, int] = {
     "nearest": cv2.INTER_NEAREST,
@@ -26,46 +24,7 @@ _FLAGS: dict[str, int] = {
 }
 _SUPPORT_PX = 4
 """Half width of the widest interpolation kernel."""
-_LATTICE_STEP_PX = 16
-"""The lens models are evaluated this far apart and splined between: below 0.001 px of error."""
-
-
-@dataclass(frozen=True)
-class Mapping:
-    """From raw pixels of the reference file to raw pixels of the moving file."""
-
-    fixed_to_moving: Matrix
-    fixed_lens: Lens | None = None
-    moving_lens: Lens | None = None
-    pre_distortion: Lens | None = None
-    """Lens through which the given pixels go first, where they are undistorted ones of the reference."""
-
-    def __call__(self, reference_px: ArrayLike) -> Points:
-        """(..., 2) raw reference pixels to raw moving pixels."""
-        raw = lens.distort(self.pre_distortion, reference_px)
-        undistorted = lens.undistort(self.fixed_lens, raw)
-        return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, undistorted))
-
-    def from_undistorted(self, reference_lens: Lens) -> "Mapping":
-        """The mapping for undistorted pixels of the reference instead of its raw ones."""
-        if self.fixed_lens is not None:
-            return replace(self, fixed_lens=None)
-        return replace(self, pre_distortion=reference_lens)
-
-    @property
-    def bends(self) -> bool:
-        """True where a lens model takes part, so that the mapping is not just a homography."""
-        return any(map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion)))
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A rectangle of the reference grid."""
-
-    x0: int
-    y0: int
-    width: int
-    height: int
+_SAMPLE_PX = 16
 
 
 def tiles(area: Tile, side_px: int) -> Iterator[Tile]:
@@ -77,28 +36,6 @@ def tiles(area: Tile, side_px: int) -> Iterator[Tile]:
             yield Tile(x, y, width, height)
 
 
-def source_positions(mapping: Mapping, tile: Tile) -> Points:
-    """Where each pixel of a tile lies in the moving file, (height, width, 2) raw px."""
-    x = np.arange(tile.x0, tile.x0 + tile.width, dtype=np.float64)
-    y = np.arange(tile.y0, tile.y0 + tile.height, dtype=np.float64)
-    if not mapping.bends:
-        h = mapping.fixed_to_moving
-        denominator = (h[2, 0] * x)[None, :] + (h[2, 1] * y + h[2, 2])[:, None]
-        return np.stack(
-            [((h[k, 0] * x)[None, :] + (h[k, 1] * y + h[k, 2])[:, None]) / denominator for k in (0, 1)], axis=-1
-        )
-    knots_x = _knots(tile.x0, tile.width)
-    knots_y = _knots(tile.y0, tile.height)
-    at_knots = mapping(np.stack(np.meshgrid(knots_x, knots_y), axis=-1))
-    splines = [RectBivariateSpline(knots_y, knots_x, at_knots[..., k]) for k in (0, 1)]
-    return np.stack([spline(y, x) for spline in splines], axis=-1)
-
-
-def _knots(start: int, length: int) -> NDArray[np.float64]:
-    count = max(4, 1 + -(-(length - 1) // _LATTICE_STEP_PX))
-    return np.linspace(start, start + max(length - 1, 3), count)
-
-
 def resample_tile(
     band: Band, mapping: Mapping, tile: Tile, interpolation: Interpolation
 ) -> tuple[NDArray[np.generic], Mask]:
@@ -106,10 +43,13 @@ def resample_tile(
 
     A pixel is valid where it lies inside the moving image and no invalid pixel has a part in it.
     """
-    positions = source_positions(mapping, tile)
+    positions = mapping.positions(tile)
     shape = tile.height, tile.width
-    low = np.floor(np.nanmin(positions, axis=(0, 1))).astype(int) - _SUPPORT_PX
-    high = np.ceil(np.nanmax(positions, axis=(0, 1))).astype(int) + _SUPPORT_PX + 1
+    # The mapping is smooth: a coarse sample of it, edges included, tells its extent to a pixel.
+    rows, columns = (np.append(np.arange(0, n, _SAMPLE_PX), n - 1) for n in shape)
+    some = positions[np.ix_(rows, columns)]
+    low = np.floor(np.nanmin(some, axis=(0, 1))).astype(int) - _SUPPORT_PX - 1
+    high = np.ceil(np.nanmax(some, axis=(0, 1))).astype(int) + _SUPPORT_PX + 2
     x0, y0 = np.maximum(low, 0)
     x1, y1 = np.minimum(high, band.size_px)
     if x1 - x0 < 1 or y1 - y0 < 1:
@@ -138,8 +78,9 @@ def resample(
     source = _for_remap(pixels if everything else _filled(pixels, valid), interpolation)
     sampled = cv2.remap(source, map_xy, None, _FLAGS[interpolation], borderMode=cv2.BORDER_REPLICATE)
     half = 0.5 if interpolation == "nearest" else 0.0
-    inside = (positions >= np.subtract(sensor_start, half)).all(axis=-1)
-    inside &= (positions <= np.subtract(sensor_end, 1 - half)).all(axis=-1)
+    inside = np.ones(positions.shape[:2], dtype=bool)
+    for along, start, end in zip((positions[..., 0], positions[..., 1]), sensor_start, sensor_end, strict=True):
+        inside &= (along >= start - half) & (along <= end - 1 + half)
     if not everything:
         flag = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
         weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)

@@ -21,9 +21,10 @@ from rasterio.windows import Window
 from agalign import geometry
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
+from agalign.mapping import Mapping
 from agalign.raster import open_raster, read_window
-from agalign.records import Band, Capture, Georeference
-from agalign.warp import Mapping, Tile, resample_tile, tiles
+from agalign.records import Band, Capture, Georeference, Tile
+from agalign.warp import resample_tile, tiles
 
 
 @dataclass(frozen=True)

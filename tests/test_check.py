@@ -9,7 +9,7 @@ from agalign.config import CheckSettings
 from agalign.records import JointResult, Residual, Seed
 
 SEED = Seed("rig", np.eye(3), 100.0, 100.0, 5.0)
-GOOD_JOINT = JointResult(np.eye(3), 0.1, 0.95, 0.004, 75, (0.5, 1.0), "fast", "homography", 0.05, 0.1)
+GOOD_JOINT = JointResult(np.eye(3), 0.1, 0.95, 0.004, 75, (0.5, 1.0), "fast", "homography", 0.05, ((0.07, 0.07),) * 4)
 GOOD_RESIDUAL = Residual(np.zeros((50, 2)), np.zeros((50, 2)), 0.05, 0.2, 1.0, 0.01)
 SIZE = (1280, 960)
 
@@ -28,7 +28,7 @@ def test_all_well() -> None:
     ("joint", "residual", "word"),
     [
         (replace(GOOD_JOINT, retrieval=0.1), GOOD_RESIDUAL, "retrieval"),
-        (replace(GOOD_JOINT, corner_std_px=5.0), GOOD_RESIDUAL, "corners"),
+        (replace(GOOD_JOINT, corner_std_xy_px=((0.1, 0.1), (3.0, 4.0))), GOOD_RESIDUAL, "corners"),
         (replace(GOOD_JOINT, fixed_to_moving=np.diag([-1.0, 1, 1])), GOOD_RESIDUAL, "folds"),
         (
             replace(GOOD_JOINT, fixed_to_moving=np.array([[1, 0, 0], [0, 1, 0], [-7e-4, 0, 1.0]])),
@@ -55,7 +55,7 @@ def test_any_doubt_is_enough(joint: JointResult | None, residual: Residual | Non
 def test_an_aligned_input_is_left_as_it_is() -> None:
     within = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.1, 0.1))
     beyond = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.4, 0.1))
-    precise = replace(within, corner_std_px=0.01)
+    precise = replace(within, corner_std_xy_px=((0.01, 0.0),) * 4)
     assert is_as_it_was(within, np.eye(3), SIZE, CheckSettings())
     assert not is_as_it_was(beyond, np.eye(3), SIZE, CheckSettings())
     assert not is_as_it_was(precise, np.eye(3), SIZE, CheckSettings())

@@ -210,7 +210,7 @@ def test_a_full_disk_is_said_and_leaves_no_half_file(tmp_path: Path) -> None:
 
     done = agalign(tmp_path / "in", "-o", tmp_path / "out", preexec_fn=limit)
     assert done.returncode == 1
-    assert "a.tif: cannot be written" in done.stderr
+    assert "cannot be written" in done.stderr
     assert not (tmp_path / "out" / "a.tif").exists()
     assert not list((tmp_path / "out").glob(".*"))
 
@@ -272,7 +272,7 @@ except SystemExit:
 
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX here")
 def test_an_interrupted_run_goes_on_where_it_was(flight: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "agalign", str(flight), "-o", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "agalign", str(flight), "-o", str(tmp_path / "out"), "--jobs", "1"]
     first = tmp_path / "out" / "0000SET" / "000" / "IMG_0001.json"
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 120

@@ -4,8 +4,9 @@ import torch
 
 from agalign import geometry
 from agalign.config import FastRecipe, JointSettings, PaperRecipe
-from agalign.errors import ConfigurationError, NotEnoughTextureError
-from agalign.joint import JointAligner, align_jointly, choose_device
+from agalign.errors import ConfigurationError
+from agalign.flight import align_from_scratch
+from agalign.joint import JointAligner, Subject, choose_device
 from agalign.records import JointResult, Raster
 
 from .conftest import textured_image, textured_pair
@@ -20,8 +21,13 @@ def rasters(matrix: np.ndarray, seed: int = 0) -> tuple[Raster, Raster]:
     return Raster(fixed, valid), Raster(moving, valid)
 
 
+def scratch(fixed: Raster, moving: Raster, seed: np.ndarray, settings: JointSettings) -> JointResult | str:
+    return align_from_scratch(Subject(fixed, [moving], [seed], [1], [True]), settings, lambda *_: None)[0]
+
+
 def run(settings: JointSettings, seed: np.ndarray = NEAR, **kwargs: int) -> JointResult:
-    result, _ = align_jointly(*rasters(TRUTH, **kwargs), seed, settings, trusted=True, progress=lambda *_: None)
+    result = scratch(*rasters(TRUTH, **kwargs), seed, settings)
+    assert isinstance(result, JointResult)
     return result
 
 
@@ -53,7 +59,8 @@ def test_a_translation_stays_a_translation() -> None:
     start = geometry.translation(4.0, -2.0)
     fixed, moving = rasters(geometry.translation(6.0, -4.0))
     settings = JointSettings(model_family="translation")
-    result, _ = align_jointly(fixed, moving, start, settings, trusted=True, progress=lambda *_: None)
+    result = scratch(fixed, moving, start, settings)
+    assert isinstance(result, JointResult)
     np.testing.assert_allclose(result.fixed_to_moving[:2, :2], np.eye(2), atol=1e-6)
     np.testing.assert_allclose(result.fixed_to_moving[2], [0, 0, 1], atol=1e-9)
     np.testing.assert_allclose(result.fixed_to_moving[:2, 2], [6, -4], atol=0.08)
@@ -62,28 +69,37 @@ def test_a_translation_stays_a_translation() -> None:
 def test_unrelated_images_are_not_told_apart() -> None:
     valid = np.ones((320, 400), bool)
     pair = [Raster(textured_image(400, 320, s), valid) for s in (8, 9)]
-    result, _ = align_jointly(*pair, np.eye(3), JointSettings(), trusted=True, progress=lambda *_: None)
+    result = scratch(*pair, np.eye(3), JointSettings())
+    assert isinstance(result, JointResult)
     assert result.retrieval < 0.1
 
 
 def test_rgb_against_a_single_band() -> None:
     fixed, moving = rasters(TRUTH)
     rgb = np.stack([fixed.pixels, 0.5 * fixed.pixels + 1, textured_image(400, 320, 3)])
-    result, net = align_jointly(
-        Raster(rgb, fixed.valid), moving, NEAR, JointSettings(), trusted=True, progress=lambda *_: None
-    )
-    assert net.fixed_first.convolution.weight.shape[1] == 3
+    result = scratch(Raster(rgb, fixed.valid), moving, NEAR, JointSettings())
+    assert isinstance(result, JointResult)
     assert geometry.mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
 
 
 def test_nothing_to_learn_from() -> None:
     fixed, moving = rasters(TRUTH)
     flat = Raster(np.zeros_like(fixed.pixels), fixed.valid)
-    with pytest.raises(NotEnoughTextureError):
-        align_jointly(flat, moving, NEAR, JointSettings(), trusted=True, progress=lambda *_: None)
+    assert "contrast" in str(scratch(flat, moving, NEAR, JointSettings()))
     apart = geometry.translation(390, 0)
-    with pytest.raises(NotEnoughTextureError):
-        align_jointly(fixed, moving, apart, JointSettings(), trusted=True, progress=lambda *_: None)
+    assert "keypoints" in str(scratch(fixed, moving, apart, JointSettings()))
+
+
+def test_one_network_for_two_bands_and_one_that_does_not_belong() -> None:
+    fixed, moving = rasters(TRUTH)
+    stranger = Raster(textured_image(400, 320, 9), fixed.valid)
+    other = Raster(np.tanh(fixed.pixels), fixed.valid)
+    subject = Subject(fixed, [moving, stranger, other], [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
+    found = align_from_scratch(subject, JointSettings(), lambda *_: None)
+    assert all(isinstance(r, JointResult) for r in found)
+    assert geometry.mean_error_px(found[0].fixed_to_moving, TRUTH, 400, 320) < 0.1
+    assert found[1].retrieval < 0.1
+    assert geometry.mean_error_px(found[2].fixed_to_moving, np.eye(3), 400, 320) < 0.1
 
 
 @pytest.mark.parametrize(("sharing", "left"), [("siamese", 0.35), ("pseudo-siamese", 0.35), ("unshared", 0.9)])
@@ -94,9 +110,8 @@ def test_paper_recipe_lowers_the_error(sharing: str, left: float) -> None:
     # The paper's siamese network is for one modality: give it the same contrast.
     valid = np.ones(fixed.shape, bool)
     moving = -moving if sharing == "siamese" else moving
-    result, _ = align_jointly(
-        Raster(fixed, valid), Raster(moving, valid), NEAR, settings, trusted=True, progress=lambda *_: None
-    )
+    result = scratch(Raster(fixed, valid), Raster(moving, valid), NEAR, settings)
+    assert isinstance(result, JointResult)
     assert result.recipe == "paper"
     assert result.levels == (0.25, 0.5, 1.0)
     start = geometry.mean_error_px(NEAR, TRUTH, 400, 320)
@@ -104,10 +119,7 @@ def test_paper_recipe_lowers_the_error(sharing: str, left: float) -> None:
 
 
 def test_levels_halve_down_to_the_coarsest() -> None:
-    valid = np.ones((960, 1280), bool)
-    big = Raster(np.zeros((960, 1280), np.float32), valid)
-    aligner = JointAligner(big, big, JointSettings(), lambda *_: None)
-    assert aligner.learn_scales() == [0.125, 0.25, 0.5]
+    assert JointAligner(JointSettings(), lambda *_: None).learn_scales(1280) == [0.125, 0.25, 0.5]
 
 
 def test_a_device_that_is_not_there_is_a_configuration_error() -> None:

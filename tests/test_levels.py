@@ -1,9 +1,10 @@
 import numpy as np
 import torch
 
-from agalign.levels import Sampler, footprints_inside, make_level
+from agalign import lens
+from agalign.levels import Level, Sampler, footprints_inside, make_level, make_view
 from agalign.patches import Keypoints, patch_grid, transform
-from agalign.records import Raster
+from agalign.records import Lens, Raster
 
 from .conftest import textured_image
 
@@ -18,20 +19,25 @@ def rasters() -> tuple[Raster, Raster]:
     return Raster(fixed, valid), Raster(np.where(hole, moving, 1e6).astype(np.float32), hole)
 
 
+def level_of(fixed: Raster, *moving: Raster) -> Level:
+    return make_level(fixed, moving, [np.eye(3)] * len(moving), 1.0, 0.05, torch.Generator().manual_seed(0), CPU)
+
+
 def test_images_are_standardised_over_their_valid_pixels_only() -> None:
-    level = make_level(*rasters(), 1.0, 1.0, 0.05, CPU)
+    level = level_of(*rasters())
     valid = torch.from_numpy(rasters()[1].valid)
-    inside = level.moving.image[0][valid]
+    inside = level.moving[0].image[0][valid]
     assert abs(float(inside.mean())) < 1e-4
     assert abs(float(inside.std()) - 1) < 1e-3
-    assert float(level.moving.image[0][~valid].abs().max()) == 0
+    assert float(level.moving[0].image[0][~valid].abs().max()) == 0
 
 
 def test_keypoints_never_touch_invalid_pixels() -> None:
-    level = make_level(*rasters(), 1.0, 1.0, 0.05, CPU)
+    level = level_of(*rasters())
     h = torch.tensor([[1.0, 0, 7.0], [0, 1.0, -4.0], [0, 0, 1.0]])
-    p = Sampler(torch.Generator().manual_seed(0)).draw(level, level.anywhere, h, 500, 1.0)
+    p, inside = Sampler(torch.Generator().manual_seed(0)).draw(level, level.anywhere, [h], 500, 1.0)
     assert len(p) == 500
+    assert bool(inside.all())
     touched = transform(h, patch_grid(p)).reshape(-1, 2)
     assert (touched >= 0).all()
     assert (touched <= torch.tensor([319.0, 239.0])).all()
@@ -42,7 +48,7 @@ def test_keypoints_never_touch_invalid_pixels() -> None:
 
 
 def test_held_out_cells_are_apart_from_training() -> None:
-    level = make_level(*rasters(), 1.0, 1.0, 0.05, CPU)
+    level = level_of(*rasters())
     train = {tuple(p) for p in level.trainable.tolist()}
     held = {tuple(p) for p in level.held_out.tolist()}
     assert len(held) > 500
@@ -55,14 +61,46 @@ def test_keypoints_lie_where_there_is_contrast() -> None:
     fixed, moving = rasters()
     flat = fixed.pixels.copy()
     flat[:, :160] = 0.3
-    level = make_level(Raster(flat, fixed.valid), moving, 1.0, 1.0, 0.05, CPU)
+    level = level_of(Raster(flat, fixed.valid), moving)
     assert int((level.anywhere[:, 0] < 158).sum()) == 0
 
 
 def test_points_beyond_the_horizon_are_outside() -> None:
-    level = make_level(*rasters(), 1.0, 1.0, 0.05, CPU)
+    level = level_of(*rasters())
     p = Keypoints(torch.tensor([[160.0, 60.0]]), torch.zeros(1), torch.ones(1))
     away = torch.tensor([[1.0, 0, 1e9], [0, 1.0, 0], [0, 0, 1.0]])
-    assert not bool(footprints_inside(level, p, away)[0])
+    assert not bool(footprints_inside(level, 0, p, away)[0])
     singular = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [-1 / 160, 0, 1.0]])
-    assert not bool(footprints_inside(level, p, singular)[0])
+    assert not bool(footprints_inside(level, 0, p, singular)[0])
+
+
+def test_keypoints_that_lie_in_the_most_images_come_first() -> None:
+    fixed, moving = rasters()
+    level = level_of(fixed, moving, moving)
+    near, far = torch.eye(3), torch.tensor([[1.0, 0, 200.0], [0, 1.0, 0], [0, 0, 1.0]])
+    p, inside = Sampler(torch.Generator().manual_seed(0)).draw(level, level.anywhere, [near, far], 100, 1.0)
+    assert inside.shape == (100, 2)
+    in_both = inside.all(dim=1)
+    assert int(in_both.sum()) > 0
+    assert bool((in_both[:-1] >= in_both[1:]).all())
+    for band, h in enumerate((near, far)):
+        torch.testing.assert_close(inside[:, band], footprints_inside(level, band, p, h))
+
+
+def test_patches_are_sampled_through_the_lens() -> None:
+    # A raw image whose value is its own undistorted x coordinate: undistorted positions must find their x there.
+    model = Lens(300.0, 300.0, 158.0, 121.0, (-0.1, 0.15, 0.0004, -0.0003, -0.03))
+    x, y = np.meshgrid(np.arange(320.0), np.arange(240.0))
+    raw = lens.undistort(model, np.stack([x, y], axis=-1))[..., 0].astype(np.float32)
+    valid = np.ones(raw.shape, bool)
+    view = make_view(Raster(raw, valid, model), 1.0, CPU)
+    grid = patch_grid(Keypoints(torch.tensor([[60.0, 50.0], [200.0, 180.0]]), torch.tensor([0.3, 2.0]), torch.ones(2)))
+    found = view.patches(grid)[:, 0] * float(raw.std()) + float(raw.mean())
+    torch.testing.assert_close(found, grid[..., 0], atol=0.02, rtol=0)
+
+
+def test_level_matrices_go_to_full_resolution_and_back() -> None:
+    matrix = np.array([[1.01, 0.02, 5.0], [-0.01, 0.99, -3.0], [1e-5, -2e-5, 1.0]])
+    fixed, moving = rasters()
+    level = make_level(fixed, [moving], [matrix], 0.5, 0.05, torch.Generator().manual_seed(0), CPU)
+    np.testing.assert_allclose(level.full_matrix(level.homography(matrix, 0), 0), matrix, atol=1e-4)

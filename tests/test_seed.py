@@ -3,6 +3,7 @@ import pytest
 
 from agalign import geometry
 from agalign.config import SeedSettings
+from agalign.mapping import Mapping
 from agalign.records import Band, Georeference, Raster
 from agalign.seed import best_seed, geo_seed, is_trusted, overlay, warped
 
@@ -82,8 +83,17 @@ def test_overlay_matches_the_outlines() -> None:
 
 def test_warped_shows_the_moving_image_on_the_fixed_grid() -> None:
     fixed, moving = rasters(SHIFTED)
-    there = warped(moving, SHIFTED, fixed.size_px, (1.0, 1.0))
+    there = warped(moving, Mapping(SHIFTED), fixed.size_px)
     inside = there.valid & fixed.valid
     assert np.corrcoef(fixed.pixels[inside], there.pixels[inside])[0, 1] < -0.9
-    half = warped(moving, SHIFTED, (200, 160), (0.5, 0.5))
+    half = warped(moving, Mapping(SHIFTED), (200, 160), (0.5, 0.5))
     assert half.size_px == (200, 160)
+
+
+def test_the_flights_mapping_is_enough_where_it_leaves_no_doubt() -> None:
+    near = geometry.compose(SHIFTED, geometry.translation(0.3, 0.1))
+    seed = best_seed(*rasters(SHIFTED), {"model": near, "identity": np.eye(3)}, SeedSettings())
+    assert seed.kind in ("model", "structure")
+    assert geometry.mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 1
+    lost = best_seed(*rasters(SHIFTED), {"model": geometry.translation(300, 0), "rig": SHIFTED}, SeedSettings())
+    assert geometry.mean_error_px(lost.fixed_to_moving, SHIFTED, 400, 320) < 1

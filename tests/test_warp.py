@@ -10,15 +10,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from agalign import geometry, lens, synthetic
-from agalign.records import Band
+from agalign.mapping import Mapping
+from agalign.records import Band, Tile
 from agalign.warp import (
-    Mapping,
-    Tile,
     _largest_rectangle,
     common_area,
     resample,
     resample_tile,
-    source_positions,
     tiles,
 )
 
@@ -39,7 +37,7 @@ def test_source_positions_are_the_mapping(flight: Path) -> None:
     lenses = [synthetic.BANDS[k].lens(480, 360) for k in (1, 3)]
     for mapping in (Mapping(H), Mapping(H, *lenses), Mapping(H, None, lenses[1])):
         tile = Tile(100, 40, 211, 97)
-        positions = source_positions(mapping, tile)
+        positions = mapping.positions(tile)
         x, y = np.meshgrid(np.arange(100, 311), np.arange(40, 137))
         np.testing.assert_allclose(positions, mapping(np.stack([x, y], axis=-1)), atol=1e-3)
 

@@ -7,8 +7,8 @@ import rasterio
 from agalign import geometry
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
-from agalign.records import Band, CameraIdentity, Capture, Georeference
-from agalign.warp import Mapping, Tile
+from agalign.mapping import Mapping
+from agalign.records import Band, CameraIdentity, Capture, Georeference, Tile
 from agalign.write import Layer, write_stack
 
 from .conftest import textured_image

@@ -1,0 +1,269 @@
+"""One network for a whole flight: learnt once on a few captures of a camera, then frozen for all of them.
+
+The captures of a flight share their cameras, so what tells the bands' patches apart on a few of them does on all. Each
+capture keeps its own psi (what the paper leaves as future work).
+"""
+
+import copy
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from agalign import geometry
+from agalign._version import __version__
+from agalign.config import JointSettings, Settings
+from agalign.descriptor import Descriptor
+from agalign.errors import AgalignError, GeometryError, InputError, NotEnoughTextureError, OutputError
+from agalign.geometry import Matrix
+from agalign.joint import JointAligner, Progress, Subject
+from agalign.raster import read_for_alignment
+from agalign.records import Band, Capture, JointResult, Raster, SeedKind
+from agalign.seed import RigSeed, best_seed, is_trusted, seed_candidates
+
+_FORMAT = "agalign-model/1"
+
+
+@dataclass(frozen=True)
+class FlightModel:
+    """A learnt network and the mappings that it found, for one camera."""
+
+    net: Descriptor
+    camera: str
+    """As `camera_key` has it."""
+    bands: tuple[str, ...]
+    """Names of the moving bands; the network's side of one is its place here, counted from 1."""
+    mappings: Mapping[str, Matrix]
+    """Median fixed_to_moving of the bands that were aligned, undistorted px of the files."""
+    fingerprint: str
+    """Of what it was learnt from, and how."""
+
+    def side(self, band: str) -> int | None:
+        """The network's side for a moving band; None where it knows none of that name."""
+        return self.bands.index(band) + 1 if band in self.bands else None
+
+
+def camera_key(capture: Capture) -> str:
+    """Captures with the same key were taken by the same camera, with the same bands and reference."""
+    camera = capture.camera
+    bands = ", ".join(f"{b.name} {b.width_px}x{b.height_px}" for b in (capture.reference, *capture.moving))
+    return f"{camera.make} {camera.model} {camera.serial}".strip() + f" [{bands}]"
+
+
+def flights_of(captures: Iterable[Capture]) -> list[list[Capture]]:
+    """The captures grouped by camera and flight, in their order."""
+    groups: dict[tuple[str, str], list[Capture]] = {}
+    for capture in captures:
+        groups.setdefault((camera_key(capture), capture.flight_id), []).append(capture)
+    return list(groups.values())
+
+
+def model_names(groups: Sequence[Sequence[Capture]]) -> list[str]:
+    """A file name for each group's model: the camera, and a number where one camera has several."""
+    names: list[str] = []
+    for group in groups:
+        camera = group[0].camera
+        stem = re.sub(r"[^\w.+-]+", "_", f"{camera.model} {camera.serial}".strip()) or "camera"
+        names.append(f"{stem}-{names.count(stem) + 1}" if stem in names else stem)
+    return [f"{name}.safetensors" for name in names]
+
+
+# ---- learning
+
+
+def learn_flight(
+    captures: Sequence[Capture], rig_seed: RigSeed, settings: Settings, progress: Progress,
+    start: FlightModel | None = None,
+) -> FlightModel | None:  # fmt: skip
+    """Learn one network on a few captures spread over the flight; None where none of them could be aligned.
+
+    With `start`, its network is where theta starts.
+    """
+    chosen = _choose(captures, settings.flight.captures)
+    loaded = [s for c in chosen if (s := _subject(c, rig_seed, settings)) is not None]
+    if not loaded:
+        return None
+    aligner = JointAligner(settings.joint, progress)
+    subjects = [subject for subject, _ in loaded]
+    bands = tuple(b.name for b in captures[0].moving)
+    if start is None:
+        net = aligner.new_descriptor([1] * (1 + len(bands)), half_rectified=True, unit_length=True)
+    else:
+        net = copy.deepcopy(start.net)
+    try:
+        aligner.learn(subjects, net, learnt=start is not None)
+        results = [aligner.refine(net, subject) for subject in subjects]
+    except NotEnoughTextureError:
+        return None
+    found: dict[str, list[Matrix]] = {}
+    for (_, names), subject_results in zip(loaded, results, strict=True):
+        for name, result in zip(names, subject_results, strict=True):
+            if isinstance(result, JointResult) and result.retrieval >= settings.joint.fast.step_gate:
+                found.setdefault(name, []).append(result.fixed_to_moving)
+    if not found:
+        return None
+    size = captures[0].reference.size_px
+    scale = min(1.0, settings.joint.longest_side_px / max(size))
+    mappings = {}
+    for name, matrices in found.items():
+        small = median_mapping(matrices, (round(size[0] * scale), round(size[1] * scale)))
+        moving = next(b for b in captures[0].moving if b.name == name)
+        down = [_reduction(b, settings.joint.longest_side_px) for b in (captures[0].reference, moving)]
+        mappings[name] = geometry.rescale(small, *[(1 / x, 1 / y) for x, y in down])
+    return FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings, start))
+
+
+def learning_fingerprint(captures: Sequence[Capture], settings: Settings, start: FlightModel | None) -> str:
+    """Changes when the captures that would be learnt from, or the settings, do."""
+    names = [(c.label, [(b.path.name, b.path.stat().st_size) for b in c.bands if b.path.exists()]) for c in captures]
+    text = f"{__version__} {settings.joint} {settings.seed} {settings.flight} {names} {start and start.fingerprint}"
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matrix:
+    """The homography through the median of where each point of a lattice is sent."""
+    if len(matrices) == 1:
+        return matrices[0]
+    points = geometry.lattice(*size_px, 9, 7)
+    there = np.median([geometry.apply(m, points) for m in matrices], axis=0)
+    fitted, _ = cv2.findHomography(points, there, 0)
+    return geometry.normalised(fitted)
+
+
+def _choose(captures: Sequence[Capture], count: int) -> list[Capture]:
+    """Of each of `count` stretches of the flight, the most textured of three captures."""
+    chosen = []
+    for stretch in np.array_split(np.arange(len(captures)), min(count, len(captures))):
+        some = stretch[np.unique(np.linspace(0, len(stretch) - 1, 3).round().astype(int))]
+        candidates = [captures[i] for i in some]
+        chosen.append(candidates[0] if len(candidates) == 1 else max(candidates, key=_texture))
+    return chosen
+
+
+def _texture(capture: Capture) -> float:
+    """Median gradient of the reference relative to its spread; 0 where it cannot be read."""
+    try:
+        raster = read_for_alignment(capture.reference, 640)
+    except AgalignError:
+        return 0.0
+    if raster.valid.mean() < 0.5:
+        return 0.0
+    inside = raster.pixels[raster.valid]
+    gx, gy = (cv2.Sobel(raster.pixels, cv2.CV_32F, *d, scale=1 / 8) for d in ((1, 0), (0, 1)))
+    return float(np.median(cv2.magnitude(gx, gy)[raster.valid]) / max(float(inside.std()), 1e-12))
+
+
+def _reduction(band: Band, longest_side_px: int) -> tuple[float, float]:
+    reduction = max(1.0, max(band.size_px) / longest_side_px)
+    return round(band.width_px / reduction) / band.width_px, round(band.height_px / reduction) / band.height_px
+
+
+def _subject(capture: Capture, rig_seed: RigSeed, settings: Settings) -> tuple[Subject, list[str]] | None:
+    """A capture to learn from and the names of its moving bands; None where there is no pair that can be read."""
+    longest = settings.joint.longest_side_px
+    try:
+        fixed = read_for_alignment(capture.reference, longest)
+    except AgalignError:
+        return None
+    names, rasters, mappings, trusted = [], [], [], []
+    for band in capture.moving:
+        if (capture.reference.lens is None) != (band.lens is None):
+            continue
+        with suppress(AgalignError):
+            raster = read_for_alignment(band, longest)
+            candidates = seed_candidates(capture.reference, band, rig_seed, settings.seed)
+            scales = _reduction(capture.reference, longest), _reduction(band, longest)
+            down: dict[SeedKind, Matrix] = {k: geometry.rescale(m, *scales) for k, m in candidates.items()}
+            seed = best_seed(fixed, raster, down, settings.seed)
+            names.append(band.name)
+            rasters.append(raster)
+            mappings.append(seed.fixed_to_moving)
+            trusted.append(is_trusted(seed, settings.seed))
+    if not names:
+        return None
+    order = [b.name for b in capture.moving]
+    return Subject(fixed, rasters, mappings, [order.index(n) + 1 for n in names], trusted), names
+
+
+# ---- using
+
+
+def refine_with(
+    model: FlightModel, subject: Subject, joint: JointSettings, progress: Progress
+) -> list[JointResult | str]:
+    """Every psi of a capture with the flight's theta frozen."""
+    results = JointAligner(joint, progress).refine(model.net, subject)
+    return [r if isinstance(r, str) else replace(r, recipe="flight") for r in results]
+
+
+def align_from_scratch(subject: Subject, joint: JointSettings, progress: Progress) -> list[JointResult | str]:
+    """Theta and every psi of one capture, starting from nothing but the seeds."""
+    aligner = JointAligner(joint, progress)
+    results: list[JointResult | str] = []
+    if joint.recipe == "paper":
+        for moving, seed in zip(subject.moving, subject.mappings, strict=True):
+            try:
+                results.append(aligner.paper(subject.fixed, moving, seed))
+            except (NotEnoughTextureError, GeometryError) as why_not:
+                results.append(str(why_not))
+        return results
+    channels = [_channels(subject.fixed), *(_channels(m) for m in subject.moving)]
+    net = aligner.new_descriptor(channels, half_rectified=True, unit_length=True)
+    try:
+        steps, loss = aligner.learn([subject], net)
+        results = aligner.refine(net, subject)
+    except NotEnoughTextureError as why_not:
+        return [str(why_not)] * len(subject.moving)
+    return [r if isinstance(r, str) else replace(r, loss=loss, iterations=steps) for r in results]
+
+
+def _channels(raster: Raster) -> int:
+    return 1 if raster.pixels.ndim == 2 else len(raster.pixels)
+
+
+# ---- files
+
+
+def save_model(model: FlightModel, path: Path) -> None:
+    """Write a model, complete or not at all. Raises OutputError."""
+    tensors = {f"theta.{k}": v.detach().cpu().contiguous() for k, v in model.net.state_dict().items()}
+    tensors |= {f"mapping.{k}": torch.tensor(m) for k, m in model.mappings.items()}
+    facts = {
+        "format": _FORMAT, "agalign": __version__, "camera": model.camera, "bands": json.dumps(model.bands),
+        "sharing": model.net.sharing, "fingerprint": model.fingerprint,
+    }  # fmt: skip
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_file(tensors, partial, facts)
+        partial.replace(path)
+    except (OSError, SafetensorError) as error:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise OutputError(f"{path}: cannot be written ({error})") from None
+
+
+def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
+    """Raises InputError, naming the file, where it is not a model of this program."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            facts = file.metadata() or {}
+            if facts.get("format") != _FORMAT:
+                raise InputError(f"{path}: is no model of agalign; give a file of an earlier run's models folder")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        bands = tuple(json.loads(facts["bands"]))
+        net = Descriptor(facts["sharing"], [1] * (1 + len(bands)), half_rectified=True, unit_length=True)
+        net.load_state_dict({k.removeprefix("theta."): v for k, v in tensors.items() if k.startswith("theta.")})
+    except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be read as a model ({str(error).splitlines()[0]})") from None
+    mappings = {k.removeprefix("mapping."): v.numpy() for k, v in tensors.items() if k.startswith("mapping.")}
+    return FlightModel(net.to(device()), facts["camera"], bands, mappings, facts["fingerprint"])

@@ -1,0 +1,100 @@
+"""Psi with theta frozen: Gauss-Newton on L0 squared, inverse-compositional.
+
+The descriptors of the reference and their gradient over a shift are worked out once and serve every moving band and
+every step (Baker & Matthews 2004, Sec. 3.2): a step costs one pass of the moving band's patches.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from agalign import losses
+from agalign.config import FastRecipe
+from agalign.descriptor import REFERENCE, Descriptor
+from agalign.errors import NotEnoughTextureError
+from agalign.gauss_newton import Step, shift_gradient, solve
+from agalign.levels import Level, footprints_inside
+from agalign.patches import Keypoints, far_apart, patch_grid, transform
+from agalign.records import ModelFamily
+
+LEAST_KEYPOINTS = 16
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Patches of the reference as the network describes them."""
+
+    keypoints: Keypoints
+    f: Tensor
+    """(N, 256) descriptors."""
+    gradient: Tensor
+    """(N, 256, 2) their derivative over a shift, per px."""
+
+
+def describe_fixed(net: Descriptor, level: Level, keypoints: Keypoints) -> Tensor:
+    """f(x) for keypoints of I, (N, 256)."""
+    out: Tensor = net(level.fixed.patches(patch_grid(keypoints)), REFERENCE)
+    return out
+
+
+def moving_patches(level: Level, band: int, homography: Tensor, keypoints: Keypoints) -> Tensor:
+    """B(w(x; psi); I'), (N, C, 16, 16): every sample goes through the homography, not only the keypoint's frame."""
+    return level.moving[band].patches(transform(homography, patch_grid(keypoints)))
+
+
+@torch.no_grad()
+def make_anchors(net: Descriptor, level: Level, keypoints: Keypoints, difference_px: float) -> Anchors:
+    """Descriptors and gradient of the reference's patches."""
+
+    def describe(k: Keypoints) -> Tensor:
+        return describe_fixed(net, level, k)
+
+    return Anchors(keypoints, describe(keypoints), shift_gradient(describe, keypoints, difference_px))
+
+
+@torch.no_grad()
+def psi_step(
+    net: Descriptor, level: Level, band: int, side: int, homography: Tensor, anchors: Anchors,
+    family: ModelFamily | None, recipe: FastRecipe,
+) -> Step:  # fmt: skip
+    """One Gauss-Newton step. Raises NotEnoughTextureError where too few patches lie in both images."""
+    rows = footprints_inside(level, band, anchors.keypoints, homography).nonzero()[:, 0]
+    if len(rows) < LEAST_KEYPOINTS:
+        raise NotEnoughTextureError(f"only {len(rows)} keypoints lie on the common valid area")
+    p = anchors.keypoints[rows]
+    residual = anchors.f[rows] - net(moving_patches(level, band, homography, p), side)
+    return solve(
+        p, residual, anchors.gradient[rows], level.fixed.size_px, family,
+        recipe.most_corner_std_px, recipe.longest_step_px,
+    )  # fmt: skip
+
+
+def refine(
+    net: Descriptor, level: Level, band: int, side: int, start: Tensor, anchors: Anchors,
+    family: ModelFamily | None, recipe: FastRecipe,
+) -> tuple[Tensor, Step]:  # fmt: skip
+    """Steps from `start` until one moves no corner by more than `final_rest_px`."""
+    h = start
+    for _ in range(recipe.final_steps):
+        step = psi_step(net, level, band, side, h, anchors, family, recipe)
+        h = (h.double() @ step.change).float()
+        if step.length_px < recipe.final_rest_px:
+            break
+    return h, step
+
+
+@torch.no_grad()
+def retrieval(
+    net: Descriptor, level: Level, band: int, side: int, homography: Tensor, keypoints: Keypoints, f: Tensor,
+    recipe: FastRecipe,
+) -> tuple[float, float]:  # fmt: skip
+    """How often the nearest descriptor in I' is the right one among the keypoints that lie in both images, and what
+    guessing would give. `f` (N, 256) are the reference's descriptors.
+    """
+    rows = footprints_inside(level, band, keypoints, homography).nonzero()[:, 0]
+    if len(rows) < LEAST_KEYPOINTS:
+        return 0.0, 1.0
+    p = keypoints[rows]
+    f_prime = net(moving_patches(level, band, homography, p), side)
+    return losses.retrieval(f[rows], f_prime, far_apart(p, recipe.least_negative_px)), 1 / len(rows)

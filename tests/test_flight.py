@@ -1,0 +1,129 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import agalign
+from agalign import demo, geometry
+from agalign.batch import RunOptions, rig_seed, run_flight
+from agalign.config import FastRecipe, FlightSettings, JointSettings, Settings
+from agalign.discover import discover
+from agalign.errors import ConfigurationError, InputError
+from agalign.flight import (
+    FlightModel,
+    camera_key,
+    flights_of,
+    learn_flight,
+    load_model,
+    median_mapping,
+    model_names,
+    save_model,
+)
+from agalign.sidecar import find_sidecars, read_sidecar
+
+SETTINGS = Settings(flight=FlightSettings(captures=1))
+
+
+def cpu() -> torch.device:
+    return torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def model(flight: Path) -> FlightModel:
+    captures = flights_of(discover(flight).captures)[0]
+    found = learn_flight(captures, rig_seed, SETTINGS, lambda *_: None)
+    assert found is not None
+    return found
+
+
+def test_a_frozen_network_aligns_a_capture_that_it_has_never_seen(flight: Path, tmp_path: Path) -> None:
+    reports = list(run_flight(discover(flight), tmp_path, SETTINGS))
+    bands = [b for r in reports for b in r.sidecar.bands if b.joint]
+    assert {b.joint.recipe for b in bands} == {"flight"}
+    assert {b.joint.iterations for b in bands} == {0}
+    scores = demo.score_against_truth(reports, flight / "truth.json")
+    assert len(scores) == 8
+    assert max(s.median_px for s in scores) < 0.2
+    assert [p.name for p in (tmp_path / "models").iterdir()] == ["RedEdge-M_SY01-0000001-AG.safetensors"]
+
+
+def test_saved_and_loaded_it_is_the_same(model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "models" / "m.safetensors"
+    save_model(model, path)
+    again = load_model(path, cpu)
+    assert (again.camera, again.bands, again.fingerprint) == (model.camera, model.bands, model.fingerprint)
+    for name, matrix in model.mappings.items():
+        np.testing.assert_array_equal(again.mappings[name], matrix)
+    patches = torch.randn(5, 1, 16, 16)
+    for side in range(5):
+        torch.testing.assert_close(again.net(patches, side), model.net(patches, side))
+
+
+def test_what_is_no_model_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    with pytest.raises(InputError, match=r"m\.safetensors"):
+        load_model(path, cpu)
+    path.write_bytes(b"nonsense" * 100)
+    with pytest.raises(InputError, match=r"m\.safetensors"):
+        load_model(path, cpu)
+    from safetensors.torch import save_file
+
+    save_file({"x": torch.zeros(1)}, path)
+    with pytest.raises(InputError, match="no model of agalign"):
+        load_model(path, cpu)
+
+
+def test_a_model_is_used_again_and_refused_for_another_camera(flight: Path, model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    steps = FastRecipe(most_steps=1)  # nothing could be learnt in one step
+    settings = Settings(joint=JointSettings(fast=steps), flight=FlightSettings(captures=1))
+    reports = list(run_flight(discover(flight), tmp_path / "out", settings, model=path))
+    assert all(r.good for r in reports)
+    save_model(replace(model, camera="Another 1 [Green 10x10]"), path)
+    with pytest.raises(ConfigurationError, match=r"m\.safetensors: was learnt for Another 1"):
+        list(run_flight(discover(flight), tmp_path / "out2", settings, model=path))
+
+
+def test_several_processes_give_the_same_numbers(flight: Path, tmp_path: Path) -> None:
+    found = []
+    for jobs in (1, 2):
+        out = tmp_path / str(jobs)
+        agalign.align_folder(flight, out, settings=SETTINGS, run=RunOptions(jobs=jobs))
+        sidecars = [read_sidecar(p) for p in find_sidecars(out)]
+        found.append([(b.grid, b.metrics, b.joint) for s in sidecars for b in s.bands])
+    assert len(found[0]) == 10
+    assert found[0] == found[1]
+
+
+def test_a_second_run_learns_nothing_anew(flight: Path, tmp_path: Path) -> None:
+    list(run_flight(discover(flight), tmp_path, SETTINGS))
+    path = next((tmp_path / "models").iterdir())
+    before = path.stat().st_mtime_ns
+    next(iter(find_sidecars(tmp_path))).unlink()
+    states = [r.state for r in run_flight(discover(flight), tmp_path, SETTINGS)]
+    assert sorted(states) == ["done", "kept"]
+    assert path.stat().st_mtime_ns == before
+
+
+def test_cameras_and_flights_are_kept_apart(flight: Path) -> None:
+    captures = discover(flight).captures
+    other = replace(captures[1], camera=replace(captures[1].camera, serial="X9"))
+    later = replace(captures[1], flight_id="another")
+    assert len(flights_of(captures)) == 1
+    groups = flights_of([*captures, other, later])
+    assert [len(g) for g in groups] == [2, 1, 1]
+    assert camera_key(captures[0]) == camera_key(later) != camera_key(other)
+    assert model_names(groups) == [
+        "RedEdge-M_SY01-0000001-AG.safetensors", "RedEdge-M_X9.safetensors", "RedEdge-M_SY01-0000001-AG-2.safetensors",
+    ]  # fmt: skip
+
+
+def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:
+    good = geometry.translation(10, 5)
+    wrong = geometry.translation(-80, 90)
+    near = geometry.translation(10.1, 5.1)
+    found = median_mapping([good, wrong, near], (400, 300))
+    assert geometry.corner_error_px(found, good, 400, 300) < 0.2
