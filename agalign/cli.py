@@ -146,7 +146,14 @@ Pattern = Annotated[
 ]
 Reference = Annotated[str | None, typer.Option(help="Name of the reference band; by default green.")]
 Jobs = Annotated[
-    int, typer.Option("--jobs", "-j", min=0, show_default=False, help="Captures at a time; by default one a core.")
+    int,
+    typer.Option(
+        "--jobs",
+        "-j",
+        min=0,
+        show_default=False,
+        help="Captures at a time; by default one a core, and one for short flights.",
+    ),
 ]
 IgnoreMetadata = Annotated[bool, typer.Option("--ignore-metadata", help="Use no lens or rig tags.")]
 
@@ -422,9 +429,10 @@ def _run(
     from agalign.batch import Listener, RunOptions, run_flight
     from agalign.joint import choose_device
 
-    # One process feeds a GPU.
-    gpu = choose_device(settings.joint.device).type != "cpu"
-    options = RunOptions(overwrite, jobs or (1 if gpu else os.cpu_count() or 1))
+    # One process feeds a GPU; and to start one costs as much as two captures.
+    on_cpu = choose_device(settings.joint.device).type == "cpu"
+    worth_starting = min(os.cpu_count() or 1, len(flight.captures) // 4) if on_cpu else 1
+    options = RunOptions(overwrite, jobs or max(1, worth_starting))
     reports: list[CaptureReport] = []
     done_pairs, all_pairs = 0, sum(len(c.moving) for c in flight.captures)
     pairs = {c.label: len(c.moving) for c in flight.captures}

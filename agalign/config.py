@@ -46,6 +46,8 @@ class FastRecipe(Stage):
     """Patches in a Gauss-Newton step while learning."""
     final_patches: Positive = 600
     """Patches in a Gauss-Newton step at full resolution."""
+    first_patches: Positive = 200
+    """Patches at full resolution while psi is not at rest."""
     final_steps: Positive = 10
     final_rest_px: float = 0.01
     """psi has converged when a step moves no corner by more than this."""

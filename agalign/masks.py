@@ -8,6 +8,8 @@ from agalign.records import Mask
 
 _LEAST_FILL_SHARE = 0.002
 """A constant patch at the border smaller than this share of the image is content, not fill."""
+_LEAST_SATURATED_PX = 7
+"""Saturated spots narrower than this are content: half a patch still shows their surroundings."""
 
 
 def data_mask(pixels: NDArray[np.generic], nodata: float | None) -> Mask:
@@ -39,11 +41,15 @@ def undeclared_fill(pixels: ArrayLike) -> Mask:
 
 
 def learnable(valid: Mask, pixels: ArrayLike, saturation_value: float | None) -> Mask:
-    """The valid pixels whose value says something: not saturated, and not next to what is."""
+    """The valid pixels whose value says something: not in a saturated area, and not next to one.
+
+    Glints narrower than an area's least width stay: their outlines are structure like any other.
+    """
     if saturation_value is None:
         return valid
     saturated = (np.asarray(pixels) >= saturation_value).astype(np.uint8)
     if not saturated.any():
         return valid
-    grown = cv2.dilate(saturated, np.ones((3, 3), np.uint8)) > 0
+    areas = cv2.morphologyEx(saturated, cv2.MORPH_OPEN, np.ones((_LEAST_SATURATED_PX,) * 2, np.uint8))
+    grown = cv2.dilate(areas, np.ones((3, 3), np.uint8)) > 0
     return np.asarray(valid & ~grown)

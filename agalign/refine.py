@@ -31,6 +31,11 @@ class Anchors:
     gradient: Tensor
     """(N, 256, 2) their derivative over a shift, per px."""
 
+    def head(self, count: int) -> "Anchors":
+        """The first `count` of them."""
+        rows = torch.arange(min(count, len(self.f)), device=self.f.device)
+        return Anchors(self.keypoints[rows], self.f[rows], self.gradient[rows])
+
 
 def describe_fixed(net: Descriptor, level: Level, keypoints: Keypoints) -> Tensor:
     """f(x) for keypoints of I, (N, 256)."""
@@ -74,13 +79,18 @@ def refine(
     net: Descriptor, level: Level, band: int, side: int, start: Tensor, anchors: Anchors,
     family: ModelFamily | None, recipe: FastRecipe,
 ) -> tuple[Tensor, Step]:  # fmt: skip
-    """Steps from `start` until one moves no corner by more than `final_rest_px`."""
-    h = start
+    """Steps from `start` until one moves no corner by more than `final_rest_px`.
+
+    While the steps are long, a part of the anchors tells where to go.
+    """
+    h, some = start, anchors.head(recipe.first_patches)
     for _ in range(recipe.final_steps):
-        step = psi_step(net, level, band, side, h, anchors, family, recipe)
+        step = psi_step(net, level, band, side, h, some, family, recipe)
         h = (h.double() @ step.change).float()
-        if step.length_px < recipe.final_rest_px:
+        if step.length_px < recipe.final_rest_px and some is anchors:
             break
+        if step.length_px < recipe.rest_px:
+            some = anchors
     return h, step
 
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from agalign import geometry, lens
 from agalign.geometry import Matrix, Points
@@ -105,8 +106,9 @@ def make_flight(
 ) -> Path:  # fmt: skip
     """Write `captures` captures of all bands into folder/0000SET/000 and the truth into folder/truth.json.
 
-    The truth is {capture: {"reference": file, "bands": {file: {"ties": [[x_ref, y_ref, x_mov, y_mov], ...]}}}} in raw
-    pixels, centre of the top-left pixel (0, 0), exact to 0.001 px. Returns the path of truth.json.
+    The truth is {capture: {"reference": file, "bands": {file: {"fixed_to_moving": [[...]], "ties": [[x_ref, y_ref,
+    x_mov, y_mov], ...]}}}}: the homography between undistorted pixels, and ties in raw pixels, exact to 0.001 px; the
+    centre of the top-left pixel is (0, 0). Returns the path of truth.json.
     """
     rng = np.random.default_rng(rng_seed)
     poses = [_pose(rng, number) for number in range(captures)]
@@ -125,7 +127,12 @@ def make_flight(
         truth[f"IMG_{number:04d}"] = {
             "reference": names[reference.name],
             "bands": {
-                names[b.name]: {"ties": true_ties(reference, b, pose, size_px)} for b in bands if b is not reference
+                names[b.name]: {
+                    "fixed_to_moving": true_homography(reference, b, pose, size_px).tolist(),
+                    "ties": true_ties(reference, b, pose, size_px),
+                }
+                for b in bands
+                if b is not reference
             },
         }
     path = folder / "truth.json"
@@ -208,7 +215,7 @@ def paint_ground(rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple
     wobble = 0.06 * metre * _noise(rng, side, 1.5 * metre)
     rows = np.cos(across_x * (axis[None, :] + wobble) + across_y * (axis[:, None] + wobble))
     leaves = 0.7 * _noise(rng, side, 0.05 * metre) + 0.5 * _noise(rng, side, 0.25 * metre)
-    crop = 1 / (1 + np.exp(-6 * (rows + leaves + density.astype(np.float32)[parcel])))
+    crop = expit(6 * (rows + leaves + density.astype(np.float32)[parcel]))
     gaps = _noise(rng, side, 0.6 * metre) > 1.5
     crop = np.where(gaps, crop * 0.15, crop)
     crop = np.where(edge < 0.35 * metre, 0.03, crop)

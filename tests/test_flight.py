@@ -1,3 +1,5 @@
+import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -127,3 +129,22 @@ def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:
     near = geometry.translation(10.1, 5.1)
     found = median_mapping([good, wrong, near], (400, 300))
     assert geometry.corner_error_px(found, good, 400, 300) < 0.2
+
+
+def test_any_executor_will_do(flight: Path, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        reports = agalign.align_folder(flight, tmp_path, settings=SETTINGS, run=RunOptions(executor=executor))
+    assert sorted(r.label for r in reports) == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
+    assert all(r.good for r in reports)
+
+
+def test_one_broken_reference_stops_neither_learning_nor_the_others(flight: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "in"
+    shutil.copytree(flight, copy)
+    for pattern in ("IMG_0001_2.tif", "IMG_0002_4.tif"):
+        path = next(copy.rglob(pattern))
+        data = path.read_bytes()
+        path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+    reports = {r.label[-8:]: r for r in run_flight(discover(copy), tmp_path / "out", Settings())}
+    statuses = {b.band: b.status for b in reports["IMG_0002"].sidecar.bands}
+    assert statuses["Blue"] == statuses["Red"] == "aligned"

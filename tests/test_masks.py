@@ -29,10 +29,12 @@ def test_a_few_dark_pixels_at_the_border_are_content() -> None:
     assert not undeclared_fill(image).any()
 
 
-def test_saturated_pixels_and_their_neighbours_are_not_learnt_from() -> None:
-    pixels = np.full((9, 9), 100, np.uint16)
-    pixels[4, 4] = 65520
-    mask = learnable(np.ones((9, 9), bool), pixels, 65520)
-    assert (~mask).sum() == 9
-    assert not mask[3:6, 3:6].any()
-    assert learnable(np.ones((9, 9), bool), pixels, None).all()
+def test_saturated_areas_and_their_neighbours_are_not_learnt_from() -> None:
+    pixels = np.full((30, 30), 100, np.uint16)
+    pixels[5:15, 5:15] = 65520
+    pixels[22, 22:27] = 65520  # a glint
+    everywhere = np.ones((30, 30), bool)
+    mask = learnable(everywhere, pixels, 65520)
+    assert (~mask).sum() == 12 * 12
+    assert not mask[4:16, 4:16].any()
+    assert learnable(everywhere, pixels, None).all()
