@@ -18,9 +18,10 @@ import torch
 from torch import Tensor
 
 from agalign import geometry, losses
-from agalign.config import JointSettings
+from agalign.config import FastRecipe, JointSettings
 from agalign.descriptor import REFERENCE, Descriptor
 from agalign.errors import ConfigurationError, GeometryError, NotEnoughTextureError
+from agalign.gauss_newton import Step
 from agalign.geometry import Matrix
 from agalign.levels import Level, Sampler, make_level
 from agalign.patches import (
@@ -173,7 +174,7 @@ class JointAligner:
         held_out, chance = retrieval(net, level, 0, 1, h, test, f_test, self.settings.fast)
         return JointResult(
             subject.mappings[0], loss, held_out, chance, steps, scales, "paper", self.family or "homography",
-            last_step_px, curvature.corner_std_xy_px,
+            last_step_px, _complete_std(curvature, self.settings.fast),
         )  # fmt: skip
 
     def descend(
@@ -347,7 +348,13 @@ class JointAligner:
             results.append(
                 JointResult(
                     matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family,
-                    step.length_px, step.corner_std_xy_px,
+                    step.length_px, _complete_std(step, recipe),
                 )
             )  # fmt: skip
         return results
+
+
+def _complete_std(step: Step, recipe: FastRecipe) -> tuple[tuple[float, float], ...]:
+    """Random and systematic parts together."""
+    systematic = recipe.systematic_std_px
+    return tuple((math.hypot(x, systematic), math.hypot(y, systematic)) for x, y in step.corner_std_xy_px)
