@@ -14,7 +14,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
@@ -150,7 +150,11 @@ def run_flight(
         yield from _on_executor(waiting, options.executor, _most_in_flight(options.executor))
     elif options.jobs > 1 and len(waiting) > 1:
         jobs = min(options.jobs, len(waiting))
-        with ProcessPoolExecutor(jobs, get_context("spawn"), _start_worker, (jobs,)) as pool:
+        threads = max(1, (os.cpu_count() or 1) // jobs)
+        with (
+            _threads_of_children(threads),
+            ProcessPoolExecutor(jobs, get_context("spawn"), _start_worker, (threads,)) as pool,
+        ):
             yield from _on_executor(waiting, pool, 2 * jobs)
     else:
         with ThreadPoolExecutor(1) as reader:
@@ -218,10 +222,28 @@ def _most_in_flight(executor: Executor) -> int:
     return 2 * workers if isinstance(workers, int) else 64
 
 
-def _start_worker(jobs: int) -> None:
+def _start_worker(threads: int) -> None:
     """The interrupt key is for the main process, which lets the workers finish what they have begun."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    limit_threads(max(1, (os.cpu_count() or 1) // jobs))
+    limit_threads(threads)
+
+
+@contextmanager
+def _threads_of_children(count: int) -> Iterator[None]:
+    """Libraries read these once, when they are loaded: threads of several processes that wait for each other's cores
+    take twice the time.
+    """
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, str(count)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _read_ahead(capture: Capture) -> None:

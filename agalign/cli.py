@@ -369,6 +369,8 @@ def main() -> None:
         arguments = ["align", *arguments]
     # Threads that spin while they wait cost a multiple of the time where another program wants the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # The matrices here are small: a second BLAS thread does nothing but spin.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.getLogger("rasterio").setLevel(logging.CRITICAL)
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     app(args=arguments, prog_name="agalign")
