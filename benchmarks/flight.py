@@ -5,7 +5,7 @@
 Prints a table, the line total = learning + captures x steady through its rows, and the largest memory of any process.
 """
 
-import resource
+import os
 import subprocess
 import sys
 import tempfile
@@ -19,11 +19,11 @@ def main() -> None:
     lengths = [int(n) for n in (sys.argv[1] if len(sys.argv) > 1 else "10,30,100").split(",")]
     jobs = [int(n) for n in (sys.argv[2] if len(sys.argv) > 2 else "1,2").split(",")]
     seconds: dict[tuple[int, int], float] = {}
-    print("| captures | jobs | seconds | largest process so far, GB |")
+    print("| captures | jobs | seconds | largest process, GB |")
     print("|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "flight"
-        # In a process of its own: a child's memory is counted from its parent's.
+        # In a process of its own: a child's memory is counted from its parent's at its start.
         make = f"from agalign.synthetic import make_flight; make_flight(Path({str(source)!r}), {max(lengths)})"
         subprocess.run([sys.executable, "-c", f"from pathlib import Path; {make}"], check=True)
         images = sorted((source / "0000SET" / "000").glob("*.tif"))
@@ -37,9 +37,9 @@ def main() -> None:
                 out = Path(folder) / f"out{length}-{count}"
                 command = [sys.executable, "-m", "agalign", str(part), "-o", str(out), "-q", "--jobs", str(count)]
                 began = time.perf_counter()
-                subprocess.run(command, check=False)
+                _, _, usage = os.wait4(subprocess.Popen(command).pid, 0)
                 seconds[length, count] = time.perf_counter() - began
-                gigabytes = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
+                gigabytes = usage.ru_maxrss / 1e6
                 print(f"| {length} | {count} | {seconds[length, count]:.1f} | {gigabytes:.2f} |", flush=True)
     for count in jobs:
         slope, offset = np.polyfit(lengths, [seconds[n, count] for n in lengths], 1)
