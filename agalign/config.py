@@ -41,11 +41,13 @@ class FastRecipe(Stage):
     test_keypoints: Positive = 256
     """Held-out keypoints among which retrieval is measured."""
     octaves: float = 1.0
-    """Patch scales are drawn from [1, 2**octaves] px between samples."""
+    """Patch scales are drawn from [1, 2**octaves] px between samples while learning."""
     learn_patches: Positive = 300
     """Patches in a Gauss-Newton step while learning."""
-    final_patches: Positive = 600
+    final_patches: Positive = 400
     """Patches in a Gauss-Newton step at full resolution."""
+    final_octaves: float = 0.3
+    """Their range of scales: small patches place themselves more exactly."""
     first_patches: Positive = 200
     """Patches at full resolution while psi is not at rest."""
     final_steps: Positive = 10

@@ -149,7 +149,7 @@ class JointAligner:
 
     def paper(self, fixed: Raster, moving: Raster, seed: Matrix) -> JointResult:
         """SGD on theta and psi through one loss, level by level; theta starts anew at each, psi is handed on."""
-        recipe = self.settings.paper
+        recipe, fast = self.settings.paper, self.settings.fast
         subject = Subject(fixed, [moving], [seed], [1], [False])
         halvings = max(0, round(math.log2(max(fixed.size_px) / recipe.coarsest_px)))
         scales = tuple(0.5**k for k in range(halvings, -1, -1))
@@ -165,16 +165,16 @@ class JointAligner:
             subject.mappings[0], level_steps, loss, last_step_px = self.descend(net, level, subject.mappings[0], report)
             steps += level_steps
         h = level.homography(subject.mappings[0], 0)
-        p, _ = self.sampler.draw(level, level.anywhere, [h], self.settings.fast.final_patches, 1.0)
-        anchors = make_anchors(net, level, p, self.settings.fast.difference_px)
-        curvature = psi_step(net, level, 0, 1, h, anchors, self.family, self.settings.fast)
-        test, _ = self.sampler.draw(level, level.held_out, [h], self.settings.fast.test_keypoints, 1.0)
+        p, _ = self.sampler.draw(level, level.anywhere, [h], fast.final_patches, fast.final_octaves)
+        anchors = make_anchors(net, level, p, fast.difference_px)
+        curvature = psi_step(net, level, 0, 1, h, anchors, self.family, fast)
+        test, _ = self.sampler.draw(level, level.held_out, [h], fast.test_keypoints, fast.final_octaves)
         with torch.no_grad():
             f_test = describe_fixed(net, level, test)
-        held_out, chance = retrieval(net, level, 0, 1, h, test, f_test, self.settings.fast)
+        held_out, chance = retrieval(net, level, 0, 1, h, test, f_test, fast)
         return JointResult(
             subject.mappings[0], loss, held_out, chance, steps, scales, "paper", self.family or "homography",
-            last_step_px, _complete_std(curvature, self.settings.fast),
+            last_step_px, _complete_std(curvature, fast),
         )  # fmt: skip
 
     def descend(
@@ -327,8 +327,8 @@ class JointAligner:
         recipe = self.settings.fast
         level = self.level(subject, 1.0, range(len(subject.moving)))
         h = [level.homography(matrix, b) for b, matrix in enumerate(subject.mappings)]
-        p, _ = self.sampler.draw(level, level.anywhere, h, recipe.final_patches, recipe.octaves)
-        test, _ = self.sampler.draw(level, level.held_out, h, recipe.test_keypoints, recipe.octaves)
+        p, _ = self.sampler.draw(level, level.anywhere, h, recipe.final_patches, recipe.final_octaves)
+        test, _ = self.sampler.draw(level, level.held_out, h, recipe.test_keypoints, recipe.final_octaves)
         if len(p) < LEAST_KEYPOINTS:
             return [f"only {len(p)} keypoints lie on the common valid area"] * len(h)
         anchors = make_anchors(net, level, p, recipe.difference_px)

@@ -161,6 +161,9 @@ def footprints_inside(level: Level, band: int, keypoints: Keypoints, homography:
 
 
 def _room_px(valid: Mask) -> NDArray[np.float32]:
+    if valid.all():
+        column, row = (np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1)) for n in valid.shape[::-1])
+        return np.minimum(column[None, :], row[:, None]).astype(np.float32)
     bordered = np.pad(valid.astype(np.uint8), 1)
     return np.asarray(cv2.distanceTransform(bordered, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1], np.float32)
 

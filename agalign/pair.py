@@ -15,9 +15,10 @@ from agalign.flight import FlightModel, align_from_scratch, refine_with
 from agalign.geometry import Matrix
 from agalign.joint import Subject
 from agalign.mapping import Mapping as PixelMapping
-from agalign.metrics import FixedWindows, similarity
+from agalign.metrics import FixedSimilarity
 from agalign.raster import read_for_alignment
-from agalign.records import Alignment, Band, Capture, JointResult, Raster, Residual, Seed, SeedKind
+from agalign.records import Alignment, Band, Capture, JointResult, Raster, Seed, SeedKind
+from agalign.residuals import FixedWindows
 from agalign.seed import RigSeed, best_seed, is_trusted, overlay, seed_candidates, single, warped
 from agalign.structure import textured
 
@@ -93,7 +94,7 @@ def align_images(
     if not images:
         return {}
     found: dict[str, Alignment] = {}
-    windows = FixedWindows(single(images[0][1]), settings.check)
+    yardsticks = Yardsticks(single(images[0][1]), settings.check)
     clock = time.perf_counter()
 
     def spent(count: int) -> float:
@@ -118,7 +119,7 @@ def align_images(
         share = spent(len(known))
         for pair in known:
             progress(pair.name, "checking", 0.0)
-            alignment = _checked(pair, results[pair.name], windows, settings)
+            alignment = _checked(pair, results[pair.name], yardsticks, settings)
             seconds[pair.name] += share + spent(1)
             if alignment.status == "aligned":
                 found[pair.name] = replace(alignment, seconds=seconds[pair.name])
@@ -127,7 +128,7 @@ def align_images(
     share = spent(len(remaining))
     for pair in remaining:
         progress(pair.name, "checking", 0.0)
-        alignment = _checked(pair, results[pair.name], windows, settings)
+        alignment = _checked(pair, results[pair.name], yardsticks, settings)
         found[pair.name] = replace(alignment, seconds=seconds[pair.name] + share + spent(1))
     return found
 
@@ -183,20 +184,30 @@ def _of(pairs: Sequence[Pair], progress: PairProgress) -> Callable[[str, float],
     return lambda stage, share: progress(pairs[0].name, stage, share)
 
 
-def _checked(pair: Pair, joint: JointResult | str, windows: FixedWindows, settings: Settings) -> Alignment:
+class Yardsticks:
+    """What the moving bands of one reference are measured against, on the pixel grid on which they are written."""
+
+    def __init__(self, fixed: Raster, settings: CheckSettings) -> None:
+        self.windows = FixedWindows(fixed, settings)
+        self.similarity = FixedSimilarity(fixed)
+
+
+def _checked(pair: Pair, joint: JointResult | str, yardsticks: Yardsticks, settings: Settings) -> Alignment:
     """The alignment with its verdict and metrics, in px of the images."""
     why_not = joint if isinstance(joint, str) else ""
     found = None if isinstance(joint, str) else _snapped(joint, pair, settings.check)
     matrix = pair.seed.fixed_to_moving if found is None else found.fixed_to_moving
-    residual, after = _measure(pair, matrix, windows)
+    there = _laid_on_reference(pair, matrix)
+    residual = yardsticks.windows.residuals(there)
     size = pair.fixed.size_px
     status, doubt = verdict(pair.seed, pair.trusted, found, why_not, residual, size, settings.check)
     if status != "aligned" and found is not None:
         matrix = pair.seed.fixed_to_moving
-        residual, after = _measure(pair, matrix, windows)
-    if status == "seed_only" and (residual is None or residual.coverage < settings.check.least_seed_coverage):
+        there = _laid_on_reference(pair, matrix)
+        residual = yardsticks.windows.residuals(there)
+    if status == "seed_only" and residual.coverage < settings.check.least_seed_coverage:
         status, doubt = "failed", f"{doubt}, but it does not fit either"
-    before = _similarity_as_they_lie(pair)
+    before, after = (yardsticks.similarity.to(r) for r in (_laid_as_files_lie(pair), there))
     return Alignment(matrix, pair.space, status, doubt, pair.seed, found, residual, 0.0, before, after)
 
 
@@ -207,21 +218,14 @@ def _snapped(joint: JointResult, pair: Pair, settings: CheckSettings) -> JointRe
     return joint
 
 
-def _similarity_as_they_lie(pair: Pair) -> dict[str, float]:
-    """The files laid on each other as they are."""
+def _laid_as_files_lie(pair: Pair) -> Raster:
     scale = np.divide(pair.moving.size_px, pair.fixed.size_px)
     lying = PixelMapping(geometry.resolution_change(float(scale[0]), float(scale[1])))
-    there = warped(single(pair.moving), lying, pair.fixed.size_px)
-    return similarity(single(pair.fixed).pixels, there.pixels, pair.fixed.valid & there.valid)
+    return warped(single(pair.moving), lying, pair.fixed.size_px)
 
 
-def _measure(pair: Pair, matrix: Matrix, windows: FixedWindows) -> tuple[Residual | None, dict[str, float]]:
-    """On the reference's own pixel grid, where the result is written."""
-    fixed = single(pair.fixed)
-    mapping = PixelMapping(matrix, pair.fixed.lens, pair.moving.lens)
-    there = warped(single(pair.moving), mapping, fixed.size_px)
-    after = similarity(fixed.pixels, there.pixels, fixed.valid & there.valid)
-    return windows.residuals(there), after
+def _laid_on_reference(pair: Pair, matrix: Matrix) -> Raster:
+    return warped(single(pair.moving), PixelMapping(matrix, pair.fixed.lens, pair.moving.lens), pair.fixed.size_px)
 
 
 def _scale(raster: Raster, band: Band) -> tuple[float, float]:

@@ -27,11 +27,11 @@ from agalign.batch import rig_seed
 from agalign.config import CheckSettings, SeedSettings, Settings
 from agalign.discover import discover
 from agalign.mapping import Mapping
-from agalign.metrics import FixedWindows
 from agalign.pair import align_images
 from agalign.pipeline import quiet
 from agalign.raster import probe, read_for_alignment
 from agalign.records import Band, Capture, Raster
+from agalign.residuals import FixedWindows
 from agalign.seed import best_seed, warped
 
 Matrix = np.ndarray
