@@ -15,7 +15,7 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
 from multiprocessing import get_context
@@ -52,6 +52,9 @@ SUMMARY_COLUMNS = (
 )  # fmt: skip
 
 _MOST_READ_AHEAD_BYTES = 64 << 20
+_DASK_ANSWERS_WITHIN_S = 10
+_MOST_HANDED_OVER = 1000
+"""Captures that wait in an executor at a time: enough for any cluster, and little memory."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ class RunOptions:
     jobs: int = 1
     """Captures at a time, each in a process of its own where there are several."""
     executor: Executor | None = None
-    """Where the captures are done instead: any executor whose workers see the same folders."""
+    """Where the captures are done instead: any executor whose workers see the same folders (`dask_executor` is one)."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ def run_flight(
             path = _learn(group, out / "models" / name, settings, listener, known)
             waiting += [Task(c, out, settings, path) for c in left]
     if options.executor is not None:
-        yield from _on_executor(waiting, options.executor, _most_in_flight(options.executor))
+        yield from _on_executor([t.absolute() for t in waiting], options.executor, _MOST_HANDED_OVER)
     elif options.jobs > 1 and len(waiting) > 1:
         jobs = min(options.jobs, len(waiting))
         threads = max(1, (os.cpu_count() or 1) // jobs)
@@ -173,6 +176,12 @@ class Task:
     out: Path
     settings: Settings
     model: Path | None
+
+    def absolute(self) -> "Task":
+        """With absolute paths: workers elsewhere have another working folder."""
+        bands = tuple(replace(b, path=b.path.absolute()) for b in self.capture.bands)
+        model = None if self.model is None else self.model.absolute()
+        return replace(self, capture=replace(self.capture, bands=bands), out=self.out.absolute(), model=model)
 
 
 def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
@@ -215,11 +224,30 @@ def _report_of(future: "Future[CaptureReport]", task: Task) -> CaptureReport:
         raise
     except MemoryError:
         return CaptureReport(task.capture.label, "error", None, f"{task.capture.label}: out of memory")
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] != "distributed":
+            raise
+        problem = f"{task.capture.label}: the cluster lost it ({error}); run again to do what is left"
+        return CaptureReport(task.capture.label, "error", None, problem)
 
 
-def _most_in_flight(executor: Executor) -> int:
-    workers = getattr(executor, "_max_workers", None)
-    return 2 * workers if isinstance(workers, int) else 64
+@contextmanager
+def dask_executor(address: str) -> Iterator[Executor]:
+    """The workers of a Dask cluster as an executor. Each needs this package and sees the same folders.
+
+    `address` is a scheduler's, such as tcp://host:8786. Raises ConfigurationError where Dask is not installed or the
+    scheduler does not answer.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ConfigurationError("Dask is not installed; pip install 'agalign[dask]'") from None
+    try:
+        client = Client(address, set_as_default=False, timeout=_DASK_ANSWERS_WITHIN_S)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"no Dask scheduler answers at {address} ({error})") from None
+    with client:
+        yield client.get_executor(pure=False)
 
 
 def _start_worker(threads: int) -> None:

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -155,6 +155,10 @@ Jobs = Annotated[
         help="Captures at a time; by default one a core, and one for short flights.",
     ),
 ]
+Dask = Annotated[
+    str | None,
+    typer.Option(help="Scheduler of a Dask cluster that does the captures, tcp://host:8786; it sees the same folders."),
+]
 IgnoreMetadata = Annotated[bool, typer.Option("--ignore-metadata", help="Use no lens or rig tags.")]
 
 
@@ -204,6 +208,7 @@ def align(
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
     rng_seed: Annotated[int, typer.Option(help="Seed of all random numbers; the same seed gives the same result.")] = 0,
     jobs: Jobs = 0,
+    dask: Dask = None,
     model: Annotated[
         Path | None, typer.Option(help="Start from what an earlier flight of the same camera learnt: OUT/models/….")
     ] = None,
@@ -238,7 +243,7 @@ def align(
         )  # fmt: skip
         options = DiscoverOptions(pattern, reference, ignore_metadata, (target,))
         flight = _discover(folder, options, voice)
-        reports = _run(flight, target, settings, voice, overwrite=overwrite, jobs=jobs, model=model)
+        reports = _run(flight, target, settings, voice, overwrite=overwrite, jobs=jobs, dask=dask, model=model)
         raise typer.Exit(_conclude(flight, reports, target, voice))
 
 
@@ -426,20 +431,21 @@ def _discover(folder: Path, options: "DiscoverOptions", voice: Voice, *, silent:
 
 def _run(
     flight: "Flight", out: Path, settings: "Settings", voice: Voice, *,
-    overwrite: bool, jobs: int, model: Path | None = None,
+    overwrite: bool, jobs: int, dask: str | None = None, model: Path | None = None,
 ) -> "list[CaptureReport]":  # fmt: skip
-    from agalign.batch import Listener, RunOptions, run_flight
+    from agalign.batch import Listener, RunOptions, dask_executor, run_flight
     from agalign.joint import choose_device
 
     # One process feeds a GPU; and to start one costs as much as two captures.
     on_cpu = choose_device(settings.joint.device).type == "cpu"
     worth_starting = min(os.cpu_count() or 1, len(flight.captures) // 4) if on_cpu else 1
-    options = RunOptions(overwrite, jobs or max(1, worth_starting))
     reports: list[CaptureReport] = []
     done_pairs, all_pairs = 0, sum(len(c.moving) for c in flight.captures)
     pairs = {c.label: len(c.moving) for c in flight.captures}
     started = time.monotonic()
-    with _progress(voice, all_pairs) as show, _interruptible() as check_interrupt:
+    cluster = nullcontext() if dask is None else dask_executor(dask)
+    with cluster as executor, _progress(voice, all_pairs) as show, _interruptible() as check_interrupt:
+        options = RunOptions(overwrite, jobs or max(1, worth_starting), executor)
         current: Capture | None = None
 
         def on_start(capture: "Capture") -> None:

@@ -23,13 +23,17 @@ class FastRecipe(Stage):
     """Longer side of the images on which theta is learnt, but at least half of the full resolution."""
     coarsest_px: Positive = 160
     """Longer side of the coarsest level, where an untrusted seed starts."""
+    start: Literal["starter", "random"] = "starter"
+    """Where theta starts: from the network that comes with the package, or from random weights."""
     batch: Positive = 128
     temperature: float = 0.07
     learning_rate: float = 2e-3
     most_steps: Positive = 150
     warm_up_steps: int = 50
-    """Steps on theta alone before psi may move."""
-    steps_between_updates: Positive = 25
+    """Steps on random weights before psi may move."""
+    first_updates: Positive = 5
+    """Most steps on psi before the first on weights that are not random."""
+    steps_between_updates: Positive = 10
     step_gate: float = 0.2
     """Held-out retrieval below which psi does not move."""
     enough_retrieval: float = 0.6

@@ -68,6 +68,8 @@ class Descriptor(nn.Module):
                 f"siamese networks need images of the same channels, not {tuple(channels)}; use pseudo-siamese"
             )
         self.sharing = sharing
+        self.learnt = False
+        """True where the weights are not random, so that psi may move from the first step on."""
         self.unit_length = unit_length
         own_first = channels if sharing != "siamese" else channels[:1]
         self.first = nn.ModuleList(_FirstLayer(c, half_rectified) for c in own_first)

@@ -89,18 +89,15 @@ def learn_flight(
     With `start`, its network is where theta starts.
     """
     chosen = _choose(captures, settings.flight.captures)
-    loaded = [s for c in chosen if (s := _subject(c, rig_seed, settings)) is not None]
+    loaded = [s for c in chosen if (s := read_subject(c, rig_seed, settings)) is not None]
     if not loaded:
         return None
     aligner = JointAligner(settings.joint, progress)
     subjects = [subject for subject, _ in loaded]
     bands = tuple(b.name for b in captures[0].moving)
-    if start is None:
-        net = aligner.new_descriptor([1] * (1 + len(bands)), half_rectified=True, unit_length=True)
-    else:
-        net = copy.deepcopy(start.net)
+    net = aligner.fast_descriptor([1] * (1 + len(bands))) if start is None else copy.deepcopy(start.net)
     try:
-        aligner.learn(subjects, net, learnt=start is not None)
+        aligner.learn(subjects, net)
         results = [aligner.refine(net, subject) for subject in subjects]
     except NotEnoughTextureError:
         return None
@@ -167,7 +164,7 @@ def _reduction(band: Band, longest_side_px: int) -> tuple[float, float]:
     return round(band.width_px / reduction) / band.width_px, round(band.height_px / reduction) / band.height_px
 
 
-def _subject(capture: Capture, rig_seed: RigSeed, settings: Settings) -> tuple[Subject, list[str]] | None:
+def read_subject(capture: Capture, rig_seed: RigSeed, settings: Settings) -> tuple[Subject, list[str]] | None:
     """A capture to learn from and the names of its moving bands; None where there is no pair that can be read."""
     longest = settings.joint.longest_side_px
     try:
@@ -212,12 +209,12 @@ def align_from_scratch(subject: Subject, joint: JointSettings, progress: Progres
     if joint.recipe == "paper":
         for moving, seed in zip(subject.moving, subject.mappings, strict=True):
             try:
-                results.append(aligner.paper(subject.fixed, moving, seed))
+                results.append(aligner.paper(subject.fixed, moving, seed)[1])
             except (NotEnoughTextureError, GeometryError) as why_not:
                 results.append(str(why_not))
         return results
     channels = [_channels(subject.fixed), *(_channels(m) for m in subject.moving)]
-    net = aligner.new_descriptor(channels, half_rectified=True, unit_length=True)
+    net = aligner.fast_descriptor(channels)
     try:
         steps, loss = aligner.learn([subject], net)
         results = aligner.refine(net, subject)
@@ -263,6 +260,7 @@ def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
         bands = tuple(json.loads(facts["bands"]))
         net = Descriptor(facts["sharing"], [1] * (1 + len(bands)), half_rectified=True, unit_length=True)
         net.load_state_dict({k.removeprefix("theta."): v for k, v in tensors.items() if k.startswith("theta.")})
+        net.learnt = True
     except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read as a model ({str(error).splitlines()[0]})") from None
     mappings = {k.removeprefix("mapping."): v.numpy() for k, v in tensors.items() if k.startswith("mapping.")}

@@ -11,7 +11,7 @@ homography, L0 and L1 the losses. Two recipes share the levels, the keypoints, t
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import torch
@@ -43,6 +43,7 @@ from agalign.refine import (
     refine,
     retrieval,
 )
+from agalign.starter import start_from_starter
 
 Progress = Callable[[str, float], None]
 """Called with the name of what is being done and the share of it that is behind, 0 to 1."""
@@ -101,8 +102,11 @@ class Pairs:
     bands: Sequence[int]
     level: Level
     h: list[Tensor] = field(init=False)
+    settled: list[bool] = field(init=False)
+    """Those whose psi has been at rest once; it is moved on all the same."""
 
     def __post_init__(self) -> None:
+        self.settled = [False] * len(self.bands)
         self.h = [self.level.homography(self.subject.mappings[b], i) for i, b in enumerate(self.bands)]
 
     def side(self, index: int) -> int:
@@ -145,11 +149,18 @@ class JointAligner:
             net = Descriptor(self.settings.sharing, channels, half_rectified=half_rectified, unit_length=unit_length)
         return net.to(self.device)
 
+    def fast_descriptor(self, channels: Sequence[int]) -> Descriptor:
+        """F of recipe fast where theta starts."""
+        net = self.new_descriptor(channels, half_rectified=True, unit_length=True)
+        if self.settings.fast.start == "starter":
+            start_from_starter(net)
+        return net
+
     # ---- recipe paper
 
-    def paper(self, fixed: Raster, moving: Raster, seed: Matrix) -> JointResult:
+    def paper(self, fixed: Raster, moving: Raster, seed: Matrix) -> tuple[Descriptor, JointResult]:
         """SGD on theta and psi through one loss, level by level; theta starts anew at each, psi is handed on."""
-        recipe, fast = self.settings.paper, self.settings.fast
+        recipe = self.settings.paper
         subject = Subject(fixed, [moving], [seed], [1], [False])
         halvings = max(0, round(math.log2(max(fixed.size_px) / recipe.coarsest_px)))
         scales = tuple(0.5**k for k in range(halvings, -1, -1))
@@ -164,17 +175,12 @@ class JointAligner:
 
             subject.mappings[0], level_steps, loss, last_step_px = self.descend(net, level, subject.mappings[0], report)
             steps += level_steps
-        h = level.homography(subject.mappings[0], 0)
-        p, _ = self.sampler.draw(level, level.anywhere, [h], fast.final_patches, fast.final_octaves)
-        anchors = make_anchors(net, level, p, fast.difference_px)
-        curvature = psi_step(net, level, 0, 1, h, anchors, self.family, fast)
-        test, _ = self.sampler.draw(level, level.held_out, [h], fast.test_keypoints, fast.final_octaves)
-        with torch.no_grad():
-            f_test = describe_fixed(net, level, test)
-        held_out, chance = retrieval(net, level, 0, 1, h, test, f_test, fast)
-        return JointResult(
-            subject.mappings[0], loss, held_out, chance, steps, scales, "paper", self.family or "homography",
-            last_step_px, _complete_std(curvature, fast),
+        found = self.refine(net, subject, move=False)[0]
+        if isinstance(found, str):
+            raise NotEnoughTextureError(found)
+        return net, replace(
+            found, fixed_to_moving=subject.mappings[0], loss=loss, iterations=steps, levels=scales, recipe="paper",
+            last_step_px=last_step_px,
         )  # fmt: skip
 
     def descend(
@@ -227,10 +233,9 @@ class JointAligner:
 
     # ---- recipe fast
 
-    def learn(self, subjects: Sequence[Subject], net: Descriptor, *, learnt: bool = False) -> tuple[int, float]:
+    def learn(self, subjects: Sequence[Subject], net: Descriptor) -> tuple[int, float]:
         """Theta and every psi of all subjects, coarse to fine; theta is carried from level to level.
 
-        A network that is `learnt` may move psi from the first step on, and needs none where that is enough.
         Returns the steps taken and the last loss. Raises NotEnoughTextureError where a reference has no contrast.
         """
         scales = self.learn_scales(max(max(s.fixed.size_px) for s in subjects))
@@ -240,7 +245,7 @@ class JointAligner:
             wanted = [(s, [b for b in range(len(s.moving)) if last or not s.trusted[b]]) for s in subjects]
             pairs = [Pairs(s, bands, self.level(s, scale, bands)) for s, bands in wanted if bands]
             if pairs:
-                taken, loss = self.learn_level(net, pairs, learnt)
+                taken, loss = self.learn_level(net, pairs)
                 steps += taken
             for p in pairs:
                 p.hand_on()
@@ -254,18 +259,22 @@ class JointAligner:
             scales.insert(0, scales[0] / 2)
         return scales
 
-    def learn_level(self, net: Descriptor, pairs: Sequence[Pairs], learnt: bool) -> tuple[int, float]:
-        """Theta by Adam, a capture at a time; each psi by Gauss-Newton once held-out patches are told apart."""
+    def learn_level(self, net: Descriptor, pairs: Sequence[Pairs]) -> tuple[int, float]:
+        """Theta by Adam, a capture at a time; each psi by Gauss-Newton once held-out patches are told apart.
+
+        A network that is learnt already needs no step where its first ones on psi are enough.
+        """
         recipe = self.settings.fast
         optimiser = torch.optim.Adam(net.parameters(), recipe.learning_rate)
         loss_value = float("nan")
         most_steps = recipe.most_steps * len(pairs)
         between = recipe.steps_between_updates * len(pairs)
-        if learnt:
-            for _ in range(2):
-                at_rest = [self.move_psi(net, p) for p in pairs]
-            if all(at_rest):
-                return 0, loss_value
+        warm_up = 0 if net.learnt else recipe.warm_up_steps
+        if net.learnt:
+            for _ in range(recipe.first_updates):
+                settled = [self.move_psi(net, p) for p in pairs]
+                if all(settled):
+                    return 0, loss_value
         for step in range(1, most_steps + 1):
             loss = self.loss(net, pairs[step % len(pairs)])
             if loss is not None:
@@ -273,12 +282,13 @@ class JointAligner:
                 torch.autograd.backward(loss)
                 optimiser.step()
                 loss_value = float(loss.detach())
-            if step < recipe.warm_up_steps or step % between:
+            if step < warm_up or step % between:
                 continue
             self.progress("learning", step / most_steps)
-            at_rest = [self.move_psi(net, p) for p in pairs]
-            if all(at_rest):
+            settled = [self.move_psi(net, p) for p in pairs]
+            if all(settled):
                 break
+        net.learnt = True
         return step, loss_value
 
     def loss(self, net: Descriptor, pairs: Pairs) -> Tensor | None:
@@ -301,7 +311,7 @@ class JointAligner:
 
     @torch.no_grad()
     def move_psi(self, net: Descriptor, pairs: Pairs) -> bool:
-        """One step on each psi of a capture whose held-out patches are retrieved; True where all are at rest."""
+        """One step on each psi of a capture whose held-out patches are retrieved; True where all have settled."""
         recipe, level = self.settings.fast, pairs.level
         test, _ = self.sampler.draw(level, level.held_out, pairs.h, recipe.test_keypoints, recipe.octaves)
         p, _ = self.sampler.draw(level, level.anywhere, pairs.h, recipe.learn_patches, recipe.octaves)
@@ -309,21 +319,22 @@ class JointAligner:
             return True
         f_test = describe_fixed(net, level, test)
         anchors = make_anchors(net, level, p, recipe.difference_px)
-        at_rest = True
         for b, h in enumerate(pairs.h):
             retrieved, _ = retrieval(net, level, b, pairs.side(b), h, test, f_test, recipe)
             if retrieved < recipe.step_gate:
-                at_rest = False
                 continue
             with suppress(NotEnoughTextureError):
                 step = psi_step(net, level, b, pairs.side(b), h, anchors, self.family, recipe)
                 pairs.h[b] = (h.double() @ step.change).float()
-                at_rest &= retrieved > recipe.enough_retrieval and step.length_px < recipe.rest_px
-        return at_rest
+                pairs.settled[b] |= retrieved > recipe.enough_retrieval and step.length_px < recipe.rest_px
+        return all(pairs.settled)
 
     @torch.no_grad()
-    def refine(self, net: Descriptor, subject: Subject) -> list[JointResult | str]:
-        """Every psi of a capture at full resolution with theta frozen; a text says why a pair has none."""
+    def refine(self, net: Descriptor, subject: Subject, *, move: bool = True) -> list[JointResult | str]:
+        """Every psi of a capture at full resolution with theta frozen; a text says why a pair has none.
+
+        Without `move` psi stays where it is, and what is said of it is how sure it is.
+        """
         recipe = self.settings.fast
         level = self.level(subject, 1.0, range(len(subject.moving)))
         h = [level.homography(matrix, b) for b, matrix in enumerate(subject.mappings)]
@@ -336,7 +347,10 @@ class JointAligner:
         results: list[JointResult | str] = []
         for b, side in enumerate(subject.sides):
             try:
-                found, step = refine(net, level, b, side, h[b], anchors, self.family, recipe)
+                if move:
+                    found, step = refine(net, level, b, side, h[b], anchors, self.family, recipe)
+                else:
+                    found, step = h[b], psi_step(net, level, b, side, h[b], anchors, self.family, recipe)
                 matrix = level.full_matrix(found, b)
             except NotEnoughTextureError as why_not:
                 results.append(str(why_not))

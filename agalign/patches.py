@@ -95,9 +95,13 @@ def warp_keypoints(keypoints: Keypoints, homography: Tensor) -> Keypoints:
     return Keypoints(transform(h, keypoints.xy), torch.atan2(v_prime[:, 1], v_prime[:, 0]), v_prime.norm(dim=1))
 
 
-def patch_grid(keypoints: Keypoints) -> Tensor:
-    """Sample positions of each keypoint's patch, (N, 16, 16, 2) px, centred on the keypoint."""
-    offset = torch.arange(PATCH_PX, dtype=keypoints.xy.dtype, device=keypoints.xy.device) - (PATCH_PX - 1) / 2
+def patch_grid(keypoints: Keypoints, side: int = PATCH_PX) -> Tensor:
+    """Sample positions of each keypoint's patch, (N, side, side, 2) px, centred on the keypoint.
+
+    Another `side` than 16 samples the same patch more or less finely.
+    """
+    offset = torch.arange(side, dtype=keypoints.xy.dtype, device=keypoints.xy.device) - (side - 1) / 2
+    offset = offset * (PATCH_PX / side)
     v, u = torch.meshgrid(offset, offset, indexing="ij")
     cos = (keypoints.angle.cos() * keypoints.scale)[:, None, None]
     sin = (keypoints.angle.sin() * keypoints.scale)[:, None, None]

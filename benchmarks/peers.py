@@ -1,15 +1,16 @@
 """One machine, the same images: this program beside what people use today. Prints tables and draws a plot.
 
-    pip install -e '.[bench]' && python benchmarks/peers.py DATA [--plot FILE] [--methods a,b,...]
+    pip install -e '.[bench]' && python benchmarks/peers.py DATA... [--plot FILE] [--methods 'a;b;...']
 
 DATA holds folders of bands with `ties.json` (benchmarks/accuracy.py says how); a synthetic flight is added, whose truth
 is exact. All methods get lens-corrected images where the camera's lens is known, and homographies are scored between
-corrected pixels; correcting the images is not counted as theirs. Each method runs in a process of its own, two threads.
+corrected pixels; correcting the images is not counted as theirs. Each method runs in a process of its own, with as many
+threads as it takes; memory is that process's largest, and the row `identity` shows what the images alone take.
 """
 
 import argparse
 import json
-import resource
+import os
 import subprocess
 import sys
 import tempfile
@@ -65,11 +66,11 @@ class Case:
         )  # type: ignore[return-value]
 
 
-def cases(data: Path) -> Iterator[Case]:
-    """Every band pair below DATA that has ties."""
-    for path in sorted(data.rglob("ties.json")) + sorted(data.rglob("truth.json")):
+def cases(folders: list[Path]) -> Iterator[Case]:
+    """Every band pair of the folders, each of which holds ties.json or truth.json."""
+    for path in [p for folder in folders for p in (folder / "ties.json", folder / "truth.json") if p.is_file()]:
         captures = {}
-        for capture in discover(path.parent).captures if any(path.parent.rglob("*_1.tif")) else ():
+        for capture in discover(path.parent).captures:
             captures.update({b.path.name: capture for b in capture.bands})
         for entry in json.loads(path.read_text()).values():
             capture = captures.get(entry["reference"])
@@ -224,9 +225,9 @@ PEERS: dict[str, Method] = {
 OURS = ("agalign, from scratch", "agalign, flight")
 
 
-def run_peer(name: str, data: Path) -> list[dict[str, Any]]:
+def run_peer(name: str, folders: list[Path]) -> list[dict[str, Any]]:
     rows = []
-    for case in cases(data):
+    for case in cases(folders):
         fixed, moving = case.straight()
         began = time.perf_counter()
         try:
@@ -237,12 +238,12 @@ def run_peer(name: str, data: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def run_ours(name: str, data: Path) -> list[dict[str, Any]]:
+def run_ours(name: str, folders: list[Path]) -> list[dict[str, Any]]:
     """The pairs of a capture together, seeded, aligned and checked, as a run does it."""
     from agalign.flight import camera_key, learn_flight
 
     groups: dict[tuple[str, str], list[Case]] = {}
-    for case in cases(data):
+    for case in cases(folders):
         groups.setdefault((case.set_name, case.reference.path.name), []).append(case)
     models: dict[str, Any] = {}
     rows = []
@@ -279,37 +280,54 @@ def _row(case: Case, matrix: Matrix | None, seconds: float, status: str) -> dict
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path)
+    parser.add_argument("data", type=Path, nargs="+")
     parser.add_argument("--plot", type=Path)
     parser.add_argument("--methods")
     parser.add_argument("--captures", type=int, default=2, help="of the synthetic flight")
     parser.add_argument("--only", help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.only == "synthetic flight":
+        synthetic.make_flight(options.data[0], options.captures, rng_seed=11)
+        return
     if options.only:
         rows = (run_ours if options.only in OURS else run_peer)(options.only, options.data)
-        gigabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(json.dumps({"rows": rows, "gigabytes": gigabytes}))
+        print(json.dumps(rows))
         return
     names = options.methods.split(";") if options.methods else [*PEERS, *OURS]
     results = {}
-    with tempfile.TemporaryDirectory() as folder:
-        everything = Path(folder) / "data"
-        everything.mkdir()
-        for path in sorted(options.data.rglob("ties.json")):
-            (everything / path.parent.name).symlink_to(path.parent.resolve(), target_is_directory=True)
-        synthetic.make_flight(everything / "synthetic", options.captures, rng_seed=11)
+    with tempfile.TemporaryDirectory() as temporary:
+        made = Path(temporary) / "synthetic"
+        child("synthetic flight", [made], "--captures", str(options.captures))
+        folders = [path.parent for data in options.data for path in sorted(data.rglob("ties.json"))] + [made]
         for name in names:
-            command = [sys.executable, __file__, str(everything), "--only", name]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode == 0:
-                results[name] = json.loads(done.stdout.splitlines()[-1])
-            else:
-                print(f"{name}: left out: {done.stderr.splitlines()[-1]}", file=sys.stderr)
+            output, gigabytes = child(name, folders)
+            if output is not None:
+                results[name] = {"rows": json.loads(output.splitlines()[-1]), "gigabytes": gigabytes}
+    if not results:
+        sys.exit("no method could be run")
     sets = list(dict.fromkeys(r["set"] for r in next(iter(results.values()))["rows"]))
     for set_name in sets:
         table(set_name, results)
     if options.plot:
         plot(results, sets, options.plot)
+
+
+def child(name: str, data: list[Path], *options: str) -> tuple[str | None, float]:
+    """(output, largest memory in GB) of this script doing one thing; no output where it could not be done.
+
+    A child's memory is counted from its parent's at its start, so the parent holds no images.
+    """
+    command = [sys.executable, __file__, *map(str, data), "--only", name, *options]
+    with tempfile.TemporaryFile("w+") as output:
+        process = subprocess.Popen(command, stdout=output)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        output.seek(0)
+        text = output.read()
+    if process.returncode:
+        print(f"{name}: left out", file=sys.stderr)
+        return None, 0.0
+    return text, usage.ru_maxrss / 1e6
 
 
 def table(set_name: str, results: dict[str, Any]) -> None:

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from distributed import LocalCluster
 
 import agalign
-from agalign import demo, geometry
-from agalign.batch import RunOptions, rig_seed, run_flight
+from agalign import batch, demo, geometry
+from agalign.batch import RunOptions, dask_executor, rig_seed, run_flight
 from agalign.config import FastRecipe, FlightSettings, JointSettings, Settings
 from agalign.discover import discover
 from agalign.errors import ConfigurationError, InputError
@@ -136,6 +137,26 @@ def test_any_executor_will_do(flight: Path, tmp_path: Path) -> None:
         reports = agalign.align_folder(flight, tmp_path, settings=SETTINGS, run=RunOptions(executor=executor))
     assert sorted(r.label for r in reports) == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
     assert all(r.good for r in reports)
+
+
+def test_a_dask_cluster_does_the_captures(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(flight.parent)
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        dask_executor(cluster.scheduler_address) as executor,
+    ):
+        reports = agalign.align_folder(flight.name, tmp_path, settings=SETTINGS, run=RunOptions(executor=executor))
+    assert all(r.good for r in reports)
+    assert len(reports) == 2
+
+
+def test_a_scheduler_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "_DASK_ANSWERS_WITHIN_S", 0.5)
+    with (
+        pytest.raises(ConfigurationError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "),
+        dask_executor("tcp://127.0.0.1:1"),
+    ):
+        pass
 
 
 def test_one_broken_reference_stops_neither_learning_nor_the_others(flight: Path, tmp_path: Path) -> None:

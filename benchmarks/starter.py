@@ -1,0 +1,86 @@
+"""Does the starter network earn its place? Alignment from scratch with it and with random weights, on real images.
+
+    python benchmarks/starter.py FOLDER...
+
+A FOLDER holds captures with `ties.json` (benchmarks/accuracy.py says how), or pairs NAME_1.png / OTHER_1.png with
+their homography in a text file, which start 5 % of the image away from the truth.
+"""
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from peers import cases
+
+from agalign import geometry
+from agalign.config import FastRecipe, JointSettings, Settings
+from agalign.pair import align_images
+from agalign.pipeline import quiet
+from agalign.records import Raster
+
+Matrix = np.ndarray
+Group = tuple[str, list[tuple[str, Raster, Raster, dict[str, Matrix]]], dict[str, Matrix]]
+"""(set, images as align_images takes them, ties (n, 4) by name)."""
+
+PAIRS = (("VIS_{}.png", "NIR_TF_{}.png", "GT_{}.txt"), ("VI_{}_a.png", "VI_{}_b.png", "VI_{}_fixed_to_moving.txt"))
+
+
+def groups(folder: Path) -> Iterator[Group]:
+    captures: dict[str, list] = {}
+    for case in cases([folder]):
+        captures.setdefault(case.reference.path.name, []).append(case)
+    for some in captures.values():
+        images = [(c.band.name, c.fixed, c.moving, {"rig": c.rig, "identity": np.eye(3)}) for c in some]
+        yield folder.name, images, {c.band.name: c.ties for c in some}
+    for number in range(1, 100):
+        for fixed, moving, truth in ([folder / name.format(number) for name in names] for names in PAIRS):
+            if fixed.is_file():
+                yield _pair(folder.name, number, _read(fixed), _read(moving), np.loadtxt(truth))
+
+
+def _pair(set_name: str, number: int, fixed: Raster, moving: Raster, truth: Matrix) -> Group:
+    points = geometry.lattice(*fixed.size_px, 20, 20)
+    there = geometry.apply(truth, points)
+    common = ((there >= 0) & (there <= np.subtract(moving.size_px, 1))).all(axis=1)
+    angle = 2.4 * number  # a direction of its own for each pair
+    shift = 0.05 * max(fixed.size_px) * np.array([np.cos(angle), np.sin(angle)])
+    start = geometry.compose(truth, geometry.translation(*shift))
+    return set_name, [("moving", fixed, moving, {"given": start})], {"moving": np.hstack([points, there])[common]}
+
+
+def _read(path: Path) -> Raster:
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32)
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1))
+    return Raster(image, np.ones(image.shape[-2:], bool))
+
+
+def main() -> None:
+    print("| set | theta starts from | pairs | aligned | median error, px | worst | wrong by 1 px | s a pair |")
+    print("|---|---|---|---|---|---|---|---|")
+    for folder in map(Path, sys.argv[1:]):
+        for start in ("random", "starter"):
+            settings = Settings(joint=JointSettings(fast=FastRecipe(start=start)))
+            errors, seconds, pairs = [], [], 0
+            for _, images, ties in groups(folder):
+                began = time.perf_counter()
+                found = align_images(images, settings, quiet)
+                seconds += [(time.perf_counter() - began) / len(images)] * len(images)
+                pairs += len(images)
+                for name, alignment in found.items():
+                    if alignment.status == "aligned":
+                        moved = geometry.apply(alignment.fixed_to_moving, ties[name][:, :2])
+                        errors.append(np.median(np.linalg.norm(moved - ties[name][:, 2:], axis=1)))
+            e = np.array(errors or [np.nan])
+            print(
+                f"| {folder.name} | {start} | {pairs} | {len(errors)} | {np.median(e):.3f} | {e.max():.3f} "
+                f"| {(e > 1).sum()} | {np.median(seconds):.2f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
