@@ -11,14 +11,11 @@ from agalign.config import Interpolation, Settings
 from agalign.discover import DiscoverOptions, discover
 from agalign.errors import InputError
 from agalign.mapping import Mapping
-from agalign.masks import data_mask, learnable, undeclared_fill
+from agalign.masks import raster_of
 from agalign.pair import align_images
 from agalign.pipeline import CaptureOutcome, process_capture, quiet
-from agalign.records import Alignment, Capture, Mask, Raster, SeedKind, Tile
+from agalign.records import Alignment, Capture, Mask, SeedKind, Tile
 from agalign.warp import resample
-
-_LEAST_SIDE_PX = 48
-_MOST_CHANNELS = 16
 
 
 def align(
@@ -44,8 +41,8 @@ def align(
     Raises InputError for arrays that are no images, GeometryError for a seed that is no homography.
     """
     settings = settings or Settings()
-    one = _raster(fixed, fixed_valid, "fixed")
-    other = _raster(moving, moving_valid, "moving")
+    one = raster_of(fixed, fixed_valid, "fixed")
+    other = raster_of(moving, moving_valid, "moving")
     candidates: dict[SeedKind, geometry.Matrix] = {}
     if seed is not None:
         candidates["user"] = geometry.normalised(seed)
@@ -110,29 +107,3 @@ def align_folder(
     write_summary(target)
     write_report(target)
     return reports
-
-
-def _raster(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
-    array = np.asarray(image)
-    if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
-        raise InputError(
-            f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"
-        )
-    if array.ndim == 3 and array.shape[-1] <= _MOST_CHANNELS < array.shape[0]:
-        array = np.moveaxis(array, -1, 0)
-    planes = array if array.ndim == 3 else array[None]
-    if len(planes) > _MOST_CHANNELS or min(planes.shape[1:]) < _LEAST_SIDE_PX:
-        raise InputError(
-            f"{name} is {array.shape}: images need {_LEAST_SIDE_PX} px a side and at most {_MOST_CHANNELS} channels"
-        )
-    saturation = float(np.iinfo(array.dtype).max) if array.dtype.kind in "ui" and array.dtype.itemsize <= 2 else None
-    mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
-    if mask.shape != planes.shape[1:]:
-        raise InputError(f"{name}_valid is {mask.shape}, the image {planes.shape[1:]}")
-    for plane in planes:
-        mask &= data_mask(plane, None)
-    mask &= ~np.logical_and.reduce([undeclared_fill(plane) for plane in planes])
-    for plane in planes:
-        mask = learnable(mask, plane, saturation)
-    pixels = np.where(mask, planes, 0).astype(np.float32)
-    return Raster(pixels if len(planes) > 1 else pixels[0], mask)

@@ -283,9 +283,9 @@ def _read_ahead(capture: Capture) -> None:
 
 
 def _given_model(path: Path, flight: Flight, settings: Settings) -> FlightModel:
-    """The model to start from. Raises ConfigurationError where no capture is of its camera."""
+    """The model to start from. Raises ConfigurationError where it is another camera's than any capture's."""
     model = load_model(path, lambda: choose_device(settings.joint.device))
-    if not any(camera_key(c) == model.camera for c in flight.captures):
+    if model.camera and not any(camera_key(c) == model.camera for c in flight.captures):
         here = camera_key(flight.captures[0])
         raise ConfigurationError(f"{path}: was learnt for {model.camera}; the images here are of {here}")
     return model
@@ -297,7 +297,7 @@ def _learn(
     """The path of the flight's model, learnt now or found from an earlier run; None where none could be learnt."""
     if settings.joint.recipe != "fast" or not settings.flight.together:
         return None
-    start = known if known is not None and known.camera == camera_key(captures[0]) else None
+    start = known if known is not None and known.camera in ("", camera_key(captures[0])) else None
     device = settings.joint.device
     if path.is_file():
         with suppress(AgalignError):

@@ -13,21 +13,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from agalign import cli_evaluate
 from agalign._version import __version__
-from agalign.errors import AgalignError, ConfigurationError
+from agalign.errors import ConfigurationError
+from agalign.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
 
 if TYPE_CHECKING:
     from agalign.batch import CaptureReport
     from agalign.config import Settings
     from agalign.discover import DiscoverOptions, Flight
     from agalign.records import Capture
-
-EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
 app = typer.Typer(
     name="agalign",
@@ -37,8 +36,10 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-_PLAIN_WIDTH = 160
-_COMMANDS = ("align", "demo", "info", "report")
+_COMMANDS = ("align", "demo", "info", "report", "learn", "evaluate", "surface")
+
+
+cli_evaluate.register(app)
 
 
 class SeedChoice(StrEnum):
@@ -48,6 +49,7 @@ class SeedChoice(StrEnum):
     rig = "rig"
     geo = "geo"
     structure = "structure"
+    match = "match"
     identity = "identity"
 
 
@@ -106,38 +108,6 @@ class CompressionChoice(StrEnum):
     none = "none"
 
 
-class Voice:
-    """How the program speaks: results to standard output, progress and complaints to standard error."""
-
-    def __init__(self, *, quiet: bool, verbose: bool, log_json: bool) -> None:
-        self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
-        # Lines in a file or a pipe are not wrapped to a terminal's width.
-        self.out = Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-        self.err = Console(stderr=True, highlight=False, emoji=False, soft_wrap=not sys.stderr.isatty())
-
-    def event(self, name: str, text: str = "", style: str = "", **fields: Any) -> None:
-        """One line of progress: JSON with --log-json, else the text unless --quiet."""
-        if self.log_json:
-            print(json.dumps({"event": name, **fields}, default=str), file=sys.stderr, flush=True)
-        elif text and not self.quiet:
-            self.err.print(f"[{style}]{escape(text)}[/]" if style else escape(text))
-
-    def problem(self, text: str, **fields: Any) -> None:
-        """A complaint: shown even with --quiet."""
-        if self.log_json:
-            self.event("problem", message=text, **fields)
-        else:
-            self.err.print(f"[yellow]agalign: {escape(text)}[/]")
-
-    def result(self, thing: Any) -> None:
-        """A result on standard output, unless --quiet."""
-        if not self.quiet and not self.log_json:
-            self.out.print(thing)
-
-
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print problems only.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print a line per band pair.")]
-LogJson = Annotated[bool, typer.Option("--log-json", help="Print one JSON object a line to standard error.")]
 FolderArgument = Annotated[
     Path, typer.Argument(help="Folder with the images, sub-folders included.", show_default=False)
 ]
@@ -224,7 +194,7 @@ def align(
 ) -> None:
     """Align every capture below FOLDER."""
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with _exits(voice):
+    with exits(voice):
         from agalign.config import FlightSettings, JointSettings, SeedSettings, Settings, WriteSettings
         from agalign.discover import DiscoverOptions
 
@@ -260,7 +230,7 @@ def demo(
 ) -> None:
     """Make a synthetic flight, align it, and compare the result with the known truth."""
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with _exits(voice):
+    with exits(voice):
         from agalign.batch import prepare_output
         from agalign.config import JointSettings, Settings
         from agalign.demo import make_flight, score_against_truth
@@ -294,7 +264,7 @@ def info(
 ) -> None:
     """Show what was found: cameras, captures, bands, seeds, and what is missing."""
     voice = Voice(quiet=False, verbose=False, log_json=False)
-    with _exits(voice):
+    with exits(voice):
         from agalign.discover import DiscoverOptions
 
         flight = _discover(folder, DiscoverOptions(pattern, reference, ignore_metadata), voice, silent=as_json)
@@ -321,7 +291,7 @@ def report(
 ) -> None:
     """Rebuild the report and the summary from the sidecars."""
     voice = Voice(quiet=False, verbose=False, log_json=False)
-    with _exits(voice):
+    with exits(voice):
         from agalign.batch import write_summary
         from agalign.errors import InputError
         from agalign.report import write_report
@@ -383,25 +353,6 @@ def main() -> None:
 
 def _is_root_option(argument: str) -> bool:
     return argument in ("--help", "-h", "--version")
-
-
-@contextmanager
-def _exits(voice: Voice) -> Iterator[None]:
-    """Turns what can go wrong into one line and an exit code."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        voice.problem("interrupted; what is finished stays, and the same command goes on from there")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    except ConfigurationError as error:
-        voice.problem(str(error))
-        raise typer.Exit(EXIT_USAGE) from None
-    except AgalignError as error:
-        voice.problem(str(error))
-        raise typer.Exit(EXIT_NOTHING) from None
-    except MemoryError:
-        voice.problem("out of memory; close other programs or try a smaller image")
-        raise typer.Exit(EXIT_NOTHING) from None
 
 
 def _discover(folder: Path, options: "DiscoverOptions", voice: Voice, *, silent: bool = False) -> "Flight":

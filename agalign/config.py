@@ -21,8 +21,13 @@ class FastRecipe(Stage):
 
     learn_px: Positive = 640
     """Longer side of the images on which theta is learnt, but at least half of the full resolution."""
-    coarsest_px: Positive = 160
-    """Longer side of the coarsest level, where an untrusted seed starts."""
+    coarsest_px: Positive = 200
+    """The coarsest level, where an untrusted seed starts, is between this and twice this on its longer side."""
+    search_share: float = 0.22
+    """How far around an untrusted seed the loss is searched at the coarsest level, in longer sides."""
+    search_step_px: float = 4.0
+    """Between neighbouring translations that are tried, px of that level."""
+    search_patches: Positive = 64
     start: Literal["starter", "random"] = "starter"
     """Where theta starts: from the network that comes with the package, or from random weights."""
     batch: Positive = 128
@@ -34,6 +39,8 @@ class FastRecipe(Stage):
     first_updates: Positive = 5
     """Most steps on psi before the first on weights that are not random."""
     steps_between_updates: Positive = 10
+    hopeless_steps: Positive = 50
+    """Steps after which a level is given up where no held-out patches could be told apart."""
     step_gate: float = 0.2
     """Held-out retrieval below which psi does not move."""
     enough_retrieval: float = 0.6

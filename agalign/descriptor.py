@@ -68,6 +68,7 @@ class Descriptor(nn.Module):
                 f"siamese networks need images of the same channels, not {tuple(channels)}; use pseudo-siamese"
             )
         self.sharing = sharing
+        self.channels = tuple(channels)
         self.learnt = False
         """True where the weights are not random, so that psi may move from the first step on."""
         self.unit_length = unit_length

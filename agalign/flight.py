@@ -4,7 +4,6 @@ The captures of a flight share their cameras, so what tells the bands' patches a
 capture keeps its own psi (what the paper leaves as future work).
 """
 
-import copy
 import hashlib
 import json
 import re
@@ -26,9 +25,11 @@ from agalign.descriptor import Descriptor
 from agalign.errors import AgalignError, GeometryError, InputError, NotEnoughTextureError, OutputError
 from agalign.geometry import Matrix
 from agalign.joint import JointAligner, Progress, Subject
+from agalign.match import with_match
 from agalign.raster import read_for_alignment
-from agalign.records import Band, Capture, JointResult, Raster, SeedKind
+from agalign.records import Band, Capture, JointResult, SeedKind
 from agalign.seed import RigSeed, best_seed, is_trusted, seed_candidates
+from agalign.starter import start_from
 
 _FORMAT = "agalign-model/1"
 
@@ -39,7 +40,7 @@ class FlightModel:
 
     net: Descriptor
     camera: str
-    """As `camera_key` has it."""
+    """As `camera_key` has it; empty for one that was learnt on pairs of any cameras."""
     bands: tuple[str, ...]
     """Names of the moving bands; the network's side of one is its place here, counted from 1."""
     mappings: Mapping[str, Matrix]
@@ -86,16 +87,18 @@ def learn_flight(
 ) -> FlightModel | None:  # fmt: skip
     """Learn one network on a few captures spread over the flight; None where none of them could be aligned.
 
-    With `start`, its network is where theta starts.
+    With `start`, its network is where theta starts; its last side is where bands start that it does not know.
     """
     chosen = _choose(captures, settings.flight.captures)
-    loaded = [s for c in chosen if (s := read_subject(c, rig_seed, settings)) is not None]
+    loaded = [s for c in chosen if (s := read_subject(c, rig_seed, settings, start)) is not None]
     if not loaded:
         return None
     aligner = JointAligner(settings.joint, progress)
     subjects = [subject for subject, _ in loaded]
     bands = tuple(b.name for b in captures[0].moving)
-    net = aligner.fast_descriptor([1] * (1 + len(bands))) if start is None else copy.deepcopy(start.net)
+    net = aligner.fast_descriptor([1] * (1 + len(bands)))
+    if start is not None:
+        start_from(net, start.net.state_dict())
     try:
         aligner.learn(subjects, net)
         results = [aligner.refine(net, subject) for subject in subjects]
@@ -164,8 +167,13 @@ def _reduction(band: Band, longest_side_px: int) -> tuple[float, float]:
     return round(band.width_px / reduction) / band.width_px, round(band.height_px / reduction) / band.height_px
 
 
-def read_subject(capture: Capture, rig_seed: RigSeed, settings: Settings) -> tuple[Subject, list[str]] | None:
-    """A capture to learn from and the names of its moving bands; None where there is no pair that can be read."""
+def read_subject(
+    capture: Capture, rig_seed: RigSeed, settings: Settings, start: FlightModel | None = None
+) -> tuple[Subject, list[str]] | None:
+    """A capture to learn from and the names of its moving bands; None where there is no pair that can be read.
+
+    `start` is the network with which a seed of kind `match` is found.
+    """
     longest = settings.joint.longest_side_px
     try:
         fixed = read_for_alignment(capture.reference, longest)
@@ -180,7 +188,9 @@ def read_subject(capture: Capture, rig_seed: RigSeed, settings: Settings) -> tup
             candidates = seed_candidates(capture.reference, band, rig_seed, settings.seed)
             scales = _reduction(capture.reference, longest), _reduction(band, longest)
             down: dict[SeedKind, Matrix] = {k: geometry.rescale(m, *scales) for k, m in candidates.items()}
-            seed = best_seed(fixed, raster, down, settings.seed)
+            learnt, side = (None, 1) if start is None else (start.net, start.side(band.name) or 1)
+            known = with_match(down, fixed, raster, settings.seed, learnt, side)
+            seed = best_seed(fixed, raster, known, settings.seed)
             names.append(band.name)
             rasters.append(raster)
             mappings.append(seed.fixed_to_moving)
@@ -213,7 +223,7 @@ def align_from_scratch(subject: Subject, joint: JointSettings, progress: Progres
             except (NotEnoughTextureError, GeometryError) as why_not:
                 results.append(str(why_not))
         return results
-    channels = [_channels(subject.fixed), *(_channels(m) for m in subject.moving)]
+    channels = [r.channels for r in (subject.fixed, *subject.moving)]
     net = aligner.fast_descriptor(channels)
     try:
         steps, loss = aligner.learn([subject], net)
@@ -221,10 +231,6 @@ def align_from_scratch(subject: Subject, joint: JointSettings, progress: Progres
     except NotEnoughTextureError as why_not:
         return [str(why_not)] * len(subject.moving)
     return [r if isinstance(r, str) else replace(r, loss=loss, iterations=steps) for r in results]
-
-
-def _channels(raster: Raster) -> int:
-    return 1 if raster.pixels.ndim == 2 else len(raster.pixels)
 
 
 # ---- files
@@ -236,7 +242,7 @@ def save_model(model: FlightModel, path: Path) -> None:
     tensors |= {f"mapping.{k}": torch.tensor(m) for k, m in model.mappings.items()}
     facts = {
         "format": _FORMAT, "agalign": __version__, "camera": model.camera, "bands": json.dumps(model.bands),
-        "sharing": model.net.sharing, "fingerprint": model.fingerprint,
+        "sharing": model.net.sharing, "channels": json.dumps(model.net.channels), "fingerprint": model.fingerprint,
     }  # fmt: skip
     partial = path.with_name(f".{path.name}.part")
     try:
@@ -258,7 +264,8 @@ def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
                 raise InputError(f"{path}: is no model of agalign; give a file of an earlier run's models folder")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         bands = tuple(json.loads(facts["bands"]))
-        net = Descriptor(facts["sharing"], [1] * (1 + len(bands)), half_rectified=True, unit_length=True)
+        channels = json.loads(facts["channels"])
+        net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
         net.load_state_dict({k.removeprefix("theta."): v for k, v in tensors.items() if k.startswith("theta.")})
         net.learnt = True
     except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:

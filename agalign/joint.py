@@ -31,11 +31,13 @@ from agalign.patches import (
     patch_grid,
     psi_from_homography,
     transform,
+    translation,
     warp_keypoints,
 )
 from agalign.records import JointResult, Raster
 from agalign.refine import (
     LEAST_KEYPOINTS,
+    best_shift,
     describe_fixed,
     make_anchors,
     moving_patches,
@@ -104,6 +106,8 @@ class Pairs:
     h: list[Tensor] = field(init=False)
     settled: list[bool] = field(init=False)
     """Those whose psi has been at rest once; it is moved on all the same."""
+    told_apart: bool = False
+    """Held-out patches of some image have been, so that its psi could move."""
 
     def __post_init__(self) -> None:
         self.settled = [False] * len(self.bands)
@@ -184,16 +188,21 @@ class JointAligner:
         )  # fmt: skip
 
     def descend(
-        self, net: Descriptor, level: Level, start: Matrix, report: Callable[[float], None]
+        self, net: Descriptor, level: Level, start: Matrix, report: Callable[[float], None], *, move: bool = True
     ) -> tuple[Matrix, int, float, float]:
-        """Argmin over theta and psi of sum L0(x; psi, theta) + sum L1(x, x'; theta) (paper, Eq. 5)."""
+        """Argmin over theta and psi of sum L0(x; psi, theta) + sum L1(x, x'; theta) (paper, Eq. 5).
+
+        Without `move` over theta alone, with psi known (paper, Eq. 3). Returns the mapping, the steps taken, the mean
+        loss a keypoint of the last pass and the last step's length in px of the level.
+        """
         recipe = self.settings.paper
         width, height = level.fixed.size_px
         fixed, moving = level.fixed, level.moving[0]
         h = level.homography(start, 0)
         psi = psi_from_homography(h.double(), width, height).float().requires_grad_()
         movable = torch.zeros(8, device=self.device)
-        movable[list(FAMILY_PARAMETERS[self.family or "homography"])] = 1.0
+        if move:
+            movable[list(FAMILY_PARAMETERS[self.family or "homography"])] = 1.0
 
         p, _ = self.sampler.draw(level, level.trainable, [h], recipe.keypoints, recipe.octaves, recipe.spacing_px)
         if len(p) < recipe.batch:
@@ -210,6 +219,7 @@ class JointAligner:
         loss_value, before = float("nan"), psi.detach().clone()
         for _ in range(recipe.epochs):
             shuffled = torch.randperm(len(p), generator=self.sampler.generator).to(self.device)
+            pass_loss = 0.0
             for rows in torch.split(shuffled[: batches * recipe.batch], recipe.batch):
                 h = homography_from_psi(psi, width, height)
                 f = net(fixed.patches(patch_grid(p[rows])), REFERENCE)
@@ -224,7 +234,8 @@ class JointAligner:
                 before = psi.detach().clone()
                 optimiser.step()
                 annealing.step()
-            loss_value = float(loss.detach()) / recipe.batch
+                pass_loss += float(loss.detach())
+            loss_value = pass_loss / (batches * recipe.batch)
             report(annealing.last_epoch / steps)
         h, h_before = (homography_from_psi(q, width, height).detach() for q in (psi, before))
         corner_points = torch.tensor(geometry.corners(width, height), dtype=h.dtype, device=self.device)
@@ -244,6 +255,9 @@ class JointAligner:
             last = number == len(scales) - 1
             wanted = [(s, [b for b in range(len(s.moving)) if last or not s.trusted[b]]) for s in subjects]
             pairs = [Pairs(s, bands, self.level(s, scale, bands)) for s, bands in wanted if bands]
+            if number == 0 and net.learnt:
+                for p in pairs:
+                    self.search(net, p)
             if pairs:
                 taken, loss = self.learn_level(net, pairs)
                 steps += taken
@@ -258,6 +272,21 @@ class JointAligner:
         while scales[0] * longer_side_px >= 2 * recipe.coarsest_px:
             scales.insert(0, scales[0] / 2)
         return scales
+
+    @torch.no_grad()
+    def search(self, net: Descriptor, pairs: Pairs) -> None:
+        """Move each untrusted psi by the translation under which the patches' loss is least.
+
+        Around the truth the loss is a funnel (paper, Fig. 2) that is wider than what one Gauss-Newton step sees.
+        """
+        recipe, level = self.settings.fast, pairs.level
+        for b, h in enumerate(pairs.h):
+            if pairs.subject.trusted[pairs.bands[b]]:
+                continue
+            p, _ = self.sampler.draw(level, level.anywhere, [h], recipe.search_patches, recipe.octaves)
+            reach = recipe.search_share * max(level.fixed.size_px)
+            shift = best_shift(net, level, b, pairs.side(b), h, p, reach, recipe.search_step_px)
+            pairs.h[b] = h @ translation(shift).to(h)
 
     def learn_level(self, net: Descriptor, pairs: Sequence[Pairs]) -> tuple[int, float]:
         """Theta by Adam, a capture at a time; each psi by Gauss-Newton once held-out patches are told apart.
@@ -287,6 +316,8 @@ class JointAligner:
             self.progress("learning", step / most_steps)
             settled = [self.move_psi(net, p) for p in pairs]
             if all(settled):
+                break
+            if step >= warm_up + recipe.hopeless_steps * len(pairs) and not any(p.told_apart for p in pairs):
                 break
         net.learnt = True
         return step, loss_value
@@ -323,6 +354,7 @@ class JointAligner:
             retrieved, _ = retrieval(net, level, b, pairs.side(b), h, test, f_test, recipe)
             if retrieved < recipe.step_gate:
                 continue
+            pairs.told_apart = True
             with suppress(NotEnoughTextureError):
                 step = psi_step(net, level, b, pairs.side(b), h, anchors, self.family, recipe)
                 pairs.h[b] = (h.double() @ step.change).float()

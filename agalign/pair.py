@@ -15,6 +15,7 @@ from agalign.flight import FlightModel, align_from_scratch, refine_with
 from agalign.geometry import Matrix
 from agalign.joint import Subject
 from agalign.mapping import Mapping as PixelMapping
+from agalign.match import with_match
 from agalign.metrics import FixedSimilarity
 from agalign.raster import read_for_alignment
 from agalign.records import Alignment, Band, Capture, JointResult, Raster, Seed, SeedKind
@@ -105,6 +106,8 @@ def align_images(
     pairs: list[Pair] = []
     for name, fixed, moving, candidates in images:
         progress(name, "seeding", 0.0)
+        learnt, side = (None, 1) if model is None else (model.net, model.side(name) or 1)
+        candidates = with_match(candidates, fixed, moving, settings.seed, learnt, side)
         pair = _seeded(name, fixed, moving, candidates, settings)
         if isinstance(pair, Pair):
             pairs.append(pair)

@@ -60,6 +60,13 @@ def transform(homography: Tensor, points: Tensor) -> Tensor:
     return mapped[..., :2] / mapped[..., 2:]
 
 
+def translation(shift: Tensor) -> Tensor:
+    """(2,) px -> (3, 3)."""
+    h = torch.eye(3, dtype=shift.dtype, device=shift.device)
+    h[:2, 2] = shift
+    return h
+
+
 @dataclass(frozen=True)
 class Keypoints:
     """Oriented, scaled positions in one image."""

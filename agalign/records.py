@@ -13,7 +13,7 @@ Matrix = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-SeedKind = Literal["user", "model", "rig", "geo", "structure", "identity"]
+SeedKind = Literal["user", "match", "model", "rig", "geo", "structure", "identity"]
 PairStatus = Literal["reference", "aligned", "seed_only", "failed"]
 CaptureStatus = Literal["ok", "degraded", "failed"]
 ModelFamily = Literal["homography", "affine", "translation"]
@@ -139,6 +139,11 @@ class Raster:
     def size_px(self) -> tuple[int, int]:
         """(width, height) in pixels."""
         return int(self.valid.shape[1]), int(self.valid.shape[0])
+
+    @property
+    def channels(self) -> int:
+        """1 for a single band."""
+        return 1 if self.pixels.ndim == 2 else len(self.pixels)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ The descriptors of the reference and their gradient over a shift are worked out 
 every step (Baker & Matthews 2004, Sec. 3.2): a step costs one pass of the moving band's patches.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -15,10 +16,12 @@ from agalign.descriptor import REFERENCE, Descriptor
 from agalign.errors import NotEnoughTextureError
 from agalign.gauss_newton import Step, shift_gradient, solve
 from agalign.levels import Level, footprints_inside
-from agalign.patches import Keypoints, far_apart, patch_grid, transform
+from agalign.patches import Keypoints, far_apart, patch_grid, transform, translation
 from agalign.records import ModelFamily
 
 LEAST_KEYPOINTS = 16
+_PLAIN_GAIN = 3.0
+"""Standard errors by which a loss must be less to count."""
 
 
 @dataclass(frozen=True)
@@ -108,3 +111,38 @@ def retrieval(
     p = keypoints[rows]
     f_prime = net(moving_patches(level, band, homography, p), side)
     return losses.retrieval(f[rows], f_prime, far_apart(p, recipe.least_negative_px)), 1 / len(rows)
+
+
+@torch.no_grad()
+def best_shift(
+    net: Descriptor, level: Level, band: int, side: int, homography: Tensor, keypoints: Keypoints, reach_px: float,
+    step_px: float,
+) -> Tensor:  # fmt: skip
+    """The translation (2,) of the fixed side, up to `reach_px` long, at which the mean L0 of the patches that lie in
+    both images is least; none where that is not plainly less than without.
+    """
+    if len(keypoints) < LEAST_KEYPOINTS:
+        return homography.new_zeros(2)
+    f = describe_fixed(net, level, keypoints)
+    count = int(reach_px / step_px)
+    along = torch.arange(-count, count + 1, device=homography.device) * step_px
+    shifts = torch.cartesian_prod(along, along).to(homography)
+    lengths = shifts.norm(dim=1)
+    shifts = shifts[lengths <= reach_px]
+
+    def loss(shift: Tensor) -> Tensor:
+        """L0 of each keypoint, nan where its patch leaves an image."""
+        moved = homography @ translation(shift)
+        apart = losses.distance(f, net(moving_patches(level, band, moved, keypoints), side))
+        return apart.masked_fill(~footprints_inside(level, band, keypoints, moved), float("nan"))
+
+    table = torch.stack([loss(s) for s in shifts])
+    enough = table.isfinite().sum(dim=1) >= LEAST_KEYPOINTS
+    means = table.nanmean(dim=1).masked_fill(~enough, float("inf"))
+    best, start = int(means.argmin()), int(lengths[lengths <= reach_px].argmin())
+    gain = table[start] - table[best]
+    gain = gain[gain.isfinite()]
+    if not bool(enough[start]) or len(gain) < LEAST_KEYPOINTS:
+        return shifts[best]
+    plain = float(gain.mean()) > _PLAIN_GAIN * float(gain.std()) / math.sqrt(len(gain))
+    return shifts[best] if plain else homography.new_zeros(2)

@@ -48,11 +48,8 @@ def best_seed(fixed: Raster, moving: Raster, candidates: MappingType[SeedKind, M
         best = max(scored, key=lambda seed: seed.score)
         if kind == "model" and is_trusted(best, settings):
             return best
-    if settings.force is not None and settings.force != "structure":
-        return next(s for s in scored if s.kind == settings.force)
-    if settings.force == "structure":
-        scored = [s for s in scored if s.kind == "structure"] or scored
-    return max(scored, key=lambda seed: seed.score)
+    forced = [s for s in scored if s.kind == settings.force]
+    return max(forced or scored, key=lambda seed: seed.score)
 
 
 def scored_seeds(

@@ -54,7 +54,7 @@ class HomographyPart(_Part):
 class SeedPart(_Part):
     """Where the optimisation started, in the same space as the homography."""
 
-    kind: Literal["user", "model", "rig", "geo", "structure", "identity"]
+    kind: Literal["user", "match", "model", "rig", "geo", "structure", "identity"]
     fixed_to_moving: Matrix3x3
     peak_sigma: float
     runner_up_sigma: float

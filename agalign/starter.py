@@ -3,6 +3,7 @@
 It is one siamese network. A pseudo-siamese one takes its first layer on every side and goes on from there.
 """
 
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -16,16 +17,29 @@ from agalign.descriptor import Descriptor
 _FILE = "starter.safetensors"
 
 
-def start_from_starter(net: Descriptor) -> None:
-    """Give a network the starter's weights. The first layer's are shared out among the channels of a side."""
+def start_from(net: Descriptor, weights: Mapping[str, Tensor], sides: Sequence[int] | None = None) -> None:
+    """Give a network the weights of another, as its state_dict has them.
+
+    `sides` says which of the other's sides each side takes; by default the one of the same number. Where the other has
+    not so many, its last one serves. A first layer of other channels takes them together: what describes a grey image
+    then describes three equal ones.
+    """
     state = net.state_dict()
     for name, value in state.items():
-        group, _side, rest = name.split(".", 2)
-        given = _weights()[f"{group}.0.{rest}"]
-        channels = value.shape[1] // given.shape[1] if value.ndim == 4 else 1
-        state[name] = given.repeat(1, channels, 1, 1) / channels if channels > 1 else given
+        group, side, rest = name.split(".", 2)
+        wanted = int(side) if sides is None else sides[int(side)]
+        last = max(int(other.split(".")[1]) for other in weights if other.startswith(f"{group}."))
+        given = weights[f"{group}.{min(wanted, last)}.{rest}"]
+        if given.shape != value.shape:
+            given = given.sum(dim=1, keepdim=True).expand_as(value) / value.shape[1]
+        state[name] = given
     net.load_state_dict(state)
     net.learnt = True
+
+
+def start_from_starter(net: Descriptor) -> None:
+    """Give a network the weights that come with the package."""
+    start_from(net, _weights())
 
 
 def save_starter(net: Descriptor, path: Path) -> None:

@@ -1,0 +1,1 @@
+"""The paper's experiments on pairs of images whose homography is known."""

@@ -1,0 +1,258 @@
+"""What is compared: descriptors learnt on the pair, learnt before, and made by hand; and registration by elastix.
+
+A method gets a pair and a start, and gives descriptors of both images' patches, a homography, or both.
+"""
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import get_args
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from agalign import geometry
+from agalign.config import JointSettings, SeedSettings, Settings
+from agalign.descriptor import Descriptor, Sharing
+from agalign.detect import grey, to_8_bit
+from agalign.errors import ConfigurationError, InputError, NotEnoughTextureError
+from agalign.evaluation.protocol import grey_patches
+from agalign.flight import load_model
+from agalign.geometry import Matrix
+from agalign.joint import JointAligner, Subject
+from agalign.mapping import Mapping
+from agalign.match import matching_network
+from agalign.patches import Keypoints, patch_grid, transform
+from agalign.records import Raster
+from agalign.refine import describe_fixed, moving_patches
+from agalign.seed import best_seed, is_trusted, single, warped
+
+
+@dataclass(frozen=True)
+class Task:
+    """Two images and where alignment starts."""
+
+    fixed: Raster
+    moving: Raster
+    start: Matrix
+    """fixed_to_moving, px."""
+    device: str = "auto"
+    rng_seed: int = 0
+    seeding: bool = True
+    """False starts from `start` as it is; True lets the structures correct it first, as a run does."""
+
+
+Describe = Callable[[Keypoints, Matrix], tuple[Tensor, Tensor]]
+"""(f, f'), each (N, D), of the patches around keypoints of the first image and of the same patches sent to the second
+one by a homography."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a method gives for a pair."""
+
+    describe: Describe | None = None
+    fixed_to_moving: Matrix | None = None
+
+
+Method = Callable[[Task], Outcome]
+
+
+def method_named(name: str) -> Method:
+    """The method of a name as the command line takes it.
+
+    * `fast` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`), and `:grey` to leave colour
+      aside: learnt on the pair by that recipe.
+    * `sift`, `daisy`, `elastix`.
+    * FILE.safetensors: a network of this program. FILE.pt: a TorchScript module that takes (N, 1, P, P) in [0, 1]; P is
+      32, or what follows an @, as in hardnet.pt@32.
+
+    Raises ConfigurationError for any other, InputError for a file that cannot be used.
+    """
+    fixed_names: dict[str, Method] = {"sift": _sift, "daisy": _daisy, "elastix": _elastix}
+    if name in fixed_names:
+        return fixed_names[name]
+    learnt = re.fullmatch(r"(fast|paper):([a-z-]+)(:grey)?", name)
+    if learnt and learnt[2] in get_args(Sharing):
+        settings = JointSettings.model_validate({"recipe": learnt[1], "sharing": learnt[2]})
+        return lambda task: _learnt_on_the_pair(task, settings, colour=learnt[3] is None)
+    if ".safetensors" in name:
+        return _saved_network(Path(name))
+    if ".pt" in name:
+        file, _, side = name.partition("@")
+        return _torchscript(Path(file), int(side) if side.isdigit() else 32)
+    raise ConfigurationError(
+        f"'{name}' is no method; there are sift, daisy, elastix, fast:SHARING, paper:SHARING, and files of networks"
+    )
+
+
+# ---- this program's
+
+
+def _learnt_on_the_pair(task: Task, settings: JointSettings, *, colour: bool) -> Outcome:
+    """Recipe fast or paper from the task's start."""
+    fixed, moving = task.fixed, task.moving
+    if not colour or (settings.sharing == "siamese" and fixed.channels != moving.channels):
+        fixed, moving = (_without_colour(r) for r in (fixed, moving))
+    settings = settings.model_copy(update={"device": task.device, "rng_seed": task.rng_seed})
+    start, trusted = task.start, False
+    if task.seeding:
+        seed = best_seed(single(fixed), single(moving), {"user": task.start}, SeedSettings())
+        start, trusted = seed.fixed_to_moving, is_trusted(seed, SeedSettings())
+    aligner = JointAligner(settings, lambda *_: None)
+    subject = Subject(fixed, [moving], [start], [1], [trusted])
+    try:
+        if settings.recipe == "paper":
+            net, found = aligner.paper(fixed, moving, start)
+            subject.mappings[0] = found.fixed_to_moving
+        else:
+            net = aligner.fast_descriptor([fixed.channels, moving.channels])
+            aligner.learn([subject], net)
+            refined = aligner.refine(net, subject)[0]
+            if not isinstance(refined, str):
+                subject.mappings[0] = refined.fixed_to_moving
+    except NotEnoughTextureError:
+        return Outcome(None, start)
+    return Outcome(_by_network(net, aligner, fixed, moving), subject.mappings[0])
+
+
+def _without_colour(raster: Raster) -> Raster:
+    return replace(raster, pixels=grey(raster.pixels))
+
+
+def _by_network(net: Descriptor, aligner: JointAligner, one: Raster, other: Raster) -> Describe:
+    @torch.no_grad()
+    def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
+        level = aligner.level(Subject(one, [other], [fixed_to_moving], [1], [True]), 1.0, [0])
+        h = level.homography(fixed_to_moving, 0)
+        return describe_fixed(net, level, keypoints), net(moving_patches(level, 0, h, keypoints), 1)
+
+    return describe
+
+
+def _saved_network(path: Path) -> Method:
+    """A network of `agalign learn` or of an earlier run; images of other channels than it learnt are made grey."""
+    model = load_model(path, lambda: torch.device("cpu"))
+
+    def method(task: Task) -> Outcome:
+        fixed, moving = (
+            r if r.channels == channels else _without_colour(r)
+            for r, channels in zip((task.fixed, task.moving), model.net.channels, strict=False)
+        )
+        net = matching_network(model.net, 1, (fixed.channels, moving.channels))
+        aligner = JointAligner(JointSettings(device="cpu"), lambda *_: None)
+        return Outcome(_by_network(net, aligner, fixed, moving))
+
+    return method
+
+
+# ---- others'
+
+
+def _from_patches(task: Task, side: int, describe_patches: Callable[[Tensor], Tensor]) -> Outcome:
+    """A descriptor of (N, 1, side, side) patches in [0, 1]."""
+
+    def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
+        grid = patch_grid(keypoints, side)
+        there = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
+        return describe_patches(grey_patches(task.fixed, grid)), describe_patches(grey_patches(task.moving, there))
+
+    return Outcome(describe)
+
+
+_HAND_MADE_SIDE = 64
+
+
+def _sift(task: Task) -> Outcome:
+    return _from_patches(task, _HAND_MADE_SIDE, sift_of_patches)
+
+
+def _daisy(task: Task) -> Outcome:
+    return _from_patches(task, _HAND_MADE_SIDE, daisy_of_patches)
+
+
+def _mosaic(patches: Tensor) -> NDArray[np.float32]:
+    """Square patches (N, 1, P, P) side by side in one image, row by row, so that OpenCV and scikit-image see them all
+    at once.
+    """
+    columns = max(1, math.ceil(math.sqrt(len(patches))))
+    rows = max(1, math.ceil(len(patches) / columns))
+    side = patches.shape[-1]
+    sheet = patches.new_zeros((rows * columns, side, side))
+    sheet[: len(patches)] = patches[:, 0]
+    return np.asarray(sheet.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, -1).numpy())
+
+
+def sift_of_patches(patches: Tensor) -> Tensor:
+    """(N, 1, P, P) -> (N, 128): SIFT at the centre, upright, its 4 x 4 cells over the whole patch."""
+    side = patches.shape[-1]
+    sheet = np.asarray((_mosaic(patches) * 255).round(), np.uint8)
+    columns = sheet.shape[1] // side
+    keypoints = [
+        cv2.KeyPoint(
+            (i % columns) * side + (side - 1) / 2, (i // columns) * side + (side - 1) / 2, side / 6, 0.0, 1.0, 0
+        )
+        for i in range(len(patches))
+    ]
+    _, found = cv2.SIFT.create().compute(sheet, keypoints)
+    return torch.from_numpy(np.asarray(found, np.float32).reshape(len(patches), -1))
+
+
+def daisy_of_patches(patches: Tensor) -> Tensor:
+    """(N, 1, P, P) -> (N, 200): DAISY (Tola et al. 2010) at the centre, three rings of eight over the whole patch."""
+    from skimage.feature import daisy
+
+    side = patches.shape[-1]
+    sheet = _mosaic(patches)
+    columns = sheet.shape[1] // side
+    radius = side * 3 // 8  # with the outer ring's own width it reaches the patch's edge
+    first = side // 2 - radius
+    found = daisy(sheet[first:, first:], step=side, radius=radius, rings=3, histograms=8, orientations=8)
+    return torch.from_numpy(found[:, :columns].reshape(-1, found.shape[-1])[: len(patches)].astype(np.float32))
+
+
+def _torchscript(path: Path, side: int) -> Method:
+    try:
+        module = torch.jit.load(str(path), map_location="cpu").eval()  # type: ignore[no-untyped-call]
+        with torch.no_grad():
+            module(torch.zeros(2, 1, side, side))
+    except (OSError, RuntimeError, ValueError) as error:
+        problem = str(error).strip().splitlines()[-1]
+        raise InputError(f"{path}: is no TorchScript module of {side} x {side} patches ({problem})") from None
+
+    @torch.no_grad()
+    def describe(patches: Tensor) -> Tensor:
+        return torch.cat([module(some).flatten(1) for some in torch.split(patches, 512)])
+
+    return lambda task: _from_patches(task, side, describe)
+
+
+def _elastix(task: Task) -> Outcome:
+    """Affine, Mattes mutual information, on the pyramid of recipe paper."""
+    try:
+        import itk  # type: ignore[import-untyped]
+    except ImportError:
+        raise ConfigurationError("elastix is not installed; pip install 'agalign[elastix]'") from None
+    laid = warped(single(task.moving), Mapping(task.start), task.fixed.size_px)
+    coarsest = Settings().joint.paper.coarsest_px
+    parameters = itk.ParameterObject.New()
+    chosen = parameters.GetDefaultParameterMap("affine")
+    chosen["NumberOfResolutions"] = [str(1 + max(0, round(math.log2(max(task.fixed.size_px) / coarsest))))]
+    parameters.AddParameterMap(chosen)
+    images = [itk.GetImageFromArray(to_8_bit(r).astype(np.float32)) for r in (task.fixed, laid)]
+    try:
+        _, found = itk.elastix_registration_method(*images, parameter_object=parameters, log_to_console=False)
+    except RuntimeError:  # it gives up where the samples leave the image
+        return Outcome(None, task.start)
+    table = found.GetParameterMap(0)
+    a, b, c, d, tx, ty = (float(v) for v in table["TransformParameters"])
+    centre = np.array([float(v) for v in table["CenterOfRotationPoint"]])
+    linear = np.array([[a, b], [c, d]])
+    matrix = np.eye(3)
+    matrix[:2, :2], matrix[:2, 2] = linear, np.array([tx, ty]) + centre - linear @ centre
+    return Outcome(None, geometry.compose(task.start, matrix))

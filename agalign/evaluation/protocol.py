@@ -1,0 +1,35 @@
+"""The paper's protocol: patches around keypoints, warped by the truth; how often the nearest descriptor is right."""
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from agalign import geometry
+from agalign.detect import to_8_bit
+from agalign.geometry import Matrix
+from agalign.patches import bilinear
+from agalign.records import Raster
+
+
+def grey_patches(raster: Raster, grid: Tensor) -> Tensor:
+    """(N, 1, side, side) in [0, 1] at positions (N, side, side, 2) px."""
+    plane = torch.from_numpy(to_8_bit(raster).astype(np.float32) / 255)
+    return bilinear(plane[None], grid)
+
+
+def average_precision(f: Tensor, f_prime: Tensor) -> float:
+    """Share of descriptors (N, D) of the first image whose exact L2 nearest neighbour among those of the second
+    (N, D) is their own.
+    """
+    if len(f) == 0:
+        return math.nan
+    nearest = torch.cat([torch.cdist(some, f_prime).argmin(dim=1) for some in torch.split(f, 512)])
+    return float((nearest == torch.arange(len(f), device=f.device)).float().mean())
+
+
+def homography_error_px(found: Matrix, truth: Matrix, points: NDArray[np.float64]) -> float:
+    """Mean distance between where two homographies send the true matches (N, 2), px of the second image."""
+    return float(np.linalg.norm(geometry.apply(found, points) - geometry.apply(truth, points), axis=1).mean())

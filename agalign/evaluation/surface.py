@@ -1,0 +1,67 @@
+"""The training loss over known misalignments (the paper's Fig. 2): why the loss can be followed to the alignment."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign import geometry
+from agalign.config import JointSettings
+from agalign.errors import NotEnoughTextureError, OutputError
+from agalign.geometry import Matrix
+from agalign.joint import JointAligner, Subject
+from agalign.records import Raster
+
+
+def loss_surface(
+    fixed: Raster, moving: Raster, truth: Matrix, offsets_px: NDArray[np.float64], settings: JointSettings,
+    longer_side_px: int = 512, progress: Callable[[float], None] = lambda _: None,
+) -> NDArray[np.float64]:  # fmt: skip
+    """Mean loss a keypoint at the end of training with psi held at the truth moved by (x, y), for all pairs of offsets.
+
+    (n, n), rows along y; nan where too few keypoints remain. Each is learnt from the same random weights by recipe
+    paper, at the resolution whose longer side is at most `longer_side_px`. Offsets are px of the full resolution.
+    """
+    scale = min(1.0, longer_side_px / max(fixed.size_px))
+    found = np.full((len(offsets_px), len(offsets_px)), np.nan)
+    for row, dy in enumerate(offsets_px):
+        for column, dx in enumerate(offsets_px):
+            start = geometry.compose(truth, geometry.translation(float(dx), float(dy)))
+            aligner = JointAligner(settings, lambda *_: None)
+            channels = [fixed.channels, moving.channels]
+            try:
+                level = aligner.level(Subject(fixed, [moving], [start], [1], [False]), scale, [0])
+                net = aligner.new_descriptor(channels, half_rectified=False, unit_length=False)
+                _, _, loss, _ = aligner.descend(net, level, start, lambda _: None, move=False)
+                found[row, column] = loss
+            except NotEnoughTextureError:
+                pass
+            progress((row * len(offsets_px) + column + 1) / found.size)
+    return found
+
+
+def draw_surface(surface: NDArray[np.float64], offsets_px: NDArray[np.float64], path: Path) -> None:
+    """A picture of a loss surface, dark where the loss is low, with its axes in px. Raises OutputError."""
+    side, margin = 440, 56
+    low, high = np.nanmin(surface), np.nanmax(surface)
+    shade = np.nan_to_num((surface - low) / max(high - low, 1e-12), nan=1.0) * 255
+    field = cv2.resize(shade.astype(np.uint8), (side, side), interpolation=cv2.INTER_CUBIC)
+    sheet = np.full((side + 2 * margin, side + 2 * margin, 3), 255, np.uint8)
+    sheet[margin : margin + side, margin : margin + side] = cv2.applyColorMap(field, cv2.COLORMAP_VIRIDIS)
+    ink, font = (40, 40, 40), cv2.FONT_HERSHEY_SIMPLEX
+
+    def write(text: str, x: int, y: int) -> None:
+        width = cv2.getTextSize(text, font, 0.42, 1)[0][0]
+        cv2.putText(sheet, text, (x - width // 2, y), font, 0.42, ink, 1, cv2.LINE_AA)
+
+    half = side / (2 * len(offsets_px))
+    for k in np.linspace(0, len(offsets_px) - 1, 5).round().astype(int):
+        at = margin + round(half + k * (side - 2 * half) / (len(offsets_px) - 1))
+        write(f"{offsets_px[k]:g}", at, margin + side + 18)
+        write(f"{offsets_px[k]:g}", margin // 2, at + 4)
+    write("offset along x, px", margin + side // 2, margin + side + 42)
+    write(f"loss a keypoint, {low:.3f} (dark) to {high:.3f}; offset along y at the left", margin + side // 2, 32)
+    if not cv2.imwrite(str(path), sheet):
+        raise OutputError(f"{path}: cannot be written")
