@@ -16,6 +16,7 @@ from agalign.evaluation.methods import Method, Task
 from agalign.evaluation.protocol import average_precision, homography_error_px
 from agalign.geometry import Matrix
 from agalign.image_pairs import ImagePair, read_image
+from agalign.joint import one_thread
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,8 @@ def evaluate(
             rng = np.random.default_rng((rng_seed, number))
             for shift, start in starts.of(truth, max(fixed.size_px), rng):
                 began = time.perf_counter()
-                outcome = method(Task(fixed, moving, start, device, rng_seed, starts.seeding))
+                with one_thread():
+                    outcome = method(Task(fixed, moving, start, device, rng_seed, starts.seeding))
                 seconds = time.perf_counter() - began
                 precision = error = math.nan
                 if outcome.describe is not None and len(keypoints):

@@ -1,0 +1,117 @@
+"""The paper's experiments on a folder of aerial RGB/NIR pairs (VIS_1.png, NIR_TF_1.png, GT_1.txt ...). Prints tables.
+
+    python benchmarks/paper.py FOLDER precision|robustness|automatic [method...]
+
+precision: descriptors and homographies from starts 5 % off, no seeding. robustness: starts 0 to 20 % off in four
+directions, with and without seeding, beside elastix; also robustness.csv for `plot`. automatic: 20 pairs teach a
+descriptor without labels, 5 test it. The same is to be had from `agalign evaluate` and `agalign learn` on any pairs.
+"""
+
+import random
+import sys
+import tempfile
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+from agalign.config import JointSettings, Settings
+from agalign.evaluation.methods import method_named
+from agalign.evaluation.run import Result, Starts, as_csv, error_table, evaluate, precision_table
+from agalign.flight import save_model
+from agalign.image_pairs import ImagePair, read_image
+from agalign.learn import CoarsePair, learn_descriptor
+
+SHIFTS = (0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2)
+SPLIT_SEED = 2018
+
+
+def pairs_of(folder: Path) -> list[ImagePair]:
+    found = []
+    for truth in sorted(folder.glob("GT_*.txt"), key=lambda p: int(p.stem[3:])):
+        number = truth.stem[3:]
+        images = folder / f"VIS_{number}.png", folder / f"NIR_TF_{number}.png"
+        found.append(ImagePair(number, "aerial", *images, np.loadtxt(truth)))
+    return found
+
+
+def split(pairs: list[ImagePair]) -> tuple[list[ImagePair], list[ImagePair]]:
+    """20 to learn from, 5 to test."""
+    mixed = random.Random(SPLIT_SEED).sample(pairs, len(pairs))
+    return mixed[:20], mixed[20:]
+
+
+def precision(pairs: list[ImagePair], names: list[str]) -> None:
+    names = names or ["fast:pseudo-siamese", "fast:siamese", "fast:unshared", "sift", "daisy", "paper:pseudo-siamese"]
+    methods = {name: method_named(name) for name in names}
+    results = list(evaluate(pairs, methods, Starts((0.05,))))
+    markdown(precision_table(results))
+    markdown(error_table(results))
+
+
+def robustness(pairs: list[ImagePair], names: list[str]) -> None:
+    results: list[Result] = []
+    for name in names or ["fast:pseudo-siamese", "fast:pseudo-siamese+seeds", "elastix"]:
+        method, _, seeds = name.partition("+")
+        starts = Starts(SHIFTS, directions=4, seeding=bool(seeds))
+        results += evaluate(pairs, {name: method_named(method)}, starts)
+        Path(f"robustness-{name.replace(':', '-')}.csv").write_text(as_csv(results))
+    markdown(error_table(results))
+
+
+def plot(results: list[Result], path: Path) -> None:
+    """Mean homography error and mAP over the start's error, a line a method."""
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6))
+    for name in dict.fromkeys(r.method for r in results):
+        shifts = [s for s in SHIFTS if any(r.method == name and r.shift == s for r in results)]
+        for axis, field, scale in zip(axes, ("error_share", "average_precision"), (100, 1), strict=True):
+            means = [scale * np.mean([getattr(r, field) for r in results if (r.method, r.shift) == (name, s)])
+                     for s in shifts]  # fmt: skip
+            if np.isfinite(means).all():
+                axis.plot([100 * s for s in shifts], means, marker="o", label=name)
+    axes[0].set(xlabel="start off by, % of the side", ylabel="mean homography error, % of the side")
+    axes[1].set(xlabel="start off by, % of the side", ylabel="mAP", ylim=(0, 1))
+    for axis in axes:
+        axis.grid(alpha=0.25)
+    axes[0].legend(frameon=False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+def automatic(pairs: list[ImagePair], _names: list[str]) -> None:
+    train, test = split(pairs)
+    rng = np.random.default_rng(SPLIT_SEED)
+    coarse = []
+    for pair in train:
+        fixed, moving = read_image(pair.fixed), read_image(pair.moving)
+        assert pair.fixed_to_moving is not None
+        ((_, start),) = Starts((0.05,)).of(pair.fixed_to_moving, max(fixed.size_px), rng)
+        coarse.append(CoarsePair(pair.name, fixed, moving, start))
+    methods = {name: method_named(name) for name in ("sift", "daisy")}
+    with tempfile.TemporaryDirectory() as temporary:
+        for sharing in ("siamese", "pseudo-siamese"):
+            path = Path(temporary) / f"automatic, {sharing}.safetensors"
+            settings = Settings(joint=JointSettings.model_validate({"sharing": sharing}))
+            aligned = []
+            model = learn_descriptor(coarse, settings, on_pair=lambda lesson, a=aligned: a.append(lesson.status))
+            print(f"{sharing}: {aligned.count('aligned')} of {len(aligned)} pairs aligned", flush=True)
+            save_model(model, path)
+            methods[path.stem] = method_named(str(path))
+        results = list(evaluate(test, methods, Starts((0.05,))))
+    markdown(precision_table(results))
+
+
+def markdown(rows: list[list[str]]) -> None:
+    for number, row in enumerate(rows):
+        print("| " + " | ".join(row) + " |")
+        if number == 0:
+            print("|" + "---|" * len(row))
+    print(flush=True)
+
+
+if __name__ == "__main__":
+    steps = {"precision": precision, "robustness": robustness, "automatic": automatic}
+    steps[sys.argv[2]](pairs_of(Path(sys.argv[1])), sys.argv[3:])
