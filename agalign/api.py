@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign import geometry
-from agalign.batch import CaptureReport, RunOptions, rig_seed, run_flight, write_summary
+from agalign.batch import CaptureReport, RunOptions, run_flight
+from agalign.cameras import rig_seed
 from agalign.config import Interpolation, Settings
 from agalign.discover import DiscoverOptions, discover
 from agalign.errors import InputError
@@ -15,6 +16,7 @@ from agalign.masks import raster_of
 from agalign.pair import align_images
 from agalign.pipeline import CaptureOutcome, process_capture, quiet
 from agalign.records import Alignment, Capture, Mask, SeedKind, Tile
+from agalign.summary import write_summary
 from agalign.warp import resample
 
 
@@ -95,7 +97,7 @@ def align_folder(
 
     `run` says how: how many captures at a time, or on which executor; with several processes the calling script must
     be importable (`if __name__ == "__main__":`). `model` is a file of an earlier run's `models` folder to start from.
-    Raises InputError where there is nothing to align, OutputError where `out` cannot be written, ConfigurationError
+    Raises InputError where there is no such folder, OutputError where `out` cannot be written, ConfigurationError
     for a model of another camera.
     """
     from agalign.report import write_report

@@ -1,13 +1,12 @@
 """Many captures: which are still to be done, each one done, one summary."""
 
-import csv
-import io
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
@@ -22,11 +21,11 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
-from agalign.cameras import known_cameras
+from agalign.cameras import rig_seed
 from agalign.config import Settings
-from agalign.describe import fingerprint
 from agalign.discover import Flight
 from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError, WorkerError
+from agalign.fingerprint import fingerprint
 from agalign.flight import (
     FlightModel,
     camera_key,
@@ -37,19 +36,11 @@ from agalign.flight import (
     model_names,
     save_model,
 )
-from agalign.geometry import Matrix
 from agalign.joint import choose_device, limit_threads, one_thread
 from agalign.pair import PairProgress
 from agalign.pipeline import output_paths, process_capture, quiet
-from agalign.records import Band, Capture
-from agalign.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar, write_text
-
-SUMMARY_COLUMNS = (
-    "folder", "capture", "band", "wavelength_nm", "status", "reason", "seed", "retrieval", "corner_std_px",
-    "residual_px", "residual_p95_px", "residual_coverage", "mattes_mi_before", "mattes_mi_after", "nmi_before",
-    "nmi_after", "ncc_before", "ncc_after", "gradient_correlation_before", "gradient_correlation_after",
-    "structure_ssim_before", "structure_ssim_after", "seconds",
-)  # fmt: skip
+from agalign.records import Capture
+from agalign.sidecar import Sidecar, read_sidecar
 
 _MOST_READ_AHEAD_BYTES = 64 << 20
 _DASK_ANSWERS_WITHIN_S = 10
@@ -67,6 +58,16 @@ class CaptureReport:
     sidecar: Sidecar | None
     error: str | None = None
 
+    def without_tables(self) -> "CaptureReport":
+        """The same without the sidecar's long tables: a thousand of these are kept until a run ends."""
+        if self.sidecar is None:
+            return self
+        bands = [
+            b.model_copy(update={"grid": None, "metrics": b.metrics and b.metrics.model_copy(update={"tiles": []})})
+            for b in self.sidecar.bands
+        ]
+        return replace(self, sidecar=self.sidecar.model_copy(update={"bands": bands}))
+
     @property
     def good(self) -> bool:
         """True where every band pair of the capture is aligned and none is missing."""
@@ -76,15 +77,6 @@ class CaptureReport:
     def useful(self) -> bool:
         """True where at least one band pair is aligned."""
         return self.sidecar is not None and any(b.status == "aligned" for b in self.sidecar.bands)
-
-
-def rig_seed(reference: Band, moving: Band) -> Matrix | None:
-    """The first camera's answer that has one: bands carry their rig's data themselves."""
-    for camera in known_cameras():
-        found = camera.rig_seed(reference, moving)
-        if found is not None:
-            return found
-    return None
 
 
 def prepare_output(out: Path) -> None:
@@ -136,6 +128,9 @@ def run_flight(
     prepare_output(out)
     _refuse_to_overwrite_inputs(flight, out)
     known = None if model is None else _given_model(model, flight, settings)
+    if known is not None:
+        used = settings.flight.model_copy(update={"start": known.fingerprint})
+        settings = settings.model_copy(update={"flight": used})
     waiting: list[Task] = []
     groups = flights_of(flight.captures)
     for group, name in zip(groups, model_names(groups), strict=True):
@@ -188,7 +183,8 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     """Do one capture; what can go wrong with it is in the report."""
     label = task.capture.label
     try:
-        model = None if task.model is None else _loaded(task.model, task.settings.joint.device)
+        device = task.settings.joint.device
+        model = None if task.model is None else _loaded(task.model, device, _stamp(task.model))
         with one_thread():
             outcome = process_capture(task.capture, task.out, rig_seed, task.settings, on_pair, model)
     except AgalignError as error:
@@ -225,7 +221,8 @@ def _report_of(future: "Future[CaptureReport]", task: Task) -> CaptureReport:
     except MemoryError:
         return CaptureReport(task.capture.label, "error", None, f"{task.capture.label}: out of memory")
     except Exception as error:
-        if type(error).__module__.partition(".")[0] != "distributed":
+        lost = isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed"
+        if not lost:
             raise
         problem = f"{task.capture.label}: the cluster lost it ({error}); run again to do what is left"
         return CaptureReport(task.capture.label, "error", None, problem)
@@ -283,9 +280,13 @@ def _read_ahead(capture: Capture) -> None:
 
 
 def _given_model(path: Path, flight: Flight, settings: Settings) -> FlightModel:
-    """The model to start from. Raises ConfigurationError where it is another camera's than any capture's."""
+    """The model to start from. Raises ConfigurationError where it is of no use here."""
+    if settings.joint.recipe != "fast" or not settings.flight.together:
+        raise ConfigurationError("a model is of use only where one network is learnt for a flight, by recipe fast")
     model = load_model(path, lambda: choose_device(settings.joint.device))
-    if model.camera and not any(camera_key(c) == model.camera for c in flight.captures):
+    if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
+        raise ConfigurationError(f"{path}: was learnt unshared; add --sharing unshared")
+    if model.camera and flight.captures and not any(camera_key(c) == model.camera for c in flight.captures):
         here = camera_key(flight.captures[0])
         raise ConfigurationError(f"{path}: was learnt for {model.camera}; the images here are of {here}")
     return model
@@ -301,7 +302,7 @@ def _learn(
     device = settings.joint.device
     if path.is_file():
         with suppress(AgalignError):
-            if _loaded(path, device).fingerprint == learning_fingerprint(captures, settings, start):
+            if _loaded(path, device, _stamp(path)).fingerprint == learning_fingerprint(captures, settings):
                 return path
 
     def progress(_stage: str, share: float) -> None:
@@ -310,13 +311,19 @@ def _learn(
     model = learn_flight(captures, rig_seed, settings, progress, start)
     if model is None:
         return None
-    _loaded.cache_clear()
     save_model(model, path)
     return path
 
 
+def _stamp(path: Path) -> int:
+    """Workers live longer than runs: a model that was learnt anew has the same path and another stamp."""
+    with suppress(OSError):
+        return path.stat().st_mtime_ns
+    return 0
+
+
 @lru_cache(maxsize=8)
-def _loaded(path: Path, device: str) -> FlightModel:
+def _loaded(path: Path, device: str, _stamp: int) -> FlightModel:
     return load_model(path, lambda: choose_device(device))
 
 
@@ -341,52 +348,3 @@ def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar 
         return None
     size = stack.stat().st_size if stack.is_file() else None
     return sidecar if size == (sidecar.output.bytes if sidecar.output else None) else None
-
-
-def write_summary(out: Path, on_problem: Callable[[str], None] = quiet) -> Path:
-    """OUT/summary.csv from all sidecars below OUT, a row per band pair; unreadable ones are told to `on_problem`.
-
-    Raises OutputError.
-    """
-    table = io.StringIO()
-    writer = csv.DictWriter(table, SUMMARY_COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    for folder, sidecar in sidecars_below(out, on_problem):
-        writer.writerows(_row(folder, sidecar, band) for band in sidecar.bands if band.status != "reference")
-    path = out / "summary.csv"
-    write_text(path, table.getvalue())
-    return path
-
-
-def sidecars_below(out: Path, on_problem: Callable[[str], None] = quiet) -> Iterable[tuple[str, Sidecar]]:
-    """(folder relative to OUT, sidecar) of every readable sidecar; `on_problem` is told of the others."""
-    for path in find_sidecars(out):
-        try:
-            yield path.parent.relative_to(out).as_posix(), read_sidecar(path)
-        except SidecarError as error:
-            on_problem(str(error))
-
-
-def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:
-    row: dict[str, object] = {
-        "folder": folder,
-        "capture": sidecar.capture,
-        "band": band.band,
-        "wavelength_nm": band.wavelength_nm,
-        "status": band.status,
-        "reason": band.reason,
-        "seed": band.seed.kind if band.seed else None,
-        "seconds": band.seconds,
-    }
-    if band.joint is not None:
-        row |= {"retrieval": round(band.joint.retrieval, 4), "corner_std_px": round(band.joint.corner_std_px, 4)}
-    if band.metrics is not None:
-        before, after = band.metrics.before.model_dump(), band.metrics.after.model_dump()
-        row |= {k: _short(after[k]) for k in ("residual_px", "residual_p95_px", "residual_coverage")}
-        for name in ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim"):
-            row |= {f"{name}_before": _short(before[name]), f"{name}_after": _short(after[name])}
-    return row
-
-
-def _short(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)

@@ -1,5 +1,7 @@
 """Whether an alignment can be believed. A wrong one called `aligned` is the worst this program could do."""
 
+import numpy as np
+
 from agalign import geometry
 from agalign.config import CheckSettings
 from agalign.geometry import Matrix
@@ -23,17 +25,21 @@ def _doubt(
     joint: JointResult, residual: Residual | None, size_px: tuple[int, int], settings: CheckSettings
 ) -> str | None:
     scale = geometry.local_scale(joint.fixed_to_moving, *size_px)
-    if scale.min() <= 0 or scale.max() > 4 * scale.min():
+    # Written so that nan passes nowhere.
+    if not (scale.min() > 0 and scale.max() <= 4 * scale.min()):
         return "the mapping folds or stretches the image"
-    if joint.retrieval < settings.least_retrieval:
+    if not joint.retrieval >= max(settings.least_retrieval, settings.least_times_chance * joint.chance):
         return f"descriptors do not tell held-out patches apart (retrieval {joint.retrieval:.2f})"
-    if joint.corner_std_px > settings.most_corner_std_px:
+    if not joint.corner_std_px <= settings.most_corner_std_px:
         return f"the corners are known to {joint.corner_std_px:.1f} px only"
     if residual is None or len(residual.centres_px) < settings.least_windows:
         return "too little structure in common to check the result"
     if residual.coverage < settings.least_coverage:
         return f"the structures agree in only {residual.coverage:.0%} of the windows"
-    if residual.median_px > settings.most_residual_px:
+    close = np.linalg.norm(residual.shifts_px, axis=1) <= settings.most_residual_px
+    if not close.mean() >= settings.least_close:
+        return f"the structures lie within {settings.most_residual_px:g} px in only {close.mean():.0%} of the windows"
+    if not residual.median_px <= settings.most_residual_px:
         return f"the structures still lie {residual.median_px:.1f} px apart"
     return None
 

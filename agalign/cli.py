@@ -1,4 +1,4 @@
-"""The command line: parses, calls the library, prints. Everything that prints is here."""
+"""The command line: parses, calls the library, prints."""
 
 import json
 import logging
@@ -40,6 +40,7 @@ _COMMANDS = ("align", "demo", "info", "report", "learn", "evaluate", "surface")
 
 
 cli_evaluate.register(app)
+_GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
 
 
 class SeedChoice(StrEnum):
@@ -176,7 +177,9 @@ def align(
         CompressionChoice, typer.Option(help="Lossless compression of the stacks.")
     ] = CompressionChoice.zstd,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
-    rng_seed: Annotated[int, typer.Option(help="Seed of all random numbers; the same seed gives the same result.")] = 0,
+    rng_seed: Annotated[
+        int, typer.Option(min=0, help="Seed of all random numbers; the same seed gives the same result.")
+    ] = 0,
     jobs: Jobs = 0,
     dask: Dask = None,
     model: Annotated[
@@ -194,7 +197,7 @@ def align(
 ) -> None:
     """Align every capture below FOLDER."""
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice):
+    with exits(voice, _GOES_ON):
         from agalign.config import FlightSettings, JointSettings, SeedSettings, Settings, WriteSettings
         from agalign.discover import DiscoverOptions
 
@@ -223,14 +226,14 @@ def demo(
     captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
     jobs: Jobs = 0,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
-    rng_seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
+    rng_seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
     """Make a synthetic flight, align it, and compare the result with the known truth."""
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice):
+    with exits(voice, _GOES_ON):
         from agalign.batch import prepare_output
         from agalign.config import JointSettings, Settings
         from agalign.demo import make_flight, score_against_truth
@@ -244,7 +247,7 @@ def demo(
         truth = make_flight(source, captures, rng_seed=rng_seed)
         flight = _discover(source, DiscoverOptions(), voice)
         settings = Settings(joint=JointSettings(device=device, rng_seed=rng_seed))
-        reports = _run(flight, target, settings, voice, overwrite=True, jobs=jobs)
+        reports = _run(flight, target, settings, voice, overwrite=True, jobs=jobs, keep_tables=True)
         table = Table("Capture", "Band", "Status", title="Error against the truth, px")
         for name in ("before", "median", "95 %"):
             table.add_column(name, justify="right")
@@ -292,10 +295,10 @@ def report(
     """Rebuild the report and the summary from the sidecars."""
     voice = Voice(quiet=False, verbose=False, log_json=False)
     with exits(voice):
-        from agalign.batch import write_summary
         from agalign.errors import InputError
         from agalign.report import write_report
         from agalign.sidecar import find_sidecars
+        from agalign.summary import write_summary
 
         if not out.is_dir() or not find_sidecars(out):
             raise InputError(f"{out}: no sidecars there; give the output folder of a run")
@@ -309,7 +312,7 @@ def report(
 
 def _facts(capture: "Capture") -> dict[str, Any]:
     """What `info` shows of a capture."""
-    from agalign.batch import rig_seed
+    from agalign.cameras import rig_seed
     from agalign.seed import geo_seed
 
     kinds = {
@@ -382,7 +385,7 @@ def _discover(folder: Path, options: "DiscoverOptions", voice: Voice, *, silent:
 
 def _run(
     flight: "Flight", out: Path, settings: "Settings", voice: Voice, *,
-    overwrite: bool, jobs: int, dask: str | None = None, model: Path | None = None,
+    overwrite: bool, jobs: int, dask: str | None = None, model: Path | None = None, keep_tables: bool = False,
 ) -> "list[CaptureReport]":  # fmt: skip
     from agalign.batch import Listener, RunOptions, dask_executor, run_flight
     from agalign.joint import choose_device
@@ -422,7 +425,7 @@ def _run(
             listener = Listener(on_start, on_pair, on_learning)
             for capture_report in run_flight(flight, out, settings, options, listener, model):
                 check_interrupt()
-                reports.append(capture_report)
+                reports.append(capture_report if keep_tables else capture_report.without_tables())
                 done_pairs += pairs[capture_report.label]
                 show(done_pairs, capture_report.label)
                 _tell(capture_report, voice, len(reports), len(flight.captures))
@@ -435,8 +438,8 @@ def _run(
 
 def _write_pages(out: Path, reports: "list[CaptureReport]") -> None:
     """Also after an interruption: what is finished is reported."""
-    from agalign.batch import write_summary
     from agalign.report import write_report
+    from agalign.summary import write_summary
 
     if reports:
         write_summary(out)

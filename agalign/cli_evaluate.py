@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from agalign.errors import ConfigurationError, OutputError
+from agalign.errors import ConfigurationError
 from agalign.terminal import LogJson, Quiet, Verbose, Voice, exits
 
 Pairs = Annotated[
@@ -16,7 +16,7 @@ Pairs = Annotated[
     ),
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")]
-RngSeed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
+RngSeed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -56,20 +56,23 @@ def evaluate(
         from agalign.evaluation.methods import method_named
         from agalign.evaluation.run import Starts, as_csv, error_table, evaluate, precision_table
         from agalign.image_pairs import find_pairs
+        from agalign.sidecar import write_text
 
-        chosen = methods or ["fast:pseudo-siamese", "fast:siamese", "sift", "daisy"]
+        chosen = methods or ["fast:pseudo-siamese", "fast:siamese", "sift"]
         named = {name: method_named(name) for name in chosen}
         starts = Starts(_shares(shift), directions, seeding)
         results = []
-        for result in evaluate(find_pairs(pairs), named, starts, device, rng_seed):
-            results.append(result)
-            line = f"{result.pair}, {result.method}: precision {result.average_precision:.3f}, {result.error_px:.3f} px"
-            voice.event("result", line if verbose else "", **vars(result))
+        try:
+            for result in evaluate(find_pairs(pairs), named, starts, device, rng_seed):
+                results.append(result)
+                line = f"{result.pair}, {result.method}: mAP {result.average_precision:.3f}, {result.error_px:.3f} px"
+                voice.event("result", line if verbose else "", **vars(result))
+        finally:
+            if out is not None and results:
+                write_text(out, as_csv(results))
         for title, rows in (("Mean average precision", precision_table(results)), ("Homography", error_table(results))):
             if len(rows) > 1:
                 voice.result(_table(title, rows))
-        if out is not None:
-            _write(out, as_csv(results))
 
 
 def surface(
@@ -93,6 +96,8 @@ def surface(
         from agalign.evaluation.surface import draw_surface, loss_surface
         from agalign.image_pairs import find_pairs, read_image
 
+        if out.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
+            raise ConfigurationError(f"{out}: is no name of a picture, such as loss-surface.png")
         known = [p for p in find_pairs(pairs) if p.fixed_to_moving is not None]
         if number > len(known):
             raise ConfigurationError(f"{pairs}: has {len(known)} pairs with a homography, not {number}")
@@ -101,7 +106,11 @@ def surface(
         settings = JointSettings(recipe="paper", device=device, rng_seed=rng_seed)
         images = read_image(pair.fixed), read_image(pair.moving)
         assert pair.fixed_to_moving is not None
-        found = loss_surface(*images, pair.fixed_to_moving, offsets, settings)
+
+        def progress(share: float) -> None:
+            voice.event("surface", f"{share:.0%}" if verbose else "", share=round(share, 3))
+
+        found = loss_surface(*images, pair.fixed_to_moving, offsets, settings, progress=progress)
         draw_surface(found, offsets, out)
         voice.event("surface", f"{out}: {pair.name}", file=str(out))
 
@@ -156,11 +165,3 @@ def _table(title: str, rows: list[list[str]]) -> Table:
     for row in rows[1:]:
         table.add_row(*row)
     return table
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None

@@ -103,7 +103,7 @@ class JointSettings(Stage):
     sharing: Literal["siamese", "pseudo-siamese", "unshared"] = "pseudo-siamese"
     model_family: ModelFamily | Literal["auto"] = "auto"
     device: str = "auto"
-    rng_seed: int = 0
+    rng_seed: Annotated[int, Field(ge=0)] = 0
     fast: FastRecipe = FastRecipe()
     paper: PaperRecipe = PaperRecipe()
     longest_side_px: Positive = 4096
@@ -117,6 +117,8 @@ class FlightSettings(Stage):
     """False learns every capture alone."""
     captures: Positive = 3
     """How many the network is learnt on, spread over the flight."""
+    start: str = ""
+    """Fingerprint of the network that theta starts from, where one is given: results depend on it."""
 
 
 class SeedSettings(Stage):
@@ -149,13 +151,19 @@ class CheckSettings(Stage):
     """Correlation peak, in standard deviations of its surface, from which a window's shift is believed."""
     least_retrieval: float = 0.2
     """Held-out retrieval; chance is below 0.01, unrelated images reach 0.05."""
+    least_times_chance: float = 5.0
+    """The same in multiples of what guessing gives, where few keypoints could be drawn."""
     most_residual_px: float = 1.0
     """Median length of the windows' residual shifts."""
     least_coverage: float = 0.6
     """Share of the windows with structure in which a shift could be measured."""
+    least_close: float = 0.5
+    """Share of all these windows in which the shift is at most `most_residual_px`."""
     least_windows: Positive = 4
     least_seed_coverage: float = 0.3
     """The same as `least_coverage` for a seed that is used as it is."""
+    most_seed_residual_px: float = 8.0
+    """The same as `most_residual_px` for a seed that is used as it is."""
     most_corner_std_px: float = 2.0
     """Standard deviation of the mapped corners."""
     most_snap_px: float = 0.25

@@ -1,9 +1,7 @@
 """A capture's outcome as its sidecar."""
 
-import hashlib
 import math
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +9,7 @@ from numpy.typing import NDArray
 from agalign import geometry
 from agalign._version import __version__
 from agalign.config import Settings
+from agalign.fingerprint import fingerprint
 from agalign.geometry import Matrix
 from agalign.pair import mapping_of
 from agalign.records import Alignment, Band, Capture, CaptureStatus, JointResult, Residual
@@ -32,25 +31,6 @@ from agalign.sidecar import (
 from agalign.write import Stack
 
 _GRID_COLUMNS, _GRID_ROWS = 17, 13
-
-
-def fingerprint(capture: Capture, settings: Settings) -> str:
-    """Changes when the settings, the files or the program's version do.
-
-    What the other captures of the flight are does not count: a result stays good when the card holds more.
-    """
-    bands = [(b.name, b.address, b.lens, b.georeference is not None, _state(b.path)) for b in capture.bands]
-    text = f"{__version__} {settings.model_dump_json()} {capture.reference_index} {bands}"
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _state(path: Path) -> tuple[int, int]:
-    """Size and time of change: a file that was copied from the card again is another file."""
-    try:
-        state = path.stat()
-    except OSError:
-        return 0, 0
-    return state.st_size, state.st_mtime_ns
 
 
 def capture_status(statuses: list[str]) -> CaptureStatus:

@@ -18,9 +18,11 @@ _SPACING_PER_SIZE = 6 / PATCH_PX
 
 
 def grey(image: FloatImage) -> FloatImage:
-    """(H, W): the luma of three channels (ITU-R BT.601), a single band as it is."""
+    """(H, W): the luma of three channels (ITU-R BT.601), the mean of any other number, a single band as it is."""
     if image.ndim == 2:
         return image
+    if len(image) != 3:
+        return np.asarray(image.mean(axis=0), np.float32)
     return np.tensordot(np.array([0.299, 0.587, 0.114], np.float32), image, axes=1)
 
 

@@ -4,9 +4,9 @@ The captures of a flight share their cameras, so what tells the bands' patches a
 capture keeps its own psi (what the paper leaves as future work).
 """
 
-import hashlib
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -23,6 +23,7 @@ from agalign._version import __version__
 from agalign.config import JointSettings, Settings
 from agalign.descriptor import Descriptor
 from agalign.errors import AgalignError, GeometryError, InputError, NotEnoughTextureError, OutputError
+from agalign.fingerprint import fingerprint, hashed
 from agalign.geometry import Matrix
 from agalign.joint import JointAligner, Progress, Subject
 from agalign.match import with_match
@@ -44,7 +45,7 @@ class FlightModel:
     bands: tuple[str, ...]
     """Names of the moving bands; the network's side of one is its place here, counted from 1."""
     mappings: Mapping[str, Matrix]
-    """Median fixed_to_moving of the bands that were aligned, undistorted px of the files."""
+    """Median fixed_to_moving of the bands whose held-out patches were told apart, undistorted px of the files."""
     fingerprint: str
     """Of what it was learnt from, and how."""
 
@@ -71,11 +72,13 @@ def flights_of(captures: Iterable[Capture]) -> list[list[Capture]]:
 def model_names(groups: Sequence[Sequence[Capture]]) -> list[str]:
     """A file name for each group's model: the camera, and a number where one camera has several."""
     names: list[str] = []
+    seen: Counter[str] = Counter()
     for group in groups:
         camera = group[0].camera
         stem = re.sub(r"[^\w.+-]+", "_", f"{camera.model} {camera.serial}".strip()) or "camera"
-        names.append(f"{stem}-{names.count(stem) + 1}" if stem in names else stem)
-    return [f"{name}.safetensors" for name in names]
+        seen[stem] += 1
+        names.append(f"{stem}.safetensors" if seen[stem] == 1 else f"{stem}-{seen[stem]}.safetensors")
+    return names
 
 
 # ---- learning
@@ -119,14 +122,13 @@ def learn_flight(
         moving = next(b for b in captures[0].moving if b.name == name)
         down = [_reduction(b, settings.joint.longest_side_px) for b in (captures[0].reference, moving)]
         mappings[name] = geometry.rescale(small, *[(1 / x, 1 / y) for x, y in down])
-    return FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings, start))
+    return FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings))
 
 
-def learning_fingerprint(captures: Sequence[Capture], settings: Settings, start: FlightModel | None) -> str:
+def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:
     """Changes when the captures that would be learnt from, or the settings, do."""
-    names = [(c.label, [(b.path.name, b.path.stat().st_size) for b in c.bands if b.path.exists()]) for c in captures]
-    text = f"{__version__} {settings.joint} {settings.seed} {settings.flight} {names} {start and start.fingerprint}"
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    stages = settings.joint, settings.seed, settings.flight
+    return hashed(camera_key(captures[0]), *(fingerprint(c, *stages) for c in captures))
 
 
 def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matrix:
@@ -213,7 +215,7 @@ def refine_with(
 
 
 def align_from_scratch(subject: Subject, joint: JointSettings, progress: Progress) -> list[JointResult | str]:
-    """Theta and every psi of one capture, starting from nothing but the seeds."""
+    """Theta and every psi of one capture by itself."""
     aligner = JointAligner(joint, progress)
     results: list[JointResult | str] = []
     if joint.recipe == "paper":

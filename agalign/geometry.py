@@ -94,12 +94,6 @@ def corner_error_px(one: Matrix, other: Matrix, width_px: int, height_px: int) -
     return float(np.nan_to_num(distance, nan=np.inf).max())
 
 
-def mean_error_px(one: Matrix, other: Matrix, width_px: int, height_px: int) -> float:
-    """Mean distance in px between the images of a 20 x 20 lattice under two homographies."""
-    points = lattice(width_px, height_px, 20, 20)
-    return float(np.linalg.norm(apply(one, points) - apply(other, points), axis=1).mean())
-
-
 def local_scale(matrix: Matrix, width_px: int, height_px: int) -> Points:
     """Square root of the mapping's area change at the corners and the centre, (5,); negative where it folds.
 

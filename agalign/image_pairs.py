@@ -74,7 +74,7 @@ def _image(folder: Path, stem: str) -> Path:
 
 def _from_csv(path: Path) -> Iterator[ImagePair]:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None

@@ -8,6 +8,7 @@ homography, L0 and L1 the losses. Two recipes share the levels, the keypoints, t
   One theta for as many captures as are given, each pair with its own psi (the paper's future work).
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -280,10 +281,10 @@ class JointAligner:
         Around the truth the loss is a funnel (paper, Fig. 2) that is wider than what one Gauss-Newton step sees.
         """
         recipe, level = self.settings.fast, pairs.level
+        p, _ = self.sampler.draw(level, level.anywhere, pairs.h, recipe.search_patches, recipe.octaves)
         for b, h in enumerate(pairs.h):
             if pairs.subject.trusted[pairs.bands[b]]:
                 continue
-            p, _ = self.sampler.draw(level, level.anywhere, [h], recipe.search_patches, recipe.octaves)
             reach = recipe.search_share * max(level.fixed.size_px)
             shift = best_shift(net, level, b, pairs.side(b), h, p, reach, recipe.search_step_px)
             pairs.h[b] = h @ translation(shift).to(h)
@@ -390,11 +391,15 @@ class JointAligner:
             except GeometryError:
                 results.append("the optimisation ended in a mapping that cannot be inverted")
                 continue
+            std = _complete_std(step, recipe)
+            if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
+                results.append("the patches do not say where the corners lie")
+                continue
             held_out, chance = retrieval(net, level, b, side, found, test, f_test, recipe)
             results.append(
                 JointResult(
                     matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family,
-                    step.length_px, _complete_std(step, recipe),
+                    step.length_px, std,
                 )
             )  # fmt: skip
         return results

@@ -3,7 +3,6 @@
 The keypoints are SIFT's, the positives their patches warped by the estimated homographies (paper, Sec. 6.2).
 """
 
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,15 +12,15 @@ import numpy as np
 import torch
 
 from agalign import geometry, losses
-from agalign._version import __version__
 from agalign.config import Settings
 from agalign.descriptor import REFERENCE, Descriptor
 from agalign.detect import sift_keypoints, visible_in_both
 from agalign.errors import InputError, NotEnoughTextureError
+from agalign.fingerprint import hashed
 from agalign.flight import FlightModel
 from agalign.geometry import Matrix
 from agalign.image_pairs import find_pairs, read_image
-from agalign.joint import JointAligner, Subject
+from agalign.joint import JointAligner, Subject, one_thread
 from agalign.levels import Level
 from agalign.pair import align_images
 from agalign.patches import Keypoints, far_apart, patch_grid
@@ -60,7 +59,7 @@ class _Example:
 
 def learn_descriptor(
     pairs: Sequence[CoarsePair], settings: Settings, *, steps_a_pair: int = 200,
-    on_pair: Callable[[Lesson], None] = lambda _: None, progress: Callable[[float], None] = lambda _: None,
+    on_pair: Callable[[Lesson], None] = lambda _: None,
 ) -> FlightModel:  # fmt: skip
     """One network for all pairs, whose fixed images have the same channels, and whose moving images have.
 
@@ -73,7 +72,8 @@ def learn_descriptor(
     examples = []
     for pair in pairs:
         start: dict[SeedKind, Matrix] = {"user": pair.start}
-        found = align_images([(pair.name, pair.fixed, pair.moving, start)], settings, lambda *_: None)[pair.name]
+        with one_thread():
+            found = align_images([(pair.name, pair.fixed, pair.moving, start)], settings, lambda *_: None)[pair.name]
         on_pair(Lesson(pair.name, found.status, found.reason or ""))
         if found.status == "aligned":
             try:
@@ -83,10 +83,10 @@ def learn_descriptor(
     if not examples:
         raise InputError("no pair could be aligned, so there is nothing to learn from")
     net = aligner.fast_descriptor([*channels.pop()])
-    _learn(net, examples, aligner, steps_a_pair * len(examples), progress)
-    names = " ".join(p.name for p in pairs)
-    fingerprint = hashlib.sha256(f"{__version__} {settings.joint} {names}".encode()).hexdigest()[:16]
-    return FlightModel(net, "", (_MOVING_BAND,), {}, fingerprint)
+    with one_thread():
+        _learn(net, examples, aligner, steps_a_pair * len(examples))
+    weights = b"".join(value.cpu().numpy().tobytes() for value in net.state_dict().values())
+    return FlightModel(net, "", (_MOVING_BAND,), {}, hashed(weights))
 
 
 def _example(aligner: JointAligner, pair: CoarsePair, fixed_to_moving: Matrix) -> _Example:
@@ -96,23 +96,22 @@ def _example(aligner: JointAligner, pair: CoarsePair, fixed_to_moving: Matrix) -
     keypoints = visible_in_both(keypoints, fixed_to_moving, pair.fixed, pair.moving)
     if len(keypoints) < 2:
         raise NotEnoughTextureError("too few keypoints lie in both images")
-    return _Example(level, level.homography(fixed_to_moving, 0), keypoints)
+    return _Example(level, level.homography(fixed_to_moving, 0), keypoints.to(aligner.device))
 
 
-def _learn(
-    net: Descriptor, examples: Sequence[_Example], aligner: JointAligner, steps: int, progress: Callable[[float], None]
-) -> None:
+def _learn(net: Descriptor, examples: Sequence[_Example], aligner: JointAligner, steps: int) -> None:
     """Theta by Adam with psi known, a pair at a time; the rate falls to nothing along a cosine."""
     recipe, generator = aligner.settings.fast, aligner.sampler.generator
     optimiser = torch.optim.Adam(net.parameters(), recipe.learning_rate)
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for step in range(steps):
         example = examples[step % len(examples)]
-        k = example.keypoints[torch.randint(len(example.keypoints), (recipe.batch,), generator=generator)]
+        rows = torch.randint(len(example.keypoints), (recipe.batch,), generator=generator)
+        k = example.keypoints[rows.to(aligner.device)]
         # SIFT's own scale and orientation are one of many that a patch may have: the network is to know all.
         turn = 2 * math.pi * torch.rand(len(k), generator=generator)
         zoom = 2 ** (torch.rand(len(k), generator=generator) - 0.5)
-        k = Keypoints(k.xy, k.angle + turn, k.scale * zoom)
+        k = Keypoints(k.xy, k.angle + turn.to(k.angle), k.scale * zoom.to(k.scale))
         patches = [example.level.fixed.patches(patch_grid(k)), moving_patches(example.level, 0, example.homography, k)]
         f, f_prime = net.describe(patches, [REFERENCE, 1])
         loss = losses.in_batch(f, f_prime, far_apart(k, recipe.least_negative_px), recipe.temperature)
@@ -120,7 +119,6 @@ def _learn(
         torch.autograd.backward(loss)
         optimiser.step()
         annealing.step()
-        progress((step + 1) / steps)
 
 
 def read_coarse_pairs(source: Path) -> list[CoarsePair]:

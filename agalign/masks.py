@@ -30,7 +30,7 @@ def undeclared_fill(pixels: ArrayLike) -> Mask:
     """
     values = np.asarray(pixels)
     fill = np.zeros(values.shape, dtype=bool)
-    constants = [0] if values.dtype.kind == "f" else [0, np.iinfo(values.dtype).max]
+    constants = [0] if values.dtype.kind in "fb" else [0, np.iinfo(values.dtype).max]
     for constant in constants:
         same = (values == constant).astype(np.uint8)
         edge = np.concatenate([same[0], same[-1], same[:, 0], same[:, -1]])

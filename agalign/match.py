@@ -11,7 +11,7 @@ from torch import Tensor
 
 from agalign import geometry, lens
 from agalign.config import SeedSettings
-from agalign.descriptor import REFERENCE, Descriptor
+from agalign.descriptor import REFERENCE, Descriptor, Sharing
 from agalign.detect import sift_keypoints
 from agalign.errors import GeometryError
 from agalign.geometry import Matrix
@@ -30,11 +30,14 @@ _LEAST_MATCHES = 12
 
 def matching_network(learnt: Descriptor | None, side: int, channels: tuple[int, int]) -> Descriptor:
     """A network for two images of these channels: the reference's and a moving side of a learnt one, or the starter."""
-    net = Descriptor("pseudo-siamese", channels, half_rectified=True, unit_length=True).eval()
+    unshared = learnt is not None and learnt.sharing == "unshared"
+    sharing: Sharing = "unshared" if unshared else "pseudo-siamese"
+    net = Descriptor(sharing, channels, half_rectified=True, unit_length=True)
     if learnt is None:
         start_from_starter(net)
     else:
         start_from(net, learnt.state_dict(), (REFERENCE, side))
+        net.to(next(learnt.parameters()).device)
     return net
 
 
@@ -88,7 +91,7 @@ def _keypoints(raster: Raster, device: torch.device) -> tuple[View, Keypoints]:
     small = shrink(raster, view.size_px)
     found = sift_keypoints(small)
     xy = torch.from_numpy(lens.undistort(view.lens, found.xy.numpy()).astype(np.float32))
-    straight = Keypoints(xy.to(device), found.angle.to(device), found.scale.to(device))
+    straight = Keypoints(xy, found.angle, found.scale).to(device)
     rows = (view.room_at(straight.xy) > footprint_radius(straight.scale)).nonzero()[:, 0]
     return view, straight[rows]
 

@@ -140,7 +140,8 @@ def _seeded(name: str, fixed: Raster, moving: Raster, candidates: Candidates, se
     if not (textured(fixed) and textured(moving)):
         blank = "reference" if not textured(fixed) else "moving"
         kind, matrix = next(iter(candidates.items()))
-        return _failed(Seed(kind, matrix, 0.0), f"the {blank} band is constant or all invalid")
+        failed = _failed(Seed(kind, matrix, 0.0), f"the {blank} band is constant or all invalid")
+        return failed if fixed.lens is None else replace(failed, space="undistorted")
     seed = best_seed(fixed, moving, candidates, settings.seed)
     return Pair(name, fixed, moving, candidates, seed, is_trusted(seed, settings.seed))
 
@@ -208,7 +209,8 @@ def _checked(pair: Pair, joint: JointResult | str, yardsticks: Yardsticks, setti
         matrix = pair.seed.fixed_to_moving
         there = _laid_on_reference(pair, matrix)
         residual = yardsticks.windows.residuals(there)
-    if status == "seed_only" and residual.coverage < settings.check.least_seed_coverage:
+    fits = residual.coverage >= settings.check.least_seed_coverage
+    if status == "seed_only" and not (fits and residual.median_px <= settings.check.most_seed_residual_px):
         status, doubt = "failed", f"{doubt}, but it does not fit either"
     before, after = (yardsticks.similarity.to(r) for r in (_laid_as_files_lie(pair), there))
     return Alignment(matrix, pair.space, status, doubt, pair.seed, found, residual, 0.0, before, after)
@@ -216,6 +218,8 @@ def _checked(pair: Pair, joint: JointResult | str, yardsticks: Yardsticks, setti
 
 def _snapped(joint: JointResult, pair: Pair, settings: CheckSettings) -> JointResult:
     for given in (pair.candidates[kind] for kind in _AS_FILES_LIE if kind in pair.candidates):
+        if PixelMapping(given, pair.fixed.lens, pair.moving.lens).bends:
+            continue  # the files do not lie that way
         if is_as_it_was(joint, given, pair.fixed.size_px, settings):
             return replace(joint, fixed_to_moving=given)
     return joint
@@ -247,7 +251,7 @@ def _in_file_px(alignment: Alignment, fixed_scale: tuple[float, float], moving_s
     if residual is not None:
         residual = replace(
             residual, centres_px=(residual.centres_px + 0.5) * up - 0.5, shifts_px=residual.shifts_px * up,
-            median_px=residual.median_px * up[0], p95_px=residual.p95_px * up[0], bias_px=residual.bias_px * up[0],
+            median_px=residual.median_px * up[0], p95_px=residual.p95_px * up[0],
         )  # fmt: skip
     seed = replace(seed, fixed_to_moving=geometry.rescale(seed.fixed_to_moving, up, there))
     matrix = geometry.rescale(alignment.fixed_to_moving, up, there)

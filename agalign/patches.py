@@ -84,6 +84,10 @@ class Keypoints:
     def __getitem__(self, rows: Tensor) -> "Keypoints":
         return Keypoints(self.xy[rows], self.angle[rows], self.scale[rows])
 
+    def to(self, device: torch.device) -> "Keypoints":
+        """The same on a device."""
+        return Keypoints(self.xy.to(device), self.angle.to(device), self.scale.to(device))
+
     def moved(self, dx_px: float, dy_px: float) -> "Keypoints":
         """The same keypoints shifted."""
         return Keypoints(self.xy + self.xy.new_tensor([dx_px, dy_px]), self.angle, self.scale)

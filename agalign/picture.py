@@ -1,5 +1,6 @@
 """The small before/after picture beside each stack: three bands as red, green and blue; misalignment is colour."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -46,9 +47,15 @@ def write_picture(
     names = ", ".join(b.name for b in chosen)
     sheet = _sheet(before, after, f"before: {names} as red, green, blue", "after")
     partial = path.with_name(f".{path.stem}.part.png")
-    if not cv2.imwrite(str(partial), sheet[..., ::-1]):
-        raise OutputError(f"{path}: cannot be written")
-    partial.replace(path)
+    try:
+        if not cv2.imwrite(str(partial), sheet[..., ::-1]):
+            raise OutputError(f"{path}: cannot be written")
+        partial.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 def _before(band: Band, reference: Band, crop: tuple[int, int, int, int]) -> NDArray[np.float32]:

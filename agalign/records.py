@@ -163,7 +163,7 @@ class Seed:
     kind: SeedKind
     fixed_to_moving: Matrix
     score: float
-    """Structure agreement in [-1, 1]: the coherence of gradient orientations on the common area."""
+    """By which candidates are compared: the height of the correlation at this mapping, in standard deviations."""
     peak_sigma: float = 0.0
     """Height of the correlation peak above its surroundings, in standard deviations."""
     runner_up_sigma: float = 0.0
@@ -208,8 +208,6 @@ class Residual:
     p95_px: float
     coverage: float
     """Share of the tiles with enough structure in which a shift could be measured."""
-    bias_px: float
-    """Length of the median shift vector."""
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def best_shift(
     step_px: float,
 ) -> Tensor:  # fmt: skip
     """The translation (2,) of the fixed side, up to `reach_px` long, at which the mean L0 of the patches that lie in
-    both images is least; none where that is not plainly less than without.
+    both images is least; none where that is not plainly less than without, for the patches that both have.
     """
     if len(keypoints) < LEAST_KEYPOINTS:
         return homography.new_zeros(2)
@@ -142,7 +142,7 @@ def best_shift(
     best, start = int(means.argmin()), int(lengths[lengths <= reach_px].argmin())
     gain = table[start] - table[best]
     gain = gain[gain.isfinite()]
-    if not bool(enough[start]) or len(gain) < LEAST_KEYPOINTS:
-        return shifts[best]
+    if not bool(enough[best]) or len(gain) < LEAST_KEYPOINTS:
+        return homography.new_zeros(2)
     plain = float(gain.mean()) > _PLAIN_GAIN * float(gain.std()) / math.sqrt(len(gain))
     return shifts[best] if plain else homography.new_zeros(2)

@@ -47,7 +47,6 @@ class FixedWindows:
             median_px=float(np.median(length)) if some else float("inf"),
             p95_px=float(np.percentile(length, 95)) if some else float("inf"),
             coverage=float(measured.mean()) if tried else 0.0,
-            bias_px=float(np.linalg.norm(np.median(found[measured], axis=0))) if some else float("inf"),
         )
 
     def _cut(self, image: NDArray[Any], origin: tuple[int, int]) -> NDArray[Any]:

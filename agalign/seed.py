@@ -15,6 +15,9 @@ from agalign.mapping import Mapping
 from agalign.records import Band, Raster, Seed, SeedKind, Tile
 from agalign.structure import correlation_surface, find_peak, shrink, structure_field
 
+_SAME_PEAK_PX = 2.0
+"""A candidate no farther from the peak than this, in working px, is on its flank."""
+
 RigSeed = Callable[[Band, Band], Matrix | None]
 """A camera's fixed_to_moving between undistorted pixels from metadata alone."""
 
@@ -26,9 +29,10 @@ def seed_candidates(reference: Band, moving: Band, rig_seed: RigSeed, settings: 
         rig = rig_seed(reference, moving)
         if rig is not None:
             candidates["rig"] = rig
-    geo = geo_seed(reference, moving)
-    if geo is not None:
-        candidates["geo"] = geo
+    with suppress(GeometryError):
+        geo = geo_seed(reference, moving)
+        if geo is not None:
+            candidates["geo"] = geo
     candidates["identity"] = overlay(reference, moving)
     if settings.force is not None and settings.force in candidates:
         return {settings.force: candidates[settings.force]}
@@ -75,7 +79,9 @@ def scored_seeds(
         return [Seed(kind, fixed_to_moving, peak.sigma, peak.sigma, peak.runner_up_sigma)]
     shift = geometry.translation(peak.shift_px[0] / scale_xy[0], peak.shift_px[1] / scale_xy[1])
     shifted = geometry.compose(fixed_to_moving, shift)
-    unmoved = Seed(kind, fixed_to_moving, peak.sigma_at_zero, peak.sigma_at_zero, peak.runner_up_sigma)
+    # Where the peak is another place, it is what this candidate has to stand up to.
+    rival = peak.sigma if np.hypot(*peak.shift_px) > _SAME_PEAK_PX else peak.runner_up_sigma
+    unmoved = Seed(kind, fixed_to_moving, peak.sigma_at_zero, peak.sigma_at_zero, rival)
     # The correlation is circular: its peak may lay the images beside each other.
     points = Mapping(shifted, fixed.lens, moving.lens)(geometry.lattice(width, height, 16, 12))
     if ((points >= 0) & (points <= np.subtract(moving.size_px, 1))).all(axis=1).mean() < settings.least_overlap:
@@ -98,7 +104,10 @@ def geo_seed(reference: Band, moving: Band) -> Matrix | None:
         return None
     to_corner = geometry.translation(0.5, 0.5)
     # Not geometry.invert: metres in the millions beside pixels of centimetres look singular to it.
-    map_to_there: Matrix = np.linalg.inv(there.transform).astype(np.float64)
+    try:
+        map_to_there: Matrix = np.linalg.inv(there.transform).astype(np.float64)
+    except np.linalg.LinAlgError:
+        raise GeometryError(f"{moving.path}: its geotransform cannot be inverted") from None
     return geometry.compose(geometry.invert(to_corner), map_to_there, here.transform, to_corner)
 
 

@@ -1,6 +1,7 @@
 """How the commands speak: results, progress, complaints and exit codes."""
 
 import json
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,12 @@ from agalign.errors import AgalignError, ConfigurationError
 
 EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 _PLAIN_WIDTH = 160
+_OUT_OF_MEMORY = "out of memory; close other programs or try a smaller image"
+
+
+def _finite(fields: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no nan."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in fields.items()}
 
 
 class Voice:
@@ -25,12 +32,12 @@ class Voice:
         self.out = Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
         self.err = Console(stderr=True, highlight=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 
-    def event(self, name: str, text: str = "", style: str = "", **fields: Any) -> None:
+    def event(self, kind: str, text: str = "", /, **fields: Any) -> None:
         """One line of progress: JSON with --log-json, else the text unless --quiet."""
         if self.log_json:
-            print(json.dumps({"event": name, **fields}, default=str), file=sys.stderr, flush=True)
+            print(json.dumps({"event": kind, **_finite(fields)}, default=str), file=sys.stderr, flush=True)
         elif text and not self.quiet:
-            self.err.print(f"[{style}]{escape(text)}[/]" if style else escape(text))
+            self.err.print(escape(text))
 
     def problem(self, text: str, **fields: Any) -> None:
         """A complaint: shown even with --quiet."""
@@ -51,12 +58,12 @@ LogJson = Annotated[bool, typer.Option("--log-json", help="Print one JSON object
 
 
 @contextmanager
-def exits(voice: Voice) -> Iterator[None]:
+def exits(voice: Voice, on_interrupt: str = "interrupted") -> Iterator[None]:
     """Turns what can go wrong into one line and an exit code."""
     try:
         yield
     except KeyboardInterrupt:
-        voice.problem("interrupted; what is finished stays, and the same command goes on from there")
+        voice.problem(on_interrupt)
         raise typer.Exit(EXIT_INTERRUPTED) from None
     except ConfigurationError as error:
         voice.problem(str(error))
@@ -65,5 +72,10 @@ def exits(voice: Voice) -> Iterator[None]:
         voice.problem(str(error))
         raise typer.Exit(EXIT_NOTHING) from None
     except MemoryError:
-        voice.problem("out of memory; close other programs or try a smaller image")
+        voice.problem(_OUT_OF_MEMORY)
+        raise typer.Exit(EXIT_NOTHING) from None
+    except RuntimeError as error:  # torch's, on the CPU and on CUDA
+        if "out of memory" not in str(error) and "not enough memory" not in str(error):
+            raise
+        voice.problem(_OUT_OF_MEMORY)
         raise typer.Exit(EXIT_NOTHING) from None

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from agalign import geometry, lens, synthetic
-from agalign.batch import rig_seed
+from agalign.cameras import rig_seed
 from agalign.config import CheckSettings, SeedSettings, Settings
 from agalign.discover import discover
 from agalign.mapping import Mapping

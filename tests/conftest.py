@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign import synthetic
+from agalign import geometry, synthetic
 
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -56,3 +56,9 @@ def textured_pair(
     fixed = view(to_canvas)
     moving = view(to_canvas @ np.linalg.inv(fixed_to_moving))
     return fixed, (-moving + 0.15 * moving**2).astype(np.float32)
+
+
+def mean_error_px(one: np.ndarray, other: np.ndarray, width: int, height: int) -> float:
+    """Mean distance between where two homographies send the pixels of an image."""
+    points = geometry.lattice(width, height, 40, 30)
+    return float(np.linalg.norm(geometry.apply(one, points) - geometry.apply(other, points), axis=1).mean())

@@ -10,7 +10,8 @@ from agalign.records import JointResult, Residual, Seed
 
 SEED = Seed("rig", np.eye(3), 100.0, 100.0, 5.0)
 GOOD_JOINT = JointResult(np.eye(3), 0.1, 0.95, 0.004, 75, (0.5, 1.0), "fast", "homography", 0.05, ((0.07, 0.07),) * 4)
-GOOD_RESIDUAL = Residual(np.zeros((50, 2)), np.zeros((50, 2)), 0.05, 0.2, 1.0, 0.01)
+GOOD_RESIDUAL = Residual(np.zeros((50, 2)), np.zeros((50, 2)), 0.05, 0.2, 1.0)
+HALF_WRONG = np.vstack([np.zeros((20, 2)), np.full((30, 2), 5.0)])
 SIZE = (1280, 960)
 
 
@@ -41,6 +42,10 @@ def test_all_well() -> None:
         (GOOD_JOINT, replace(GOOD_RESIDUAL, median_px=2.5), "2.5 px"),
         (GOOD_JOINT, replace(GOOD_RESIDUAL, median_px=float("inf")), "px"),
         (None, GOOD_RESIDUAL, "no texture"),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, shifts_px=HALF_WRONG), "in only 40%"),
+        (replace(GOOD_JOINT, retrieval=float("nan")), GOOD_RESIDUAL, "retrieval"),
+        (replace(GOOD_JOINT, retrieval=0.3, chance=1 / 16), GOOD_RESIDUAL, "retrieval"),
+        (replace(GOOD_JOINT, corner_std_xy_px=((float("nan"), 0.1),) * 4), GOOD_RESIDUAL, "corners"),
     ],
 )
 def test_any_doubt_is_enough(joint: JointResult | None, residual: Residual | None, word: str) -> None:

@@ -10,7 +10,8 @@ from distributed import LocalCluster
 
 import agalign
 from agalign import batch, demo, geometry
-from agalign.batch import RunOptions, dask_executor, rig_seed, run_flight
+from agalign.batch import RunOptions, dask_executor, run_flight
+from agalign.cameras import rig_seed
 from agalign.config import FastRecipe, FlightSettings, JointSettings, Settings
 from agalign.discover import discover
 from agalign.errors import ConfigurationError, InputError
@@ -19,6 +20,7 @@ from agalign.flight import (
     camera_key,
     flights_of,
     learn_flight,
+    learning_fingerprint,
     load_model,
     median_mapping,
     model_names,
@@ -81,7 +83,7 @@ def test_what_is_no_model_is_named(tmp_path: Path) -> None:
 def test_a_model_is_used_again_and_refused_for_another_camera(flight: Path, model: FlightModel, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     save_model(model, path)
-    steps = FastRecipe(most_steps=1)  # nothing could be learnt in one step
+    steps = FastRecipe(start="random", most_steps=1)  # nothing could be learnt in one step
     settings = Settings(joint=JointSettings(fast=steps), flight=FlightSettings(captures=1))
     reports = list(run_flight(discover(flight), tmp_path / "out", settings, model=path))
     assert all(r.good for r in reports)
@@ -119,9 +121,38 @@ def test_cameras_and_flights_are_kept_apart(flight: Path) -> None:
     groups = flights_of([*captures, other, later])
     assert [len(g) for g in groups] == [2, 1, 1]
     assert camera_key(captures[0]) == camera_key(later) != camera_key(other)
-    assert model_names(groups) == [
-        "RedEdge-M_SY01-0000001-AG.safetensors", "RedEdge-M_X9.safetensors", "RedEdge-M_SY01-0000001-AG-2.safetensors",
+    stem = "RedEdge-M_SY01-0000001-AG"
+    assert model_names([*groups, [later]]) == [
+        f"{stem}.safetensors", "RedEdge-M_X9.safetensors", f"{stem}-2.safetensors", f"{stem}-3.safetensors",
     ]  # fmt: skip
+
+
+def test_a_model_is_learnt_anew_where_what_it_depends_on_has_changed(flight: Path) -> None:
+    captures = discover(flight).captures
+    before = learning_fingerprint(captures, SETTINGS)
+    assert learning_fingerprint(discover(flight).captures, SETTINGS) == before
+    no_lens = [replace(c, bands=tuple(replace(b, lens=None) for b in c.bands)) for c in captures]
+    other_reference = [replace(c, reference_index=0) for c in captures]
+    elsewhere = Settings(flight=FlightSettings(captures=1, start="another network"))
+    assert len({learning_fingerprint(c, SETTINGS) for c in (captures, no_lens, other_reference)}) == 3
+    assert learning_fingerprint(captures, elsewhere) != before
+
+
+def test_a_capture_is_done_again_with_another_model(flight: Path, model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    out = tmp_path / "out"
+    assert [r.state for r in run_flight(discover(flight), out, SETTINGS)] == ["done", "done"]
+    assert [r.state for r in run_flight(discover(flight), out, SETTINGS, model=path)] == ["done", "done"]
+    assert [r.state for r in run_flight(discover(flight), out, SETTINGS, model=path)] == ["kept", "kept"]
+
+
+def test_a_model_of_no_use_is_refused(flight: Path, model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    alone = Settings(flight=FlightSettings(together=False))
+    with pytest.raises(ConfigurationError, match="of use only where one network is learnt"):
+        list(run_flight(discover(flight), tmp_path / "out", alone, model=path))
 
 
 def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:

@@ -21,7 +21,7 @@ def test_hpatches_layout(tmp_path: Path) -> None:
     for name in ("i_sun", "v_wall"):
         (tmp_path / name).mkdir()
         for k in range(1, 7):
-            write_image(tmp_path / name / f"{k}.ppm")
+            write_image(tmp_path / name / f"{k}.ppm", channels=3)
         for k in range(2, 7):
             np.savetxt(tmp_path / name / f"H_1_{k}", H)
     found = find_pairs(tmp_path)

@@ -1,3 +1,5 @@
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from agalign.flight import align_from_scratch
 from agalign.joint import JointAligner, Subject, choose_device
 from agalign.records import JointResult, Raster
 
-from .conftest import textured_image, textured_pair
+from .conftest import mean_error_px, textured_image, textured_pair
 
 TRUTH = np.array([[1.004, 0.006, 6.0], [-0.005, 0.998, -4.0], [4e-6, -6e-6, 1.0]])
 NEAR = geometry.translation(7.5, -5.5)
@@ -31,16 +33,17 @@ def run(settings: JointSettings, seed: np.ndarray = NEAR, **kwargs: int) -> Join
     return result
 
 
-def test_fast_recovers_a_homography_through_reversed_contrast() -> None:
-    result = run(JointSettings())
-    assert geometry.mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.08
+@pytest.mark.parametrize("start", ["random", "starter"])
+def test_fast_recovers_a_homography_through_reversed_contrast(start: Literal["random", "starter"]) -> None:
+    result = run(JointSettings(fast=FastRecipe(start=start)))
+    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.08
     assert result.retrieval > 0.8
     assert result.chance < 0.01
     assert result.model_family == "homography"
 
 
 def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> None:
-    short = FastRecipe(most_steps=50, final_steps=1)
+    short = FastRecipe(start="random", most_steps=50, final_steps=1)
     one, same = (run(JointSettings(fast=short, rng_seed=4)) for _ in range(2))
     other = run(JointSettings(fast=short, rng_seed=5))
     np.testing.assert_array_equal(one.fixed_to_moving, same.fixed_to_moving)
@@ -51,7 +54,7 @@ def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> 
 def test_the_global_random_state_is_left_alone() -> None:
     torch.manual_seed(1)
     before = torch.get_rng_state()
-    run(JointSettings(fast=FastRecipe(most_steps=50, final_steps=1)))
+    run(JointSettings(fast=FastRecipe(start="random", most_steps=50, final_steps=1)))
     assert torch.equal(before, torch.get_rng_state())
 
 
@@ -79,7 +82,7 @@ def test_rgb_against_a_single_band() -> None:
     rgb = np.stack([fixed.pixels, 0.5 * fixed.pixels + 1, textured_image(400, 320, 3)])
     result = scratch(Raster(rgb, fixed.valid), moving, NEAR, JointSettings())
     assert isinstance(result, JointResult)
-    assert geometry.mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
+    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
 
 
 def test_nothing_to_learn_from() -> None:
@@ -97,9 +100,9 @@ def test_one_network_for_two_bands_and_one_that_does_not_belong() -> None:
     subject = Subject(fixed, [moving, stranger, other], [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
     found = align_from_scratch(subject, JointSettings(), lambda *_: None)
     assert all(isinstance(r, JointResult) for r in found)
-    assert geometry.mean_error_px(found[0].fixed_to_moving, TRUTH, 400, 320) < 0.1
+    assert mean_error_px(found[0].fixed_to_moving, TRUTH, 400, 320) < 0.1
     assert found[1].retrieval < 0.1
-    assert geometry.mean_error_px(found[2].fixed_to_moving, np.eye(3), 400, 320) < 0.1
+    assert mean_error_px(found[2].fixed_to_moving, np.eye(3), 400, 320) < 0.1
 
 
 @pytest.mark.parametrize(("sharing", "left"), [("siamese", 0.35), ("pseudo-siamese", 0.35), ("unshared", 0.9)])
@@ -114,8 +117,8 @@ def test_paper_recipe_lowers_the_error(sharing: str, left: float) -> None:
     assert isinstance(result, JointResult)
     assert result.recipe == "paper"
     assert result.levels == (0.25, 0.5, 1.0)
-    start = geometry.mean_error_px(NEAR, TRUTH, 400, 320)
-    assert geometry.mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < left * start
+    start = mean_error_px(NEAR, TRUTH, 400, 320)
+    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < left * start
 
 
 def test_levels_halve_down_to_the_coarsest() -> None:

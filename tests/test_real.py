@@ -10,7 +10,7 @@ from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
 from agalign import geometry
-from agalign.batch import rig_seed
+from agalign.cameras import rig_seed
 from agalign.config import SeedSettings, Settings
 from agalign.discover import DiscoverOptions, discover
 from agalign.pipeline import process_capture

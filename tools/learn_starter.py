@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 import agalign
-from agalign.batch import rig_seed
+from agalign.cameras import rig_seed
 from agalign.config import FastRecipe, JointSettings, Settings
 from agalign.discover import discover
 from agalign.flight import read_subject

@@ -3,6 +3,7 @@
 A method gets a pair and a start, and gives descriptors of both images' patches, a homography, or both.
 """
 
+import importlib.util
 import math
 import re
 from collections.abc import Callable
@@ -15,12 +16,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from agalign import geometry
 from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.descriptor import Descriptor, Sharing
 from agalign.detect import grey, to_8_bit
-from agalign.errors import ConfigurationError, InputError, NotEnoughTextureError
+from agalign.errors import ConfigurationError, GeometryError, InputError, NotEnoughTextureError
 from agalign.evaluation.protocol import grey_patches
 from agalign.flight import load_model
 from agalign.geometry import Matrix
@@ -75,6 +77,8 @@ def method_named(name: str) -> Method:
     Raises ConfigurationError for any other, InputError for a file that cannot be used.
     """
     fixed_names: dict[str, Method] = {"sift": _sift, "daisy": _daisy, "elastix": _elastix}
+    if name in _MODULES and importlib.util.find_spec(_MODULES[name]) is None:
+        raise ConfigurationError(f"{name} needs more than is installed; pip install 'agalign[evaluate]'")
     if name in fixed_names:
         return fixed_names[name]
     learnt = re.fullmatch(r"(fast|paper):([a-z-]+)(:grey)?", name)
@@ -89,6 +93,9 @@ def method_named(name: str) -> Method:
     raise ConfigurationError(
         f"'{name}' is no method; there are sift, daisy, elastix, fast:SHARING, paper:SHARING, and files of networks"
     )
+
+
+_MODULES = {"daisy": "skimage", "elastix": "itk"}
 
 
 # ---- this program's
@@ -116,7 +123,7 @@ def _learnt_on_the_pair(task: Task, settings: JointSettings, *, colour: bool) ->
             refined = aligner.refine(net, subject)[0]
             if not isinstance(refined, str):
                 subject.mappings[0] = refined.fixed_to_moving
-    except NotEnoughTextureError:
+    except (NotEnoughTextureError, GeometryError):
         return Outcome(None, start)
     return Outcome(_by_network(net, aligner, fixed, moving), subject.mappings[0])
 
@@ -129,7 +136,7 @@ def _by_network(net: Descriptor, aligner: JointAligner, one: Raster, other: Rast
     @torch.no_grad()
     def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
         level = aligner.level(Subject(one, [other], [fixed_to_moving], [1], [True]), 1.0, [0])
-        h = level.homography(fixed_to_moving, 0)
+        h, keypoints = level.homography(fixed_to_moving, 0), keypoints.to(aligner.device)
         return describe_fixed(net, level, keypoints), net(moving_patches(level, 0, h, keypoints), 1)
 
     return describe
@@ -166,6 +173,8 @@ def _from_patches(task: Task, side: int, describe_patches: Callable[[Tensor], Te
 
 
 _HAND_MADE_SIDE = 64
+_MARGIN_SHARE = 4
+"""SIFT's outer cells reach an eighth of a patch beyond its edge."""
 
 
 def _sift(task: Task) -> Outcome:
@@ -176,30 +185,27 @@ def _daisy(task: Task) -> Outcome:
     return _from_patches(task, _HAND_MADE_SIDE, daisy_of_patches)
 
 
-def _mosaic(patches: Tensor) -> NDArray[np.float32]:
-    """Square patches (N, 1, P, P) side by side in one image, row by row, so that OpenCV and scikit-image see them all
-    at once.
+def _mosaic(patches: Tensor) -> tuple[NDArray[np.float32], int, int]:
+    """(image, its columns, side of a cell): square patches (N, 1, P, P) beside each other, row by row, so that OpenCV
+    and scikit-image see them all at once. Each is continued beyond its edges, so that none sees its neighbours.
     """
+    padded = functional.pad(patches, [patches.shape[-1] // _MARGIN_SHARE] * 4, mode="replicate")
     columns = max(1, math.ceil(math.sqrt(len(patches))))
     rows = max(1, math.ceil(len(patches) / columns))
-    side = patches.shape[-1]
-    sheet = patches.new_zeros((rows * columns, side, side))
-    sheet[: len(patches)] = patches[:, 0]
-    return np.asarray(sheet.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, -1).numpy())
+    side = padded.shape[-1]
+    sheet = padded.new_zeros((rows * columns, side, side))
+    sheet[: len(patches)] = padded[:, 0]
+    image = sheet.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, -1)
+    return np.asarray(image.numpy()), columns, side
 
 
 def sift_of_patches(patches: Tensor) -> Tensor:
     """(N, 1, P, P) -> (N, 128): SIFT at the centre, upright, its 4 x 4 cells over the whole patch."""
-    side = patches.shape[-1]
-    sheet = np.asarray((_mosaic(patches) * 255).round(), np.uint8)
-    columns = sheet.shape[1] // side
-    keypoints = [
-        cv2.KeyPoint(
-            (i % columns) * side + (side - 1) / 2, (i // columns) * side + (side - 1) / 2, side / 6, 0.0, 1.0, 0
-        )
-        for i in range(len(patches))
-    ]
-    _, found = cv2.SIFT.create().compute(sheet, keypoints)
+    image, columns, side = _mosaic(patches)
+    rows_columns = (divmod(i, columns) for i in range(len(patches)))
+    centres = ((c * side + (side - 1) / 2, r * side + (side - 1) / 2) for r, c in rows_columns)
+    keypoints = [cv2.KeyPoint(x, y, patches.shape[-1] / 6, 0.0, 1.0, 0) for x, y in centres]
+    _, found = cv2.SIFT.create().compute(np.asarray((image * 255).round(), np.uint8), keypoints)
     return torch.from_numpy(np.asarray(found, np.float32).reshape(len(patches), -1))
 
 
@@ -207,12 +213,10 @@ def daisy_of_patches(patches: Tensor) -> Tensor:
     """(N, 1, P, P) -> (N, 200): DAISY (Tola et al. 2010) at the centre, three rings of eight over the whole patch."""
     from skimage.feature import daisy
 
-    side = patches.shape[-1]
-    sheet = _mosaic(patches)
-    columns = sheet.shape[1] // side
-    radius = side * 3 // 8  # with the outer ring's own width it reaches the patch's edge
+    image, columns, side = _mosaic(patches)
+    radius = patches.shape[-1] * 3 // 8  # with the outer ring's own width it reaches the patch's edge
     first = side // 2 - radius
-    found = daisy(sheet[first:, first:], step=side, radius=radius, rings=3, histograms=8, orientations=8)
+    found = daisy(image[first:, first:], step=side, radius=radius, rings=3, histograms=8, orientations=8)
     return torch.from_numpy(found[:, :columns].reshape(-1, found.shape[-1])[: len(patches)].astype(np.float32))
 
 
@@ -234,10 +238,8 @@ def _torchscript(path: Path, side: int) -> Method:
 
 def _elastix(task: Task) -> Outcome:
     """Affine, Mattes mutual information, on the pyramid of recipe paper."""
-    try:
-        import itk  # type: ignore[import-untyped]
-    except ImportError:
-        raise ConfigurationError("elastix is not installed; pip install 'agalign[elastix]'") from None
+    import itk  # type: ignore[import-untyped]
+
     laid = warped(single(task.moving), Mapping(task.start), task.fixed.size_px)
     coarsest = Settings().joint.paper.coarsest_px
     parameters = itk.ParameterObject.New()

@@ -1,6 +1,7 @@
 """The training loss over known misalignments (the paper's Fig. 2): why the loss can be followed to the alignment."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from agalign import geometry
 from agalign.config import JointSettings
 from agalign.errors import NotEnoughTextureError, OutputError
 from agalign.geometry import Matrix
-from agalign.joint import JointAligner, Subject
+from agalign.joint import JointAligner, Subject, one_thread
 from agalign.records import Raster
 
 
@@ -31,14 +32,12 @@ def loss_surface(
             start = geometry.compose(truth, geometry.translation(float(dx), float(dy)))
             aligner = JointAligner(settings, lambda *_: None)
             channels = [fixed.channels, moving.channels]
-            try:
+            with suppress(NotEnoughTextureError), one_thread():
                 level = aligner.level(Subject(fixed, [moving], [start], [1], [False]), scale, [0])
                 net = aligner.new_descriptor(channels, half_rectified=False, unit_length=False)
                 _, _, loss, _ = aligner.descend(net, level, start, lambda _: None, move=False)
                 found[row, column] = loss
-            except NotEnoughTextureError:
-                pass
-            progress((row * len(offsets_px) + column + 1) / found.size)
+        progress((row + 1) / len(offsets_px))
     return found
 
 

@@ -10,8 +10,8 @@ from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, select_autoescape
 
-from agalign.batch import sidecars_below
 from agalign.sidecar import BandPart, ResidualTile, Sidecar, write_text
+from agalign.summary import sidecars_below
 
 _FULL_SCALE_PX = 1.0
 """Residual at which a heat map's colour is full."""
