@@ -79,7 +79,7 @@ def test_sift_and_daisy_of_a_mosaic_are_those_of_single_patches() -> None:
     together = sift_of_patches(patches)
     assert torch.cosine_similarity(alone, together).min() > 0.98
     found = daisy_of_patches(patches)
-    torch.testing.assert_close(found[7], daisy_of_patches(patches[7:8])[0], atol=1e-3, rtol=0)
+    assert torch.cosine_similarity(found[7], daisy_of_patches(patches[7:8])[0], dim=0) > 0.99
 
 
 @pytest.mark.parametrize("name", ["sift", "daisy"])
