@@ -5,7 +5,7 @@ import agalign
 from agalign import geometry
 from agalign.errors import GeometryError, InputError
 
-from .conftest import textured_image, textured_pair
+from .conftest import mean_error_px, textured_image, textured_pair
 
 TRUTH = np.array([[1.004, 0.006, 9.0], [-0.005, 0.998, -7.0], [4e-6, -6e-6, 1.0]])
 
@@ -19,7 +19,7 @@ def test_two_arrays_without_any_hint() -> None:
     found = agalign.align(as_uint8(fixed), as_uint8(moving))
     assert found.status == "aligned"
     assert found.reason is None
-    assert geometry.mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.1
+    assert mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.1
     assert found.after["mattes_mi"] < found.before["mattes_mi"]
     assert found.residual is not None
     assert found.residual.median_px < 0.2
@@ -31,7 +31,7 @@ def test_a_seed_and_borders_filled_with_zeros() -> None:
     moving[:, :60] = 0
     found = agalign.align(as_uint8(fixed), moving, seed=geometry.translation(14, -12))
     assert found.status == "aligned"
-    assert geometry.mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
+    assert mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
 
 
 def test_rgb_in_either_order_of_axes() -> None:
@@ -40,7 +40,7 @@ def test_rgb_in_either_order_of_axes() -> None:
     for image in (rgb, np.moveaxis(rgb, -1, 0)):
         found = agalign.align(image, as_uint8(moving))
         assert found.status == "aligned"
-        assert geometry.mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
+        assert mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
 
 
 def test_what_is_aligned_stays_untouched() -> None:

@@ -7,7 +7,7 @@ from agalign.mapping import Mapping
 from agalign.records import Band, Georeference, Raster
 from agalign.seed import best_seed, geo_seed, is_trusted, overlay, warped
 
-from .conftest import textured_image, textured_pair
+from .conftest import mean_error_px, textured_image, textured_pair
 
 SHIFTED = np.array([[1.01, 0.01, 31.0], [-0.01, 1.0, -18.0], [0, 0, 1.0]])
 
@@ -22,7 +22,7 @@ def test_structure_finds_a_shift_that_nothing_told() -> None:
     seed = best_seed(*rasters(SHIFTED), {"identity": np.eye(3)}, SeedSettings())
     assert seed.kind == "structure"
     assert is_trusted(seed, SeedSettings())
-    assert geometry.mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 3
+    assert mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 3
 
 
 def test_the_true_rig_wins_over_a_wrong_one_and_is_kept_as_it_is() -> None:
@@ -94,6 +94,6 @@ def test_the_flights_mapping_is_enough_where_it_leaves_no_doubt() -> None:
     near = geometry.compose(SHIFTED, geometry.translation(0.3, 0.1))
     seed = best_seed(*rasters(SHIFTED), {"model": near, "identity": np.eye(3)}, SeedSettings())
     assert seed.kind in ("model", "structure")
-    assert geometry.mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 1
+    assert mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 1
     lost = best_seed(*rasters(SHIFTED), {"model": geometry.translation(300, 0), "rig": SHIFTED}, SeedSettings())
-    assert geometry.mean_error_px(lost.fixed_to_moving, SHIFTED, 400, 320) < 1
+    assert mean_error_px(lost.fixed_to_moving, SHIFTED, 400, 320) < 1
