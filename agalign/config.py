@@ -64,7 +64,7 @@ class FastRecipe(Stage):
     final_steps: Positive = 10
     final_rest_px: float = 0.01
     """psi has converged when a step moves no corner by more than this."""
-    systematic_std_px: float = 0.055
+    systematic_std_px: float = 0.035
     """Added in quadrature to the standard deviations along x and y: what the curvature cannot see, such as a bias
     between two modalities. Measured on synthetic flights."""
     longest_step_px: float = 4.0
