@@ -3,6 +3,7 @@
 A method gets a pair and a start, and gives descriptors of both images' patches, a homography, or both.
 """
 
+import importlib
 import importlib.util
 import math
 import re
@@ -238,8 +239,7 @@ def _torchscript(path: Path, side: int) -> Method:
 
 def _elastix(task: Task) -> Outcome:
     """Affine, Mattes mutual information, on the pyramid of recipe paper."""
-    import itk  # type: ignore[import-untyped]
-
+    itk = importlib.import_module("itk")
     laid = warped(single(task.moving), Mapping(task.start), task.fixed.size_px)
     coarsest = Settings().joint.paper.coarsest_px
     parameters = itk.ParameterObject.New()
