@@ -25,7 +25,7 @@ class FastRecipe(Stage):
     """The coarsest level, where an untrusted seed starts, is between this and twice this on its longer side."""
     search_share: float = 0.22
     """How far around an untrusted seed the loss is searched at the coarsest level, in longer sides."""
-    search_step_px: float = 4.0
+    search_step_px: float = 3.0
     """Between neighbouring translations that are tried, px of that level."""
     search_patches: Positive = 64
     start: Literal["starter", "random"] = "starter"
