@@ -174,7 +174,7 @@ def _from_patches(task: Task, side: int, describe_patches: Callable[[Tensor], Te
 
 
 _HAND_MADE_SIDE = 64
-_MARGIN_SHARE = 4
+_MARGIN_SHARE = 8
 """SIFT's outer cells reach an eighth of a patch beyond its edge."""
 
 
