@@ -26,7 +26,9 @@ import numpy as np
 from agalign import geometry, lens, synthetic
 from agalign.cameras import rig_seed
 from agalign.config import CheckSettings, SeedSettings, Settings
+from agalign.detect import to_8_bit
 from agalign.discover import discover
+from agalign.evaluation.methods import elastix_affinity
 from agalign.mapping import Mapping
 from agalign.pair import align_images
 from agalign.pipeline import quiet
@@ -95,12 +97,6 @@ def _band(folder: Path, name: str, capture: Capture | None) -> Band:
     return Band(path.stem, path, 1, info.width_px, info.height_px, info.dtypes[0])
 
 
-def grey(raster: Raster) -> np.ndarray:
-    """8 bits, between the 1st and the 99th percentile."""
-    low, high = np.percentile(raster.pixels[raster.valid], (1, 99))
-    return (np.clip((raster.pixels - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)
-
-
 # ---- the methods: (fixed, moving, rig) -> fixed_to_moving, or None where they give up
 
 
@@ -131,7 +127,7 @@ def structure_ties(f: Raster, m: Raster, rig: Matrix) -> Matrix | None:
 def sift(f: Raster, m: Raster, _rig: Matrix) -> Matrix | None:
     """SIFT, ratio test 0.8, RANSAC at 3 px: the textbook recipe."""
     detector = cv2.SIFT_create(5000)
-    (k1, d1), (k2, d2) = (detector.detectAndCompute(grey(r), None) for r in (f, m))
+    (k1, d1), (k2, d2) = (detector.detectAndCompute(to_8_bit(r), None) for r in (f, m))
     if d1 is None or d2 is None or min(len(d1), len(d2)) < 4:
         return None
     matches = [p for p in cv2.BFMatcher().knnMatch(d1, d2, k=2) if len(p) == 2]
@@ -147,7 +143,7 @@ def ecc(f: Raster, m: Raster, rig: Matrix) -> Matrix | None:
     """ECC on gradient magnitude over a pyramid from the rig's mapping, as MicaSense's library and ODM do."""
     edges = []
     for r in (f, m):
-        image = cv2.GaussianBlur(grey(r).astype(np.float32), (0, 0), 1.0)
+        image = cv2.GaussianBlur(to_8_bit(r).astype(np.float32), (0, 0), 1.0)
         edges.append(cv2.magnitude(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1)))
     matrix = rig
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-6)
@@ -167,37 +163,19 @@ def phase_correlation(f: Raster, m: Raster, _rig: Matrix) -> Matrix | None:
     if f.size_px != m.size_px:
         return None
     window = cv2.createHanningWindow(f.size_px, cv2.CV_32F)
-    shift, _ = cv2.phaseCorrelate(grey(f).astype(np.float32), grey(m).astype(np.float32), window)
+    shift, _ = cv2.phaseCorrelate(to_8_bit(f).astype(np.float32), to_8_bit(m).astype(np.float32), window)
     return geometry.translation(*shift)
 
 
-def elastix(f: Raster, m: Raster, _rig: Matrix, levels: int | None = None) -> Matrix | None:
-    """Affine, advanced Mattes mutual information; its own default parameters unless `levels`."""
-    import itk
-
-    parameters = itk.ParameterObject.New()
-    chosen = parameters.GetDefaultParameterMap("affine")
-    if levels is not None:
-        chosen["NumberOfResolutions"] = [str(levels)]
-    parameters.AddParameterMap(chosen)
-    images = [itk.GetImageFromArray(np.ascontiguousarray(r.pixels)) for r in (f, m)]
-    try:
-        _, found = itk.elastix_registration_method(*images, parameter_object=parameters, log_to_console=False)
-    except RuntimeError:
-        return None
-    table = found.GetParameterMap(0)
-    a, b, c, d, tx, ty = (float(v) for v in table["TransformParameters"])
-    centre = np.array([float(v) for v in table["CenterOfRotationPoint"]])
-    linear = np.array([[a, b], [c, d]])
-    matrix = np.eye(3)
-    matrix[:2, :2], matrix[:2, 2] = linear, np.array([tx, ty]) + centre - linear @ centre
-    return matrix
+def elastix(f: Raster, m: Raster, _rig: Matrix) -> Matrix | None:
+    """Affine, advanced Mattes mutual information, its own default parameters."""
+    return elastix_affinity(f, m)
 
 
 def elastix_seeded(f: Raster, m: Raster, rig: Matrix) -> Matrix | None:
     """The same from this program's seed, over five levels."""
     seed = structure_seed(f, m, rig)
-    found = elastix(f, warped(m, Mapping(seed), f.size_px), rig, levels=5)
+    found = elastix_affinity(f, warped(m, Mapping(seed), f.size_px), levels=5)
     return None if found is None else geometry.compose(seed, found)
 
 
@@ -206,7 +184,7 @@ def kornia_registrator(f: Raster, m: Raster, _rig: Matrix) -> Matrix | None:
     import torch
     from kornia.geometry import ImageRegistrator
 
-    fixed, moving = (torch.from_numpy(grey(r)).float()[None, None] / 255 for r in (f, m))
+    fixed, moving = (torch.from_numpy(to_8_bit(r)).float()[None, None] / 255 for r in (f, m))
     try:
         found = ImageRegistrator("homography").register(moving, fixed)[0].detach().double().numpy()
     except RuntimeError:

@@ -22,7 +22,7 @@ from torch.nn import functional
 from agalign import geometry
 from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.descriptor import Descriptor, Sharing
-from agalign.detect import grey, to_8_bit
+from agalign.detect import grey
 from agalign.errors import ConfigurationError, GeometryError, InputError, NotEnoughTextureError
 from agalign.evaluation.protocol import grey_patches
 from agalign.flight import load_model
@@ -238,23 +238,34 @@ def _torchscript(path: Path, side: int) -> Method:
 
 
 def _elastix(task: Task) -> Outcome:
-    """Affine, Mattes mutual information, on the pyramid of recipe paper."""
-    itk = importlib.import_module("itk")
+    """On the pyramid of recipe paper; its own default parameters otherwise."""
     laid = warped(single(task.moving), Mapping(task.start), task.fixed.size_px)
     coarsest = Settings().joint.paper.coarsest_px
+    levels = 1 + max(0, round(math.log2(max(task.fixed.size_px) / coarsest)))
+    found = elastix_affinity(single(task.fixed), laid, levels)
+    return Outcome(None, task.start if found is None else geometry.compose(task.start, found))
+
+
+def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -> Matrix | None:
+    """fixed_to_moving of two single-band images by elastix's affine registration, Mattes mutual information.
+
+    None where it gives up, as it does where too many samples leave the image. Its own number of levels by default.
+    """
+    itk = importlib.import_module("itk")
     parameters = itk.ParameterObject.New()
     chosen = parameters.GetDefaultParameterMap("affine")
-    chosen["NumberOfResolutions"] = [str(1 + max(0, round(math.log2(max(task.fixed.size_px) / coarsest))))]
+    if levels is not None:
+        chosen["NumberOfResolutions"] = [str(levels)]
     parameters.AddParameterMap(chosen)
-    images = [itk.GetImageFromArray(to_8_bit(r).astype(np.float32)) for r in (task.fixed, laid)]
+    images = [itk.GetImageFromArray(np.ascontiguousarray(r.pixels)) for r in (fixed, moving)]
     try:
         _, found = itk.elastix_registration_method(*images, parameter_object=parameters, log_to_console=False)
-    except RuntimeError:  # it gives up where the samples leave the image
-        return Outcome(None, task.start)
+    except RuntimeError:
+        return None
     table = found.GetParameterMap(0)
     a, b, c, d, tx, ty = (float(v) for v in table["TransformParameters"])
     centre = np.array([float(v) for v in table["CenterOfRotationPoint"]])
     linear = np.array([[a, b], [c, d]])
     matrix = np.eye(3)
     matrix[:2, :2], matrix[:2, 2] = linear, np.array([tx, ty]) + centre - linear @ centre
-    return Outcome(None, geometry.compose(task.start, matrix))
+    return matrix
