@@ -80,7 +80,8 @@ def surface(
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("loss-surface.png"),
     number: Annotated[int, typer.Option(min=1, help="Which of the pairs.")] = 1,
     reach: Annotated[float, typer.Option(min=1, help="Largest offset, px.")] = 100.0,
-    points: Annotated[int, typer.Option(min=3, help="Offsets along each axis.")] = 21,
+    points: Annotated[int, typer.Option(min=3, help="Offsets along each axis.")] = 17,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the keypoints for each offset.")] = 2,
     device: Device = "auto",
     rng_seed: RngSeed = 0,
     quiet: Quiet = False,
@@ -92,7 +93,7 @@ def surface(
     with exits(voice):
         import numpy as np
 
-        from agalign.config import JointSettings
+        from agalign.config import JointSettings, PaperRecipe
         from agalign.evaluation.surface import draw_surface, loss_surface
         from agalign.image_pairs import find_pairs, read_image
 
@@ -103,7 +104,8 @@ def surface(
             raise ConfigurationError(f"{pairs}: has {len(known)} pairs with a homography, not {number}")
         pair = known[number - 1]
         offsets = np.linspace(-reach, reach, points)
-        settings = JointSettings(recipe="paper", device=device, rng_seed=rng_seed)
+        recipe = PaperRecipe(epochs=epochs)
+        settings = JointSettings(recipe="paper", paper=recipe, device=device, rng_seed=rng_seed)
         images = read_image(pair.fixed), read_image(pair.moving)
         assert pair.fixed_to_moving is not None
 

@@ -69,8 +69,8 @@ Method = Callable[[Task], Outcome]
 def method_named(name: str) -> Method:
     """The method of a name as the command line takes it.
 
-    * `fast` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`), and `:grey` to leave colour
-      aside: learnt on the pair by that recipe.
+    * `fast` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`): learnt on the pair by that
+      recipe. `:grey` after it leaves colour aside, `:random` the starter (recipe paper never has one).
     * `sift`, `daisy`, `elastix`.
     * FILE.safetensors: a network of this program. FILE.pt: a TorchScript module that takes (N, 1, P, P) in [0, 1]; P is
       32, or what follows an @, as in hardnet.pt@32.
@@ -82,9 +82,12 @@ def method_named(name: str) -> Method:
         raise ConfigurationError(f"{name} needs more than is installed; pip install 'agalign[evaluate]'")
     if name in fixed_names:
         return fixed_names[name]
-    learnt = re.fullmatch(r"(fast|paper):([a-z-]+)(:grey)?", name)
+    learnt = re.fullmatch(r"(fast|paper):([a-z-]+)(:grey)?(:random)?", name)
     if learnt and learnt[2] in get_args(Sharing):
-        settings = JointSettings.model_validate({"recipe": learnt[1], "sharing": learnt[2]})
+        start = "random" if learnt[4] else "starter"
+        settings = JointSettings.model_validate(
+            {"recipe": learnt[1], "sharing": learnt[2], "fast": {"start": start}},
+        )
         return lambda task: _learnt_on_the_pair(task, settings, colour=learnt[3] is None)
     if ".safetensors" in name:
         return _saved_network(Path(name))

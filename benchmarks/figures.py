@@ -1,0 +1,100 @@
+"""The figures of docs/paper.md, from the synthetic flight: matches, a picture before and after, the loss surface.
+
+    python benchmarks/figures.py [FOLDER]
+
+Writes matches.jpg, aligned.jpg and loss-surface.png to FOLDER, by default docs/figures.
+"""
+
+import json
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import agalign
+from agalign import geometry, synthetic
+from agalign.config import JointSettings, PaperRecipe
+from agalign.detect import sift_keypoints, to_8_bit, visible_in_both
+from agalign.evaluation.methods import Task, method_named
+from agalign.evaluation.surface import draw_surface, loss_surface
+from agalign.geometry import Matrix
+from agalign.image_pairs import read_image
+from agalign.records import Raster
+
+SIZE_PX = (800, 600)
+DRAWN = 60
+GREEN, RED = (80, 200, 60), (60, 60, 230)
+
+
+def straight_pair(folder: Path) -> tuple[Raster, Raster, Matrix]:
+    """Green and near infra-red of one synthetic capture without lens distortion, and the truth between them."""
+    rig = [replace(b, distortion=(0.0,) * 5) for b in synthetic.BANDS]
+    capture = json.loads(synthetic.make_flight(folder, 1, SIZE_PX, rng_seed=11, bands=rig).read_text())["IMG_0001"]
+    fixed, moving = capture["reference"], "IMG_0001_4.tif"
+    images = [read_image(folder / "0000SET" / "000" / name) for name in (fixed, moving)]
+    return *images, np.array(capture["bands"][moving]["fixed_to_moving"])
+
+
+def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
+    """Nearest neighbours of some keypoints in the space of a descriptor: green where right."""
+    rng = np.random.default_rng(0)
+    start = geometry.compose(truth, geometry.translation(0.04 * SIZE_PX[0], 0.03 * SIZE_PX[0]))
+    keypoints = visible_in_both(sift_keypoints(fixed), truth, fixed, moving)
+    drawn = rng.choice(len(keypoints), DRAWN, replace=False)
+    rows = []
+    for name, title in (("fast:pseudo-siamese", "learnt on this pair"), ("sift", "SIFT")):
+        describe = method_named(name)(Task(fixed, moving, start, seeding=False)).describe
+        assert describe is not None
+        f, f_prime = describe(keypoints, truth)
+        nearest = ((f[:, None] - f_prime[None]) ** 2).sum(-1).argmin(1).numpy()
+        right = nearest == np.arange(len(keypoints))
+        here = keypoints.xy.numpy().astype(np.float64)[drawn]
+        there = geometry.apply(truth, keypoints.xy.numpy().astype(np.float64)[nearest[drawn]])
+        strip = np.full((34, 2 * SIZE_PX[0], 3), 255, np.uint8)
+        rows += [strip, draw_matches(fixed, moving, here, there, right[drawn])]
+        text = f"{title}: {right.mean():.0%} of {len(right)} keypoints find their own patch"
+        cv2.putText(strip, text, (6, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (40, 40, 40), 1, cv2.LINE_AA)
+    return np.vstack(rows)
+
+
+def draw_matches(
+    fixed: Raster, moving: Raster, here: NDArray[np.float64], there: NDArray[np.float64], right: NDArray[np.bool_]
+) -> NDArray[np.uint8]:  # fmt: skip
+    """Both images beside each other, a line for every row of `here` and `there`, (N, 2)."""
+    sheet = np.hstack([cv2.cvtColor(to_8_bit(r), cv2.COLOR_GRAY2BGR) for r in (fixed, moving)])
+    beside = np.array([fixed.size_px[0], 0.0])
+    for one, other, is_right in zip(here, there + beside, right, strict=True):
+        colour = GREEN if is_right else RED
+        ends = [(round(float(x)), round(float(y))) for x, y in (one, other)]
+        cv2.line(sheet, *ends, colour, 1, cv2.LINE_AA)
+        for end in ends:
+            cv2.circle(sheet, end, 4, colour, 1, cv2.LINE_AA)
+    return sheet
+
+
+def before_and_after(folder: Path) -> NDArray[np.uint8]:
+    """The picture that a run writes."""
+    reports = agalign.align_folder(folder / "0000SET", folder / "aligned")
+    assert all(r.good for r in reports)
+    return cv2.imread(str(next((folder / "aligned").rglob("IMG_*.png"))))
+
+
+def main(out: Path) -> None:
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        fixed, moving, truth = straight_pair(folder)
+        drawn = cv2.resize(matches(fixed, moving, truth), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(out / "matches.jpg"), drawn, [cv2.IMWRITE_JPEG_QUALITY, 40])
+        cv2.imwrite(str(out / "aligned.jpg"), before_and_after(folder), [cv2.IMWRITE_JPEG_QUALITY, 80])
+        offsets = np.linspace(-100, 100, 17)
+        settings = JointSettings(recipe="paper", paper=PaperRecipe(epochs=2))
+        surface = loss_surface(fixed, moving, truth, offsets, settings)
+        draw_surface(surface, offsets, out / "loss-surface.png")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/figures"))
