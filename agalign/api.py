@@ -7,15 +7,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from agalign import geometry
 from agalign.batch import CaptureReport, RunOptions, run_flight
-from agalign.cameras import rig_seed
-from agalign.config import Interpolation, Settings
+from agalign.choices import Interpolation, SeedKind
+from agalign.config import Settings
 from agalign.discover import DiscoverOptions, discover
 from agalign.errors import InputError
 from agalign.mapping import Mapping
 from agalign.masks import raster_of
 from agalign.pair import align_images
 from agalign.pipeline import CaptureOutcome, process_capture, quiet
-from agalign.records import Alignment, Capture, Mask, SeedKind, Tile
+from agalign.records import Alignment, Capture, Mask, Tile
 from agalign.summary import write_summary
 from agalign.warp import resample
 
@@ -81,7 +81,7 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
 
     Raises UnreadableFileError where its reference band cannot be read, and OutputError.
     """
-    return process_capture(capture, Path(out), rig_seed, settings or Settings())
+    return process_capture(capture, Path(out), settings or Settings())
 
 
 def align_folder(

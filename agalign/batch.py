@@ -21,7 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
-from agalign.cameras import rig_seed
+from agalign.choices import Layout
 from agalign.config import Settings
 from agalign.discover import Flight
 from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError, WorkerError
@@ -41,6 +41,7 @@ from agalign.pair import PairProgress
 from agalign.pipeline import output_paths, process_capture, quiet
 from agalign.records import Capture
 from agalign.sidecar import Sidecar, read_sidecar
+from agalign.write import band_file_names
 
 _MOST_READ_AHEAD_BYTES = 64 << 20
 _DASK_ANSWERS_WITHIN_S = 10
@@ -126,7 +127,7 @@ def run_flight(
     """
     options, listener = options or RunOptions(), listener or Listener()
     prepare_output(out)
-    _refuse_to_overwrite_inputs(flight, out)
+    _refuse_to_overwrite_inputs(flight, out, settings.write.layout)
     known = None if model is None else _given_model(model, flight, settings)
     if known is not None:
         used = settings.flight.model_copy(update={"start": known.fingerprint})
@@ -186,7 +187,7 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
         device = task.settings.joint.device
         model = None if task.model is None else _loaded(task.model, device, _stamp(task.model))
         with one_thread():
-            outcome = process_capture(task.capture, task.out, rig_seed, task.settings, on_pair, model)
+            outcome = process_capture(task.capture, task.out, task.settings, on_pair, model)
     except AgalignError as error:
         return CaptureReport(label, "error", None, str(error))
     return CaptureReport(label, "done", outcome.sidecar)
@@ -281,7 +282,7 @@ def _read_ahead(capture: Capture) -> None:
 
 def _given_model(path: Path, flight: Flight, settings: Settings) -> FlightModel:
     """The model to start from. Raises ConfigurationError where it is of no use here."""
-    if settings.joint.recipe != "fast" or not settings.flight.together:
+    if settings.joint.recipe != "fast" or not settings.flight.together or settings.seed.only:
         raise ConfigurationError("a model is of use only where one network is learnt for a flight, by recipe fast")
     model = load_model(path, lambda: choose_device(settings.joint.device))
     if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
@@ -296,7 +297,7 @@ def _learn(
     captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, known: FlightModel | None
 ) -> Path | None:
     """The path of the flight's model, learnt now or found from an earlier run; None where none could be learnt."""
-    if settings.joint.recipe != "fast" or not settings.flight.together:
+    if settings.joint.recipe != "fast" or not settings.flight.together or settings.seed.only:
         return None
     start = known if known is not None and known.camera in ("", camera_key(captures[0])) else None
     device = settings.joint.device
@@ -308,7 +309,7 @@ def _learn(
     def progress(_stage: str, share: float) -> None:
         listener.on_learning(path.stem, share)
 
-    model = learn_flight(captures, rig_seed, settings, progress, start)
+    model = learn_flight(captures, settings, progress, start)
     if model is None:
         return None
     save_model(model, path)
@@ -327,12 +328,16 @@ def _loaded(path: Path, device: str, _stamp: int) -> FlightModel:
     return load_model(path, lambda: choose_device(device))
 
 
-def _refuse_to_overwrite_inputs(flight: Flight, out: Path) -> None:
+def _refuse_to_overwrite_inputs(flight: Flight, out: Path, layout: Layout) -> None:
     sources = {band.path.resolve() for capture in flight.captures for band in capture.bands}
     for capture in flight.captures:
         stack, _ = output_paths(capture, out)
-        if stack.resolve() in sources:
-            raise ConfigurationError(f"{stack}: is an image to be aligned; choose another output folder with -o")
+        written = (
+            [stack] if layout == "stack" else [stack, *(stack.parent / n for n in band_file_names(capture).values())]
+        )
+        for path in written:
+            if path.resolve() in sources:
+                raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder with -o")
 
 
 def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar | None:
@@ -346,5 +351,13 @@ def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar 
         return None
     if sidecar.settings != fingerprint(capture, settings):
         return None
-    size = stack.stat().st_size if stack.is_file() else None
-    return sidecar if size == (sidecar.output.bytes if sidecar.output else None) else None
+    return sidecar if _outputs_are_there(sidecar, path.parent, stack) else None
+
+
+def _outputs_are_there(sidecar: Sidecar, folder: Path, stack: Path) -> bool:
+    output = sidecar.output
+    if output is None:
+        return not stack.is_file()
+    files = [(f.file, f.bytes) for f in output.band_files]
+    files += [] if output.file is None or output.bytes is None else [(output.file, output.bytes)]
+    return all((folder / name).is_file() and (folder / name).stat().st_size == size for name, size in files)

@@ -3,9 +3,10 @@
 import numpy as np
 
 from agalign import geometry
+from agalign.choices import PairStatus
 from agalign.config import CheckSettings
 from agalign.geometry import Matrix
-from agalign.records import JointResult, PairStatus, Residual, Seed
+from agalign.records import JointResult, Residual, Seed
 
 
 def verdict(

@@ -4,9 +4,19 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from agalign.records import ModelFamily, SeedKind
+from agalign.choices import (
+    Compression,
+    Crop,
+    FamilyChoice,
+    Interpolation,
+    Layout,
+    RasterFormat,
+    Recipe,
+    Resolution,
+    SeedKind,
+    Sharing,
+)
 
-Interpolation = Literal["nearest", "bilinear", "cubic", "lanczos"]
 Positive = Annotated[int, Field(gt=0)]
 
 
@@ -99,9 +109,9 @@ class PaperRecipe(Stage):
 class JointSettings(Stage):
     """The joint aligner."""
 
-    recipe: Literal["fast", "paper"] = "fast"
-    sharing: Literal["siamese", "pseudo-siamese", "unshared"] = "pseudo-siamese"
-    model_family: ModelFamily | Literal["auto"] = "auto"
+    recipe: Recipe = "fast"
+    sharing: Sharing = "pseudo-siamese"
+    model_family: FamilyChoice = "auto"
     device: str = "auto"
     rng_seed: Annotated[int, Field(ge=0)] = 0
     fast: FastRecipe = FastRecipe()
@@ -126,6 +136,8 @@ class SeedSettings(Stage):
 
     force: SeedKind | None = None
     """Use this kind of seed whatever its score."""
+    only: bool = False
+    """Stop at the seed: nothing is learnt or optimised."""
     working_px: Positive = 384
     """Longer side of the images on which seeds are scored."""
     smoothing_px: float = 1.0
@@ -177,15 +189,22 @@ class WriteSettings(Stage):
     interpolation: Interpolation = "lanczos"
     """Lanczos has half the error of OpenCV's cubic kernel on band-limited images, bilinear five times as much:
     docs/method.md has the figures."""
-    crop: Literal["common", "none"] = "common"
-    format: Literal["gtiff", "cog"] = "gtiff"
-    compression: Literal["zstd", "deflate", "none"] = "zstd"
+    crop: Crop = "common"
+    format: RasterFormat = "gtiff"
+    compression: Compression = "auto"
+    """auto is Zstandard for stacks and Deflate for files of single bands."""
     tile_px: Positive = 256
     """Side of the tiles within a TIFF."""
     work_tile_px: Positive = 2048
     """Side of the tiles in which moving bands are resampled: it bounds the memory."""
     undistort: bool = False
     """Write the lens-corrected grid of the reference instead of its own."""
+    layout: Layout = "stack"
+    """One file a capture, one for each of its files, or both."""
+    resolution: Resolution = "reference"
+    """The reference's own pixels, or as many more as the finest band has."""
+    radiometry: bool = False
+    """Write reflectance or radiance (float32) instead of raw numbers, where the camera's tags tell how."""
 
 
 class Settings(Stage):

@@ -8,27 +8,30 @@ from numpy.typing import NDArray
 
 from agalign import geometry
 from agalign._version import __version__
+from agalign.choices import CaptureStatus
 from agalign.config import Settings
 from agalign.fingerprint import fingerprint
 from agalign.geometry import Matrix
 from agalign.pair import mapping_of
-from agalign.records import Alignment, Band, Capture, CaptureStatus, JointResult, Residual
+from agalign.records import Alignment, Band, Capture, JointResult, Residual
 from agalign.sidecar import (
     BandPart,
     CameraPart,
+    FilePart,
     GridPart,
     HomographyPart,
     JointPart,
     Matrix3x3,
     MetricsPart,
     OutputPart,
+    PlacePart,
     ReferencePart,
     ResidualTile,
     SeedPart,
     Sidecar,
     SimilarityPart,
 )
-from agalign.write import Stack
+from agalign.write import Written
 
 _GRID_COLUMNS, _GRID_ROWS = 17, 13
 
@@ -42,7 +45,7 @@ def capture_status(statuses: list[str]) -> CaptureStatus:
 
 
 def describe_capture(
-    capture: Capture, alignments: dict[str, Alignment], stack: Stack | None, settings: Settings
+    capture: Capture, alignments: dict[str, Alignment], written: Written | None, settings: Settings
 ) -> Sidecar:
     """The sidecar of a capture whose moving bands have the given alignments, by band name."""
     reference = capture.reference
@@ -62,6 +65,8 @@ def describe_capture(
             )
         else:
             parts.append(_band_part(reference, band, alignments[band.name]))
+    if written is not None:
+        parts = [p.model_copy(update={"place": _place(written, p.band)}) for p in parts]
     status = capture_status([p.status for p in parts])
     return Sidecar(
         agalign=__version__,
@@ -80,22 +85,35 @@ def describe_capture(
             height=reference.height_px,
         ),
         bands=parts,
-        output=None if stack is None else _output_part(stack),
+        output=None if written is None else _output_part(written),
         settings=fingerprint(capture, settings),
     )
 
 
-def _output_part(stack: Stack) -> OutputPart:
-    nodata: float | str | None = stack.nodata
+def _output_part(written: Written) -> OutputPart:
+    nodata: float | str | None = written.nodata
     if isinstance(nodata, float) and math.isnan(nodata):
         nodata = "nan"
-    crop = stack.crop
+    grid, stack = written.grid, written.stack
     return OutputPart(
-        file=stack.path.name,
-        bytes=stack.path.stat().st_size,
-        crop=(crop.x0, crop.y0, crop.width, crop.height),
+        file=None if stack is None else stack.name,
+        bytes=None if stack is None else stack.stat().st_size,
+        band_files=[
+            FilePart(file=path.relative_to(written.folder).as_posix(), bytes=path.stat().st_size)
+            for path in written.band_files
+        ],
+        crop=(grid.x0, grid.y0, grid.width, grid.height),
+        scale=grid.scale,
         nodata=nodata,
     )
+
+
+def _place(written: Written, band: str) -> PlacePart | None:
+    """Not of a band that is all nodata."""
+    if band not in written.places:
+        return None
+    path, index = written.places[band]
+    return PlacePart(file=path.relative_to(written.folder).as_posix(), band_index=index)
 
 
 def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:

@@ -4,14 +4,12 @@ Conv(C, 32, 5) - Tanh - MaxPool(2) - Conv(32, 64, 3) - Tanh - FC(256) on 16 x 16
 """
 
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
+from agalign.choices import Sharing
 from agalign.errors import ConfigurationError
-
-Sharing = Literal["siamese", "pseudo-siamese", "unshared"]
 
 PATCH_PX = 16
 DIMENSION = 256

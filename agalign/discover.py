@@ -1,5 +1,6 @@
 """From a folder to captures."""
 
+import math
 import os
 import re
 from collections import defaultdict
@@ -8,9 +9,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from agalign.cameras import Camera, default_reference, known_cameras
+from agalign.choices import BandOrder
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
-from agalign.metadata import Tags, read_tags
-from agalign.raster import TIFF_SUFFIXES, probe
+from agalign.metadata import CAPTURE_IDS, FLIGHT_IDS, Tags, read_tags
+from agalign.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, probe
 from agalign.records import Band, CameraIdentity, Capture
 
 
@@ -31,6 +33,9 @@ class Flight:
     problems: tuple[Problem, ...]
 
 
+_SUFFIXES = TIFF_SUFFIXES | JPEG_SUFFIXES
+
+
 @dataclass(frozen=True)
 class _File:
     path: Path
@@ -49,6 +54,12 @@ class DiscoverOptions:
     """Name of the reference band; None is the camera's default."""
     ignore_metadata: bool = False
     """Leave lens and rig tags aside."""
+    with_rgb: bool = False
+    """The colour photographs that some cameras take beside the narrow bands take part, as three bands."""
+    bands: tuple[str, ...] = ()
+    """Names of the bands that take part; empty for all."""
+    order: BandOrder = "index"
+    """Of the bands in the stacks: as the camera counts them, by wavelength, or by name."""
     skip: tuple[Path, ...] = field(default=())
     """Folders not to look into, such as the output's."""
 
@@ -67,14 +78,18 @@ def discover(
     cameras = known_cameras(options.pattern)
     problems: list[Problem] = []
     files: list[_File] = []
-    paths = _tiffs(folder, options.skip)
+    paths = _images(folder, options.skip)
     if not paths:
-        raise InputError(f"{folder}: no .tif or .tiff file in it or below it")
+        raise InputError(f"{folder}: no .tif, .tiff, .jpg or .jpeg file in it or below it")
     for number, path in enumerate(paths, start=1):
         try:
-            files.append(_examine(path, cameras))
+            file = _examine(path, cameras, with_rgb=options.with_rgb)
+            if file.bands:
+                files.append(file)
         except UnreadableFileError as error:
-            problems.append(Problem(path, str(error)))
+            # A colour photograph that does not take part does no harm either.
+            if options.with_rgb or path.suffix.lower() in TIFF_SUFFIXES:
+                problems.append(Problem(path, str(error)))
         if progress is not None:
             progress(number, len(paths))
     captures: list[Capture] = []
@@ -89,7 +104,7 @@ def discover(
     return Flight(folder, tuple(captures), tuple(problems))
 
 
-def _tiffs(folder: Path, skip: Sequence[Path]) -> list[Path]:
+def _images(folder: Path, skip: Sequence[Path]) -> list[Path]:
     skipped = {p.resolve() for p in skip}
     found: list[Path] = []
     for parent, folders, names in os.walk(folder):
@@ -98,9 +113,9 @@ def _tiffs(folder: Path, skip: Sequence[Path]) -> list[Path]:
             d for d in folders
             if not d.startswith(".") and (here / d).resolve() not in skipped and not _is_output(here / d)
         )  # fmt: skip
-        tiffs = [n for n in names if Path(n).suffix.lower() in TIFF_SUFFIXES and not n.startswith(".")]
-        tiffs.sort(key=_natural)
-        found.extend(here / n for n in tiffs)
+        images = [n for n in names if Path(n).suffix.lower() in _SUFFIXES and not n.startswith(".")]
+        images.sort(key=_natural)
+        found.extend(here / n for n in images)
     return found
 
 
@@ -114,27 +129,33 @@ def _is_output(folder: Path) -> bool:
     return (folder / "summary.csv").is_file() and (folder / "index.html").is_file()
 
 
-def _examine(path: Path, cameras: Iterable[Camera]) -> _File:
+def _examine(path: Path, cameras: Iterable[Camera], *, with_rgb: bool) -> _File:
     info = probe(path)
     tags = read_tags(path)
     camera = next(c for c in cameras if c.recognises(tags))
-    return _File(path, camera, tags, camera.bands(path, tags, info))
+    bands = camera.bands(path, tags, info)
+    return _File(path, camera, tags, tuple(b for b in bands if with_rgb or not b.companion))
+
+
+def _is_whole(file: _File) -> bool:
+    """True for a file that is a capture in itself: of several bands, each with a lens of its own."""
+    return len(file.bands) > 1 and not file.bands[0].one_lens
 
 
 def _groups(files: Iterable[_File]) -> list[list[_File]]:
-    """Files of one capture: same camera, folder and key. A file of several bands is a capture of its own."""
+    """Files of one capture: same camera, folder and key."""
     groups: dict[tuple[str, ...], list[_File]] = defaultdict(list)
     for file in files:
-        key = file.camera.capture_key(file.path, file.tags) if len(file.bands) == 1 else file.path.name
-        groups[(file.camera.name, str(file.path.parent), key)].append(file)
+        key = file.path.name if _is_whole(file) else file.camera.capture_key(file.path, file.tags)
+        groups[(file.camera.name, str(file.camera.capture_folder(file.path)), key)].append(file)
     # A file whose tags are damaged lost its capture id, but not its name.
     for group_key in list(groups):
         camera, folder, key = group_key
         stray = groups[group_key]
-        if len(stray[0].bands) > 1 or stray[0].camera.capture_name(stray[0].path) != key:
+        if _is_whole(stray[0]) or stray[0].camera.capture_name(stray[0].path) != key:
             continue
         for other_key, other in groups.items():
-            same_place = other_key[:2] == (camera, folder) and other_key != group_key and len(other[0].bands) == 1
+            same_place = other_key[:2] == (camera, folder) and other_key != group_key and not _is_whole(other[0])
             if same_place and all(f.camera.capture_name(f.path) == key for f in other):
                 other.extend(groups.pop(group_key))
                 other.sort(key=lambda f: _natural(f.path.name))
@@ -143,28 +164,38 @@ def _groups(files: Iterable[_File]) -> list[list[_File]]:
 
 
 def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capture | Problem:
+    # Narrow bands first: the capture is theirs, and the colour photograph's name comes before them.
+    files = sorted(files, key=lambda f: f.bands[0].companion)
     bands = [b for file in files for b in file.bands]
     first = files[0]
+    if options.bands:
+        wanted = {name.lower() for name in options.bands}
+        bands = [b for b in bands if b.name.lower() in wanted]
+        if len(bands) < 2:
+            return Problem(first.path, f"{first.path}: of this capture, --bands leaves {_names(bands) or 'nothing'}")
+    if len(bands) > 1 and len(files) == 1 and first.bands[0].one_lens:
+        return Problem(first.path, f"{first.path}: its bands come through one lens; there is nothing to align")
     if len(bands) < 2:
         text = f"{first.path}: a band with no companion; name files '<capture>_<band>.tif' or give --pattern"
         return Problem(first.path, text)
     bands = _with_unique_band_names(bands)
     if options.ignore_metadata:
-        bands = [replace(b, lens=None, rig_rotation=None) for b in bands]
+        bands = [replace(b, lens=None, to_rig=None) for b in bands]
     try:
-        reference = _reference_index(bands, options.reference, first.path)
+        reference = bands[_reference_index(bands, options.reference, first.path)]
     except ConfigurationError as error:
         return Problem(first.path, str(error))
+    bands = _ordered(bands, options.order)
     tags = first.tags
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
     return Capture(
         name=first.path.stem if len(files) == 1 else first.camera.capture_name(first.path),
-        folder=first.path.parent.relative_to(folder),
+        folder=first.camera.capture_folder(first.path).relative_to(folder),
         bands=tuple(bands),
-        reference_index=reference,
+        reference_index=next(i for i, b in enumerate(bands) if b is reference),
         camera=CameraIdentity(tags.make, tags.model, "+".join(serials)),
-        capture_id=tags.text("MicaSense", "CaptureId") or tags.text("drone-dji", "CaptureUUID"),
-        flight_id=tags.text("MicaSense", "FlightId"),
+        capture_id=tags.first_text(CAPTURE_IDS),
+        flight_id=tags.first_text(FLIGHT_IDS),
         captured_at=tags.captured_at,
     )
 
@@ -175,8 +206,17 @@ def _reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> i
     for index, band in enumerate(bands):
         if band.name.lower() == wanted.lower():
             return index
-    names = ", ".join(b.name for b in bands)
-    raise ConfigurationError(f"{path}: no band '{wanted}' for the reference; this capture has {names}")
+    raise ConfigurationError(f"{path}: no band '{wanted}' for the reference; this capture has {_names(bands)}")
+
+
+def _names(bands: Sequence[Band]) -> str:
+    return ", ".join(b.name for b in bands)
+
+
+def _ordered(bands: Sequence[Band], order: BandOrder) -> list[Band]:
+    if order == "wavelength":
+        return sorted(bands, key=lambda b: math.inf if b.wavelength_nm is None else b.wavelength_nm)
+    return sorted(bands, key=lambda b: _natural(b.name)) if order == "name" else list(bands)
 
 
 def _with_unique_band_names(bands: Sequence[Band]) -> list[Band]:

@@ -25,11 +25,12 @@ from agalign.descriptor import Descriptor
 from agalign.errors import AgalignError, GeometryError, InputError, NotEnoughTextureError, OutputError
 from agalign.fingerprint import fingerprint, hashed
 from agalign.geometry import Matrix
+from agalign.images import PairImages, moving_lenses, read_pairs
 from agalign.joint import JointAligner, Progress, Subject
 from agalign.match import with_match
 from agalign.raster import read_for_alignment
-from agalign.records import Band, Capture, JointResult, SeedKind
-from agalign.seed import RigSeed, best_seed, is_trusted, seed_candidates
+from agalign.records import Capture, JointResult
+from agalign.seed import best_seed, is_trusted
 from agalign.starter import start_from
 
 _FORMAT = "agalign-model/1"
@@ -85,7 +86,7 @@ def model_names(groups: Sequence[Sequence[Capture]]) -> list[str]:
 
 
 def learn_flight(
-    captures: Sequence[Capture], rig_seed: RigSeed, settings: Settings, progress: Progress,
+    captures: Sequence[Capture], settings: Settings, progress: Progress,
     start: FlightModel | None = None,
 ) -> FlightModel | None:  # fmt: skip
     """Learn one network on a few captures spread over the flight; None where none of them could be aligned.
@@ -93,12 +94,12 @@ def learn_flight(
     With `start`, its network is where theta starts; its last side is where bands start that it does not know.
     """
     chosen = _choose(captures, settings.flight.captures)
-    loaded = [s for c in chosen if (s := read_subject(c, rig_seed, settings, start)) is not None]
+    loaded = [s for c in chosen if (s := read_subject(c, settings, start)) is not None]
     if not loaded:
         return None
     aligner = JointAligner(settings.joint, progress)
     subjects = [subject for subject, _ in loaded]
-    bands = tuple(b.name for b in captures[0].moving)
+    bands = moving_names(captures[0])
     net = aligner.fast_descriptor([1] * (1 + len(bands)))
     if start is not None:
         start_from(net, start.net.state_dict())
@@ -108,20 +109,14 @@ def learn_flight(
     except NotEnoughTextureError:
         return None
     found: dict[str, list[Matrix]] = {}
-    for (_, names), subject_results in zip(loaded, results, strict=True):
-        for name, result in zip(names, subject_results, strict=True):
+    for (_, pairs), subject_results in zip(loaded, results, strict=True):
+        for pair, result in zip(pairs, subject_results, strict=True):
             if isinstance(result, JointResult) and result.retrieval >= settings.joint.fast.step_gate:
-                found.setdefault(name, []).append(result.fixed_to_moving)
+                found.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
     if not found:
         return None
     size = captures[0].reference.size_px
-    scale = min(1.0, settings.joint.longest_side_px / max(size))
-    mappings = {}
-    for name, matrices in found.items():
-        small = median_mapping(matrices, (round(size[0] * scale), round(size[1] * scale)))
-        moving = next(b for b in captures[0].moving if b.name == name)
-        down = [_reduction(b, settings.joint.longest_side_px) for b in (captures[0].reference, moving)]
-        mappings[name] = geometry.rescale(small, *[(1 / x, 1 / y) for x, y in down])
+    mappings = {name: median_mapping(matrices, size) for name, matrices in found.items()}
     return FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings))
 
 
@@ -164,43 +159,37 @@ def _texture(capture: Capture) -> float:
     return float(np.median(cv2.magnitude(gx, gy)[raster.valid]) / max(float(inside.std()), 1e-12))
 
 
-def _reduction(band: Band, longest_side_px: int) -> tuple[float, float]:
-    reduction = max(1.0, max(band.size_px) / longest_side_px)
-    return round(band.width_px / reduction) / band.width_px, round(band.height_px / reduction) / band.height_px
-
-
 def read_subject(
-    capture: Capture, rig_seed: RigSeed, settings: Settings, start: FlightModel | None = None
-) -> tuple[Subject, list[str]] | None:
-    """A capture to learn from and the names of its moving bands; None where there is no pair that can be read.
+    capture: Capture, settings: Settings, start: FlightModel | None = None
+) -> tuple[Subject, list[PairImages]] | None:
+    """A capture to learn from and its pairs; None where there is none that can be read.
 
     `start` is the network with which a seed of kind `match` is found.
     """
-    longest = settings.joint.longest_side_px
     try:
-        fixed = read_for_alignment(capture.reference, longest)
+        pairs, _ = read_pairs(capture, settings)
     except AgalignError:
         return None
-    names, rasters, mappings, trusted = [], [], [], []
-    for band in capture.moving:
-        if (capture.reference.lens is None) != (band.lens is None):
-            continue
-        with suppress(AgalignError):
-            raster = read_for_alignment(band, longest)
-            candidates = seed_candidates(capture.reference, band, rig_seed, settings.seed)
-            scales = _reduction(capture.reference, longest), _reduction(band, longest)
-            down: dict[SeedKind, Matrix] = {k: geometry.rescale(m, *scales) for k, m in candidates.items()}
-            learnt, side = (None, 1) if start is None else (start.net, start.side(band.name) or 1)
-            known = with_match(down, fixed, raster, settings.seed, learnt, side)
-            seed = best_seed(fixed, raster, known, settings.seed)
-            names.append(band.name)
-            rasters.append(raster)
-            mappings.append(seed.fixed_to_moving)
-            trusted.append(is_trusted(seed, settings.seed))
-    if not names:
+    undistorted = capture.reference.lens is not None
+    pairs = [p for p in pairs if (p.moving.lens is not None) == undistorted]
+    if not pairs:
         return None
-    order = [b.name for b in capture.moving]
-    return Subject(fixed, rasters, mappings, [order.index(n) + 1 for n in names], trusted), names
+    names = moving_names(capture)
+    seeds = []
+    for pair in pairs:
+        learnt, side = (None, 1) if start is None else (start.net, start.side(pair.name) or 1)
+        candidates = with_match(pair.candidates, pair.fixed, pair.moving, settings.seed, learnt, side)
+        seeds.append(best_seed(pair.fixed, pair.moving, candidates, settings.seed))
+    subject = Subject(
+        pairs[0].fixed, [p.moving for p in pairs], [s.fixed_to_moving for s in seeds],
+        [names.index(p.name) + 1 for p in pairs], [is_trusted(s, settings.seed) for s in seeds],
+    )  # fmt: skip
+    return subject, pairs
+
+
+def moving_names(capture: Capture) -> tuple[str, ...]:
+    """Of the moving bands that get a side of the network: one for each lens."""
+    return tuple(bands[0].name for bands in moving_lenses(capture))
 
 
 # ---- using

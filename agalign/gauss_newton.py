@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from agalign.choices import ModelFamily
 from agalign.patches import ALPHA, FAMILY_PARAMETERS, Keypoints, homography_from_psi, transform
-from agalign.records import ModelFamily
 
 _REWEIGHTINGS = 4
 _DAMPING = 1e-4

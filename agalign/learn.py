@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from agalign import geometry, losses
+from agalign.choices import SeedKind
 from agalign.config import Settings
 from agalign.descriptor import REFERENCE, Descriptor
 from agalign.detect import sift_keypoints, visible_in_both
@@ -24,7 +25,7 @@ from agalign.joint import JointAligner, Subject, one_thread
 from agalign.levels import Level
 from agalign.pair import align_images
 from agalign.patches import Keypoints, far_apart, patch_grid
-from agalign.records import Raster, SeedKind
+from agalign.records import Raster
 from agalign.refine import moving_patches
 
 _MOVING_BAND = "moving"

@@ -2,13 +2,15 @@
 
 Brown-Conrady in OpenCV's convention, on normalised coordinates x = (u - cx) / fx, y = (v - cy) / fy, r^2 = x^2 + y^2:
 
-    radial = 1 + k1 r^2 + k2 r^4 + k3 r^6
+    radial = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
     x_d = x radial + 2 p1 x y + p2 (r^2 + 2 x^2)
     y_d = y radial + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-The undistorted image has the same camera matrix K as the raw one.
+The undistorted image has the same camera matrix K as the raw one. Fisheyes are expressed the same way: for the angles
+that drone cameras see the quotient follows them to a hundredth of a pixel (`radial_coefficients`).
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -38,11 +40,13 @@ def distort(lens: Lens | None, undistorted_px: ArrayLike) -> Points:
 
 def distorted(lens: Lens, u: Any, v: Any) -> tuple[Any, Any]:
     """`distort` on separate coordinates, for anything with arithmetic: arrays or tensors."""
-    k1, k2, p1, p2, k3 = _five(lens)
+    k1, k2, p1, p2, k3, k4, k5, k6 = _eight(lens)
     x, y = (u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px
     xx, yy, xy = x * x, y * y, x * y
     r2 = xx + yy
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if k4 or k5 or k6:
+        radial = radial / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     x_d = x * radial + (2.0 * p1) * xy + p2 * (r2 + 2.0 * xx)
     y_d = y * radial + p1 * (r2 + 2.0 * yy) + (2.0 * p2) * xy
     return lens.fx_px * x_d + lens.cx_px, lens.fy_px * y_d + lens.cy_px
@@ -54,7 +58,7 @@ def undistort(lens: Lens | None, raw_px: ArrayLike) -> Points:
     if lens is None or not is_distorting(lens) or points.size == 0:
         return points
     flat = np.ascontiguousarray(points.reshape(-1, 1, 2))
-    coefficients = np.array(_five(lens))
+    coefficients = np.array(_eight(lens))
     straight = cv2.undistortPoints(flat, lens.matrix, coefficients, P=lens.matrix, criteria=_UNDISTORT_CRITERIA)
     return np.asarray(straight, dtype=np.float64).reshape(points.shape)
 
@@ -73,6 +77,20 @@ def rescaled(lens: Lens | None, scale: tuple[float, float]) -> Lens | None:
     )
 
 
-def _five(lens: Lens) -> tuple[float, float, float, float, float]:
-    k1, k2, p1, p2, k3 = (*lens.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-    return k1, k2, p1, p2, k3
+def radial_coefficients(bent: Callable[[Points], Points], reach: float) -> tuple[float, ...]:
+    """The distortion (k1, k2, 0, 0, k3, k4, k5, k6) of a lens that puts a ray at distance r from the axis, in focal
+    lengths, to `bent(r)`; fitted for r up to `reach`.
+
+    bent(r) / r (1 + k4 r^2 + k5 r^4 + k6 r^6) = 1 + k1 r^2 + k2 r^4 + k3 r^6 is linear in k.
+    """
+    r = np.linspace(reach / 256, reach, 256)
+    ratio = bent(r) / r
+    powers = np.stack([r**2, r**4, r**6], axis=1)
+    k = np.linalg.lstsq(np.hstack([powers, -ratio[:, None] * powers]), ratio - 1.0, rcond=None)[0]
+    k1, k2, k3, k4, k5, k6 = k.tolist()
+    return k1, k2, 0.0, 0.0, k3, k4, k5, k6
+
+
+def _eight(lens: Lens) -> tuple[float, float, float, float, float, float, float, float]:
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*lens.distortion, *(0.0,) * 8)[:8]
+    return k1, k2, p1, p2, k3, k4, k5, k6

@@ -10,14 +10,15 @@ import torch
 from torch import Tensor
 
 from agalign import geometry, lens
+from agalign.choices import SeedKind, Sharing
 from agalign.config import SeedSettings
-from agalign.descriptor import REFERENCE, Descriptor, Sharing
+from agalign.descriptor import REFERENCE, Descriptor
 from agalign.detect import sift_keypoints
 from agalign.errors import GeometryError
 from agalign.geometry import Matrix
 from agalign.levels import View, make_view
 from agalign.patches import Keypoints, footprint_radius, patch_grid
-from agalign.records import Raster, SeedKind
+from agalign.records import Raster
 from agalign.starter import start_from, start_from_starter
 from agalign.structure import shrink
 

@@ -1,29 +1,27 @@
-"""Tags of a TIFF as typed fields: the standard ones, EXIF, GPS, and XMP read by namespace."""
+"""Tags of a TIFF or JPEG as typed fields: the standard ones, EXIF, GPS, and XMP read by namespace."""
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
-from xml.etree.ElementTree import Element, ParseError
+from typing import Any
 
 import tifffile
-from defusedxml import DefusedXmlException
-from defusedxml.ElementTree import fromstring
+from PIL import ExifTags, Image
 
 from agalign.errors import UnreadableFileError
+from agalign.xmp import Namespace, Packet
 
-Namespace = Literal["Camera", "MicaSense", "DLS", "drone-dji"]
-
-_NAMESPACES: dict[str, Namespace] = {
-    "http://pix4d.com/camera/1.0": "Camera",
-    "http://pix4d.com/1.0": "Camera",
-    "http://micasense.com/MicaSense/1.0": "MicaSense",
-    "http://micasense.com/DLS/1.0": "DLS",
-    "http://www.dji.com/drone-dji/1.0": "drone-dji",
-}
-_RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
+CAPTURE_IDS: tuple[tuple[Namespace, str], ...] = (
+    ("MicaSense", "CaptureId"), ("drone-dji", "CaptureUUID"), ("Camera", "CaptureUUID"), ("Sentera", "CaptureUUID"),
+    ("Sentera", "ImageUniqueID"),
+)  # fmt: skip
+"""Where cameras write an id that the bands of a capture share."""
+FLIGHT_IDS: tuple[tuple[Namespace, str], ...] = (
+    ("MicaSense", "FlightId"), ("Camera", "FlightUUID"), ("Sentera", "FlightUUID"), ("Sentera", "FlightUniqueID"),
+)  # fmt: skip
+"""Where they write one that a flight shares."""
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -38,12 +36,22 @@ class Tags:
     serial: str = ""
     captured_at: str = ""
     """ISO 8601 as written by the camera, without a time zone where it gives none."""
+    orientation: int = 1
+    """EXIF's: how the stored image is to be turned to be seen upright."""
+    size_px: tuple[int, int] = (0, 0)
+    """(width, height) of a TIFF's image."""
+    black_level: float | None = None
+    """Mean of the tag's values."""
     xmp: Mapping[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
     exif: Mapping[str, Any] = field(default_factory=dict)
 
     def text(self, namespace: Namespace, name: str) -> str:
         """An XMP value as text; a sequence's items are joined by commas."""
         return ",".join(self.xmp.get((namespace, name), ()))
+
+    def first_text(self, names: Iterable[tuple[Namespace, str]]) -> str:
+        """The text of the first of some names that has one."""
+        return next((text for name in names if (text := self.text(*name))), "")
 
     def numbers(self, namespace: Namespace, name: str) -> tuple[float, ...]:
         """The finite numbers in an XMP value, whether it is one text, a list in a text, or a sequence."""
@@ -57,11 +65,16 @@ class Tags:
 
     @property
     def pixels_per_mm(self) -> float | None:
-        """Density of the pixels in the focal plane, from EXIF FocalPlaneXResolution and its unit."""
+        """Density of the pixels in the focal plane, from EXIF FocalPlaneXResolution and its unit, else from DJI's
+        focal length in px and EXIF's in mm.
+        """
         resolution = rational(self.exif.get("FocalPlaneXResolution"))
         unit = self.exif.get("FocalPlaneResolutionUnit", 2)
         mm = _MM_PER_UNIT.get(int(unit)) if isinstance(unit, int) else None
-        return resolution / mm if resolution and mm else None
+        if resolution and mm:
+            return resolution / mm
+        focal_px, focal_mm = self.number("drone-dji", "CalibratedFocalLength"), rational(self.exif.get("FocalLength"))
+        return focal_px / focal_mm if focal_px and focal_mm else None
 
 
 def rational(value: Any) -> float | None:
@@ -74,63 +87,48 @@ def rational(value: Any) -> float | None:
 
 
 def read_tags(path: Path) -> Tags:
-    """The tags of a TIFF's first page. Raises UnreadableFileError where it is no TIFF or is cut short."""
+    """The tags of a TIFF's first page or of a JPEG. Raises UnreadableFileError where it is neither or is cut short."""
+    kind, read = ("JPEG", _jpeg_values) if path.suffix.lower() in (".jpg", ".jpeg") else ("TIFF", _tiff_values)
     try:
-        with tifffile.TiffFile(path) as tiff:
-            page = tiff.pages[0]
-            values = {tag.code: tag.value for tag in page.tags.values()}  # type: ignore[union-attr]
-    except Exception as error:  # a damaged file makes tifffile fail in any way: struct.error, KeyError, MemoryError …
+        values = read(path)
+    except Exception as error:  # a damaged file makes readers fail in any way: struct.error, KeyError, MemoryError …
         raise UnreadableFileError(
-            f"{path}: not a readable TIFF ({error or 'empty'}); copy it from the card again"
+            f"{path}: not a readable {kind} ({error or 'empty'}); copy it from the card again"
         ) from None
     exif = values.get(34665)
     exif = exif if isinstance(exif, dict) else {}
+    orientation = values.get(274, 1)
     return Tags(
         make=_text(values.get(271)),
         model=_text(values.get(272)),
         serial=_text(exif.get("BodySerialNumber")),
         captured_at=_iso_time(exif, values.get(306)),
-        xmp=parse_xmp(values.get(700, b"")),
+        orientation=int(orientation) if orientation in range(1, 9) else 1,
+        size_px=(int(values.get(256, 0)), int(values.get(257, 0))),
+        black_level=_mean(values.get(50714)),
+        xmp=Packet.parse(values.get(700, b"")).values(),
         exif=exif,
     )
 
 
-def parse_xmp(packet: Any) -> dict[tuple[str, str], tuple[str, ...]]:
-    """An XMP packet (bytes or text) as {(namespace, name): values}, from all rdf:Description blocks.
-
-    A value may be an attribute, an element's text, or an rdf:Seq or rdf:Bag. A malformed packet is an empty one:
-    cameras do write them, and the images are still good.
-    """
-    text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
-    if not isinstance(text, str):
-        return {}
-    start, end = text.find("<x:xmpmeta"), text.rfind("</x:xmpmeta>")
-    if start < 0 or end < 0:
-        return {}
-    try:
-        root = fromstring(text[start : end + len("</x:xmpmeta>")])
-    except (ParseError, DefusedXmlException, ValueError):
-        return {}
-    values: dict[tuple[str, str], tuple[str, ...]] = {}
-    for description in root.iter(f"{_RDF}Description"):
-        for name, value in description.attrib.items():
-            _keep(values, name, (value,))
-        for element in description:
-            items = [item.text or "" for item in element.iter(f"{_RDF}li")]
-            _keep(values, element.tag, tuple(items) if items else (_own_text(element),))
-    return values
+def _tiff_values(path: Path) -> dict[int, Any]:
+    with tifffile.TiffFile(path) as tiff:
+        return {tag.code: tag.value for tag in tiff.pages[0].tags.values()}  # type: ignore[union-attr]
 
 
-def _keep(values: dict[tuple[str, str], tuple[str, ...]], tag: str, found: tuple[str, ...]) -> None:
-    uri, _, name = tag.removeprefix("{").rpartition("}")
-    namespace = _NAMESPACES.get(uri.rstrip("/"))
-    cleaned = tuple(v.strip() for v in found)
-    if namespace and any(cleaned):
-        values.setdefault((namespace, name), cleaned)
+def _jpeg_values(path: Path) -> dict[int, Any]:
+    with Image.open(path) as image:
+        exif = image.getexif()
+        named = {ExifTags.TAGS.get(code, str(code)): value for code, value in exif.get_ifd(34665).items()}
+        return {**exif, 34665: named, 700: image.info.get("xmp", b"")}
 
 
-def _own_text(element: Element) -> str:
-    return (element.text or "").strip()
+def _mean(value: Any) -> float | None:
+    """Of a tag of one or several numbers or fractions."""
+    numbers = value if isinstance(value, (tuple, list)) else [value]
+    if not numbers or not all(isinstance(n, (int, float)) for n in numbers):
+        return None
+    return float(sum(numbers)) / len(numbers)
 
 
 def _text(value: Any) -> str:

@@ -1,7 +1,7 @@
 """The band pairs of one capture: seeded, aligned together, each one checked."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,24 +9,22 @@ import numpy as np
 
 from agalign import geometry
 from agalign.check import is_as_it_was, verdict
+from agalign.choices import SeedKind
 from agalign.config import CheckSettings, Settings
-from agalign.errors import AgalignError
 from agalign.flight import FlightModel, align_from_scratch, refine_with
 from agalign.geometry import Matrix
+from agalign.images import Candidates, bands_of_the_references_lens, read_pairs
 from agalign.joint import Subject
 from agalign.mapping import Mapping as PixelMapping
 from agalign.match import with_match
 from agalign.metrics import FixedSimilarity
-from agalign.raster import read_for_alignment
-from agalign.records import Alignment, Band, Capture, JointResult, Raster, Seed, SeedKind
+from agalign.records import Alignment, Band, Capture, JointResult, Raster, Seed
 from agalign.residuals import FixedWindows
-from agalign.seed import RigSeed, best_seed, is_trusted, overlay, seed_candidates, single, warped
+from agalign.seed import best_seed, is_trusted, overlay, single, warped
 from agalign.structure import textured
 
 PairProgress = Callable[[str, str, float], None]
 """Called with the band's name, the stage, and the share of the stage that is behind."""
-
-Candidates = Mapping[SeedKind, Matrix]
 
 _AS_FILES_LIE: tuple[SeedKind, ...] = ("geo", "identity")
 """Seeds that change nothing: an input aligned already is left untouched, not resampled by a hundredth of a pixel."""
@@ -51,7 +49,7 @@ class Pair:
 
 
 def align_capture_bands(
-    capture: Capture, rig_seed: RigSeed, settings: Settings, model: FlightModel | None, progress: PairProgress
+    capture: Capture, settings: Settings, model: FlightModel | None, progress: PairProgress
 ) -> dict[str, Alignment]:
     """Align every moving band of a capture, by name; a band that cannot be read is `failed` and stops no other.
 
@@ -59,28 +57,20 @@ def align_capture_bands(
     """
     reference = capture.reference
     progress(reference.name, "reading", 0.0)
-    whole = read_for_alignment(reference, settings.joint.longest_side_px)
+    pairs, unreadable = read_pairs(capture, settings, None if model is None else model.mappings)
+    images = [(p.name, p.fixed, p.moving, p.candidates) for p in pairs]
+    aligned = align_images(images, settings, progress, model)
     found: dict[str, Alignment] = {}
-    images: list[tuple[str, Raster, Raster, Candidates]] = []
+    for band in bands_of_the_references_lens(capture):
+        unmoved = Seed("identity", geometry.identity(), 0.0)
+        found[band.name] = Alignment(unmoved.fixed_to_moving, "pixel", "aligned", None, unmoved, None, None, 0.0)
+    for pair in pairs:
+        alignment = _in_file_px(aligned[pair.name], *pair.scales)
+        shared = replace(alignment, seconds=alignment.seconds / len(pair.moving_bands))
+        found |= dict.fromkeys((b.name for b in pair.moving_bands), shared)
     for band in capture.moving:
-        try:
-            moving = read_for_alignment(band, settings.joint.longest_side_px)
-        except AgalignError as error:
-            nothing = Seed("identity", overlay(reference, band), 0.0)
-            found[band.name] = _failed(nothing, str(error))
-            continue
-        candidates = dict(seed_candidates(reference, band, rig_seed, settings.seed))
-        if model is not None and band.name in model.mappings and settings.seed.force is None:
-            candidates = {"model": model.mappings[band.name], **candidates}
-        # Without both lenses nothing can be undistorted.
-        lenses = whole.lens is not None and moving.lens is not None
-        fixed, moving = (r if lenses else replace(r, lens=None) for r in (whole, moving))
-        down = {k: geometry.rescale(m, _scale(fixed, reference), _scale(moving, band)) for k, m in candidates.items()}
-        images.append((band.name, fixed, moving, down))
-    for name, alignment in align_images(images, settings, progress, model).items():
-        band = next(b for b in capture.moving if b.name == name)
-        moving = next(m for n, _, m, _ in images if n == name)
-        found[name] = _in_file_px(alignment, _scale(whole, reference), _scale(moving, band))
+        if band.name in unreadable:
+            found[band.name] = _failed(Seed("identity", overlay(reference, band), 0.0), unreadable[band.name])
     return {band.name: found[band.name] for band in capture.moving}
 
 
@@ -116,6 +106,11 @@ def align_images(
     seeding = spent(len(images))
     seconds = dict.fromkeys((p.name for p in pairs), seeding)
     remaining = pairs
+    if settings.seed.only:
+        for pair in pairs:
+            found[pair.name] = _checked(pair, "only the seed was asked for", yardsticks, settings)
+        share = spent(len(images))
+        return {name: replace(a, seconds=share) for name, a in found.items()}
     if model is not None and settings.joint.recipe == "fast":
         known = [p for p in pairs if model.side(p.name) is not None]
         results = _frozen(known, model, settings, progress)
@@ -204,7 +199,8 @@ def _checked(pair: Pair, joint: JointResult | str, yardsticks: Yardsticks, setti
     there = _laid_on_reference(pair, matrix)
     residual = yardsticks.windows.residuals(there)
     size = pair.fixed.size_px
-    status, doubt = verdict(pair.seed, pair.trusted, found, why_not, residual, size, settings.check)
+    usable = pair.trusted or settings.seed.only
+    status, doubt = verdict(pair.seed, usable, found, why_not, residual, size, settings.check)
     if status != "aligned" and found is not None:
         matrix = pair.seed.fixed_to_moving
         there = _laid_on_reference(pair, matrix)
@@ -233,10 +229,6 @@ def _laid_as_files_lie(pair: Pair) -> Raster:
 
 def _laid_on_reference(pair: Pair, matrix: Matrix) -> Raster:
     return warped(single(pair.moving), PixelMapping(matrix, pair.fixed.lens, pair.moving.lens), pair.fixed.size_px)
-
-
-def _scale(raster: Raster, band: Band) -> tuple[float, float]:
-    return raster.size_px[0] / band.width_px, raster.size_px[1] / band.height_px
 
 
 def _in_file_px(alignment: Alignment, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> Alignment:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from agalign.choices import ModelFamily
 from agalign.descriptor import PATCH_PX
-from agalign.records import ModelFamily
 
 ALPHA = 64.0
 """Scale of the homography's parameters (paper, Sec. 5.1)."""

@@ -1,5 +1,6 @@
 """The small before/after picture beside each stack: three bands as red, green and blue; misalignment is colour."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from agalign.errors import OutputError
 from agalign.raster import read_preview
-from agalign.records import Band, Capture
+from agalign.records import Band, Capture, Grid
 
 Picture = NDArray[np.uint8]
 
@@ -31,14 +32,12 @@ def choose_bands(bands: list[Band], reference: Band) -> list[Band]:
 
 
 def write_picture(
-    capture: Capture, stack: Path, crop: tuple[int, int, int, int], usable: list[Band], path: Path
+    capture: Capture, places: Mapping[str, tuple[Path, int]], grid: Grid, usable: list[Band], path: Path
 ) -> None:
-    """Write the picture of a capture's stack, whose bands are in the capture's order. Raises OutputError."""
+    """Write the picture of a capture, whose bands were written to `places` on a grid. Raises OutputError."""
     chosen = choose_bands(usable, capture.reference)
-    x0, y0, width, height = crop
-    order = {b.name: i for i, b in enumerate(capture.bands, start=1)}
-    after_planes = [read_preview(stack, order[b.name], (0, 0, width, height)) for b in chosen]
-    before_planes = [_before(b, capture.reference, (x0, y0, width, height)) for b in chosen]
+    after_planes = [read_preview(*places[b.name], (0, 0, grid.width, grid.height)) for b in chosen]
+    before_planes = [_before(b, capture.reference, grid) for b in chosen]
     stretches = [_limits(plane) for plane in after_planes]
     before, after = (
         np.stack([_stretched(p, s) for p, s in zip(planes, stretches, strict=True)], axis=-1)
@@ -58,12 +57,13 @@ def write_picture(
             partial.unlink(missing_ok=True)
 
 
-def _before(band: Band, reference: Band, crop: tuple[int, int, int, int]) -> NDArray[np.float32]:
-    """The raw file laid on the reference as it is, cut to the crop."""
-    x0, y0, width, height = crop
-    sx, sy = band.width_px / reference.width_px, band.height_px / reference.height_px
-    window = round(x0 * sx), round(y0 * sy), max(1, round(width * sx)), max(1, round(height * sy))
-    return read_preview(band.path, band.band_index, window, size_px=_preview_size(width, height))
+def _before(band: Band, reference: Band, grid: Grid) -> NDArray[np.float32]:
+    """The raw file laid on the reference as it is, cut to the grid."""
+    sx, sy = (n / (grid.scale * m) for n, m in zip(band.size_px, reference.size_px, strict=True))
+    window = (
+        round(grid.x0 * sx), round(grid.y0 * sy), max(1, round(grid.width * sx)), max(1, round(grid.height * sy)),
+    )  # fmt: skip
+    return read_preview(band.path, band.band_index, window, size_px=_preview_size(grid.width, grid.height))
 
 
 def _preview_size(width: int, height: int) -> tuple[int, int]:

@@ -1,22 +1,25 @@
 """One capture, start to end: its pairs aligned, its stack and sidecar written."""
 
+import math
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from agalign import geometry
-from agalign.config import Settings
+from agalign.config import Settings, WriteSettings
 from agalign.describe import describe_capture
-from agalign.errors import AgalignError
+from agalign.errors import AgalignError, InputError
 from agalign.flight import FlightModel
-from agalign.mapping import Mapping
+from agalign.mapping import Mapping as PixelMapping
 from agalign.pair import PairProgress, align_capture_bands, mapping_of
 from agalign.picture import write_picture
-from agalign.records import Alignment, Capture, Tile
-from agalign.seed import RigSeed
+from agalign.records import Alignment, Band, Capture, Grid, Tile
 from agalign.sidecar import Sidecar, write_sidecar
 from agalign.warp import common_area
-from agalign.write import Layer, Stack, write_stack
+from agalign.write import Layer, write_capture
 
 
 def quiet(*_: object) -> None:
@@ -38,7 +41,7 @@ def output_paths(capture: Capture, out: Path) -> tuple[Path, Path]:
 
 
 def process_capture(
-    capture: Capture, out: Path, rig_seed: RigSeed, settings: Settings, progress: PairProgress = quiet,
+    capture: Capture, out: Path, settings: Settings, progress: PairProgress = quiet,
     model: FlightModel | None = None,
 ) -> CaptureOutcome:  # fmt: skip
     """Align a capture and write its stack and sidecar; a band that cannot be aligned does not stop the others.
@@ -47,40 +50,68 @@ def process_capture(
     Raises UnreadableFileError where the reference itself cannot be read, and OutputError.
     """
     reference = capture.reference
-    alignments = align_capture_bands(capture, rig_seed, settings, model, progress)
+    if settings.write.radiometry:
+        _need_radiometry(capture)
+    alignments = align_capture_bands(capture, settings, model, progress)
     progress(reference.name, "writing", 0.0)
     stack_path, sidecar_path = output_paths(capture, out)
-    stack = _write(capture, alignments, stack_path, settings)
-    if stack is not None:
-        usable = [b for b in capture.moving if alignments[b.name].status != "failed"]
-        crop = stack.crop.x0, stack.crop.y0, stack.crop.width, stack.crop.height
+    usable = [b for b in capture.moving if alignments[b.name].status != "failed"]
+    written = None
+    if usable:
+        layers, grid = lay_out(capture, {b.name: alignments[b.name] for b in usable}, settings.write)
+        written = write_capture(capture, layers, grid, stack_path, settings.write)
         # The picture is a convenience: a full disk must not cost the sidecar.
         with suppress(AgalignError):
-            write_picture(capture, stack.path, crop, usable, stack_path.with_suffix(".png"))
-    sidecar = describe_capture(capture, alignments, stack, settings)
+            write_picture(capture, written.places, grid, usable, stack_path.with_suffix(".png"))
+    else:
+        # An earlier run's stack does not stay either.
+        for stale in (stack_path, stack_path.with_suffix(".png")):
+            stale.unlink(missing_ok=True)
+    sidecar = describe_capture(capture, alignments, written, settings)
     write_sidecar(sidecar_path, sidecar)
     return CaptureOutcome(sidecar, sidecar_path)
 
 
-def _write(capture: Capture, alignments: dict[str, Alignment], path: Path, settings: Settings) -> Stack | None:
-    """The stack, or None where no moving band is of use: then an earlier run's stack does not stay either."""
+def lay_out(capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings) -> tuple[list[Layer], Grid]:
+    """The layers of a capture, whose usable moving bands have these alignments, and the grid they are written on."""
     reference = capture.reference
-    mappings = {
-        b.name: mapping_of(reference, b, alignments[b.name])
-        for b in capture.moving
-        if alignments[b.name].status != "failed"
-    }
-    if not mappings:
-        for stale in (path, path.with_suffix(".png")):
-            stale.unlink(missing_ok=True)
-        return None
-    own: Mapping | None = None
-    if settings.write.undistort and reference.lens is not None:
-        own = Mapping(geometry.identity(), None, reference.lens)
+    mappings = {b.name: mapping_of(reference, b, alignments[b.name]) for b in capture.moving if b.name in alignments}
+    scale = _finest_scale(mappings.values(), reference) if settings.resolution == "finest" else 1.0
+    own = PixelMapping(geometry.identity())
+    undistorted = settings.undistort and reference.lens is not None
+    if reference.lens is not None and undistorted:
+        own = PixelMapping(geometry.identity(), None, reference.lens)
         mappings = {name: mapping.from_undistorted(reference.lens) for name, mapping in mappings.items()}
+    size_px = round(reference.width_px * scale), round(reference.height_px * scale)
+    scales = size_px[0] / reference.width_px, size_px[1] / reference.height_px
+    if scale != 1.0:
+        own = own.rescaled(scales, (1.0, 1.0))
+        mappings = {name: mapping.rescaled(scales, (1.0, 1.0)) for name, mapping in mappings.items()}
+    copied = scale == 1.0 and not undistorted
     layers = [
-        Layer(b, own, is_reference=True) if b is reference else Layer(b, mappings.get(b.name)) for b in capture.bands
+        Layer(b, None if copied else own, is_reference=True) if b is reference else Layer(b, mappings.get(b.name))
+        for b in capture.bands
     ]
-    usable = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
-    crop = common_area(usable, *reference.size_px) if settings.write.crop == "common" else None
-    return write_stack(capture, layers, crop or Tile(0, 0, *reference.size_px), path, settings.write)
+    moved = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
+    crop = common_area(moved, *size_px) if settings.crop == "common" else None
+    crop = crop or Tile(0, 0, *size_px)
+    return layers, Grid(crop.x0, crop.y0, crop.width, crop.height, scale, undistorted)
+
+
+def _finest_scale(mappings: Iterable[PixelMapping], reference: Band) -> float:
+    """How many of the finest band's pixels lie along one of the reference's, in the middle of the image."""
+    middle = (np.array(reference.size_px) - 1) / 2
+    finest = 1.0
+    for mapping in mappings:
+        across = np.stack([mapping(middle + d) - mapping(middle - d) for d in 0.5 * np.eye(2)])
+        finest = max(finest, math.sqrt(abs(float(np.linalg.det(across)))))
+    return round(finest, 2)
+
+
+def _need_radiometry(capture: Capture) -> None:
+    without = [b.name for b in capture.bands if b.radiometry is None]
+    if without:
+        raise InputError(
+            f"{capture.reference.path}: no tags that agalign can turn into reflectance in {', '.join(without)}; leave "
+            "--radiometry out"
+        )

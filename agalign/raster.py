@@ -19,6 +19,7 @@ from agalign.masks import data_mask, learnable, undeclared_fill
 from agalign.records import Band, Georeference, Mask, Raster
 
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
+JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 _GDAL_ENVIRONMENT = {"GDAL_PAM_ENABLED": "NO", "GDAL_NUM_THREADS": "ALL_CPUS"}
 
 

@@ -9,21 +9,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.choices import ModelFamily, PairStatus, SeedKind, Space
+
 Matrix = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-
-SeedKind = Literal["user", "match", "model", "rig", "geo", "structure", "identity"]
-PairStatus = Literal["reference", "aligned", "seed_only", "failed"]
-CaptureStatus = Literal["ok", "degraded", "failed"]
-ModelFamily = Literal["homography", "affine", "translation"]
 
 
 @dataclass(frozen=True)
 class Lens:
     """A camera's intrinsics in raw pixels: x_px = fx * x / z + cx, after Brown-Conrady distortion.
 
-    `distortion` is k1, k2, p1, p2, k3 in OpenCV's order and for normalised coordinates; empty means none.
+    `distortion` is k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order and for normalised coordinates; what is left out at
+    the end is 0, and empty means none.
     """
 
     fx_px: float
@@ -49,6 +47,25 @@ class Georeference:
 
 
 @dataclass(frozen=True)
+class Radiometry:
+    """What turns a band's raw numbers into a physical quantity; `radiometry` has the equation."""
+
+    quantity: Literal["reflectance", "relative reflectance", "radiance"]
+    """Reflectance by the light sensor, 0 to 1, or up to a factor that all bands share; without a light sensor
+    radiance, W / m^2 / sr / nm or the maker's own unit.
+    """
+    black_level: float
+    full_scale: float
+    gain: float
+    vignetting_centre_px: tuple[float, float] = (0.0, 0.0)
+    vignetting: tuple[float, ...] = ()
+    """k1 ... k6, per px, px^2 ..."""
+    vignetting_divides: bool = True
+    row_gradient: float = 0.0
+    """Share of the signal that each row has more than the one above it."""
+
+
+@dataclass(frozen=True)
 class Band:
     """One band of a capture: where its pixels are and what the camera says of them."""
 
@@ -67,11 +84,15 @@ class Band:
     saturation_value: float | None = None
     """Raw value at and above which a pixel is taken as saturated."""
     lens: Lens | None = None
-    rig_rotation: Matrix | None = None
-    """Rotation of this camera in the rig, 3x3."""
-    rig_group: str = ""
-    """Bands whose rig rotations refer to the same camera share this."""
+    to_rig: Matrix | None = None
+    """Homography from this file's undistorted pixels (raw ones without a lens model) to a plane that all bands of the
+    rig share, as far as the tags tell."""
+    one_lens: bool = False
+    """The file's bands come through one lens and are aligned as one."""
+    companion: bool = False
+    """Of a colour photograph beside the capture: takes part only where asked for."""
     georeference: Georeference | None = None
+    radiometry: Radiometry | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -157,6 +178,29 @@ class Tile:
 
 
 @dataclass(frozen=True)
+class Grid:
+    """The pixels that are written, within the reference's: its pixel x lies at scale (x + 0.5) - 0.5 - x0."""
+
+    x0: int
+    y0: int
+    width: int
+    height: int
+    scale: float = 1.0
+    """Written pixels along one of the reference."""
+    undistorted: bool = False
+    """The lens-corrected grid of the reference."""
+
+    @property
+    def tile(self) -> Tile:
+        """The rectangle of the reference's grid at this scale."""
+        return Tile(self.x0, self.y0, self.width, self.height)
+
+    def px(self, x: float, y: float) -> tuple[float, float]:
+        """Where a pixel of the reference lies."""
+        return self.scale * (x + 0.5) - 0.5 - self.x0, self.scale * (y + 0.5) - 0.5 - self.y0
+
+
+@dataclass(frozen=True)
 class Seed:
     """A coarse mapping to start from and how well the images agree under it."""
 
@@ -216,7 +260,7 @@ class Alignment:
 
     fixed_to_moving: Matrix
     """Between undistorted pixels where both lenses are known, else between raw pixels."""
-    space: Literal["pixel", "undistorted"]
+    space: Space
     status: PairStatus
     reason: str | None
     seed: Seed

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from agalign import losses
+from agalign.choices import ModelFamily
 from agalign.config import FastRecipe
 from agalign.descriptor import REFERENCE, Descriptor
 from agalign.errors import NotEnoughTextureError
 from agalign.gauss_newton import Step, shift_gradient, solve
 from agalign.levels import Level, footprints_inside
 from agalign.patches import Keypoints, far_apart, patch_grid, transform, translation
-from agalign.records import ModelFamily
 
 LEAST_KEYPOINTS = 16
 _PLAIN_GAIN = 3.0

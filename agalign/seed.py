@@ -1,6 +1,5 @@
 """Coarse alignments to start from, each scored on the images, the best kept."""
 
-from collections.abc import Callable
 from collections.abc import Mapping as MappingType
 from contextlib import suppress
 
@@ -8,21 +7,20 @@ import cv2
 import numpy as np
 
 from agalign import geometry
+from agalign.cameras import rig_seed
+from agalign.choices import SeedKind
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
 from agalign.geometry import Matrix
 from agalign.mapping import Mapping
-from agalign.records import Band, Raster, Seed, SeedKind, Tile
+from agalign.records import Band, Raster, Seed, Tile
 from agalign.structure import correlation_surface, find_peak, shrink, structure_field
 
 _SAME_PEAK_PX = 2.0
 """A candidate no farther from the peak than this, in working px, is on its flank."""
 
-RigSeed = Callable[[Band, Band], Matrix | None]
-"""A camera's fixed_to_moving between undistorted pixels from metadata alone."""
 
-
-def seed_candidates(reference: Band, moving: Band, rig_seed: RigSeed, settings: SeedSettings) -> dict[SeedKind, Matrix]:
+def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> dict[SeedKind, Matrix]:
     """The coarse mappings that metadata offers, in order of trust; identity is always among them."""
     candidates: dict[SeedKind, Matrix] = {}
     with suppress(GeometryError):  # numbers in the tags that make no camera

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from agalign.choices import CaptureStatus, ModelFamily, PairStatus, SeedKind, Space
 from agalign.errors import OutputError, SidecarError
 
 SCHEMA = "agalign/1"
@@ -48,13 +49,13 @@ class HomographyPart(_Part):
     """A homography and the pixels it is between: `undistorted` ones where lens models are known."""
 
     fixed_to_moving: Matrix3x3
-    space: Literal["pixel", "undistorted"]
+    space: Space
 
 
 class SeedPart(_Part):
     """Where the optimisation started, in the same space as the homography."""
 
-    kind: Literal["user", "match", "model", "rig", "geo", "structure", "identity"]
+    kind: SeedKind
     fixed_to_moving: Matrix3x3
     peak_sigma: float
     runner_up_sigma: float
@@ -76,7 +77,7 @@ class JointPart(_Part):
     iterations: int
     levels: list[float]
     recipe: str
-    model_family: Literal["homography", "affine", "translation"]
+    model_family: ModelFamily
     last_step_px: float
     corner_std_px: float
     """Root mean square distance of the least certain corner from where it is mapped to."""
@@ -114,6 +115,13 @@ class MetricsPart(_Part):
     tiles: list[ResidualTile]
 
 
+class PlacePart(_Part):
+    """A file beside the sidecar that holds a band's aligned pixels, and the band's index there, from 1."""
+
+    file: str
+    band_index: int
+
+
 class BandPart(_Part):
     """One band of the capture."""
 
@@ -121,22 +129,36 @@ class BandPart(_Part):
     wavelength_nm: float | None
     file: str
     band_index: int
-    status: Literal["reference", "aligned", "seed_only", "failed"]
+    status: PairStatus
     reason: str | None
     homography: HomographyPart | None = None
     seed: SeedPart | None = None
     grid: GridPart | None = None
     joint: JointPart | None = None
     metrics: MetricsPart | None = None
+    place: PlacePart | None = None
     seconds: float
 
 
-class OutputPart(_Part):
-    """The stack beside the sidecar. `crop` is x0, y0, width, height on the reference's pixel grid."""
+class FilePart(_Part):
+    """A file beside the sidecar."""
 
     file: str
     bytes: int
+
+
+class OutputPart(_Part):
+    """The stack beside the sidecar, null where only single bands were written.
+
+    `crop` is x0, y0, width, height on the reference's pixel grid, which has `scale` times as many pixels along each
+    side as the reference's file.
+    """
+
+    file: str | None
+    bytes: int | None
+    band_files: list[FilePart] = []
     crop: tuple[int, int, int, int]
+    scale: float = 1.0
     nodata: float | str | None
 
 
@@ -150,7 +172,7 @@ class Sidecar(_Part):
     flight_id: str
     captured_at: str
     camera: CameraPart
-    status: Literal["ok", "degraded", "failed"]
+    status: CaptureStatus
     missing_bands: list[str]
     reference: ReferencePart
     bands: list[BandPart]

@@ -6,7 +6,6 @@ spectrum: vegetation is darker than soil in the visible bands and far brighter i
 """
 
 import json
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from agalign import geometry, lens
 from agalign.geometry import Matrix, Points
 from agalign.mapping import splined
 from agalign.records import Lens, Tile
+from agalign.tiff_directory import Entry, add_directories, byte_string, rational, short, text
 
 Field = NDArray[np.float32]
 
@@ -29,6 +29,11 @@ _PIXELS_PER_MM = 266.666667
 _FOCAL_LENGTH_MM = 5.45
 _BLACK_LEVEL = 4800.0
 _WHITE_LEVEL = 52000.0
+_VIGNETTING = 0.35
+"""What the corners lack of the middle's light."""
+_EXPOSURE_S = 1.3e-3
+_IRRADIANCE = 0.8
+"""W/m^2/nm at every wavelength."""
 _MAP_PX_PER_IMAGE_PX = 1.25
 """Resolution of the painted ground relative to the images, so that they do not show its pixels."""
 
@@ -52,6 +57,11 @@ class BandSpec:
     """k1, k2, p1, p2, k3."""
     centre_offset_px: tuple[float, float]
     """Of the principal point from the middle of a 1280 x 960 sensor."""
+
+    @property
+    def exposure(self) -> float:
+        """Share of the full signal that a reflectance of 1 would give."""
+        return 0.55 / max(self.soil, self.crop)
 
     def lens(self, width_px: int, height_px: int) -> Lens:
         """The lens on a sensor of the given size; smaller sensors have larger pixels."""
@@ -177,9 +187,8 @@ def render(
     y, x = np.arange(height), np.arange(width)
     scene = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     radius2 = ((x - width / 2) ** 2)[None, :] + ((y - height / 2) ** 2)[:, None]
-    vignetting = 1 - 0.35 * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
-    exposure = 0.55 / max(band.soil, band.crop)
-    signal = np.clip(scene * exposure * vignetting, 0, 1)
+    vignetting = 1 - _VIGNETTING * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
+    signal = np.clip(scene * band.exposure * vignetting, 0, 1)
     electrons = signal * 4000
     noisy = electrons + rng.normal(size=signal.shape) * np.sqrt(electrons + 60)
     levels = _BLACK_LEVEL + noisy / 4000 * (_WHITE_LEVEL - _BLACK_LEVEL)
@@ -320,69 +329,32 @@ def _write_band(
         p1=band.distortion[2], p2=band.distortion[3],
         rig=", ".join(f"{v:.6f}" for v in band.rig_degrees), index=band.rig_index, reference=REFERENCE,
         capture=f"synthetic{number:011d}", altitude=pose.altitude_m,
+        middle_x=size_px[0] / 2, middle_y=size_px[1] / 2,
+        fall=-_VIGNETTING / ((size_px[0] / 2) ** 2 + (size_px[1] / 2) ** 2),
+        gain=_IRRADIANCE / np.pi * _EXPOSURE_S * 65536 / (_WHITE_LEVEL - _BLACK_LEVEL) / band.exposure,
+        irradiance=_IRRADIANCE * 100,
     ).encode()  # fmt: skip
-    extra: list[Any] = [(271, 2, 0, "MicaSense", True), (272, 2, 0, "RedEdge-M", True), (700, 7, len(xmp), xmp, True)]
-    extra += [(code, 4, 1, 0, True) for code in _PLACEHOLDERS.values()]
-    tifffile.imwrite(
-        path, pixels, photometric="minisblack", rowsperstrip=100, software="agalign demo", datetime=moment,
-        metadata=None, extratags=extra,
-    )  # fmt: skip
+    tifffile.imwrite(path, pixels, photometric="minisblack", rowsperstrip=100, metadata=None)
     latitude, longitude = 52.0 + pose.north_m / 111_320, 5.0 + pose.east_m / 68_500
-    exif = [
-        (0x829A, _rational(1.3e-3)), (0x9003, _ascii(moment)), (0x920A, _rational(5.5)), (0x9290, _ascii("000000")),
-        (0xA20E, _rational(density)), (0xA20F, _rational(density)), (0xA210, _short(4)),
-        (0xA431, _ascii("SY01-0000001-AG")),
-    ]  # fmt: skip
-    gps = [
-        (1, _ascii("N")), (2, _degrees(latitude)), (3, _ascii("E")), (4, _degrees(longitude)),
-        (5, (1, 1, b"\0\0\0\0")), (6, _rational(pose.altitude_m)),
-    ]  # fmt: skip
-    _append_directory(path, 34665, exif)
-    _append_directory(path, 34853, gps)
-
-
-_PLACEHOLDERS = {34665: 65001, 34853: 65002}
-"""tifffile writes no Exif and GPS pointers, so private tags hold their places, in the same order."""
-
-Entry = tuple[int, int, bytes]
-"""TIFF type, count, and the value's bytes, little-endian."""
-
-
-def _short(value: int) -> Entry:
-    return 3, 1, struct.pack("<HH", value, 0)
-
-
-def _ascii(text: str) -> Entry:
-    data = text.encode("ascii") + b"\0"
-    return 2, len(data), data.ljust(4, b"\0")
-
-
-def _rational(*values: float) -> Entry:
-    return 5, len(values), b"".join(struct.pack("<II", round(v * 1_000_000), 1_000_000) for v in values)
+    first = {
+        271: text("MicaSense"), 272: text("RedEdge-M"), 305: text("agalign demo"), 306: text(moment),
+        700: byte_string(xmp), 50714: short(round(_BLACK_LEVEL)),
+    }  # fmt: skip
+    exif = {
+        0x829A: rational(_EXPOSURE_S), 0x8827: short(100), 0x9003: text(moment), 0x920A: rational(_FOCAL_LENGTH_MM),
+        0x9290: text("000000"), 0xA20E: rational(density), 0xA20F: rational(density), 0xA210: short(4),
+        0xA431: text("SY01-0000001-AG"),
+    }  # fmt: skip
+    gps = {
+        1: text("N"), 2: _degrees(latitude), 3: text("E"), 4: _degrees(longitude), 5: byte_string(b"\0"),
+        6: rational(pose.altitude_m),
+    }  # fmt: skip
+    add_directories(path, first, exif, gps)
 
 
 def _degrees(angle_deg: float) -> Entry:
     minutes = angle_deg % 1 * 60
-    return _rational(int(angle_deg), int(minutes), minutes % 1 * 60)
-
-
-def _append_directory(path: Path, pointer_tag: int, entries: list[tuple[int, Entry]]) -> None:
-    """Append a sub-directory to a little-endian TIFF and turn the placeholder of `pointer_tag` into its pointer."""
-    with tifffile.TiffFile(path) as tiff:
-        placeholder = tiff.pages[0].tags[_PLACEHOLDERS[pointer_tag]]  # type: ignore[union-attr]
-    with path.open("r+b") as file:
-        start = file.seek(0, 2)
-        start += file.write(b"\0" * (start % 2))
-        values_at = start + 2 + 12 * len(entries) + 4
-        directory, values = struct.pack("<H", len(entries)), b""
-        for tag, (kind, count, data) in sorted(entries):
-            inline = len(data) <= 4
-            where = data if inline else struct.pack("<I", values_at + len(values))
-            directory += struct.pack("<HHI", tag, kind, count) + where
-            values += b"" if inline else data + b"\0" * (len(data) % 2)
-        file.write(directory + struct.pack("<I", 0) + values)
-        file.seek(placeholder.offset)
-        file.write(struct.pack("<HHII", pointer_tag, 4, 1, start))
+    return rational(int(angle_deg), int(minutes), minutes % 1 * 60)
 
 
 _XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
@@ -402,6 +374,15 @@ _XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
      <rdf:li>{k1}</rdf:li><rdf:li>{k2}</rdf:li><rdf:li>{k3}</rdf:li><rdf:li>{p1}</rdf:li><rdf:li>{p2}</rdf:li>
     </rdf:Seq>
    </Camera:PerspectiveDistortion>
+   <Camera:VignettingCenter>
+    <rdf:Seq><rdf:li>{middle_x}</rdf:li><rdf:li>{middle_y}</rdf:li></rdf:Seq>
+   </Camera:VignettingCenter>
+   <Camera:VignettingPolynomial>
+    <rdf:Seq>
+     <rdf:li>0</rdf:li><rdf:li>{fall:.9e}</rdf:li><rdf:li>0</rdf:li>
+     <rdf:li>0</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li>
+    </rdf:Seq>
+   </Camera:VignettingPolynomial>
    <Camera:RigRelatives>{rig}</Camera:RigRelatives>
    <Camera:RigCameraIndex>{index}</Camera:RigCameraIndex>
    <Camera:RigRelativesReferenceRigCameraIndex>{reference}</Camera:RigRelativesReferenceRigCameraIndex>
@@ -410,6 +391,12 @@ _XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
    <MicaSense:FlightId>syntheticflight00001</MicaSense:FlightId>
    <MicaSense:CaptureId>{capture}</MicaSense:CaptureId>
    <MicaSense:PressureAlt>{altitude:.3f}</MicaSense:PressureAlt>
+   <MicaSense:RadiometricCalibration>
+    <rdf:Seq><rdf:li>{gain:.9e}</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li></rdf:Seq>
+   </MicaSense:RadiometricCalibration>
+  </rdf:Description>
+  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:DLS="http://micasense.com/DLS/1.0/">
+   <DLS:HorizontalIrradiance>{irradiance:.6f}</DLS:HorizontalIrradiance>
   </rdf:Description>
  </rdf:RDF>
 </x:xmpmeta>

@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.config import Interpolation
+from agalign.choices import Interpolation
 from agalign.geometry import Points
 from agalign.mapping import Mapping
+from agalign.radiometry import calibrated
 from agalign.raster import open_raster, read_window
-from agalign.records import Band, Mask, Tile
+from agalign.records import Band, Mask, Radiometry, Tile
 
 _FLAGS: dict[str, int] = {
     "nearest": cv2.INTER_NEAREST,
@@ -37,9 +38,10 @@ def tiles(area: Tile, side_px: int) -> Iterator[Tile]:
 
 
 def resample_tile(
-    band: Band, mapping: Mapping, tile: Tile, interpolation: Interpolation
+    band: Band, mapping: Mapping, tile: Tile, interpolation: Interpolation, radiometry: Radiometry | None = None
 ) -> tuple[NDArray[np.generic], Mask]:
-    """The moving band on a tile of the reference grid, in its own type (integers rounded and clipped), and its mask.
+    """The moving band on a tile of the reference grid, in its own type (integers rounded and clipped) or, calibrated
+    with `radiometry`, as float32, and its mask.
 
     A pixel is valid where it lies inside the moving image and no invalid pixel has a part in it.
     """
@@ -56,6 +58,8 @@ def resample_tile(
         return np.zeros(shape, dtype=band.dtype), np.zeros(shape, dtype=bool)
     with open_raster(band.path) as dataset:
         pixels, valid = read_window(dataset, band, int(x0), int(y0), int(x1 - x0), int(y1 - y0))
+    if radiometry is not None:
+        pixels = calibrated(pixels, radiometry, int(x0), int(y0))
     return resample(
         pixels, valid, positions - (x0, y0), (band.width_px - x0, band.height_px - y0), (-x0, -y0), interpolation
     )

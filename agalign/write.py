@@ -1,9 +1,12 @@
-"""Aligned stacks: tiled GeoTIFF or COG on the reference's pixel grid."""
+"""Aligned rasters, tiled GeoTIFF or COG, on the reference's pixel grid: a stack of all bands, a file for each input
+file, or both.
+"""
 
 import errno
 import math
 import os
 import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,52 +22,125 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from agalign import geometry
+from agalign.carried_tags import CarriedTags, band_tags, capture_tags
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
-from agalign.mapping import Mapping
-from agalign.raster import open_raster, read_window
-from agalign.records import Band, Capture, Georeference, Tile
+from agalign.mapping import Mapping as PixelMapping
+from agalign.radiometry import calibrated
+from agalign.raster import TIFF_SUFFIXES, open_raster, read_window
+from agalign.records import Band, Capture, Georeference, Grid, Mask, Tile
+from agalign.tiff_directory import add_directories
 from agalign.warp import resample_tile, tiles
+
+Pixels = NDArray[np.generic]
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One band of the stack: the reference (no mapping), a moving band, or a gap (nothing to write)."""
+    """One band of the output: where its pixels come from.
+
+    `mapping` leads from the written pixels, before they are cut, to raw pixels of the file. The reference has none
+    where its own pixels are copied, and a moving band has none where there is nothing to write.
+    """
 
     band: Band
-    mapping: Mapping | None
+    mapping: PixelMapping | None
     is_reference: bool = False
+
+    @property
+    def is_gap(self) -> bool:
+        """True where there is nothing to write."""
+        return self.mapping is None and not self.is_reference
 
 
 @dataclass(frozen=True)
-class Stack:
-    """What was written."""
+class Written:
+    """What was written of a capture."""
 
-    path: Path
-    crop: Tile
+    folder: Path
+    grid: Grid
     nodata: float | None
+    stack: Path | None
+    band_files: tuple[Path, ...]
+    places: Mapping[str, tuple[Path, int]]
+    """By band: a file that holds it, and its index there, from 1."""
 
 
-def write_stack(capture: Capture, layers: list[Layer], crop: Tile, path: Path, settings: WriteSettings) -> Stack:
-    """Write all layers to `path`, complete or not at all. Raises OutputError, or UnreadableFileError for an input.
+def write_capture(
+    capture: Capture, layers: Sequence[Layer], grid: Grid, stack: Path, settings: WriteSettings
+) -> Written:
+    """Write what the layout asks for, each file complete or not at all; `stack` is the stack's path.
 
-    The type is the reference's where all bands share it, else the smallest that holds them all. A nodata value is
-    declared only where some pixel needs it; valid moving pixels that happen to equal it are moved by the smallest step.
+    Raises OutputError, or UnreadableFileError for an input.
     """
-    dtype = np.result_type(*(layer.band.dtype for layer in layers))
-    nodata = _nodata(capture, layers, crop, dtype, settings)
-    profile = _profile(capture.reference, len(layers), crop, dtype, nodata, settings)
+    places: dict[str, tuple[Path, int]] = {}
+    reference = capture.reference
+    nodata = None
+    if settings.layout != "stack":
+        names = band_file_names(capture)
+        for name in dict.fromkeys(names.values()):
+            some = [layer for layer in layers if names[layer.band.name] == name and not layer.is_gap]
+            if some:
+                tags = band_tags(
+                    some[0].band.path, reference.path, grid, _from_source(some[0], grid), radiometry=settings.radiometry
+                )
+                path = stack.parent / name
+                nodata = write_raster(capture, some, grid, path, settings, tags)
+                places |= {layer.band.name: (path, i) for i, layer in enumerate(some, start=1)}
+    files = tuple(dict.fromkeys(path for path, _ in places.values()))
+    if settings.layout != "bands":
+        nodata = write_raster(capture, layers, grid, stack, settings, capture_tags(reference.path, grid))
+        places |= {layer.band.name: (stack, i) for i, layer in enumerate(layers, start=1) if not layer.is_gap}
+    return Written(stack.parent, grid, nodata, None if settings.layout == "bands" else stack, files, places)
+
+
+def band_file_names(capture: Capture) -> dict[str, Path]:
+    """By band: the file for it in layout `bands`, below the capture's output folder.
+
+    It keeps the name of the file it comes from; where several bands of a file have lenses of their own, or the bands'
+    folders tell them apart, those are part of it.
+    """
+    several = {b.path for b in capture.bands if sum(b.path == o.path for o in capture.bands) > 1 and not b.one_lens}
+    same_name = len({b.path.name for b in capture.bands}) < len({b.path for b in capture.bands})
+    names = {}
+    for band in capture.bands:
+        suffix = band.path.suffix if band.path.suffix.lower() in TIFF_SUFFIXES else ".tif"
+        stem = f"{band.path.stem}_{_in_file_name(band.name)}" if band.path in several else band.path.stem
+        names[band.name] = Path(band.path.parent.name if same_name else "", f"{stem}{suffix}")
+    return names
+
+
+def _in_file_name(text: str) -> str:
+    return "".join(c if c.isalnum() or c in "-." else "_" for c in text)
+
+
+def write_raster(
+    capture: Capture, layers: Sequence[Layer], grid: Grid, path: Path, settings: WriteSettings,
+    tags: CarriedTags | None = None,
+) -> float | None:  # fmt: skip
+    """Write layers as the bands of one file, complete or not at all; returns its nodata value.
+
+    The type is the layers' where all share it, else the smallest that holds them all; float32 after radiometry. A
+    nodata value is declared only where some pixel needs it; valid moving pixels that happen to equal it are moved by
+    the smallest step. Tags that TIFF libraries do not write are left out of a COG, whose layout they would break.
+    Raises OutputError, or UnreadableFileError for an input.
+    """
+    dtype = np.dtype(np.float32) if settings.radiometry else np.result_type(*(layer.band.dtype for layer in layers))
+    nodata = _nodata(capture, layers, grid, dtype, settings)
+    profile = _profile(capture.reference, len(layers), grid, dtype, nodata, settings)
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with warnings.catch_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO", GDAL_NUM_THREADS="ALL_CPUS"):
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(partial, "w", **profile) as dataset:
-                _describe(dataset, capture, layers)
+                _describe(dataset, capture, layers, settings)
                 for index, layer in enumerate(layers, start=1):
-                    _write_layer(dataset, index, layer, crop, nodata, settings)
+                    _write_layer(dataset, index, layer, grid, nodata, settings)
+            if tags is not None:
+                add_directories(partial, tags.first, tags.exif, tags.gps)
             if settings.format == "cog":
-                _to_cog(partial, settings)
+                _to_cog(partial, settings, len(layers))
         _verify(partial)
         partial.replace(path)
     except (OSError, RasterioError, tifffile.TiffFileError) as error:
@@ -72,27 +148,55 @@ def write_stack(capture: Capture, layers: list[Layer], crop: Tile, path: Path, s
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
-    return Stack(path, crop, nodata)
+    return nodata
+
+
+def _from_source(layer: Layer, grid: Grid) -> Any:
+    """Where a pixel of the layer's file lies in the reference's pixels: the mapping the other way, by iteration."""
+    to_file = PixelMapping(geometry.identity()) if layer.mapping is None else layer.mapping
+    width, height = round(grid.x0 + grid.width), round(grid.y0 + grid.height)
+
+    def from_source(x: float, y: float) -> tuple[float, float]:
+        at = np.array([width / 2, height / 2])
+        for _ in range(20):
+            here = to_file(at)
+            step = np.stack([to_file(at + d) - here for d in np.eye(2)], axis=-1)
+            at = at + np.linalg.solve(step, np.array([x, y]) - here)
+        return (at[0] + 0.5) / grid.scale - 0.5, (at[1] + 0.5) / grid.scale - 0.5
+
+    return from_source
+
+
+# ---- pixels
 
 
 def _write_layer(
-    dataset: Any, index: int, layer: Layer, crop: Tile, nodata: float | None, settings: WriteSettings
+    dataset: Any, index: int, layer: Layer, grid: Grid, nodata: float | None, settings: WriteSettings
 ) -> None:
-    for tile in tiles(crop, settings.work_tile_px):
-        window = Window(tile.x0 - crop.x0, tile.y0 - crop.y0, tile.width, tile.height)
-        if layer.is_reference and layer.mapping is None:
-            with open_raster(layer.band.path) as source:
-                pixels, _ = read_window(source, layer.band, tile.x0, tile.y0, tile.width, tile.height)
-        elif layer.mapping is None:
-            pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dataset.dtypes[0])
-        else:
-            pixels, valid = resample_tile(layer.band, layer.mapping, tile, settings.interpolation)
-            if nodata is not None:
-                pixels = _marked(pixels.astype(dataset.dtypes[0], copy=False), valid, nodata)
-        dataset.write(pixels.astype(dataset.dtypes[0], copy=False), index, window=window)
+    dtype = np.dtype(dataset.dtypes[0])
+    for tile in tiles(grid.tile, settings.work_tile_px):
+        pixels, valid = _tile_of(layer, tile, settings)
+        if pixels is None:
+            pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
+        elif nodata is not None and (layer.mapping is not None or settings.radiometry):
+            pixels = _marked(pixels.astype(dtype, copy=False), valid, nodata)
+        window = Window(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
+        dataset.write(pixels.astype(dtype, copy=False), index, window=window)
 
 
-def _marked(pixels: NDArray[np.generic], valid: NDArray[np.bool_], nodata: float) -> NDArray[np.generic]:
+def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels | None, Mask]:
+    """A layer's pixels on a tile and their mask; no pixels for a gap."""
+    if layer.is_gap:
+        return None, np.zeros((tile.height, tile.width), dtype=bool)
+    radiometry = layer.band.radiometry if settings.radiometry else None
+    if layer.mapping is not None:
+        return resample_tile(layer.band, layer.mapping, tile, settings.interpolation, radiometry)
+    with open_raster(layer.band.path) as source:
+        pixels, valid = read_window(source, layer.band, tile.x0, tile.y0, tile.width, tile.height)
+    return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
+
+
+def _marked(pixels: Pixels, valid: Mask, nodata: float) -> Pixels:
     if not math.isnan(nodata):
         step = 1 if pixels.dtype.kind != "f" else np.spacing(np.abs(pixels.dtype.type(nodata)) + 1)
         beside = (
@@ -103,13 +207,16 @@ def _marked(pixels: NDArray[np.generic], valid: NDArray[np.bool_], nodata: float
 
 
 def _nodata(
-    capture: Capture, layers: list[Layer], crop: Tile, dtype: np.dtype[Any], settings: WriteSettings
+    capture: Capture, layers: Iterable[Layer], grid: Grid, dtype: np.dtype[Any], settings: WriteSettings
 ) -> float | None:
+    if settings.radiometry:
+        return math.nan
     declared = capture.reference.nodata
     if declared is not None and (dtype.kind == "f" or float(declared).is_integer()):
         return declared
-    gaps = any(layer.mapping is None and not layer.is_reference for layer in layers)
-    whole = crop == Tile(0, 0, *capture.reference.size_px)
+    layers = list(layers)
+    gaps = any(layer.is_gap for layer in layers)
+    whole = grid == Grid(0, 0, *capture.reference.size_px)
     moved = any(layer.mapping is not None for layer in layers)
     masked = any(layer.band.nodata is not None or layer.band.has_mask for layer in layers)
     masked |= dtype.kind == "f"  # nan needs no declaration in a source
@@ -119,13 +226,16 @@ def _nodata(
     return math.nan if dtype.kind == "f" else 0.0
 
 
+# ---- what the file says of itself
+
+
 def _profile(
-    reference: Band, count: int, crop: Tile, dtype: np.dtype[Any], nodata: float | None, settings: WriteSettings
+    reference: Band, count: int, grid: Grid, dtype: np.dtype[Any], nodata: float | None, settings: WriteSettings
 ) -> dict[str, Any]:
     profile: dict[str, Any] = {
         "driver": "GTiff",
-        "width": crop.width,
-        "height": crop.height,
+        "width": grid.width,
+        "height": grid.height,
         "count": count,
         "dtype": dtype.name,
         "interleave": "band",
@@ -137,22 +247,31 @@ def _profile(
     }
     if nodata is not None:
         profile["nodata"] = nodata
-    if settings.compression != "none":
-        profile |= {"compress": settings.compression, "predictor": 3 if dtype.kind == "f" else 2}
-        profile |= {"zstd_level": 1} if settings.compression == "zstd" else {"zlevel": 6}
+    compression = _compression(settings, count)
+    if compression != "none":
+        profile |= {"compress": compression, "predictor": 3 if dtype.kind == "f" else 2}
+        profile |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
     if reference.georeference is not None:
-        profile |= _georeference(reference.georeference, crop)
+        profile |= _georeference(reference.georeference, grid)
     return profile
 
 
-def _georeference(georeference: Georeference, crop: Tile) -> dict[str, Any]:
+def _compression(settings: WriteSettings, count: int) -> str:
+    """Files of single bands go on to programs that seldom know Zstandard."""
+    if settings.compression != "auto":
+        return settings.compression
+    return "deflate" if count == 1 or settings.layout == "bands" else "zstd"
+
+
+def _georeference(georeference: Georeference, grid: Grid) -> dict[str, Any]:
     # Only where the source has one: an identity transform would be an invented georeference.
-    # Whole pixels, so that corner and centre conventions move alike.
-    cropped = georeference.transform @ geometry.translation(crop.x0, crop.y0)
-    return {"transform": Affine(*cropped[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
+    # Geotransforms count from corners, where a change of resolution is a mere factor.
+    shrunk = np.diag([1 / grid.scale, 1 / grid.scale, 1.0])
+    written = georeference.transform @ shrunk @ geometry.translation(grid.x0, grid.y0)
+    return {"transform": Affine(*written[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
 
 
-def _describe(dataset: Any, capture: Capture, layers: list[Layer]) -> None:
+def _describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings: WriteSettings) -> None:
     facts = {
         "TIFFTAG_SOFTWARE": "agalign",
         "TIFFTAG_DATETIME": capture.captured_at[:19].replace("-", ":").replace("T", " "),
@@ -160,6 +279,9 @@ def _describe(dataset: Any, capture: Capture, layers: list[Layer]) -> None:
         "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
         "REFERENCE_BAND": capture.reference.name,
     }
+    quantities = [layer.band.radiometry.quantity for layer in layers if layer.band.radiometry is not None]
+    if settings.radiometry and quantities:
+        facts["RADIOMETRY"] = " and ".join(dict.fromkeys(quantities))
     dataset.update_tags(**{k: v for k, v in facts.items() if v})
     for index, layer in enumerate(layers, start=1):
         dataset.set_band_description(index, layer.band.name)
@@ -179,9 +301,10 @@ def _verify(path: Path) -> None:
         raise OSError(errno.EIO, "the file came out incomplete; is the disk full?")
 
 
-def _to_cog(path: Path, settings: WriteSettings) -> None:
+def _to_cog(path: Path, settings: WriteSettings, count: int) -> None:
     cog = path.with_name(f"{path.name}.cog")
-    options = {} if settings.compression == "none" else {"compress": settings.compression, "predictor": "yes"}
+    compression = _compression(settings, count)
+    options = {} if compression == "none" else {"compress": compression, "predictor": "yes"}
     try:
         copy_dataset(path, cog, driver="COG", blocksize=512, bigtiff="if_safer", **options)
         cog.replace(path)

@@ -233,7 +233,7 @@ def run_ours(name: str, folders: list[Path]) -> list[dict[str, Any]]:
             if key not in models:
                 flight = list({c.capture.name: c.capture for g in groups.values() for c in g
                                if c.capture is not None and c.set_name == set_name}.values())  # fmt: skip
-                models[key] = learn_flight(flight, rig_seed, Settings(), quiet)
+                models[key] = learn_flight(flight, Settings(), quiet)
             model = models[key]
         images = []
         for case in group:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from agalign import geometry, synthetic
-from agalign.cameras import default_reference, known_cameras
+from agalign.cameras import default_reference, known_cameras, rig_seed
+from agalign.cameras.base import rotation
 from agalign.cameras.generic import Generic
-from agalign.cameras.micasense import MicaSense, rotation
+from agalign.cameras.micasense import MicaSense
 from agalign.errors import ConfigurationError
 from agalign.metadata import Tags, read_tags
 from agalign.raster import RasterInfo, probe
@@ -37,7 +38,7 @@ def test_rig_seed_is_the_truth_at_infinity(flight: Path) -> None:
     far = synthetic.Pose(1e4, 0.0, 0.0, 0.0, 0.0, 0.0)
     reference = synthetic.BANDS[synthetic.REFERENCE]
     for spec in synthetic.BANDS:
-        seed = MicaSense().rig_seed(bands["Green"], bands[spec.name])
+        seed = rig_seed(bands["Green"], bands[spec.name])
         assert seed is not None
         truth = synthetic.true_homography(reference, spec, far, (480, 360))
         assert geometry.corner_error_px(seed, truth, 480, 360) < 0.01
@@ -65,14 +66,13 @@ def test_focal_length_of_old_firmware_is_in_pixels() -> None:
         (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), found, INFO)
         assert band.lens is not None
         assert band.lens.fx_px == pytest.approx(expected)
-        assert band.rig_rotation is None
 
 
 @pytest.mark.parametrize("rig", ["", "a, b, c", "1.0, 2.0", "inf"])
 def test_malformed_rig_tags_leave_the_principal_points(rig: str) -> None:
     both = [tags(PerspectiveFocalLength="5.45", PrincipalPoint=p, RigRelatives=rig) for p in ("2.4,1.8", "2.5,1.8")]
     (one,), (other,) = (MicaSense().bands(Path("IMG_0001_4.tif"), t, INFO) for t in both)
-    seed = MicaSense().rig_seed(one, other)
+    seed = rig_seed(one, other)
     np.testing.assert_allclose(seed, geometry.translation(26.6666667, 0), atol=1e-9)
 
 
@@ -80,14 +80,29 @@ def test_without_a_lens_there_is_no_rig_seed() -> None:
     (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), Tags(make="MicaSense"), INFO)
     assert band.lens is None
     assert band.name == "band_4"
-    assert MicaSense().rig_seed(band, band) is None
+    assert rig_seed(band, band) is None
 
 
-def test_who_recognises_what() -> None:
-    micasense, generic = known_cameras()
-    assert micasense.recognises(Tags(make="MicaSense"))
-    assert not micasense.recognises(Tags(make="DJI"))
-    assert generic.recognises(Tags())
+@pytest.mark.parametrize(
+    ("tags", "name"),
+    [
+        (Tags(make="MicaSense"), "MicaSense"),
+        (Tags(xmp={("MicaSense", "CaptureId"): ("a",)}), "MicaSense"),
+        (Tags(make="DJI"), "DJI"),
+        (Tags(make="Parrot"), "Parrot Sequoia"),
+        (Tags(xmp={("Camera", "RigName"): ("Sequoia",)}), "Parrot Sequoia"),
+        (Tags(make="Sentera"), "Sentera"),
+        (Tags(xmp={("Sentera", "AlignMatrix"): ("1",)}), "Sentera"),
+        (Tags(make="MAPIR"), "MAPIR"),
+        (Tags(model="LATT-M3M-L41-F550"), "MAPIR"),
+        (Tags(), "generic"),
+    ],
+)
+def test_who_recognises_what(tags: Tags, name: str) -> None:
+    assert next(c for c in known_cameras() if c.recognises(tags)).name == name
+
+
+def test_a_pattern_is_above_all_cameras() -> None:
     assert [c.name for c in known_cameras("{capture}_{band}.tif")] == ["generic"]
 
 

@@ -31,13 +31,13 @@ def test_a_micasense_flight(flight: Path) -> None:
     assert [b.name for b in first.bands] == ["Blue", "Green", "Red", "NIR", "Red edge"]
     assert first.reference.name == "Green"
     assert first.capture_id == "synthetic00000000001"
-    assert all(b.lens is not None and b.rig_rotation is not None for b in first.bands)
+    assert all(b.lens is not None and b.to_rig is not None for b in first.bands)
 
 
 def test_ignoring_metadata_keeps_the_captures_but_not_the_lenses(flight: Path) -> None:
     found = discover(flight, DiscoverOptions(ignore_metadata=True))
     assert len(found.captures) == 2
-    assert all(b.lens is None and b.rig_rotation is None for c in found.captures for b in c.bands)
+    assert all(b.lens is None and b.to_rig is None for c in found.captures for b in c.bands)
 
 
 def test_names_that_repeat_in_sub_folders_are_different_captures(flight: Path, tmp_path: Path) -> None:

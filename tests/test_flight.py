@@ -11,7 +11,6 @@ from distributed import LocalCluster
 import agalign
 from agalign import batch, demo, geometry
 from agalign.batch import RunOptions, dask_executor, run_flight
-from agalign.cameras import rig_seed
 from agalign.config import FastRecipe, FlightSettings, JointSettings, Settings
 from agalign.discover import discover
 from agalign.errors import ConfigurationError, InputError
@@ -38,7 +37,7 @@ def cpu() -> torch.device:
 @pytest.fixture(scope="module")
 def model(flight: Path) -> FlightModel:
     captures = flights_of(discover(flight).captures)[0]
-    found = learn_flight(captures, rig_seed, SETTINGS, lambda *_: None)
+    found = learn_flight(captures, SETTINGS, lambda *_: None)
     assert found is not None
     return found
 

@@ -3,7 +3,8 @@ from pathlib import Path
 import pytest
 
 from agalign.errors import UnreadableFileError
-from agalign.metadata import Tags, parse_xmp, rational, read_tags
+from agalign.metadata import Tags, rational, read_tags
+from agalign.xmp import Packet
 
 ENVELOPE = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">
 <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"
@@ -27,16 +28,18 @@ def packet(body: str, camera: str = "http://pix4d.com/camera/1.0") -> bytes:
     ],
 )
 def test_a_value_may_be_attribute_element_sequence_or_bag(body: str) -> None:
-    assert Tags(xmp=parse_xmp(packet(body))).numbers("Camera", "PrincipalPoint") == (2.4, 1.8)
+    assert Tags(xmp=Packet.parse(packet(body)).values()).numbers("Camera", "PrincipalPoint") == (2.4, 1.8)
 
 
 @pytest.mark.parametrize("uri", ["http://pix4d.com/camera/1.0/", "http://pix4d.com/1.0", "http://pix4d.com/camera/1.0"])
 def test_namespaces_are_compared_without_their_slash(uri: str) -> None:
-    assert parse_xmp(packet('<rdf:Description Camera:BandName="Red"/>', uri)) == {("Camera", "BandName"): ("Red",)}
+    assert Packet.parse(packet('<rdf:Description Camera:BandName="Red"/>', uri)).values() == {
+        ("Camera", "BandName"): ("Red",)
+    }
 
 
 def test_the_same_name_in_another_namespace_is_another_tag() -> None:
-    assert parse_xmp(packet('<rdf:Description other:Yaw="1"/>')) == {}
+    assert Packet.parse(packet('<rdf:Description other:Yaw="1"/>')).values() == {}
 
 
 @pytest.mark.parametrize(
@@ -47,12 +50,12 @@ def test_the_same_name_in_another_namespace_is_another_tag() -> None:
     ],
 )  # fmt: skip
 def test_malformed_or_empty_xmp_is_no_xmp(bad: bytes) -> None:
-    assert parse_xmp(bad) == {}
+    assert Packet.parse(bad).values() == {}
 
 
 def test_an_xml_bomb_is_refused() -> None:
     bomb = b'<x:xmpmeta xmlns:x="a"><!DOCTYPE l [<!ENTITY a "b"><!ENTITY c "&a;&a;">]>&c;</x:xmpmeta>'
-    assert parse_xmp(bomb) == {}
+    assert Packet.parse(bomb).values() == {}
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
 from agalign import geometry
-from agalign.cameras import rig_seed
 from agalign.config import SeedSettings, Settings
 from agalign.discover import DiscoverOptions, discover
 from agalign.pipeline import process_capture
@@ -49,7 +48,7 @@ def test_captures(real_data: Path, tmp_path: Path, folder: str, pairs: int, medi
 
 def test_a_capture_of_the_row_crop_flight(real_data: Path, tmp_path: Path) -> None:
     flight = discover(real_data / "flights/rededge_m_rowcrop")
-    process_capture(flight.captures[2], tmp_path, rig_seed, Settings())
+    process_capture(flight.captures[2], tmp_path, Settings())
     medians = pair_medians(tmp_path, real_data / "flights/rededge_m_rowcrop/ties.json")
     assert len(medians) == 4
     assert np.median(list(medians.values())) < 0.12
@@ -58,7 +57,7 @@ def test_a_capture_of_the_row_crop_flight(real_data: Path, tmp_path: Path) -> No
 
 def test_without_metadata_and_from_identity_nothing_is_wrongly_aligned(real_data: Path, tmp_path: Path) -> None:
     flight = discover(real_data / "flights/rededge_m_rowcrop", DiscoverOptions(ignore_metadata=True))
-    process_capture(flight.captures[0], tmp_path, rig_seed, Settings(seed=SeedSettings(force="identity")))
+    process_capture(flight.captures[0], tmp_path, Settings(seed=SeedSettings(force="identity")))
     medians = pair_medians(tmp_path, real_data / "flights/rededge_m_rowcrop/ties.json")
     assert all(m < 0.5 for m in medians.values())
 

@@ -3,8 +3,9 @@ from typing import get_args
 import pytest
 import torch
 
+from agalign.choices import Sharing
 from agalign.config import FastRecipe, JointSettings
-from agalign.descriptor import REFERENCE, Descriptor, Sharing
+from agalign.descriptor import REFERENCE, Descriptor
 from agalign.joint import JointAligner
 from agalign.starter import start_from_starter
 

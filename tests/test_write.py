@@ -8,8 +8,8 @@ from agalign import geometry
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.mapping import Mapping
-from agalign.records import Band, CameraIdentity, Capture, Georeference, Tile
-from agalign.write import Layer, write_stack
+from agalign.records import Band, CameraIdentity, Capture, Georeference, Grid
+from agalign.write import Layer, write_raster
 
 from .conftest import textured_image
 
@@ -50,7 +50,7 @@ def make_capture(
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 SHIFT = Mapping(geometry.translation(3.25, -2.5))
-CROP = Tile(4, 6, 180, 130)
+CROP = Grid(4, 6, 180, 130)
 
 
 def layers_of(capture: Capture) -> list[Layer]:
@@ -63,8 +63,9 @@ def layers_of(capture: Capture) -> list[Layer]:
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_the_reference_is_bit_identical_and_the_type_kept(tmp_path: Path, dtype: str, compression: str) -> None:
     capture = make_capture(tmp_path, dtype)
-    stack = write_stack(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings(compression=compression))
-    with rasterio.open(stack.path) as written, rasterio.open(capture.reference.path) as source:
+    out = tmp_path / "out.tif"
+    write_raster(capture, layers_of(capture), CROP, out, WriteSettings(compression=compression))
+    with rasterio.open(out) as written, rasterio.open(capture.reference.path) as source:
         assert set(written.dtypes) == {dtype}
         np.testing.assert_array_equal(written.read(2), source.read(1)[6:136, 4:184])
         assert written.descriptions == ("B0", "B1", "B2")
@@ -76,9 +77,10 @@ def test_the_reference_is_bit_identical_and_the_type_kept(tmp_path: Path, dtype:
 
 def test_no_georeference_and_no_nodata_are_invented(tmp_path: Path) -> None:
     capture = make_capture(tmp_path)
-    stack = write_stack(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())
-    assert stack.nodata is None
-    with rasterio.open(stack.path) as written:
+    out = tmp_path / "out.tif"
+    nodata_written = write_raster(capture, layers_of(capture), CROP, out, WriteSettings())
+    assert nodata_written is None
+    with rasterio.open(out) as written:
         assert written.crs is None
         assert written.transform.is_identity
         assert written.nodata is None
@@ -88,8 +90,9 @@ def test_no_georeference_and_no_nodata_are_invented(tmp_path: Path) -> None:
 @pytest.mark.parametrize("file_format", ["gtiff", "cog"])
 def test_the_georeference_follows_the_crop(tmp_path: Path, file_format: str) -> None:
     capture = make_capture(tmp_path, georeferenced=True)
-    stack = write_stack(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings(format=file_format))
-    with rasterio.open(stack.path) as written:
+    out = tmp_path / "out.tif"
+    write_raster(capture, layers_of(capture), CROP, out, WriteSettings(format=file_format))
+    with rasterio.open(out) as written:
         assert written.crs.to_epsg() == 32631
         assert tuple(written.transform)[:6] == pytest.approx((0.1, 0, 500000.4, 0, -0.1, 5799999.4))
         if file_format == "cog":
@@ -103,18 +106,20 @@ def test_moving_bands_are_resampled_where_the_mapping_says(tmp_path: Path) -> No
     layers = [
         Layer(b, None if b is capture.reference else whole, is_reference=b is capture.reference) for b in capture.bands
     ]
-    stack = write_stack(capture, layers, CROP, tmp_path / "out.tif", WriteSettings())
-    with rasterio.open(stack.path) as written, rasterio.open(capture.bands[0].path) as source:
+    out = tmp_path / "out.tif"
+    write_raster(capture, layers, CROP, out, WriteSettings())
+    with rasterio.open(out) as written, rasterio.open(capture.bands[0].path) as source:
         np.testing.assert_allclose(written.read(1), source.read(1)[4:134, 7:187], rtol=1e-6)
 
 
 @pytest.mark.parametrize(("dtype", "nodata"), [("uint16", None), ("float32", None), ("int16", -9999), ("uint8", 255)])
 def test_outside_the_moving_image_is_nodata(tmp_path: Path, dtype: str, nodata: float | None) -> None:
     capture = make_capture(tmp_path, dtype, nodata)
-    frame = Tile(0, 0, 200, 150)
-    stack = write_stack(capture, layers_of(capture), frame, tmp_path / "out.tif", WriteSettings(crop="none"))
+    frame = Grid(0, 0, 200, 150)
+    out = tmp_path / "out.tif"
+    write_raster(capture, layers_of(capture), frame, out, WriteSettings(crop="none"))
     expected = nodata if nodata is not None else (np.nan if dtype == "float32" else 0)
-    with rasterio.open(stack.path) as written:
+    with rasterio.open(out) as written:
         np.testing.assert_equal(written.nodata, expected)
         mask = written.read_masks(1) > 0
         assert not mask[:2].any()  # rows -2.5 and -1.5 of the moving image
@@ -126,18 +131,18 @@ def test_valid_pixels_that_equal_nodata_are_moved_beside_it(tmp_path: Path) -> N
     capture = make_capture(tmp_path, "uint8")
     with rasterio.open(capture.bands[0].path, "r+") as dataset:
         dataset.write(np.zeros((150, 200), np.uint8), 1)
-    stack = write_stack(
-        capture, layers_of(capture), Tile(0, 0, 200, 150), tmp_path / "out.tif", WriteSettings(crop="none")
-    )
-    with rasterio.open(stack.path) as written:
+    out = tmp_path / "out.tif"
+    write_raster(capture, layers_of(capture), Grid(0, 0, 200, 150), out, WriteSettings(crop="none"))
+    with rasterio.open(out) as written:
         assert set(np.unique(written.read(1))) == {0, 1}
 
 
 def test_a_gap_is_all_nodata(tmp_path: Path) -> None:
     capture = make_capture(tmp_path)
     layers = [Layer(capture.bands[0], None), *layers_of(capture)[1:]]
-    stack = write_stack(capture, layers, CROP, tmp_path / "out.tif", WriteSettings())
-    with rasterio.open(stack.path) as written:
+    out = tmp_path / "out.tif"
+    write_raster(capture, layers, CROP, out, WriteSettings())
+    with rasterio.open(out) as written:
         assert not written.read_masks(1).any()
         assert written.read_masks(3).all()
 
@@ -148,8 +153,9 @@ def test_undeclared_nan_stays_nan(tmp_path: Path) -> None:
         pixels = dataset.read(1)
         pixels[50:70, 60:90] = np.nan
         dataset.write(pixels, 1)
-    stack = write_stack(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())
-    with rasterio.open(stack.path) as written:
+    out = tmp_path / "out.tif"
+    write_raster(capture, layers_of(capture), CROP, out, WriteSettings())
+    with rasterio.open(out) as written:
         assert np.isnan(written.nodata)
         hole = np.isnan(written.read(1))
         assert hole[50:60, 60:80].all()
@@ -162,7 +168,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "out.tif").write_bytes(b"the earlier result")
     capture.bands[2].path.unlink()
     with pytest.raises(Exception, match=r"f_2\.tif"):
-        write_stack(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())
+        write_raster(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())
     assert (tmp_path / "out.tif").read_bytes() == b"the earlier result"
     assert not list(tmp_path.glob(".*"))
 
@@ -171,4 +177,4 @@ def test_a_folder_where_the_file_should_be(tmp_path: Path) -> None:
     capture = make_capture(tmp_path)
     (tmp_path / "out.tif").mkdir()
     with pytest.raises(OutputError, match=r"out\.tif"):
-        write_stack(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())
+        write_raster(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())

@@ -14,7 +14,6 @@ from pathlib import Path
 import torch
 
 import agalign
-from agalign.cameras import rig_seed
 from agalign.config import FastRecipe, JointSettings, Settings
 from agalign.discover import discover
 from agalign.flight import read_subject
@@ -36,7 +35,7 @@ def main() -> None:
             folder = Path(temporary) / str(number)
             make_flight(folder, 1, rng_seed=1000 + number)
             captures += discover(folder).captures
-        subjects = [read_subject(c, rig_seed, Settings())[0] for c in captures]
+        subjects = [read_subject(c, Settings())[0] for c in captures]
     for rate, steps in SCHEDULE:
         # psi may move as always, but nothing is ever learnt well enough to stop.
         recipe = FastRecipe(start="random", learning_rate=rate, most_steps=steps, enough_retrieval=1.0)

@@ -1,13 +1,13 @@
 """Any other GeoTIFF: multiband files, and one file a band under any naming."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import largest_value
+from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.errors import ConfigurationError
-from agalign.geometry import Matrix
 from agalign.metadata import Tags
-from agalign.raster import RasterInfo
+from agalign.raster import JPEG_SUFFIXES, RasterInfo
 from agalign.records import Band
 
 _BAND_WORDS = (
@@ -21,7 +21,7 @@ _SUFFIX = re.compile(
 )
 
 
-class Generic:
+class Generic(Camera):
     """Files that no vendor claims. `pattern` holds {capture} and {band}, as in '{capture}_{band}.tif'."""
 
     name = "generic"
@@ -33,26 +33,18 @@ class Generic:
         return True
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+        if path.suffix.lower() in JPEG_SUFFIXES:
+            return colour_bands(path, info)
         own_name = tags.text("Camera", "BandName") or self.split(path)[1]
         indexes = [i for i in range(1, len(info.dtypes) + 1) if i != info.alpha_index]
-        return tuple(
-            Band(
-                name=info.descriptions[i - 1] or (own_name if len(indexes) == 1 else f"band_{i}") or f"band_{i}",
-                path=path,
-                band_index=i,
-                width_px=info.width_px,
-                height_px=info.height_px,
-                dtype=info.dtypes[i - 1],
-                nodata=info.nodata[i - 1],
-                has_mask=info.has_mask,
-                wavelength_nm=info.wavelengths_nm[i - 1]
-                or tags.number("Camera", "CentralWavelength")
-                or _wavelength_in(own_name),
-                saturation_value=largest_value(info.dtypes[i - 1]),
-                georeference=info.georeference,
+        found = []
+        for i in indexes:
+            name = info.descriptions[i - 1] or (own_name if len(indexes) == 1 else "") or f"band_{i}"
+            wavelength = (
+                info.wavelengths_nm[i - 1] or tags.number("Camera", "CentralWavelength") or _wavelength_in(own_name)
             )
-            for i in indexes
-        )
+            found.append(replace(band_of(path, info, name, i), wavelength_nm=wavelength))
+        return tuple(found)
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         return self.split(path)[0]
@@ -60,9 +52,6 @@ class Generic:
     def capture_name(self, path: Path) -> str:
         # `red.tif` and `nir.tif` alone in a folder are a capture that the folder names.
         return self.split(path)[0] or path.absolute().parent.name
-
-    def rig_seed(self, reference: Band, moving: Band) -> Matrix | None:
-        return None
 
     def split(self, path: Path) -> tuple[str, str]:
         """(capture, band) as the file's name has them; the band is empty where the name does not tell."""

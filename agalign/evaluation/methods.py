@@ -20,8 +20,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from agalign import geometry
+from agalign.choices import Sharing
 from agalign.config import JointSettings, SeedSettings, Settings
-from agalign.descriptor import Descriptor, Sharing
+from agalign.descriptor import Descriptor
 from agalign.detect import grey
 from agalign.errors import ConfigurationError, GeometryError, InputError, NotEnoughTextureError
 from agalign.evaluation.protocol import grey_patches

@@ -80,7 +80,7 @@ def write_report(out: Path) -> Path:
 def _capture_view(out: Path, folder: str, sidecar: Sidecar) -> CaptureView:
     base = "" if folder == "." else f"{folder}/"
     picture = f"{base}{sidecar.capture}.png"
-    stack = f"{base}{sidecar.output.file}" if sidecar.output else None
+    stack = f"{base}{sidecar.output.file}" if sidecar.output and sidecar.output.file else None
     reference = sidecar.reference
     pairs = tuple(_pair_view(b, reference.width, reference.height) for b in sidecar.bands if b.status != "reference")
     return CaptureView(

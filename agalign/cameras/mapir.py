@@ -1,0 +1,47 @@
+"""MAPIR: LATTICE arrays, a file a camera, and Survey3, whose three bands share one lens.
+
+`capture_<serial>_<sequence>_<date>_<time>_<fraction>.tiff`: what follows the serial number is the capture. The model
+`LATT-<sensor>-<lens>-F<filter>` holds the wavelength. There are no rig tags.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from agalign.cameras.base import Camera, band_of
+from agalign.metadata import Tags
+from agalign.raster import RasterInfo
+from agalign.records import Band
+
+_FILE = re.compile(r"^capture_(?P<serial>[^_]+)_(?P<moment>.+)$", re.IGNORECASE)
+_FILTER = re.compile(r"-F(?P<wavelength>\d{3,4})$")
+_NAMES = ((500, "Blue"), (600, "Green"), (690, "Red"), (760, "Red edge"), (1100, "NIR"))
+"""The name of a band up to a wavelength, nm."""
+
+
+class Mapir(Camera):
+    """MAPIR LATTICE and Survey3."""
+
+    name = "MAPIR"
+
+    def recognises(self, tags: Tags) -> bool:
+        return "mapir" in tags.make.lower() or tags.model.upper().startswith(("LATT-", "SURVEY3"))
+
+    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+        if len(info.dtypes) > 1:
+            names = [f"band_{i}" for i in range(1, len(info.dtypes) + 1) if i != info.alpha_index]
+            return tuple(replace(band_of(path, info, n, i), one_lens=True) for i, n in enumerate(names, start=1))
+        found = _FILTER.search(tags.model)
+        if not found:
+            file = _FILE.match(path.stem)
+            return (band_of(path, info, f"band_{file['serial']}" if file else path.stem),)
+        wavelength = float(found["wavelength"])
+        name = next((n for most, n in _NAMES if wavelength <= most), f"{wavelength:g}nm")
+        return (replace(band_of(path, info, name), wavelength_nm=wavelength),)
+
+    def capture_key(self, path: Path, tags: Tags) -> str:
+        return self.capture_name(path)
+
+    def capture_name(self, path: Path) -> str:
+        file = _FILE.match(path.stem)
+        return f"capture_{file['moment']}" if file else path.stem

@@ -1,0 +1,62 @@
+"""Sentera 6X (a folder a band) and Double 4K (two folders of JPEGs with equal names).
+
+6X files are registered on board by default, so that identity is tried beside Sentera:AlignMatrix, a band -> colour
+camera matrix. The Double 4K's second camera has red edge in its red and near infra-red in its blue channel; the two
+fire 0.3 s apart, so that hundreds of pixels lie between them.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from agalign.cameras.base import Camera, band_of, colour_bands, perspective_lens, spectral
+from agalign.metadata import CAPTURE_IDS, Tags
+from agalign.raster import RasterInfo
+from agalign.records import Band
+
+_BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
+_ANY_BAND_FOLDER = re.compile(
+    r"^(?:\d+-)?[A-Za-z ]+-\d{3,4}(?:-\d+)?$|^(?:\d+-)?(?:RGB|NDRE|NDVI|NIR|RE|LWIR)\b.*$", re.I
+)
+_CHANNELS = {"NDRE": {1: ("Red edge", 720.0), 3: ("NIR", 840.0)}, "NDVI": {1: ("Red", 625.0), 3: ("NIR", 850.0)}}
+"""Of the one-lens cameras: the channels that hold a band, with their centre wavelengths in nm."""
+
+
+class Sentera(Camera):
+    """Sentera 6X and Double 4K."""
+
+    name = "Sentera"
+
+    def recognises(self, tags: Tags) -> bool:
+        return "sentera" in tags.make.lower() or any(namespace == "Sentera" for namespace, _ in tags.xmp)
+
+    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+        matrix = tags.numbers("Sentera", "AlignMatrix")
+        to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
+        if len(info.dtypes) > 1:
+            kind = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), "")
+            if not kind:
+                # The Double 4K's colour camera is one of its two: no mere companion.
+                return tuple(replace(b, companion="6X" in tags.model.upper()) for b in colour_bands(path, info))
+            return tuple(
+                replace(band_of(path, info, name, index), wavelength_nm=wavelength, one_lens=True)
+                for index, (name, wavelength) in _CHANNELS[kind].items()
+            )
+        folder = _BAND_FOLDER.match(path.parent.name)
+        name = tags.text("Camera", "BandName") or (folder["name"] if folder else path.stem)
+        band = spectral(band_of(path, info, name), tags)
+        if folder and band.wavelength_nm is None:
+            width = float(folder["width"]) if folder["width"] else None
+            band = replace(band, wavelength_nm=float(folder["wavelength"]), bandwidth_nm=width)
+        return (replace(band, lens=perspective_lens(tags) if to_rig is None else None, to_rig=to_rig),)
+
+    def capture_key(self, path: Path, tags: Tags) -> str:
+        return tags.first_text(CAPTURE_IDS) or self.capture_name(path)
+
+    def capture_folder(self, path: Path) -> Path:
+        return path.parent.parent if _ANY_BAND_FOLDER.match(path.parent.name) else path.parent
+
+    def capture_name(self, path: Path) -> str:
+        return re.sub(r"_\d{3}_\d{2,3}$", "", path.stem)

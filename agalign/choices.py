@@ -1,0 +1,21 @@
+"""The words that options, settings, results and files have in common."""
+
+from typing import Literal
+
+SeedKind = Literal["user", "match", "model", "rig", "geo", "structure", "identity"]
+SeedChoice = Literal["auto", "rig", "geo", "structure", "match", "identity"]
+Recipe = Literal["fast", "paper"]
+Sharing = Literal["siamese", "pseudo-siamese", "unshared"]
+ModelFamily = Literal["homography", "affine", "translation"]
+FamilyChoice = Literal["auto", "homography", "affine", "translation"]
+Space = Literal["pixel", "undistorted"]
+PairStatus = Literal["reference", "aligned", "seed_only", "failed"]
+CaptureStatus = Literal["ok", "degraded", "failed"]
+
+BandOrder = Literal["index", "wavelength", "name"]
+Interpolation = Literal["nearest", "bilinear", "cubic", "lanczos"]
+Crop = Literal["common", "none"]
+Layout = Literal["stack", "bands", "both"]
+Resolution = Literal["reference", "finest"]
+RasterFormat = Literal["gtiff", "cog"]
+Compression = Literal["auto", "zstd", "deflate", "none"]

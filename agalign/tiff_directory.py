@@ -1,0 +1,196 @@
+"""The directories of a TIFF, entry by entry: what rasterio and tifffile do not write, Exif and GPS, is added to a
+finished file. Classic TIFF and BigTIFF, TIFF 6.0 and the EXIF specification.
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+from PIL import Image
+
+EXIF, GPS = 34665, 34853
+"""Tags whose value is the place of a directory."""
+XMP = 700
+_SIZE = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+"""Bytes of a value of each type."""
+_SWAPPED = {**_SIZE, 5: 4, 10: 4}
+"""Bytes that a byte order turns round together: a rational is two numbers."""
+_LONGEST_VALUE = 1 << 28
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A tag's value: its TIFF type, how many there are, and their bytes, little-endian."""
+
+    type: int
+    count: int
+    data: bytes
+
+
+Directory = dict[int, Entry]
+
+
+def short(*values: int) -> Entry:
+    """16-bit numbers."""
+    return Entry(3, len(values), struct.pack(f"<{len(values)}H", *values))
+
+
+def long(*values: int) -> Entry:
+    """32-bit numbers."""
+    return Entry(4, len(values), struct.pack(f"<{len(values)}I", *values))
+
+
+def text(value: str) -> Entry:
+    """A text; what is not ASCII is written as UTF-8, as most readers take it."""
+    data = value.encode() + b"\0"
+    return Entry(2, len(data), data)
+
+
+def byte_string(value: bytes, kind: int = 1) -> Entry:
+    """Bytes; `kind` is 1 for BYTE or 7 for UNDEFINED."""
+    return Entry(kind, len(value), value)
+
+
+def rational(*values: float) -> Entry:
+    """Fractions of millionths."""
+    pairs = b"".join(struct.pack("<II", round(v * 1_000_000), 1_000_000) for v in values)
+    return Entry(5, len(values), pairs)
+
+
+def read_directories(path: Path) -> dict[int, Directory]:
+    """{0: the first directory, EXIF: …, GPS: …} of a TIFF, or of the Exif part of a JPEG, with its XMP.
+
+    Raises ValueError where the file is malformed, OSError where it cannot be read.
+    """
+    with path.open("rb") as file:
+        if file.read(2) != b"\xff\xd8":
+            return _read_all(file)
+    with Image.open(path) as image:
+        block, packet = image.info.get("exif", b""), image.info.get("xmp", b"")
+    found = _read_all(BytesIO(block[6:])) if block.startswith(b"Exif\0\0") else {0: {}, EXIF: {}, GPS: {}}
+    if packet:
+        found[0][XMP] = byte_string(packet)
+    return found
+
+
+def add_directories(path: Path, first: Mapping[int, Entry], exif: Directory, gps: Directory) -> None:
+    """Give a finished TIFF these entries in its first directory, and these Exif and GPS directories.
+
+    The first directory is written anew at the file's end; pixels stay where they are.
+    """
+    with path.open("r+b") as file:
+        layout, at, pointer_at = _header(file)
+        entries, following = _read_directory(file, layout, at)
+        entries |= first
+        for tag, directory in ((EXIF, exif), (GPS, gps)):
+            if directory:
+                entries[tag] = long(_write_directory(file, layout, directory, 0))
+        start = _write_directory(file, layout, entries, following)
+        file.seek(pointer_at)
+        file.write(struct.pack(layout.order + layout.offset, start))
+
+
+# ---- within
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How a file writes numbers: classic TIFF or BigTIFF, in either byte order."""
+
+    order: str
+    offset: str
+    """Format of an offset, and of a value's count."""
+    entries: str
+    """Format of a directory's number of entries."""
+
+    @property
+    def inline_bytes(self) -> int:
+        """Values up to this long stand in the entry itself."""
+        return struct.calcsize(self.offset)
+
+
+def _read_all(file: BinaryIO) -> dict[int, Directory]:
+    layout, at, _ = _header(file)
+    first, _ = _read_directory(file, layout, at)
+    found = {0: first, EXIF: Directory(), GPS: Directory()}
+    for tag in (EXIF, GPS):
+        if tag in first:
+            place = int.from_bytes(first[tag].data[: _SIZE[first[tag].type]], "little")
+            found[tag] = _read_directory(file, layout, place)[0]
+    return found
+
+
+def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
+    """(layout, where the first directory is, where that is written)."""
+    file.seek(0)
+    head = file.read(16)
+    order = {b"II": "<", b"MM": ">"}.get(head[:2])
+    if order is None or len(head) < 8:
+        raise ValueError("no TIFF header")
+    (version,) = struct.unpack_from(order + "H", head, 2)
+    if version == 43 and len(head) == 16:
+        return _Layout(order, "Q", "Q"), struct.unpack_from(order + "Q", head, 8)[0], 8
+    if version != 42:
+        raise ValueError("no TIFF header")
+    return _Layout(order, "I", "H"), struct.unpack_from(order + "I", head, 4)[0], 4
+
+
+def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory, int]:
+    """(entries, where the next directory is)."""
+    entry_format = f"{layout.order}HH{layout.offset}"
+    fixed = struct.calcsize(entry_format)
+    file.seek(at)
+    (count,) = struct.unpack(layout.order + layout.entries, _exactly(file, struct.calcsize(layout.entries)))
+    raw = _exactly(file, count * (fixed + layout.inline_bytes))
+    (following,) = struct.unpack(layout.order + layout.offset, _exactly(file, layout.inline_bytes))
+    found: Directory = {}
+    for start in range(0, len(raw), fixed + layout.inline_bytes):
+        tag, kind, number = struct.unpack_from(entry_format, raw, start)
+        length = _SIZE.get(kind, 0) * number
+        if length == 0 or length > _LONGEST_VALUE:
+            continue
+        value = raw[start + fixed : start + fixed + layout.inline_bytes]
+        if length > layout.inline_bytes:
+            file.seek(struct.unpack(layout.order + layout.offset, value)[0])
+            value = _exactly(file, length)
+        found[tag] = Entry(kind, number, _turned(value[:length], kind, layout.order))
+    return found, following
+
+
+def _write_directory(file: BinaryIO, layout: _Layout, entries: Directory, following: int) -> int:
+    """Append a directory, values first, and return where it is."""
+    packed = []
+    for tag, entry in sorted(entries.items()):
+        value = _turned(entry.data, entry.type, layout.order)
+        if len(value) > layout.inline_bytes:
+            value = struct.pack(layout.order + layout.offset, _append(file, value))
+        place = struct.pack(f"{layout.order}HH{layout.offset}", tag, entry.type, entry.count)
+        packed.append(place + value.ljust(layout.inline_bytes, b"\0"))
+    count = struct.pack(layout.order + layout.entries, len(packed))
+    return _append(file, count + b"".join(packed) + struct.pack(layout.order + layout.offset, following))
+
+
+def _append(file: BinaryIO, data: bytes) -> int:
+    """Write at the file's end, on an even place as the specification wants it; returns the place."""
+    end = file.seek(0, 2)
+    place = end + file.write(b"\0" * (end % 2))
+    file.write(data)
+    return place
+
+
+def _turned(value: bytes, kind: int, order: str) -> bytes:
+    """Between little-endian and a file's byte order."""
+    size = _SWAPPED[kind]
+    if order == "<" or size == 1:
+        return value
+    return b"".join(value[i : i + size][::-1] for i in range(0, len(value), size))
+
+
+def _exactly(file: BinaryIO, length: int) -> bytes:
+    data = file.read(length)
+    if len(data) != length:
+        raise ValueError("the file ends within a directory")
+    return data
