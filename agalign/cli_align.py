@@ -106,6 +106,10 @@ def align(
     layout: Annotated[
         Layout, typer.Option(help="A stack of all bands, a file for each input file with its tags, or both.")
     ] = "stack",
+    local: Annotated[
+        bool,
+        typer.Option("--local", help="Follow parallax over trees and buildings: a smooth field over the homography."),
+    ] = False,
     radiometry: Annotated[
         bool,
         typer.Option(
@@ -138,7 +142,7 @@ def align(
     """Align every capture below FOLDER."""
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(voice, GOES_ON):
-        from agalign.config import FlightSettings, JointSettings, SeedSettings, Settings, WriteSettings
+        from agalign.config import FlightSettings, JointSettings, LocalSettings, SeedSettings, Settings, WriteSettings
         from agalign.discover import DiscoverOptions
 
         target = out or folder.absolute().parent / f"{folder.absolute().name}-aligned"
@@ -148,6 +152,7 @@ def align(
                 recipe=recipe, sharing=sharing, model_family=model_family, device=device, rng_seed=rng_seed
             ),
             flight=FlightSettings(together=not each_alone),
+            local=LocalSettings(use=local),
             write=WriteSettings(
                 interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
                 radiometry=radiometry,

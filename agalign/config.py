@@ -183,6 +183,28 @@ class CheckSettings(Stage):
     and within this."""
 
 
+class LocalSettings(Stage):
+    """A smooth field of displacements over the homography, for parallax over trees, terraces and buildings."""
+
+    use: bool = False
+    window_px: Positive = 64
+    """Side of the windows in which shifts are measured, half of which they overlap."""
+    most_windows: Positive = 4000
+    """In larger images they lie farther apart."""
+    lattice_px: Positive = 32
+    smoothness: float = 4.0
+    """Weight of the field's second differences beside one window's shift."""
+    pull: float = 0.003
+    """The same of its own length."""
+    least_spread_px: float = 0.05
+    reweightings: Positive = 4
+    rounds: Positive = 2
+    folds: Positive = 4
+    least_windows: Positive = 24
+    least_gain_sigma: float = 4.0
+    """A field is kept where the squared shifts of windows left out of its fit fall by so many standard errors."""
+
+
 class WriteSettings(Stage):
     """The aligned stacks."""
 
@@ -214,4 +236,5 @@ class Settings(Stage):
     joint: JointSettings = JointSettings()
     flight: FlightSettings = FlightSettings()
     check: CheckSettings = CheckSettings()
+    local: LocalSettings = LocalSettings()
     write: WriteSettings = WriteSettings()

@@ -13,7 +13,7 @@ from agalign.config import Settings
 from agalign.fingerprint import fingerprint
 from agalign.geometry import Matrix
 from agalign.pair import mapping_of
-from agalign.records import Alignment, Band, Capture, JointResult, Residual
+from agalign.records import Alignment, Band, Capture, JointResult, LocalResult, Residual
 from agalign.sidecar import (
     BandPart,
     CameraPart,
@@ -21,6 +21,7 @@ from agalign.sidecar import (
     GridPart,
     HomographyPart,
     JointPart,
+    LocalPart,
     Matrix3x3,
     MetricsPart,
     OutputPart,
@@ -33,7 +34,9 @@ from agalign.sidecar import (
 )
 from agalign.write import Written
 
-_GRID_COLUMNS, _GRID_ROWS = 17, 13
+_GRID = 17, 13
+_LOCAL_GRID = 65, 49
+"""Local displacements need more points than a lens."""
 
 
 def capture_status(statuses: list[str]) -> CaptureStatus:
@@ -118,7 +121,9 @@ def _place(written: Written, band: str) -> PlacePart | None:
 
 def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
     joint, residual = alignment.joint, alignment.residual
-    grid_px = geometry.lattice(reference.width_px, reference.height_px, _GRID_COLUMNS, _GRID_ROWS)
+    local = alignment.local
+    bent = local is not None and local.field is not None
+    grid_px = geometry.lattice(reference.width_px, reference.height_px, *(_LOCAL_GRID if bent else _GRID))
     there_px = mapping_of(reference, band, alignment)(grid_px)
     after = dict(alignment.after)
     if residual is not None and math.isfinite(residual.median_px):
@@ -144,8 +149,14 @@ def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
         metrics=MetricsPart(
             before=_similarity_part(alignment.before), after=_similarity_part(after), tiles=_tile_parts(residual)
         ),
+        local=None if local is None else _local_part(local),
         seconds=round(alignment.seconds, 3),
     )
+
+
+def _local_part(local: LocalResult) -> LocalPart:
+    before, after = (v if math.isfinite(v) else None for v in (local.before_p95_px, local.after_p95_px))
+    return LocalPart(applied=local.field is not None, before_p95_px=before, after_p95_px=after)
 
 
 def _joint_part(joint: JointResult) -> JointPart:

@@ -9,10 +9,12 @@ from scipy.interpolate import CubicSpline
 
 from agalign import geometry, lens
 from agalign.geometry import Matrix, Points
-from agalign.records import Lens, Tile
+from agalign.records import Lens, LocalField, Tile
 
 _LATTICE_STEP_PX = 32
 """Curved mappings are evaluated this far apart and splined between: with real lenses below 0.0001 px of error."""
+_LOCAL_LATTICE_STEP_PX = 12
+"""The same where displacements change from place to place."""
 
 
 @dataclass(frozen=True)
@@ -24,16 +26,21 @@ class Mapping:
     moving_lens: Lens | None = None
     pre_distortion: Lens | None = None
     """Lens through which the given pixels go first, where they are undistorted ones of the reference."""
+    local: LocalField | None = None
+    """Displacements of raw reference px before anything else; `local_scale` is px of its image for one of these."""
+    local_scale: tuple[float, float] = (1.0, 1.0)
 
     def __call__(self, reference_px: ArrayLike) -> Points:
         """(..., 2) raw reference pixels to raw moving pixels."""
         raw = lens.distort(self.pre_distortion, reference_px)
+        if self.local is not None:
+            raw = raw + self.local((raw + 0.5) * self.local_scale - 0.5) / self.local_scale
         undistorted = lens.undistort(self.fixed_lens, raw)
         return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, undistorted))
 
     def from_undistorted(self, reference_lens: Lens) -> "Mapping":
         """The mapping for undistorted pixels of the reference instead of its raw ones."""
-        if self.fixed_lens is not None:
+        if self.fixed_lens is not None and self.local is None:
             return replace(self, fixed_lens=None)
         return replace(self, pre_distortion=reference_lens)
 
@@ -44,17 +51,21 @@ class Mapping:
             lens.rescaled(self.fixed_lens, fixed_scale),
             lens.rescaled(self.moving_lens, moving_scale),
             lens.rescaled(self.pre_distortion, fixed_scale),
+            self.local,
+            (self.local_scale[0] / fixed_scale[0], self.local_scale[1] / fixed_scale[1]),
         )
 
     @property
     def bends(self) -> bool:
-        """True where a lens model takes part, so that the mapping is not just a homography."""
-        return any(map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion)))
+        """True where the mapping is not just a homography: a lens model or a local field takes part."""
+        return self.local is not None or any(
+            map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion))
+        )
 
     def positions(self, tile: Tile) -> Points:
         """Where each pixel of a tile lies in the moving image, (height, width, 2) raw px."""
         if self.bends:
-            return splined(self, tile)
+            return splined(self, tile, _LATTICE_STEP_PX if self.local is None else _LOCAL_LATTICE_STEP_PX)
         x = np.arange(tile.x0, tile.x0 + tile.width, dtype=np.float64)
         y = np.arange(tile.y0, tile.y0 + tile.height, dtype=np.float64)
         h = self.fixed_to_moving
@@ -66,12 +77,12 @@ class Mapping:
         return found
 
 
-def splined(mapping: Callable[[Points], Points], tile: Tile) -> Points:
+def splined(mapping: Callable[[Points], Points], tile: Tile, step_px: int = _LATTICE_STEP_PX) -> Points:
     """A smooth mapping of points (..., 2) at every pixel of a tile, (height, width, 2): a bicubic spline through its
     values on a lattice. The spline is linear in those values, so it is two products of matrices.
     """
-    knots_x, weights_x = _spline_weights(tile.x0, tile.width)
-    knots_y, weights_y = _spline_weights(tile.y0, tile.height)
+    knots_x, weights_x = _spline_weights(tile.x0, tile.width, step_px)
+    knots_y, weights_y = _spline_weights(tile.y0, tile.height, step_px)
     values = mapping(np.stack(np.meshgrid(knots_x, knots_y), axis=-1))
     across = np.ascontiguousarray(weights_x.T)
     found = np.empty((tile.height, tile.width, 2))
@@ -80,9 +91,9 @@ def splined(mapping: Callable[[Points], Points], tile: Tile) -> Points:
     return found
 
 
-def _spline_weights(start: int, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _spline_weights(start: int, length: int, step_px: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(knots (k,), weights (length, k)): what each pixel takes of the value at each knot."""
-    count = max(4, 1 + -(-(length - 1) // _LATTICE_STEP_PX))
+    count = max(4, 1 + -(-(length - 1) // step_px))
     knots = np.linspace(start, start + max(length - 1, 3), count)
     weights = CubicSpline(knots, np.eye(count))(np.arange(start, start + length, dtype=np.float64))
     return knots, np.asarray(weights)

@@ -15,10 +15,11 @@ from agalign.flight import FlightModel, align_from_scratch, refine_with
 from agalign.geometry import Matrix
 from agalign.images import Candidates, bands_of_the_references_lens, read_pairs
 from agalign.joint import Subject
+from agalign.local import LocalRefiner
 from agalign.mapping import Mapping as PixelMapping
 from agalign.match import with_match
 from agalign.metrics import FixedSimilarity
-from agalign.records import Alignment, Band, Capture, JointResult, Raster, Seed
+from agalign.records import Alignment, Band, Capture, JointResult, LocalField, LocalResult, Raster, Seed
 from agalign.residuals import FixedWindows
 from agalign.seed import best_seed, is_trusted, overlay, single, warped
 from agalign.structure import textured
@@ -187,8 +188,16 @@ class Yardsticks:
     """What the moving bands of one reference are measured against, on the pixel grid on which they are written."""
 
     def __init__(self, fixed: Raster, settings: CheckSettings) -> None:
+        self.fixed = fixed
         self.windows = FixedWindows(fixed, settings)
         self.similarity = FixedSimilarity(fixed)
+        self._refiner: LocalRefiner | None = None
+
+    def refiner(self, settings: Settings) -> LocalRefiner:
+        """Small windows for local displacements, cut when they are first asked for."""
+        if self._refiner is None:
+            self._refiner = LocalRefiner(self.fixed, settings.local, settings.check)
+        return self._refiner
 
 
 def _checked(pair: Pair, joint: JointResult | str, yardsticks: Yardsticks, settings: Settings) -> Alignment:
@@ -208,8 +217,13 @@ def _checked(pair: Pair, joint: JointResult | str, yardsticks: Yardsticks, setti
     fits = residual.coverage >= settings.check.least_seed_coverage
     if status == "seed_only" and not (fits and residual.median_px <= settings.check.most_seed_residual_px):
         status, doubt = "failed", f"{doubt}, but it does not fit either"
+    local = None
+    if settings.local.use and status == "aligned":
+        local = yardsticks.refiner(settings).refine(single(pair.moving), _mapping(pair, matrix))
+        there = warped(single(pair.moving), _mapping(pair, matrix, local), size)
+        residual = yardsticks.windows.residuals(there)
     before, after = (yardsticks.similarity.to(r) for r in (_laid_as_files_lie(pair), there))
-    return Alignment(matrix, pair.space, status, doubt, pair.seed, found, residual, 0.0, before, after)
+    return Alignment(matrix, pair.space, status, doubt, pair.seed, found, residual, 0.0, before, after, local)
 
 
 def _snapped(joint: JointResult, pair: Pair, settings: CheckSettings) -> JointResult:
@@ -228,7 +242,11 @@ def _laid_as_files_lie(pair: Pair) -> Raster:
 
 
 def _laid_on_reference(pair: Pair, matrix: Matrix) -> Raster:
-    return warped(single(pair.moving), PixelMapping(matrix, pair.fixed.lens, pair.moving.lens), pair.fixed.size_px)
+    return warped(single(pair.moving), _mapping(pair, matrix), pair.fixed.size_px)
+
+
+def _mapping(pair: Pair, matrix: Matrix, local: LocalResult | None = None) -> PixelMapping:
+    return PixelMapping(matrix, pair.fixed.lens, pair.moving.lens, local=local.field if local is not None else None)
 
 
 def _in_file_px(alignment: Alignment, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> Alignment:
@@ -247,11 +265,17 @@ def _in_file_px(alignment: Alignment, fixed_scale: tuple[float, float], moving_s
         )  # fmt: skip
     seed = replace(seed, fixed_to_moving=geometry.rescale(seed.fixed_to_moving, up, there))
     matrix = geometry.rescale(alignment.fixed_to_moving, up, there)
-    return replace(alignment, fixed_to_moving=matrix, seed=seed, joint=joint, residual=residual)
+    local = alignment.local
+    if local is not None and local.field is not None:
+        # The lattice's first node lies at the centre of a pixel; half a reduced pixel is nothing to a smooth field.
+        larger = LocalField(local.field.step_px * up[0], local.field.displacements_px * up)
+        local = LocalResult(larger, local.before_p95_px * up[0], local.after_p95_px * up[0])
+    return replace(alignment, fixed_to_moving=matrix, seed=seed, joint=joint, residual=residual, local=local)
 
 
 def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> PixelMapping:
     """The complete mapping between the raw pixels of the two files."""
+    local = None if alignment.local is None else alignment.local.field
     if alignment.space == "pixel":
-        return PixelMapping(alignment.fixed_to_moving)
-    return PixelMapping(alignment.fixed_to_moving, reference.lens, moving.lens)
+        return PixelMapping(alignment.fixed_to_moving, local=local)
+    return PixelMapping(alignment.fixed_to_moving, reference.lens, moving.lens, local=local)

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from agalign.choices import ModelFamily, PairStatus, SeedKind, Space
 
@@ -255,6 +256,34 @@ class Residual:
 
 
 @dataclass(frozen=True)
+class LocalField:
+    """A smooth field of displacements on an image, px, by its values on a lattice."""
+
+    step_px: float
+    displacements_px: NDArray[np.float64]
+    """(rows, columns, 2); the first lies at (0, 0)."""
+
+    def __call__(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The displacement (..., 2) at points (..., 2), by cubic splines; beyond the lattice that of its edge."""
+        at = np.moveaxis(np.asarray(points_px)[..., ::-1] / self.step_px, -1, 0)
+        planes = np.moveaxis(self.displacements_px, -1, 0)
+        return np.stack([map_coordinates(plane, at, order=3, mode="nearest") for plane in planes], axis=-1)
+
+    def plus(self, other: "LocalField") -> "LocalField":
+        """X -> x + d(x) with this field, measured again under it: d(x) + other(x)."""
+        return LocalField(self.step_px, self.displacements_px + other.displacements_px)
+
+
+@dataclass(frozen=True)
+class LocalResult:
+    """A field of displacements, where it gains something, and what it gains on windows it was not fitted to."""
+
+    field: LocalField | None
+    before_p95_px: float
+    after_p95_px: float
+
+
+@dataclass(frozen=True)
 class Alignment:
     """The mapping found for one band pair and everything known about it."""
 
@@ -269,3 +298,5 @@ class Alignment:
     seconds: float
     before: Mapping[str, float] = field(default_factory=dict)
     after: Mapping[str, float] = field(default_factory=dict)
+    local: LocalResult | None = None
+    """Displacements in raw px of the reference, before the homography; None where they were not asked for."""

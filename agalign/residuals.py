@@ -14,13 +14,14 @@ from agalign.structure import Field, correlation_surfaces, structure_field, wind
 class FixedWindows:
     """The reference cut into windows, ready to be compared with any number of moving bands."""
 
-    def __init__(self, fixed: Raster, settings: CheckSettings) -> None:
+    def __init__(self, fixed: Raster, settings: CheckSettings, step_px: int | None = None) -> None:
+        """`step_px` is how far apart the windows lie; by default side by side."""
         self.settings = settings
         self.valid = fixed.valid
         width, height = fixed.size_px
         self.side = max(32, min(settings.tile_px, width // 4, height // 4))
         field = structure_field(fixed, settings.smoothing_px)
-        origins = [(x, y) for y in _starts(height, self.side) for x in _starts(width, self.side)]
+        origins = [(x, y) for y in _starts(height, self.side, step_px) for x in _starts(width, self.side, step_px)]
         fits = min(width, height) >= self.side
         strengths = [_strength(self._cut(field, o)) for o in origins] if fits else []
         self.origins = [o for o, s in zip(origins, strengths, strict=False) if s >= settings.least_strength]
@@ -68,8 +69,8 @@ def _strength(window: Field) -> float:
     return float(np.abs(window[::2, ::2]).mean())
 
 
-def _starts(length: int, side: int) -> list[int]:
-    count = max(1, math.ceil(length / side))
+def _starts(length: int, side: int, step: int | None) -> list[int]:
+    count = max(1, math.ceil(length / side) if step is None else 1 + math.ceil((length - side) / step))
     return [round(v) for v in np.linspace(0, max(0, length - side), count)]
 
 

@@ -115,6 +115,14 @@ class MetricsPart(_Part):
     tiles: list[ResidualTile]
 
 
+class LocalPart(_Part):
+    """What a local field of displacements gains: 95th percentile of the shifts of windows left out of its fit, px."""
+
+    applied: bool
+    before_p95_px: float | None
+    after_p95_px: float | None
+
+
 class PlacePart(_Part):
     """A file beside the sidecar that holds a band's aligned pixels, and the band's index there, from 1."""
 
@@ -136,6 +144,7 @@ class BandPart(_Part):
     grid: GridPart | None = None
     joint: JointPart | None = None
     metrics: MetricsPart | None = None
+    local: LocalPart | None = None
     place: PlacePart | None = None
     seconds: float
 

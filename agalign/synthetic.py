@@ -1,8 +1,9 @@
 """A synthetic flight over a farm, written as a MicaSense-like camera would, with the truth beside it.
 
-The scene is a plane of parcels with crop rows of different directions and spacings, bare soil, tracks and trees. Each
-band sees it through its own lens (distortion, principal point), from its own place and angle in the rig, with its own
-spectrum: vegetation is darker than soil in the visible bands and far brighter in the near infra-red.
+The scene is a plane of parcels with crop rows of different directions and spacings, bare soil, tracks and trees, or
+terraces with trees that stand up from them. Each band sees it through its own lens (distortion, principal point), from
+its own place and angle in the rig, with its own spectrum: vegetation is darker than soil in the visible bands and far
+brighter in the near infra-red.
 """
 
 import json
@@ -29,6 +30,10 @@ _PIXELS_PER_MM = 266.666667
 _FOCAL_LENGTH_MM = 5.45
 _BLACK_LEVEL = 4800.0
 _WHITE_LEVEL = 52000.0
+_TIES, _TIES_OVER_RELIEF = (25, 19), (65, 49)
+_TERRACE_M = 5.0
+_RAY_STEPS = 12
+"""A ray falls on relief by repeated intersection with the height below its last place."""
 _VIGNETTING = 0.35
 """What the corners lack of the middle's light."""
 _EXPOSURE_S = 1.3e-3
@@ -108,21 +113,24 @@ class Ground:
     brightness: Field
     vigour: Field
     metres_per_px: float
+    height_m: Field | None = None
+    """Above the plane; None where everything lies on it."""
 
 
 def make_flight(
     folder: Path, captures: int = 3, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0,
-    bands: Sequence[BandSpec] = BANDS,
+    bands: Sequence[BandSpec] = BANDS, relief_m: float = 0.0,
 ) -> Path:  # fmt: skip
     """Write `captures` captures of all bands into folder/0000SET/000 and the truth into folder/truth.json.
 
     The truth is {capture: {"reference": file, "bands": {file: {"fixed_to_moving": [[...]], "ties": [[x_ref, y_ref,
     x_mov, y_mov], ...]}}}}: the homography between undistorted pixels, and ties in raw pixels, exact to 0.001 px; the
-    centre of the top-left pixel is (0, 0). Returns the path of truth.json.
+    centre of the top-left pixel is (0, 0). With `relief_m` the ground has terraces of that height and trees as high
+    again: the homography then is the plane's below them, and the ties are true. Returns the path of truth.json.
     """
     rng = np.random.default_rng(rng_seed)
     poses = [_pose(rng, number) for number in range(captures)]
-    ground = paint_ground(rng, poses, size_px)
+    ground = paint_ground(rng, poses, size_px, relief_m)
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
     truth: dict[str, Any] = {}
@@ -130,7 +138,7 @@ def make_flight(
     for band in bands:
         painted = reflectance(ground, band)
         for number, pose in enumerate(poses, start=1):
-            pixels = render(painted, ground.metres_per_px, band, pose, size_px, rng)
+            pixels = render(painted, ground, band, pose, size_px, rng)
             _write_band(images / _file_name(number, band), pixels, band, pose, number, size_px)
     for number, pose in enumerate(poses, start=1):
         names = {b.name: _file_name(number, b) for b in bands}
@@ -139,7 +147,7 @@ def make_flight(
             "bands": {
                 names[b.name]: {
                     "fixed_to_moving": true_homography(reference, b, pose, size_px).tolist(),
-                    "ties": true_ties(reference, b, pose, size_px),
+                    "ties": true_ties(ground, reference, b, pose, size_px),
                 }
                 for b in bands
                 if b is not reference
@@ -157,13 +165,17 @@ def true_homography(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tu
     )
 
 
-def true_ties(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> list[list[float]]:
+def true_ties(
+    ground: Ground, reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]
+) -> list[list[float]]:
     """[x_ref, y_ref, x_mov, y_mov] in raw pixels on a lattice, where both lie in their images."""
     width, height = size_px
-    here = geometry.lattice(width, height, 25, 19)
-    straight = lens.undistort(reference.lens(*size_px), here)
-    moved = geometry.apply(true_homography(reference, band, pose, size_px), straight)
-    there = lens.distort(band.lens(*size_px), moved)
+    here = geometry.lattice(width, height, *(_TIES if ground.height_m is None else _TIES_OVER_RELIEF))
+    place, rays = _place_and_rays(band, pose, size_px)
+    seen = _on_ground(ground, reference, pose, size_px, here)
+    # The way back: a point of the ground from the band's place, as a ray of its camera.
+    straight = geometry.apply(geometry.invert(rays), (seen[:, :2] - place[:2]) / (seen[:, 2:] - place[2]))
+    there = lens.distort(band.lens(*size_px), straight)
     inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
     rows: list[list[float]] = np.hstack([here, there])[inside].round(4).tolist()
     return rows
@@ -174,17 +186,19 @@ def _file_name(number: int, band: BandSpec) -> str:
 
 
 def render(
-    painted: Field, metres_per_px: float, band: BandSpec, pose: Pose, size_px: tuple[int, int], rng: np.random.Generator
+    painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.uint16]:
     """What one camera records of the ground painted in its band: (height, width) uint16 with vignetting and noise."""
     width, height = size_px
-    to_ground, middle = _pixel_to_ground(band, pose, size_px), (len(painted) - 1) / 2
 
     def on_map(raw_px: Points) -> Points:
-        return geometry.apply(to_ground, lens.undistort(band.lens(*size_px), raw_px)) / metres_per_px + middle
+        return _map_px(ground, _on_ground(ground, band, pose, size_px, raw_px)[..., :2])
 
-    positions = splined(on_map, Tile(0, 0, width, height)).astype(np.float32)
     y, x = np.arange(height), np.arange(width)
+    if ground.height_m is None:
+        positions = splined(on_map, Tile(0, 0, width, height)).astype(np.float32)
+    else:
+        positions = on_map(np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)).astype(np.float32)
     scene = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     radius2 = ((x - width / 2) ** 2)[None, :] + ((y - height / 2) ** 2)[:, None]
     vignetting = 1 - _VIGNETTING * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
@@ -206,7 +220,9 @@ def reflectance(ground: Ground, band: BandSpec) -> Field:
     )
 
 
-def paint_ground(rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int]) -> Ground:
+def paint_ground(
+    rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int], relief_m: float = 0.0
+) -> Ground:
     """Parcels, rows, tracks and trees, large enough for all poses."""
     focal = _FOCAL_LENGTH_MM * _PIXELS_PER_MM * size_px[0] / 1280
     lowest, highest = min(p.altitude_m for p in poses), max(p.altitude_m for p in poses)
@@ -240,7 +256,19 @@ def paint_ground(rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple
         brightness.astype(np.float32),
         np.clip(vigour, -1.5, 1.5).astype(np.float32),
         metres_per_px,
+        _relief(rng, tree, metre, relief_m) if relief_m else None,
     )
+
+
+def _relief(rng: np.random.Generator, tree: Field, metre: float, relief_m: float) -> Field:
+    """Metres above the plane: three levels with slopes between them, and round trees upon them."""
+    angle = rng.uniform(0, np.pi)
+    axis = np.arange(len(tree)) / (_TERRACE_M * metre)
+    along = np.cos(angle) * axis[None, :] + np.sin(angle) * axis[:, None]
+    slope = np.clip((along % 1 - 0.7) / 0.3, 0, 1)
+    level = np.floor(along) + slope * slope * (3 - 2 * slope)
+    crowns = cv2.GaussianBlur(tree, (0, 0), 0.2 * metre)
+    return np.asarray(relief_m * (np.abs(level % 4 - 2) + crowns), np.float32)
 
 
 def _parcels(rng: np.random.Generator, side: int, count: int) -> tuple[NDArray[np.int64], Field]:
@@ -301,12 +329,38 @@ def _pose(rng: np.random.Generator, number: int) -> Pose:
 
 def _pixel_to_ground(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
     """Undistorted pixel -> metres east and south on the plane below: the ray from the lens, cut with the plane."""
-    attitude = _rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
-    rays = attitude @ _rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
-    place = attitude @ np.array([*band.baseline_m, 0.0]) + (pose.east_m, pose.north_m, -pose.altitude_m)
+    place, rays = _place_and_rays(band, pose, size_px)
     # ground = place + ray * (-place_z / ray_z): linear in the homogeneous pixel once multiplied by ray_z.
     to_plane = np.array([[-place[2], 0.0, place[0]], [0.0, -place[2], place[1]], [0.0, 0.0, 1.0]])
     return geometry.normalised(to_plane @ rays)
+
+
+def _place_and_rays(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> tuple[NDArray[np.float64], Matrix]:
+    """(where the lens is, metres east, south and down of the origin; undistorted pixel -> direction of its ray)."""
+    attitude = _rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
+    rays = attitude @ _rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
+    place = attitude @ np.array([*band.baseline_m, 0.0]) + (pose.east_m, pose.north_m, -pose.altitude_m)
+    return place, rays
+
+
+def _on_ground(ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], raw_px: Points) -> Points:
+    """(..., 3) metres east, south and down of what raw pixels (..., 2) see."""
+    straight = lens.undistort(band.lens(*size_px), raw_px)
+    place, rays = _place_and_rays(band, pose, size_px)
+    direction = np.concatenate([straight, np.ones_like(straight[..., :1])], axis=-1) @ rays.T
+    down = np.zeros(direction.shape[:-1])
+    seen = place + direction * ((down - place[2]) / direction[..., 2])[..., None]
+    for _ in range(0 if ground.height_m is None else _RAY_STEPS):
+        at = _map_px(ground, seen[..., :2]).astype(np.float32).reshape(len(seen), -1, 2)
+        height = cv2.remap(ground.height_m, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        down = -height.reshape(down.shape).astype(np.float64)
+        seen = place + direction * ((down - place[2]) / direction[..., 2])[..., None]
+    return np.asarray(seen)
+
+
+def _map_px(ground: Ground, metres: Points) -> Points:
+    """Positions on the painted ground's pixels."""
+    return metres / ground.metres_per_px + (len(ground.crop) - 1) / 2
 
 
 def _rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:

@@ -1,0 +1,146 @@
+"""When one plane is not enough: a smooth field of displacements over the homography, from the shifts that windows of
+the two bands still show. It is kept only where it explains windows that it was not fitted to, and it never folds.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csr_matrix, dia_matrix, diags, identity, kron, vstack
+from scipy.sparse.linalg import splu
+
+from agalign.config import CheckSettings, LocalSettings
+from agalign.mapping import Mapping
+from agalign.records import LocalField, LocalResult, Raster, Residual
+from agalign.residuals import FixedWindows
+from agalign.seed import warped
+
+Shifts = NDArray[np.float64]
+
+
+class LocalRefiner:
+    """The reference cut into small, overlapping windows, ready for any number of moving bands."""
+
+    def __init__(self, fixed: Raster, settings: LocalSettings, check: CheckSettings) -> None:
+        self.settings, self.fixed = settings, fixed
+        area = fixed.size_px[0] * fixed.size_px[1]
+        step = max(settings.window_px // 2, round((area / settings.most_windows) ** 0.5))
+        self.windows = FixedWindows(fixed, check.model_copy(update={"tile_px": settings.window_px}), step)
+
+    def refine(self, moving: Raster, mapping: Mapping) -> LocalResult:
+        """The field over a mapping, and what it gains on windows that it was not fitted to.
+
+        The shifts are measured again after each round, under the field so far: windows over steps sharpen so.
+        """
+        field: LocalField | None = None
+        first = self._measure(moving, mapping)
+        gain = _held_out_gain(first, self.settings, self.fixed.size_px)
+        if gain.sigma < self.settings.least_gain_sigma:
+            return LocalResult(None, gain.before_p95_px, gain.after_p95_px)
+        for _ in range(self.settings.rounds):
+            found = first if field is None else self._measure(moving, replace(mapping, local=field))
+            more = fitted_field(*_measured(found), self.settings, self.fixed.size_px)
+            total = more if field is None else field.plus(more)
+            if not _is_one_to_one(total, self.fixed.size_px):
+                break
+            field = total
+        return LocalResult(field, gain.before_p95_px, gain.after_p95_px)
+
+    def _measure(self, moving: Raster, mapping: Mapping) -> Residual:
+        return self.windows.residuals(warped(moving, mapping, self.fixed.size_px))
+
+
+def _measured(residual: Residual) -> tuple[Shifts, Shifts]:
+    """(centres, shifts) of the windows in which a shift was found, (n, 2) each."""
+    known = np.isfinite(residual.shifts_px[:, 0])
+    return residual.centres_px[known], residual.shifts_px[known]
+
+
+@dataclass(frozen=True)
+class _Gain:
+    """What a field gains on windows left out of its fit."""
+
+    before_p95_px: float = math.nan
+    after_p95_px: float = math.nan
+    sigma: float = 0.0
+    """Mean fall of the squared shifts, in standard errors of that mean."""
+
+
+def _held_out_gain(residual: Residual, settings: LocalSettings, size_px: tuple[int, int]) -> _Gain:
+    """Blocks of windows are left out in turn, so that no window is explained by one that overlaps it."""
+    centres, shifts = _measured(residual)
+    if len(centres) < settings.least_windows:
+        return _Gain()
+    block = np.floor(centres / (2 * settings.window_px)).astype(int)
+    fold = (block[:, 0] + 2 * block[:, 1]) % settings.folds
+    left = np.full(len(centres), np.nan)
+    for k in range(settings.folds):
+        kept = fold != k
+        if kept.sum() >= settings.least_windows // 2 and not kept.all():
+            field = fitted_field(centres[kept], shifts[kept], settings, size_px)
+            left[~kept] = np.linalg.norm(shifts[~kept] - field(centres[~kept]), axis=1)
+    tried = np.isfinite(left)
+    if not tried.any():
+        return _Gain()
+    before, after = np.linalg.norm(shifts[tried], axis=1), left[tried]
+    # Wrong peaks must not decide: what lies far out counts no more than twice the 95th percentile.
+    most = 2 * np.percentile(before, 95)
+    fall = np.minimum(before, most) ** 2 - np.minimum(after, most) ** 2
+    sigma = fall.mean() / max(fall.std() / math.sqrt(len(fall)), 1e-12)
+    return _Gain(float(np.percentile(before, 95)), float(np.percentile(after, 95)), float(sigma))
+
+
+def fitted_field(
+    centres_px: Shifts, shifts_px: Shifts, settings: LocalSettings, size_px: tuple[int, int]
+) -> LocalField:
+    """The smooth field d through shifts s at centres x (n, 2): on a lattice,
+
+        min sum_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + pull |d|^2
+
+    with second differences D2, and Cauchy weights w against windows that found a wrong peak. The pull to nothing is
+    small: it decides where nothing was measured.
+    """
+    step = settings.lattice_px
+    columns, rows = (int(np.ceil(n / step)) + 1 for n in size_px)
+    design = _interpolation(centres_px / step, columns, rows)
+    bend = vstack([
+        kron(identity(rows), _second_differences(columns)), kron(_second_differences(rows), identity(columns)),
+    ])  # fmt: skip
+    penalty = settings.smoothness * (bend.T @ bend) + settings.pull * identity(rows * columns)
+    weight = np.ones(len(centres_px))
+    found = np.zeros((rows * columns, 2))
+    for _ in range(settings.reweightings):
+        weighted = design.T @ diags(weight)
+        found = splu((weighted @ design + penalty).tocsc()).solve(weighted @ shifts_px)
+        off = np.linalg.norm(shifts_px - design @ found, axis=1)
+        spread = max(1.4826 * float(np.median(off)), settings.least_spread_px)
+        weight = 1 / (1 + (off / (2 * spread)) ** 2)
+    return LocalField(float(step), found.reshape(rows, columns, 2))
+
+
+def _interpolation(at: Shifts, columns: int, rows: int) -> csr_matrix:
+    """(n, rows columns): bilinear weights of the lattice's nodes at points in its steps."""
+    cell = np.clip(np.floor(at).astype(int), 0, (columns - 2, rows - 2))
+    part = at - cell
+    entries = []
+    for dx in (0, 1):
+        for dy in (0, 1):
+            weight = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
+            entries.append((weight, np.arange(len(at)), (cell[:, 1] + dy) * columns + cell[:, 0] + dx))
+    weights, which, nodes = (np.concatenate(column) for column in zip(*entries, strict=True))
+    return coo_matrix((weights, (which, nodes)), shape=(len(at), rows * columns)).tocsr()
+
+
+def _second_differences(count: int) -> dia_matrix:
+    return diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
+
+
+def _is_one_to_one(field: LocalField, size_px: tuple[int, int]) -> bool:
+    """True where x + d(x) folds nowhere: its Jacobian is positive at four points a step of the lattice."""
+    x = np.arange(0.0, size_px[0], field.step_px / 4)
+    y = np.arange(0.0, size_px[1], field.step_px / 4)
+    points = np.stack(np.meshgrid(x, y), axis=-1)
+    there = points + field(points)
+    by_x, by_y = np.diff(there, axis=1)[:-1], np.diff(there, axis=0)[:, :-1]
+    return bool((by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0] > 0).all())
