@@ -116,6 +116,7 @@ def align(
             "--radiometry", help="Write reflectance or radiance as the camera's tags give it, not raw numbers."
         ),
     ] = False,
+    stac: Annotated[bool, typer.Option("--stac", help="A STAC item beside each capture's files.")] = False,
     format: Annotated[RasterFormat, typer.Option(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
     compression: Annotated[
         Compression, typer.Option(help="Lossless; auto is zstd for stacks and deflate for single bands.")
@@ -144,6 +145,7 @@ def align(
     with exits(voice, GOES_ON):
         from agalign.config import FlightSettings, JointSettings, LocalSettings, SeedSettings, Settings, WriteSettings
         from agalign.discover import DiscoverOptions
+        from agalign.stac import need_stac
 
         target = out or folder.absolute().parent / f"{folder.absolute().name}-aligned"
         settings = Settings(
@@ -155,13 +157,15 @@ def align(
             local=LocalSettings(use=local),
             write=WriteSettings(
                 interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
-                radiometry=radiometry,
+                radiometry=radiometry, stac=stac,
                 format=format, compression=compression,
             ),
         )  # fmt: skip
         options = DiscoverOptions(
             pattern, reference, ignore_metadata, with_rgb, band_names(bands), order, skip=(target,)
         )  # fmt: skip
+        if stac:
+            need_stac()
         flight = find_captures(folder, options, voice)
         reports = run(flight, target, settings, voice, overwrite=overwrite, jobs=jobs, dask=dask, model=model)
         raise typer.Exit(conclude(flight, reports, target, voice))

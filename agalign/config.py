@@ -192,11 +192,14 @@ class LocalSettings(Stage):
     most_windows: Positive = 4000
     """In larger images they lie farther apart."""
     lattice_px: Positive = 32
-    smoothness: float = 4.0
-    """Weight of the field's second differences beside one window's shift."""
+    smoothness: tuple[float, ...] = (0.3, 1.0, 4.0, 16.0)
+    """Weights of the field's second differences beside one window's shift, of which the windows left out of a fit
+    choose."""
     pull: float = 0.003
     """The same of its own length."""
     least_spread_px: float = 0.05
+    outlier_spreads: float = 4.0
+    """A window that the field misses by so many times what it misses most by has half a vote."""
     reweightings: Positive = 4
     rounds: Positive = 2
     folds: Positive = 4
@@ -225,6 +228,8 @@ class WriteSettings(Stage):
     """One file a capture, one for each of its files, or both."""
     resolution: Resolution = "reference"
     """The reference's own pixels, or as many more as the finest band has."""
+    stac: bool = False
+    """A STAC item beside each capture's files."""
     radiometry: bool = False
     """Write reflectance or radiance (float32) instead of raw numbers, where the camera's tags tell how."""
 

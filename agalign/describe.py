@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from agalign.sidecar import (
     MetricsPart,
     OutputPart,
     PlacePart,
+    PositionPart,
     ReferencePart,
     ResidualTile,
     SeedPart,
@@ -77,6 +79,7 @@ def describe_capture(
         capture_id=capture.capture_id,
         flight_id=capture.flight_id,
         captured_at=capture.captured_at,
+        position=None if capture.position is None else PositionPart(**asdict(capture.position)),
         camera=CameraPart(make=capture.camera.make, model=capture.camera.model, serial=capture.camera.serial),
         status="degraded" if status == "ok" and capture.missing_bands else status,
         missing_bands=list(capture.missing_bands),

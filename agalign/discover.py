@@ -197,6 +197,7 @@ def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capt
         capture_id=tags.first_text(CAPTURE_IDS),
         flight_id=tags.first_text(FLIGHT_IDS),
         captured_at=tags.captured_at,
+        position=tags.position,
     )
 
 

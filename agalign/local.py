@@ -35,12 +35,15 @@ class LocalRefiner:
         """
         field: LocalField | None = None
         first = self._measure(moving, mapping)
-        gain = _held_out_gain(first, self.settings, self.fixed.size_px)
+        gain = min(
+            (_held_out_gain(first, s, self.settings, self.fixed.size_px) for s in self.settings.smoothness),
+            key=lambda g: g.upper_quartile_px,
+        )
         if gain.sigma < self.settings.least_gain_sigma:
             return LocalResult(None, gain.before_p95_px, gain.after_p95_px)
         for _ in range(self.settings.rounds):
             found = first if field is None else self._measure(moving, replace(mapping, local=field))
-            more = fitted_field(*_measured(found), self.settings, self.fixed.size_px)
+            more = fitted_field(*_measured(found), gain.smoothness, self.settings, self.fixed.size_px)
             total = more if field is None else field.plus(more)
             if not _is_one_to_one(total, self.fixed.size_px):
                 break
@@ -61,38 +64,42 @@ def _measured(residual: Residual) -> tuple[Shifts, Shifts]:
 class _Gain:
     """What a field gains on windows left out of its fit."""
 
+    smoothness: float
     before_p95_px: float = math.nan
     after_p95_px: float = math.nan
+    upper_quartile_px: float = math.inf
+    """Of what is left: wrong peaks and the edges of trees, which no smooth field follows, have no say in it."""
     sigma: float = 0.0
     """Mean fall of the squared shifts, in standard errors of that mean."""
 
 
-def _held_out_gain(residual: Residual, settings: LocalSettings, size_px: tuple[int, int]) -> _Gain:
+def _held_out_gain(residual: Residual, smoothness: float, settings: LocalSettings, size_px: tuple[int, int]) -> _Gain:
     """Blocks of windows are left out in turn, so that no window is explained by one that overlaps it."""
     centres, shifts = _measured(residual)
     if len(centres) < settings.least_windows:
-        return _Gain()
+        return _Gain(smoothness)
     block = np.floor(centres / (2 * settings.window_px)).astype(int)
     fold = (block[:, 0] + 2 * block[:, 1]) % settings.folds
     left = np.full(len(centres), np.nan)
     for k in range(settings.folds):
         kept = fold != k
         if kept.sum() >= settings.least_windows // 2 and not kept.all():
-            field = fitted_field(centres[kept], shifts[kept], settings, size_px)
+            field = fitted_field(centres[kept], shifts[kept], smoothness, settings, size_px)
             left[~kept] = np.linalg.norm(shifts[~kept] - field(centres[~kept]), axis=1)
     tried = np.isfinite(left)
     if not tried.any():
-        return _Gain()
+        return _Gain(smoothness)
     before, after = np.linalg.norm(shifts[tried], axis=1), left[tried]
     # Wrong peaks must not decide: what lies far out counts no more than twice the 95th percentile.
     most = 2 * np.percentile(before, 95)
     fall = np.minimum(before, most) ** 2 - np.minimum(after, most) ** 2
     sigma = fall.mean() / max(fall.std() / math.sqrt(len(fall)), 1e-12)
-    return _Gain(float(np.percentile(before, 95)), float(np.percentile(after, 95)), float(sigma))
+    upper_quartile, after_p95 = (float(v) for v in np.percentile(after, (75, 95)))
+    return _Gain(smoothness, float(np.percentile(before, 95)), after_p95, upper_quartile, float(sigma))
 
 
 def fitted_field(
-    centres_px: Shifts, shifts_px: Shifts, settings: LocalSettings, size_px: tuple[int, int]
+    centres_px: Shifts, shifts_px: Shifts, smoothness: float, settings: LocalSettings, size_px: tuple[int, int]
 ) -> LocalField:
     """The smooth field d through shifts s at centres x (n, 2): on a lattice,
 
@@ -107,7 +114,7 @@ def fitted_field(
     bend = vstack([
         kron(identity(rows), _second_differences(columns)), kron(_second_differences(rows), identity(columns)),
     ])  # fmt: skip
-    penalty = settings.smoothness * (bend.T @ bend) + settings.pull * identity(rows * columns)
+    penalty = smoothness * (bend.T @ bend) + settings.pull * identity(rows * columns)
     weight = np.ones(len(centres_px))
     found = np.zeros((rows * columns, 2))
     for _ in range(settings.reweightings):
@@ -115,7 +122,7 @@ def fitted_field(
         found = splu((weighted @ design + penalty).tocsc()).solve(weighted @ shifts_px)
         off = np.linalg.norm(shifts_px - design @ found, axis=1)
         spread = max(1.4826 * float(np.median(off)), settings.least_spread_px)
-        weight = 1 / (1 + (off / (2 * spread)) ** 2)
+        weight = 1 / (1 + (off / (settings.outlier_spreads * spread)) ** 2)
     return LocalField(float(step), found.reshape(rows, columns, 2))
 
 

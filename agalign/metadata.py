@@ -11,6 +11,7 @@ import tifffile
 from PIL import ExifTags, Image
 
 from agalign.errors import UnreadableFileError
+from agalign.records import Position
 from agalign.xmp import Namespace, Packet
 
 CAPTURE_IDS: tuple[tuple[Namespace, str], ...] = (
@@ -34,6 +35,7 @@ class Tags:
     make: str = ""
     model: str = ""
     serial: str = ""
+    position: Position | None = None
     captured_at: str = ""
     """ISO 8601 as written by the camera, without a time zone where it gives none."""
     orientation: int = 1
@@ -102,6 +104,7 @@ def read_tags(path: Path) -> Tags:
         make=_text(values.get(271)),
         model=_text(values.get(272)),
         serial=_text(exif.get("BodySerialNumber")),
+        position=_position(values.get(34853)),
         captured_at=_iso_time(exif, values.get(306)),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
         size_px=(int(values.get(256, 0)), int(values.get(257, 0))),
@@ -120,7 +123,35 @@ def _jpeg_values(path: Path) -> dict[int, Any]:
     with Image.open(path) as image:
         exif = image.getexif()
         named = {ExifTags.TAGS.get(code, str(code)): value for code, value in exif.get_ifd(34665).items()}
-        return {**exif, 34665: named, 700: image.info.get("xmp", b"")}
+        place = {ExifTags.GPSTAGS.get(code, str(code)): value for code, value in exif.get_ifd(34853).items()}
+        return {**exif, 34665: named, 34853: place, 700: image.info.get("xmp", b"")}
+
+
+def _position(gps: Any) -> Position | None:
+    """From a GPS directory; cameras without a fix write an empty one."""
+    if not isinstance(gps, dict):
+        return None
+    latitude, longitude = (_degrees(gps.get(f"GPS{axis}")) for axis in ("Latitude", "Longitude"))
+    if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
+        return None
+    south, west = (_text(gps.get(f"GPS{axis}Ref")) for axis in ("Latitude", "Longitude"))
+    altitude = rational(gps.get("GPSAltitude"))
+    below = gps.get("GPSAltitudeRef") in (1, b"\x01")
+    return Position(
+        -latitude if south.upper() == "S" else latitude, -longitude if west.upper() == "W" else longitude,
+        -altitude if altitude is not None and below else altitude,
+    )  # fmt: skip
+
+
+def _degrees(value: Any) -> float | None:
+    """Degrees, minutes and seconds, as fractions or as the numerators and denominators of fractions."""
+    if not isinstance(value, (tuple, list)):
+        return None
+    pairs = [value[i : i + 2] for i in range(0, 6, 2)] if len(value) == 6 else list(value)
+    parts = [rational(pair) for pair in pairs]
+    if len(parts) != 3 or any(part is None for part in parts):
+        return None
+    return float(sum((part or 0.0) / 60**k for k, part in enumerate(parts)))
 
 
 def _mean(value: Any) -> float | None:

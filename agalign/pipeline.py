@@ -18,6 +18,7 @@ from agalign.pair import PairProgress, align_capture_bands, mapping_of
 from agalign.picture import write_picture
 from agalign.records import Alignment, Band, Capture, Grid, Tile
 from agalign.sidecar import Sidecar, write_sidecar
+from agalign.stac import write_item
 from agalign.warp import common_area
 from agalign.write import Layer, write_capture
 
@@ -63,6 +64,8 @@ def process_capture(
         # The picture is a convenience: a full disk must not cost the sidecar.
         with suppress(AgalignError):
             write_picture(capture, written.places, grid, usable, stack_path.with_suffix(".png"))
+        if settings.write.stac:
+            write_item(capture, written, sidecar_path, stack_path.with_suffix(".png"))
     else:
         # An earlier run's stack does not stay either.
         for stale in (stack_path, stack_path.with_suffix(".png")):

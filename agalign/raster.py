@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio import warp
 from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
 from rasterio.windows import Window
 
 from agalign import lens
-from agalign.errors import UnreadableFileError
+from agalign.errors import GeometryError, UnreadableFileError
 from agalign.masks import data_mask, learnable, undeclared_fill
 from agalign.records import Band, Georeference, Mask, Raster
 
@@ -37,6 +38,9 @@ class RasterInfo:
     """Index from 1 of an alpha band, which is no band of the scene."""
     georeference: Georeference | None
     has_mask: bool = False
+    scales_offsets: tuple[tuple[float, float], ...] = ()
+    """A pair a band; none where the file says nothing of the kind."""
+    overviews: tuple[int, ...] = ()
 
 
 @contextmanager
@@ -66,6 +70,7 @@ def probe(path: Path) -> RasterInfo:
             dataset.width, dataset.height, tuple(dataset.dtypes), tuple(dataset.nodatavals),
             tuple(dataset.descriptions), wavelengths, alpha[0] if alpha else None, georeference,
             MaskFlags.per_dataset in dataset.mask_flag_enums[0],
+            tuple(zip(dataset.scales, dataset.offsets, strict=True)), tuple(dataset.overviews(1)),
         )  # fmt: skip
 
 
@@ -115,6 +120,20 @@ def read_preview(
         nodata = dataset.nodata
     values = pixels.astype(np.float32)
     return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))
+
+
+def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDArray[np.float64]:
+    """(n, 2) map positions, x or longitude first, in another coordinate reference system (WKT or EPSG:number).
+
+    Raises GeometryError where there is no way.
+    """
+    try:
+        x, y = warp.transform(
+            rasterio.CRS.from_user_input(from_crs), rasterio.CRS.from_user_input(to_crs), points[:, 0], points[:, 1]
+        )
+    except (RasterioError, ValueError) as error:
+        raise GeometryError(f"coordinates cannot be transformed ({error})") from None
+    return np.stack([x, y], axis=-1)
 
 
 def _dataset_mask(dataset: rasterio.DatasetReader, index: int, shape: tuple[int, int]) -> Mask:

@@ -93,6 +93,10 @@ class Band:
     companion: bool = False
     """Of a colour photograph beside the capture: takes part only where asked for."""
     georeference: Georeference | None = None
+    scale_offset: tuple[float, float] = (1.0, 0.0)
+    """What the file says that its numbers are to be multiplied by, and what to be added then."""
+    overviews: tuple[int, ...] = ()
+    """Reductions at which the file holds the band too."""
     radiometry: Radiometry | None = None
 
     @property
@@ -104,6 +108,15 @@ class Band:
     def address(self) -> str:
         """The file's name, with the band's index where the file has several."""
         return self.path.name if self.band_index == 1 else f"{self.path.name}[{self.band_index}]"
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where the camera was: WGS 84, degrees, and metres as the camera has them."""
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -128,6 +141,7 @@ class Capture:
     capture_id: str = ""
     flight_id: str = ""
     captured_at: str = ""
+    position: Position | None = None
     missing_bands: tuple[str, ...] = ()
 
     @property

@@ -13,6 +13,7 @@ from agalign.config import SeedSettings
 from agalign.errors import GeometryError
 from agalign.geometry import Matrix
 from agalign.mapping import Mapping
+from agalign.raster import transformed
 from agalign.records import Band, Raster, Seed, Tile
 from agalign.structure import correlation_surface, find_peak, shrink, structure_field
 
@@ -93,12 +94,13 @@ def is_trusted(seed: Seed, settings: SeedSettings) -> bool:
 
 
 def geo_seed(reference: Band, moving: Band) -> Matrix | None:
-    """fixed_to_moving from the two files' geotransforms; None where either has none or their CRS differ.
+    """fixed_to_moving from the two files' geotransforms; None where either has none.
 
-    Geotransforms count from the corner of the top-left pixel, this package from its centre: hence the half pixels.
+    Between two coordinate reference systems it is the homography nearest to the transformation. Geotransforms count
+    from the corner of the top-left pixel, this package from its centre: hence the half pixels. Raises GeometryError.
     """
     here, there = reference.georeference, moving.georeference
-    if here is None or there is None or here.crs_wkt != there.crs_wkt:
+    if here is None or there is None:
         return None
     to_corner = geometry.translation(0.5, 0.5)
     # Not geometry.invert: metres in the millions beside pixels of centimetres look singular to it.
@@ -106,7 +108,14 @@ def geo_seed(reference: Band, moving: Band) -> Matrix | None:
         map_to_there: Matrix = np.linalg.inv(there.transform).astype(np.float64)
     except np.linalg.LinAlgError:
         raise GeometryError(f"{moving.path}: its geotransform cannot be inverted") from None
-    return geometry.compose(geometry.invert(to_corner), map_to_there, here.transform, to_corner)
+    if here.crs_wkt == there.crs_wkt:
+        return geometry.compose(geometry.invert(to_corner), map_to_there, here.transform, to_corner)
+    points = geometry.lattice(*reference.size_px, 9, 7)
+    on_map = transformed(geometry.apply(here.transform, points + 0.5), here.crs_wkt, there.crs_wkt)
+    found, _ = cv2.findHomography(points, geometry.apply(map_to_there, on_map) - 0.5, 0)
+    if found is None or not np.isfinite(found).all():
+        raise GeometryError(f"{moving.path}: lies where {reference.path.name}'s coordinates do not reach")
+    return geometry.normalised(found)
 
 
 def overlay(reference: Band, moving: Band) -> Matrix:

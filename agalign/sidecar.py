@@ -35,6 +35,14 @@ class CameraPart(_Part):
     serial: str
 
 
+class PositionPart(_Part):
+    """Where the camera was: WGS 84, degrees, and metres as the camera has them."""
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None
+
+
 class ReferencePart(_Part):
     """The band whose pixel grid everything is aligned to."""
 
@@ -180,6 +188,7 @@ class Sidecar(_Part):
     capture_id: str
     flight_id: str
     captured_at: str
+    position: PositionPart | None = None
     camera: CameraPart
     status: CaptureStatus
     missing_bands: list[str]

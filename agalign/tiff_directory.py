@@ -87,7 +87,7 @@ def add_directories(path: Path, first: Mapping[int, Entry], exif: Directory, gps
         entries |= first
         for tag, directory in ((EXIF, exif), (GPS, gps)):
             if directory:
-                entries[tag] = long(_write_directory(file, layout, directory, 0))
+                entries[tag] = layout.pointer(_write_directory(file, layout, directory, 0))
         start = _write_directory(file, layout, entries, following)
         file.seek(pointer_at)
         file.write(struct.pack(layout.order + layout.offset, start))
@@ -110,6 +110,10 @@ class _Layout:
     def inline_bytes(self) -> int:
         """Values up to this long stand in the entry itself."""
         return struct.calcsize(self.offset)
+
+    def pointer(self, place: int) -> Entry:
+        """The place of a directory as a tag's value: LONG, or LONG8 in a BigTIFF."""
+        return Entry(16 if self.offset == "Q" else 4, 1, struct.pack("<" + self.offset, place))
 
 
 def _read_all(file: BinaryIO) -> dict[int, Directory]:

@@ -16,6 +16,7 @@ import numpy as np
 import rasterio
 import tifffile
 from numpy.typing import NDArray
+from rasterio.enums import Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.shutil import copy as copy_dataset
 from rasterio.transform import Affine
@@ -137,6 +138,9 @@ def write_raster(
                 _describe(dataset, capture, layers, settings)
                 for index, layer in enumerate(layers, start=1):
                     _write_layer(dataset, index, layer, grid, nodata, settings)
+            if capture.reference.overviews and settings.format == "gtiff":
+                with rasterio.open(partial, "r+") as dataset:
+                    dataset.build_overviews(list(capture.reference.overviews), Resampling.average)
             if tags is not None:
                 add_directories(partial, tags.first, tags.exif, tags.gps)
             if settings.format == "cog":
@@ -283,6 +287,8 @@ def _describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings:
     if settings.radiometry and quantities:
         facts["RADIOMETRY"] = " and ".join(dict.fromkeys(quantities))
     dataset.update_tags(**{k: v for k, v in facts.items() if v})
+    if not settings.radiometry and any(layer.band.scale_offset != (1.0, 0.0) for layer in layers):
+        dataset.scales, dataset.offsets = zip(*(layer.band.scale_offset for layer in layers), strict=True)
     for index, layer in enumerate(layers, start=1):
         dataset.set_band_description(index, layer.band.name)
         if layer.band.wavelength_nm is not None:

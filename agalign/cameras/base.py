@@ -82,6 +82,8 @@ def band_of(path: Path, info: RasterInfo, name: str, index: int = 1) -> Band:
         has_mask=info.has_mask,
         saturation_value=largest_value(info.dtypes[index - 1]),
         georeference=info.georeference,
+        scale_offset=info.scales_offsets[index - 1] if info.scales_offsets else (1.0, 0.0),
+        overviews=info.overviews,
     )
 
 
