@@ -54,14 +54,13 @@ def write_item(capture: Capture, written: Written, sidecar: Path, picture: Path)
         item.properties["proj:wkt2"] = (
             capture.reference.georeference.crs_wkt if capture.reference.georeference else None
         )
-    for path in dict.fromkeys(path for path, _ in written.places.values()):
-        bands = sorted((i, b) for b, (file, i) in written.places.items() if file == path)
-        by_name = {b.name: b for b in capture.bands}
+    by_name = {b.name: b for b in capture.bands}
+    for path, names in written.contents.items():
         asset = pystac.Asset(
             path.relative_to(sidecar.parent).as_posix(), media_type=pystac.MediaType.GEOTIFF, roles=["data"],
-            extra_fields={"bands": [_band(by_name[name]) for _, name in bands]},
+            extra_fields={"bands": [_band(by_name[name]) for name in names]},
         )  # fmt: skip
-        item.add_asset("stack" if path == written.stack else bands[0][1], asset)
+        item.add_asset("stack" if path == written.stack else path.stem, asset)
     item.add_asset("sidecar", pystac.Asset(sidecar.name, media_type=pystac.MediaType.JSON, roles=["metadata"]))
     if picture.is_file():
         item.add_asset("picture", pystac.Asset(picture.name, media_type=pystac.MediaType.PNG, roles=["thumbnail"]))

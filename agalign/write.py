@@ -62,9 +62,25 @@ class Written:
     grid: Grid
     nodata: float | None
     stack: Path | None
-    band_files: tuple[Path, ...]
-    places: Mapping[str, tuple[Path, int]]
-    """By band: a file that holds it, and its index there, from 1."""
+    contents: Mapping[Path, tuple[str, ...]]
+    """Of every file, the names of its bands in their order."""
+    gaps: frozenset[str]
+    """Bands that are all nodata in the stack."""
+
+    @property
+    def band_files(self) -> list[Path]:
+        """All files but the stack."""
+        return [path for path in self.contents if path != self.stack]
+
+    @property
+    def places(self) -> dict[str, tuple[Path, int]]:
+        """By band that holds something: a file, the stack where there is one, and its index there, from 1."""
+        return {
+            name: (path, index)
+            for path in [*self.band_files, *([self.stack] if self.stack is not None else [])]
+            for index, name in enumerate(self.contents[path], start=1)
+            if name not in self.gaps
+        }
 
 
 def write_capture(
@@ -74,25 +90,24 @@ def write_capture(
 
     Raises OutputError, or UnreadableFileError for an input.
     """
-    places: dict[str, tuple[Path, int]] = {}
-    reference = capture.reference
-    nodata = None
+    contents: dict[Path, tuple[str, ...]] = {}
+    reference, nodata = capture.reference, None
     if settings.layout != "stack":
         names = band_file_names(capture)
         for name in dict.fromkeys(names.values()):
             some = [layer for layer in layers if names[layer.band.name] == name and not layer.is_gap]
             if some:
+                source, path = some[0].band.path, stack.parent / name
                 tags = band_tags(
-                    some[0].band.path, reference.path, grid, _from_source(some[0], grid), radiometry=settings.radiometry
+                    source, reference.path, grid, _from_source(some[0], grid), radiometry=settings.radiometry
                 )
-                path = stack.parent / name
                 nodata = write_raster(capture, some, grid, path, settings, tags)
-                places |= {layer.band.name: (path, i) for i, layer in enumerate(some, start=1)}
-    files = tuple(dict.fromkeys(path for path, _ in places.values()))
+                contents[path] = tuple(layer.band.name for layer in some)
     if settings.layout != "bands":
         nodata = write_raster(capture, layers, grid, stack, settings, capture_tags(reference.path, grid))
-        places |= {layer.band.name: (stack, i) for i, layer in enumerate(layers, start=1) if not layer.is_gap}
-    return Written(stack.parent, grid, nodata, None if settings.layout == "bands" else stack, files, places)
+        contents[stack] = tuple(layer.band.name for layer in layers)
+    gaps = frozenset(layer.band.name for layer in layers if layer.is_gap)
+    return Written(stack.parent, grid, nodata, stack if stack in contents else None, contents, gaps)
 
 
 def band_file_names(capture: Capture) -> dict[str, Path]:
