@@ -128,9 +128,7 @@ def make_flight(
     centre of the top-left pixel is (0, 0). With `relief_m` the ground has terraces of that height and trees as high
     again: the homography then is the plane's below them, and the ties are true. Returns the path of truth.json.
     """
-    rng = np.random.default_rng(rng_seed)
-    poses = [_pose(rng, number) for number in range(captures)]
-    ground = paint_ground(rng, poses, size_px, relief_m)
+    poses, ground, rng = lay_out_flight(captures, size_px, rng_seed, relief_m)
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
     truth: dict[str, Any] = {}
@@ -156,6 +154,15 @@ def make_flight(
     path = folder / "truth.json"
     path.write_text(json.dumps(truth))
     return path
+
+
+def lay_out_flight(
+    captures: int, size_px: tuple[int, int], rng_seed: int = 0, relief_m: float = 0.0
+) -> tuple[list[Pose], Ground, np.random.Generator]:
+    """(poses, ground, generator of the noise that follows) of the flight that `make_flight` writes."""
+    rng = np.random.default_rng(rng_seed)
+    poses = [_pose(rng, number) for number in range(captures)]
+    return poses, paint_ground(rng, poses, size_px, relief_m), rng
 
 
 def true_homography(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
@@ -185,10 +192,8 @@ def _file_name(number: int, band: BandSpec) -> str:
     return f"IMG_{number:04d}_{band.rig_index + 1}.tif"
 
 
-def render(
-    painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], rng: np.random.Generator
-) -> NDArray[np.uint16]:
-    """What one camera records of the ground painted in its band: (height, width) uint16 with vignetting and noise."""
+def view(painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Field:
+    """(height, width) of a painted ground as a band's camera sees it, through its lens, without vignetting or noise."""
     width, height = size_px
 
     def on_map(raw_px: Points) -> Points:
@@ -199,7 +204,17 @@ def render(
         positions = splined(on_map, Tile(0, 0, width, height)).astype(np.float32)
     else:
         positions = on_map(np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)).astype(np.float32)
-    scene = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    seen = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return np.asarray(seen, np.float32)
+
+
+def render(
+    painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], rng: np.random.Generator
+) -> NDArray[np.uint16]:
+    """What one camera records of the ground painted in its band: (height, width) uint16 with vignetting and noise."""
+    width, height = size_px
+    scene = view(painted, ground, band, pose, size_px)
+    y, x = np.arange(height), np.arange(width)
     radius2 = ((x - width / 2) ** 2)[None, :] + ((y - height / 2) ** 2)[:, None]
     vignetting = 1 - _VIGNETTING * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
     signal = np.clip(scene * band.exposure * vignetting, 0, 1)

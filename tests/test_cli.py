@@ -290,3 +290,34 @@ def test_an_interrupted_run_goes_on_where_it_was(flight: Path, tmp_path: Path) -
     assert done.returncode == 0
     assert "IMG_0001: 4 of 4 aligned" in done.stderr
     assert done.stderr.count("kept from an earlier run") == 1
+
+
+def test_indices_of_a_run(aligned: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    out, _ = aligned
+    done = agalign("ndvi", out, "--index", "ndvi,GNDVI")
+    assert done.returncode == 0, done.stderr
+    assert "4 of 4 written" in done.stdout
+    assert "raw numbers, not reflectance" in done.stderr
+    assert len(list(out.rglob("*_gndvi.tif"))) == len(list(out.rglob("*_ndvi.png"))) == 2
+    assert agalign("ndvi", out, "--index", "xyz").returncode == 2
+    assert agalign("ndvi", out, "--index", "savi").returncode == 1
+    assert agalign("ndvi", out / "nowhere").returncode == 1
+
+
+def test_seeds_alone_are_no_alignment(flight: Path, tmp_path: Path) -> None:
+    done = agalign(flight, "-o", tmp_path, "--only-seed", "--bands", "green,red,blue", "--layout", "bands")
+    assert done.returncode == 3, done.stderr
+    data = json.loads((tmp_path / "0000SET" / "000" / "IMG_0001.json").read_text())
+    assert [b["band"] for b in data["bands"]] == ["Blue", "Green", "Red"]
+    assert {b["status"] for b in data["bands"]} == {"reference", "seed_only"}
+    assert data["output"]["file"] is None
+    assert data["bands"][2]["place"] == {"file": "IMG_0001_3.tif", "band_index": 1}
+    assert not (tmp_path / "models").exists()
+    assert (tmp_path / "0000SET" / "000" / "IMG_0001.png").is_file()
+
+
+def test_wrong_words_are_usage_errors(flight: Path, tmp_path: Path) -> None:
+    for options in (("--layout", "pile"), ("--order", "size"), ("--seed", "luck"), ("--compression", "lzma")):
+        done = agalign(flight, "-o", tmp_path, *options)
+        assert done.returncode == 2
+        assert "is not one of" in done.stderr

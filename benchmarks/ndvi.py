@@ -1,0 +1,64 @@
+"""NDVI of the synthetic flight against the reflectance it was painted with, before and after alignment. Prints a table.
+
+python benchmarks/ndvi.py [CAPTURES]
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import rasterio
+
+import agalign
+from agalign import synthetic
+from agalign.cameras.micasense import MicaSense
+from agalign.config import Settings, WriteSettings
+from agalign.index_rasters import write_indices
+from agalign.indices import INDICES, compute
+from agalign.metadata import read_tags
+from agalign.radiometry import calibrated
+from agalign.raster import probe
+from agalign.sidecar import read_sidecar
+
+SIZE_PX = (1280, 960)
+NDVI = INDICES["ndvi"]
+
+
+def main(captures: int) -> None:
+    errors: dict[str, list[np.ndarray]] = {"before": [], "after": []}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, out = Path(temporary) / "flight", Path(temporary) / "aligned"
+        synthetic.make_flight(folder, captures, SIZE_PX)
+        poses, ground, _ = synthetic.lay_out_flight(captures, SIZE_PX)
+        settings = Settings(write=WriteSettings(radiometry=True))
+        agalign.align_folder(folder, out, settings=settings)
+        bands = {b.name: b for b in synthetic.BANDS}
+        reference = synthetic.BANDS[synthetic.REFERENCE]
+        for number, (pose, report) in enumerate(zip(poses, write_indices(out, [NDVI]), strict=True), start=1):
+            painted = [synthetic.reflectance(ground, bands[name]) for name in ("NIR", "Red")]
+            truth = compute(NDVI, [synthetic.view(p, ground, reference, pose, SIZE_PX) for p in painted])
+            before = compute(NDVI, [as_it_lies(folder, number, bands[name]) for name in ("NIR", "Red")])
+            with rasterio.open(report.path) as dataset:
+                after = dataset.read(1)
+            x0, y0, width, height = read_sidecar(report.path.with_name(f"IMG_{number:04d}.json")).output.crop
+            window = np.s_[y0 : y0 + height, x0 : x0 + width]
+            errors["before"].append(np.abs(before[window] - truth[window]))
+            errors["after"].append(np.abs(after - truth[window]))
+    print("| NDVI | median error | mean | 95 % | pixels off by more than 0.1 |\n|---|---|---|---|---|")
+    for name, found in errors.items():
+        all_of = np.concatenate([e[np.isfinite(e)] for e in found])
+        middle, p95 = np.percentile(all_of, (50, 95))
+        print(f"| {name} | {middle:.3f} | {all_of.mean():.3f} | {p95:.3f} | {(all_of > 0.1).mean():.1%} |")
+
+
+def as_it_lies(folder: Path, number: int, spec: synthetic.BandSpec) -> np.ndarray:
+    """Reflectance of a band in its own pixels."""
+    path = folder / "0000SET" / "000" / f"IMG_{number:04d}_{spec.rig_index + 1}.tif"
+    (band,) = MicaSense().bands(path, read_tags(path), probe(path))
+    with rasterio.open(path) as dataset:
+        return calibrated(dataset.read(1), band.radiometry, 0, 0)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)

@@ -1,0 +1,80 @@
+"""How far off the coarse alignments are, per camera: the table of docs/cameras.md.
+
+    python benchmarks/seeds.py DATA
+
+DATA holds captures below flights/ and captures/, with reference ties in ties.json beside them. Without ties the windows
+of the two bands tell what is left, where they can.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from agalign.config import Settings
+from agalign.discover import discover
+from agalign.images import PairImages, read_pairs
+from agalign.mapping import Mapping
+from agalign.records import Capture
+from agalign.residuals import FixedWindows
+from agalign.seed import best_seed, overlay, scored_seeds, single, warped
+
+KINDS = ("identity", "rig", "structure", "chosen")
+
+
+def seeds_of(pair: PairImages) -> dict[str, Mapping]:
+    """Mappings between raw px by each kind of seed, and by the one that a run starts from."""
+    settings = Settings().seed
+    moving = single(pair.moving)
+    lenses = pair.fixed.lens, pair.moving.lens
+    plain = overlay(pair.reference, pair.moving_bands[0])
+    found = {"identity": Mapping(plain)}
+    if "rig" in pair.candidates:
+        found["rig"] = Mapping(pair.candidates["rig"], *lenses)
+    shifted = [s for s in scored_seeds(pair.fixed, moving, "identity", plain, settings) if s.kind == "structure"]
+    if shifted:
+        found["structure"] = Mapping(shifted[0].fixed_to_moving, *lenses)
+    found["chosen"] = Mapping(best_seed(pair.fixed, moving, pair.candidates, settings).fixed_to_moving, *lenses)
+    return found
+
+
+def errors(capture: Capture, ties: dict | None) -> dict[str, list[float]]:
+    """Median error of each pair in px, by kind of seed."""
+    settings = Settings()
+    pairs, _ = read_pairs(capture, settings)
+    windows = FixedWindows(single(pairs[0].fixed), settings.check)
+    found: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    for pair in pairs:
+        known = None if ties is None else ties["bands"].get(pair.moving_bands[0].path.name)
+        if ties is not None and known is None:
+            continue
+        for kind, mapping in seeds_of(pair).items():
+            if known is not None:
+                points = np.array(known["ties"])
+                error = np.linalg.norm(mapping(points[:, :2]) - points[:, 2:], axis=1)
+                found[kind].append(float(np.median(error)))
+            else:
+                there = warped(single(pair.moving), mapping, pair.fixed.size_px)
+                found[kind].append(windows.residuals(there).median_px)
+    return found
+
+
+def main(data: Path) -> None:
+    print("| camera, set | pairs | " + " | ".join(KINDS) + " |\n|---|---|" + "---|" * len(KINDS))
+    for folder in sorted(p for p in [*(data / "flights").iterdir(), *(data / "captures").iterdir()] if p.is_dir()):
+        ties_path = folder / "ties.json"
+        truth = json.loads(ties_path.read_text()) if ties_path.is_file() else None
+        totals: dict[str, list[float]] = {kind: [] for kind in KINDS}
+        for capture in discover(folder).captures:
+            files = {b.path.name for b in capture.bands}
+            ties = next((t for t in truth.values() if t["reference"] in files), None) if truth else None
+            for kind, values in errors(capture, ties).items():
+                totals[kind] += values
+        cells = [f"{np.median(v):.1f} / {max(v):.1f}" if v else "-" for v in totals.values()]
+        name = f"{folder.name}{'' if truth else ', by windows'}"
+        print(f"| {name} | {len(totals['identity'])} | " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
