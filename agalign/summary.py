@@ -10,7 +10,8 @@ from agalign.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar, writ
 
 SUMMARY_COLUMNS = (
     "folder", "capture", "band", "wavelength_nm", "status", "reason", "seed", "retrieval", "corner_std_px",
-    "residual_px", "residual_p95_px", "residual_coverage", "mattes_mi_before", "mattes_mi_after", "nmi_before",
+    "residual_px", "residual_p95_px", "residual_coverage", "local_applied", "local_p95_before_px",
+    "local_p95_after_px", "mattes_mi_before", "mattes_mi_after", "nmi_before",
     "nmi_after", "ncc_before", "ncc_after", "gradient_correlation_before", "gradient_correlation_after",
     "structure_ssim_before", "structure_ssim_after", "seconds",
 )  # fmt: skip
@@ -57,6 +58,10 @@ def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:
     }
     if band.joint is not None:
         row |= {"retrieval": round(band.joint.retrieval, 4), "corner_std_px": round(band.joint.corner_std_px, 4)}
+    if band.local is not None:
+        local = band.local
+        before_px, after_px = _short(local.before_p95_px), _short(local.after_p95_px)
+        row |= {"local_applied": local.applied, "local_p95_before_px": before_px, "local_p95_after_px": after_px}
     if band.metrics is not None:
         before, after = band.metrics.before.model_dump(), band.metrics.after.model_dump()
         row |= {k: _short(after[k]) for k in ("residual_px", "residual_p95_px", "residual_coverage")}

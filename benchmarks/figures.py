@@ -89,7 +89,7 @@ def main(out: Path) -> None:
         fixed, moving, truth = straight_pair(folder)
         drawn = cv2.resize(matches(fixed, moving, truth), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(out / "matches.jpg"), drawn, [cv2.IMWRITE_JPEG_QUALITY, 40])
-        cv2.imwrite(str(out / "aligned.jpg"), before_and_after(folder), [cv2.IMWRITE_JPEG_QUALITY, 80])
+        cv2.imwrite(str(out / "aligned.jpg"), before_and_after(folder), [cv2.IMWRITE_JPEG_QUALITY, 65])
         offsets = np.linspace(-100, 100, 17)
         settings = JointSettings(recipe="paper", paper=PaperRecipe(epochs=2))
         surface = loss_surface(fixed, moving, truth, offsets, settings)

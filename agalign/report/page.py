@@ -70,6 +70,7 @@ def write_report(out: Path) -> Path:
         median_residual_px=median(residuals) if residuals else None,
         worst_residual_px=max(residuals, default=None),
         bands=_by_band(pairs),
+        has_local=any(p.local is not None for p in pairs),
         version=captures[0].sidecar.agalign if captures else "",
     )
     path = out / "index.html"
