@@ -16,7 +16,7 @@ from agalign.records import LocalField, LocalResult, Raster, Residual
 from agalign.residuals import FixedWindows
 from agalign.seed import warped
 
-Shifts = NDArray[np.float64]
+Points = NDArray[np.float64]
 
 
 class LocalRefiner:
@@ -37,13 +37,13 @@ class LocalRefiner:
         first = self._measure(moving, mapping)
         gain = min(
             (_held_out_gain(first, s, self.settings, self.fixed.size_px) for s in self.settings.smoothness),
-            key=lambda g: g.upper_quartile_px,
+            key=lambda g: g.left,
         )
         if gain.sigma < self.settings.least_gain_sigma:
             return LocalResult(None, gain.before_p95_px, gain.after_p95_px)
         for _ in range(self.settings.rounds):
             found = first if field is None else self._measure(moving, replace(mapping, local=field))
-            more = fitted_field(*_measured(found), gain.smoothness, self.settings, self.fixed.size_px)
+            more = fitted_field(Shifts.of(found), gain.smoothness, self.settings, self.fixed.size_px)
             total = more if field is None else field.plus(more)
             if not _is_one_to_one(total, self.fixed.size_px):
                 break
@@ -51,13 +51,36 @@ class LocalRefiner:
         return LocalResult(field, gain.before_p95_px, gain.after_p95_px)
 
     def _measure(self, moving: Raster, mapping: Mapping) -> Residual:
-        return self.windows.residuals(warped(moving, mapping, self.fixed.size_px))
+        return self.windows.residuals(warped(moving, mapping, self.fixed.size_px), least_valid=1.0)
 
 
-def _measured(residual: Residual) -> tuple[Shifts, Shifts]:
-    """(centres, shifts) of the windows in which a shift was found, (n, 2) each."""
-    known = np.isfinite(residual.shifts_px[:, 0])
-    return residual.centres_px[known], residual.shifts_px[known]
+_FAR_PX = 0.1
+_LEAST_TRUST = 0.1
+"""Of windows that are asked what a field explains; parallax within a window lowers its peak too."""
+
+
+@dataclass(frozen=True)
+class Shifts:
+    """The windows in which a shift was found."""
+
+    centres_px: Points
+    shifts_px: Points
+    trust: NDArray[np.float64]
+    """(n,) relative weights, 1 in the median: inverse variances, as the error of a shift falls with the square of how
+    far its peak stands out."""
+
+    @classmethod
+    def of(cls, residual: Residual) -> "Shifts":
+        known = np.isfinite(residual.shifts_px[:, 0])
+        sigma = residual.peaks_sigma[known]
+        trust = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
+        return cls(residual.centres_px[known], residual.shifts_px[known], trust)
+
+    def some(self, which: NDArray[np.bool_]) -> "Shifts":
+        return Shifts(self.centres_px[which], self.shifts_px[which], self.trust[which])
+
+    def __len__(self) -> int:
+        return len(self.centres_px)
 
 
 @dataclass(frozen=True)
@@ -67,66 +90,68 @@ class _Gain:
     smoothness: float
     before_p95_px: float = math.nan
     after_p95_px: float = math.nan
-    upper_quartile_px: float = math.inf
-    """Of what is left: wrong peaks and the edges of trees, which no smooth field follows, have no say in it."""
+    left: float = math.inf
+    """What is left, on a scale on which wrong peaks and the edges of trees, which no smooth field follows, hardly
+    count: mean log(1 + (shift / 0.1 px)^2), weighted by trust."""
     sigma: float = 0.0
     """Mean fall of the squared shifts, in standard errors of that mean."""
 
 
 def _held_out_gain(residual: Residual, smoothness: float, settings: LocalSettings, size_px: tuple[int, int]) -> _Gain:
     """Blocks of windows are left out in turn, so that no window is explained by one that overlaps it."""
-    centres, shifts = _measured(residual)
-    if len(centres) < settings.least_windows:
+    found = Shifts.of(residual)
+    if len(found) < settings.least_windows:
         return _Gain(smoothness)
-    block = np.floor(centres / (2 * settings.window_px)).astype(int)
+    block = np.floor(found.centres_px / (2 * settings.window_px)).astype(int)
     fold = (block[:, 0] + 2 * block[:, 1]) % settings.folds
-    left = np.full(len(centres), np.nan)
+    left = np.full(len(found), np.nan)
     for k in range(settings.folds):
         kept = fold != k
         if kept.sum() >= settings.least_windows // 2 and not kept.all():
-            field = fitted_field(centres[kept], shifts[kept], smoothness, settings, size_px)
-            left[~kept] = np.linalg.norm(shifts[~kept] - field(centres[~kept]), axis=1)
-    tried = np.isfinite(left)
+            field = fitted_field(found.some(kept), smoothness, settings, size_px)
+            out = found.some(~kept)
+            left[~kept] = np.linalg.norm(out.shifts_px - field(out.centres_px), axis=1)
+    # What is measured badly says little of a field.
+    tried = np.isfinite(left) & (found.trust >= _LEAST_TRUST)
     if not tried.any():
         return _Gain(smoothness)
-    before, after = np.linalg.norm(shifts[tried], axis=1), left[tried]
+    before, after = np.linalg.norm(found.shifts_px[tried], axis=1), left[tried]
     # Wrong peaks must not decide: what lies far out counts no more than twice the 95th percentile.
     most = 2 * np.percentile(before, 95)
     fall = np.minimum(before, most) ** 2 - np.minimum(after, most) ** 2
     sigma = fall.mean() / max(fall.std() / math.sqrt(len(fall)), 1e-12)
-    upper_quartile, after_p95 = (float(v) for v in np.percentile(after, (75, 95)))
-    return _Gain(smoothness, float(np.percentile(before, 95)), after_p95, upper_quartile, float(sigma))
+    what_is_left = float(np.average(np.log1p((after / _FAR_PX) ** 2), weights=found.trust[tried]))
+    before_p95, after_p95 = (float(np.percentile(shifts, 95)) for shifts in (before, after))
+    return _Gain(smoothness, before_p95, after_p95, what_is_left, float(sigma))
 
 
-def fitted_field(
-    centres_px: Shifts, shifts_px: Shifts, smoothness: float, settings: LocalSettings, size_px: tuple[int, int]
-) -> LocalField:
-    """The smooth field d through shifts s at centres x (n, 2): on a lattice,
+def fitted_field(found: Shifts, smoothness: float, settings: LocalSettings, size_px: tuple[int, int]) -> LocalField:
+    """The smooth field d through shifts s at centres x: on a lattice,
 
-        min sum_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + pull |d|^2
+        min sum_i t_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + pull |d|^2
 
-    with second differences D2, and Cauchy weights w against windows that found a wrong peak. The pull to nothing is
-    small: it decides where nothing was measured.
+    with trust t, second differences D2, and Cauchy weights w against windows that found a wrong peak. The pull to
+    nothing is small: it decides where nothing was measured.
     """
     step = settings.lattice_px
     columns, rows = (int(np.ceil(n / step)) + 1 for n in size_px)
-    design = _interpolation(centres_px / step, columns, rows)
+    design = _interpolation(found.centres_px / step, columns, rows)
     bend = vstack([
         kron(identity(rows), _second_differences(columns)), kron(_second_differences(rows), identity(columns)),
     ])  # fmt: skip
     penalty = smoothness * (bend.T @ bend) + settings.pull * identity(rows * columns)
-    weight = np.ones(len(centres_px))
-    found = np.zeros((rows * columns, 2))
+    weight = np.ones(len(found))
+    nodes = np.zeros((rows * columns, 2))
     for _ in range(settings.reweightings):
-        weighted = design.T @ diags(weight)
-        found = splu((weighted @ design + penalty).tocsc()).solve(weighted @ shifts_px)
-        off = np.linalg.norm(shifts_px - design @ found, axis=1)
+        weighted = design.T @ diags(found.trust * weight)
+        nodes = splu((weighted @ design + penalty).tocsc()).solve(weighted @ found.shifts_px)
+        off = np.linalg.norm(found.shifts_px - design @ nodes, axis=1)
         spread = max(1.4826 * float(np.median(off)), settings.least_spread_px)
         weight = 1 / (1 + (off / (settings.outlier_spreads * spread)) ** 2)
-    return LocalField(float(step), found.reshape(rows, columns, 2))
+    return LocalField(float(step), nodes.reshape(rows, columns, 2))
 
 
-def _interpolation(at: Shifts, columns: int, rows: int) -> csr_matrix:
+def _interpolation(at: Points, columns: int, rows: int) -> csr_matrix:
     """(n, rows columns): bilinear weights of the lattice's nodes at points in its steps."""
     cell = np.clip(np.floor(at).astype(int), 0, (columns - 2, rows - 2))
     part = at - cell

@@ -267,6 +267,9 @@ class Residual:
     p95_px: float
     coverage: float
     """Share of the tiles with enough structure in which a shift could be measured."""
+    peaks_sigma: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    """(n,) how far each tile's correlation peak stands out, in standard deviations: the error of a shift falls with its
+    square."""
 
 
 @dataclass(frozen=True)

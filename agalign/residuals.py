@@ -27,18 +27,23 @@ class FixedWindows:
         self.origins = [o for o, s in zip(origins, strengths, strict=False) if s >= settings.least_strength]
         self.spectra = windowed_spectra(self._windows(field, self.origins))
 
-    def residuals(self, moving: Raster) -> Residual:
-        """The shift of each window's content; a window counts as measured where its peak stands out."""
+    def residuals(self, moving: Raster, least_valid: float = 0.9) -> Residual:
+        """The shift of each window's content; a window counts as measured where its peak stands out.
+
+        It is looked at where this share of it is valid in both. What is not valid holds no structure, but its outline
+        pulls at the shift: by some tenths of a px in windows of 64 px of which a twentieth is missing.
+        """
         both = self.valid & moving.valid
         field = structure_field(moving, self.settings.smoothing_px)
         tried = [
             i for i, o in enumerate(self.origins)
-            if self._cut(both, o).mean() > 0.9 and _strength(self._cut(field, o)) >= self.settings.least_strength
+            if self._cut(both, o).mean() >= least_valid
+            and _strength(self._cut(field, o)) >= self.settings.least_strength
         ]  # fmt: skip
         origins = [self.origins[i] for i in tried]
         surfaces = correlation_surfaces(self.spectra[tried], windowed_spectra(self._windows(field, origins)))
-        shifts = [_shift_at_peak(surface, self.settings) for surface in surfaces]
-        found = np.array(shifts, dtype=np.float64).reshape(-1, 2)
+        peaks = np.array([_peak(surface, self.settings) for surface in surfaces], dtype=np.float64).reshape(-1, 3)
+        found = peaks[:, :2]
         measured = np.isfinite(found[:, 0])
         length = np.linalg.norm(found[measured], axis=1)
         some = bool(measured.any())
@@ -48,6 +53,7 @@ class FixedWindows:
             median_px=float(np.median(length)) if some else float("inf"),
             p95_px=float(np.percentile(length, 95)) if some else float("inf"),
             coverage=float(measured.mean()) if tried else 0.0,
+            peaks_sigma=peaks[:, 2],
         )
 
     def _cut(self, image: NDArray[Any], origin: tuple[int, int]) -> NDArray[Any]:
@@ -74,21 +80,22 @@ def _starts(length: int, side: int, step: int | None) -> list[int]:
     return [round(v) for v in np.linspace(0, max(0, length - side), count)]
 
 
-def _shift_at_peak(surface: NDArray[np.float32], settings: CheckSettings) -> tuple[float, float]:
-    """The shift that a correlation surface shows; nan, nan where no peak stands out."""
+def _peak(surface: NDArray[np.float32], settings: CheckSettings) -> tuple[float, float, float]:
+    """(x, y, height in standard deviations) of a correlation surface's peak; x and y nan where none stands out."""
     height, width = surface.shape
     row, column = divmod(int(surface.argmax()), width)
     # Its mean is 0: the windows have none.
     spread = math.sqrt(float(np.vdot(surface, surface)) / surface.size)
-    if spread <= 0 or surface[row, column] < settings.least_peak_sigma * spread:
-        return math.nan, math.nan
+    sigma = float(surface[row, column]) / spread if spread > 0 else 0.0
+    if sigma < settings.least_peak_sigma:
+        return math.nan, math.nan, sigma
     patch = np.take(
         np.take(surface, range(row - 1, row + 2), 0, mode="wrap"), range(column - 1, column + 2), 1, mode="wrap"
     )
     dx, dy = _paraboloid_top(patch)
     x = (column + width // 2) % width - width // 2 + dx
     y = (row + height // 2) % height - height // 2 + dy
-    return float(x), float(y)
+    return float(x), float(y), sigma
 
 
 def _paraboloid_top(patch: NDArray[np.float32]) -> tuple[float, float]:

@@ -31,8 +31,8 @@ _FOCAL_LENGTH_MM = 5.45
 _BLACK_LEVEL = 4800.0
 _WHITE_LEVEL = 52000.0
 _TIES, _TIES_OVER_RELIEF = (25, 19), (65, 49)
-_TERRACE_M = 5.0
-_RAY_STEPS = 12
+_TERRACE_M = 8.0
+_RAY_STEPS = 40
 """A ray falls on relief by repeated intersection with the height below its last place."""
 _VIGNETTING = 0.35
 """What the corners lack of the middle's light."""
@@ -125,8 +125,8 @@ def make_flight(
 
     The truth is {capture: {"reference": file, "bands": {file: {"fixed_to_moving": [[...]], "ties": [[x_ref, y_ref,
     x_mov, y_mov], ...]}}}}: the homography between undistorted pixels, and ties in raw pixels, exact to 0.001 px; the
-    centre of the top-left pixel is (0, 0). With `relief_m` the ground has terraces of that height and trees as high
-    again: the homography then is the plane's below them, and the ties are true. Returns the path of truth.json.
+    centre of the top-left pixel is (0, 0). With `relief_m` the ground has terraces of that height and trees half as
+    high: the homography then is the plane's below them, and the ties are true. Returns the path of truth.json.
     """
     poses, ground, rng = lay_out_flight(captures, size_px, rng_seed, relief_m)
     images = folder / "0000SET" / "000"
@@ -276,14 +276,17 @@ def paint_ground(
 
 
 def _relief(rng: np.random.Generator, tree: Field, metre: float, relief_m: float) -> Field:
-    """Metres above the plane: three levels with slopes between them, and round trees upon them."""
+    """Metres above the plane: three levels with slopes between them, and round trees upon them.
+
+    No slope is so steep that a camera could not see it: where one hides another there is nothing to align.
+    """
     angle = rng.uniform(0, np.pi)
     axis = np.arange(len(tree)) / (_TERRACE_M * metre)
     along = np.cos(angle) * axis[None, :] + np.sin(angle) * axis[:, None]
-    slope = np.clip((along % 1 - 0.7) / 0.3, 0, 1)
+    slope = np.clip((along % 1 - 0.4) / 0.6, 0, 1)
     level = np.floor(along) + slope * slope * (3 - 2 * slope)
-    crowns = cv2.GaussianBlur(tree, (0, 0), 0.2 * metre)
-    return np.asarray(relief_m * (np.abs(level % 4 - 2) + crowns), np.float32)
+    crowns = cv2.GaussianBlur(tree, (0, 0), 0.4 * metre)
+    return np.asarray(relief_m * (np.abs(level % 4 - 2) + 0.5 * crowns), np.float32)
 
 
 def _parcels(rng: np.random.Generator, side: int, count: int) -> tuple[NDArray[np.int64], Field]:

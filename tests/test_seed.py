@@ -3,6 +3,7 @@ import pytest
 
 from agalign import geometry
 from agalign.config import SeedSettings
+from agalign.errors import GeometryError
 from agalign.mapping import Mapping
 from agalign.records import Band, Georeference, Raster
 from agalign.seed import best_seed, geo_seed, is_trusted, overlay, warped
@@ -71,8 +72,9 @@ def test_geo_seed_maps_the_same_ground_to_the_same_ground() -> None:
     seed = geo_seed(band(100, 100, moved[0]), band(50, 50, moved[1]))
     assert seed is not None
     np.testing.assert_allclose(geometry.apply(seed, [20, 20]), [4.75, 4.75], atol=1e-6)
-    other = Georeference(coarse.transform, "another crs")
-    assert geo_seed(band(100, 100, fine), band(50, 50, other)) is None
+    other = Georeference(coarse.transform, "no crs at all")
+    with pytest.raises(GeometryError, match="cannot be transformed"):
+        geo_seed(band(100, 100, fine), band(50, 50, other))
 
 
 def test_overlay_matches_the_outlines() -> None:

@@ -1,6 +1,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +16,8 @@ def test_the_truth_follows_from_rays_and_the_plane() -> None:
     size = (1280, 960)
     reference, band = synthetic.BANDS[synthetic.REFERENCE], synthetic.BANDS[3]
     attitude = synthetic._rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
-    ties = np.array(synthetic.true_ties(reference, band, pose, size))
+    ground = synthetic.paint_ground(np.random.default_rng(0), [pose], (320, 240))
+    ties = np.array(synthetic.true_ties(ground, reference, band, pose, size))
     for x_ref, y_ref, x_mov, y_mov in ties[::37]:
         u, v = lens.undistort(reference.lens(*size), (x_ref, y_ref))
         model = reference.lens(*size)
@@ -25,9 +27,9 @@ def test_the_truth_follows_from_rays_and_the_plane() -> None:
             @ [(u - model.cx_px) / model.fx_px, (v - model.cy_px) / model.fy_px, 1]
         )
         place = attitude @ [*reference.baseline_m, 0] + [pose.east_m, pose.north_m, -pose.altitude_m]
-        ground = place - ray * place[2] / ray[2]
+        below = place - ray * place[2] / ray[2]
         other = attitude @ [*band.baseline_m, 0] + [pose.east_m, pose.north_m, -pose.altitude_m]
-        seen = (attitude @ synthetic._rotation(*band.rig_degrees)).T @ (ground - other)
+        seen = (attitude @ synthetic._rotation(*band.rig_degrees)).T @ (below - other)
         model = band.lens(*size)
         straight = (seen[0] / seen[2] * model.fx_px + model.cx_px, seen[1] / seen[2] * model.fy_px + model.cy_px)
         np.testing.assert_allclose(lens.distort(model, straight), (x_mov, y_mov), atol=2e-3)
@@ -89,3 +91,24 @@ def test_bands_are_well_exposed(flight: Path, band: synthetic.BandSpec) -> None:
     raster = read_for_alignment(found, 4096)
     assert raster.valid.mean() > 0.95
     assert raster.pixels[raster.valid].std() > 1000
+
+
+def test_relief_moves_what_stands_up(tmp_path: Path) -> None:
+    truths = {}
+    for relief_m in (0.0, 3.0):
+        path = synthetic.make_flight(tmp_path / str(relief_m), 1, (320, 240), rng_seed=2, relief_m=relief_m)
+        bands = json.loads(path.read_text())["IMG_0001"]["bands"]
+        truths[relief_m] = {(x, y): (u, v) for x, y, u, v in bands["IMG_0001_4.tif"]["ties"]}
+    capture = discover(tmp_path / "3.0").captures[0]
+    assert capture.reference.name == "Green"
+    # Ties over relief lie on no plane: the nearest homography leaves some of what the heights do.
+    points = np.array([[*k, *v] for k, v in truths[3.0].items()])
+    flat = np.array([[*k, *v] for k, v in truths[0.0].items()])
+    left = {}
+    for name, ties in (("relief", points), ("plane", flat)):
+        spec = [synthetic.BANDS[i].lens(320, 240) for i in (synthetic.REFERENCE, 3)]
+        here, there = lens.undistort(spec[0], ties[:, :2]), lens.undistort(spec[1], ties[:, 2:])
+        fitted, _ = cv2.findHomography(here, there, 0)
+        left[name] = np.linalg.norm(geometry.apply(fitted, here) - there, axis=1)
+    assert left["plane"].max() < 1e-3
+    assert 0.02 < np.median(left["relief"]) < 0.5
