@@ -1,5 +1,6 @@
 """Many captures: which are still to be done, each one done, one summary."""
 
+import logging
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +21,8 @@ from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
+
+import numpy as np
 
 from agalign.choices import Layout
 from agalign.config import Settings
@@ -43,6 +46,7 @@ from agalign.records import Capture
 from agalign.sidecar import Sidecar, read_sidecar
 from agalign.write import band_file_names
 
+_LOG = logging.getLogger(__name__)
 _MOST_READ_AHEAD_BYTES = 64 << 20
 _DASK_ANSWERS_WITHIN_S = 10
 _MOST_HANDED_OVER = 1000
@@ -190,6 +194,11 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
             outcome = process_capture(task.capture, task.out, task.settings, on_pair, model)
     except AgalignError as error:
         return CaptureReport(label, "error", None, str(error))
+    except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, np.linalg.LinAlgError) as error:
+        # A fault of this program: it must not cost the captures that follow.
+        problem = f"{label}: agalign failed on it ({type(error).__name__}: {error}); please report this"
+        _LOG.debug(problem, exc_info=True)
+        return CaptureReport(label, "error", None, problem)
     return CaptureReport(label, "done", outcome.sidecar)
 
 
@@ -329,6 +338,8 @@ def _loaded(path: Path, device: str, _stamp: int) -> FlightModel:
 
 
 def _refuse_to_overwrite_inputs(flight: Flight, out: Path, layout: Layout) -> None:
+    if out.resolve() == flight.folder.resolve():
+        raise ConfigurationError(f"{out}: is the folder of the images; choose another output folder with -o")
     sources = {band.path.resolve() for capture in flight.captures for band in capture.bands}
     for capture in flight.captures:
         stack, _ = output_paths(capture, out)

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from agalign.errors import UnreadableFileError
 from agalign.metadata import Tags, read_tags
-from agalign.records import Grid
-from agalign.tiff_directory import EXIF, GPS, XMP, Directory, byte_string, long, rational, read_directories
+from agalign.records import Band, Grid
+from agalign.tiff_directory import EXIF, GPS, XMP, Directory, byte_string, long, number, rational, read_directories
 from agalign.xmp import Name, Packet
 
 _ORIENTATION, _UPSIDE_DOWN = 274, 3
@@ -33,6 +33,9 @@ _PRINCIPAL_POINT: Name = ("Camera", "PrincipalPoint")
 _FOCAL_LENGTH: Name = ("Camera", "PerspectiveFocalLength")
 _DISTORTION: Name = ("Camera", "PerspectiveDistortion")
 _AFFINE: Name = ("Camera", "FisheyeAffineMatrix")
+_FOCAL_LENGTH_UNITS: Name = ("Camera", "PerspectiveFocalLengthUnits")
+_MODEL_TYPE: Name = ("Camera", "ModelType")
+_FISHEYE: tuple[Name, ...] = (("Camera", "FisheyePolynomial"), _AFFINE, ("Camera", "FisheyeAffineSymmetric"))
 _DEWARP: Name = ("drone-dji", "DewarpData")
 _CENTRE: tuple[Name, Name] = (("drone-dji", "CalibratedOpticalCenterX"), ("drone-dji", "CalibratedOpticalCenterY"))
 _IN_PX: tuple[Name, ...] = (
@@ -40,18 +43,19 @@ _IN_PX: tuple[Name, ...] = (
     ("drone-dji", "RelativeOpticalCenterY"), _AFFINE,
 )  # fmt: skip
 _GEOMETRY: frozenset[Name] = frozenset({
-    _PRINCIPAL_POINT, _FOCAL_LENGTH, ("Camera", "PerspectiveFocalLengthUnits"), _DISTORTION, ("Camera", "ModelType"),
-    ("Camera", "FisheyePolynomial"), _AFFINE, ("Camera", "FisheyeAffineSymmetric"), ("Camera", "RigRelatives"),
-    ("Camera", "RigTranslations"), ("Camera", "RigRelativesReferenceRigCameraIndex"), *_CENTRE, _DEWARP, *_IN_PX,
-    ("drone-dji", "DewarpFlag"), ("drone-dji", "DewarpHMatrix"), ("drone-dji", "CalibratedHMatrix"),
+    _PRINCIPAL_POINT, _FOCAL_LENGTH, _FOCAL_LENGTH_UNITS, _DISTORTION, _MODEL_TYPE, *_FISHEYE,
+    ("Camera", "RigRelatives"), ("Camera", "RigTranslations"), ("Camera", "RigRelativesReferenceRigCameraIndex"),
+    *_CENTRE, _DEWARP, *_IN_PX, ("drone-dji", "DewarpFlag"), ("drone-dji", "DewarpHMatrix"),
+    ("drone-dji", "CalibratedHMatrix"),
 })  # fmt: skip
 _OF_THE_SENSOR: frozenset[Name] = frozenset({
     ("Camera", "InvalidPixel"), ("Camera", "VignettingPolynomial2D"), ("Camera", "VignettingPolynomial2DName"),
+    ("drone-dji", "VignettingData"),
 })  # fmt: skip
 """True of the sensor's own pixels only."""
 _VIGNETTING_CENTRE: Name = ("Camera", "VignettingCenter")
 _VIGNETTING_POLYNOMIAL: Name = ("Camera", "VignettingPolynomial")
-_VIGNETTING: frozenset[Name] = frozenset({_VIGNETTING_CENTRE, _VIGNETTING_POLYNOMIAL, ("drone-dji", "VignettingData")})
+_VIGNETTING: frozenset[Name] = frozenset({_VIGNETTING_CENTRE, _VIGNETTING_POLYNOMIAL})
 _RADIOMETRY: frozenset[Name] = _VIGNETTING | {
     ("Camera", "BlackCurrent"), ("drone-dji", "BlackLevel"), ("MicaSense", "RadiometricCalibration"),
     ("MicaSense", "DarkRowValue"),
@@ -70,32 +74,31 @@ class CarriedTags:
 
 
 FromSource = Callable[[float, float], tuple[float, float]]
-"""Where a pixel of the band's own file lies in the reference's pixels."""
+"""Where a pixel of the band's own file lies in the reference's pixels; nan where that cannot be told."""
 
 
-def capture_tags(reference: Path, grid: Grid) -> CarriedTags:
+def capture_tags(reference: Band, grid: Grid) -> CarriedTags:
     """For a stack: what is true of all bands of a capture."""
-    source = _directories(reference)
+    source = _directories(reference.path)
     first = _some(source[0], _OF_THE_CAPTURE | {_ORIENTATION})
     return CarriedTags(first, _on_grid(_some(source[EXIF], _EXIF_OF_THE_CAPTURE), source[EXIF], grid), source[GPS])
 
 
 def band_tags(
-    source: Path, reference: Path, grid: Grid, from_source: FromSource, *, radiometry: bool = False
+    source: Path, reference: Band, grid: Grid, from_source: FromSource, *, radiometry: bool = False
 ) -> CarriedTags:
     """For a file whose aligned bands came from `source`.
 
     With `radiometry` black level, vignetting and exposure have been taken out of the pixels.
     """
-    own, theirs = _directories(source), _directories(reference)
+    own, theirs = _directories(source), _directories(reference.path)
     first = _some(own[0], _OF_THE_FILE - _BLACK_LEVEL if radiometry else _OF_THE_FILE)
     first |= _some(theirs[0], {_ORIENTATION})
     exif = {tag: entry for tag, entry in own[EXIF].items() if tag not in _NOT_CARRIED | _GEOMETRIC_EXIF}
     packet = Packet.parse(own[0][XMP].data if XMP in own[0] else b"")
     with suppress(UnreadableFileError):
-        _put_geometry(
-            packet, Packet.parse(theirs[0][XMP].data if XMP in theirs[0] else b""), read_tags(reference), grid
-        )
+        theirs_packet = Packet.parse(theirs[0][XMP].data if XMP in theirs[0] else b"")
+        _put_geometry(packet, theirs_packet, reference, grid)
         _put_vignetting(packet, read_tags(source), grid, from_source, radiometry=radiometry)
         if serialised := packet.serialised():
             first[XMP] = byte_string(serialised)
@@ -116,23 +119,27 @@ def _some(directory: Directory, tags: Iterable[int]) -> Directory:
 def _on_grid(exif: Directory, reference: Directory, grid: Grid) -> Directory:
     """With the reference's focal length and pixel density, and the size that is written."""
     found = exif | _some(reference, _GEOMETRIC_EXIF)
-    for tag in _DENSITIES & found.keys():
-        numerator, denominator = struct.unpack("<II", found[tag].data[:8]) if found[tag].type == 5 else (0, 0)
-        if grid.scale != 1 and denominator:
-            found[tag] = rational(grid.scale * numerator / denominator)
+    for tag in _DENSITIES & found.keys() if grid.scale != 1 else ():
+        density = number(found[tag])
+        if density is not None and density > 0:
+            found[tag] = rational(grid.scale * density)
     sizes = zip(_EXIF_SIZES, (grid.width, grid.height), strict=True)
     return found | {tag: long(size) for tag, size in sizes if tag in found}
 
 
-def _put_geometry(packet: Packet, reference: Packet, tags: Tags, grid: Grid) -> None:
-    packet.take(reference, _GEOMETRY)
+def _put_geometry(packet: Packet, theirs: Packet, reference: Band, grid: Grid) -> None:
+    tags = read_tags(reference.path)
+    packet.take(theirs, _GEOMETRY)
     packet.remove(_OF_THE_SENSOR)
     density, point = tags.pixels_per_mm, tags.numbers(*_PRINCIPAL_POINT)
     if density and len(point) == 2:
-        x, y = _upright(tags, (point[0] * density, point[1] * density), None)
-        written = _upright(tags, grid.px(x, y), grid)
+        turned = tags.orientation == _UPSIDE_DOWN
+        x, y = (v * density for v in point)
+        stored = (reference.width_px - x, reference.height_px - y) if turned else (x, y)
+        x, y = grid.px(*stored)
+        written = (grid.width - x, grid.height - y) if turned else (x, y)
         packet.put(_PRINCIPAL_POINT, [_number(v / (density * grid.scale)) for v in written])
-    if "px" in tags.text("Camera", "PerspectiveFocalLengthUnits").lower():
+    if tags.focal_length_is_in_px:
         _scale(packet, tags, _FOCAL_LENGTH, grid.scale)
     for name in _IN_PX:
         _scale(packet, tags, name, grid.scale)
@@ -147,17 +154,12 @@ def _put_geometry(packet: Packet, reference: Packet, tags: Tags, grid: Grid) -> 
         packet.put(_DEWARP, [f"{date};" + ",".join(map(_number, terms))])
     if grid.undistorted:
         packet.put(_DISTORTION, ["0"] * len(tags.numbers(*_DISTORTION)))
-
-
-def _upright(tags: Tags, at: tuple[float, float], grid: Grid | None) -> tuple[float, float]:
-    """Between a position in the stored image and in the one that its Orientation makes, counted from outer edges.
-
-    `grid` is None for the reference's file, whose size then is its tags'.
-    """
-    if tags.orientation != _UPSIDE_DOWN:
-        return at
-    size = tags.size_px if grid is None else (grid.width, grid.height)
-    return size[0] - at[0], size[1] - at[1]
+        if tags.numbers(*_AFFINE) and density and reference.lens is not None:
+            # What was a fisheye is a pinhole now.
+            packet.remove(_FISHEYE)
+            packet.put(_MODEL_TYPE, ["perspective"])
+            packet.add(_FOCAL_LENGTH, _number(reference.lens.fx_px / density))
+            packet.add(_FOCAL_LENGTH_UNITS, "mm")
 
 
 def _put_vignetting(packet: Packet, tags: Tags, grid: Grid, from_source: FromSource, *, radiometry: bool) -> None:
@@ -170,6 +172,7 @@ def _put_vignetting(packet: Packet, tags: Tags, grid: Grid, from_source: FromSou
         return
     here, beside = from_source(*centre), from_source(centre[0] + 1, centre[1])
     magnification = math.dist(here, beside)
+    # Written so that nan passes nowhere.
     if not 1 / _MOST_MAGNIFICATION < magnification < _MOST_MAGNIFICATION:
         packet.remove(_VIGNETTING)
         return

@@ -196,13 +196,10 @@ _COMMANDS = {command.name or getattr(command.callback, "__name__", "") for comma
 
 def _facts(capture: "Capture") -> dict[str, Any]:
     """What `info` shows of a capture."""
-    from agalign.cameras import rig_seed
-    from agalign.seed import geo_seed
+    from agalign.config import SeedSettings
+    from agalign.seed import seed_candidates
 
-    kinds = {
-        "rig": any(rig_seed(capture.reference, b) is not None for b in capture.moving),
-        "geo": any(geo_seed(capture.reference, b) is not None for b in capture.moving),
-    }
+    offered = {kind for b in capture.moving for kind in seed_candidates(capture.reference, b, SeedSettings())}
     bands = [
         {
             "name": b.name, "file": str(b.path), "band_index": b.band_index, "wavelength_nm": b.wavelength_nm,
@@ -219,7 +216,7 @@ def _facts(capture: "Capture") -> dict[str, Any]:
         "capture_id": capture.capture_id,
         "flight_id": capture.flight_id,
         "bands": bands,
-        "seeds": [kind for kind, there in kinds.items() if there] + ["structure", "identity"],
+        "seeds": [kind for kind in ("rig", "geo") if kind in offered] + ["structure", "identity"],
         "missing_bands": list(capture.missing_bands),
     }
 

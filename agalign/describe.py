@@ -109,7 +109,7 @@ def _output_part(written: Written) -> OutputPart:
             for path in written.band_files
         ],
         crop=(grid.x0, grid.y0, grid.width, grid.height),
-        scale=grid.scale,
+        scale=grid.scale_xy,
         nodata=nodata,
     )
 

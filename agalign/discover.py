@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from agalign.cameras import Camera, default_reference, known_cameras
 from agalign.choices import BandOrder
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.metadata import CAPTURE_IDS, FLIGHT_IDS, Tags, read_tags
-from agalign.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, probe
+from agalign.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, RasterInfo, probe
 from agalign.records import Band, CameraIdentity, Capture
 
 
@@ -69,7 +69,8 @@ def discover(
 ) -> Flight:
     """All captures below `folder`, sorted by folder and name. `progress` gets (files done, files in all).
 
-    Raises InputError where the folder does not exist or holds no TIFF.
+    Raises InputError where the folder does not exist or holds no image, ConfigurationError for a band that no capture
+    has.
     """
     options = options or DiscoverOptions()
     if not folder.is_dir():
@@ -99,6 +100,10 @@ def discover(
             problems.append(found)
         else:
             captures.append(found)
+    known = {b.name.lower() for file in files for b in file.bands}
+    unknown = [name for name in options.bands if name.lower() not in known]
+    if unknown and files:
+        raise ConfigurationError(f"{folder}: no capture has a band {' or '.join(map(repr, unknown))}, as --bands asks")
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = _with_missing_bands(_with_unique_names(captures))
     return Flight(folder, tuple(captures), tuple(problems))
@@ -132,9 +137,16 @@ def _is_output(folder: Path) -> bool:
 def _examine(path: Path, cameras: Iterable[Camera], *, with_rgb: bool) -> _File:
     info = probe(path)
     tags = read_tags(path)
-    camera = next(c for c in cameras if c.recognises(tags))
+    # Cameras write one band a file, or photographs: a stack is someone's product, whatever make it carries on.
+    *_, generic = cameras
+    camera = generic if _is_stack(path, info) else next(c for c in cameras if c.recognises(tags))
     bands = camera.bands(path, tags, info)
     return _File(path, camera, tags, tuple(b for b in bands if with_rgb or not b.companion))
+
+
+def _is_stack(path: Path, info: RasterInfo) -> bool:
+    photograph = info.dtypes[0] == "uint8" and len(info.dtypes) in (3, 4)
+    return path.suffix.lower() in TIFF_SUFFIXES and len(info.dtypes) > 1 and not photograph
 
 
 def _is_whole(file: _File) -> bool:
@@ -190,7 +202,7 @@ def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capt
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
     return Capture(
         name=first.path.stem if len(files) == 1 else first.camera.capture_name(first.path),
-        folder=first.camera.capture_folder(first.path).relative_to(folder),
+        folder=_below(folder, first.camera.capture_folder(first.path)),
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),
         camera=CameraIdentity(tags.make, tags.model, "+".join(serials)),
@@ -208,6 +220,11 @@ def _reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> i
         if band.name.lower() == wanted.lower():
             return index
     raise ConfigurationError(f"{path}: no band '{wanted}' for the reference; this capture has {_names(bands)}")
+
+
+def _below(folder: Path, of_capture: Path) -> Path:
+    """Relative to the input folder, and never above it: bands whose folders lie beside each other may be the input."""
+    return of_capture.relative_to(folder) if of_capture.is_relative_to(folder) else Path()
 
 
 def _names(bands: Sequence[Band]) -> str:
@@ -231,12 +248,15 @@ def _with_unique_band_names(bands: Sequence[Band]) -> list[Band]:
 
 def _with_unique_names(captures: Sequence[Capture]) -> list[Capture]:
     """Two captures of one folder must not write the same file: the later one gets a number."""
-    seen: dict[str, int] = defaultdict(int)
+    taken: set[str] = set()
     unique = []
     for capture in captures:
-        seen[capture.label.lower()] += 1
-        count = seen[capture.label.lower()]
-        unique.append(capture if count == 1 else replace(capture, name=f"{capture.name}-{count}"))
+        count, given = 1, capture
+        while given.label.lower() in taken:
+            count += 1
+            given = replace(capture, name=f"{capture.name}-{count}")
+        taken.add(given.label.lower())
+        unique.append(given)
     return unique
 
 
@@ -249,13 +269,18 @@ def _with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
         camera = capture.camera
         return (camera.make, camera.model) if camera.model else (capture.folder.as_posix(),)
 
-    usual: dict[tuple[str, ...], dict[str, None]] = defaultdict(dict)
-    separate = [c for c in captures if len({b.path for b in c.bands}) > 1]
-    for capture in separate:
-        usual[family(capture)].update(dict.fromkeys(b.name for b in capture.bands))
+    separate = {c.label for c in captures if len({b.path for b in c.bands}) > 1}
+    members: Counter[tuple[str, ...]] = Counter()
+    seen: dict[tuple[str, ...], Counter[str]] = defaultdict(Counter)
+    for capture in captures:
+        if capture.label in separate:
+            members[family(capture)] += 1
+            seen[family(capture)].update(b.name for b in capture.bands)
+    # A band that most captures do not have is a name that damaged tags have made up.
+    usual = {f: [n for n, count in names.items() if 2 * count >= members[f]] for f, names in seen.items()}
     complete = []
     for capture in captures:
         known = {b.name for b in capture.bands}
-        missing = tuple(n for n in usual[family(capture)] if n not in known) if capture in separate else ()
+        missing = tuple(n for n in usual[family(capture)] if n not in known) if capture.label in separate else ()
         complete.append(replace(capture, missing_bands=missing) if missing else capture)
     return complete

@@ -12,15 +12,18 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+import tifffile
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window
 
 from agalign.errors import AgalignError, InputError, OutputError
 from agalign.indices import Index, bands_for, compute
+from agalign.picture import write_png
 from agalign.raster import open_raster
 from agalign.records import FloatImage
 from agalign.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
+from agalign.write import verify
 
 _TILE_PX = 256
 _WORK_PX = 2048
@@ -29,6 +32,10 @@ _PICTURE_PX = 720
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Water, soil, and the greens, red green blue, over an index's span."""
 _NODATA_COLOUR = (225, 225, 225)
+_RAW = "raw numbers"
+
+Source = tuple[rasterio.DatasetReader, int]
+"""A file and the index of a band in it."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +75,10 @@ def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> 
 
     Raises InputError where a band is missing, not aligned, or not in the unit that the index needs; OutputError.
     """
-    parts = [part for part in sidecar.bands if part.place is not None]
+    parts = sidecar.bands
     chosen = [parts[i] for i in bands_for(index, [p.band for p in parts], [p.wavelength_nm for p in parts])]
     for part in chosen:
-        if part.status not in ("reference", "aligned"):
+        if part.status not in ("reference", "aligned") or part.place is None:
             raise InputError(f"{index.name} is left out: {part.band} is {part.status} ({part.reason})")
     target = path.with_name(f"{path.stem}_{index.name}.tif")
     partial = target.with_name(f".{target.name}.{os.getpid()}.part")
@@ -79,18 +86,10 @@ def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> 
     try:
         with ExitStack() as stack:
             sources = [_open(stack, path, part) for part in chosen]
-            raw = any(_is_raw(source, i) for source, i in sources)
-            if raw and not index.any_unit:
-                raise InputError(
-                    f"{index.name} needs reflectance, and the bands are raw numbers; align with --radiometry"
-                )
-            dataset = _create(stack, partial, sources[0][0], index, raw=raw)
-            for window in _windows(dataset.width, dataset.height):
-                value = compute(index, [_physical(source, i, window) for source, i in sources])
-                counts += np.histogram(value[np.isfinite(value)].clip(*index.span), edges)[0]
-                dataset.write(value, 1, window=window)
+            unit = _unit(index, sources)
+            _write_values(partial, target, index, sources, unit, counts, edges)
         partial.replace(target)
-    except (OSError, RasterioError) as error:
+    except OSError as error:
         raise OutputError(f"{target}: cannot be written ({error})") from None
     finally:
         with suppress(OSError):
@@ -98,18 +97,49 @@ def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> 
     _write_picture(target, index, counts)
     middle = np.searchsorted(np.cumsum(counts), counts.sum() / 2)
     median = float(edges[middle : middle + 2].mean()) if counts.any() else math.nan
-    return IndexReport(label, index.name, target, median, raw)
+    return IndexReport(label, index.name, target, median, unit == _RAW)
 
 
-def _open(stack: ExitStack, sidecar: Path, part: BandPart) -> tuple[rasterio.DatasetReader, int]:
+def _open(stack: ExitStack, sidecar: Path, part: BandPart) -> Source:
     assert part.place is not None
     return stack.enter_context(open_raster(sidecar.parent / part.place.file)), part.place.band_index
 
 
-def _is_raw(source: rasterio.DatasetReader, index: int) -> bool:
-    """Whole numbers without a scale, and no word of radiometry."""
+def _unit(index: Index, sources: Sequence[Source]) -> str:
+    """What the bands' numbers are. Raises InputError where the index needs something else."""
+    units = {unit for source, i in sources for unit in _units_of(source, i)}
+    if len(units) > 1:
+        raise InputError(f"{index.name} is left out: its bands are in different units ({', '.join(sorted(units))})")
+    (unit,) = units
+    if not index.any_unit and unit != "reflectance":
+        raise InputError(f"{index.name} needs reflectance, and the bands are {unit}; align with --radiometry")
+    return unit
+
+
+def _units_of(source: rasterio.DatasetReader, index: int) -> list[str]:
+    """Whole numbers without a scale and without a word of radiometry are raw."""
+    said = str(source.tags().get("RADIOMETRY", ""))
+    if said:
+        return said.split(" and ")
     whole = np.dtype(source.dtypes[index - 1]).kind in "ui"
-    return whole and source.scales[index - 1] == 1.0 and "RADIOMETRY" not in source.tags()
+    return [_RAW] if whole and source.scales[index - 1] == 1.0 else ["reflectance"]
+
+
+def _write_values(
+    partial: Path, target: Path, index: Index, sources: Sequence[Source], unit: str, counts: NDArray[np.int64],
+    edges: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Write the raster and add its values to the histogram's counts. Raises OutputError."""
+    try:
+        with ExitStack() as stack:
+            dataset = _create(stack, partial, sources[0][0], index, raw=unit == _RAW)
+            for window in _windows(dataset.width, dataset.height):
+                value = compute(index, [_physical(source, i, window) for source, i in sources])
+                counts += np.histogram(value[np.isfinite(value)].clip(*index.span), edges)[0]
+                dataset.write(value, 1, window=window)
+        verify(partial)
+    except (OSError, RasterioError, tifffile.TiffFileError) as error:
+        raise OutputError(f"{target}: cannot be written ({error})") from None
 
 
 def _physical(source: rasterio.DatasetReader, index: int, window: Window) -> FloatImage:
@@ -172,9 +202,7 @@ def _write_picture(raster: Path, index: Index, counts: NDArray[np.int64]) -> Non
         offset = cv2.getTextSize(text, font, 0.42, 1)[0][0] // 2
         cv2.putText(sheet, text, (at - offset, base + 18), font, 0.42, (60, 60, 60), 1, cv2.LINE_AA)
     cv2.putText(sheet, index.name.upper(), (margin, shape[0] + 18), font, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
-    target = raster.with_suffix(".png")
-    if not cv2.imwrite(str(target), sheet[..., ::-1]):
-        raise OutputError(f"{target}: cannot be written")
+    write_png(sheet, raster.with_suffix(".png"))
 
 
 def _coloured(values: NDArray[np.floating[Any]], index: Index) -> NDArray[np.uint8]:

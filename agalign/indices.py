@@ -22,6 +22,10 @@ _NAMES: dict[Role, tuple[str, ...]] = {
 }  # fmt: skip
 
 
+_NOT_NARROW = ("pan", "rgb", "lwir", "thermal")
+"""Bands of these names lie within a role's wavelengths by accident."""
+
+
 @dataclass(frozen=True)
 class Index:
     """A vegetation index of reflectances."""
@@ -75,10 +79,13 @@ def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float
     Raises InputError that says which is missing.
     """
     found = []
+    narrow = [not name.lower().startswith(_NOT_NARROW) for name in names]
     for role in index.roles:
         shortest, nominal, longest = _NOMINAL_NM[role]
         near = [
-            (abs(w - nominal), i) for i, w in enumerate(wavelengths_nm) if w is not None and shortest <= w <= longest
+            (abs(w - nominal), i)
+            for i, w in enumerate(wavelengths_nm)
+            if w is not None and narrow[i] and shortest <= w <= longest
         ]
         named = [i for i, n in enumerate(names) if wavelengths_nm[i] is None and n.lower() in _NAMES[role]]
         if not near and not named:

@@ -23,8 +23,10 @@ FLIGHT_IDS: tuple[tuple[Namespace, str], ...] = (
     ("MicaSense", "FlightId"), ("Camera", "FlightUUID"), ("Sentera", "FlightUUID"), ("Sentera", "FlightUniqueID"),
 )  # fmt: skip
 """Where they write one that a flight shares."""
+_RATIONAL_TYPES = (5, 10)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
+_LONGEST_FOCAL_LENGTH_MM = 100.0
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -40,8 +42,6 @@ class Tags:
     """ISO 8601 as written by the camera, without a time zone where it gives none."""
     orientation: int = 1
     """EXIF's: how the stored image is to be turned to be seen upright."""
-    size_px: tuple[int, int] = (0, 0)
-    """(width, height) of a TIFF's image."""
     black_level: float | None = None
     """Mean of the tag's values."""
     xmp: Mapping[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
@@ -67,8 +67,8 @@ class Tags:
 
     @property
     def pixels_per_mm(self) -> float | None:
-        """Density of the pixels in the focal plane, from EXIF FocalPlaneXResolution and its unit, else from DJI's
-        focal length in px and EXIF's in mm.
+        """Density of the pixels in the focal plane, from EXIF FocalPlaneXResolution and its unit, else from a focal
+        length in px and EXIF's in mm.
         """
         resolution = rational(self.exif.get("FocalPlaneXResolution"))
         unit = self.exif.get("FocalPlaneResolutionUnit", 2)
@@ -76,7 +76,16 @@ class Tags:
         if resolution and mm:
             return resolution / mm
         focal_px, focal_mm = self.number("drone-dji", "CalibratedFocalLength"), rational(self.exif.get("FocalLength"))
+        if not focal_px and self.focal_length_is_in_px:
+            focal_px = self.number("Camera", "PerspectiveFocalLength")
         return focal_px / focal_mm if focal_px and focal_mm else None
+
+    @property
+    def focal_length_is_in_px(self) -> bool:
+        """True where Camera:PerspectiveFocalLength is in px: old firmware gives them without saying so."""
+        units = self.text("Camera", "PerspectiveFocalLengthUnits").lower()
+        length = self.number("Camera", "PerspectiveFocalLength")
+        return "px" in units or "pixel" in units or (length is not None and length > _LONGEST_FOCAL_LENGTH_MM)
 
 
 def rational(value: Any) -> float | None:
@@ -107,7 +116,6 @@ def read_tags(path: Path) -> Tags:
         position=_position(values.get(34853)),
         captured_at=_iso_time(exif, values.get(306)),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
-        size_px=(int(values.get(256, 0)), int(values.get(257, 0))),
         black_level=_mean(values.get(50714)),
         xmp=Packet.parse(values.get(700, b"")).values(),
         exif=exif,
@@ -116,7 +124,13 @@ def read_tags(path: Path) -> Tags:
 
 def _tiff_values(path: Path) -> dict[int, Any]:
     with tifffile.TiffFile(path) as tiff:
-        return {tag.code: tag.value for tag in tiff.pages[0].tags.values()}  # type: ignore[union-attr]
+        tags = tiff.pages[0].tags.values()  # type: ignore[union-attr]
+        return {tag.code: _fractions(tag.value) if tag.dtype in _RATIONAL_TYPES else tag.value for tag in tags}
+
+
+def _fractions(value: tuple[int, ...]) -> tuple[float, ...]:
+    """From numerators and denominators one after the other."""
+    return tuple(n / d if d else math.nan for n, d in zip(value[::2], value[1::2], strict=True))
 
 
 def _jpeg_values(path: Path) -> dict[int, Any]:
@@ -155,9 +169,9 @@ def _degrees(value: Any) -> float | None:
 
 
 def _mean(value: Any) -> float | None:
-    """Of a tag of one or several numbers or fractions."""
+    """Of a tag of one or several numbers."""
     numbers = value if isinstance(value, (tuple, list)) else [value]
-    if not numbers or not all(isinstance(n, (int, float)) for n in numbers):
+    if not numbers or not all(isinstance(n, (int, float)) and math.isfinite(n) for n in numbers):
         return None
     return float(sum(numbers)) / len(numbers)
 

@@ -45,9 +45,14 @@ def write_picture(
     )
     names = ", ".join(b.name for b in chosen)
     sheet = _sheet(before, after, f"before: {names} as red, green, blue", "after")
+    write_png(sheet, path)
+
+
+def write_png(image: Picture, path: Path) -> None:
+    """Write (H, W, 3) red, green, blue, complete or not at all. Raises OutputError."""
     partial = path.with_name(f".{path.stem}.part.png")
     try:
-        if not cv2.imwrite(str(partial), sheet[..., ::-1]):
+        if not cv2.imwrite(str(partial), image[..., ::-1]):
             raise OutputError(f"{path}: cannot be written")
         partial.replace(path)
     except OSError as error:
@@ -59,7 +64,7 @@ def write_picture(
 
 def _before(band: Band, reference: Band, grid: Grid) -> NDArray[np.float32]:
     """The raw file laid on the reference as it is, cut to the grid."""
-    sx, sy = (n / (grid.scale * m) for n, m in zip(band.size_px, reference.size_px, strict=True))
+    sx, sy = (n / (s * m) for n, s, m in zip(band.size_px, grid.scale_xy, reference.size_px, strict=True))
     window = (
         round(grid.x0 * sx), round(grid.y0 * sy), max(1, round(grid.width * sx)), max(1, round(grid.height * sy)),
     )  # fmt: skip

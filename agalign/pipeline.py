@@ -11,13 +11,13 @@ import numpy as np
 from agalign import geometry
 from agalign.config import Settings, WriteSettings
 from agalign.describe import describe_capture
-from agalign.errors import AgalignError, InputError
+from agalign.errors import AgalignError, InputError, SidecarError
 from agalign.flight import FlightModel
 from agalign.mapping import Mapping as PixelMapping
 from agalign.pair import PairProgress, align_capture_bands, mapping_of
 from agalign.picture import write_picture
 from agalign.records import Alignment, Band, Capture, Grid, Tile
-from agalign.sidecar import Sidecar, write_sidecar
+from agalign.sidecar import Sidecar, read_sidecar, write_sidecar
 from agalign.stac import write_item
 from agalign.warp import common_area
 from agalign.write import Layer, write_capture
@@ -57,22 +57,33 @@ def process_capture(
     progress(reference.name, "writing", 0.0)
     stack_path, sidecar_path = output_paths(capture, out)
     usable = [b for b in capture.moving if alignments[b.name].status != "failed"]
+    picture = stack_path.with_suffix(".png")
+    discard_outputs(stack_path, sidecar_path)
     written = None
     if usable:
         layers, grid = lay_out(capture, {b.name: alignments[b.name] for b in usable}, settings.write)
         written = write_capture(capture, layers, grid, stack_path, settings.write)
         # The picture is a convenience: a full disk must not cost the sidecar.
         with suppress(AgalignError):
-            write_picture(capture, written.places, grid, usable, stack_path.with_suffix(".png"))
+            write_picture(capture, written.places, grid, usable, picture)
         if settings.write.stac:
-            write_item(capture, written, sidecar_path, stack_path.with_suffix(".png"))
-    else:
-        # An earlier run's stack does not stay either.
-        for stale in (stack_path, stack_path.with_suffix(".png")):
-            stale.unlink(missing_ok=True)
+            write_item(capture, written, sidecar_path, picture)
     sidecar = describe_capture(capture, alignments, written, settings)
     write_sidecar(sidecar_path, sidecar)
     return CaptureOutcome(sidecar, sidecar_path)
+
+
+def discard_outputs(stack: Path, sidecar: Path) -> None:
+    """What an earlier run wrote of a capture goes before something else takes its place: a sidecar never stands beside
+    rasters that it does not describe, nor a band on an old grid beside new ones.
+    """
+    with suppress(SidecarError):
+        output = read_sidecar(sidecar).output
+        for part in output.band_files if output else []:
+            (sidecar.parent / part.file).unlink(missing_ok=True)
+    for path in (sidecar, stack, stack.with_suffix(".png"), stack.with_suffix(".stac.json")):
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def lay_out(capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings) -> tuple[list[Layer], Grid]:
@@ -98,7 +109,7 @@ def lay_out(capture: Capture, alignments: Mapping[str, Alignment], settings: Wri
     moved = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
     crop = common_area(moved, *size_px) if settings.crop == "common" else None
     crop = crop or Tile(0, 0, *size_px)
-    return layers, Grid(crop.x0, crop.y0, crop.width, crop.height, scale, undistorted)
+    return layers, Grid(crop.x0, crop.y0, crop.width, crop.height, scales, undistorted)
 
 
 def _finest_scale(mappings: Iterable[PixelMapping], reference: Band) -> float:

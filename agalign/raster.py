@@ -131,7 +131,7 @@ def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDAr
         x, y = warp.transform(
             rasterio.CRS.from_user_input(from_crs), rasterio.CRS.from_user_input(to_crs), points[:, 0], points[:, 1]
         )
-    except (RasterioError, ValueError) as error:
+    except Exception as error:  # GDAL's own errors have no public class
         raise GeometryError(f"coordinates cannot be transformed ({error})") from None
     return np.stack([x, y], axis=-1)
 

@@ -200,10 +200,15 @@ class Grid:
     y0: int
     width: int
     height: int
-    scale: float = 1.0
-    """Written pixels along one of the reference."""
+    scale_xy: tuple[float, float] = (1.0, 1.0)
+    """Written pixels along one of the reference, in whole numbers a side."""
     undistorted: bool = False
     """The lens-corrected grid of the reference."""
+
+    @property
+    def scale(self) -> float:
+        """`scale_xy` for what has one number for both."""
+        return math.sqrt(self.scale_xy[0] * self.scale_xy[1])
 
     @property
     def tile(self) -> Tile:
@@ -212,7 +217,8 @@ class Grid:
 
     def px(self, x: float, y: float) -> tuple[float, float]:
         """Where a pixel of the reference lies."""
-        return self.scale * (x + 0.5) - 0.5 - self.x0, self.scale * (y + 0.5) - 0.5 - self.y0
+        sx, sy = self.scale_xy
+        return sx * (x + 0.5) - 0.5 - self.x0, sy * (y + 0.5) - 0.5 - self.y0
 
 
 @dataclass(frozen=True)

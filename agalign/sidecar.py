@@ -167,15 +167,15 @@ class FilePart(_Part):
 class OutputPart(_Part):
     """The stack beside the sidecar, null where only single bands were written.
 
-    `crop` is x0, y0, width, height on the reference's pixel grid, which has `scale` times as many pixels along each
-    side as the reference's file.
+    `crop` is x0, y0, width, height on the reference's pixel grid, which has `scale` (x, y) times as many pixels along
+    its sides as the reference's file.
     """
 
     file: str | None
     bytes: int | None
     band_files: list[FilePart] = []
     crop: tuple[int, int, int, int]
-    scale: float = 1.0
+    scale: tuple[float, float] = (1.0, 1.0)
     nodata: float | str | None
 
 

@@ -60,7 +60,7 @@ def write_item(capture: Capture, written: Written, sidecar: Path, picture: Path)
             path.relative_to(sidecar.parent).as_posix(), media_type=pystac.MediaType.GEOTIFF, roles=["data"],
             extra_fields={"bands": [_band(by_name[name]) for name in names]},
         )  # fmt: skip
-        item.add_asset("stack" if path == written.stack else path.stem, asset)
+        item.add_asset("stack" if path == written.stack else asset.href, asset)
     item.add_asset("sidecar", pystac.Asset(sidecar.name, media_type=pystac.MediaType.JSON, roles=["metadata"]))
     if picture.is_file():
         item.add_asset("picture", pystac.Asset(picture.name, media_type=pystac.MediaType.PNG, roles=["thumbnail"]))
@@ -84,7 +84,7 @@ def _footprint(reference: Band, grid: Grid) -> Any:
         return None
     x0, y0 = grid.x0, grid.y0
     x1, y1 = x0 + grid.width, y0 + grid.height
-    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]], dtype=np.float64) / grid.scale
+    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]], dtype=np.float64) / grid.scale_xy
     try:
         on_map = geometry.apply(reference.georeference.transform, corners)
         return transformed(on_map, reference.georeference.crs_wkt, _WGS84)

@@ -19,6 +19,7 @@ _SIZE = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12:
 _SWAPPED = {**_SIZE, 5: 4, 10: 4}
 """Bytes that a byte order turns round together: a rational is two numbers."""
 _LONGEST_VALUE = 1 << 28
+_TOP = (1 << 32) - 1
 
 
 @dataclass(frozen=True)
@@ -55,9 +56,23 @@ def byte_string(value: bytes, kind: int = 1) -> Entry:
 
 
 def rational(*values: float) -> Entry:
-    """Fractions of millionths."""
-    pairs = b"".join(struct.pack("<II", round(v * 1_000_000), 1_000_000) for v in values)
+    """Fractions, of millionths where they fit into 32 bits. Raises ValueError for what does not."""
+    pairs = b""
+    for value in values:
+        if not 0 <= value < _TOP:
+            raise ValueError(f"{value} is no TIFF fraction")
+        denominator = 1_000_000 if value < 4000 else max(1, int(_TOP / (value + 1)))
+        pairs += struct.pack("<II", round(value * denominator), denominator)
     return Entry(5, len(values), pairs)
+
+
+def number(entry: Entry) -> float | None:
+    """The first value of an entry of numbers; None for others and for fractions of nothing."""
+    formats = {3: "<H", 4: "<I", 8: "<h", 9: "<i", 11: "<f", 12: "<d"}
+    if entry.type in (5, 10):
+        numerator, denominator = struct.unpack_from("<II" if entry.type == 5 else "<ii", entry.data)
+        return numerator / denominator if denominator else None
+    return float(struct.unpack_from(formats[entry.type], entry.data)[0]) if entry.type in formats else None
 
 
 def read_directories(path: Path) -> dict[int, Directory]:

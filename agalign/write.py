@@ -34,6 +34,7 @@ from agalign.tiff_directory import add_directories
 from agalign.warp import resample_tile, tiles
 
 Pixels = NDArray[np.generic]
+_FOUND_PX = 0.1
 
 
 @dataclass(frozen=True)
@@ -98,13 +99,11 @@ def write_capture(
             some = [layer for layer in layers if names[layer.band.name] == name and not layer.is_gap]
             if some:
                 source, path = some[0].band.path, stack.parent / name
-                tags = band_tags(
-                    source, reference.path, grid, _from_source(some[0], grid), radiometry=settings.radiometry
-                )
+                tags = band_tags(source, reference, grid, _from_source(some[0], grid), radiometry=settings.radiometry)
                 nodata = write_raster(capture, some, grid, path, settings, tags)
                 contents[path] = tuple(layer.band.name for layer in some)
     if settings.layout != "bands":
-        nodata = write_raster(capture, layers, grid, stack, settings, capture_tags(reference.path, grid))
+        nodata = write_raster(capture, layers, grid, stack, settings, capture_tags(reference, grid))
         contents[stack] = tuple(layer.band.name for layer in layers)
     gaps = frozenset(layer.band.name for layer in layers if layer.is_gap)
     return Written(stack.parent, grid, nodata, stack if stack in contents else None, contents, gaps)
@@ -117,12 +116,20 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
     folders tell them apart, those are part of it.
     """
     several = {b.path for b in capture.bands if sum(b.path == o.path for o in capture.bands) > 1 and not b.one_lens}
-    same_name = len({b.path.name for b in capture.bands}) < len({b.path for b in capture.bands})
-    names = {}
+    folders = {b.path.parent for b in capture.bands}
+    same_name = len({b.path.stem for b in capture.bands}) < len({b.path for b in capture.bands})
+    names: dict[str, Path] = {}
+    taken: dict[Path, Path] = {}
     for band in capture.bands:
-        suffix = band.path.suffix if band.path.suffix.lower() in TIFF_SUFFIXES else ".tif"
         stem = f"{band.path.stem}_{_in_file_name(band.name)}" if band.path in several else band.path.stem
-        names[band.name] = Path(band.path.parent.name if same_name else "", f"{stem}{suffix}")
+        folder = band.path.parent.name if same_name and len(folders) > 1 else ""
+        suffix = band.path.suffix if band.path.suffix.lower() in TIFF_SUFFIXES else ".tif"
+        name = Path(folder, f"{stem}{suffix}")
+        # The stack has its own name, and so has each file.
+        if name == Path(f"{capture.name}.tif") or taken.get(name, band.path) != band.path:
+            name = Path(folder, f"{stem}_{band.path.suffix[1:].lower()}.tif")
+        taken[name] = band.path
+        names[band.name] = name
     return names
 
 
@@ -143,7 +150,9 @@ def write_raster(
     """
     dtype = np.dtype(np.float32) if settings.radiometry else np.result_type(*(layer.band.dtype for layer in layers))
     nodata = _nodata(capture, layers, grid, dtype, settings)
-    profile = _profile(capture.reference, len(layers), grid, dtype, nodata, settings)
+    whole = len(layers) == len(capture.bands) and settings.layout != "bands"
+    compression = _compression(settings, whole=whole)
+    profile = _profile(capture.reference, len(layers), grid, dtype, nodata, compression, settings.tile_px)
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -159,8 +168,8 @@ def write_raster(
             if tags is not None:
                 add_directories(partial, tags.first, tags.exif, tags.gps)
             if settings.format == "cog":
-                _to_cog(partial, settings, len(layers))
-        _verify(partial)
+                _to_cog(partial, compression)
+        verify(partial)
         partial.replace(path)
     except (OSError, RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{path}: cannot be written ({error})") from None
@@ -177,11 +186,16 @@ def _from_source(layer: Layer, grid: Grid) -> Any:
 
     def from_source(x: float, y: float) -> tuple[float, float]:
         at = np.array([width / 2, height / 2])
-        for _ in range(20):
-            here = to_file(at)
-            step = np.stack([to_file(at + d) - here for d in np.eye(2)], axis=-1)
-            at = at + np.linalg.solve(step, np.array([x, y]) - here)
-        return (at[0] + 0.5) / grid.scale - 0.5, (at[1] + 0.5) / grid.scale - 0.5
+        try:
+            for _ in range(20):
+                here = to_file(at)
+                step = np.stack([to_file(at + d) - here for d in np.eye(2)], axis=-1)
+                at = at + np.linalg.solve(step, np.array([x, y]) - here)
+        except np.linalg.LinAlgError:
+            return math.nan, math.nan
+        if not np.abs(to_file(at) - (x, y)).max() < _FOUND_PX:
+            return math.nan, math.nan
+        return (at[0] + 0.5) / grid.scale_xy[0] - 0.5, (at[1] + 0.5) / grid.scale_xy[1] - 0.5
 
     return from_source
 
@@ -197,7 +211,7 @@ def _write_layer(
         pixels, valid = _tile_of(layer, tile, settings)
         if pixels is None:
             pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
-        elif nodata is not None and (layer.mapping is not None or settings.radiometry):
+        elif nodata is not None and (layer.mapping is not None or settings.radiometry or layer.band.has_mask):
             pixels = _marked(pixels.astype(dtype, copy=False), valid, nodata)
         window = Window(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
         dataset.write(pixels.astype(dtype, copy=False), index, window=window)
@@ -231,7 +245,7 @@ def _nodata(
     if settings.radiometry:
         return math.nan
     declared = capture.reference.nodata
-    if declared is not None and (dtype.kind == "f" or float(declared).is_integer()):
+    if declared is not None and _fits(declared, dtype):
         return declared
     layers = list(layers)
     gaps = any(layer.is_gap for layer in layers)
@@ -245,11 +259,18 @@ def _nodata(
     return math.nan if dtype.kind == "f" else 0.0
 
 
+def _fits(value: float, dtype: np.dtype[Any]) -> bool:
+    if dtype.kind == "f":
+        return True
+    limits = np.iinfo(str(dtype))
+    return float(value).is_integer() and limits.min <= value <= limits.max
+
+
 # ---- what the file says of itself
 
 
 def _profile(
-    reference: Band, count: int, grid: Grid, dtype: np.dtype[Any], nodata: float | None, settings: WriteSettings
+    reference: Band, count: int, grid: Grid, dtype: np.dtype[Any], nodata: float | None, compression: str, tile_px: int
 ) -> dict[str, Any]:
     profile: dict[str, Any] = {
         "driver": "GTiff",
@@ -261,12 +282,11 @@ def _profile(
         "photometric": "minisblack",
         "bigtiff": "if_safer",
         "tiled": True,
-        "blockxsize": settings.tile_px,
-        "blockysize": settings.tile_px,
+        "blockxsize": tile_px,
+        "blockysize": tile_px,
     }
     if nodata is not None:
         profile["nodata"] = nodata
-    compression = _compression(settings, count)
     if compression != "none":
         profile |= {"compress": compression, "predictor": 3 if dtype.kind == "f" else 2}
         profile |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
@@ -275,17 +295,17 @@ def _profile(
     return profile
 
 
-def _compression(settings: WriteSettings, count: int) -> str:
+def _compression(settings: WriteSettings, *, whole: bool) -> str:
     """Files of single bands go on to programs that seldom know Zstandard."""
     if settings.compression != "auto":
         return settings.compression
-    return "deflate" if count == 1 or settings.layout == "bands" else "zstd"
+    return "zstd" if whole else "deflate"
 
 
 def _georeference(georeference: Georeference, grid: Grid) -> dict[str, Any]:
     # Only where the source has one: an identity transform would be an invented georeference.
     # Geotransforms count from corners, where a change of resolution is a mere factor.
-    shrunk = np.diag([1 / grid.scale, 1 / grid.scale, 1.0])
+    shrunk = np.diag([1 / grid.scale_xy[0], 1 / grid.scale_xy[1], 1.0])
     written = georeference.transform @ shrunk @ geometry.translation(grid.x0, grid.y0)
     return {"transform": Affine(*written[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
 
@@ -313,8 +333,11 @@ def _describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings:
             dataset.update_tags(index, ns="IMAGERY", CENTRAL_WAVELENGTH_UM=micrometres)
 
 
-def _verify(path: Path) -> None:
-    """GDAL flushes when a file is closed, and what fails then (a full disk) is not raised: look at the result."""
+def verify(path: Path) -> None:
+    """Raises OSError for a raster that is not whole.
+
+    GDAL flushes when a file is closed, and what fails then (a full disk) is not raised: look at the result.
+    """
     size = path.stat().st_size
     with tifffile.TiffFile(path) as tiff:
         segments = [s for page in tiff.pages for s in zip(page.dataoffsets, page.databytecounts, strict=True)]
@@ -322,9 +345,8 @@ def _verify(path: Path) -> None:
         raise OSError(errno.EIO, "the file came out incomplete; is the disk full?")
 
 
-def _to_cog(path: Path, settings: WriteSettings, count: int) -> None:
+def _to_cog(path: Path, compression: str) -> None:
     cog = path.with_name(f"{path.name}.cog")
-    compression = _compression(settings, count)
     options = {} if compression == "none" else {"compress": compression, "predictor": "yes"}
     try:
         copy_dataset(path, cog, driver="COG", blocksize=512, bigtiff="if_safer", **options)

@@ -94,6 +94,14 @@ class Packet:
                 else:
                     items[0].text = ",".join(values)
 
+    def add(self, name: Name, value: str) -> None:
+        """Give it a value that it does not have."""
+        self.remove([name])
+        mine = next(self._descriptions(), None)
+        if mine is not None:
+            uri = next(uri for uri, namespace in _NAMESPACES.items() if namespace == name[0])
+            ElementTree.SubElement(mine, f"{{{uri}}}{name[1]}").text = value
+
     def serialised(self) -> bytes:
         """As it stands in a file; nothing for an empty packet."""
         if self.root is None:

@@ -1,6 +1,7 @@
 """Aligned bands as other programs see them."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,15 @@ import agalign
 from agalign import geometry, lens
 from agalign.cameras import rig_seed
 from agalign.cameras.micasense import MicaSense
+from agalign.cameras.parrot import Sequoia
 from agalign.carried_tags import band_tags
 from agalign.config import Settings, WriteSettings
 from agalign.metadata import Tags, read_tags
 from agalign.raster import probe
 from agalign.records import Band, Grid
-from agalign.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, short, text
+from agalign.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, rational, read_directories, short, text
 
-from .test_vendors import VENDORS, packet, write_capture
+from .test_vendors import SIZE, VENDORS, packet, write_capture
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -115,7 +117,8 @@ def test_the_bands_pixels_are_the_stacks(both: Path) -> None:
 def carried(tmp_path: Path, vendor: str, file: str, reference: str, grid: Grid, **options: bool) -> Tags:
     """The tags of a file that got what is carried from `file`."""
     write_capture(tmp_path, VENDORS[vendor])
-    tags = band_tags(tmp_path / file, tmp_path / reference, grid, lambda x, y: (x, y), **options)
+    band = Band("reference", tmp_path / reference, 1, *SIZE, "uint16")
+    tags = band_tags(tmp_path / file, band, grid, lambda x, y: (x, y), **options)
     out = tmp_path / "out.tif"
     tifffile.imwrite(out, np.zeros((grid.height, grid.width), np.uint16), photometric="minisblack", metadata=None)
     add_directories(out, tags.first, tags.exif, tags.gps)
@@ -123,7 +126,7 @@ def carried(tmp_path: Path, vendor: str, file: str, reference: str, grid: Grid, 
 
 
 def test_djis_geometry_is_the_references(tmp_path: Path) -> None:
-    grid = Grid(20, 10, 200, 180, scale=2.0)
+    grid = Grid(20, 10, 200, 180, scale_xy=(2.0, 2.0))
     prefix = "DJI_20230607112233_0001_MS_"
     found = carried(tmp_path, "Mavic 3", f"{prefix}NIR.TIF", f"{prefix}G.TIF", grid)
     assert found.text("Camera", "BandName") == "NIR"
@@ -163,9 +166,8 @@ def test_radiometry_takes_what_it_used(tmp_path: Path) -> None:
 
 def carried_from(folder: Path, *, radiometry: bool) -> Tags:
     grid = Grid(0, 0, 160, 120)
-    tags = band_tags(
-        folder / "IMG_0007_4.tif", folder / "IMG_0007_2.tif", grid, lambda x, y: (x, y), radiometry=radiometry
-    )
+    reference = Band("Green", folder / "IMG_0007_2.tif", 1, *SIZE, "uint16")
+    tags = band_tags(folder / "IMG_0007_4.tif", reference, grid, lambda x, y: (x, y), radiometry=radiometry)
     out = folder / "out.tiff"
     tifffile.imwrite(out, np.zeros((120, 160), np.float32), photometric="minisblack", metadata=None)
     add_directories(out, tags.first, tags.exif, tags.gps)
@@ -174,6 +176,52 @@ def carried_from(folder: Path, *, radiometry: bool) -> Tags:
 
 def test_a_source_that_cannot_be_followed_gives_nothing(tmp_path: Path) -> None:
     (tmp_path / "broken.tif").write_bytes(b"II*\0\xff\xff\xff\xff")
-    tags = band_tags(tmp_path / "broken.tif", tmp_path / "broken.tif", Grid(0, 0, 9, 9), lambda x, y: (x, y))
+    band = Band("broken", tmp_path / "broken.tif", 1, 9, 9, "uint16")
+    tags = band_tags(tmp_path / "broken.tif", band, Grid(0, 0, 9, 9), lambda x, y: (x, y))
     assert (tags.first, tags.exif, tags.gps) == ({}, {}, {})
     assert text("x").count == 2
+
+
+def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
+    write_capture(tmp_path, VENDORS["Sequoia"])
+    path = tmp_path / "IMG_180413_080658_0000_GRE.TIF"
+    (reference,) = Sequoia().bands(path, read_tags(path), probe(path))
+    tags = band_tags(path, reference, Grid(0, 0, *SIZE, undistorted=True), lambda x, y: (x, y))
+    out = tmp_path / "out_GRE.TIF"
+    tifffile.imwrite(out, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
+    add_directories(out, tags.first, tags.exif, tags.gps)
+    (found,) = Sequoia().bands(out, read_tags(out), probe(out))
+    assert found.lens is not None
+    assert reference.lens is not None
+    assert not any(found.lens.distortion)
+    assert found.lens.fx_px == pytest.approx(reference.lens.fx_px, rel=1e-6)
+    assert found.lens.cx_px == pytest.approx(reference.lens.cx_px, abs=1e-3)
+
+
+def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
+    values = {("Camera", "PrincipalPoint"): ("2.4", "1.8"), ("Camera", "PerspectiveFocalLength"): ("1451.8",)}
+    path = tmp_path / "IMG_0001_2.tif"
+    tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
+    exif = {37386: rational(5.45)}
+    add_directories(path, {271: text("MicaSense"), 700: byte_string(packet(values, "elements"))}, exif, {})
+    (before,) = MicaSense().bands(path, read_tags(path), probe(path))
+    tags = band_tags(path, before, Grid(40, 30, 200, 150, scale_xy=(2.0, 2.0)), lambda x, y: (x, y))
+    out = tmp_path / "IMG_0002_2.tif"
+    tifffile.imwrite(out, np.zeros((150, 200), np.uint16), photometric="minisblack", metadata=None)
+    add_directories(out, tags.first, tags.exif, tags.gps)
+    (after,) = MicaSense().bands(out, read_tags(out), probe(out))
+    assert before.lens is not None
+    assert after.lens is not None
+    assert after.lens.fx_px == pytest.approx(2 * before.lens.fx_px)
+    assert after.lens.cx_px == pytest.approx(2 * (before.lens.cx_px + 0.5) - 0.5 - 40, abs=1e-3)
+
+
+@pytest.mark.parametrize("centre", [("1e30", "1e30"), ("nan", "0"), ("99999", "99999")])
+def test_a_centre_of_vignetting_that_lies_nowhere_is_left_out(tmp_path: Path, centre: tuple[str, str]) -> None:
+    values = {("Camera", "VignettingCenter"): centre, ("Camera", "VignettingPolynomial"): ("1e-4",)}
+    path = tmp_path / "IMG_0001_2.tif"
+    tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
+    add_directories(path, {271: text("MicaSense"), 700: byte_string(packet(values, "elements"))}, {}, {})
+    band = Band("Green", path, 1, *SIZE, "uint16")
+    tags = band_tags(path, band, Grid(0, 0, *SIZE), lambda x, y: (math.nan, math.nan))
+    assert b"VignettingCenter" not in tags.first[XMP].data or centre[0] == "nan"

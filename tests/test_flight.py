@@ -25,6 +25,7 @@ from agalign.flight import (
     model_names,
     save_model,
 )
+from agalign.records import Capture
 from agalign.sidecar import find_sidecars, read_sidecar
 
 SETTINGS = Settings(flight=FlightSettings(captures=1))
@@ -199,3 +200,19 @@ def test_one_broken_reference_stops_neither_learning_nor_the_others(flight: Path
     reports = {r.label[-8:]: r for r in run_flight(discover(copy), tmp_path / "out", Settings())}
     statuses = {b.band: b.status for b in reports["IMG_0002"].sidecar.bands}
     assert statuses["Blue"] == statuses["Red"] == "aligned"
+
+
+def test_a_fault_in_one_capture_costs_no_other(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = batch.process_capture
+
+    def faulty(capture: Capture, *arguments: object) -> object:
+        if capture.name == "IMG_0001":
+            raise ZeroDivisionError("of nothing")
+        return real(capture, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(batch, "process_capture", faulty)
+    reports = {r.label: r for r in agalign.align_folder(flight, tmp_path)}
+    assert reports["0000SET/000/IMG_0002"].good
+    problem = reports["0000SET/000/IMG_0001"].error
+    assert problem is not None
+    assert "please report this" in problem

@@ -49,3 +49,8 @@ def test_vegetation_is_above_bare_soil(index: object) -> None:
     soil = {"blue": 0.08, "green": 0.12, "red": 0.18, "red edge": 0.22, "nir": 0.26}
     values = [compute(index, [np.float32([[of[r]]]) for r in index.roles])[0, 0] for of in (crop, soil)]  # type: ignore[attr-defined]
     assert (values[0] > values[1]) != (index.name == "ndwi")  # type: ignore[attr-defined]
+
+
+def test_a_panchromatic_band_is_nobodys_red() -> None:
+    with pytest.raises(InputError, match="needs a red band"):
+        bands_for(INDICES["ndvi"], ("Blue", "Panchro", "NIR"), (475.0, 634.5, 842.0))

@@ -12,13 +12,14 @@ import agalign
 from agalign import geometry, synthetic
 from agalign.config import JointSettings, SeedSettings, Settings, WriteSettings
 from agalign.discover import DiscoverOptions, discover
-from agalign.errors import InputError
+from agalign.errors import ConfigurationError, InputError
 from agalign.index_rasters import write_indices
 from agalign.indices import INDICES
 from agalign.pair import mapping_of
 from agalign.pipeline import lay_out
 from agalign.records import Alignment, Band, Capture, Georeference, Seed
 from agalign.seed import geo_seed
+from agalign.write import band_file_names
 
 from .conftest import textured_image
 
@@ -51,7 +52,9 @@ def test_bands_can_be_chosen_and_ordered(aligned_capture: Path) -> None:
 
     assert names(bands=("NIR", "green")) == ["green", "nir"]
     assert names(order="name") == ["green", "nir", "pan", "red"]
-    found = discover(aligned_capture, DiscoverOptions(bands=("nir", "swir")))
+    with pytest.raises(ConfigurationError, match="no capture has a band 'swir'"):
+        discover(aligned_capture, DiscoverOptions(bands=("nir", "swir")))
+    found = discover(aligned_capture, DiscoverOptions(bands=("nir",)))
     assert not found.captures
     assert "leaves nir" in found.problems[0].text
 
@@ -68,7 +71,7 @@ def test_the_finest_resolution_is_the_pans(aligned_capture: Path, tmp_path: Path
     assert report.sidecar is not None
     assert {b.status for b in report.sidecar.bands} == {"reference", "seed_only"}
     assert report.sidecar.output is not None
-    assert report.sidecar.output.scale == 2.0
+    assert report.sidecar.output.scale == (2.0, 2.0)
     pan = tifffile.imread(aligned_capture / "field_pan.tif").astype(float)
     with rasterio.open(tmp_path / "out" / "field.tif") as stack:
         assert stack.shape == (600, 800)
@@ -210,3 +213,70 @@ def test_a_georeferenced_item_has_a_footprint(tmp_path: Path) -> None:
     assert abs(ring[0] - ring[2]).max() < 0.001
     assert ring[0] == pytest.approx([3.0, 52.35], abs=0.05)
     assert "change of" in item["properties"]["agalign:datetime_source"]
+
+
+def test_the_references_own_mask_is_kept(tmp_path: Path) -> None:
+    for name, gain in (("green", 900), ("red", 500)):
+        pixels = (3000 + gain * textured_image(300, 240, 3)).clip(0).astype(np.uint16)
+        write_band(tmp_path / "in" / f"f_{name}.tif", pixels)
+    mask = np.full((240, 300), 255, np.uint8)
+    mask[100:140, 50:120] = 0
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(tmp_path / "in" / "f_green.tif", "r+") as dataset:
+        dataset.write_mask(mask)
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=ONLY_SEED)
+    with rasterio.open(tmp_path / "out" / "f.tif") as stack:
+        valid = stack.read_masks(stack.descriptions.index("green") + 1) > 0
+        assert not valid[100:140, 50:120].any()
+        assert valid.mean() == pytest.approx((mask > 0).mean())
+
+
+def test_a_nodata_value_that_a_type_cannot_hold_is_not_declared(tmp_path: Path) -> None:
+    scene = textured_image(300, 240, 3)
+    write_band(tmp_path / "in" / "f_green.tif", (3000 + 900 * scene).astype(np.uint16), nodata=65535)
+    write_band(tmp_path / "in" / "f_red.tif", (120 + 25 * scene).astype(np.uint8))
+    settings = ONLY_SEED.model_copy(update={"write": WriteSettings(layout="bands")})
+    (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
+    assert report.error is None
+    with rasterio.open(tmp_path / "out" / "f_red.tif") as band:
+        assert band.dtypes == ("uint8",)
+        assert band.nodata in (None, 0)
+
+
+def test_nothing_of_another_layout_or_of_a_lost_band_stays(tmp_path: Path) -> None:
+    scene = textured_image(300, 240, 3)
+    for name, gain in (("green", 900), ("red", 500), ("nir", 700)):
+        write_band(tmp_path / "in" / f"f_{name}.tif", (3000 + gain * scene).clip(1).astype(np.uint16))
+    settings = ONLY_SEED.model_copy(update={"write": WriteSettings(layout="both")})
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
+    assert (tmp_path / "out" / "f_nir.tif").is_file()
+    write_band(tmp_path / "in" / "f_nir.tif", np.full((240, 300), 7, np.uint16))  # nothing to see any more
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
+    assert not (tmp_path / "out" / "f_nir.tif").exists()
+    assert (tmp_path / "out" / "f_red.tif").is_file()
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=ONLY_SEED)
+    assert sorted(p.name for p in (tmp_path / "out").glob("f*.tif")) == ["f.tif"]
+
+
+def test_the_stack_and_a_photograph_of_its_name_live_beside_each_other(aligned_capture: Path) -> None:
+    green = Band("green", aligned_capture / "field_green.tif", 1, 9, 9, "uint8")
+    photograph = Band("RGB Red", aligned_capture / "field.jpg", 1, 9, 9, "uint8", one_lens=True)
+    names = band_file_names(Capture("field", Path(), (green, photograph), 0))
+    assert names == {"green": Path("field_green.tif"), "RGB Red": Path("field_jpg.tif")}
+
+
+def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path / "in", 1, (480, 360), rng_seed=3)
+    out = tmp_path / "out"
+    agalign.align_folder(tmp_path / "in", out, settings=Settings(write=WriteSettings(radiometry=True)))
+    (stack,) = out.rglob("IMG_0001.tif")
+    with rasterio.open(stack, "r+") as dataset:
+        dataset.update_tags(RADIOMETRY="reflectance and radiance")
+    assert "different units" in next(write_indices(out, [INDICES["ndvi"]])).problem
+    with rasterio.open(stack, "r+") as dataset:
+        dataset.update_tags(RADIOMETRY="radiance")
+    assert "needs reflectance, and the bands are radiance" in next(write_indices(out, [INDICES["savi"]])).problem
+
+
+def test_the_folder_of_the_images_is_no_output(aligned_capture: Path) -> None:
+    with pytest.raises(ConfigurationError, match="is the folder of the images"):
+        agalign.align_folder(aligned_capture, aligned_capture, settings=ONLY_SEED)

@@ -111,4 +111,4 @@ def test_relief_moves_what_stands_up(tmp_path: Path) -> None:
         fitted, _ = cv2.findHomography(here, there, 0)
         left[name] = np.linalg.norm(geometry.apply(fitted, here) - there, axis=1)
     assert left["plane"].max() < 1e-3
-    assert 0.02 < np.median(left["relief"]) < 0.5
+    assert 0.03 < np.percentile(left["relief"], 95) < 0.5

@@ -300,3 +300,47 @@ def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
     assert band.radiometry is not None
     assert band.radiometry.gain == pytest.approx(0.9 / (2 * 1e-3) / 5000)
     assert not band.radiometry.vignetting_divides
+
+
+def test_one_damaged_file_makes_no_band_that_others_lack(tmp_path: Path) -> None:
+    for number in range(3):
+        folder = tmp_path / f"{number:03d}"
+        write_capture(folder, VENDORS["RedEdge"])
+    stray = tmp_path / "001" / "IMG_0007_3.tif"
+    stray.unlink()
+    tifffile.imwrite(stray, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
+    add_directories(stray, {271: text("MicaSense"), 272: text("RedEdge-M")}, {}, {})
+    missing = {c.folder.name: c.missing_bands for c in discover(tmp_path).captures}
+    assert missing == {"000": (), "001": ("Red",), "002": ()}
+
+
+def test_a_stack_with_a_vendors_make_is_a_stack(tmp_path: Path) -> None:
+    for make in ("MicaSense", "DJI", "Parrot", "Sentera", "MAPIR"):
+        path = tmp_path / f"{make}.tif"
+        pixels = np.zeros((5, 120, 160), np.uint16)
+        tifffile.imwrite(path, pixels, photometric="minisblack", planarconfig="separate", metadata=None)
+        add_directories(path, {271: text(make)}, {}, {})
+    found = discover(tmp_path)
+    assert not found.problems
+    assert [len(c.bands) for c in found.captures] == [5] * 5
+
+
+@pytest.mark.parametrize("folder", ["NDVI 2024", "NDVI"])
+def test_a_flat_folder_named_like_a_band(tmp_path: Path, folder: str) -> None:
+    for k, nm in enumerate((475, 550, 840)):
+        path = tmp_path / folder / f"IMG_0001_{nm}_30.tif"
+        path.parent.mkdir(exist_ok=True)
+        tifffile.imwrite(path, np.zeros((120, 160), np.uint16), photometric="minisblack", metadata=None)
+        name = ("Blue", "Green", "NIR")[k]
+        xmp = packet({("Camera", "BandName"): (name,)}, "attributes")
+        add_directories(path, {271: text("Sentera"), 700: byte_string(xmp)}, {}, {})
+    (capture,) = discover(tmp_path / folder).captures
+    assert {b.name for b in capture.bands} == {"Blue", "Green", "NIR"}
+    assert capture.label == "IMG_0001"
+
+
+def test_black_levels_may_be_fractions(tmp_path: Path) -> None:
+    path = tmp_path / "x.tif"
+    tifffile.imwrite(path, np.zeros((120, 160), np.uint16), photometric="minisblack", metadata=None)
+    add_directories(path, {50714: rational(4800, 4801, 4799, 4800)}, {}, {})
+    assert read_tags(path).black_level == pytest.approx(4800)

@@ -14,13 +14,12 @@ import numpy as np
 from agalign import geometry
 from agalign.errors import GeometryError
 from agalign.geometry import Matrix
-from agalign.metadata import Tags, rational
+from agalign.metadata import Tags
 from agalign.raster import RasterInfo
 from agalign.records import Band, Lens
 
 _PREFERRED_REFERENCES = ("green", "gre", "g")
-_LONGEST_FOCAL_LENGTH_MM = 100.0
-"""Focal lengths above this are in pixels: old firmware gives px without saying so."""
+_THERMAL = ("lwir", "thermal")
 _COLOURS = ("Red", "Green", "Blue")
 
 
@@ -56,7 +55,8 @@ def default_reference(bands: Sequence[Band]) -> int:
         if re.split(r"[-_ ]", band.name.lower())[0] in _PREFERRED_REFERENCES:
             return index
     known = [(abs(b.wavelength_nm - 550), i) for i, b in enumerate(bands) if b.wavelength_nm is not None]
-    return min(known)[1] if known else 0
+    seeing = [i for i, b in enumerate(bands) if not b.name.lower().startswith(_THERMAL)]
+    return min(known)[1] if known else next(iter(seeing), 0)
 
 
 def rig_seed(reference: Band, moving: Band) -> Matrix | None:
@@ -133,14 +133,9 @@ def perspective_lens(tags: Tags) -> Lens | None:
     centre = tags.numbers("Camera", "PrincipalPoint")
     if focal is None or focal <= 0 or len(centre) != 2:
         return None
-    units = tags.text("Camera", "PerspectiveFocalLengthUnits").lower()
-    in_px = "px" in units or "pixel" in units or focal > _LONGEST_FOCAL_LENGTH_MM
     if density is None:
-        focal_mm = rational(tags.exif.get("FocalLength"))
-        if not (in_px and focal_mm):
-            return None
-        density = focal / focal_mm
-    focal_px = focal if in_px else focal * density
+        return None
+    focal_px = focal if tags.focal_length_is_in_px else focal * density
     k = tags.numbers("Camera", "PerspectiveDistortion")
     distortion = (k[0], k[1], k[3], k[4], k[2]) if len(k) == 5 else ()
     return Lens(focal_px, focal_px, centre[0] * density, centre[1] * density, distortion)

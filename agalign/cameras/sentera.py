@@ -17,9 +17,7 @@ from agalign.raster import RasterInfo
 from agalign.records import Band
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
-_ANY_BAND_FOLDER = re.compile(
-    r"^(?:\d+-)?[A-Za-z ]+-\d{3,4}(?:-\d+)?$|^(?:\d+-)?(?:RGB|NDRE|NDVI|NIR|RE|LWIR)\b.*$", re.I
-)
+_ANY_BAND_FOLDER = re.compile(r"^(?:\d+-)?[A-Za-z ]+-\d{3,4}(?:-\d+)?$|^(?:\d+-)?(?:RGB|NDRE|NDVI|NIR|RE|LWIR)$", re.I)
 _CHANNELS = {"NDRE": {1: ("Red edge", 720.0), 3: ("NIR", 840.0)}, "NDVI": {1: ("Red", 625.0), 3: ("NIR", 850.0)}}
 """Of the one-lens cameras: the channels that hold a band, with their centre wavelengths in nm."""
 
@@ -43,6 +41,7 @@ class Sentera(Camera):
             return tuple(
                 replace(band_of(path, info, name, index), wavelength_nm=wavelength, one_lens=True)
                 for index, (name, wavelength) in _CHANNELS[kind].items()
+                if index <= len(info.dtypes)
             )
         folder = _BAND_FOLDER.match(path.parent.name)
         name = tags.text("Camera", "BandName") or (folder["name"] if folder else path.stem)
