@@ -68,13 +68,13 @@ def plot(results: list[Result], path: Path) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6))
-    for name in dict.fromkeys(r.method for r in results):
+    for number, name in enumerate(dict.fromkeys(r.method for r in results)):
         shifts = [s for s in SHIFTS if any(r.method == name and r.shift == s for r in results)]
         for axis, field, scale in zip(axes, ("error_share", "average_precision"), (100, 1), strict=True):
             means = [scale * np.mean([getattr(r, field) for r in results if (r.method, r.shift) == (name, s)])
                      for s in shifts]  # fmt: skip
             if np.isfinite(means).all():
-                axis.plot([100 * s for s in shifts], means, marker="o", label=name)
+                axis.plot([100 * s for s in shifts], means, marker="o", color=f"C{number}", label=name)
     axes[0].set(xlabel="start off by, % of the side", ylabel="mean homography error, % of the side")
     axes[1].set(xlabel="start off by, % of the side", ylabel="mAP", ylim=(0, 1))
     for axis in axes:
