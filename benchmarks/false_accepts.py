@@ -30,7 +30,7 @@ def scene(rng: np.random.Generator, east_m: float = 0.0) -> tuple[synthetic.Grou
 
 def view(ground: synthetic.Ground, band: int, pose: synthetic.Pose, rng: np.random.Generator) -> np.ndarray:
     painted = synthetic.reflectance(ground, BANDS[band])
-    return synthetic.render(painted, ground.metres_per_px, BANDS[band], pose, SIZE, rng)
+    return synthetic.render(painted, ground, BANDS[band], pose, SIZE, rng)
 
 
 def water(rng: np.random.Generator) -> np.ndarray:
