@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -280,3 +281,39 @@ def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
 def test_the_folder_of_the_images_is_no_output(aligned_capture: Path) -> None:
     with pytest.raises(ConfigurationError, match="is the folder of the images"):
         agalign.align_folder(aligned_capture, aligned_capture, settings=ONLY_SEED)
+
+
+def test_bands_of_other_sizes_are_aligned(tmp_path: Path) -> None:
+    canvas = cv2.GaussianBlur(textured_image(3000, 2400, 5), (0, 0), 1.5)
+
+    def view(pixel_to_canvas: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        return cv2.warpPerspective(canvas, pixel_to_canvas, size_px, flags=flags)
+
+    def turned(scale: float, angle: float, x: float, y: float) -> np.ndarray:
+        c, s = scale * np.cos(angle), scale * np.sin(angle)
+        return np.array([[c, -s, x], [s, c, y], [0, 0, 1.0]])
+
+    green = view(turned(1, 0, 198.5, 148.5), (2560, 1920)).reshape(480, 4, 640, 4).mean((1, 3))
+    truth = {"pan": turned(2, 0.012, 230, 120), "lwir": turned(16, 0.01, 210, 160)}
+    # Reversed contrast at twice the resolution, and a blurred image at a quarter.
+    images = {
+        "green": green, "pan": -view(truth["pan"], (1280, 960)),
+        "lwir": cv2.GaussianBlur(view(truth["lwir"], (160, 120)), (0, 0), 0.7),
+    }  # fmt: skip
+    for name, pixels in images.items():
+        write_band(tmp_path / "in" / f"f_{name}.tif", (3000 + 600 * pixels).clip(1).astype(np.uint16))
+    (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out")
+    assert report.sidecar is not None
+    for band in report.sidecar.bands:
+        if band.grid is None:
+            continue
+        assert band.status == "aligned", band.reason
+        expected = geometry.apply(
+            geometry.compose(geometry.invert(truth[band.band]), turned(4, 0, 200, 150)),
+            np.array(band.grid.reference_px),
+        )
+        width, height = images[band.band].shape[::-1]
+        inside = ((expected > 0) & (expected < (width - 1, height - 1))).all(axis=1)
+        error = np.linalg.norm(np.array(band.grid.moving_px) - expected, axis=1)[inside]
+        assert np.median(error) < 0.15
