@@ -1,5 +1,6 @@
 """Scenes that the tests generate, and the way to the real captures where they are present."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -7,6 +8,9 @@ import numpy as np
 import pytest
 
 from agalign import geometry, synthetic
+
+# Each worker has a core of its own; read when torch is loaded, which nothing above does.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
