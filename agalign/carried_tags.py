@@ -122,7 +122,8 @@ def _on_grid(exif: Directory, reference: Directory, grid: Grid) -> Directory:
     for tag in _DENSITIES & found.keys() if grid.scale != 1 else ():
         density = number(found[tag])
         if density is not None and density > 0:
-            found[tag] = rational(grid.scale * density)
+            with suppress(ValueError):  # a density that no camera has
+                found[tag] = rational(grid.scale * density)
     sizes = zip(_EXIF_SIZES, (grid.width, grid.height), strict=True)
     return found | {tag: long(size) for tag, size in sizes if tag in found}
 

@@ -23,7 +23,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from agalign import geometry
-from agalign.carried_tags import CarriedTags, band_tags, capture_tags
+from agalign.carried_tags import CarriedTags, FromSource, band_tags, capture_tags
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.mapping import Mapping as PixelMapping
@@ -179,13 +179,13 @@ def write_raster(
     return nodata
 
 
-def _from_source(layer: Layer, grid: Grid) -> Any:
+def _from_source(layer: Layer, grid: Grid) -> FromSource:
     """Where a pixel of the layer's file lies in the reference's pixels: the mapping the other way, by iteration."""
     to_file = PixelMapping(geometry.identity()) if layer.mapping is None else layer.mapping
-    width, height = round(grid.x0 + grid.width), round(grid.y0 + grid.height)
+    middle = np.array([grid.x0 + grid.width / 2, grid.y0 + grid.height / 2])
 
     def from_source(x: float, y: float) -> tuple[float, float]:
-        at = np.array([width / 2, height / 2])
+        at = middle
         try:
             for _ in range(20):
                 here = to_file(at)
