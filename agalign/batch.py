@@ -22,6 +22,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from agalign.choices import Layout
@@ -46,6 +47,9 @@ from agalign.records import Capture
 from agalign.sidecar import Sidecar, read_sidecar
 from agalign.write import band_file_names
 
+_FAULTS = (
+    ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, np.linalg.LinAlgError, cv2.error,
+)  # fmt: skip
 _LOG = logging.getLogger(__name__)
 _MOST_READ_AHEAD_BYTES = 64 << 20
 _DASK_ANSWERS_WITHIN_S = 10
@@ -194,7 +198,9 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
             outcome = process_capture(task.capture, task.out, task.settings, on_pair, model)
     except AgalignError as error:
         return CaptureReport(label, "error", None, str(error))
-    except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, np.linalg.LinAlgError) as error:
+    except _FAULTS as error:
+        if "memory" in str(error):  # torch's way to say so: the captures that follow would fare no better
+            raise
         # A fault of this program: it must not cost the captures that follow.
         problem = f"{label}: agalign failed on it ({type(error).__name__}: {error}); please report this"
         _LOG.debug(problem, exc_info=True)

@@ -288,9 +288,11 @@ class LocalField:
 
     def __call__(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """The displacement (..., 2) at points (..., 2), by cubic splines; beyond the lattice that of its edge."""
-        at = np.moveaxis(np.asarray(points_px)[..., ::-1] / self.step_px, -1, 0)
+        points = np.asarray(points_px)
+        at = points.reshape(-1, 2)[:, ::-1].T / self.step_px
         planes = np.moveaxis(self.displacements_px, -1, 0)
-        return np.stack([map_coordinates(plane, at, order=3, mode="nearest") for plane in planes], axis=-1)
+        found = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
+        return np.stack(found, axis=-1).reshape(points.shape)
 
     def plus(self, other: "LocalField") -> "LocalField":
         """X -> x + d(x) with this field, measured again under it: d(x) + other(x)."""

@@ -11,7 +11,7 @@ import tifffile
 
 import agalign
 from agalign import geometry, synthetic
-from agalign.config import JointSettings, SeedSettings, Settings, WriteSettings
+from agalign.config import JointSettings, LocalSettings, SeedSettings, Settings, WriteSettings
 from agalign.discover import DiscoverOptions, discover
 from agalign.errors import ConfigurationError, InputError
 from agalign.index_rasters import write_indices
@@ -317,3 +317,43 @@ def test_bands_of_other_sizes_are_aligned(tmp_path: Path) -> None:
         inside = ((expected > 0) & (expected < (width - 1, height - 1))).all(axis=1)
         error = np.linalg.norm(np.array(band.grid.moving_px) - expected, axis=1)[inside]
         assert np.median(error) < 0.15
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"layout": "both", "undistort": True, "resolution": "finest"},
+        {"layout": "bands", "format": "cog", "crop": "none", "radiometry": True},
+        {"layout": "both", "radiometry": True, "stac": True, "interpolation": "nearest"},
+        {"layout": "stack", "format": "cog", "undistort": True, "compression": "none"},
+    ],
+    ids=str,
+)
+def test_options_go_together(relief_flight: Path, tmp_path: Path, options: dict[str, object]) -> None:
+    write = WriteSettings.model_validate(options)
+    settings = Settings(local=LocalSettings(use=True), write=write)
+    (report,) = agalign.align_folder(relief_flight, tmp_path, settings=settings)
+    assert report.error is None
+    assert report.sidecar is not None
+    assert report.sidecar.status == "ok"
+    assert any(b.local is not None and b.local.applied for b in report.sidecar.bands)
+    folder = tmp_path / "0000SET" / "000"
+    planes = {}
+    for band in report.sidecar.bands:
+        assert band.place is not None
+        with rasterio.open(folder / band.place.file) as dataset:
+            assert dataset.shape == report.sidecar.output.crop[3:1:-1]  # type: ignore[union-attr]
+            plane = dataset.read(band.place.band_index).astype(float)
+            planes[band.band] = np.where(dataset.read_masks(band.place.band_index) > 0, plane, np.nan)
+    both = np.isfinite(planes["Green"]) & np.isfinite(planes["Red"])
+    assert both.mean() > 0.8
+    # Green and red see the same field: what options do to one they do to the other.
+    assert np.corrcoef(planes["Green"][both], planes["Red"][both])[0, 1] > 0.6
+
+
+@pytest.fixture(scope="module")
+def relief_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One capture of terraces and trees."""
+    folder = tmp_path_factory.mktemp("relief")
+    synthetic.make_flight(folder, 1, (640, 480), rng_seed=5, relief_m=6.0)
+    return folder
