@@ -7,7 +7,7 @@ from agalign.choices import Sharing
 from agalign.config import FastRecipe, JointSettings
 from agalign.descriptor import REFERENCE, Descriptor
 from agalign.joint import JointAligner
-from agalign.starter import start_from_starter
+from agalign.starter import start_from, start_from_starter
 
 PATCHES = torch.randn(8, 1, 16, 16, generator=torch.Generator().manual_seed(1))
 
@@ -46,3 +46,14 @@ def test_the_recipe_starts_from_it_unless_told_otherwise() -> None:
 
     torch.testing.assert_close(first("starter"), started("pseudo-siamese", (1, 1))(PATCHES, 1))
     assert (first("starter") - first("random")).abs().max() > 0.1
+
+
+def test_each_side_takes_the_side_it_is_told() -> None:
+    learnt = Descriptor("unshared", [1, 1, 1], half_rectified=True, unit_length=True)
+    two = Descriptor("unshared", [1, 1], half_rectified=True, unit_length=True)
+    start_from(two, learnt.state_dict(), (REFERENCE, 2))
+    patches = torch.randn(8, 1, 16, 16, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        torch.testing.assert_close(two(patches, REFERENCE), learnt(patches, REFERENCE))
+        torch.testing.assert_close(two(patches, 1), learnt(patches, 2))
+        assert (two(patches, 1) - learnt(patches, 1)).abs().max() > 1e-3
