@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
-import numpy as np
 
 from agalign.choices import Layout
 from agalign.config import Settings
@@ -47,9 +46,7 @@ from agalign.records import Capture
 from agalign.sidecar import Sidecar, read_sidecar
 from agalign.write import band_file_names
 
-_FAULTS = (
-    ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, np.linalg.LinAlgError, cv2.error,
-)  # fmt: skip
+_FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, cv2.error)
 _LOG = logging.getLogger(__name__)
 _MOST_READ_AHEAD_BYTES = 64 << 20
 _DASK_ANSWERS_WITHIN_S = 10
@@ -199,8 +196,8 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     except AgalignError as error:
         return CaptureReport(label, "error", None, str(error))
     except _FAULTS as error:
-        if "memory" in str(error):  # torch's way to say so: the captures that follow would fare no better
-            raise
+        if "memory" in str(error):  # as torch and OpenCV say it: the captures that follow would fare no better
+            raise MemoryError(str(error)) from None
         # A fault of this program: it must not cost the captures that follow.
         problem = f"{label}: agalign failed on it ({type(error).__name__}: {error}); please report this"
         _LOG.debug(problem, exc_info=True)

@@ -216,3 +216,12 @@ def test_a_fault_in_one_capture_costs_no_other(flight: Path, tmp_path: Path, mon
     problem = reports["0000SET/000/IMG_0001"].error
     assert problem is not None
     assert "please report this" in problem
+
+
+def test_a_want_of_memory_is_said_so(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def greedy(*_: object) -> object:
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory")
+
+    monkeypatch.setattr(batch, "process_capture", greedy)
+    with pytest.raises(MemoryError, match="not enough memory"):
+        agalign.align_folder(flight, tmp_path, settings=Settings(flight=FlightSettings(together=False)))
