@@ -1,6 +1,6 @@
 """`python -m agalign` is `agalign`."""
 
-from agalign.cli import main
+from agalign.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -5,19 +5,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agalign import geometry
 from agalign.batch import CaptureReport, RunOptions, run_flight
-from agalign.choices import Interpolation, SeedKind
+from agalign.batch.capture import CaptureOutcome, process_capture, quiet
+from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.capture.align import align_pairs
+from agalign.capture.band_pair import BandPair, Candidates
 from agalign.config import Settings
-from agalign.discover import DiscoverOptions, discover
 from agalign.errors import InputError
-from agalign.mapping import Mapping
-from agalign.masks import raster_of
-from agalign.pair import align_images
-from agalign.pipeline import CaptureOutcome, process_capture, quiet
-from agalign.records import Alignment, Capture, Mask, Tile
-from agalign.summary import write_summary
-from agalign.warp import resample
+from agalign.pixels.masks import raster_of
+from agalign.pixels.resample import resample
+from agalign.products.summary import write_summary
+from agalign.values import geometry
+from agalign.values.alignment import Alignment
+from agalign.values.capture import Capture
+from agalign.values.choices import Interpolation
+from agalign.values.image import Mask, Tile
+from agalign.values.mapping import PixelMapping
 
 
 def align(
@@ -45,13 +48,11 @@ def align(
     settings = settings or Settings()
     one = raster_of(fixed, fixed_valid, "fixed")
     other = raster_of(moving, moving_valid, "moving")
-    candidates: dict[SeedKind, geometry.Matrix] = {}
+    candidates: Candidates = {"identity": geometry.overlay(one.size_px, other.size_px)}
     if seed is not None:
-        candidates["user"] = geometry.normalised(seed)
-    else:
-        scale = np.divide(other.size_px, one.size_px)
-        candidates["identity"] = geometry.resolution_change(float(scale[0]), float(scale[1]))
-    return align_images([("moving", one, other, candidates)], settings, quiet)["moving"]
+        candidates = {"user": geometry.normalised(seed)}
+    pair = BandPair.of_images("moving", one, other, candidates, settings)
+    return align_pairs([pair], settings, quiet)["moving"]
 
 
 def warp_onto(
@@ -70,7 +71,7 @@ def warp_onto(
     if pixels.ndim != 2:
         raise InputError(f"moving must be (H, W), not {pixels.shape}; warp several bands one by one")
     mask = np.ones(pixels.shape, bool) if valid is None else np.asarray(valid, bool)
-    mapping = Mapping(geometry.normalised(fixed_to_moving))
+    mapping = PixelMapping(geometry.normalised(fixed_to_moving))
     positions = mapping.positions(Tile(0, 0, *fixed_size_px))
     end = pixels.shape[1], pixels.shape[0]
     return resample(pixels, mask, positions, end, (0, 0), interpolation)
@@ -100,7 +101,7 @@ def align_folder(
     Raises InputError where there is no such folder, OutputError where `out` cannot be written, ConfigurationError
     for a model of another camera.
     """
-    from agalign.report import write_report
+    from agalign.products.report import write_report
 
     source, target = Path(folder), Path(out)
     found = discover(source, options or DiscoverOptions(skip=(target,)))

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from agalign.choices import (
+from agalign.values.choices import (
     Compression,
     Crop,
     FamilyChoice,
@@ -202,10 +202,10 @@ class LocalSettings(Stage):
     """A window that the field misses by so many times what it misses most by has half a vote."""
     reweightings: Positive = 4
     rounds: Positive = 2
-    folds: Positive = 4
     least_windows: Positive = 24
     least_gain_sigma: float = 4.0
-    """A field is kept where the squared shifts of windows left out of its fit fall by so many standard errors."""
+    """A field is kept where the squared shifts of windows left out of its fit fall by so many standard errors, and
+    their 95th percentile does not rise."""
 
 
 class WriteSettings(Stage):

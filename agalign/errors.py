@@ -17,12 +17,30 @@ class ConfigurationError(AgalignError):
     """Options that contradict each other or name something that does not exist."""
 
 
+class NoSuchBandError(ConfigurationError):
+    """A band that was asked for by name is in no capture."""
+
+
 class GeometryError(AgalignError):
     """A mapping cannot be inverted or estimated (singular homography, too few points)."""
 
 
 class NotEnoughTextureError(AgalignError):
     """Too few keypoints lie on the common valid area to learn from."""
+
+    def __init__(self, keypoints: int, least: int) -> None:
+        super().__init__(keypoints, least)
+        self.keypoints, self.least = keypoints, least
+
+    def __str__(self) -> str:
+        return f"only {self.keypoints} keypoints lie on the common valid area"
+
+
+class NoContrastError(AgalignError):
+    """No pixel of the reference has contrast enough to learn from."""
+
+    def __str__(self) -> str:
+        return "no pixel of the reference band has contrast enough to learn from"
 
 
 class SidecarError(InputError):

@@ -15,22 +15,24 @@ import cv2
 import numpy as np
 
 import agalign
-from agalign import geometry, synthetic
-from agalign.synthetic import BANDS
+from agalign.synthetic.flight import render
+from agalign.synthetic.ground import Ground, paint_ground, reflectance
+from agalign.synthetic.rig import BANDS, REFERENCE, Pose, true_homography
+from agalign.values import geometry
 
 SIZE = (640, 480)
 
 
-def scene(rng: np.random.Generator, east_m: float = 0.0) -> tuple[synthetic.Ground, synthetic.Pose, synthetic.Pose]:
+def scene(rng: np.random.Generator, east_m: float = 0.0) -> tuple[Ground, Pose, Pose]:
     """A field, a place above it, and another place `east_m` away."""
-    here = synthetic.Pose(26.0, float(rng.uniform(-180, 180)), 0.0, 0.0, 0.0, 0.0)
-    there = synthetic.Pose(26.0, here.yaw_deg, 0.0, 0.0, east_m, 0.0)
-    return synthetic.paint_ground(rng, [here, there], SIZE), here, there
+    here = Pose(26.0, float(rng.uniform(-180, 180)), 0.0, 0.0, 0.0, 0.0)
+    there = Pose(26.0, here.yaw_deg, 0.0, 0.0, east_m, 0.0)
+    return paint_ground(rng, [here, there], SIZE), here, there
 
 
-def view(ground: synthetic.Ground, band: int, pose: synthetic.Pose, rng: np.random.Generator) -> np.ndarray:
-    painted = synthetic.reflectance(ground, BANDS[band])
-    return synthetic.render(painted, ground, BANDS[band], pose, SIZE, rng)
+def view(ground: Ground, band: int, pose: Pose, rng: np.random.Generator) -> np.ndarray:
+    painted = reflectance(ground, BANDS[band])
+    return render(painted, ground, BANDS[band], pose, SIZE, rng)
 
 
 def water(rng: np.random.Generator) -> np.ndarray:
@@ -44,10 +46,10 @@ def water(rng: np.random.Generator) -> np.ndarray:
 def pair(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
     """(fixed, moving, seed, truth): truth is None where the images do not show the same."""
     band = int(rng.choice([0, 2, 3, 4]))
-    reference, moving = BANDS[synthetic.REFERENCE], BANDS[band]
+    reference, moving = BANDS[REFERENCE], BANDS[band]
     away = {"another place of the field": 60.0, "8 % overlap": 0.92 * SIZE[0] / 640 * 26.0 * 1280 / 1453.33}
     ground, here, there = scene(rng, away.get(kind, 0.0))
-    fixed = view(ground, synthetic.REFERENCE, here, rng)
+    fixed = view(ground, REFERENCE, here, rng)
     if kind == "water":
         return water(rng), water(rng), None, None
     if kind == "another field":
@@ -56,7 +58,7 @@ def pair(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
     other_view = view(ground, band, there, rng)
     if kind in away:
         return fixed, other_view, None, None
-    truth = synthetic.true_homography(reference, moving, here, SIZE)
+    truth = true_homography(reference, moving, here, SIZE)
     seed = None
     if kind == "all but saturated":
         level = np.quantile(other_view, 0.01)

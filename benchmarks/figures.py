@@ -16,14 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import agalign
-from agalign import geometry, synthetic
 from agalign.config import JointSettings, PaperRecipe
-from agalign.detect import sift_keypoints, to_8_bit, visible_in_both
+from agalign.evaluation.image_pairs import read_image
 from agalign.evaluation.methods import Task, method_named
 from agalign.evaluation.surface import draw_surface, loss_surface
-from agalign.geometry import Matrix
-from agalign.image_pairs import read_image
-from agalign.records import Raster
+from agalign.method.detect import sift_keypoints, to_8_bit, visible_in_both
+from agalign.synthetic import flight as synthetic
+from agalign.synthetic import rig
+from agalign.values import geometry
+from agalign.values.geometry import Matrix
+from agalign.values.image import Raster
 
 SIZE_PX = (800, 600)
 DRAWN = 60
@@ -32,8 +34,8 @@ GREEN, RED = (80, 200, 60), (60, 60, 230)
 
 def straight_pair(folder: Path) -> tuple[Raster, Raster, Matrix]:
     """Green and near infra-red of one synthetic capture without lens distortion, and the truth between them."""
-    rig = [replace(b, distortion=(0.0,) * 5) for b in synthetic.BANDS]
-    capture = json.loads(synthetic.make_flight(folder, 1, SIZE_PX, rng_seed=11, bands=rig).read_text())["IMG_0001"]
+    straight = [replace(b, distortion=(0.0,) * 5) for b in rig.BANDS]
+    capture = json.loads(synthetic.make_flight(folder, 1, SIZE_PX, rng_seed=11, bands=straight).read_text())["IMG_0001"]
     fixed, moving = capture["reference"], "IMG_0001_4.tif"
     images = [read_image(folder / "0000SET" / "000" / name) for name in (fixed, moving)]
     return *images, np.array(capture["bands"][moving]["fixed_to_moving"])

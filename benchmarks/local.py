@@ -11,8 +11,8 @@ import numpy as np
 
 import agalign
 from agalign.config import LocalSettings, Settings
-from agalign.demo import score_against_truth
-from agalign.synthetic import make_flight
+from agalign.synthetic.flight import make_flight
+from agalign.synthetic.score import score_against_truth
 
 
 def main(reliefs_m: list[float]) -> None:

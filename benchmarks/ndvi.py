@@ -11,15 +11,17 @@ import numpy as np
 import rasterio
 
 import agalign
-from agalign import synthetic
+from agalign.cameras.metadata import read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.config import Settings, WriteSettings
-from agalign.index_rasters import write_indices
-from agalign.indices import INDICES, compute
-from agalign.metadata import read_tags
-from agalign.radiometry import calibrated
-from agalign.raster import probe
-from agalign.sidecar import read_sidecar
+from agalign.pixels.radiometry import calibrated
+from agalign.pixels.raster import probe
+from agalign.products.index_rasters import write_indices
+from agalign.products.indices import INDICES, compute
+from agalign.products.sidecar import read_sidecar
+from agalign.synthetic import flight as synthetic
+from agalign.synthetic import rig
+from agalign.synthetic.ground import reflectance
 
 SIZE_PX = (1280, 960)
 NDVI = INDICES["ndvi"]
@@ -33,10 +35,10 @@ def main(captures: int) -> None:
         poses, ground, _ = synthetic.lay_out_flight(captures, SIZE_PX)
         settings = Settings(write=WriteSettings(radiometry=True))
         agalign.align_folder(folder, out, settings=settings)
-        bands = {b.name: b for b in synthetic.BANDS}
-        reference = synthetic.BANDS[synthetic.REFERENCE]
+        bands = {b.name: b for b in rig.BANDS}
+        reference = rig.BANDS[rig.REFERENCE]
         for number, (pose, report) in enumerate(zip(poses, write_indices(out, [NDVI]), strict=True), start=1):
-            painted = [synthetic.reflectance(ground, bands[name]) for name in ("NIR", "Red")]
+            painted = [reflectance(ground, bands[name]) for name in ("NIR", "Red")]
             truth = compute(NDVI, [synthetic.view(p, ground, reference, pose, SIZE_PX) for p in painted])
             before = compute(NDVI, [as_it_lies(folder, number, bands[name]) for name in ("NIR", "Red")])
             with rasterio.open(report.path) as dataset:
@@ -52,7 +54,7 @@ def main(captures: int) -> None:
         print(f"| {name} | {middle:.3f} | {all_of.mean():.3f} | {p95:.3f} | {(all_of > 0.1).mean():.1%} |")
 
 
-def as_it_lies(folder: Path, number: int, spec: synthetic.BandSpec) -> np.ndarray:
+def as_it_lies(folder: Path, number: int, spec: rig.BandSpec) -> np.ndarray:
     """Reflectance of a band in its own pixels."""
     path = folder / "0000SET" / "000" / f"IMG_{number:04d}_{spec.rig_index + 1}.tif"
     (band,) = MicaSense().bands(path, read_tags(path), probe(path))

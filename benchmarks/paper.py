@@ -16,33 +16,34 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
+from agalign.capture.band_pair import BandPair
 from agalign.config import JointSettings, Settings
+from agalign.evaluation.image_pairs import PairFiles, read_image
+from agalign.evaluation.learn import learn_descriptor
 from agalign.evaluation.methods import method_named
 from agalign.evaluation.run import Result, Starts, as_csv, error_table, evaluate, precision_table
-from agalign.flight import save_model
-from agalign.image_pairs import ImagePair, read_image
-from agalign.learn import CoarsePair, learn_descriptor
+from agalign.flight.model import save_model
 
 SHIFTS = (0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2)
 SPLIT_SEED = 2018
 
 
-def pairs_of(folder: Path) -> list[ImagePair]:
+def pairs_of(folder: Path) -> list[PairFiles]:
     found = []
     for truth in sorted(folder.glob("GT_*.txt"), key=lambda p: int(p.stem[3:])):
         number = truth.stem[3:]
         images = folder / f"VIS_{number}.png", folder / f"NIR_TF_{number}.png"
-        found.append(ImagePair(number, "aerial", *images, np.loadtxt(truth)))
+        found.append(PairFiles(number, "aerial", *images, np.loadtxt(truth)))
     return found
 
 
-def split(pairs: list[ImagePair]) -> tuple[list[ImagePair], list[ImagePair]]:
+def split(pairs: list[PairFiles]) -> tuple[list[PairFiles], list[PairFiles]]:
     """20 to learn from, 5 to test."""
     mixed = random.Random(SPLIT_SEED).sample(pairs, len(pairs))
     return mixed[:20], mixed[20:]
 
 
-def precision(pairs: list[ImagePair], names: list[str]) -> None:
+def precision(pairs: list[PairFiles], names: list[str]) -> None:
     names = names or ["fast:pseudo-siamese", "fast:siamese", "fast:unshared", "sift", "daisy", "paper:pseudo-siamese"]
     methods = {name: method_named(name) for name in names}
     results = list(evaluate(pairs, methods, Starts((0.05,))))
@@ -50,7 +51,7 @@ def precision(pairs: list[ImagePair], names: list[str]) -> None:
     markdown(error_table(results))
 
 
-def robustness(pairs: list[ImagePair], names: list[str]) -> None:
+def robustness(pairs: list[PairFiles], names: list[str]) -> None:
     results: list[Result] = []
     for name in names or ["fast:pseudo-siamese", "fast:pseudo-siamese+seeds", "elastix", "paper:pseudo-siamese"]:
         method, _, seeds = name.partition("+")
@@ -84,7 +85,7 @@ def plot(results: list[Result], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def automatic(pairs: list[ImagePair], _names: list[str]) -> None:
+def automatic(pairs: list[PairFiles], _names: list[str]) -> None:
     train, test = split(pairs)
     rng = np.random.default_rng(SPLIT_SEED)
     coarse = []
@@ -92,14 +93,15 @@ def automatic(pairs: list[ImagePair], _names: list[str]) -> None:
         fixed, moving = read_image(pair.fixed), read_image(pair.moving)
         assert pair.fixed_to_moving is not None
         ((_, start),) = Starts((0.05,)).of(pair.fixed_to_moving, max(fixed.size_px), rng)
-        coarse.append(CoarsePair(pair.name, fixed, moving, start))
+        coarse.append((pair.name, fixed, moving, {"user": start}))
     methods = {name: method_named(name) for name in ("sift", "daisy")}
     with tempfile.TemporaryDirectory() as temporary:
         for sharing in ("siamese", "pseudo-siamese"):
             path = Path(temporary) / f"automatic, {sharing}.safetensors"
             settings = Settings(joint=JointSettings.model_validate({"sharing": sharing}))
             aligned = []
-            model = learn_descriptor(coarse, settings, on_pair=lambda lesson, a=aligned: a.append(lesson.status))
+            pairs = [BandPair.of_images(*c, settings) for c in coarse]
+            model = learn_descriptor(pairs, settings, on_pair=lambda lesson, a=aligned: a.append(lesson.status))
             print(f"{sharing}: {aligned.count('aligned')} of {len(aligned)} pairs aligned", flush=True)
             save_model(model, path)
             methods[path.stem] = method_named(str(path))

@@ -23,19 +23,23 @@ from typing import Any
 import cv2
 import numpy as np
 
-from agalign import geometry, lens, synthetic
+from agalign.batch.capture import quiet
 from agalign.cameras import rig_seed
-from agalign.config import CheckSettings, SeedSettings, Settings
-from agalign.detect import to_8_bit
-from agalign.discover import discover
+from agalign.cameras.discover import discover
+from agalign.capture.align import align_pairs
+from agalign.capture.band_pair import BandPair
+from agalign.capture.reference import Reference
+from agalign.capture.seeding import best_seed
+from agalign.config import CheckSettings, Settings
 from agalign.evaluation.methods import elastix_affinity
-from agalign.mapping import Mapping
-from agalign.pair import align_images
-from agalign.pipeline import quiet
-from agalign.raster import probe, read_for_alignment
-from agalign.records import Band, Capture, Raster
-from agalign.residuals import FixedWindows
-from agalign.seed import best_seed, warped
+from agalign.method.detect import to_8_bit
+from agalign.pixels.raster import probe, read_for_alignment
+from agalign.pixels.resample import warped
+from agalign.synthetic import flight as synthetic
+from agalign.values import geometry, lens
+from agalign.values.capture import Band, Capture
+from agalign.values.image import Raster
+from agalign.values.mapping import PixelMapping
 
 Matrix = np.ndarray
 
@@ -63,7 +67,7 @@ class Case:
     def straight(self) -> tuple[Raster, Raster]:
         """Both images lens-corrected."""
         return tuple(
-            warped(r, Mapping(np.eye(3), None, r.lens), r.size_px) if lens.is_distorting(r.lens) else r
+            warped(r, PixelMapping(np.eye(3), None, r.lens), r.size_px) if lens.is_distorting(r.lens) else r
             for r in (self.fixed, self.moving)
         )  # type: ignore[return-value]
 
@@ -109,13 +113,15 @@ def rig_only(_f: Raster, _m: Raster, rig: Matrix) -> Matrix:
 
 
 def structure_seed(f: Raster, m: Raster, rig: Matrix) -> Matrix:
-    return best_seed(f, m, {"rig": rig, "identity": np.eye(3)}, SeedSettings()).fixed_to_moving
+    candidates: dict[Any, Matrix] = {"rig": rig, "identity": np.eye(3)}
+    return best_seed(BandPair.of_images("moving", f, m, candidates, Settings()), candidates).fixed_to_moving
 
 
 def structure_ties(f: Raster, m: Raster, rig: Matrix) -> Matrix | None:
     """The structure seed, then local shifts in windows as ties, then MAGSAC++."""
     seed = structure_seed(f, m, rig)
-    found = FixedWindows(f, CheckSettings(tile_px=64)).residuals(warped(m, Mapping(seed), f.size_px))
+    windows = Reference(f, Settings(check=CheckSettings(tile_px=64))).windows
+    found = windows.residuals(warped(m, PixelMapping(seed), f.size_px))
     some = np.isfinite(found.shifts_px[:, 0])
     if some.sum() < 8:
         return None
@@ -175,7 +181,7 @@ def elastix(f: Raster, m: Raster, _rig: Matrix) -> Matrix | None:
 def elastix_seeded(f: Raster, m: Raster, rig: Matrix) -> Matrix | None:
     """The same from this program's seed, over five levels."""
     seed = structure_seed(f, m, rig)
-    found = elastix_affinity(f, warped(m, Mapping(seed), f.size_px), levels=5)
+    found = elastix_affinity(f, warped(m, PixelMapping(seed), f.size_px), levels=5)
     return None if found is None else geometry.compose(seed, found)
 
 
@@ -218,7 +224,8 @@ def run_peer(name: str, folders: list[Path]) -> list[dict[str, Any]]:
 
 def run_ours(name: str, folders: list[Path]) -> list[dict[str, Any]]:
     """The pairs of a capture together, seeded, aligned and checked, as a run does it."""
-    from agalign.flight import camera_key, learn_flight
+    from agalign.batch.learn import learn_flight
+    from agalign.flight.groups import camera_key
 
     groups: dict[tuple[str, str], list[Case]] = {}
     for case in cases(folders):
@@ -235,13 +242,14 @@ def run_ours(name: str, folders: list[Path]) -> list[dict[str, Any]]:
                                if c.capture is not None and c.set_name == set_name}.values())  # fmt: skip
                 models[key] = learn_flight(flight, Settings(), quiet)
             model = models[key]
-        images = []
+        pairs = []
+        reference = Reference(group[0].fixed, Settings())
         for case in group:
             candidates: dict[Any, Matrix] = {"rig": case.rig, "identity": np.eye(3)}
             if model is not None and case.band.name in model.mappings:
                 candidates = {"model": model.mappings[case.band.name], **candidates}
-            images.append((case.band.name, case.fixed, case.moving, candidates))
-        found = align_images(images, Settings(), quiet, model)
+            pairs.append(BandPair(case.band.name, reference, case.moving, candidates))
+        found = align_pairs(pairs, Settings(), quiet, model)
         for case in group:
             alignment = found[case.band.name]
             rows.append(_row(case, alignment.fixed_to_moving, alignment.seconds, alignment.status))

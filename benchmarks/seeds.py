@@ -12,41 +12,36 @@ from pathlib import Path
 
 import numpy as np
 
+from agalign.cameras.discover import discover
+from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.seeding import best_seed
 from agalign.config import Settings
-from agalign.discover import discover
-from agalign.images import PairImages, read_pairs
-from agalign.mapping import Mapping
-from agalign.records import Capture
-from agalign.residuals import FixedWindows
-from agalign.seed import best_seed, overlay, scored_seeds, single, warped
+from agalign.values import geometry
+from agalign.values.capture import Capture
+from agalign.values.mapping import PixelMapping
 
 KINDS = ("identity", "rig", "structure", "chosen")
 
 
-def seeds_of(pair: PairImages) -> dict[str, Mapping]:
+def seeds_of(pair: BandPair) -> dict[str, PixelMapping]:
     """Mappings between raw px by each kind of seed, and by the one that a run starts from."""
-    settings = Settings().seed
-    moving = single(pair.moving)
-    lenses = pair.fixed.lens, pair.moving.lens
-    plain = overlay(pair.reference, pair.moving_bands[0])
-    found = {"identity": Mapping(plain)}
+    plain = geometry.overlay(pair.fixed.size_px, pair.moving.size_px)
+    found = {"identity": PixelMapping(plain)}
     if "rig" in pair.candidates:
-        found["rig"] = Mapping(pair.candidates["rig"], *lenses)
-    shifted = [s for s in scored_seeds(pair.fixed, moving, "identity", plain, settings) if s.kind == "structure"]
-    if shifted:
-        found["structure"] = Mapping(shifted[0].fixed_to_moving, *lenses)
-    found["chosen"] = Mapping(best_seed(pair.fixed, moving, pair.candidates, settings).fixed_to_moving, *lenses)
+        found["rig"] = pair.mapping(pair.candidates["rig"])
+    shifted = best_seed(pair, {"identity": plain})
+    if shifted.kind == "structure":
+        found["structure"] = pair.mapping(shifted.fixed_to_moving)
+    found["chosen"] = pair.mapping(best_seed(pair, pair.candidates).fixed_to_moving)
     return found
 
 
 def errors(capture: Capture, ties: dict | None) -> dict[str, list[float]]:
     """Median error of each pair in px, by kind of seed."""
-    settings = Settings()
-    pairs, _ = read_pairs(capture, settings)
-    windows = FixedWindows(single(pairs[0].fixed), settings.check)
+    pairs, _ = read_pairs(capture, Settings())
     found: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for pair in pairs:
-        known = None if ties is None else ties["bands"].get(pair.moving_bands[0].path.name)
+        known = None if ties is None else ties["bands"].get(pair.bands[0].path.name)
         if ties is not None and known is None:
             continue
         for kind, mapping in seeds_of(pair).items():
@@ -55,8 +50,7 @@ def errors(capture: Capture, ties: dict | None) -> dict[str, list[float]]:
                 error = np.linalg.norm(mapping(points[:, :2]) - points[:, 2:], axis=1)
                 found[kind].append(float(np.median(error)))
             else:
-                there = warped(single(pair.moving), mapping, pair.fixed.size_px)
-                found[kind].append(windows.residuals(there).median_px)
+                found[kind].append(pair.reference.windows.residuals(pair.laid(mapping)).median_px)
     return found
 
 

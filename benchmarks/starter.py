@@ -15,11 +15,13 @@ import cv2
 import numpy as np
 from peers import cases
 
-from agalign import geometry
+from agalign.batch.capture import quiet
+from agalign.capture.align import align_pairs
+from agalign.capture.band_pair import BandPair
+from agalign.capture.reference import Reference
 from agalign.config import FastRecipe, JointSettings, Settings
-from agalign.pair import align_images
-from agalign.pipeline import quiet
-from agalign.records import Raster
+from agalign.values import geometry
+from agalign.values.image import Raster
 
 Matrix = np.ndarray
 Group = tuple[str, list[tuple[str, Raster, Raster, dict[str, Matrix]]], dict[str, Matrix]]
@@ -48,7 +50,7 @@ def _pair(set_name: str, number: int, fixed: Raster, moving: Raster, truth: Matr
     angle = 2.4 * number  # a direction of its own for each pair
     shift = 0.05 * max(fixed.size_px) * np.array([np.cos(angle), np.sin(angle)])
     start = geometry.compose(truth, geometry.translation(*shift))
-    return set_name, [("moving", fixed, moving, {"given": start})], {"moving": np.hstack([points, there])[common]}
+    return set_name, [("moving", fixed, moving, {"user": start})], {"moving": np.hstack([points, there])[common]}
 
 
 def _read(path: Path) -> Raster:
@@ -67,7 +69,9 @@ def main() -> None:
             errors, seconds, pairs = [], [], 0
             for _, images, ties in groups(folder):
                 began = time.perf_counter()
-                found = align_images(images, settings, quiet)
+                reference = Reference(images[0][1], settings)
+                pairs_here = [BandPair(name, reference, moving, starts) for name, _, moving, starts in images]
+                found = align_pairs(pairs_here, settings, quiet)
                 seconds += [(time.perf_counter() - began) / len(images)] * len(images)
                 pairs += len(images)
                 for name, alignment in found.items():

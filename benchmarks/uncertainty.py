@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 import agalign
-from agalign import geometry, synthetic
+from agalign.synthetic import flight as synthetic
+from agalign.values import geometry
 
 
 def main() -> None:

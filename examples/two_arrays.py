@@ -9,7 +9,7 @@ from pathlib import Path
 import tifffile
 
 import agalign
-from agalign.synthetic import make_flight
+from agalign.synthetic.flight import make_flight
 
 with tempfile.TemporaryDirectory() as folder:
     make_flight(Path(folder), captures=1, size_px=(640, 480))

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign import geometry, synthetic
+from agalign.synthetic import flight as synthetic
+from agalign.values import geometry
 
 # Each worker has a core of its own; read when torch is loaded, which nothing above does.
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign import geometry
 from agalign.errors import GeometryError, InputError
+from agalign.values import geometry
 
 from .conftest import mean_error_px, textured_image, textured_pair
 

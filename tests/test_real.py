@@ -9,11 +9,11 @@ import pytest
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
-from agalign import geometry
+from agalign.batch.capture import process_capture
 from agalign.cameras import rig_seed
+from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.config import LocalSettings, SeedSettings, Settings
-from agalign.discover import DiscoverOptions, discover
-from agalign.pipeline import process_capture
+from agalign.values import geometry
 
 pytestmark = pytest.mark.real
 

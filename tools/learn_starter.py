@@ -1,4 +1,4 @@
-"""Learns the network that recipe fast starts from, on synthetic flights, and writes agalign/starter.safetensors.
+"""Learns the network that recipe fast starts from, on synthetic flights, and writes agalign/method/starter.safetensors.
 
     python tools/learn_starter.py [scenes, by default 40]
 
@@ -14,12 +14,13 @@ from pathlib import Path
 import torch
 
 import agalign
+from agalign.batch.learn import read_subject
+from agalign.cameras.discover import discover
 from agalign.config import FastRecipe, JointSettings, Settings
-from agalign.discover import discover
-from agalign.flight import read_subject
-from agalign.joint import JointAligner
-from agalign.starter import save_starter
-from agalign.synthetic import make_flight
+from agalign.method.fast import learn
+from agalign.method.starter import save_starter
+from agalign.method.state import JointState
+from agalign.synthetic.flight import make_flight
 
 SCHEDULE = ((2e-3, 100), (5e-4, 50))
 """Learning rates, and the steps a scene at each."""
@@ -40,11 +41,11 @@ def main() -> None:
         # psi may move as always, but nothing is ever learnt well enough to stop.
         recipe = FastRecipe(start="random", learning_rate=rate, most_steps=steps, enough_retrieval=1.0)
         settings = JointSettings(sharing="siamese", fast=recipe)
-        aligner = JointAligner(settings, lambda _, share, rate=rate: print(f"rate {rate:g}: {share:.0%}", flush=True))
+        state = JointState(settings, lambda _, share, rate=rate: print(f"rate {rate:g}: {share:.0%}", flush=True))
         if net is None:
-            net = aligner.new_descriptor([1] * (1 + len(subjects[0].moving)), half_rectified=True, unit_length=True)
-        aligner.learn(subjects, net)
-    save_starter(net, Path(agalign.__file__).parent / "starter.safetensors")
+            net = state.fast_descriptor([1] * (1 + len(subjects[0].moving)))
+        learn(state, subjects, net)
+    save_starter(net, Path(agalign.__file__).parent / "method" / "starter.safetensors")
 
 
 if __name__ == "__main__":

@@ -11,12 +11,13 @@ from typing import Protocol
 
 import numpy as np
 
-from agalign import geometry
+from agalign.cameras.metadata import Tags
 from agalign.errors import GeometryError
-from agalign.geometry import Matrix
-from agalign.metadata import Tags
-from agalign.raster import RasterInfo
-from agalign.records import Band, Lens
+from agalign.pixels.raster import RasterInfo
+from agalign.values import geometry
+from agalign.values.capture import Band
+from agalign.values.geometry import Matrix
+from agalign.values.lens import Lens
 
 _PREFERRED_REFERENCES = ("green", "gre", "g")
 _THERMAL = ("lwir", "thermal")

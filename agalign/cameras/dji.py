@@ -15,13 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from agalign import geometry
 from agalign.cameras.base import Camera, band_of, colour_bands, spectral
+from agalign.cameras.metadata import Tags
 from agalign.errors import GeometryError
-from agalign.geometry import Matrix
-from agalign.metadata import Tags
-from agalign.raster import RasterInfo
-from agalign.records import Band, Lens, Radiometry
+from agalign.pixels.raster import RasterInfo
+from agalign.values import geometry
+from agalign.values.capture import Band, Radiometry
+from agalign.values.geometry import Matrix
+from agalign.values.lens import Lens
 
 _PHANTOM_4_BANDS = {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}
 _MAVIC_3_BANDS = {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}

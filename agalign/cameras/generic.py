@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras.base import Camera, band_of, colour_bands
+from agalign.cameras.metadata import Tags
 from agalign.errors import ConfigurationError
-from agalign.metadata import Tags
-from agalign.raster import JPEG_SUFFIXES, RasterInfo
-from agalign.records import Band
+from agalign.pixels.raster import JPEG_SUFFIXES, RasterInfo
+from agalign.values.capture import Band
 
 _BAND_WORDS = (
     "coastal|blue|green|red[ _-]?edge|near[ _-]?infra[ _-]?red|infra[ _-]?red|red|nir|swir|pan|panchro|lwir|thermal|"

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras.base import Camera, band_of
-from agalign.metadata import Tags
-from agalign.raster import RasterInfo
-from agalign.records import Band
+from agalign.cameras.metadata import Tags
+from agalign.pixels.raster import RasterInfo
+from agalign.values.capture import Band
 
 _FILE = re.compile(r"^capture_(?P<serial>[^_]+)_(?P<moment>.+)$", re.IGNORECASE)
 _FILTER = re.compile(r"-F(?P<wavelength>\d{3,4})$")

@@ -11,9 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras.base import Camera, band_of, largest_value, perspective_lens, rays_to_rig, rig_rotation, spectral
-from agalign.metadata import Tags, rational
-from agalign.raster import RasterInfo
-from agalign.records import Band, Radiometry
+from agalign.cameras.metadata import Tags, rational
+from agalign.pixels.raster import RasterInfo
+from agalign.values.capture import Band, Radiometry
 
 _TWELVE_BIT_TOP = 65520.0
 """RedEdge cameras store 12 bits in the upper bits of uint16."""

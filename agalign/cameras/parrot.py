@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras.base import Camera, band_of, colour_bands, perspective_lens, rays_to_rig, rig_rotation, spectral
-from agalign.geometry import Matrix
-from agalign.lens import radial_coefficients
-from agalign.metadata import Tags
-from agalign.raster import RasterInfo
-from agalign.records import Band, Lens
+from agalign.cameras.metadata import Tags
+from agalign.pixels.raster import RasterInfo
+from agalign.values.capture import Band
+from agalign.values.geometry import Matrix
+from agalign.values.lens import Lens, radial_coefficients
 
 _NAMES = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
 _SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)

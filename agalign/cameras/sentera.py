@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras.base import Camera, band_of, colour_bands, perspective_lens, spectral
-from agalign.metadata import CAPTURE_IDS, Tags
-from agalign.raster import RasterInfo
-from agalign.records import Band
+from agalign.cameras.metadata import CAPTURE_IDS, Tags
+from agalign.pixels.raster import RasterInfo
+from agalign.values.capture import Band
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
 _ANY_BAND_FOLDER = re.compile(r"^(?:\d+-)?[A-Za-z ]+-\d{3,4}(?:-\d+)?$|^(?:\d+-)?(?:RGB|NDRE|NDVI|NIR|RE|LWIR)$", re.I)

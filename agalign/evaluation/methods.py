@@ -19,22 +19,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from agalign import geometry
-from agalign.choices import Sharing
-from agalign.config import JointSettings, SeedSettings, Settings
-from agalign.descriptor import Descriptor
-from agalign.detect import grey
-from agalign.errors import ConfigurationError, GeometryError, InputError, NotEnoughTextureError
+from agalign.capture.band_pair import BandPair
+from agalign.capture.seeding import best_seed, subject_of
+from agalign.config import JointSettings, Settings
+from agalign.errors import ConfigurationError, GeometryError, InputError, NoContrastError, NotEnoughTextureError
 from agalign.evaluation.protocol import grey_patches
-from agalign.flight import load_model
-from agalign.geometry import Matrix
-from agalign.joint import JointAligner, Subject
-from agalign.mapping import Mapping
-from agalign.match import matching_network
-from agalign.patches import Keypoints, patch_grid, transform
-from agalign.records import Raster
-from agalign.refine import describe_fixed, moving_patches
-from agalign.seed import best_seed, is_trusted, single, warped
+from agalign.flight.model import load_model
+from agalign.method.descriptor import Descriptor
+from agalign.method.detect import grey
+from agalign.method.fast import learn
+from agalign.method.match import matching_network
+from agalign.method.paper import align_by_paper
+from agalign.method.patches import Keypoints, patch_positions, transform
+from agalign.method.refine import MovingBand, describe_fixed, refine
+from agalign.method.state import JointState
+from agalign.method.subject import Subject
+from agalign.pixels.resample import single, warped
+from agalign.values import geometry
+from agalign.values.alignment import JointResult, Seed
+from agalign.values.choices import Sharing
+from agalign.values.geometry import Matrix
+from agalign.values.image import Raster
+from agalign.values.mapping import PixelMapping
 
 
 @dataclass(frozen=True)
@@ -112,37 +118,34 @@ def _learnt_on_the_pair(task: Task, settings: JointSettings, *, colour: bool) ->
     if not colour or (settings.sharing == "siamese" and fixed.channels != moving.channels):
         fixed, moving = (_without_colour(r) for r in (fixed, moving))
     settings = settings.model_copy(update={"device": task.device, "rng_seed": task.rng_seed})
-    start, trusted = task.start, False
+    seed = Seed("user", task.start, 0.0)
+    pair = BandPair.of_images("moving", fixed, moving, {"user": task.start}, Settings())
     if task.seeding:
-        seed = best_seed(single(fixed), single(moving), {"user": task.start}, SeedSettings())
-        start, trusted = seed.fixed_to_moving, is_trusted(seed, SeedSettings())
-    aligner = JointAligner(settings, lambda *_: None)
-    subject = Subject(fixed, [moving], [start], [1], [trusted])
+        seed = best_seed(pair, pair.candidates)
+    state, subject = JointState(settings, lambda *_: None), subject_of([pair], [seed], [1])
     try:
         if settings.recipe == "paper":
-            net, found = aligner.paper(fixed, moving, start)
-            subject.mappings[0] = found.fixed_to_moving
+            net, found = align_by_paper(state, subject)
         else:
-            net = aligner.fast_descriptor([fixed.channels, moving.channels])
-            aligner.learn([subject], net)
-            refined = aligner.refine(net, subject)[0]
-            if not isinstance(refined, str):
-                subject.mappings[0] = refined.fixed_to_moving
-    except (NotEnoughTextureError, GeometryError):
-        return Outcome(None, start)
-    return Outcome(_by_network(net, aligner, fixed, moving), subject.mappings[0])
+            net = state.fast_descriptor([fixed.channels, moving.channels])
+            learn(state, [subject], net)
+            found = refine(state, net, subject)[0]
+    except (NotEnoughTextureError, NoContrastError, GeometryError):
+        return Outcome(None, seed.fixed_to_moving)
+    mapping = found.fixed_to_moving if isinstance(found, JointResult) else subject.mappings[0]
+    return Outcome(_by_network(net, state, fixed, moving), mapping)
 
 
 def _without_colour(raster: Raster) -> Raster:
     return replace(raster, pixels=grey(raster.pixels))
 
 
-def _by_network(net: Descriptor, aligner: JointAligner, one: Raster, other: Raster) -> Describe:
+def _by_network(net: Descriptor, state: JointState, one: Raster, other: Raster) -> Describe:
     @torch.no_grad()
     def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
-        level = aligner.level(Subject(one, [other], [fixed_to_moving], [1], [True]), 1.0, [0])
-        h, keypoints = level.homography(fixed_to_moving, 0), keypoints.to(aligner.device)
-        return describe_fixed(net, level, keypoints), net(moving_patches(level, 0, h, keypoints), 1)
+        level = state.level(Subject.of_one(one, other, fixed_to_moving), 1.0, [0])
+        h, keypoints = level.homography(fixed_to_moving, 0), keypoints.to(state.device)
+        return describe_fixed(net, level, keypoints), MovingBand(net, level, 0, 1).describe(keypoints, h)
 
     return describe
 
@@ -157,8 +160,8 @@ def _saved_network(path: Path) -> Method:
             for r, channels in zip((task.fixed, task.moving), model.net.channels, strict=False)
         )
         net = matching_network(model.net, 1, (fixed.channels, moving.channels))
-        aligner = JointAligner(JointSettings(device="cpu"), lambda *_: None)
-        return Outcome(_by_network(net, aligner, fixed, moving))
+        state = JointState(JointSettings(device="cpu"), lambda *_: None)
+        return Outcome(_by_network(net, state, fixed, moving))
 
     return method
 
@@ -170,7 +173,7 @@ def _from_patches(task: Task, side: int, describe_patches: Callable[[Tensor], Te
     """A descriptor of (N, 1, side, side) patches in [0, 1]."""
 
     def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
-        grid = patch_grid(keypoints, side)
+        grid = patch_positions(keypoints, side)
         there = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
         return describe_patches(grey_patches(task.fixed, grid)), describe_patches(grey_patches(task.moving, there))
 
@@ -243,7 +246,7 @@ def _torchscript(path: Path, side: int) -> Method:
 
 def _elastix(task: Task) -> Outcome:
     """On the pyramid of recipe paper; its own default parameters otherwise."""
-    laid = warped(single(task.moving), Mapping(task.start), task.fixed.size_px)
+    laid = warped(single(task.moving), PixelMapping(task.start), task.fixed.size_px)
     coarsest = Settings().joint.paper.coarsest_px
     levels = 1 + max(0, round(math.log2(max(task.fixed.size_px) / coarsest)))
     found = elastix_affinity(single(task.fixed), laid, levels)

@@ -7,11 +7,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agalign import geometry
-from agalign.detect import to_8_bit
-from agalign.geometry import Matrix
-from agalign.patches import bilinear
-from agalign.records import Raster
+from agalign.method.detect import to_8_bit
+from agalign.method.patches import bilinear
+from agalign.values import geometry
+from agalign.values.geometry import Matrix
+from agalign.values.image import Raster
 
 
 def grey_patches(raster: Raster, grid: Tensor) -> Tensor:

@@ -9,14 +9,14 @@ from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
-from agalign import geometry
-from agalign.detect import sift_keypoints, visible_in_both
 from agalign.errors import InputError
+from agalign.evaluation.image_pairs import PairFiles, read_image
 from agalign.evaluation.methods import Method, Task
 from agalign.evaluation.protocol import average_precision, homography_error_px
-from agalign.geometry import Matrix
-from agalign.image_pairs import ImagePair, read_image
-from agalign.joint import one_thread
+from agalign.method.detect import sift_keypoints, visible_in_both
+from agalign.method.device import one_memory_error, one_thread
+from agalign.values import geometry
+from agalign.values.geometry import Matrix
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Result:
 
 
 def evaluate(
-    pairs: Sequence[ImagePair], methods: Mapping[str, Method], starts: Starts, device: str = "auto", rng_seed: int = 0
+    pairs: Sequence[PairFiles], methods: Mapping[str, Method], starts: Starts, device: str = "auto", rng_seed: int = 0
 ) -> Iterator[Result]:
     """Results pair by pair. A descriptor that is not learnt on the pair depends on no start and is measured once.
 
@@ -79,7 +79,7 @@ def evaluate(
             rng = np.random.default_rng((rng_seed, number))
             for shift, start in starts.of(truth, max(fixed.size_px), rng):
                 began = time.perf_counter()
-                with one_thread():
+                with one_thread(), one_memory_error():
                     outcome = method(Task(fixed, moving, start, device, rng_seed, starts.seeding))
                 seconds = time.perf_counter() - began
                 precision = error = math.nan

@@ -8,12 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign import geometry
 from agalign.config import JointSettings
-from agalign.errors import NotEnoughTextureError, OutputError
-from agalign.geometry import Matrix
-from agalign.joint import JointAligner, Subject, one_thread
-from agalign.records import Raster
+from agalign.errors import NoContrastError, NotEnoughTextureError
+from agalign.method.device import one_memory_error, one_thread
+from agalign.method.paper import descend
+from agalign.method.state import JointState
+from agalign.method.subject import Subject
+from agalign.products.picture import write_png
+from agalign.values import geometry
+from agalign.values.geometry import Matrix
+from agalign.values.image import Raster
 
 
 def loss_surface(
@@ -30,13 +34,12 @@ def loss_surface(
     for row, dy in enumerate(offsets_px):
         for column, dx in enumerate(offsets_px):
             start = geometry.compose(truth, geometry.translation(float(dx), float(dy)))
-            aligner = JointAligner(settings, lambda *_: None)
-            channels = [fixed.channels, moving.channels]
-            with suppress(NotEnoughTextureError), one_thread():
-                level = aligner.level(Subject(fixed, [moving], [start], [1], [False]), scale, [0])
-                net = aligner.new_descriptor(channels, half_rectified=False, unit_length=False)
-                _, _, loss, _ = aligner.descend(net, level, start, lambda _: None, move=False)
-                found[row, column] = loss
+            state = JointState(settings, lambda *_: None)
+            with suppress(NotEnoughTextureError, NoContrastError), one_thread(), one_memory_error():
+                level = state.level(Subject.of_one(fixed, moving, start), scale, [0])
+                net = state.paper_descriptor([fixed.channels, moving.channels])
+                pool = level.trainable
+                found[row, column] = descend(state, net, level, pool, start, lambda _: None, move=False).loss
         progress((row + 1) / len(offsets_px))
     return found
 
@@ -62,5 +65,4 @@ def draw_surface(surface: NDArray[np.float64], offsets_px: NDArray[np.float64], 
         write(f"{offsets_px[k]:g}", margin // 2, at + 4)
     write("offset along x, px", margin + side // 2, margin + side + 42)
     write(f"loss a keypoint, {low:.3f} (dark) to {high:.3f}; offset along y at the left", margin + side // 2, 32)
-    if not cv2.imwrite(str(path), sheet):
-        raise OutputError(f"{path}: cannot be written")
+    write_png(sheet[..., ::-1], path)

@@ -1,0 +1,94 @@
+"""One capture, start to end: its pairs aligned, its stack and sidecar written."""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from agalign.capture.align import PairProgress, align_capture_bands
+from agalign.config import Settings
+from agalign.errors import AgalignError, InputError, SidecarError
+from agalign.flight.model import FlightModel
+from agalign.products.fill_sidecar import sidecar_of
+from agalign.products.layout import lay_out
+from agalign.products.picture import write_picture
+from agalign.products.sidecar import Sidecar, read_sidecar, write_sidecar
+from agalign.products.stac import write_item
+from agalign.products.write import write_capture
+from agalign.values.capture import Capture
+
+
+def quiet(*_: object) -> None:
+    """A progress callback that reports nothing."""
+
+
+@dataclass(frozen=True)
+class CaptureOutcome:
+    """A capture's sidecar and where it was written."""
+
+    sidecar: Sidecar
+    path: Path
+
+
+def output_paths(capture: Capture, out: Path) -> tuple[Path, Path]:
+    """(stack, sidecar) of a capture below the output folder."""
+    folder = out / capture.folder
+    return folder / f"{capture.name}.tif", folder / f"{capture.name}.json"
+
+
+def process_capture(
+    capture: Capture, out: Path, settings: Settings, progress: PairProgress = quiet,
+    model: FlightModel | None = None,
+) -> CaptureOutcome:  # fmt: skip
+    """Align a capture and write its stack and sidecar; a band that cannot be aligned does not stop the others.
+
+    With the flight's `model` only what it cannot align is learnt anew.
+    Raises UnreadableFileError where the reference itself cannot be read, and OutputError.
+    """
+    reference = capture.reference
+    if settings.write.radiometry:
+        _need_radiometry(capture)
+    alignments = align_capture_bands(capture, settings, model, progress)
+    progress(reference.name, "writing", 0.0)
+    stack_path, sidecar_path = output_paths(capture, out)
+    usable = [b for b in capture.moving if alignments[b.name].status != "failed"]
+    picture = stack_path.with_suffix(".png")
+    discard_outputs(stack_path, sidecar_path)
+    written = None
+    if usable:
+        layers, grid = lay_out(capture, {b.name: alignments[b.name] for b in usable}, settings.write)
+        written = write_capture(capture, layers, grid, stack_path, settings.write)
+        # The picture is a convenience: a full disk must not cost the sidecar.
+        with suppress(AgalignError):
+            write_picture(capture, written.places, grid, usable, picture)
+        if settings.write.stac:
+            write_item(capture, written, sidecar_path, picture)
+    sidecar = sidecar_of(capture, alignments, written, settings)
+    write_sidecar(sidecar_path, sidecar)
+    return CaptureOutcome(sidecar, sidecar_path)
+
+
+def discard_outputs(stack: Path, sidecar: Path) -> None:
+    """What an earlier run wrote of a capture goes before something else takes its place: a sidecar never stands beside
+    rasters that it does not describe, nor a band on an old grid beside new ones.
+
+    What cannot be removed is written over, or told by the writing that fails.
+    """
+    old = [sidecar, stack, stack.with_suffix(".png"), stack.with_suffix(".stac.json")]
+    with suppress(SidecarError):
+        output = read_sidecar(sidecar).output
+        old += [sidecar.parent / part.file for part in output.band_files] if output else []
+    folder = sidecar.parent.resolve()
+    for path in old:
+        with suppress(OSError):
+            # A sidecar is a file like any other: what it names beyond its folder is not ours to remove.
+            if path.parent.resolve().is_relative_to(folder):
+                path.unlink(missing_ok=True)
+
+
+def _need_radiometry(capture: Capture) -> None:
+    without = [b.name for b in capture.bands if b.radiometry is None]
+    if without:
+        raise InputError(
+            f"{capture.reference.path}: no tags that agalign can turn into reflectance in {', '.join(without)}; leave "
+            "--radiometry out"
+        )

@@ -1,0 +1,132 @@
+"""Learning a flight: one network on a few of its captures, to be frozen for all of them."""
+
+import logging
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.seeding import find_seed, subject_of
+from agalign.config import Settings
+from agalign.errors import AgalignError
+from agalign.flight.fingerprint import fingerprint, hashed
+from agalign.flight.groups import camera_key
+from agalign.flight.model import FlightModel
+from agalign.method.device import one_memory_error, one_thread
+from agalign.method.fast import learn
+from agalign.method.refine import refine
+from agalign.method.starter import start_from
+from agalign.method.state import JointState, Progress
+from agalign.method.subject import Subject
+from agalign.pixels.raster import read_for_alignment
+from agalign.values import geometry
+from agalign.values.alignment import JointResult, Seed
+from agalign.values.capture import Capture
+from agalign.values.geometry import Matrix
+
+_LOG = logging.getLogger(__name__)
+
+
+@one_thread()
+@one_memory_error()
+def learn_flight(
+    captures: Sequence[Capture], settings: Settings, progress: Progress, start: FlightModel | None = None
+) -> FlightModel | None:
+    """Learn one network on a few captures spread over the flight; None where none of them could be aligned.
+
+    With `start`, its network is where theta starts; its last side is where bands start that it does not know.
+    """
+    chosen = _choose(captures, settings.flight.captures)
+    loaded = [s for c in chosen if (s := read_subject(c, settings, start)) is not None]
+    if not loaded:
+        return None
+    state = JointState(settings.joint, progress)
+    subjects = [subject for subject, _ in loaded]
+    bands = _sides(captures[0])
+    net = state.fast_descriptor([1] * (1 + len(bands)))
+    if start is not None:
+        start_from(net, start.net.state_dict())
+    try:
+        learn(state, subjects, net)
+        results = [refine(state, net, subject) for subject in subjects]
+    except (AgalignError, cv2.error) as why_not:
+        # What one capture does to the others' learning must not cost the flight: each is learnt alone then.
+        _LOG.debug("the flight could not be learnt from: %s", why_not)
+        return None
+    found: dict[str, list[Matrix]] = {}
+    for (_, pairs), of_subject in zip(loaded, results, strict=True):
+        for pair, result in zip(pairs, of_subject, strict=True):
+            if isinstance(result, JointResult) and result.retrieval >= settings.joint.fast.step_gate:
+                found.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
+    if not found:
+        return None
+    size = captures[0].reference.size_px
+    mappings = {name: median_mapping(matrices, size) for name, matrices in found.items()}
+    return FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings))
+
+
+def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:
+    """Changes when the captures that would be learnt from, or the settings, do."""
+    stages = settings.joint, settings.seed, settings.flight
+    return hashed(camera_key(captures[0]), *(fingerprint(c, *stages) for c in captures))
+
+
+def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matrix:
+    """The homography through the median of where each point of a lattice is sent."""
+    if len(matrices) == 1:
+        return matrices[0]
+    points = geometry.lattice(*size_px, 9, 7)
+    there = np.median([geometry.apply(m, points) for m in matrices], axis=0)
+    fitted, _ = cv2.findHomography(points, there, 0)
+    return geometry.normalised(fitted)
+
+
+def _choose(captures: Sequence[Capture], count: int) -> list[Capture]:
+    """Of each of `count` stretches of the flight, the most textured of three captures."""
+    chosen = []
+    for stretch in np.array_split(np.arange(len(captures)), min(count, len(captures))):
+        some = stretch[np.unique(np.linspace(0, len(stretch) - 1, 3).round().astype(int))]
+        candidates = [captures[i] for i in some]
+        chosen.append(candidates[0] if len(candidates) == 1 else max(candidates, key=_texture))
+    return chosen
+
+
+def _texture(capture: Capture) -> float:
+    """Median gradient of the reference relative to its spread; 0 where it cannot be read."""
+    try:
+        raster = read_for_alignment(capture.reference, 640)
+    except AgalignError:
+        return 0.0
+    if raster.valid.mean() < 0.5:
+        return 0.0
+    inside = raster.pixels[raster.valid]
+    gx, gy = (cv2.Sobel(raster.pixels, cv2.CV_32F, *d, scale=1 / 8) for d in ((1, 0), (0, 1)))
+    return float(np.median(cv2.magnitude(gx, gy)[raster.valid]) / max(float(inside.std()), 1e-12))
+
+
+def read_subject(
+    capture: Capture, settings: Settings, start: FlightModel | None = None
+) -> tuple[Subject, list[BandPair]] | None:
+    """A capture to learn from and its pairs; None where there is none that can be read.
+
+    `start` is the network with which a seed of kind `match` is found.
+    """
+    try:
+        pairs, _ = read_pairs(capture, settings)
+    except AgalignError:
+        return None
+    wanted = "pixel" if capture.reference.lens is None else "undistorted"
+    sides = _sides(capture)
+    seeds = [(p, find_seed(p, start)) for p in pairs if p.space == wanted]
+    usable = [(p, seed) for p, seed in seeds if isinstance(seed, Seed)]
+    if not usable:
+        return None
+    of_subject = [p for p, _ in usable]
+    numbers = [sides.index(p.name) + 1 for p in of_subject]
+    return subject_of(of_subject, [seed for _, seed in usable], numbers), of_subject
+
+
+def _sides(capture: Capture) -> tuple[str, ...]:
+    """Names of the moving bands that get a side of the network: one for each lens."""
+    return tuple(bands[0].name for bands in capture.moving_lenses)

@@ -1,0 +1,193 @@
+"""Many captures: which are still to be done, what their flight learns first, and each one done."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from agalign.batch.capture import output_paths, quiet
+from agalign.batch.learn import learn_flight, learning_fingerprint
+from agalign.batch.workers import (
+    MOST_HANDED_OVER,
+    CaptureReport,
+    Task,
+    do_capture,
+    loaded_model,
+    on_executor,
+    read_ahead,
+    stamp,
+    start_worker,
+    threads_of_children,
+)
+from agalign.cameras.discover import Flight
+from agalign.capture.align import PairProgress
+from agalign.config import Settings
+from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
+from agalign.flight.fingerprint import fingerprint
+from agalign.flight.groups import camera_key, flights_of, model_names
+from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.method.device import choose_device
+from agalign.products.sidecar import Sidecar, read_sidecar
+from agalign.products.write import band_file_names
+from agalign.values.capture import Capture
+from agalign.values.choices import Layout
+
+
+def prepare_output(out: Path) -> None:
+    """Make the output folder. Raises OutputError where it cannot be made or written to."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if not os.access(out, os.W_OK):
+            raise OutputError(f"{out}: no permission to write there; choose another folder with -o")
+    except FileExistsError:
+        raise OutputError(f"{out}: is a file; choose another folder with -o") from None
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be made ({error.strerror or error})") from None
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run goes about it: nothing here changes a result."""
+
+    overwrite: bool = False
+    """Do captures again that an earlier run finished."""
+    jobs: int = 1
+    """Captures at a time, each in a process of its own where there are several."""
+    executor: Executor | None = None
+    """Where the captures are done instead: any executor whose workers see the same folders (`dask_executor` is one)."""
+
+
+@dataclass(frozen=True)
+class Listener:
+    """What a run tells while it runs."""
+
+    on_start: Callable[[Capture], None] = quiet
+    on_pair: PairProgress = quiet
+    """Of captures in this process only."""
+    on_learning: Callable[[str, float], None] = quiet
+    """The camera whose network is learnt, and the share that is behind."""
+
+
+def run_flight(
+    flight: Flight, out: Path, settings: Settings, options: RunOptions | None = None,
+    listener: Listener | None = None, model: Path | None = None,
+) -> Iterator[CaptureReport]:  # fmt: skip
+    """Align the captures, yielding each as it is done; those done before are kept.
+
+    A network is learnt for every camera and flight first and saved below OUT/models; `model` is one to start from.
+    One capture's failure never stops the others, and no result depends on the order in which they are done.
+    Raises OutputError where the output folder cannot be used, InputError or ConfigurationError for `model`.
+    """
+    options, listener = options or RunOptions(), listener or Listener()
+    prepare_output(out)
+    _refuse_to_overwrite_inputs(flight, out, settings.write.layout)
+    known = None if model is None else _given_model(model, flight, settings)
+    if known is not None:
+        used = settings.flight.model_copy(update={"start": known.fingerprint})
+        settings = settings.model_copy(update={"flight": used})
+    waiting: list[Task] = []
+    groups = flights_of(flight.captures)
+    for group, name in zip(groups, model_names(groups), strict=True):
+        left = []
+        for capture in group:
+            earlier = None if options.overwrite else finished_before(capture, out, settings)
+            if earlier is None:
+                left.append(capture)
+            else:
+                yield CaptureReport(capture.label, "kept", earlier)
+        if left:
+            path = _learn(group, out / "models" / name, settings, listener, known)
+            waiting += [Task(c, out, settings, path) for c in left]
+    if options.executor is not None:
+        yield from on_executor([t.absolute() for t in waiting], options.executor, MOST_HANDED_OVER)
+    elif options.jobs > 1 and len(waiting) > 1:
+        jobs = min(options.jobs, len(waiting))
+        threads = max(1, (os.cpu_count() or 1) // jobs)
+        with (
+            threads_of_children(threads),
+            ProcessPoolExecutor(jobs, get_context("spawn"), start_worker, (threads,)) as pool,
+        ):
+            yield from on_executor(waiting, pool, 2 * jobs)
+    else:
+        with ThreadPoolExecutor(1) as reader:
+            for number, task in enumerate(waiting, start=1):
+                listener.on_start(task.capture)
+                for following in waiting[number : number + 1]:
+                    reader.submit(read_ahead, following.capture)
+                yield do_capture(task, listener.on_pair)
+
+
+def _given_model(path: Path, flight: Flight, settings: Settings) -> FlightModel:
+    """The model to start from. Raises ConfigurationError where it is of no use here."""
+    if settings.joint.recipe != "fast" or not settings.flight.together or settings.seed.only:
+        raise ConfigurationError("a model is of use only where one network is learnt for a flight, by recipe fast")
+    model = load_model(path, lambda: choose_device(settings.joint.device))
+    if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
+        raise ConfigurationError(f"{path}: was learnt unshared; add --sharing unshared")
+    if model.camera and flight.captures and not any(camera_key(c) == model.camera for c in flight.captures):
+        here = camera_key(flight.captures[0])
+        raise ConfigurationError(f"{path}: was learnt for {model.camera}; the images here are of {here}")
+    return model
+
+
+def _learn(
+    captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, known: FlightModel | None
+) -> Path | None:
+    """The path of the flight's model, learnt now or found from an earlier run; None where none could be learnt."""
+    if settings.joint.recipe != "fast" or not settings.flight.together or settings.seed.only:
+        return None
+    start = known if known is not None and known.camera in ("", camera_key(captures[0])) else None
+    device = settings.joint.device
+    if path.is_file():
+        with suppress(AgalignError):
+            if loaded_model(path, device, stamp(path)).fingerprint == learning_fingerprint(captures, settings):
+                return path
+
+    def progress(_stage: str, share: float) -> None:
+        listener.on_learning(path.stem, share)
+
+    model = learn_flight(captures, settings, progress, start)
+    if model is None:
+        return None
+    save_model(model, path)
+    return path
+
+
+def _refuse_to_overwrite_inputs(flight: Flight, out: Path, layout: Layout) -> None:
+    if out.resolve() == flight.folder.resolve():
+        raise ConfigurationError(f"{out}: is the folder of the images; choose another output folder with -o")
+    sources = {band.path.resolve() for capture in flight.captures for band in capture.bands}
+    for capture in flight.captures:
+        stack, _ = output_paths(capture, out)
+        written = (
+            [stack] if layout == "stack" else [stack, *(stack.parent / n for n in band_file_names(capture).values())]
+        )
+        for path in written:
+            if path.resolve() in sources:
+                raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder with -o")
+
+
+def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar | None:
+    """The sidecar of an earlier run with the same settings and bands whose outputs are still there."""
+    stack, path = output_paths(capture, out)
+    if not path.is_file():
+        return None
+    try:
+        sidecar = read_sidecar(path)
+    except SidecarError:
+        return None
+    if sidecar.settings != fingerprint(capture, settings):
+        return None
+    return sidecar if _outputs_are_there(sidecar, path.parent, stack) else None
+
+
+def _outputs_are_there(sidecar: Sidecar, folder: Path, stack: Path) -> bool:
+    output = sidecar.output
+    if output is None:
+        return not stack.is_file()
+    files = [(f.file, f.bytes) for f in output.band_files]
+    files += [] if output.file is None or output.bytes is None else [(output.file, output.bytes)]
+    return all((folder / name).is_file() and (folder / name).stat().st_size == size for name, size in files)

@@ -1,0 +1,286 @@
+"""From a folder to captures."""
+
+import math
+import os
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from agalign.cameras import Camera, default_reference, known_cameras
+from agalign.cameras.metadata import CAPTURE_IDS, FLIGHT_IDS, Tags, read_tags
+from agalign.errors import ConfigurationError, InputError, UnreadableFileError
+from agalign.pixels.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, RasterInfo, probe
+from agalign.values.capture import Band, CameraIdentity, Capture
+from agalign.values.choices import BandOrder
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A file or capture that cannot take part, and why, in one line."""
+
+    path: Path
+    text: str
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Everything found below a folder."""
+
+    folder: Path
+    captures: tuple[Capture, ...]
+    problems: tuple[Problem, ...]
+
+
+_SUFFIXES = TIFF_SUFFIXES | JPEG_SUFFIXES
+
+
+@dataclass(frozen=True)
+class _File:
+    path: Path
+    camera: Camera
+    tags: Tags
+    bands: tuple[Band, ...]
+
+
+@dataclass(frozen=True)
+class DiscoverOptions:
+    """What to look for."""
+
+    pattern: str | None = None
+    """File names as '{capture}_{band}.tif', for files whose names follow no known scheme."""
+    reference: str | None = None
+    """Name of the reference band; None is the camera's default."""
+    ignore_metadata: bool = False
+    """Leave lens and rig tags aside."""
+    with_rgb: bool = False
+    """The colour photographs that some cameras take beside the narrow bands take part, as three bands."""
+    bands: tuple[str, ...] = ()
+    """Names of the bands that take part; empty for all."""
+    order: BandOrder = "index"
+    """Of the bands in the stacks: as the camera counts them, by wavelength, or by name."""
+    skip: tuple[Path, ...] = field(default=())
+    """Folders not to look into, such as the output's."""
+
+
+def discover(
+    folder: Path, options: DiscoverOptions | None = None, progress: Callable[[int, int], None] | None = None
+) -> Flight:
+    """All captures below `folder`, sorted by folder and name. `progress` gets (files done, files in all).
+
+    Raises InputError where the folder does not exist or holds no image, ConfigurationError for a band that no capture
+    has.
+    """
+    options = options or DiscoverOptions()
+    if not folder.is_dir():
+        what = "is a file; give the folder it is in" if folder.exists() else "does not exist"
+        raise InputError(f"{folder}: {what}")
+    cameras = known_cameras(options.pattern)
+    problems: list[Problem] = []
+    files: list[_File] = []
+    paths = _images(folder, options.skip)
+    if not paths:
+        raise InputError(f"{folder}: no .tif, .tiff, .jpg or .jpeg file in it or below it")
+    for number, path in enumerate(paths, start=1):
+        try:
+            file = _examine(path, cameras, with_rgb=options.with_rgb)
+            if file.bands:
+                files.append(file)
+        except UnreadableFileError as error:
+            # A colour photograph that does not take part does no harm either.
+            if options.with_rgb or path.suffix.lower() in TIFF_SUFFIXES:
+                problems.append(Problem(path, str(error)))
+        if progress is not None:
+            progress(number, len(paths))
+    captures: list[Capture] = []
+    for group in _groups(files):
+        found = _capture(folder, group, options)
+        if isinstance(found, Problem):
+            problems.append(found)
+        else:
+            captures.append(found)
+    known = {b.name.lower() for file in files for b in file.bands}
+    unknown = [name for name in options.bands if name.lower() not in known]
+    if unknown and files:
+        raise ConfigurationError(f"{folder}: no capture has a band {' or '.join(map(repr, unknown))}, as --bands asks")
+    captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
+    captures = _with_missing_bands(_with_unique_names(captures))
+    return Flight(folder, tuple(captures), tuple(problems))
+
+
+def _images(folder: Path, skip: Sequence[Path]) -> list[Path]:
+    skipped = {p.resolve() for p in skip}
+    found: list[Path] = []
+    for parent, folders, names in os.walk(folder):
+        here = Path(parent)
+        folders[:] = sorted(
+            d for d in folders
+            if not d.startswith(".") and (here / d).resolve() not in skipped and not _is_output(here / d)
+        )  # fmt: skip
+        images = [n for n in names if Path(n).suffix.lower() in _SUFFIXES and not n.startswith(".")]
+        images.sort(key=_natural)
+        found.extend(here / n for n in images)
+    return found
+
+
+def _natural(name: str) -> list[tuple[bool, int, str]]:
+    """Sorts `_2` before `_10`."""
+    return [(part.isdigit(), int(part) if part.isdigit() else 0, part.lower()) for part in re.split(r"(\d+)", name)]
+
+
+def _is_output(folder: Path) -> bool:
+    """An earlier run's output folder lies below its input: its stacks are not captures."""
+    return (folder / "summary.csv").is_file() and (folder / "index.html").is_file()
+
+
+def _examine(path: Path, cameras: Iterable[Camera], *, with_rgb: bool) -> _File:
+    info = probe(path)
+    tags = read_tags(path)
+    # Cameras write one band a file, or photographs: a stack is someone's product, whatever make it carries on.
+    *_, generic = cameras
+    camera = generic if _is_stack(path, info) else next(c for c in cameras if c.recognises(tags))
+    bands = camera.bands(path, tags, info)
+    return _File(path, camera, tags, tuple(b for b in bands if with_rgb or not b.companion))
+
+
+def _is_stack(path: Path, info: RasterInfo) -> bool:
+    photograph = info.dtypes[0] == "uint8" and len(info.dtypes) in (3, 4)
+    return path.suffix.lower() in TIFF_SUFFIXES and len(info.dtypes) > 1 and not photograph
+
+
+def _is_whole(file: _File) -> bool:
+    """True for a file that is a capture in itself: of several bands, each with a lens of its own."""
+    return len(file.bands) > 1 and not file.bands[0].one_lens
+
+
+def _groups(files: Iterable[_File]) -> list[list[_File]]:
+    """Files of one capture: same camera, folder and key."""
+    groups: dict[tuple[str, ...], list[_File]] = defaultdict(list)
+    for file in files:
+        key = file.path.name if _is_whole(file) else file.camera.capture_key(file.path, file.tags)
+        groups[(file.camera.name, str(file.camera.capture_folder(file.path)), key)].append(file)
+    # A file whose tags are damaged lost its capture id, but not its name.
+    for group_key in list(groups):
+        camera, folder, key = group_key
+        stray = groups[group_key]
+        if _is_whole(stray[0]) or stray[0].camera.capture_name(stray[0].path) != key:
+            continue
+        for other_key, other in groups.items():
+            same_place = other_key[:2] == (camera, folder) and other_key != group_key and not _is_whole(other[0])
+            if same_place and all(f.camera.capture_name(f.path) == key for f in other):
+                other.extend(groups.pop(group_key))
+                other.sort(key=lambda f: _natural(f.path.name))
+                break
+    return list(groups.values())
+
+
+def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capture | Problem:
+    # Narrow bands first: the capture is theirs, and the colour photograph's name comes before them.
+    files = sorted(files, key=lambda f: f.bands[0].companion)
+    bands = [b for file in files for b in file.bands]
+    first = files[0]
+    if options.bands:
+        wanted = {name.lower() for name in options.bands}
+        bands = [b for b in bands if b.name.lower() in wanted]
+        if len(bands) < 2:
+            return Problem(first.path, f"{first.path}: of this capture, --bands leaves {_names(bands) or 'nothing'}")
+    if len(bands) > 1 and len(files) == 1 and first.bands[0].one_lens:
+        return Problem(first.path, f"{first.path}: its bands come through one lens; there is nothing to align")
+    if len(bands) < 2:
+        text = f"{first.path}: a band with no companion; name files '<capture>_<band>.tif' or give --pattern"
+        return Problem(first.path, text)
+    bands = _with_unique_band_names(bands)
+    if options.ignore_metadata:
+        bands = [replace(b, lens=None, to_rig=None) for b in bands]
+    try:
+        reference = bands[_reference_index(bands, options.reference, first.path)]
+    except ConfigurationError as error:
+        return Problem(first.path, str(error))
+    bands = _ordered(bands, options.order)
+    tags = first.tags
+    serials = sorted({f.tags.serial for f in files if f.tags.serial})
+    return Capture(
+        name=first.path.stem if len(files) == 1 else first.camera.capture_name(first.path),
+        folder=_below(folder, first.camera.capture_folder(first.path)),
+        bands=tuple(bands),
+        reference_index=next(i for i, b in enumerate(bands) if b is reference),
+        camera=CameraIdentity(tags.make, tags.model, "+".join(serials)),
+        capture_id=tags.first_text(CAPTURE_IDS),
+        flight_id=tags.first_text(FLIGHT_IDS),
+        captured_at=tags.captured_at,
+        position=tags.position,
+    )
+
+
+def _reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> int:
+    if wanted is None or wanted.lower() == "auto":
+        return default_reference(bands)
+    for index, band in enumerate(bands):
+        if band.name.lower() == wanted.lower():
+            return index
+    raise ConfigurationError(f"{path}: no band '{wanted}' for the reference; this capture has {_names(bands)}")
+
+
+def _below(folder: Path, of_capture: Path) -> Path:
+    """Relative to the input folder, and never above it: bands whose folders lie beside each other may be the input."""
+    return of_capture.relative_to(folder) if of_capture.is_relative_to(folder) else Path()
+
+
+def _names(bands: Sequence[Band]) -> str:
+    return ", ".join(b.name for b in bands)
+
+
+def _ordered(bands: Sequence[Band], order: BandOrder) -> list[Band]:
+    if order == "wavelength":
+        return sorted(bands, key=lambda b: math.inf if b.wavelength_nm is None else b.wavelength_nm)
+    return sorted(bands, key=lambda b: _natural(b.name)) if order == "name" else list(bands)
+
+
+def _with_unique_band_names(bands: Sequence[Band]) -> list[Band]:
+    seen: dict[str, int] = defaultdict(int)
+    unique = []
+    for band in bands:
+        seen[band.name] += 1
+        unique.append(band if seen[band.name] == 1 else replace(band, name=f"{band.name}-{seen[band.name]}"))
+    return unique
+
+
+def _with_unique_names(captures: Sequence[Capture]) -> list[Capture]:
+    """Two captures of one folder must not write the same file: the later one gets a number."""
+    taken: set[str] = set()
+    unique = []
+    for capture in captures:
+        count, given = 1, capture
+        while given.label.lower() in taken:
+            count += 1
+            given = replace(capture, name=f"{capture.name}-{count}")
+        taken.add(given.label.lower())
+        unique.append(given)
+    return unique
+
+
+def _with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
+    """What other captures of the same kind have and this one lacks."""
+
+    # A dual camera that lost all bands of one half has lost a serial number too: so it is the model that counts, and
+    # where no tag names one, the folder. Multiband files are each complete in themselves.
+    def family(capture: Capture) -> tuple[str, ...]:
+        camera = capture.camera
+        return (camera.make, camera.model) if camera.model else (capture.folder.as_posix(),)
+
+    separate = {c.label for c in captures if len({b.path for b in c.bands}) > 1}
+    members: Counter[tuple[str, ...]] = Counter()
+    seen: dict[tuple[str, ...], Counter[str]] = defaultdict(Counter)
+    for capture in captures:
+        if capture.label in separate:
+            members[family(capture)] += 1
+            seen[family(capture)].update(b.name for b in capture.bands)
+    # A band that most captures do not have is a name that damaged tags have made up.
+    usual = {f: [n for n, count in names.items() if 2 * count >= members[f]] for f, names in seen.items()}
+    complete = []
+    for capture in captures:
+        known = {b.name for b in capture.bands}
+        missing = tuple(n for n in usual[family(capture)] if n not in known) if capture.label in separate else ()
+        complete.append(replace(capture, missing_bands=missing) if missing else capture)
+    return complete

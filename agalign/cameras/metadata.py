@@ -1,0 +1,192 @@
+"""Tags of a TIFF or JPEG as typed fields: the standard ones, EXIF, GPS, and XMP read by namespace."""
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tifffile
+from PIL import ExifTags, Image
+
+from agalign.cameras.xmp import Namespace, Packet
+from agalign.errors import UnreadableFileError
+from agalign.values.capture import Position
+
+CAPTURE_IDS: tuple[tuple[Namespace, str], ...] = (
+    ("MicaSense", "CaptureId"), ("drone-dji", "CaptureUUID"), ("Camera", "CaptureUUID"), ("Sentera", "CaptureUUID"),
+    ("Sentera", "ImageUniqueID"),
+)  # fmt: skip
+"""Where cameras write an id that the bands of a capture share."""
+FLIGHT_IDS: tuple[tuple[Namespace, str], ...] = (
+    ("MicaSense", "FlightId"), ("Camera", "FlightUUID"), ("Sentera", "FlightUUID"), ("Sentera", "FlightUniqueID"),
+)  # fmt: skip
+"""Where they write one that a flight shares."""
+_RATIONAL_TYPES = (5, 10)
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+"""EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
+_LONGEST_FOCAL_LENGTH_MM = 100.0
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Tags:
+    """What the metadata of one file says. Absent or unusable tags are empty strings, empty mappings or None."""
+
+    make: str = ""
+    model: str = ""
+    serial: str = ""
+    position: Position | None = None
+    captured_at: str = ""
+    """ISO 8601 as written by the camera, without a time zone where it gives none."""
+    orientation: int = 1
+    """EXIF's: how the stored image is to be turned to be seen upright."""
+    black_level: float | None = None
+    """Mean of the tag's values."""
+    xmp: Mapping[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
+    exif: Mapping[str, Any] = field(default_factory=dict)
+
+    def text(self, namespace: Namespace, name: str) -> str:
+        """An XMP value as text; a sequence's items are joined by commas."""
+        return ",".join(self.xmp.get((namespace, name), ()))
+
+    def first_text(self, names: Iterable[tuple[Namespace, str]]) -> str:
+        """The text of the first of some names that has one."""
+        return next((text for name in names if (text := self.text(*name))), "")
+
+    def numbers(self, namespace: Namespace, name: str) -> tuple[float, ...]:
+        """The finite numbers in an XMP value, whether it is one text, a list in a text, or a sequence."""
+        numbers = (float(n) for n in _NUMBER.findall(self.text(namespace, name)))
+        return tuple(n for n in numbers if math.isfinite(n))
+
+    def number(self, namespace: Namespace, name: str) -> float | None:
+        """The first number in an XMP value."""
+        numbers = self.numbers(namespace, name)
+        return numbers[0] if numbers else None
+
+    @property
+    def pixels_per_mm(self) -> float | None:
+        """Density of the pixels in the focal plane, from EXIF FocalPlaneXResolution and its unit, else from a focal
+        length in px and EXIF's in mm.
+        """
+        resolution = rational(self.exif.get("FocalPlaneXResolution"))
+        unit = self.exif.get("FocalPlaneResolutionUnit", 2)
+        mm = _MM_PER_UNIT.get(int(unit)) if isinstance(unit, int) else None
+        if resolution and mm:
+            return resolution / mm
+        focal_px, focal_mm = self.number("drone-dji", "CalibratedFocalLength"), rational(self.exif.get("FocalLength"))
+        if not focal_px and self.focal_length_is_in_px:
+            focal_px = self.number("Camera", "PerspectiveFocalLength")
+        return focal_px / focal_mm if focal_px and focal_mm else None
+
+    @property
+    def focal_length_is_in_px(self) -> bool:
+        """True where Camera:PerspectiveFocalLength is in px: old firmware gives them without saying so."""
+        units = self.text("Camera", "PerspectiveFocalLengthUnits").lower()
+        length = self.number("Camera", "PerspectiveFocalLength")
+        return "px" in units or "pixel" in units or (length is not None and length > _LONGEST_FOCAL_LENGTH_MM)
+
+
+def rational(value: Any) -> float | None:
+    """An EXIF number or numerator-denominator pair as a finite float, else None."""
+    try:
+        number = value[0] / value[1] if isinstance(value, (tuple, list)) else float(value)
+    except (TypeError, ValueError, ZeroDivisionError, IndexError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def read_tags(path: Path) -> Tags:
+    """The tags of a TIFF's first page or of a JPEG. Raises UnreadableFileError where it is neither or is cut short."""
+    kind, read = ("JPEG", _jpeg_values) if path.suffix.lower() in (".jpg", ".jpeg") else ("TIFF", _tiff_values)
+    try:
+        values = read(path)
+    except Exception as error:  # a damaged file makes readers fail in any way: struct.error, KeyError, MemoryError …
+        raise UnreadableFileError(
+            f"{path}: not a readable {kind} ({error or 'empty'}); copy it from the card again"
+        ) from None
+    exif = values.get(34665)
+    exif = exif if isinstance(exif, dict) else {}
+    orientation = values.get(274, 1)
+    return Tags(
+        make=_text(values.get(271)),
+        model=_text(values.get(272)),
+        serial=_text(exif.get("BodySerialNumber")),
+        position=_position(values.get(34853)),
+        captured_at=_iso_time(exif, values.get(306)),
+        orientation=int(orientation) if orientation in range(1, 9) else 1,
+        black_level=_mean(values.get(50714)),
+        xmp=Packet.parse(values.get(700, b"")).values(),
+        exif=exif,
+    )
+
+
+def _tiff_values(path: Path) -> dict[int, Any]:
+    with tifffile.TiffFile(path) as tiff:
+        tags = tiff.pages[0].tags.values()  # type: ignore[union-attr]
+        return {tag.code: _fractions(tag.value) if tag.dtype in _RATIONAL_TYPES else tag.value for tag in tags}
+
+
+def _fractions(value: tuple[int, ...]) -> tuple[float, ...]:
+    """From numerators and denominators one after the other."""
+    return tuple(n / d if d else math.nan for n, d in zip(value[::2], value[1::2], strict=True))
+
+
+def _jpeg_values(path: Path) -> dict[int, Any]:
+    with Image.open(path) as image:
+        exif = image.getexif()
+        named = {ExifTags.TAGS.get(code, str(code)): value for code, value in exif.get_ifd(34665).items()}
+        place = {ExifTags.GPSTAGS.get(code, str(code)): value for code, value in exif.get_ifd(34853).items()}
+        return {**exif, 34665: named, 34853: place, 700: image.info.get("xmp", b"")}
+
+
+def _position(gps: Any) -> Position | None:
+    """From a GPS directory; cameras without a fix write an empty one."""
+    if not isinstance(gps, dict):
+        return None
+    latitude, longitude = (_degrees(gps.get(f"GPS{axis}")) for axis in ("Latitude", "Longitude"))
+    if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
+        return None
+    south, west = (_text(gps.get(f"GPS{axis}Ref")) for axis in ("Latitude", "Longitude"))
+    altitude = rational(gps.get("GPSAltitude"))
+    below = gps.get("GPSAltitudeRef") in (1, b"\x01")
+    return Position(
+        -latitude if south.upper() == "S" else latitude, -longitude if west.upper() == "W" else longitude,
+        -altitude if altitude is not None and below else altitude,
+    )  # fmt: skip
+
+
+def _degrees(value: Any) -> float | None:
+    """Degrees, minutes and seconds, as fractions or as the numerators and denominators of fractions."""
+    if not isinstance(value, (tuple, list)):
+        return None
+    pairs = [value[i : i + 2] for i in range(0, 6, 2)] if len(value) == 6 else list(value)
+    parts = [rational(pair) for pair in pairs]
+    if len(parts) != 3 or any(part is None for part in parts):
+        return None
+    return float(sum((part or 0.0) / 60**k for k, part in enumerate(parts)))
+
+
+def _mean(value: Any) -> float | None:
+    """Of a tag of one or several numbers."""
+    numbers = value if isinstance(value, (tuple, list)) else [value]
+    if not numbers or not all(isinstance(n, (int, float)) and math.isfinite(n) for n in numbers):
+        return None
+    return float(sum(numbers)) / len(numbers)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    return str(value).strip("\0 ") if isinstance(value, (str, int)) else ""
+
+
+def _iso_time(exif: Mapping[str, Any], fallback: Any) -> str:
+    moment = _text(exif.get("DateTimeOriginal")) or _text(fallback)
+    match = re.fullmatch(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)", moment)
+    if not match:
+        return ""
+    year, month, day, clock = match.groups()
+    fraction = _text(exif.get("SubsecTimeOriginal") or exif.get("SubsecTime"))
+    return f"{year}-{month}-{day}T{clock}" + (f".{fraction}" if fraction.isdigit() else "")

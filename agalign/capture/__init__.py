@@ -1,0 +1,1 @@
+"""One capture: its bands beside the reference, where each starts, and what comes of it."""

@@ -1,0 +1,134 @@
+"""The band pairs of one capture: seeded, aligned together, each one checked."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.evidence import judged, without_result
+from agalign.capture.seeding import find_seed, subject_of, unscored
+from agalign.config import Settings
+from agalign.flight.model import FlightModel
+from agalign.method.device import one_thread
+from agalign.method.joint import Results, align_from_scratch, refine_with
+from agalign.method.subject import Subject
+from agalign.values import geometry
+from agalign.values.alignment import Alignment, JointResult, Seed
+from agalign.values.capture import Capture
+from agalign.values.doubts import Doubt
+
+PairProgress = Callable[[str, str, float], None]
+"""Called with the band's name, the stage, and the share of the stage that is behind."""
+Start = tuple[BandPair, Seed]
+_Align = Callable[[Subject, Callable[[str, float], None]], Results]
+
+
+def align_capture_bands(
+    capture: Capture, settings: Settings, model: FlightModel | None, progress: PairProgress
+) -> dict[str, Alignment]:
+    """Align every moving band of a capture, by name; a band that cannot be read is `failed` and stops no other.
+
+    Raises UnreadableFileError where the reference cannot be read.
+    """
+    reference = capture.reference
+    progress(reference.name, "reading", 0.0)
+    pairs, left_out = read_pairs(capture, settings, None if model is None else model.mappings)
+    aligned = align_pairs(pairs, settings, progress, model)
+    found: dict[str, Alignment] = {}
+    for band in capture.bands_of_the_references_lens:
+        unmoved = Seed("identity", geometry.identity(), 0.0)
+        found[band.name] = Alignment(unmoved.fixed_to_moving, "pixel", "aligned", (), unmoved, None, None, 0.0)
+    for pair in pairs:
+        alignment = aligned[pair.name].between_files(*pair.scales)
+        shared = replace(alignment, seconds=alignment.seconds / len(pair.bands))
+        found |= dict.fromkeys((b.name for b in pair.bands), shared)
+    for band in capture.moving:
+        if band.name in left_out:
+            lying = Seed("identity", geometry.overlay(reference.size_px, band.size_px), 0.0)
+            found[band.name] = without_result(lying, "pixel", left_out[band.name])
+    return {band.name: found[band.name] for band in capture.moving}
+
+
+@one_thread()
+def align_pairs(
+    pairs: Sequence[BandPair], settings: Settings, progress: PairProgress, model: FlightModel | None = None
+) -> dict[str, Alignment]:
+    """Align the pairs of one capture, which share a reference, by name.
+
+    Those that the flight's network cannot align are learnt from scratch, together.
+    """
+    watch = _Watch()
+    found: dict[str, Alignment] = {}
+    starts: list[Start] = []
+    for pair in pairs:
+        progress(pair.name, "seeding", 0.0)
+        seed = find_seed(pair, model)
+        if isinstance(seed, Doubt):
+            found[pair.name] = without_result(unscored(pair), pair.space, seed)
+        else:
+            starts.append((pair, seed))
+    watch.lap([p.name for p in pairs])
+    if settings.seed.only:
+        asked = Doubt("seed_asked_for")
+        found |= {pair.name: judged(pair, seed, asked, settings) for pair, seed in starts}
+        watch.lap([pair.name for pair, _ in starts])
+        return watch.timed(found)
+
+    def attempt(some: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
+        results = _results(some, sides, align, progress)
+        watch.lap([pair.name for pair, _ in some])
+        for (pair, seed), result in zip(some, results, strict=True):
+            progress(pair.name, "checking", 0.0)
+            found[pair.name] = judged(pair, seed, result, settings)
+            watch.lap([pair.name])
+
+    if model is not None and settings.joint.recipe == "fast":
+        net = model.net
+        known = [s for s in starts if model.side(s[0].name) is not None]
+        sides = [model.side(pair.name) or 0 for pair, _ in known]
+        attempt(known, sides, lambda subject, report: refine_with(net, subject, settings.joint, report))
+    left = [s for s in starts if s[0].name not in found or found[s[0].name].status != "aligned"]
+    attempt(left, [], lambda subject, report: align_from_scratch(subject, settings.joint, report))
+    return watch.timed(found)
+
+
+def _results(
+    starts: Sequence[Start], sides: Sequence[int], align: _Align, progress: PairProgress
+) -> list[JointResult | Doubt]:
+    """Pairs that share the reference's undistorted pixels are aligned together, and those that share its raw ones.
+
+    `sides` are the network's for the moving images; where none are given, they are counted within each group.
+    """
+    found: dict[int, JointResult | Doubt] = {}
+    for space in ("undistorted", "pixel"):
+        group = [i for i, (pair, _) in enumerate(starts) if pair.space == space]
+        if not group:
+            continue
+        pairs, seeds = zip(*(starts[i] for i in group), strict=True)
+        own_sides = [sides[i] for i in group] if sides else list(range(1, len(group) + 1))
+        first = pairs[0].name
+
+        def report(stage: str, share: float, first: str = first) -> None:
+            """Pairs that advance together are told as the first one."""
+            progress(first, stage, share)
+
+        found |= dict(zip(group, align(subject_of(pairs, seeds, own_sides), report), strict=True))
+    return [found[i] for i in range(len(starts))]
+
+
+class _Watch:
+    """Seconds by name; what is done for several together is shared by them."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, float] = {}
+        self._since = time.perf_counter()
+
+    def lap(self, names: Sequence[str]) -> None:
+        """The time since the last lap was theirs."""
+        now = time.perf_counter()
+        for name in names:
+            self._seconds[name] = self._seconds.get(name, 0.0) + (now - self._since) / len(names)
+        self._since = now
+
+    def timed(self, found: dict[str, Alignment]) -> dict[str, Alignment]:
+        return {name: replace(a, seconds=self._seconds.get(name, 0.0)) for name, a in found.items()}

@@ -1,0 +1,118 @@
+"""A moving image beside the reference, as the estimation sees the two, with the mappings that its tags offer."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from agalign.capture.reference import Reference
+from agalign.capture.tag_seeds import seed_candidates
+from agalign.config import Settings
+from agalign.errors import AgalignError
+from agalign.pixels.raster import read_for_alignment
+from agalign.pixels.resample import single, warped
+from agalign.values import geometry
+from agalign.values.alignment import LocalField
+from agalign.values.capture import Band, Capture
+from agalign.values.choices import SeedKind, Space
+from agalign.values.doubts import Doubt
+from agalign.values.geometry import Matrix
+from agalign.values.image import Raster
+from agalign.values.mapping import PixelMapping
+
+Candidates = Mapping[SeedKind, Matrix]
+"""fixed_to_moving homographies between undistorted pixels, in order of trust."""
+_NOT_REDUCED = (1.0, 1.0), (1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class BandPair:
+    """One moving image beside the reference."""
+
+    name: str
+    """The moving band's, or of several that one lens took, the first one's."""
+    reference: Reference
+    moving_image: Raster
+    candidates: Candidates
+    bands: tuple[Band, ...] = ()
+    """The moving bands: one, but for colour photographs; none where the images are arrays."""
+    scales: tuple[tuple[float, float], tuple[float, float]] = _NOT_REDUCED
+    """(x, y) of the fixed and of the moving image relative to their files."""
+
+    @classmethod
+    def of_images(
+        cls, name: str, fixed: Raster, moving: Raster, candidates: Candidates, settings: Settings
+    ) -> "BandPair":
+        """A single pair of images that are no files' reductions."""
+        return cls(name, Reference(fixed, settings), moving, candidates)
+
+    @property
+    def space(self) -> Space:
+        """What the homographies are between: without both lenses nothing can be undistorted."""
+        both = self.reference.image.lens is not None and self.moving_image.lens is not None
+        return "undistorted" if both else "pixel"
+
+    @property
+    def fixed(self) -> Raster:
+        """The reference's image, with its lens where the homographies are between undistorted pixels."""
+        return self.reference.image if self.space == "undistorted" else self.reference.raw
+
+    @property
+    def moving(self) -> Raster:
+        """The moving image, likewise."""
+        return self.moving_image if self.space == "undistorted" else replace(self.moving_image, lens=None)
+
+    def mapping(self, fixed_to_moving: Matrix, local: LocalField | None = None) -> PixelMapping:
+        """The complete mapping between the raw pixels of the two images."""
+        return PixelMapping(fixed_to_moving, self.fixed.lens, self.moving.lens, local=local)
+
+    def laid(self, mapping: PixelMapping) -> Raster:
+        """The moving image, one channel, on the reference's pixels."""
+        return warped(single(self.moving_image), mapping, self.fixed.size_px)
+
+    def in_file_px(self, fixed_to_moving: Matrix) -> Matrix:
+        """A homography between the images as one between their files."""
+        return geometry.rescale(fixed_to_moving, *((1 / x, 1 / y) for x, y in self.scales))
+
+
+def read_pairs(
+    capture: Capture, settings: Settings, known: Mapping[str, Matrix] | None = None
+) -> tuple[list[BandPair], dict[str, Doubt]]:
+    """(the pairs, one for each lens; {band: why it cannot take part}).
+
+    `known` are mappings by band, undistorted px of the files, to try before what the tags say.
+    Raises UnreadableFileError where the reference cannot be read.
+    """
+    longest = settings.joint.longest_side_px
+    reference = Reference(read_for_alignment(capture.reference, longest), settings)
+    pairs: list[BandPair] = []
+    left_out: dict[str, Doubt] = {}
+    for bands in capture.moving_lenses:
+        candidates = seed_candidates(capture.reference, bands[0], settings.seed)
+        if known is not None and bands[0].name in known and settings.seed.force is None:
+            candidates = {"model": known[bands[0].name], **candidates}
+        if not candidates:
+            absent = Doubt("no_such_seed", detail=str(settings.seed.force))
+            left_out |= dict.fromkeys((b.name for b in bands), absent)
+            continue
+        try:
+            moving = _mean(read_for_alignment(b, longest) for b in bands)
+        except AgalignError as error:
+            left_out |= dict.fromkeys((b.name for b in bands), Doubt("unreadable", detail=str(error)))
+            continue
+        scales = _scale(reference.image, capture.reference), _scale(moving, bands[0])
+        down: Candidates = {kind: geometry.rescale(m, *scales) for kind, m in candidates.items()}
+        pairs.append(BandPair(bands[0].name, reference, moving, down, bands, scales))
+    return pairs, left_out
+
+
+def _mean(rasters: Iterable[Raster]) -> Raster:
+    first, *others = rasters
+    if not others:
+        return first
+    pixels = np.asarray(np.mean([first.pixels, *(r.pixels for r in others)], axis=0, dtype=np.float32))
+    return replace(first, pixels=pixels, valid=np.logical_and.reduce([first.valid, *(r.valid for r in others)]))
+
+
+def _scale(raster: Raster, band: Band) -> tuple[float, float]:
+    return raster.size_px[0] / band.width_px, raster.size_px[1] / band.height_px

@@ -1,0 +1,80 @@
+"""A pair's alignment with everything that speaks for and against it, measured on the images laid on each other."""
+
+from dataclasses import replace
+
+from agalign.capture.band_pair import BandPair
+from agalign.config import CheckSettings, Settings
+from agalign.judge.verdict import doubts_of, is_as_it_was, seed_fits, status_of
+from agalign.pixels.resample import single
+from agalign.values import geometry
+from agalign.values.alignment import Alignment, JointResult, LocalResult, Residual, Seed
+from agalign.values.choices import SeedKind, Space
+from agalign.values.doubts import Doubt
+from agalign.values.image import Raster
+from agalign.values.mapping import PixelMapping
+
+_AS_FILES_LIE: tuple[SeedKind, ...] = ("geo", "identity")
+"""Seeds that change nothing: an input aligned already is left untouched, not resampled by a hundredth of a pixel."""
+
+
+def without_result(seed: Seed, space: Space, doubt: Doubt) -> Alignment:
+    """The failed alignment of a pair that could not be tried."""
+    return Alignment(seed.fixed_to_moving, space, "failed", (doubt,), seed, None, None, 0.0)
+
+
+def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Settings) -> Alignment:
+    """The alignment with its verdict and metrics, px of the images. A result that is doubted leaves the seed."""
+    check, size_px = settings.check, pair.fixed.size_px
+    joint: JointResult | None = None
+    doubts: tuple[Doubt, ...] = (result,) if isinstance(result, Doubt) else ()
+    matrix = seed.fixed_to_moving
+    if isinstance(result, JointResult):
+        joint = _snapped(result, pair, check)
+        there, residual = _laid(pair, pair.mapping(joint.fixed_to_moving))
+        doubts = doubts_of(joint, residual, size_px, check)
+        matrix = seed.fixed_to_moving if doubts else joint.fixed_to_moving
+    if doubts:
+        there, residual = _laid(pair, pair.mapping(matrix))
+    usable = seed.trusted or settings.seed.only
+    status = status_of(doubts, residual, check, seed=usable)
+    if usable and doubts and not seed_fits(residual, check):
+        doubts = (*doubts, Doubt("seed_does_not_fit"))
+    local = None
+    if settings.local.use and status == "aligned" and joint is not None:
+        local = pair.reference.local.refine(single(pair.moving_image), pair.mapping(matrix))
+        if local.field is not None:
+            bent, left = _laid(pair, pair.mapping(matrix, local.field))
+            # What a field makes worse is not aligned by it: the verdict is asked again.
+            if doubts_of(joint, left, size_px, check):
+                local = LocalResult(None, local.before_p95_px, local.after_p95_px)
+            else:
+                there, residual = bent, left
+    before = pair.laid(PixelMapping(geometry.overlay(size_px, pair.moving_image.size_px)))
+    similarity = pair.reference.similarity
+    return Alignment(
+        matrix,
+        pair.space,
+        status,
+        doubts,
+        seed,
+        joint,
+        residual,
+        0.0,
+        similarity.to(before),
+        similarity.to(there),
+        local,
+    )
+
+
+def _laid(pair: BandPair, mapping: PixelMapping) -> tuple[Raster, Residual]:
+    there = pair.laid(mapping)
+    return there, pair.reference.windows.residuals(there)
+
+
+def _snapped(joint: JointResult, pair: BandPair, settings: CheckSettings) -> JointResult:
+    for given in (pair.candidates[kind] for kind in _AS_FILES_LIE if kind in pair.candidates):
+        if pair.mapping(given).bends:
+            continue  # the files do not lie that way
+        if is_as_it_was(joint, given, pair.fixed.size_px, settings, max(pair.scales[0])):
+            return replace(joint, fixed_to_moving=given)
+    return joint

@@ -1,0 +1,77 @@
+"""The reference image of a capture, and what seeds, checks and metrics of all bands need of it, worked out once."""
+
+from dataclasses import replace
+from functools import cached_property
+
+from agalign.config import Settings
+from agalign.judge.local import LocalRefiner
+from agalign.judge.metrics import FixedSimilarity
+from agalign.judge.residuals import FixedWindows
+from agalign.pixels.resample import shrink, single, textured
+from agalign.pixels.structure import Field, structure_field, windowed_spectra
+from agalign.values.image import Raster
+
+
+class Reference:
+    """The reference image, and on demand its structure, spectrum, windows and statistics."""
+
+    def __init__(self, image: Raster, settings: Settings) -> None:
+        self.image = image
+        self.settings = settings
+
+    @cached_property
+    def grey(self) -> Raster:
+        """(H, W): the image or the mean of its channels."""
+        return single(self.image)
+
+    @cached_property
+    def raw(self) -> Raster:
+        """The image without its lens model, for bands beside which it is not to be corrected."""
+        return replace(self.image, lens=None)
+
+    @cached_property
+    def is_textured(self) -> bool:
+        """False where there is nothing in the image to align."""
+        return textured(self.image)
+
+    # ---- for seeds
+
+    @cached_property
+    def seed_size_px(self) -> tuple[int, int]:
+        """(width, height) at which seeds are scored."""
+        width, height = self.image.size_px
+        scale = min(1.0, self.settings.seed.working_px / max(width, height))
+        return max(8, round(width * scale)), max(8, round(height * scale))
+
+    @cached_property
+    def seed_scale(self) -> tuple[float, float]:
+        """The same relative to the image, (x, y)."""
+        return self.seed_size_px[0] / self.image.size_px[0], self.seed_size_px[1] / self.image.size_px[1]
+
+    @cached_property
+    def seed_spectrum(self) -> Field:
+        """Windowed spectrum of the structure at that size."""
+        small = shrink(self.grey, self.seed_size_px)
+        return windowed_spectra(structure_field(small, self.settings.seed.smoothing_px))
+
+    # ---- for checks and metrics
+
+    @cached_property
+    def structure(self) -> Field:
+        """At full resolution."""
+        return structure_field(self.grey, self.settings.check.smoothing_px)
+
+    @cached_property
+    def windows(self) -> FixedWindows:
+        """Those in which an alignment is checked."""
+        return FixedWindows(self.grey.valid, self.structure, self.settings.check)
+
+    @cached_property
+    def local(self) -> LocalRefiner:
+        """Smaller ones, which local displacements are fitted to."""
+        return LocalRefiner(self.grey.valid, self.structure, self.settings.local, self.settings.check)
+
+    @cached_property
+    def similarity(self) -> FixedSimilarity:
+        """Histogram positions and smoothed gradients."""
+        return FixedSimilarity(self.grey)

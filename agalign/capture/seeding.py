@@ -1,0 +1,102 @@
+"""Where a pair's alignment starts: candidates scored on the images, the best kept; and the method's subject of it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from agalign.capture.band_pair import BandPair, Candidates
+from agalign.config import SeedSettings
+from agalign.flight.model import FlightModel
+from agalign.method.match import match_seed, starter_for_matching
+from agalign.method.subject import Subject
+from agalign.pixels.resample import single, textured, warped
+from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
+from agalign.values import geometry
+from agalign.values.alignment import Seed
+from agalign.values.choices import SeedKind
+from agalign.values.doubts import Doubt
+from agalign.values.geometry import Matrix
+
+_SAME_PEAK_PX = 2.0
+"""A candidate no farther from the peak than this, in working px, is on its flank."""
+
+
+def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
+    """The best seed of a pair, or why it can have none. `model` is the network that a `match` is found with."""
+    if not pair.reference.is_textured:
+        return Doubt("blank_reference")
+    if not textured(pair.moving):
+        return Doubt("blank_moving")
+    candidates = pair.candidates
+    if pair.reference.settings.seed.force == "match":
+        channels = pair.fixed.channels, pair.moving.channels
+        net = starter_for_matching(channels) if model is None else model.matching_network(pair.name, channels)
+        found = match_seed(net, pair.fixed, pair.moving)
+        if found is None:
+            return Doubt("no_such_seed", detail="match")
+        candidates = {"match": found}
+    return best_seed(pair, candidates)
+
+
+def subject_of(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> Subject:
+    """What the method works on: pairs of one capture and one space, their seeds, and the network's side for each."""
+    mappings = [s.fixed_to_moving for s in seeds]
+    return Subject(pairs[0].fixed, [p.moving for p in pairs], mappings, sides, [s.trusted for s in seeds])
+
+
+def best_seed(pair: BandPair, candidates: Candidates) -> Seed:
+    """The candidate under which the structures agree best, or one shifted onto the peak of their correlation.
+
+    Each is scored at no shift and at its best shift; a candidate whose best shift is below `least_shift_px` stays as it
+    is. Where the flight's own mapping leaves no doubt, the others are not looked at.
+    """
+    scored: list[Seed] = []
+    for kind, matrix in candidates.items():
+        scored += _scored(pair, kind, matrix)
+        best = max(scored, key=lambda seed: seed.score)
+        if kind == "model" and best.trusted:
+            return best
+    forced = [s for s in scored if s.kind == pair.reference.settings.seed.force]
+    return max(forced or scored, key=lambda seed: seed.score)
+
+
+def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[Seed]:
+    """The candidate itself and, where the structures agree better a shift away, its `structure` variant.
+
+    On a sliver of common area the peak of the correlation means nothing: such a candidate scores 0.
+    """
+    reference, settings = pair.reference, pair.reference.settings.seed
+    size, scale = reference.seed_size_px, reference.seed_scale
+    small_moving = warped(single(pair.moving), pair.mapping(fixed_to_moving), size, scale)
+    if small_moving.valid.mean() < settings.least_overlap:
+        return [Seed(kind, fixed_to_moving, 0.0)]
+    spectrum = windowed_spectra(structure_field(small_moving, settings.smoothing_px))
+    surface = correlation_surfaces(reference.seed_spectrum, spectrum)
+    peak = find_peak(surface, apart_px=max(size) // 16)
+
+    def seed(kind: SeedKind, matrix: Matrix, sigma: float, rival: float) -> Seed:
+        return Seed(kind, matrix, sigma, sigma, rival, _leaves_no_doubt(sigma, rival, settings))
+
+    if np.hypot(*peak.shift_px) < settings.least_shift_px:
+        return [seed(kind, fixed_to_moving, peak.sigma, peak.runner_up_sigma)]
+    shift = geometry.translation(peak.shift_px[0] / scale[0], peak.shift_px[1] / scale[1])
+    shifted = geometry.compose(fixed_to_moving, shift)
+    # Where the peak is another place, it is what this candidate has to stand up to.
+    rival = peak.sigma if np.hypot(*peak.shift_px) > _SAME_PEAK_PX else peak.runner_up_sigma
+    unmoved = seed(kind, fixed_to_moving, peak.sigma_at_zero, rival)
+    # The correlation is circular: its peak may lay the images beside each other.
+    points = pair.mapping(shifted)(geometry.lattice(*pair.fixed.size_px, 16, 12))
+    within = ((points >= 0) & (points <= np.subtract(pair.moving.size_px, 1))).all(axis=1)
+    if within.mean() < settings.least_overlap:
+        return [unmoved]
+    return [unmoved, seed("structure", shifted, peak.sigma, peak.runner_up_sigma)]
+
+
+def _leaves_no_doubt(sigma: float, rival: float, settings: SeedSettings) -> bool:
+    return sigma >= max(settings.trusted_sigma, settings.trusted_ratio * rival)
+
+
+def unscored(pair: BandPair) -> Seed:
+    """The first candidate, where none can be scored."""
+    kind, matrix = next(iter(pair.candidates.items()))
+    return Seed(kind, matrix, 0.0)

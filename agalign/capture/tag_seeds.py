@@ -1,0 +1,61 @@
+"""Coarse mappings that a file's metadata offers, before any pixel is looked at."""
+
+from contextlib import suppress
+
+import cv2
+import numpy as np
+
+from agalign.cameras import rig_seed
+from agalign.config import SeedSettings
+from agalign.errors import GeometryError
+from agalign.pixels.raster import transformed
+from agalign.values import geometry
+from agalign.values.capture import Band
+from agalign.values.choices import SeedKind
+from agalign.values.geometry import Matrix
+
+_FROM_TAGS: tuple[SeedKind, ...] = ("rig", "geo", "identity")
+
+
+def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> dict[SeedKind, Matrix]:
+    """fixed_to_moving between undistorted pixels of the files, in order of trust; identity is always among them.
+
+    Where settings force a kind that tags can give, that one alone, or nothing where the tags do not give it.
+    """
+    candidates: dict[SeedKind, Matrix] = {}
+    with suppress(GeometryError):  # numbers in the tags that make no camera
+        rig = rig_seed(reference, moving)
+        if rig is not None:
+            candidates["rig"] = rig
+    with suppress(GeometryError):
+        geo = geo_seed(reference, moving)
+        if geo is not None:
+            candidates["geo"] = geo
+    candidates["identity"] = geometry.overlay(reference.size_px, moving.size_px)
+    if settings.force in _FROM_TAGS:
+        return {kind: matrix for kind, matrix in candidates.items() if kind == settings.force}
+    return candidates
+
+
+def geo_seed(reference: Band, moving: Band) -> Matrix | None:
+    """fixed_to_moving from the two files' geotransforms; None where either has none.
+
+    Between two coordinate reference systems it is the homography nearest to the transformation. Geotransforms count
+    from the corner of the top-left pixel, this package from its centre: hence the half pixels. Raises GeometryError.
+    """
+    here, there = reference.georeference, moving.georeference
+    if here is None or there is None:
+        return None
+    to_corner = geometry.translation(0.5, 0.5)
+    try:
+        map_to_there = geometry.invert(there.transform)
+    except GeometryError:
+        raise GeometryError(f"{moving.path}: its geotransform cannot be inverted") from None
+    if here.crs_wkt == there.crs_wkt:
+        return geometry.compose(geometry.invert(to_corner), map_to_there, here.transform, to_corner)
+    points = geometry.lattice(*reference.size_px, 9, 7)
+    on_map = transformed(geometry.apply(here.transform, points + 0.5), here.crs_wkt, there.crs_wkt)
+    found, _ = cv2.findHomography(points, geometry.apply(map_to_there, on_map) - 0.5, 0)
+    if found is None or not np.isfinite(found).all():
+        raise GeometryError(f"{moving.path}: lies where {reference.path.name}'s coordinates do not reach")
+    return geometry.normalised(found)

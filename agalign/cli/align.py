@@ -1,0 +1,364 @@
+"""The command that aligns a folder, and what `demo` shares with it."""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
+from agalign.errors import ConfigurationError
+from agalign.values.choices import (
+    BandOrder,
+    Compression,
+    Crop,
+    FamilyChoice,
+    Interpolation,
+    Layout,
+    RasterFormat,
+    Recipe,
+    Resolution,
+    SeedChoice,
+    Sharing,
+)
+
+if TYPE_CHECKING:
+    from agalign.batch import CaptureReport
+    from agalign.cameras.discover import DiscoverOptions, Flight
+    from agalign.config import Settings
+    from agalign.values.capture import Capture
+
+GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
+
+FolderArgument = Annotated[
+    Path, typer.Argument(help="Folder with the images, sub-folders included.", show_default=False)
+]
+Pattern = Annotated[
+    str | None, typer.Option(help="File names as '{capture}_{band}.tif', where agalign does not know them.")
+]
+Reference = Annotated[str | None, typer.Option(help="Name of the reference band; by default green.")]
+Jobs = Annotated[
+    int,
+    typer.Option(
+        "--jobs",
+        "-j",
+        min=0,
+        show_default=False,
+        help="Captures at a time; by default one a core, and one for short flights.",
+    ),
+]
+Dask = Annotated[
+    str | None,
+    typer.Option(help="Scheduler of a Dask cluster that does the captures, tcp://host:8786; it sees the same folders."),
+]
+IgnoreMetadata = Annotated[bool, typer.Option("--ignore-metadata", help="Use no lens or rig tags.")]
+BandNames = Annotated[
+    str | None, typer.Option("--bands", help="Names of the bands that take part, separated by commas; by default all.")
+]
+Order = Annotated[BandOrder, typer.Option(help="Of the bands: as the camera counts them, by wavelength, or by name.")]
+WithRgb = Annotated[
+    bool, typer.Option("--with-rgb", help="The camera's colour photograph (JPEG) takes part too, as three bands.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command()(align)
+
+
+def align(
+    folder: FolderArgument,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Output folder; by default FOLDER with '-aligned' added.")
+    ] = None,
+    reference: Reference = None,
+    bands: BandNames = None,
+    order: Order = "index",
+    with_rgb: WithRgb = False,
+    pattern: Pattern = None,
+    seed: Annotated[SeedChoice, typer.Option(help="Start from this kind of coarse alignment only.")] = "auto",
+    only_seed: Annotated[
+        bool, typer.Option("--only-seed", help="Stop at the coarse alignment; learn nothing.")
+    ] = False,
+    ignore_metadata: IgnoreMetadata = False,
+    recipe: Annotated[Recipe, typer.Option(help="How to optimise: fast, or step by step as published.")] = "fast",
+    sharing: Annotated[Sharing, typer.Option(help="What the descriptor's two sides share.")] = "pseudo-siamese",
+    model_family: Annotated[
+        FamilyChoice, typer.Option(help="Mapping to fit; auto is as rich as the images allow.")
+    ] = "auto",
+    interpolation: Annotated[Interpolation, typer.Option(help="Resampling of the moving bands.")] = "lanczos",
+    crop: Annotated[
+        Crop, typer.Option(help="Cut to the area all bands share, or keep the reference's frame.")
+    ] = "common",
+    undistort: Annotated[
+        bool, typer.Option("--undistort", help="Write the lens-corrected grid of the reference.")
+    ] = False,
+    resolution: Annotated[
+        Resolution, typer.Option(help="Of the output: the reference's, or the finest band's on the reference's frame.")
+    ] = "reference",
+    layout: Annotated[
+        Layout, typer.Option(help="A stack of all bands, a file for each input file with its tags, or both.")
+    ] = "stack",
+    local: Annotated[
+        bool,
+        typer.Option("--local", help="Follow parallax over trees and buildings: a smooth field over the homography."),
+    ] = False,
+    radiometry: Annotated[
+        bool,
+        typer.Option(
+            "--radiometry", help="Write reflectance or radiance as the camera's tags give it, not raw numbers."
+        ),
+    ] = False,
+    stac: Annotated[bool, typer.Option("--stac", help="A STAC item beside each capture's files.")] = False,
+    format: Annotated[RasterFormat, typer.Option(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
+    compression: Annotated[
+        Compression, typer.Option(help="Lossless; auto is zstd for stacks and deflate for single bands.")
+    ] = "auto",
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
+    rng_seed: Annotated[
+        int, typer.Option(min=0, help="Seed of all random numbers; the same seed gives the same result.")
+    ] = 0,
+    jobs: Jobs = 0,
+    dask: Dask = None,
+    model: Annotated[
+        Path | None, typer.Option(help="Start from what an earlier flight of the same camera learnt: OUT/models/….")
+    ] = None,
+    each_alone: Annotated[
+        bool, typer.Option("--each-alone", help="Learn every capture by itself instead of once a flight.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Do captures again that an earlier run finished.")
+    ] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    log_json: LogJson = False,
+) -> None:
+    """Align every capture below FOLDER."""
+    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(voice, GOES_ON):
+        from agalign.cameras.discover import DiscoverOptions
+        from agalign.config import FlightSettings, JointSettings, LocalSettings, SeedSettings, Settings, WriteSettings
+        from agalign.products.stac import need_stac
+
+        target = out or folder.absolute().parent / f"{folder.absolute().name}-aligned"
+        settings = Settings(
+            seed=SeedSettings(force=None if seed == "auto" else seed, only=only_seed),
+            joint=JointSettings(
+                recipe=recipe, sharing=sharing, model_family=model_family, device=device, rng_seed=rng_seed
+            ),
+            flight=FlightSettings(together=not each_alone),
+            local=LocalSettings(use=local),
+            write=WriteSettings(
+                interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
+                radiometry=radiometry, stac=stac,
+                format=format, compression=compression,
+            ),
+        )  # fmt: skip
+        options = DiscoverOptions(
+            pattern, reference, ignore_metadata, with_rgb, band_names(bands), order, skip=(target,)
+        )  # fmt: skip
+        if stac:
+            need_stac()
+        flight = find_captures(folder, options, voice)
+        reports = run(flight, target, settings, voice, overwrite=overwrite, jobs=jobs, dask=dask, model=model)
+        raise typer.Exit(conclude(flight, reports, target, voice))
+
+
+def band_names(text: str | None) -> tuple[str, ...]:
+    """The names in a list separated by commas."""
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+
+
+def find_captures(folder: Path, options: "DiscoverOptions", voice: Voice, *, silent: bool = False) -> "Flight":
+    """The captures below a folder; what is wrong with its files is said. Raises where there is none."""
+    from agalign.cameras.discover import discover
+    from agalign.errors import InputError
+
+    flight = discover(folder, options)
+    if not silent:
+        for problem in flight.problems:
+            voice.problem(problem.text, file=problem.path)
+    if not flight.captures:
+        if any("for the reference; this capture has" in p.text for p in flight.problems):
+            raise ConfigurationError(f"{folder}: no capture has a band '{options.reference}'")
+        raise InputError(
+            f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' shows what was found"
+        )
+    bands = sum(len(c.bands) for c in flight.captures)
+    if not silent:
+        voice.event(
+            "found",
+            f"{len(flight.captures)} captures, {bands} bands in {folder}",
+            captures=len(flight.captures),
+            bands=bands,
+        )
+    return flight
+
+
+def run(
+    flight: "Flight", out: Path, settings: "Settings", voice: Voice, *,
+    overwrite: bool, jobs: int, dask: str | None = None, model: Path | None = None, keep_tables: bool = False,
+) -> "list[CaptureReport]":  # fmt: skip
+    """Align the captures, saying how far it has come; their reports in the flight's order."""
+    from agalign.batch import Listener, RunOptions, run_flight
+    from agalign.batch.workers import dask_executor
+    from agalign.method.device import choose_device
+
+    # One process feeds a GPU; and to start one costs as much as two captures.
+    on_cpu = choose_device(settings.joint.device).type == "cpu"
+    worth_starting = min(os.cpu_count() or 1, len(flight.captures) // 4) if on_cpu else 1
+    reports: list[CaptureReport] = []
+    done_pairs, all_pairs = 0, sum(len(c.moving) for c in flight.captures)
+    pairs = {c.label: len(c.moving) for c in flight.captures}
+    started = time.monotonic()
+    cluster = nullcontext() if dask is None else dask_executor(dask)
+    with cluster as executor, _progress(voice, all_pairs) as show, _interruptible() as check_interrupt:
+        options = RunOptions(overwrite, jobs or max(1, worth_starting), executor)
+        current: Capture | None = None
+
+        def on_start(capture: "Capture") -> None:
+            nonlocal current
+            check_interrupt()
+            current = capture
+
+        def on_learning(camera: str, share: float) -> None:
+            check_interrupt()
+            show(done_pairs, f"learning from {camera}: {share:.0%} at most")
+
+        def on_pair(band: str, stage: str, share: float) -> None:
+            check_interrupt()
+            assert current is not None
+            names = [b.name for b in current.moving]
+            place = names.index(band) if band in names else len(names)
+            show(
+                done_pairs + place + (0.85 * share if stage in ("learning", "refining") else 0.0),
+                f"{current.label} {band}: {stage}",
+            )
+
+        try:
+            listener = Listener(on_start, on_pair, on_learning)
+            for capture_report in run_flight(flight, out, settings, options, listener, model):
+                check_interrupt()
+                reports.append(capture_report if keep_tables else capture_report.without_tables())
+                done_pairs += pairs[capture_report.label]
+                show(done_pairs, capture_report.label)
+                _tell(capture_report, voice, len(reports), len(flight.captures))
+        finally:
+            _write_pages(out, reports)
+    reports.sort(key=lambda r: list(pairs).index(r.label))
+    voice.event("finished", seconds=round(time.monotonic() - started, 1), captures=len(reports))
+    return reports
+
+
+def _write_pages(out: Path, reports: "list[CaptureReport]") -> None:
+    """Also after an interruption: what is finished is reported."""
+    from agalign.products.report import write_report
+    from agalign.products.summary import write_summary
+
+    if reports:
+        write_summary(out)
+        write_report(out)
+
+
+@contextmanager
+def _interruptible() -> Iterator[Callable[[], None]]:
+    """Yields a check that raises KeyboardInterrupt once SIGINT has come.
+
+    The exception that Python itself raises is lost where it falls into a callback from a C library.
+    """
+    came = False
+
+    def on_interrupt(_number: int, _frame: object) -> None:
+        nonlocal came
+        came = True
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if came:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _progress(voice: Voice, pairs: int) -> Iterator[Callable[[float, str], None]]:
+    """A bar on a terminal, nothing elsewhere: there each capture prints a plain line."""
+    if voice.quiet or voice.log_json or not voice.err.is_terminal:
+        yield lambda _done, _text: None
+        return
+    columns = (
+        BarColumn(bar_width=28), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )  # fmt: skip
+    with Progress(*columns, console=voice.err, transient=True) as progress:
+        task = progress.add_task("starting", total=pairs)
+        yield lambda done, text: progress.update(task, completed=done, description=escape(text))
+
+
+def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> None:
+    if report.sidecar is None:
+        voice.problem(f"{report.label}: {report.error}", capture=report.label)
+        return
+    pairs = [b for b in report.sidecar.bands if b.status != "reference"]
+    aligned = sum(b.status == "aligned" for b in pairs)
+    kept = ", kept from an earlier run" if report.state == "kept" else ""
+    seconds = sum(b.seconds for b in pairs)
+    text = f"[{number}/{count}] {report.label}: {aligned} of {len(pairs)} aligned, {seconds:.1f} s{kept}"
+    if voice.verbose or not voice.err.is_terminal or voice.log_json:
+        voice.event(
+            "capture",
+            text,
+            capture=report.label,
+            state=report.state,
+            status=report.sidecar.status,
+            aligned=aligned,
+            pairs=len(pairs),
+        )
+    for band in pairs:
+        residual = band.metrics.after.residual_px if band.metrics else None
+        shown = "" if residual is None else f", residual {residual:.3f} px"
+        if voice.verbose or voice.log_json:
+            voice.event(
+                "pair", f"    {band.band}: {band.status}{shown}, {band.seconds:.1f} s",
+                capture=report.label, band=band.band, status=band.status, reason=band.reason,
+                residual_px=residual, seconds=band.seconds,
+            )  # fmt: skip
+        if band.status in ("seed_only", "failed"):
+            voice.problem(
+                f"{report.label} {band.band}: {band.status}: {band.reason}", capture=report.label, band=band.band
+            )
+
+
+def conclude(flight: "Flight", reports: "list[CaptureReport]", out: Path, voice: Voice) -> int:
+    """The closing table, and the exit code."""
+    from statistics import median
+
+    pairs = [b for r in reports if r.sidecar for b in r.sidecar.bands if b.status != "reference"]
+    table = Table("Band", title=f"{sum(b.status == 'aligned' for b in pairs)} of {len(pairs)} band pairs aligned")
+    for name in ("Aligned", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair"):
+        table.add_column(name, justify="right")
+    for name in dict.fromkeys(b.band for b in pairs):
+        mine = [b for b in pairs if b.band == name]
+        residuals = [b.metrics.after.residual_px for b in mine if b.status == "aligned" and b.metrics]
+        known = [r for r in residuals if r is not None]
+        counts = [str(sum(b.status == s for b in mine)) for s in ("aligned", "seed_only", "failed")]
+        worst = (f"{median(known):.3f}", f"{max(known):.3f}") if known else ("-", "-")
+        table.add_row(escape(name), *counts, *worst, f"{median(b.seconds for b in mine):.1f}")
+    voice.result(table)
+    voice.result(escape(f"Report: {out / 'index.html'}"))
+    if not any(r.useful for r in reports):
+        voice.problem("no band pair could be aligned")
+        alone = all(r.sidecar is None for r in reports)
+        return EXIT_NOTHING if alone else EXIT_PARTIAL
+    return EXIT_OK if all(r.good for r in reports) and not flight.problems else EXIT_PARTIAL

@@ -1,0 +1,244 @@
+"""The command line: parses, calls the library, prints."""
+
+import json
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from agalign._version import __version__
+from agalign.cli import align as cli_align
+from agalign.cli import evaluate as cli_evaluate
+from agalign.cli.align import (
+    BandNames,
+    FolderArgument,
+    IgnoreMetadata,
+    Jobs,
+    Order,
+    Pattern,
+    Reference,
+    WithRgb,
+    band_names,
+    find_captures,
+)
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
+
+if TYPE_CHECKING:
+    from agalign.values.capture import Capture
+
+app = typer.Typer(
+    name="agalign",
+    help="Co-register the bands of multispectral drone cameras. 'agalign FOLDER' aligns everything below FOLDER.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+cli_align.register(app)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False,
+) -> None:
+    if version:
+        typer.echo(f"agalign {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Argument(help="Folder to make.")] = Path("agalign-demo"),
+    captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
+    jobs: Jobs = 0,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
+    rng_seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    log_json: LogJson = False,
+) -> None:
+    """Make a synthetic flight, align it, and compare the result with the known truth."""
+    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(voice, cli_align.GOES_ON):
+        from agalign.batch import prepare_output
+        from agalign.cameras.discover import DiscoverOptions
+        from agalign.config import JointSettings, Settings
+        from agalign.synthetic.score import make_flight, score_against_truth
+
+        source, target = out / "flight", out / "aligned"
+        prepare_output(source)
+        voice.event(
+            "make", f"Painting a field and photographing it: {captures} captures of 5 bands …", captures=captures
+        )
+        truth = make_flight(source, captures, rng_seed=rng_seed)
+        flight = find_captures(source, DiscoverOptions(), voice)
+        settings = Settings(joint=JointSettings(device=device, rng_seed=rng_seed))
+        reports = cli_align.run(flight, target, settings, voice, overwrite=True, jobs=jobs, keep_tables=True)
+        table = Table("Capture", "Band", "Status", title="Error against the truth, px")
+        for name in ("before", "median", "95 %"):
+            table.add_column(name, justify="right")
+        for s in score_against_truth(reports, truth):
+            table.add_row(s.capture, s.band, s.status, f"{s.before_px:.1f}", f"{s.median_px:.3f}", f"{s.p95_px:.3f}")
+        voice.result(table)
+        raise typer.Exit(cli_align.conclude(flight, reports, target, voice))
+
+
+@app.command()
+def info(
+    folder: FolderArgument,
+    pattern: Pattern = None,
+    reference: Reference = None,
+    bands: BandNames = None,
+    order: Order = "index",
+    with_rgb: WithRgb = False,
+    ignore_metadata: IgnoreMetadata = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """Show what was found: cameras, captures, bands, seeds, and what is missing."""
+    voice = Voice(quiet=False, verbose=False, log_json=False)
+    with exits(voice):
+        from agalign.cameras.discover import DiscoverOptions
+
+        options = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
+        flight = find_captures(folder, options, voice, silent=as_json)
+        rows = [_facts(c) for c in flight.captures]
+        if as_json:
+            problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
+            typer.echo(json.dumps({"folder": str(folder), "captures": rows, "problems": problems}, indent=1))
+        else:
+            table = Table("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
+            for row in rows:
+                bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
+                size = "{width} x {height}".format(**row["bands"][0])
+                cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
+                table.add_row(*(escape(c) for c in cells), escape(", ".join(row["missing_bands"])))
+            voice.result(table)
+            found = f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {len(flight.problems)} problems"
+            voice.result(found)
+        raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
+
+
+@app.command()
+def report(
+    out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.", show_default=False)],
+) -> None:
+    """Rebuild the report and the summary from the sidecars."""
+    voice = Voice(quiet=False, verbose=False, log_json=False)
+    with exits(voice):
+        from agalign.errors import InputError
+        from agalign.products.report import write_report
+        from agalign.products.sidecar import find_sidecars
+        from agalign.products.summary import write_summary
+
+        if not out.is_dir() or not find_sidecars(out):
+            raise InputError(f"{out}: no sidecars there; give the output folder of a run")
+        unreadable: list[str] = []
+        summary = write_summary(out, unreadable.append)
+        for text in unreadable:
+            voice.problem(text)
+        voice.result(escape(f"{write_report(out)}\n{summary}"))
+        raise typer.Exit(EXIT_PARTIAL if unreadable else EXIT_OK)
+
+
+@app.command()
+def ndvi(
+    out: Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)],
+    index: Annotated[
+        str, typer.Option(help="Names separated by commas: ndvi, ndre, gndvi, ndwi, savi, evi …")
+    ] = "ndvi",
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    log_json: LogJson = False,
+) -> None:
+    """Vegetation indices of aligned captures: a raster and a picture each."""
+    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(voice):
+        from statistics import median
+
+        from agalign.products.index_rasters import IndexReport, write_indices
+        from agalign.products.indices import index_named
+
+        chosen = [index_named(name) for name in index.split(",")]
+        reports: list[IndexReport] = []
+        for found in write_indices(out, chosen):
+            reports.append(found)
+            if found.problem:
+                voice.problem(f"{found.capture}: {found.problem}", capture=found.capture, index=found.index)
+            else:
+                text = f"{found.capture} {found.index}: median {found.median:.3f}"
+                voice.event("index", text if verbose else "", **vars(found))
+        written = [r for r in reports if r.path is not None]
+        if any(r.raw_numbers for r in written):
+            voice.problem(
+                "the bands are raw numbers, not reflectance: their indices compare places within a capture, not "
+                "captures or cameras; align with --radiometry where the camera's tags allow it"
+            )
+        table = Table("Index", title=f"{len(written)} of {len(reports)} written")
+        for name in ("Captures", "Median", "Lowest", "Highest"):
+            table.add_column(name, justify="right")
+        for one in chosen:
+            values = [r.median for r in written if r.index == one.name]
+            if values:
+                shown = (f"{v:.3f}" for v in (median(values), min(values), max(values)))
+                table.add_row(one.name, str(len(values)), *shown)
+        if written:
+            voice.result(table)
+        raise typer.Exit(EXIT_NOTHING if not written else EXIT_OK if len(written) == len(reports) else EXIT_PARTIAL)
+
+
+cli_evaluate.register(app)
+_COMMANDS = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
+
+
+def _facts(capture: "Capture") -> dict[str, Any]:
+    """What `info` shows of a capture."""
+    from agalign.capture.tag_seeds import seed_candidates
+    from agalign.config import SeedSettings
+
+    offered = {kind for b in capture.moving for kind in seed_candidates(capture.reference, b, SeedSettings())}
+    bands = [
+        {
+            "name": b.name, "file": str(b.path), "band_index": b.band_index, "wavelength_nm": b.wavelength_nm,
+            "width": b.width_px, "height": b.height_px, "dtype": b.dtype, "nodata": b.nodata,
+            "lens_model": b.lens is not None, "reference": b is capture.reference,
+        }
+        for b in capture.bands
+    ]  # fmt: skip
+    return {
+        "label": capture.label,
+        "camera": f"{capture.camera.make} {capture.camera.model}".strip() or "unknown",
+        "serial": capture.camera.serial,
+        "captured_at": capture.captured_at,
+        "capture_id": capture.capture_id,
+        "flight_id": capture.flight_id,
+        "bands": bands,
+        "seeds": [kind for kind in ("rig", "geo") if kind in offered] + ["structure", "identity"],
+        "missing_bands": list(capture.missing_bands),
+    }
+
+
+def main() -> None:
+    """Entry point: a first argument that is no command is the folder to align."""
+    arguments = sys.argv[1:]
+    if arguments and arguments[0] not in _COMMANDS and not _is_root_option(arguments[0]):
+        arguments = ["align", *arguments]
+    # Threads that spin while they wait cost a multiple of the time where another program wants the same cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # The matrices here are small: a second BLAS thread does nothing but spin.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    logging.getLogger("rasterio").setLevel(logging.CRITICAL)
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
+    app(args=arguments, prog_name="agalign")
+
+
+def _is_root_option(argument: str) -> bool:
+    return argument in ("--help", "-h", "--version")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Pairs of images and the homography between them, in the layouts in which people have them."""
+
+import csv
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from agalign.errors import GeometryError, InputError, UnreadableFileError
+from agalign.pixels.masks import raster_of
+from agalign.values import geometry
+from agalign.values.geometry import Matrix
+from agalign.values.image import Raster
+
+_HPATCHES_LEVELS = {2: "easy", 3: "easy", 4: "hard", 5: "hard", 6: "tough"}
+"""By the number of the second image: the sequences are ordered by difficulty."""
+_HPATCHES_KINDS = {"i": "illumination", "v": "viewpoint"}
+_IMAGE_TYPES = (".ppm", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
+
+
+@dataclass(frozen=True)
+class PairFiles:
+    """Where two images of one plane are, and the homography between them."""
+
+    name: str
+    group: str
+    """What its results are averaged with."""
+    fixed: Path
+    moving: Path
+    fixed_to_moving: Matrix | None
+    """px, pixel centres at integers; the truth or, to learn from, a rough one. None where it is not known."""
+
+
+def find_pairs(source: Path) -> list[PairFiles]:
+    """The pairs of a CSV file, or of a folder in the HPatches or the Oxford layout, its sub-folders included.
+
+    * HPatches: `i_NAME` and `v_NAME` with 1.ppm ... 6.ppm and H_1_2 ... H_1_6.
+    * Oxford: any folder with img1.png ... imgK.png and H1to2p ... H1toKp; the group is the folder's name.
+    * CSV: columns fixed and moving and, where known, homography (a text file of 9 numbers, or the numbers themselves),
+      name and group; paths are relative to the CSV file.
+
+    Raises InputError, naming the file, where there are none or a homography cannot be read.
+    """
+    if source.is_file():
+        found = list(_from_csv(source))
+    elif source.is_dir():
+        found = [pair for folder in sorted({source, *source.rglob("*/")}) for pair in _from_folder(folder)]
+    else:
+        raise InputError(f"{source}: does not exist")
+    if not found:
+        raise InputError(f"{source}: no pairs; give a CSV file, or a folder in the HPatches or Oxford layout")
+    return found
+
+
+def _from_folder(folder: Path) -> Iterator[PairFiles]:
+    for path in sorted([*folder.glob("H_1_*"), *folder.glob("H1to*p")]):
+        number = int(re.sub(r"\D", "", path.name.removeprefix("H_1_").removeprefix("H1to")) or 0)
+        hpatches = path.name.startswith("H_")
+        fixed, moving = (_image(folder, str(k) if hpatches else f"img{k}") for k in (1, number))
+        kind = _HPATCHES_KINDS.get(folder.name.partition("_")[0]) if hpatches else None
+        group = f"{kind}, {_HPATCHES_LEVELS.get(number, 'tough')}" if kind else folder.name
+        yield PairFiles(f"{folder.name} 1-{number}", group, fixed, moving, _read_homography(path))
+
+
+def _image(folder: Path, stem: str) -> Path:
+    for suffix in _IMAGE_TYPES:
+        if (folder / f"{stem}{suffix}").is_file():
+            return folder / f"{stem}{suffix}"
+    raise InputError(f"{folder}: has a homography for {stem} but no such image")
+
+
+def _from_csv(path: Path) -> Iterator[PairFiles]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read ({error})") from None
+    for number, row in enumerate(rows, start=2):
+        try:
+            fixed, moving = (row[column] or "" for column in ("fixed", "moving"))
+        except KeyError as missing:
+            raise InputError(f"{path}: has no column {missing}; it needs fixed and moving") from None
+        homography = row.get("homography") or ""
+        numbers = homography.replace(",", " ").split()
+        if len(numbers) > 1:
+            matrix: Matrix | None = _as_homography(numbers, f"{path}, line {number}")
+        else:
+            matrix = _read_homography(path.parent / homography) if homography else None
+        name = row.get("name") or f"{Path(fixed).stem} {Path(moving).stem}"
+        yield PairFiles(name, row.get("group") or path.stem, path.parent / fixed, path.parent / moving, matrix)
+
+
+def _read_homography(path: Path) -> Matrix:
+    try:
+        return _as_homography(path.read_text(encoding="utf-8").replace(",", " ").split(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error})") from None
+
+
+def _as_homography(numbers: list[str], where: str) -> Matrix:
+    try:
+        return geometry.normalised(np.array([float(n) for n in numbers]).reshape(3, 3))
+    except (ValueError, GeometryError):
+        raise InputError(f"{where}: a homography is nine numbers, row by row") from None
+
+
+def read_image(path: Path) -> Raster:
+    """An image file, red first. Raises UnreadableFileError."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise UnreadableFileError(f"{path}: is missing or is no image that can be read")
+    if image.ndim == 3:
+        image = image[..., :3][..., ::-1].transpose(2, 0, 1)
+    return raster_of(image, None, str(path))

@@ -1,0 +1,124 @@
+"""Automatic descriptor learning: pairs are aligned without labels, and those that pass the checks teach one network.
+
+The keypoints are SIFT's, the positives their patches warped by the estimated homographies (paper, Sec. 6.2).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from agalign.capture.align import align_pairs
+from agalign.capture.band_pair import BandPair
+from agalign.config import Settings
+from agalign.errors import InputError, NoContrastError, NotEnoughTextureError
+from agalign.evaluation.image_pairs import find_pairs, read_image
+from agalign.flight.fingerprint import hashed
+from agalign.flight.model import FlightModel
+from agalign.method import losses
+from agalign.method.descriptor import REFERENCE, Descriptor
+from agalign.method.detect import sift_keypoints, visible_in_both
+from agalign.method.device import one_memory_error, one_thread
+from agalign.method.levels import Level
+from agalign.method.patches import Keypoints, far_apart, patch_positions
+from agalign.method.refine import MovingBand
+from agalign.method.state import JointState
+from agalign.method.subject import Subject
+from agalign.values import geometry
+from agalign.values.geometry import Matrix
+
+_LEAST_KEYPOINTS = 2
+_MOVING_BAND = "moving"
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What became of a pair: whether it was aligned, and so teaches."""
+
+    name: str
+    status: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class _Example:
+    level: Level
+    homography: torch.Tensor
+    keypoints: Keypoints
+
+
+def learn_descriptor(
+    pairs: Sequence[BandPair], settings: Settings, *, steps_a_pair: int = 200,
+    on_pair: Callable[[Lesson], None] = lambda _: None,
+) -> FlightModel:  # fmt: skip
+    """One network for all pairs, whose fixed images have the same channels, and whose moving images have.
+
+    Raises InputError where no pair can be aligned or their channels differ.
+    """
+    channels = {(p.fixed.channels, p.moving.channels) for p in pairs}
+    if len(channels) > 1:
+        raise InputError(f"the pairs have different channels {sorted(channels)}; learn them one kind at a time")
+    state = JointState(settings.joint, lambda *_: None)
+    examples = []
+    with one_thread(), one_memory_error():
+        for pair in pairs:
+            found = align_pairs([pair], settings, lambda *_: None)[pair.name]
+            on_pair(Lesson(pair.name, found.status, found.reason or ""))
+            if found.status == "aligned":
+                with suppress(NoContrastError, NotEnoughTextureError):
+                    examples.append(_example(state, pair, found.fixed_to_moving))
+        if not examples:
+            raise InputError("no pair could be aligned, so there is nothing to learn from")
+        net = state.fast_descriptor([*channels.pop()])
+        _learn(net, examples, state, steps_a_pair * len(examples))
+    weights = (value.cpu().numpy() for value in net.state_dict().values())
+    return FlightModel(net, "", (_MOVING_BAND,), {}, hashed(*weights))
+
+
+def _example(state: JointState, pair: BandPair, fixed_to_moving: Matrix) -> _Example:
+    level = state.level(Subject.of_one(pair.fixed, pair.moving, fixed_to_moving), 1.0, [0])
+    keypoints = sift_keypoints(pair.fixed)
+    keypoints = visible_in_both(keypoints, fixed_to_moving, pair.fixed, pair.moving)
+    if len(keypoints) < _LEAST_KEYPOINTS:
+        raise NotEnoughTextureError(len(keypoints), _LEAST_KEYPOINTS)
+    return _Example(level, level.homography(fixed_to_moving, 0), keypoints.to(state.device))
+
+
+def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, steps: int) -> None:
+    """Theta by Adam with psi known, a pair at a time; the rate falls to nothing along a cosine."""
+    recipe, generator = state.settings.fast, state.sampler.generator
+    optimiser = torch.optim.Adam(net.parameters(), recipe.learning_rate)
+    annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for step in range(steps):
+        example = examples[step % len(examples)]
+        rows = torch.randint(len(example.keypoints), (recipe.batch,), generator=generator)
+        k = example.keypoints[rows.to(state.device)]
+        # SIFT's own scale and orientation are one of many that a patch may have: the network is to know all.
+        turn = 2 * math.pi * torch.rand(len(k), generator=generator)
+        zoom = 2 ** (torch.rand(len(k), generator=generator) - 0.5)
+        k = Keypoints(k.xy, k.angle + turn.to(k.angle), k.scale * zoom.to(k.scale))
+        moving = MovingBand(net, example.level, 0, 1)
+        patches = [example.level.fixed.patches(patch_positions(k)), moving.patches(k, example.homography)]
+        f, f_prime = net.describe(patches, [REFERENCE, moving.side])
+        loss = losses.in_batch(f, f_prime, far_apart(k, recipe.least_negative_px), recipe.temperature)
+        optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        optimiser.step()
+        annealing.step()
+
+
+def read_rough_pairs(source: Path, settings: Settings) -> list[BandPair]:
+    """The pairs of a CSV file or folder, as `find_pairs` has them, their homographies taken as rough ones; without one
+    the images are laid on each other. Raises InputError.
+    """
+    found = []
+    for files in find_pairs(source):
+        fixed, moving = read_image(files.fixed), read_image(files.moving)
+        start = files.fixed_to_moving
+        if start is None:
+            start = geometry.overlay(fixed.size_px, moving.size_px)
+        found.append(BandPair.of_images(files.name, fixed, moving, {"user": start}, settings))
+    return found

@@ -1,0 +1,73 @@
+"""Whether an alignment can be believed. A wrong one called `aligned` is the worst this program could do."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from agalign.config import CheckSettings
+from agalign.values import geometry
+from agalign.values.alignment import JointResult, Residual
+from agalign.values.choices import PairStatus
+from agalign.values.doubts import Doubt
+from agalign.values.geometry import Matrix
+
+_MOST_STRETCH = 4.0
+"""Largest over smallest magnification within an image."""
+
+
+def doubts_of(
+    joint: JointResult, residual: Residual, size_px: tuple[int, int], settings: CheckSettings
+) -> tuple[Doubt, ...]:
+    """Everything that speaks against a result on an image (width, height), the plainest first."""
+    return (*_of_the_result(joint, size_px, settings), *_of_the_windows(residual, settings))
+
+
+def status_of(doubts: tuple[Doubt, ...], residual: Residual, settings: CheckSettings, *, seed: bool) -> PairStatus:
+    """`aligned` where nothing speaks against it; else `seed_only`, where the `seed` is usable and what it leaves is not
+    too much, or `failed`.
+    """
+    if not doubts:
+        return "aligned"
+    return "seed_only" if seed and seed_fits(residual, settings) else "failed"
+
+
+def seed_fits(residual: Residual, settings: CheckSettings) -> bool:
+    """True where what a seed leaves is little enough for it to be used as it is."""
+    return residual.coverage >= settings.least_seed_coverage and residual.median_px <= settings.most_seed_residual_px
+
+
+def _of_the_result(joint: JointResult, size_px: tuple[int, int], settings: CheckSettings) -> Iterator[Doubt]:
+    # Each is written so that nan passes nowhere.
+    scale = geometry.local_scale(joint.fixed_to_moving, *size_px)
+    if not (scale.min() > 0 and scale.max() <= _MOST_STRETCH * scale.min()):
+        yield Doubt("folds", float(scale.max() / scale.min()), _MOST_STRETCH)
+    least = max(settings.least_retrieval, settings.least_times_chance * joint.chance)
+    if not joint.retrieval >= least:
+        yield Doubt("retrieval", joint.retrieval, least)
+    if not joint.corner_std_px <= settings.most_corner_std_px:
+        yield Doubt("corner_std_px", joint.corner_std_px, settings.most_corner_std_px)
+
+
+def _of_the_windows(residual: Residual, settings: CheckSettings) -> Iterator[Doubt]:
+    if len(residual.centres_px) < settings.least_windows:
+        yield Doubt("few_windows", len(residual.centres_px), settings.least_windows)
+        return
+    if not residual.coverage >= settings.least_coverage:
+        yield Doubt("coverage", residual.coverage, settings.least_coverage)
+    close = float((np.linalg.norm(residual.shifts_px, axis=1) <= settings.most_residual_px).mean())
+    if not close >= settings.least_close:
+        within = f"{settings.most_residual_px:g} px"
+        yield Doubt("close_windows", close, settings.least_close, within)
+    if not residual.median_px <= settings.most_residual_px:
+        yield Doubt("residual_px", residual.median_px, settings.most_residual_px)
+
+
+def is_as_it_was(
+    joint: JointResult, given: Matrix, size_px: tuple[int, int], settings: CheckSettings, scale: float = 1.0
+) -> bool:
+    """True where the result cannot be told from the mapping that the files came with: they were aligned already.
+
+    `scale` is the size of the image relative to its file, in whose pixels the limit is.
+    """
+    moved_px = geometry.corner_error_px(joint.fixed_to_moving, given, *size_px)
+    return moved_px <= min(settings.most_snap_px * scale, 3 * joint.corner_std_px)

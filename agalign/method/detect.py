@@ -1,0 +1,55 @@
+"""SIFT keypoints as centres of patches."""
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from agalign.method.descriptor import PATCH_PX
+from agalign.method.patches import Keypoints, patch_positions, transform
+from agalign.values.geometry import Matrix
+from agalign.values.image import FloatImage, Raster
+
+MOST_KEYPOINTS = 2000
+_SPACING_PER_SIZE = 6 / PATCH_PX
+"""SIFT describes an area 6 times its keypoint's size wide; so do the patches."""
+
+
+def grey(image: FloatImage) -> FloatImage:
+    """(H, W): the luma of three channels (ITU-R BT.601), the mean of any other number, a single band as it is."""
+    if image.ndim == 2:
+        return image
+    if len(image) != 3:
+        return np.asarray(image.mean(axis=0), np.float32)
+    return np.tensordot(np.array([0.299, 0.587, 0.114], np.float32), image, axes=1)
+
+
+def to_8_bit(raster: Raster) -> NDArray[np.uint8]:
+    """(H, W), grey, between the 1st and the 99th percentile of the valid pixels."""
+    image = grey(raster.pixels)
+    low, high = np.percentile(image[raster.valid], (1, 99)) if raster.valid.any() else (0.0, 1.0)
+    return np.asarray((np.clip((image - low) / max(high - low, 1e-9), 0, 1) * 255).round().astype(np.uint8))
+
+
+def sift_keypoints(raster: Raster, most: int = MOST_KEYPOINTS) -> Keypoints:
+    """The `most` strongest SIFT keypoints of an image, raw px."""
+    found = cv2.SIFT.create(nfeatures=most).detect(to_8_bit(raster), raster.valid.astype(np.uint8))
+    found = sorted(found, key=lambda k: -k.response)[:most]
+    return Keypoints(
+        torch.tensor([k.pt for k in found], dtype=torch.float32).reshape(-1, 2),
+        torch.tensor([math.radians(k.angle) for k in found], dtype=torch.float32),
+        torch.tensor([k.size * _SPACING_PER_SIZE for k in found], dtype=torch.float32),
+    )
+
+
+def visible_in_both(keypoints: Keypoints, fixed_to_moving: Matrix, fixed: Raster, moving: Raster) -> Keypoints:
+    """Those whose patches lie in both images."""
+    grid = patch_positions(keypoints)
+    there = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
+    inside = torch.ones(len(keypoints), dtype=torch.bool)
+    for points, raster in ((grid, fixed), (there, moving)):
+        end = torch.tensor(raster.size_px, dtype=torch.float32) - 1
+        inside &= ((points >= 0) & (points <= end)).flatten(1).all(dim=1)
+    return keypoints[inside.nonzero()[:, 0]]

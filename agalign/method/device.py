@@ -1,0 +1,83 @@
+"""Where the tensors live, with how many threads, and what to make of it when they do not fit."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import cv2
+import torch
+from torch import Tensor
+
+from agalign.errors import ConfigurationError
+
+
+def choose_device(name: str) -> torch.device:
+    """`auto` is CUDA where there is one, else the CPU. Raises ConfigurationError where `name` cannot be had."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigurationError(f"device '{name}' cannot be used here: {str(error).splitlines()[0]}") from None
+    return device
+
+
+def exact(tensor: Tensor) -> Tensor:
+    """The same in float64, in which psi is solved for; on the CPU where the device (Apple's MPS) has none."""
+    return tensor.double() if _has_float64(tensor.device) else tensor.cpu().double()
+
+
+def _has_float64(device: torch.device) -> bool:
+    return device.type != "mps"
+
+
+def limit_threads(count: int) -> None:
+    """Let torch and OpenCV use this many threads from now on."""
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)
+
+
+_lock = threading.Lock()
+_inside, _before = 0, 1
+"""How many are in `one_thread` at the moment, and the number of torch threads before the first came."""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One torch thread inside: the networks are too small to gain from more, sums do not depend on how many processes
+    share the machine, and other programs keep their cores.
+
+    Callers in several threads share one setting: the last to leave gives back what the first one found.
+    """
+    global _inside, _before
+    with _lock:
+        if _inside == 0:
+            _before = torch.get_num_threads()
+            torch.set_num_threads(1)
+        _inside += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _inside -= 1
+            if _inside == 0:
+                torch.set_num_threads(_before)
+
+
+@contextmanager
+def one_memory_error() -> Iterator[None]:
+    """Raises MemoryError where memory is short, whichever library says it."""
+    try:
+        yield
+    except (cv2.error, RuntimeError) as error:
+        if not _is_want_of_memory(error):
+            raise
+        raise MemoryError(str(error)) from None
+
+
+def _is_want_of_memory(error: cv2.error | RuntimeError) -> bool:
+    if isinstance(error, cv2.error):
+        return error.code == cv2.Error.STS_NO_MEM
+    # torch's allocator on the CPU has no class of its own for it.
+    return isinstance(error, torch.cuda.OutOfMemoryError) or "not enough memory" in str(error)

@@ -1,0 +1,185 @@
+"""Recipe fast: Adam on theta through in-batch negatives, and every few steps one Gauss-Newton step on psi.
+
+One theta for as many captures as are given, each pair with its own psi (the paper's future work). docs/method.md has
+what each choice gained.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from agalign.errors import GeometryError, NotEnoughTextureError
+from agalign.method import losses
+from agalign.method.descriptor import REFERENCE, Descriptor
+from agalign.method.levels import Level
+from agalign.method.patches import far_apart, patch_positions, translation
+from agalign.method.refine import (
+    LEAST_KEYPOINTS,
+    MovingBand,
+    Solver,
+    best_shift,
+    describe_fixed,
+    make_anchors,
+    moved,
+    retrieval,
+)
+from agalign.method.state import JointState
+from agalign.method.subject import Subject
+
+
+def learn(state: JointState, subjects: Sequence[Subject], net: Descriptor) -> tuple[int, float]:
+    """Theta and every psi of all subjects, coarse to fine; theta is carried from level to level.
+
+    Returns the steps taken and the last loss. Raises NoContrastError.
+    """
+    scales = learn_scales(state, max(max(s.fixed.size_px) for s in subjects))
+    steps, loss = 0, float("nan")
+    for number, scale in enumerate(scales):
+        last = number == len(scales) - 1
+        wanted = [(s, [b for b in range(len(s.moving)) if last or not s.trusted[b]]) for s in subjects]
+        at_level = [_AtLevel(net, s, bands, state.level(s, scale, bands)) for s, bands in wanted if bands]
+        if number == 0 and net.learnt:
+            for a in at_level:
+                _search(state, a)
+        if at_level:
+            taken, loss = _learn_level(state, net, at_level)
+            steps += taken
+        for a in at_level:
+            a.hand_on()
+    return steps, loss
+
+
+def learn_scales(state: JointState, longer_side_px: int) -> list[float]:
+    """Resolutions at which theta is learnt, coarse to fine."""
+    recipe = state.settings.fast
+    scales = [min(1.0, max(0.5, recipe.learn_px / longer_side_px))]
+    while scales[0] * longer_side_px >= 2 * recipe.coarsest_px:
+        scales.insert(0, scales[0] / 2)
+    return scales
+
+
+@dataclass
+class _AtLevel:
+    """Some moving images of a subject at one level, with their psi as homographies of that level."""
+
+    net: Descriptor
+    subject: Subject
+    which: Sequence[int]
+    """Of the subject's moving images."""
+    level: Level
+    h: list[Tensor] = field(init=False)
+    settled: list[bool] = field(init=False)
+    """Those whose psi has been at rest once; it is moved on all the same."""
+    told_apart: bool = False
+    """Held-out patches of some image have been, so that its psi could move."""
+
+    def __post_init__(self) -> None:
+        self.settled = [False] * len(self.which)
+        self.h = [self.level.homography(self.subject.mappings[b], i) for i, b in enumerate(self.which)]
+
+    @property
+    def bands(self) -> list[MovingBand]:
+        return [MovingBand(self.net, self.level, i, self.subject.sides[b]) for i, b in enumerate(self.which)]
+
+    def hand_on(self) -> None:
+        """Give what was found to the subject; a homography that cannot be inverted is not handed on."""
+        for i, b in enumerate(self.which):
+            with suppress(GeometryError):
+                self.subject.mappings[b] = self.level.full_matrix(self.h[i], i)
+
+
+@torch.no_grad()
+def _search(state: JointState, at: _AtLevel) -> None:
+    """Move each untrusted psi by the translation under which the patches' loss is least.
+
+    Around the truth the loss is a funnel (paper, Fig. 2) that is wider than what one Gauss-Newton step sees.
+    """
+    recipe, level = state.settings.fast, at.level
+    p, _ = state.sampler.draw(level, level.anywhere, at.h, recipe.search_patches, recipe.octaves)
+    for i, band in enumerate(at.bands):
+        if at.subject.trusted[at.which[i]]:
+            continue
+        reach = recipe.search_share * max(level.fixed.size_px)
+        shift = best_shift(band, at.h[i], p, reach, recipe.search_step_px)
+        at.h[i] = at.h[i] @ translation(shift).to(at.h[i])
+
+
+def _learn_level(state: JointState, net: Descriptor, at_level: Sequence[_AtLevel]) -> tuple[int, float]:
+    """Theta by Adam, a capture at a time; each psi by Gauss-Newton once held-out patches are told apart.
+
+    A network that is learnt already needs no step where its first ones on psi are enough.
+    """
+    recipe = state.settings.fast
+    loss_value = float("nan")
+    most_steps = recipe.most_steps * len(at_level)
+    between = recipe.steps_between_updates * len(at_level)
+    warm_up = 0 if net.learnt else recipe.warm_up_steps
+    if net.learnt:
+        for _ in range(recipe.first_updates):
+            settled = [_move_psi(state, a) for a in at_level]
+            if all(settled):
+                return 0, loss_value
+    optimiser = torch.optim.Adam(net.parameters(), recipe.learning_rate)
+    for step in range(1, most_steps + 1):
+        loss = _loss(state, at_level[step % len(at_level)])
+        if loss is not None:
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            optimiser.step()
+            loss_value = float(loss.detach())
+        if step < warm_up or step % between:
+            continue
+        state.progress("learning", step / most_steps)
+        settled = [_move_psi(state, a) for a in at_level]
+        if all(settled):
+            break
+        hopeless = step >= warm_up + recipe.hopeless_steps * len(at_level)
+        if hopeless and not any(a.told_apart for a in at_level):
+            break
+    net.learnt = True
+    return step, loss_value
+
+
+def _loss(state: JointState, at: _AtLevel) -> Tensor | None:
+    """The in-batch loss of one capture's pairs on keypoints that are drawn anew; None where none can be drawn."""
+    recipe, level = state.settings.fast, at.level
+    p, inside = state.sampler.draw(level, level.trainable, at.h, recipe.batch, recipe.octaves)
+    rows = [inside[:, i].nonzero()[:, 0] for i in range(len(at.h))]
+    taking_part = [band for band in at.bands if len(rows[band.index]) >= LEAST_KEYPOINTS]
+    if not taking_part:
+        return None
+    patches = [level.fixed.patches(patch_positions(p))]
+    patches += [band.patches(p[rows[band.index]], at.h[band.index]) for band in taking_part]
+    f, *f_primes = at.net.describe(patches, [REFERENCE, *(band.side for band in taking_part)])
+    apart = far_apart(p, recipe.least_negative_px)
+    terms = []
+    for band, f_prime in zip(taking_part, f_primes, strict=True):
+        mine = rows[band.index]
+        terms.append(losses.in_batch(f[mine], f_prime, apart[mine][:, mine], recipe.temperature))
+    return torch.stack(terms).mean()
+
+
+@torch.no_grad()
+def _move_psi(state: JointState, at: _AtLevel) -> bool:
+    """One step on each psi of a capture whose held-out patches are retrieved; True where all have settled."""
+    recipe, level = state.settings.fast, at.level
+    test, _ = state.sampler.draw(level, level.held_out, at.h, recipe.test_keypoints, recipe.octaves)
+    p, _ = state.sampler.draw(level, level.anywhere, at.h, recipe.learn_patches, recipe.octaves)
+    if len(p) < LEAST_KEYPOINTS:
+        return True
+    f_test = describe_fixed(at.net, level, test)
+    anchors = make_anchors(at.net, level, p, recipe.difference_px)
+    solver = Solver(state.family, recipe)
+    for i, band in enumerate(at.bands):
+        retrieved, _ = retrieval(band, at.h[i], test, f_test, recipe.least_negative_px)
+        if retrieved < recipe.step_gate:
+            continue
+        at.told_apart = True
+        with suppress(NotEnoughTextureError):
+            step = solver.step(band, at.h[i], anchors)
+            at.h[i] = moved(at.h[i], step)
+            at.settled[i] |= retrieved > recipe.enough_retrieval and step.length_px < recipe.rest_px
+    return all(at.settled)

@@ -1,0 +1,65 @@
+"""The method: learn a descriptor on the very images to be aligned while the homographies are optimised (paper, Sec. 4).
+
+    argmin over theta and psi of   sum L0(x, w(x; psi); theta) + sum L1(x, x'; theta)
+
+theta are the weights of the descriptor f, psi the parameters of the homography w from I (`fixed`) to I' (`moving`),
+L0 the distance of two descriptors and L1 the hinge on those that do not belong together. Two recipes do this on the
+same levels, keypoints, patches and networks:
+
+* `paper` (`paper.descend`): SGD on theta and psi together, coarse to fine, one pair at a time, as published.
+* `fast` (`fast.learn`, then `refine.refine`): Adam on theta through in-batch negatives; every few steps one
+  Gauss-Newton step on psi minimises L0 squared; at full resolution psi alone, theta frozen.
+
+Where theta is known already, from the flight, psi alone is left (`refine_with`).
+"""
+
+from dataclasses import replace
+
+from agalign.config import JointSettings
+from agalign.errors import GeometryError, NoContrastError, NotEnoughTextureError
+from agalign.method.descriptor import Descriptor
+from agalign.method.fast import learn
+from agalign.method.paper import align_by_paper
+from agalign.method.refine import refine
+from agalign.method.state import JointState, Progress
+from agalign.method.subject import Subject
+from agalign.values.alignment import JointResult
+from agalign.values.doubts import Doubt
+
+Results = list[JointResult | Doubt]
+"""For each moving image of a subject what was found, or why nothing was."""
+
+
+def align_from_scratch(subject: Subject, settings: JointSettings, progress: Progress) -> Results:
+    """Theta and every psi of one capture by itself. Raises ConfigurationError where there is no such device."""
+    state = JointState(settings, progress)
+    if settings.recipe == "paper":
+        return [_by_paper(state, subject, b) for b in range(len(subject.moving))]
+    net = state.fast_descriptor([r.channels for r in (subject.fixed, *subject.moving)])
+    try:
+        steps, loss = learn(state, [subject], net)
+        results = refine(state, net, subject)
+    except NoContrastError:
+        return [Doubt("no_contrast")] * len(subject.moving)
+    return [r if isinstance(r, Doubt) else replace(r, loss=loss, iterations=steps) for r in results]
+
+
+def refine_with(net: Descriptor, subject: Subject, settings: JointSettings, progress: Progress) -> Results:
+    """Every psi of a capture with the flight's theta frozen."""
+    try:
+        results = refine(JointState(settings, progress), net, subject)
+    except NoContrastError:
+        return [Doubt("no_contrast")] * len(subject.moving)
+    return [r if isinstance(r, Doubt) else replace(r, recipe="flight") for r in results]
+
+
+def _by_paper(state: JointState, subject: Subject, band: int) -> JointResult | Doubt:
+    one = Subject.of_one(subject.fixed, subject.moving[band], subject.mappings[band])
+    try:
+        return align_by_paper(state, one)[1]
+    except NotEnoughTextureError as why_not:
+        return Doubt("few_keypoints", why_not.keypoints, why_not.least)
+    except NoContrastError:
+        return Doubt("no_contrast")
+    except GeometryError:
+        return Doubt("not_invertible")

@@ -1,0 +1,212 @@
+"""The images of one capture at one resolution, and the keypoints that may be drawn from them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from agalign.method.patches import FOOTPRINT_PX, Keypoints, bilinear, footprint_radius, transform
+from agalign.pixels.resample import shrink
+from agalign.values import geometry, lens
+from agalign.values.geometry import Matrix
+from agalign.values.image import FloatImage, Mask, Raster
+from agalign.values.lens import Lens
+
+_HELD_OUT_CELLS = 8
+"""Cells along the longer side; every fifth cell, in a diagonal pattern, is kept from training."""
+_LEAST_CELL_PX = 4 * FOOTPRINT_PX
+"""Less than this across, a cell has no room for the patches of recipe fast, twice the smallest one's size."""
+_POOL = 16_384
+"""Positions kept of each kind: enough for any run, and each is undistorted only once."""
+_TRIES = 4
+"""Keypoints drawn for each that is wanted: some have patches that reach too far."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One image at one level, standardised. Positions are given undistorted: the image is sampled through its lens."""
+
+    image: Tensor
+    """(C, H, W), mean 0 and standard deviation 1 over the valid pixels, 0 elsewhere."""
+    room_px: Tensor
+    """(H, W) distance from each pixel to the nearest invalid one or to the border."""
+    scale: tuple[float, float] = (1.0, 1.0)
+    """Size (x, y) relative to the image that it was reduced from."""
+    lens: Lens | None = None
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height)."""
+        return int(self.image.shape[2]), int(self.image.shape[1])
+
+    def raw(self, points: Tensor) -> Tensor:
+        """Raw pixel positions of undistorted ones, (..., 2)."""
+        if self.lens is None or not lens.is_distorting(self.lens):
+            return points
+        return torch.stack(lens.distorted(self.lens, points[..., 0], points[..., 1]), dim=-1)
+
+    def patches(self, positions: Tensor) -> Tensor:
+        """Undistorted sample positions (N, 16, 16, 2) -> (N, C, 16, 16)."""
+        return bilinear(self.image, self.raw(positions))
+
+    def room_at(self, points: Tensor) -> Tensor:
+        """Distance to the nearest invalid pixel from undistorted positions (N, 2); 0 outside."""
+        width, height = self.size_px
+        column, row = self.raw(points).nan_to_num(-1.0).round().clamp(-2, 1e9).long().unbind(dim=1)
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        room = self.room_px[torch.where(inside, row, 0), torch.where(inside, column, 0)]
+        return torch.where(inside, room, 0.0)
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Where keypoints may lie."""
+
+    xy: Tensor
+    """(M, 2) undistorted positions."""
+    reach_px: Tensor
+    """(M,) how far a patch around each may reach; infinity where nothing but the image bounds it."""
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+
+@dataclass(frozen=True)
+class Level:
+    """I and one or more I' at one resolution, and where in I keypoints may lie."""
+
+    fixed: View
+    moving: tuple[View, ...]
+    trainable: Pool
+    """Positions with contrast enough from which theta is learnt."""
+    held_out: Pool
+    """The same in cells of the image of which theta never sees a pixel: patches around the ones share none with patches
+    around the others."""
+    anywhere: Pool
+    """Both together, their patches unbounded."""
+
+    def homography(self, matrix: Matrix, band: int) -> Tensor:
+        """A full-resolution fixed_to_moving matrix of a moving image as one between the level's, (3, 3) float32."""
+        scaled = geometry.rescale(matrix, self.fixed.scale, self.moving[band].scale)
+        return torch.tensor(scaled, dtype=torch.float32, device=self.fixed.image.device)
+
+    def full_matrix(self, homography: Tensor, band: int) -> Matrix:
+        """The inverse of `homography`."""
+        up = [(1 / x, 1 / y) for x, y in (self.fixed.scale, self.moving[band].scale)]
+        return geometry.rescale(homography.cpu().double().numpy(), up[0], up[1])
+
+
+def make_view(raster: Raster, scale: float, device: torch.device) -> View:
+    """A raster as the networks see it, reduced by `scale` (1 is its own resolution)."""
+    width, height = raster.size_px
+    small = shrink(raster, (max(1, round(width * scale)), max(1, round(height * scale))))
+    planes = small.pixels if small.pixels.ndim == 3 else small.pixels[None]
+    mask = small.valid.astype(np.uint8)
+    image = np.empty(planes.shape, np.float32)
+    for plane, standard in zip(planes, image, strict=True):
+        mean, deviation = (float(v.item()) for v in cv2.meanStdDev(plane, mask=mask))
+        np.multiply(plane - np.float32(mean), np.float32(1 / max(deviation, 1e-12)), out=standard)
+        standard[~small.valid] = 0
+    relative = small.size_px[0] / width, small.size_px[1] / height
+    room = torch.from_numpy(_room_px(small.valid)).to(device)
+    return View(torch.from_numpy(image).to(device), room, relative, small.lens)
+
+
+def make_level(
+    fixed: Raster, moving: Sequence[Raster], mappings: Sequence[Matrix], scale: float, least_gradient: float,
+    generator: torch.Generator, device: torch.device,
+) -> Level:  # fmt: skip
+    """The images reduced by `scale`, a moving one so that its mapping's magnification becomes 1 where it is larger."""
+    fixed_view = make_view(fixed, scale, device)
+    views = []
+    for raster, matrix in zip(moving, mappings, strict=True):
+        magnification = float(np.median(np.abs(geometry.local_scale(matrix, *fixed.size_px))))
+        usable = np.isfinite(magnification) and magnification > 0
+        views.append(make_view(raster, min(1.0, scale / magnification) if usable else scale, device))
+    gradient = _gradient_magnitude(fixed_view.image.cpu().numpy())
+    room = fixed_view.room_px.cpu().numpy()
+    usable_px = (gradient > least_gradient) & (room > FOOTPRINT_PX)
+    reserved = _reserved_cells(*fixed_view.size_px)
+    trainable, held_out = (
+        _pool(usable_px, cells, fixed_view.lens, generator, device) for cells in (~reserved, reserved)
+    )
+    xy = torch.cat([trainable.xy, held_out.xy])
+    anywhere = Pool(xy, torch.full_like(xy[:, 0], math.inf))
+    return Level(fixed_view, tuple(views), trainable, held_out, anywhere)
+
+
+@dataclass
+class Sampler:
+    """Draws random keypoints; the only source of randomness besides the initial weights."""
+
+    generator: torch.Generator
+
+    def draw(
+        self, level: Level, pool: Pool, homographies: Sequence[Tensor], count: int, octaves: float,
+        spacing_px: float = 1.0,
+    ) -> tuple[Keypoints, Tensor]:  # fmt: skip
+        """Up to `count` keypoints of I from `pool` whose patches lie in the valid area of I and of some I', and in
+        which I' they do, (N, bands) bool. Those that lie in the most come first.
+
+        Orientation is uniform in [0, 2 pi], log2 of the scale in units of `spacing_px` uniform in [0, octaves]
+        (paper, Sec. 5.3).
+        """
+        tries, device = _TRIES * count if len(pool) else 0, pool.xy.device
+        rows = torch.randint(max(1, len(pool)), (tries,), generator=self.generator).to(device)
+        angle = torch.rand(tries, generator=self.generator) * (2 * math.pi)
+        scale = spacing_px * 2 ** (torch.rand(tries, generator=self.generator) * octaves)
+        keypoints = Keypoints(pool.xy[rows], angle.to(device), scale.to(device))
+        inside = torch.stack([footprints_inside(level, b, keypoints, h) for b, h in enumerate(homographies)], dim=1)
+        inside &= (footprint_radius(keypoints.scale) + 1 < pool.reach_px[rows])[:, None]
+        bands = inside.sum(dim=1)
+        order = torch.argsort(bands, descending=True, stable=True)[:count]
+        order = order[bands[order] > 0]
+        return keypoints[order], inside[order]
+
+
+def footprints_inside(level: Level, band: int, keypoints: Keypoints, homography: Tensor) -> Tensor:
+    """(N,) True where a keypoint's patch touches only valid pixels in both images."""
+    radius = footprint_radius(keypoints.scale) + 1
+    there = transform(homography, keypoints.xy)
+    jacobian_scale = homography[:2, :2].det().abs().sqrt()
+    return (level.fixed.room_at(keypoints.xy) > radius) & (level.moving[band].room_at(there) > radius * jacobian_scale)
+
+
+def _room_px(valid: Mask) -> NDArray[np.float32]:
+    if valid.all():
+        column, row = (np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1)) for n in valid.shape[::-1])
+        return np.minimum(column[None, :], row[:, None]).astype(np.float32)
+    bordered = np.pad(valid.astype(np.uint8), 1)
+    return np.asarray(cv2.distanceTransform(bordered, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1], np.float32)
+
+
+def _gradient_magnitude(planes: FloatImage) -> FloatImage:
+    """Largest gradient over the channels, per pixel of distance."""
+    gradients = [
+        cv2.magnitude(cv2.Sobel(p, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(p, cv2.CV_32F, 0, 1, scale=1 / 8))
+        for p in planes
+    ]
+    return np.asarray(np.max(gradients, axis=0))
+
+
+def _reserved_cells(width_px: int, height_px: int) -> Mask:
+    cell = max(max(width_px, height_px) / _HELD_OUT_CELLS, _LEAST_CELL_PX)
+    column, row = (np.arange(n) // cell % 5 for n in (width_px, height_px))
+    # Within a row of cells, those of one column in five.
+    return np.asarray(column[None, :] == (-2 * row % 5)[:, None])
+
+
+def _pool(usable: Mask, cells: Mask, model: Lens | None, generator: torch.Generator, device: torch.device) -> Pool:
+    """Up to _POOL of the usable pixels in some cells, at least as far from all others as the smallest patch reaches."""
+    reach_px = np.asarray(cv2.distanceTransform(cells.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+    found = np.flatnonzero(usable & (reach_px > FOOTPRINT_PX + 1))
+    if len(found) > _POOL:
+        found = found[torch.randint(len(found), (_POOL,), generator=generator).numpy()]
+    row, column = np.divmod(found, usable.shape[1])
+    xy = lens.undistort(model, np.stack([column, row], axis=1)).astype(np.float32)
+    return Pool(torch.from_numpy(xy).to(device), torch.from_numpy(reach_px[row, column].astype(np.float32)).to(device))

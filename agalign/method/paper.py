@@ -1,0 +1,159 @@
+"""Recipe paper: SGD on theta and psi through one loss, level by level, as published (paper, Sec. 4 and 5).
+
+Names follow the paper: I and I' are `fixed` and `moving`, f the descriptor, theta the network's weights, psi the
+parameters of a homography, L0 and L1 the losses. What the paper leaves open is chosen in `config.PaperRecipe`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from agalign.config import PaperRecipe
+from agalign.errors import NotEnoughTextureError
+from agalign.method import losses
+from agalign.method.descriptor import REFERENCE, Descriptor
+from agalign.method.device import exact
+from agalign.method.levels import Level, Pool
+from agalign.method.patches import (
+    FAMILY_PARAMETERS,
+    Keypoints,
+    homography_from_psi,
+    patch_positions,
+    psi_from_homography,
+    transform,
+    warp_keypoints,
+)
+from agalign.method.refine import refine
+from agalign.method.state import JointState
+from agalign.method.subject import Subject
+from agalign.values import geometry
+from agalign.values.alignment import JointResult
+from agalign.values.doubts import Doubt
+from agalign.values.geometry import Matrix
+
+_MOVING = 1
+
+
+def align_by_paper(state: JointState, subject: Subject) -> tuple[Descriptor, JointResult | Doubt]:
+    """The network and what it found for a subject of one moving image.
+
+    Coarse to fine: theta starts anew at each level, psi is handed on. Raises NotEnoughTextureError, NoContrastError,
+    and GeometryError where psi ends in no homography.
+    """
+    recipe = state.settings.paper
+    channels = subject.fixed.channels, subject.moving[0].channels
+    halvings = max(0, round(math.log2(max(subject.fixed.size_px) / recipe.coarsest_px)))
+    scales = tuple(0.5**k for k in range(halvings, -1, -1))
+    steps = 0
+    for number, scale in enumerate(scales):
+        level = state.level(subject, scale, [0])
+        # Retrieval is measured with the last level's theta, from which its patches are kept.
+        pool = level.trainable if scale == 1.0 else level.anywhere
+        net = state.paper_descriptor(channels)
+
+        def report(share: float, number: int = number) -> None:
+            state.progress("learning", (number + share) / len(scales))
+
+        descent = descend(state, net, level, pool, subject.mappings[0], report)
+        subject.mappings[0] = descent.fixed_to_moving
+        steps += descent.steps
+    found = refine(state, net, subject, move=False)[0]
+    if isinstance(found, Doubt):
+        return net, found
+    return net, replace(
+        found, fixed_to_moving=descent.fixed_to_moving, loss=descent.loss, iterations=steps, levels=scales,
+        recipe="paper", last_step_px=descent.last_step_px,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Where SGD ended at one level."""
+
+    fixed_to_moving: Matrix
+    steps: int
+    loss: float
+    """Mean a keypoint of the last pass."""
+    last_step_px: float
+    """Largest movement of a corner in the last step, px of the level."""
+
+
+def descend(
+    state: JointState, net: Descriptor, level: Level, pool: Pool, start: Matrix, report: Callable[[float], None], *,
+    move: bool = True,
+) -> Descent:  # fmt: skip
+    """Argmin over theta and psi of sum L0(x; psi, theta) + sum L1(x, x'; theta) (paper, Eq. 5).
+
+    Keypoints x are drawn from `pool`. Without `move` over theta alone, with psi known (paper, Eq. 3). Raises
+    NotEnoughTextureError.
+    """
+    recipe = state.settings.paper
+    size_px = level.fixed.size_px
+    psi = psi_from_homography(exact(level.homography(start, 0)), *size_px).to(level.fixed.image).requires_grad_()
+    movable = torch.zeros_like(psi)
+    if move:
+        movable[list(FAMILY_PARAMETERS[state.family or "homography"])] = 1.0
+    keypoints = _draw(state, level, pool, homography_from_psi(psi.detach(), *size_px))
+
+    batches = len(keypoints.x) // recipe.batch
+    steps = recipe.epochs * batches
+    optimiser = torch.optim.SGD([*net.parameters(), psi], recipe.learning_rate, recipe.momentum)
+    annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    loss_value, before = float("nan"), psi.detach().clone()
+    for _ in range(recipe.epochs):
+        shuffled = torch.randperm(len(keypoints.x), generator=state.sampler.generator).to(state.device)
+        pass_loss = 0.0
+        for rows in torch.split(shuffled[: batches * recipe.batch], recipe.batch):
+            loss = _loss(net, level, keypoints.of(rows), homography_from_psi(psi, *size_px), recipe)
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            assert psi.grad is not None
+            psi.grad *= movable
+            before = psi.detach().clone()
+            optimiser.step()
+            annealing.step()
+            pass_loss += float(loss.detach())
+        loss_value = pass_loss / (batches * recipe.batch)
+        report(annealing.last_epoch / steps)
+    h, h_before = (homography_from_psi(q, *size_px).detach() for q in (psi, before))
+    corners = torch.tensor(geometry.corners(*size_px)).to(h)
+    last_step = (transform(h, corners) - transform(h_before, corners)).norm(dim=1).max()
+    return Descent(level.full_matrix(h, 0), steps, loss_value, float(last_step))
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Keypoints of I, and for each a place in I' that is not its own."""
+
+    x: Keypoints
+    x_false: Keypoints
+    is_negative: Tensor
+    """(N,) False where that place is too near to count."""
+
+    def of(self, rows: Tensor) -> "_Drawn":
+        return _Drawn(self.x[rows], self.x_false[rows], self.is_negative[rows])
+
+
+def _draw(state: JointState, level: Level, pool: Pool, h: Tensor) -> _Drawn:
+    """The negatives are drawn once: each keypoint of I with a random other one's place in I'."""
+    recipe = state.settings.paper
+    x, _ = state.sampler.draw(level, pool, [h], recipe.keypoints, recipe.octaves, recipe.spacing_px)
+    if len(x) < recipe.batch:
+        raise NotEnoughTextureError(len(x), recipe.batch)
+    order = torch.randperm(len(x), generator=state.sampler.generator).to(state.device)
+    x_false = warp_keypoints(x[order], h)
+    is_negative = (x_false.xy - transform(h, x.xy)).norm(dim=1) >= recipe.least_negative_px
+    return _Drawn(x, x_false, is_negative)
+
+
+def _loss(net: Descriptor, level: Level, batch: _Drawn, h: Tensor, recipe: PaperRecipe) -> Tensor:
+    """Sum of L0(x, w_k(x; psi)) and of L1(x, x') (paper, Eq. 4)."""
+    fixed, moving = level.fixed, level.moving[0]
+    f = net(fixed.patches(patch_positions(batch.x)), REFERENCE)
+    f_true = net(moving.patches(patch_positions(warp_keypoints(batch.x, h))), _MOVING)
+    f_false = net(moving.patches(patch_positions(batch.x_false)), _MOVING)
+    apart = losses.distance(f, f_false)[batch.is_negative]
+    return losses.contrastive(losses.distance(f, f_true), apart, recipe.margin)

@@ -1,0 +1,144 @@
+"""Keypoints, their warp under a homography, and the patches around them (paper, Sec. 5.1 to 5.3).
+
+Tensors of positions are in pixels of the image at hand: x right, y down, (0, 0) the centre of the top-left pixel.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from agalign.method.descriptor import PATCH_PX
+from agalign.values.choices import ModelFamily
+
+ALPHA = 64.0
+"""Scale of the homography's parameters (paper, Sec. 5.1)."""
+
+FOOTPRINT_PX = (PATCH_PX - 1) / 2 * math.sqrt(2.0)
+"""Distance from a keypoint to the farthest sample of its patch where the samples are 1 px apart."""
+
+FAMILY_PARAMETERS: dict[ModelFamily, tuple[int, ...]] = {
+    "homography": (0, 1, 2, 3, 4, 5, 6, 7),
+    "affine": (0, 1, 2, 3, 4, 5),
+    "translation": (4, 5),
+}
+"""Which of the eight elements of psi a model family may move."""
+
+
+def homography_from_psi(psi: Tensor, width_px: int, height_px: int) -> Tensor:
+    """Psi (8,) -> H (3, 3), with psi = alpha [h11-1, h12, h21, h22-1, h13/w, h23/h, h31 w, h32 h]."""
+    p = psi / ALPHA
+    one = torch.ones_like(p[0])
+    return torch.stack(
+        [
+            torch.stack([1 + p[0], p[1], p[4] * width_px]),
+            torch.stack([p[2], 1 + p[3], p[5] * height_px]),
+            torch.stack([p[6] / width_px, p[7] / height_px, one]),
+        ]
+    )
+
+
+def psi_from_homography(homography: Tensor, width_px: int, height_px: int) -> Tensor:
+    """The inverse of `homography_from_psi`: (3, 3) -> (8,)."""
+    h = homography / homography[2, 2]
+    return ALPHA * torch.stack(
+        [
+            h[0, 0] - 1,
+            h[0, 1],
+            h[1, 0],
+            h[1, 1] - 1,
+            h[0, 2] / width_px,
+            h[1, 2] / height_px,
+            h[2, 0] * width_px,
+            h[2, 1] * height_px,
+        ]
+    )
+
+
+def transform(homography: Tensor, points: Tensor) -> Tensor:
+    """Points (..., 2) through H (3, 3)."""
+    mapped = points @ homography[:, :2].T + homography[:, 2]
+    return mapped[..., :2] / mapped[..., 2:]
+
+
+def translation(shift: Tensor) -> Tensor:
+    """(2,) px -> (3, 3)."""
+    h = torch.eye(3, dtype=shift.dtype, device=shift.device)
+    h[:2, 2] = shift
+    return h
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Oriented, scaled positions in one image."""
+
+    xy: Tensor
+    """(N, 2) px."""
+    angle: Tensor
+    """(N,) radians from the x axis towards the y axis."""
+    scale: Tensor
+    """(N,) px between neighbouring samples of the patch."""
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def __getitem__(self, rows: Tensor) -> "Keypoints":
+        return Keypoints(self.xy[rows], self.angle[rows], self.scale[rows])
+
+    def to(self, device: torch.device) -> "Keypoints":
+        """The same on a device."""
+        return Keypoints(self.xy.to(device), self.angle.to(device), self.scale.to(device))
+
+    def moved(self, dx_px: float, dy_px: float) -> "Keypoints":
+        """The same keypoints shifted."""
+        return Keypoints(self.xy + self.xy.new_tensor([dx_px, dy_px]), self.angle, self.scale)
+
+
+def warp_keypoints(keypoints: Keypoints, homography: Tensor) -> Keypoints:
+    """w_k of the paper: the keypoints of the fixed image as keypoints of the moving one.
+
+    v = s (cos phi, sin phi); v' = [h11 v0 + h12 v1, h21 v0 + h22 v1] / (h31 x + h32 y + 1);
+    phi' = atan2(v1', v0'), s' = |v'|.
+    """
+    h = homography / homography[2, 2]
+    v = keypoints.scale[:, None] * torch.stack([keypoints.angle.cos(), keypoints.angle.sin()], dim=1)
+    denominator = keypoints.xy @ h[2, :2] + 1
+    v_prime = (v @ h[:2, :2].T) / denominator[:, None]
+    return Keypoints(transform(h, keypoints.xy), torch.atan2(v_prime[:, 1], v_prime[:, 0]), v_prime.norm(dim=1))
+
+
+def patch_positions(keypoints: Keypoints, side: int = PATCH_PX) -> Tensor:
+    """Sample positions of each keypoint's patch, (N, side, side, 2) px, centred on the keypoint.
+
+    Another `side` than 16 samples the same patch more or less finely.
+    """
+    offset = torch.arange(side, dtype=keypoints.xy.dtype, device=keypoints.xy.device) - (side - 1) / 2
+    offset = offset * (PATCH_PX / side)
+    v, u = torch.meshgrid(offset, offset, indexing="ij")
+    cos = (keypoints.angle.cos() * keypoints.scale)[:, None, None]
+    sin = (keypoints.angle.sin() * keypoints.scale)[:, None, None]
+    x = keypoints.xy[:, 0, None, None] + cos * u - sin * v
+    y = keypoints.xy[:, 1, None, None] + sin * u + cos * v
+    return torch.stack([x, y], dim=-1)
+
+
+def bilinear(image: Tensor, positions: Tensor) -> Tensor:
+    """B(p; I): image (C, H, W) at positions (N, n, n, 2) px -> (N, C, n, n); the border pixel's value outside."""
+    height, width = image.shape[-2:]
+    count, rows, columns, _ = positions.shape
+    size = positions.new_tensor([width - 1, height - 1])
+    flat = (2 * positions / size - 1).reshape(1, count * rows, columns, 2)
+    sampled = functional.grid_sample(image[None], flat, padding_mode="border", align_corners=True)
+    return sampled[0].reshape(len(image), count, rows, columns).transpose(0, 1)
+
+
+def footprint_radius(scale: Tensor) -> Tensor:
+    """Distance in px from a keypoint to the farthest sample of its patch."""
+    return scale * FOOTPRINT_PX
+
+
+def far_apart(keypoints: Keypoints, least_px: float) -> Tensor:
+    """(N, N) True where two keypoints are at least `least_px` from each other."""
+    return torch.cdist(keypoints.xy, keypoints.xy) >= least_px

@@ -1,0 +1,216 @@
+"""Psi with theta frozen: Gauss-Newton on L0 squared, inverse-compositional.
+
+The descriptors of the reference and their gradient over a shift are worked out once and serve every moving band and
+every step (Baker & Matthews 2004, Sec. 3.2): a step costs one pass of the moving band's patches.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from agalign.config import FastRecipe
+from agalign.errors import GeometryError, NotEnoughTextureError
+from agalign.method import losses
+from agalign.method.descriptor import REFERENCE, Descriptor
+from agalign.method.device import exact
+from agalign.method.gauss_newton import PatchEquations, Step, shift_gradient, solve
+from agalign.method.levels import Level, footprints_inside
+from agalign.method.patches import Keypoints, far_apart, patch_positions, transform, translation
+from agalign.method.state import JointState
+from agalign.method.subject import Subject
+from agalign.values.alignment import JointResult
+from agalign.values.choices import ModelFamily
+from agalign.values.doubts import Doubt
+
+LEAST_KEYPOINTS = 16
+_PLAIN_GAIN = 3.0
+"""Standard errors by which a loss must be less to count."""
+
+
+@dataclass(frozen=True)
+class MovingBand:
+    """One moving image I' of a level, as its side of the network describes it."""
+
+    net: Descriptor
+    level: Level
+    index: int
+    """Which of the level's moving images."""
+    side: int
+
+    def sees(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
+        """(M,) rows of the keypoints of I whose patches lie in both images."""
+        return footprints_inside(self.level, self.index, keypoints, homography).nonzero()[:, 0]
+
+    def patches(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
+        """B(w(x; psi); I'), (N, C, 16, 16): every sample goes through the homography, not only the keypoint's frame."""
+        return self.level.moving[self.index].patches(transform(homography, patch_positions(keypoints)))
+
+    def describe(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
+        """f(w(x; psi)) for keypoints x of I, (N, 256)."""
+        out: Tensor = self.net(self.patches(keypoints, homography), self.side)
+        return out
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Patches of the reference as the network describes them."""
+
+    keypoints: Keypoints
+    f: Tensor
+    """(N, 256) descriptors."""
+    gradient: Tensor
+    """(N, 256, 2) their derivative over a shift, per px."""
+
+    def head(self, count: int) -> "Anchors":
+        """The first `count` of them."""
+        rows = torch.arange(min(count, len(self.f)), device=self.f.device)
+        return Anchors(self.keypoints[rows], self.f[rows], self.gradient[rows])
+
+
+def describe_fixed(net: Descriptor, level: Level, keypoints: Keypoints) -> Tensor:
+    """f(x) for keypoints of I, (N, 256)."""
+    out: Tensor = net(level.fixed.patches(patch_positions(keypoints)), REFERENCE)
+    return out
+
+
+@torch.no_grad()
+def make_anchors(net: Descriptor, level: Level, keypoints: Keypoints, difference_px: float) -> Anchors:
+    """Descriptors and gradient of the reference's patches."""
+
+    def describe(k: Keypoints) -> Tensor:
+        return describe_fixed(net, level, k)
+
+    return Anchors(keypoints, describe(keypoints), shift_gradient(describe, keypoints, difference_px))
+
+
+@dataclass(frozen=True)
+class Solver:
+    """How psi is moved: by which family of mappings (None for as rich a one as the patches allow) and recipe."""
+
+    family: ModelFamily | None
+    recipe: FastRecipe
+
+    @torch.no_grad()
+    def step(self, band: MovingBand, homography: Tensor, anchors: Anchors) -> Step:
+        """One Gauss-Newton step. Raises NotEnoughTextureError where too few patches lie in both images."""
+        rows = band.sees(anchors.keypoints, homography)
+        if len(rows) < LEAST_KEYPOINTS:
+            raise NotEnoughTextureError(len(rows), LEAST_KEYPOINTS)
+        p = anchors.keypoints[rows]
+        residual = anchors.f[rows] - band.describe(p, homography)
+        equations = PatchEquations.of(p, residual, anchors.gradient[rows], band.level.fixed.size_px)
+        return solve(equations, self.family, self.recipe)
+
+    def converge(self, band: MovingBand, start: Tensor, anchors: Anchors) -> tuple[Tensor, Step]:
+        """Steps from `start` until one moves no corner by more than `final_rest_px`.
+
+        While the steps are long, a part of the anchors tells where to go.
+        """
+        h, some = start, anchors.head(self.recipe.first_patches)
+        for _ in range(self.recipe.final_steps):
+            step = self.step(band, h, some)
+            h = moved(h, step)
+            if step.length_px < self.recipe.final_rest_px and some is anchors:
+                break
+            if step.length_px < self.recipe.rest_px:
+                some = anchors
+        return h, step
+
+
+def moved(homography: Tensor, step: Step) -> Tensor:
+    """H <- H @ change, (3, 3) float32."""
+    return (exact(homography) @ step.change).to(homography)
+
+
+@torch.no_grad()
+def retrieval(
+    band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor, least_negative_px: float
+) -> tuple[float, float]:
+    """How often the nearest descriptor in I' is the right one among the keypoints that lie in both images, and what
+    guessing would give. `f` (N, 256) are the reference's descriptors.
+    """
+    rows = band.sees(keypoints, homography)
+    if len(rows) < LEAST_KEYPOINTS:
+        return 0.0, 1.0
+    p = keypoints[rows]
+    f_prime = band.describe(p, homography)
+    return losses.retrieval(f[rows], f_prime, far_apart(p, least_negative_px)), 1 / len(rows)
+
+
+@torch.no_grad()
+def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach_px: float, step_px: float) -> Tensor:
+    """The translation (2,) of the fixed side, up to `reach_px` long, at which the mean L0 of the patches that lie in
+    both images is least; none where that is not plainly less than without, for the patches that both have.
+    """
+    if len(keypoints) < LEAST_KEYPOINTS:
+        return homography.new_zeros(2)
+    f = describe_fixed(band.net, band.level, keypoints)
+    count = int(reach_px / step_px)
+    along = torch.arange(-count, count + 1, device=homography.device) * step_px
+    shifts = torch.cartesian_prod(along, along).to(homography)
+    lengths = shifts.norm(dim=1)
+    shifts = shifts[lengths <= reach_px]
+
+    def loss(shift: Tensor) -> Tensor:
+        """L0 of each keypoint, nan where its patch leaves an image."""
+        there = homography @ translation(shift)
+        apart = losses.distance(f, band.describe(keypoints, there))
+        inside = footprints_inside(band.level, band.index, keypoints, there)
+        return apart.masked_fill(~inside, float("nan"))
+
+    table = torch.stack([loss(s) for s in shifts])
+    enough = table.isfinite().sum(dim=1) >= LEAST_KEYPOINTS
+    means = table.nanmean(dim=1).masked_fill(~enough, float("inf"))
+    best, start = int(means.argmin()), int(lengths[lengths <= reach_px].argmin())
+    gain = table[start] - table[best]
+    gain = gain[gain.isfinite()]
+    if not bool(enough[best]) or len(gain) < LEAST_KEYPOINTS:
+        return homography.new_zeros(2)
+    plain = float(gain.mean()) > _PLAIN_GAIN * float(gain.std()) / math.sqrt(len(gain))
+    return shifts[best] if plain else homography.new_zeros(2)
+
+
+@torch.no_grad()
+def refine(state: JointState, net: Descriptor, subject: Subject, *, move: bool = True) -> list[JointResult | Doubt]:
+    """Every psi of a capture at full resolution with theta frozen; a doubt says why a pair has none.
+
+    Without `move` psi stays where it is, and what is said of it is how sure it is.
+    Raises NoContrastError.
+    """
+    recipe = state.settings.fast
+    level = state.level(subject, 1.0, range(len(subject.moving)))
+    h = [level.homography(matrix, b) for b, matrix in enumerate(subject.mappings)]
+    p, _ = state.sampler.draw(level, level.anywhere, h, recipe.final_patches, recipe.final_octaves)
+    test, _ = state.sampler.draw(level, level.held_out, h, recipe.test_keypoints, recipe.final_octaves)
+    if len(p) < LEAST_KEYPOINTS:
+        return [Doubt("few_keypoints", len(p), LEAST_KEYPOINTS)] * len(h)
+    anchors = make_anchors(net, level, p, recipe.difference_px)
+    f_test = describe_fixed(net, level, test)
+    solver = Solver(state.family, recipe)
+
+    def result(band: MovingBand, start: Tensor) -> JointResult | Doubt:
+        try:
+            found, step = solver.converge(band, start, anchors) if move else (start, solver.step(band, start, anchors))
+            matrix = level.full_matrix(found, band.index)
+        except NotEnoughTextureError as why_not:
+            return Doubt("few_keypoints", why_not.keypoints, why_not.least)
+        except GeometryError:
+            return Doubt("not_invertible")
+        std = _complete_std(step, recipe)
+        if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
+            return Doubt("corners_unknown")
+        held_out, chance = retrieval(band, found, test, f_test, recipe.least_negative_px)
+        return JointResult(
+            matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
+        )  # fmt: skip
+
+    return [result(MovingBand(net, level, b, side), h[b]) for b, side in enumerate(subject.sides)]
+
+
+def _complete_std(step: Step, recipe: FastRecipe) -> tuple[tuple[float, float], ...]:
+    """Random and systematic parts together."""
+    systematic = recipe.systematic_std_px
+    return tuple((math.hypot(x, systematic), math.hypot(y, systematic)) for x, y in step.corner_std_xy_px)

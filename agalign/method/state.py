@@ -1,0 +1,55 @@
+"""What a joint optimisation carries along: its settings, where theta starts, and the random numbers."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from agalign.config import JointSettings
+from agalign.errors import NoContrastError
+from agalign.method.descriptor import Descriptor
+from agalign.method.device import choose_device
+from agalign.method.levels import Level, Sampler, make_level
+from agalign.method.starter import start_from_starter
+from agalign.method.subject import Subject
+
+Progress = Callable[[str, float], None]
+"""Called with the name of what is being done and the share of it that is behind, 0 to 1."""
+
+
+class JointState:
+    """What both recipes share. Raises ConfigurationError where there is no such device."""
+
+    def __init__(self, settings: JointSettings, progress: Progress) -> None:
+        self.settings = settings
+        self.progress = progress
+        self.device = choose_device(settings.device)
+        self.sampler = Sampler(torch.Generator().manual_seed(settings.rng_seed))
+        self.family = None if settings.model_family == "auto" else settings.model_family
+
+    def level(self, subject: Subject, scale: float, bands: Sequence[int]) -> Level:
+        """The subject's reference and some of its moving images at a resolution. Raises NoContrastError."""
+        level = make_level(
+            subject.fixed, [subject.moving[b] for b in bands], [subject.mappings[b] for b in bands], scale,
+            self.settings.paper.least_gradient, self.sampler.generator, self.device,
+        )  # fmt: skip
+        if len(level.trainable) == 0:
+            raise NoContrastError
+        return level
+
+    def paper_descriptor(self, channels: Sequence[int]) -> Descriptor:
+        """F of recipe paper with random weights; `channels` of each side, the reference's first."""
+        return self._random_descriptor(channels, half_rectified=False, unit_length=False)
+
+    def fast_descriptor(self, channels: Sequence[int]) -> Descriptor:
+        """F of recipe fast where theta starts."""
+        net = self._random_descriptor(channels, half_rectified=True, unit_length=True)
+        if self.settings.fast.start == "starter":
+            start_from_starter(net)
+        return net
+
+    def _random_descriptor(self, channels: Sequence[int], *, half_rectified: bool, unit_length: bool) -> Descriptor:
+        """Its weights depend on nothing but the settings' rng_seed."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.settings.rng_seed)
+            net = Descriptor(self.settings.sharing, channels, half_rectified=half_rectified, unit_length=unit_length)
+        return net.to(self.device)

@@ -1,0 +1,156 @@
+"""Reading rasters: what a file holds, its pixels at any resolution, and its validity."""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio import warp
+from rasterio.enums import ColorInterp, MaskFlags, Resampling
+from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
+from rasterio.windows import Window
+
+from agalign.errors import GeometryError, UnreadableFileError
+from agalign.pixels.masks import data_mask, learnable, undeclared_fill
+from agalign.values import lens
+from agalign.values.capture import Band, Georeference
+from agalign.values.image import Mask, Raster
+
+TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
+JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
+_GDAL_ENVIRONMENT = {"GDAL_PAM_ENABLED": "NO", "GDAL_NUM_THREADS": "ALL_CPUS"}
+
+
+@dataclass(frozen=True)
+class RasterInfo:
+    """The shape and description of a raster file."""
+
+    width_px: int
+    height_px: int
+    dtypes: tuple[str, ...]
+    nodata: tuple[float | None, ...]
+    descriptions: tuple[str | None, ...]
+    wavelengths_nm: tuple[float | None, ...]
+    alpha_index: int | None
+    """Index from 1 of an alpha band, which is no band of the scene."""
+    georeference: Georeference | None
+    has_mask: bool = False
+    scales_offsets: tuple[tuple[float, float], ...] = ()
+    """A pair a band; none where the file says nothing of the kind."""
+    overviews: tuple[int, ...] = ()
+
+
+@contextmanager
+def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
+    """A rasterio dataset for reading. Raises UnreadableFileError, naming the file, where GDAL cannot."""
+    try:
+        with warnings.catch_warnings(), rasterio.Env(**_GDAL_ENVIRONMENT):
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(path) as dataset:
+                yield dataset
+    except (RasterioIOError, RasterioError, UnicodeEncodeError) as error:
+        text = str(error).replace(str(path), "").strip(" :'").splitlines()[0]
+        raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
+
+
+def probe(path: Path) -> RasterInfo:
+    """What a raster file holds, without reading its pixels. Raises UnreadableFileError."""
+    with open_raster(path) as dataset:
+        wavelengths = tuple(_wavelength_nm(dataset.tags(index)) for index in dataset.indexes)
+        alpha = [i for i, c in enumerate(dataset.colorinterp, start=1) if c == ColorInterp.alpha]
+        georeference = None
+        if dataset.crs is not None and not dataset.transform.is_identity:
+            georeference = Georeference(np.array(dataset.transform, float).reshape(3, 3), dataset.crs.to_wkt())
+        if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
+            raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
+        return RasterInfo(
+            dataset.width, dataset.height, tuple(dataset.dtypes), tuple(dataset.nodatavals),
+            tuple(dataset.descriptions), wavelengths, alpha[0] if alpha else None, georeference,
+            MaskFlags.per_dataset in dataset.mask_flag_enums[0],
+            tuple(zip(dataset.scales, dataset.offsets, strict=True)), tuple(dataset.overviews(1)),
+        )  # fmt: skip
+
+
+def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
+    """A band as float32, averaged down where it is larger than `longest_side_px`, with its learnable pixels.
+
+    Invalid are nodata, masked and saturated pixels and constant fill that runs in from the border.
+    """
+    reduction = max(1.0, max(band.size_px) / longest_side_px)
+    shape = round(band.height_px / reduction), round(band.width_px / reduction)
+    with open_raster(band.path) as dataset:
+        resampling = Resampling.average if reduction > 1 else Resampling.nearest
+        pixels = dataset.read(band.band_index, out_shape=shape, resampling=resampling)
+        valid = data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.band_index, shape)
+    if band.nodata is None:
+        valid &= ~undeclared_fill(pixels)
+    valid = learnable(valid, pixels, band.saturation_value)
+    scale = shape[1] / band.width_px, shape[0] / band.height_px
+    pixels = pixels.astype(np.float32)
+    pixels[~valid] = 0
+    return Raster(pixels, valid, lens.rescaled(band.lens, scale))
+
+
+def read_window(
+    dataset: rasterio.DatasetReader, band: Band, x0: int, y0: int, width: int, height: int
+) -> tuple[NDArray[np.generic], Mask]:
+    """Pixels of the file's own type and their data mask, both (height, width), of a window inside the image."""
+    window = Window(x0, y0, width, height)
+    pixels = dataset.read(band.band_index, window=window)
+    valid = data_mask(pixels, band.nodata)
+    if MaskFlags.per_dataset in dataset.mask_flag_enums[band.band_index - 1]:
+        valid = valid & (dataset.read_masks(band.band_index, window=window) > 0)
+    return pixels, valid
+
+
+def read_preview(
+    path: Path, index: int, window_px: tuple[int, int, int, int], size_px: tuple[int, int] | None = None
+) -> NDArray[np.float32]:
+    """A window (x0, y0, width, height) of a band as (height, width) float32, perhaps resized; nodata as nan."""
+    x0, y0, width, height = window_px
+    reduction = max(1.0, max(width, height) / 2048)
+    out = size_px or (round(width / reduction), round(height / reduction))
+    with open_raster(path) as dataset:
+        window = Window(x0, y0, width, height)
+        resampling = Resampling.average if out[0] < width else Resampling.bilinear
+        pixels = dataset.read(index, window=window, out_shape=(out[1], out[0]), resampling=resampling, boundless=False)
+        nodata = dataset.nodata
+    values = pixels.astype(np.float32)
+    return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))
+
+
+def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDArray[np.float64]:
+    """(n, 2) map positions, x or longitude first, in another coordinate reference system (WKT or EPSG:number).
+
+    Raises GeometryError where there is no way.
+    """
+    try:
+        x, y = warp.transform(
+            rasterio.CRS.from_user_input(from_crs), rasterio.CRS.from_user_input(to_crs), points[:, 0], points[:, 1]
+        )
+    except Exception as error:  # GDAL's own errors have no public class
+        raise GeometryError(f"coordinates cannot be transformed ({error})") from None
+    return np.stack([x, y], axis=-1)
+
+
+def _dataset_mask(dataset: rasterio.DatasetReader, index: int, shape: tuple[int, int]) -> Mask:
+    if MaskFlags.per_dataset not in dataset.mask_flag_enums[index - 1]:
+        return np.ones(shape, dtype=bool)
+    mask = dataset.read_masks(index, out_shape=shape, resampling=Resampling.nearest)
+    return np.asarray(mask > 0)
+
+
+def _wavelength_nm(tags: dict[str, str]) -> float | None:
+    """A band's wavelength from the tag names in use: ENVI's, GDAL's imagery domain, and ours."""
+    for name in ("wavelength", "WAVELENGTH", "CENTRAL_WAVELENGTH_NM", "central_wavelength_nm"):
+        try:
+            value = float(tags[name])
+        except (KeyError, ValueError):
+            continue
+        micrometres = value < 20 or "micro" in tags.get("wavelength_units", "").lower()
+        return value * 1000 if micrometres else value
+    return None

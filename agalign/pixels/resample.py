@@ -1,0 +1,176 @@
+"""Images on other pixel grids: a moving band onto the reference's, once, tile by tile, and what estimation needs.
+
+A reference pixel goes through the reference's lens model, the homography and the moving camera's lens model:
+raw reference px -> undistorted -> H -> undistorted -> raw moving px. Nothing that is written is interpolated twice.
+"""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.pixels.radiometry import calibrated
+from agalign.pixels.raster import open_raster, read_window
+from agalign.values import geometry, lens
+from agalign.values.capture import Band, Radiometry
+from agalign.values.choices import Interpolation
+from agalign.values.geometry import Points
+from agalign.values.image import Mask, Raster, Tile
+from agalign.values.mapping import PixelMapping
+
+_FLAGS: dict[str, int] = {
+    "nearest": cv2.INTER_NEAREST,
+    "bilinear": cv2.INTER_LINEAR,
+    "cubic": cv2.INTER_CUBIC,
+    "lanczos": cv2.INTER_LANCZOS4,
+}
+_SUPPORT_PX = 4
+"""Half width of the widest interpolation kernel."""
+_SAMPLE_PX = 16
+
+
+def tiles(area: Tile, side_px: int) -> Iterator[Tile]:
+    """The tiles of an area, row by row, those at the right and bottom cut to fit."""
+    for y in range(area.y0, area.y0 + area.height, side_px):
+        for x in range(area.x0, area.x0 + area.width, side_px):
+            width = min(side_px, area.x0 + area.width - x)
+            height = min(side_px, area.y0 + area.height - y)
+            yield Tile(x, y, width, height)
+
+
+def resample_tile(
+    band: Band, mapping: PixelMapping, tile: Tile, interpolation: Interpolation, radiometry: Radiometry | None = None
+) -> tuple[NDArray[np.generic], Mask]:
+    """The moving band on a tile of the reference grid, in its own type (integers rounded and clipped) or, calibrated
+    with `radiometry`, as float32, and its mask.
+
+    A pixel is valid where it lies inside the moving image and no invalid pixel has a part in it.
+    """
+    positions = mapping.positions(tile)
+    shape = tile.height, tile.width
+    # The mapping is smooth: a coarse sample of it, edges included, tells its extent to a pixel.
+    rows, columns = (np.append(np.arange(0, n, _SAMPLE_PX), n - 1) for n in shape)
+    some = positions[np.ix_(rows, columns)]
+    low = np.floor(np.nanmin(some, axis=(0, 1))).astype(int) - _SUPPORT_PX - 1
+    high = np.ceil(np.nanmax(some, axis=(0, 1))).astype(int) + _SUPPORT_PX + 2
+    x0, y0 = np.maximum(low, 0)
+    x1, y1 = np.minimum(high, band.size_px)
+    if x1 - x0 < 1 or y1 - y0 < 1:
+        return np.zeros(shape, dtype=band.dtype), np.zeros(shape, dtype=bool)
+    with open_raster(band.path) as dataset:
+        pixels, valid = read_window(dataset, band, int(x0), int(y0), int(x1 - x0), int(y1 - y0))
+    if radiometry is not None:
+        pixels = calibrated(pixels, radiometry, int(x0), int(y0))
+    return resample(
+        pixels, valid, positions - (x0, y0), (band.width_px - x0, band.height_px - y0), (-x0, -y0), interpolation
+    )
+
+
+def resample(
+    pixels: NDArray[np.generic],
+    valid: Mask,
+    positions: Points,
+    sensor_end: tuple[int, int],
+    sensor_start: tuple[int, int],
+    interpolation: Interpolation,
+) -> tuple[NDArray[np.generic], Mask]:
+    """Pixels (h, w) of a window at positions (H, W, 2) in px of that window.
+
+    `sensor_start` and `sensor_end` (x, y) say where the whole image begins and ends in the window's px.
+    """
+    map_xy = positions.astype(np.float32)
+    everything = bool(valid.all())
+    source = _for_remap(pixels if everything else _filled(pixels, valid), interpolation)
+    sampled = cv2.remap(source, map_xy, None, _FLAGS[interpolation], borderMode=cv2.BORDER_REPLICATE)
+    half = 0.5 if interpolation == "nearest" else 0.0
+    inside = np.ones(positions.shape[:2], dtype=bool)
+    for along, start, end in zip((positions[..., 0], positions[..., 1]), sensor_start, sensor_end, strict=True):
+        inside &= (along >= start - half) & (along <= end - 1 + half)
+    if not everything:
+        flag = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
+        weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)
+        inside &= weight > 0.999
+    return _as_type(sampled, pixels.dtype), np.asarray(inside)
+
+
+def _for_remap(pixels: NDArray[np.generic], interpolation: Interpolation) -> NDArray[np.generic]:
+    """A type that remap takes and in which it neither rounds nor clips."""
+    if interpolation == "nearest" and pixels.dtype in (np.uint8, np.uint16, np.int16, np.float32, np.float64):
+        return pixels
+    wide = pixels.dtype in (np.float64, np.int32, np.uint32, np.int64, np.uint64)
+    return pixels.astype(np.float64 if wide else np.float32)
+
+
+def _filled(pixels: NDArray[np.generic], valid: Mask) -> NDArray[np.generic]:
+    """Invalid pixels replaced by their surroundings' mean, so that wide kernels do not ring against nodata."""
+    known = valid.astype(np.float32)
+    values = np.where(valid, pixels, 0).astype(np.float32)
+    kernel = 2 * _SUPPORT_PX + 1, 2 * _SUPPORT_PX + 1
+    mean = cv2.blur(values, kernel) / np.maximum(cv2.blur(known, kernel), 1e-6)
+    return np.where(valid, pixels, mean.astype(pixels.dtype))
+
+
+def _as_type(values: NDArray[np.generic], dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+    if values.dtype == dtype or dtype.kind == "f":
+        return values.astype(dtype, copy=False)
+    if dtype.kind == "b":
+        return np.asarray(values >= np.float32(0.5))
+    limits = np.iinfo(str(dtype))
+    return np.asarray(np.clip(np.rint(values), limits.min, limits.max).astype(dtype))
+
+
+# ---- for estimation
+
+
+def warped(
+    moving: Raster, mapping: PixelMapping, size_px: tuple[int, int], fixed_scale: tuple[float, float] = (1.0, 1.0)
+) -> Raster:
+    """The moving raster resampled onto the fixed grid reduced by `fixed_scale` to `size_px`, without aliasing.
+
+    `mapping` is between the raw pixels of the two images at their full size.
+    """
+    unmoved = not mapping.bends and np.array_equal(mapping.fixed_to_moving, np.eye(3))
+    if unmoved and size_px == moving.size_px and fixed_scale == (1.0, 1.0):
+        return moving
+    full = round(size_px[0] / fixed_scale[0]), round(size_px[1] / fixed_scale[1])
+    magnification = float(np.median(np.abs(geometry.local_scale(mapping.fixed_to_moving, *full))))
+    reduce = float(np.clip(fixed_scale[0] / magnification, 8 / min(moving.size_px), 1.0))
+    moving_size = max(8, round(moving.size_px[0] * reduce)), max(8, round(moving.size_px[1] * reduce))
+    moving_scale = moving_size[0] / moving.size_px[0], moving_size[1] / moving.size_px[1]
+    small = shrink(moving, moving_size)
+    positions = mapping.rescaled(fixed_scale, moving_scale).positions(Tile(0, 0, *size_px)).astype(np.float32)
+    positions = np.nan_to_num(positions, nan=-1e6)
+    pixels = cv2.remap(small.pixels, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    known = small.valid.astype(np.uint8) * 255
+    valid = cv2.remap(known, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return Raster(np.asarray(pixels, np.float32), np.asarray(valid == 255))
+
+
+def single(raster: Raster) -> Raster:
+    """One channel: the mean of several."""
+    if raster.pixels.ndim == 2:
+        return raster
+    return Raster(np.asarray(raster.pixels.mean(axis=0), np.float32), raster.valid, raster.lens)
+
+
+def textured(raster: Raster, least_share: float = 0.02) -> bool:
+    """False where the valid pixels are (nearly) all alike or too few for a structure to exist."""
+    if np.count_nonzero(raster.valid) <= least_share * raster.valid.size:
+        return False
+    planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
+    mask = raster.valid.astype(np.uint8)
+    return any(float(cv2.meanStdDev(plane, mask=mask)[1].item()) > 0 for plane in planes)
+
+
+def shrink(raster: Raster, size_px: tuple[int, int]) -> Raster:
+    """Area-averaged copy of `size_px` (width, height); a pixel is valid where all of its source pixels are."""
+    if size_px == raster.size_px:
+        return raster
+    scale = size_px[0] / raster.size_px[0], size_px[1] / raster.size_px[1]
+    weight = cv2.resize(raster.valid.astype(np.float32), size_px, interpolation=cv2.INTER_AREA)
+    planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
+    shrunk = np.stack([cv2.resize(np.where(raster.valid, p, 0), size_px, interpolation=cv2.INTER_AREA) for p in planes])
+    shrunk = (shrunk / np.maximum(weight, 1e-6)).astype(np.float32)
+    valid: Mask = weight > 0.999
+    return Raster(shrunk if raster.pixels.ndim == 3 else shrunk[0], valid, lens.rescaled(raster.lens, scale))

@@ -1,0 +1,108 @@
+"""The structure of an image, blind to contrast: its gradient orientations, and shifts measured on them.
+
+The double-angle field z = a ((gx + i gy) / |g|)^2 is the same for an edge and its contrast-reversed twin; a is the
+gradient magnitude, clipped so that a few strong edges do not outvote the rest.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from agalign.values.image import Raster
+
+Field = NDArray[np.complex64]
+
+_AMPLITUDE_QUANTILE = 0.75
+"""Gradients above this quantile of the valid area count alike."""
+
+
+def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
+    """Z of a single-band raster, (height, width) complex64 with |z| <= 1, and 0 at and next to invalid pixels."""
+    complete = bool(raster.valid.all())
+    pixels = raster.pixels if complete else np.where(raster.valid, raster.pixels, np.float32(0))
+    smooth = cv2.GaussianBlur(np.asarray(pixels, np.float32), (0, 0), smoothing_px)
+    if not complete:
+        smooth /= np.maximum(cv2.GaussianBlur(raster.valid.astype(np.float32), (0, 0), smoothing_px), 1e-3)
+    gx, gy = (cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1)))
+    magnitude = cv2.magnitude(gx, gy)
+    inside = cv2.erode(raster.valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    some = magnitude[::3, ::3][inside[::3, ::3]]
+    ceiling = float(np.quantile(some, _AMPLITUDE_QUANTILE)) if some.size else 0.0
+    field = np.zeros((*raster.valid.shape, 2), np.float32)
+    if ceiling > 0:
+        # a ((gx + i gy) / |g|)^2 with a = min(|g| / ceiling, 1)
+        weight = inside / np.maximum(magnitude * np.maximum(magnitude, np.float32(ceiling)), np.float32(1e-30))
+        field[..., 0] = (gx - gy) * (gx + gy) * weight
+        field[..., 1] = 2 * gx * gy * weight
+    return np.asarray(field.view(np.complex64)[..., 0])
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A shift between two structure fields."""
+
+    shift_px: tuple[float, float]
+    """(dx, dy): what lies at p in the first field lies at p + shift in the second."""
+    sigma: float
+    """Height above the surface's mean, in standard deviations of the surface."""
+    runner_up_sigma: float
+    """The same for the highest value away from the peak."""
+    sigma_at_zero: float
+    """The same at no shift."""
+
+
+def correlation_surface(fixed: Field, moving: Field) -> NDArray[np.float32]:
+    """Circular correlation of two windowed fields (height, width); index [dy, dx] is the shift.
+
+    Half whitened: the square root of the cross spectrum's magnitude is divided away, between a plain correlation
+    (nothing) and phase correlation (all of it).
+    """
+    return correlation_surfaces(windowed_spectra(fixed), windowed_spectra(moving))
+
+
+def windowed_spectra(fields: Field) -> Field:
+    """Fourier transform of fields (..., height, width) under a Hann window."""
+    height, width = fields.shape[-2:]
+    window = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1]).astype(np.float32)
+    return np.asarray(fft.fft2(fields * window))
+
+
+def correlation_surfaces(fixed: Field, moving: Field) -> NDArray[np.float32]:
+    """`correlation_surface` of fields given by their `windowed_spectra`, (..., height, width)."""
+    cross = np.conj(fixed)
+    cross *= moving
+    power = cross.real**2 + cross.imag**2
+    floor = np.maximum(power.max(axis=(-2, -1), keepdims=True) * 1e-18, 1e-30)
+    # The fourth root as two square roots: far quicker than a power.
+    cross /= np.sqrt(np.sqrt(np.maximum(power, floor)))
+    return np.asarray(fft.ifft2(cross, overwrite_x=True).real)
+
+
+def find_peak(surface: NDArray[np.float32], apart_px: int) -> Peak:
+    """The highest point of a correlation surface (height, width), to a fraction of a pixel.
+
+    `apart_px` is how far away the runner-up must lie.
+    """
+    height, width = surface.shape
+    spread = float(surface.std())
+    if spread <= 0:
+        return Peak((0.0, 0.0), 0.0, 0.0, 0.0)
+    z = np.fft.fftshift((surface - surface.mean()) / spread)
+    row, column = np.unravel_index(int(z.argmax()), z.shape)
+    zero_row, zero_column = height // 2, width // 2
+    dx = column - zero_column + _vertex(z[row, (column - 1) % width], z[row, column], z[row, (column + 1) % width])
+    dy = row - zero_row + _vertex(z[(row - 1) % height, column], z[row, column], z[(row + 1) % height, column])
+    sigma = float(z[row, column])
+    at_zero = float(z[zero_row, zero_column])
+    z[max(0, row - apart_px) : row + apart_px + 1, max(0, column - apart_px) : column + apart_px + 1] = -np.inf
+    runner_up = float(z.max())
+    return Peak((float(dx), float(dy)), sigma, runner_up if np.isfinite(runner_up) else 0.0, at_zero)
+
+
+def _vertex(before: float, at: float, after: float) -> float:
+    """Offset of the top of the parabola through three samples a pixel apart, in [-0.5, 0.5]."""
+    curvature = before - 2 * at + after
+    return 0.0 if curvature >= 0 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))

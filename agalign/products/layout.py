@@ -1,0 +1,126 @@
+"""Which pixels are written of a capture: its layers, and the grid that they have in common."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.config import WriteSettings
+from agalign.values import geometry
+from agalign.values.alignment import Alignment
+from agalign.values.capture import Band, Capture
+from agalign.values.image import Mask, OutputGrid, Tile
+from agalign.values.mapping import PixelMapping, mapping_of
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One band of the output: where its pixels come from.
+
+    `mapping` leads from the written pixels, before they are cut, to raw pixels of the file. The reference has none
+    where its own pixels are copied, and a moving band has none where there is nothing to write.
+    """
+
+    band: Band
+    mapping: PixelMapping | None
+    is_reference: bool = False
+
+    @property
+    def is_gap(self) -> bool:
+        """True where there is nothing to write."""
+        return self.mapping is None and not self.is_reference
+
+    @property
+    def is_copied(self) -> bool:
+        """True where pixels are the file's own."""
+        return self.mapping is None and self.is_reference
+
+
+def lay_out(
+    capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings
+) -> tuple[list[Layer], OutputGrid]:
+    """The layers of a capture, whose usable moving bands have these alignments, and the grid they are written on."""
+    reference = capture.reference
+    mappings = {b.name: mapping_of(reference, b, alignments[b.name]) for b in capture.moving if b.name in alignments}
+    scale = _finest_scale(mappings.values(), reference) if settings.resolution == "finest" else 1.0
+    own = PixelMapping(geometry.identity())
+    undistorted = settings.undistort and reference.lens is not None
+    if reference.lens is not None and undistorted:
+        own = PixelMapping(geometry.identity(), None, reference.lens)
+        mappings = {name: mapping.from_undistorted(reference.lens) for name, mapping in mappings.items()}
+    size_px = round(reference.width_px * scale), round(reference.height_px * scale)
+    scales = size_px[0] / reference.width_px, size_px[1] / reference.height_px
+    if scale != 1.0:
+        own = own.rescaled(scales, (1.0, 1.0))
+        mappings = {name: mapping.rescaled(scales, (1.0, 1.0)) for name, mapping in mappings.items()}
+    copied = scale == 1.0 and not undistorted
+    layers = [
+        Layer(b, None if copied else own, is_reference=True) if b is reference else Layer(b, mappings.get(b.name))
+        for b in capture.bands
+    ]
+    moved = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
+    common = common_area(moved, *size_px)
+    crop = common if settings.crop == "common" and common is not None else Tile(0, 0, *size_px)
+    return layers, OutputGrid(crop.x0, crop.y0, crop.width, crop.height, scales, undistorted, crop != common)
+
+
+def _finest_scale(mappings: Iterable[PixelMapping], reference: Band) -> float:
+    """How many of the finest band's pixels lie along one of the reference's, in the middle of the image."""
+    middle = (np.array(reference.size_px) - 1) / 2
+    finest = 1.0
+    for mapping in mappings:
+        across = np.stack([mapping(middle + d) - mapping(middle - d) for d in 0.5 * np.eye(2)])
+        finest = max(finest, math.sqrt(abs(float(np.linalg.det(across)))))
+    return round(finest, 2)
+
+
+def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height_px: int) -> Tile | None:
+    """The largest rectangle of the reference grid that lies inside every moving image; None where there is none."""
+    step = max(1, min(8, width_px // 64, height_px // 64))
+    x = _cell_edges(width_px, step)
+    y = _cell_edges(height_px, step)
+    points = np.stack(np.meshgrid(x, y), axis=-1)
+    inside = np.ones(points.shape[:2], dtype=bool)
+    for mapping, band in mappings:
+        there = mapping(points)
+        with np.errstate(invalid="ignore"):
+            inside &= (there >= 0).all(axis=-1) & (there <= np.subtract(band.size_px, 1)).all(axis=-1)
+    # A cell counts where its four corners do: between them the mapping is all but straight.
+    cells = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:] & inside[1:, 1:]
+    found = _largest_rectangle(cells, np.diff(x), np.diff(y))
+    if found is None:
+        return None
+    top, bottom, left, right = found
+    x0, y0 = int(x[left]), int(y[top])
+    return Tile(x0, y0, int(x[right]) - x0 + 1, int(y[bottom]) - y0 + 1)
+
+
+def _cell_edges(length_px: int, step: int) -> NDArray[np.int64]:
+    return np.append(np.arange(0, length_px - 1, step), length_px - 1)
+
+
+def _largest_rectangle(
+    cells: Mask, widths: NDArray[np.int64], heights: NDArray[np.int64]
+) -> tuple[int, int, int, int] | None:
+    """(top, bottom, left, right) in cell edges of the all-True rectangle of the largest area: a histogram with a
+    stack, row by row.
+    """
+    best_area, best = 0, None
+    left_edge = np.concatenate([[0], np.cumsum(widths)])
+    tall = np.zeros(cells.shape[1], dtype=np.int64)
+    first_row = np.zeros(cells.shape[1], dtype=np.int64)
+    for row in range(cells.shape[0]):
+        first_row = np.where(cells[row] & (tall > 0), first_row, row)
+        tall = np.where(cells[row], tall + heights[row], 0)
+        stack: list[tuple[int, int, int]] = []
+        for column, (height, top) in enumerate([*zip(tall.tolist(), first_row.tolist(), strict=True), (0, row)]):
+            start = column
+            while stack and stack[-1][1] >= height:
+                start, stacked, stacked_top = stack.pop()
+                area = stacked * int(left_edge[column] - left_edge[start])
+                if area > best_area:
+                    best_area, best = area, (stacked_top, row + 1, start, column)
+            stack.append((start, height, top))
+    return best

@@ -1,0 +1,257 @@
+"""The sidecar that is written beside each aligned stack: schema `agalign/1`.
+
+All pixel coordinates are x right, y down, (0, 0) the centre of the top-left pixel. `fixed_to_moving` maps a pixel of
+the reference to a pixel of the moving band; `grid` samples the complete mapping between the raw pixels of the files.
+"""
+
+import json
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from agalign.errors import SidecarError
+from agalign.values.choices import CaptureStatus, ModelFamily, PairStatus, SeedKind, Space
+from agalign.values.doubts import DoubtKind
+from agalign.values.files import write_text
+
+SCHEMA = "agalign/1"
+
+Row = tuple[float, float, float]
+Matrix3x3 = tuple[Row, Row, Row]
+PointPx = tuple[float, float]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", ser_json_inf_nan="null", populate_by_name=True)
+
+
+class CameraPart(_Part):
+    """What made the images."""
+
+    make: str
+    model: str
+    serial: str
+
+
+class PositionPart(_Part):
+    """Where the camera was: WGS 84, degrees, and metres as the camera has them."""
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None
+
+
+class ReferencePart(_Part):
+    """The band whose pixel grid everything is aligned to."""
+
+    band: str
+    file: str
+    band_index: int
+    width: int
+    height: int
+
+
+class HomographyPart(_Part):
+    """A homography and the pixels it is between: `undistorted` ones where lens models are known."""
+
+    fixed_to_moving: Matrix3x3
+    space: Space
+
+
+class SeedPart(_Part):
+    """Where the optimisation started, in the same space as the homography."""
+
+    kind: SeedKind
+    fixed_to_moving: Matrix3x3
+    peak_sigma: float
+    runner_up_sigma: float
+
+
+class GridPart(_Part):
+    """The complete mapping, sampled: raw pixel of the reference file -> raw pixel of the moving file."""
+
+    reference_px: list[PointPx]
+    moving_px: list[PointPx]
+
+
+class DoubtPart(_Part):
+    """One thing that speaks against an alignment: what was measured, and what it should have been."""
+
+    kind: DoubtKind
+    value: float | None
+    limit: float | None
+
+
+class JointPart(_Part):
+    """How the joint optimisation ended."""
+
+    accepted: bool = True
+    """False where the result was doubted: the homography is the seed's then, and this describes what was rejected."""
+    loss: float | None
+    retrieval: float
+    chance: float
+    iterations: int
+    levels: list[float]
+    recipe: str
+    model_family: ModelFamily
+    last_step_px: float
+    corner_std_px: float
+    """Root mean square distance of the least certain corner from where it is mapped to."""
+    corner_std_xy_px: list[PointPx]
+    """Standard deviations along x and y at the corners of the reference, clockwise from the top left."""
+
+
+class SimilarityPart(_Part):
+    """Similarity on the common valid area; `mattes_mi` has elastix's sign (lower is better)."""
+
+    mattes_mi: float | None = None
+    nmi: float | None = None
+    ncc: float | None = None
+    gradient_correlation: float | None = None
+    structure_ssim: float | None = None
+    overlap: float | None = None
+    residual_px: float | None = None
+    """Median length of the local structure shifts, px."""
+    residual_p95_px: float | None = None
+    residual_coverage: float | None = None
+
+
+class ResidualTile(_Part):
+    """The local shift that one window shows after alignment; null where none could be measured."""
+
+    centre_px: PointPx
+    shift_px: tuple[float | None, float | None]
+
+
+class MetricsPart(_Part):
+    """Before: the files as they are. After: as written."""
+
+    before: SimilarityPart
+    after: SimilarityPart
+    tiles: list[ResidualTile]
+
+
+class LocalPart(_Part):
+    """What a local field of displacements gains: 95th percentile of the shifts of windows left out of its fit, px."""
+
+    applied: bool
+    before_p95_px: float | None
+    after_p95_px: float | None
+
+
+class PlacePart(_Part):
+    """A file beside the sidecar that holds a band's aligned pixels, and the band's index there, from 1."""
+
+    file: str
+    band_index: int
+
+
+class BandPart(_Part):
+    """One band of the capture."""
+
+    band: str
+    wavelength_nm: float | None
+    file: str
+    band_index: int
+    status: PairStatus
+    reason: str | None
+    doubts: list[DoubtPart] = []
+    """Everything that speaks against it; the first is the one that `reason` tells."""
+    homography: HomographyPart | None = None
+    seed: SeedPart | None = None
+    grid: GridPart | None = None
+    joint: JointPart | None = None
+    metrics: MetricsPart | None = None
+    local: LocalPart | None = None
+    place: PlacePart | None = None
+    seconds: float
+
+
+class FilePart(_Part):
+    """A file beside the sidecar."""
+
+    file: str
+    bytes: int
+    nodata: float | str | None = None
+
+
+class OutputPart(_Part):
+    """The stack beside the sidecar, null where only single bands were written.
+
+    `nodata` is the stack's, or what the files of single bands have in common; null where they differ.
+    `crop` is x0, y0, width, height on the reference's pixel grid, which has `scale` (x, y) times as many pixels along
+    its sides as the reference's file.
+    """
+
+    file: str | None
+    bytes: int | None
+    band_files: list[FilePart] = []
+    crop: tuple[int, int, int, int]
+    scale: tuple[float, float] = (1.0, 1.0)
+    nodata: float | str | None
+
+
+class Sidecar(_Part):
+    """One capture."""
+
+    schema_: Annotated[Literal["agalign/1"], Field(alias="schema")] = "agalign/1"
+    agalign: str
+    capture: str
+    capture_id: str
+    flight_id: str
+    captured_at: str
+    position: PositionPart | None = None
+    camera: CameraPart
+    status: CaptureStatus
+    missing_bands: list[str]
+    reference: ReferencePart
+    bands: list[BandPart]
+    output: OutputPart | None
+    settings: str
+    """Fingerprint of the settings that made this; another run with the same need not do it again."""
+
+
+def write_sidecar(path: Path, sidecar: Sidecar) -> None:
+    """Write at once or not at all. Raises OutputError."""
+    write_text(path, _compact_lists(sidecar.model_dump_json(by_alias=True, indent=1)))
+
+
+def _compact_lists(text: str) -> str:
+    """Lists of numbers on one line: a matrix reads as a matrix, and the file is a third of the size."""
+    innermost = re.compile(r"\[[^\[\]{}\"]*\]")
+    return innermost.sub(lambda match: " ".join(match.group().split()).replace("[ ", "[").replace(" ]", "]"), text)
+
+
+def read_sidecar(path: Path) -> Sidecar:
+    """Raises SidecarError, naming the file and the field, where it is missing, malformed or of another version."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SidecarError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except ValueError as error:
+        raise SidecarError(f"{path}: not valid JSON ({error}); delete it and run again") from None
+    schema = data.get("schema") if isinstance(data, dict) else None
+    if schema != SCHEMA:
+        raise SidecarError(f"{path}: schema is {schema!r}, not {SCHEMA!r}; run again with --overwrite")
+    try:
+        return Sidecar.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise SidecarError(f"{path}: {where}: {first['msg']}; run again with --overwrite") from None
+
+
+def find_sidecars(folder: Path) -> list[Path]:
+    """The sidecars below an output folder, sorted; other JSON files are passed over."""
+    found = []
+    for path in sorted(folder.rglob("*.json")):
+        try:
+            with path.open(encoding="utf-8") as file:
+                head = file.read(200)
+        except (OSError, UnicodeDecodeError):
+            continue
+        if '"agalign/' in head:
+            found.append(path)
+    return found

@@ -1,0 +1,167 @@
+"""The ground of a synthetic flight: parcels with crop rows, bare soil, tracks and trees, flat or in terraces."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from agalign.synthetic.rig import FOCAL_LENGTH_MM, PIXELS_PER_MM, BandSpec, Pose, place_and_rays
+from agalign.values import lens
+from agalign.values.geometry import Points
+
+Field = NDArray[np.float32]
+
+_TERRACE_M = 8.0
+_RAY_STEPS = 40
+"""A ray falls on relief by repeated intersection with the height below its last place."""
+_MAP_PX_PER_IMAGE_PX = 1.25
+"""Resolution of the painted ground relative to the images, so that they do not show its pixels."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The painted ground: shares of materials and textures on a square grid centred on the origin."""
+
+    crop: Field
+    tree: Field
+    brightness: Field
+    vigour: Field
+    metres_per_px: float
+    height_m: Field | None = None
+    """Above the plane; None where everything lies on it."""
+
+
+def paint_ground(
+    rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int], relief_m: float = 0.0
+) -> Ground:
+    """Parcels, rows, tracks and trees, large enough for all poses."""
+    focal = FOCAL_LENGTH_MM * PIXELS_PER_MM * size_px[0] / 1280
+    lowest, highest = min(p.altitude_m for p in poses), max(p.altitude_m for p in poses)
+    metres_per_px = lowest / focal / _MAP_PX_PER_IMAGE_PX
+    reach_m = max(np.hypot(p.east_m, p.north_m) for p in poses) + 0.62 * highest * np.hypot(*size_px) / focal
+    side = 2 * int(np.ceil(reach_m / metres_per_px))
+    metre = 1 / metres_per_px
+    count = max(6, round((side / metre / 9) ** 2))
+    parcel, edge = _parcels(rng, side, count)
+    angle, spacing = rng.uniform(0, np.pi, count), rng.uniform(0.45, 0.85, count) * metre
+    density = np.where(rng.random(count) < 0.15, -9.0, rng.uniform(-0.4, 0.4, count))
+    across_x = (2 * np.pi * np.cos(angle) / spacing).astype(np.float32)[parcel]
+    across_y = (2 * np.pi * np.sin(angle) / spacing).astype(np.float32)[parcel]
+    axis = np.arange(side, dtype=np.float32)
+    wobble = 0.06 * metre * _noise(rng, side, 1.5 * metre)
+    rows = np.cos(across_x * (axis[None, :] + wobble) + across_y * (axis[:, None] + wobble))
+    leaves = 0.7 * _noise(rng, side, 0.05 * metre) + 0.5 * _noise(rng, side, 0.25 * metre)
+    crop = expit(6 * (rows + leaves + density.astype(np.float32)[parcel]))
+    gaps = _noise(rng, side, 0.6 * metre) > 1.5
+    crop = np.where(gaps, crop * 0.15, crop)
+    crop = np.where(edge < 0.35 * metre, 0.03, crop)
+    tree = _trees(rng, side, metre)
+    crop = crop * (1 - tree)
+    ruts = np.clip(1.5 - np.abs(edge - 0.18 * metre) / (0.05 * metre), 0, 1)
+    brightness = 1 + 0.22 * _noise(rng, side, 2.5 * metre) + 0.16 * _noise(rng, side, 0.08 * metre)
+    brightness = np.clip(brightness + 0.25 * (edge < 0.35 * metre) - 0.3 * ruts, 0.3, 2.2)
+    vigour = 0.5 * _noise(rng, side, 3 * metre) + 0.45 * _noise(rng, side, 0.12 * metre)
+    return Ground(
+        crop.astype(np.float32),
+        tree,
+        brightness.astype(np.float32),
+        np.clip(vigour, -1.5, 1.5).astype(np.float32),
+        metres_per_px,
+        _relief(rng, tree, metre, relief_m) if relief_m else None,
+    )
+
+
+def reflectance(ground: Ground, band: BandSpec) -> Field:
+    """The ground in one band: materials by their shares, crop by its vigour (the other way round in the visible)."""
+    bright = 1 if band.wavelength_nm > 700 else -0.5
+    crop = band.crop * (1 + 0.35 * bright * ground.vigour)
+    soil = band.soil * ground.brightness
+    bare = 1 - ground.crop - ground.tree
+    return np.asarray(
+        soil * bare + crop * ground.crop + band.tree * (1 + 0.5 * ground.vigour) * ground.tree, np.float32
+    )
+
+
+def on_ground(ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], raw_px: Points) -> Points:
+    """(..., 3) metres east, south and down of what raw pixels (..., 2) see."""
+    straight = lens.undistort(band.lens(*size_px), raw_px)
+    place, rays = place_and_rays(band, pose, size_px)
+    direction = np.concatenate([straight, np.ones_like(straight[..., :1])], axis=-1) @ rays.T
+    down = np.zeros(direction.shape[:-1])
+    seen = place + direction * ((down - place[2]) / direction[..., 2])[..., None]
+    for _ in range(0 if ground.height_m is None else _RAY_STEPS):
+        at = map_px(ground, seen[..., :2]).astype(np.float32).reshape(len(seen), -1, 2)
+        height = cv2.remap(ground.height_m, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        down = -height.reshape(down.shape).astype(np.float64)
+        seen = place + direction * ((down - place[2]) / direction[..., 2])[..., None]
+    return np.asarray(seen)
+
+
+def map_px(ground: Ground, metres: Points) -> Points:
+    """Positions on the painted ground's pixels."""
+    return metres / ground.metres_per_px + (len(ground.crop) - 1) / 2
+
+
+def _relief(rng: np.random.Generator, tree: Field, metre: float, relief_m: float) -> Field:
+    """Metres above the plane: three levels with slopes between them, and round trees upon them.
+
+    No slope is so steep that a camera could not see it: where one hides another there is nothing to align.
+    """
+    angle = rng.uniform(0, np.pi)
+    axis = np.arange(len(tree)) / (_TERRACE_M * metre)
+    along = np.cos(angle) * axis[None, :] + np.sin(angle) * axis[:, None]
+    slope = np.clip((along % 1 - 0.4) / 0.6, 0, 1)
+    level = np.floor(along) + slope * slope * (3 - 2 * slope)
+    crowns = cv2.GaussianBlur(tree, (0, 0), 0.4 * metre)
+    return np.asarray(relief_m * (np.abs(level % 4 - 2) + 0.5 * crowns), np.float32)
+
+
+def _parcels(rng: np.random.Generator, side: int, count: int) -> tuple[NDArray[np.int64], Field]:
+    """Index of each pixel's parcel, and its distance in px from the parcel's edge: a Voronoi division.
+
+    Worked out on every fourth pixel; the tracks along the edges hide the steps.
+    """
+    small = side // 4 + 1
+    axis = np.arange(small, dtype=np.float32) * 4
+    sites = rng.uniform(0, side, (count, 2)).astype(np.float32)
+    nearest = np.full((small, small), np.inf, np.float32)
+    second = nearest.copy()
+    index = np.zeros((small, small), np.int64)
+    for number, (site_x, site_y) in enumerate(sites):
+        distance = np.hypot(axis[None, :] - site_x, axis[:, None] - site_y)
+        closer = distance < nearest
+        second = np.where(closer, nearest, np.minimum(second, distance))
+        nearest = np.where(closer, distance, nearest)
+        index[closer] = number
+    edge = cv2.resize((second - nearest) / 2, (4 * small, 4 * small), interpolation=cv2.INTER_LINEAR)
+    full = np.repeat(np.repeat(index, 4, axis=0), 4, axis=1)
+    return full[:side, :side], np.asarray(edge[:side, :side], np.float32)
+
+
+def _trees(rng: np.random.Generator, side: int, metre: float) -> Field:
+    cover = np.zeros((side, side), np.float32)
+    ragged = 0.35 * _noise(rng, side, 0.3 * metre)
+    for _ in range(max(3, round((side / metre / 10) ** 2))):
+        radius = rng.uniform(0.5, 1.2) * metre
+        column, row = rng.uniform(0, side, 2)
+        reach = 2 * radius
+        x = np.arange(max(0, int(column - reach)), min(side, int(column + reach)))
+        y = np.arange(max(0, int(row - reach)), min(side, int(row + reach)))
+        window = np.ix_(y, x)
+        inside = 1.2 * (1 - np.hypot(x[None, :] - column, y[:, None] - row) / radius) + ragged[window]
+        cover[window] = np.maximum(cover[window], np.clip(4 * inside, 0, 1))
+    return cover
+
+
+def _noise(rng: np.random.Generator, side: int, grain_px: float) -> Field:
+    """Gaussian noise of mean 0 and standard deviation 1 whose blobs are `grain_px` wide."""
+    reduction = max(1.0, grain_px / 2)
+    small = max(8, int(np.ceil(side / reduction)))
+    coarse = cv2.GaussianBlur(
+        rng.normal(size=(small, small)).astype(np.float32), (0, 0), max(0.5, grain_px / reduction / 2)
+    )
+    field = cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC)
+    return np.asarray((field - field.mean()) / field.std(), np.float32)

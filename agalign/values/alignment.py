@@ -1,0 +1,176 @@
+"""What alignment finds of a band pair, and how sure it is."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from agalign.values import geometry
+from agalign.values.choices import ModelFamily, PairStatus, SeedKind, Space
+from agalign.values.doubts import Doubt, explanation, sentence
+from agalign.values.geometry import Matrix
+
+
+@dataclass(frozen=True)
+class Seed:
+    """A coarse mapping to start from and how well the images agree under it."""
+
+    kind: SeedKind
+    fixed_to_moving: Matrix
+    score: float
+    """By which candidates are compared: the height of the correlation at this mapping, in standard deviations."""
+    peak_sigma: float = 0.0
+    """Height of the correlation peak above its surroundings, in standard deviations."""
+    runner_up_sigma: float = 0.0
+    """The same for the second highest separate peak."""
+    trusted: bool = False
+    """The images themselves leave no doubt that it is good to a few pixels."""
+
+
+@dataclass(frozen=True)
+class JointResult:
+    """What the joint optimisation ended with."""
+
+    fixed_to_moving: Matrix
+    loss: float
+    retrieval: float
+    """Share of held-out patches whose nearest descriptor in the other image is the right one."""
+    chance: float
+    """The retrieval that guessing would give."""
+    iterations: int
+    levels: tuple[float, ...]
+    """Resolutions worked at, coarse to fine; 1 is full."""
+    recipe: str
+    model_family: ModelFamily
+    last_step_px: float
+    corner_std_xy_px: tuple[tuple[float, float], ...]
+    """Standard deviations along x and y of the mapping at the corners of the reference, clockwise from the top left,
+    px of the reference: from the curvature at the solution and what the patches disagree by."""
+
+    @property
+    def corner_std_px(self) -> float:
+        """Root mean square distance of the least certain corner from where it is mapped to."""
+        return max(math.hypot(*std) for std in self.corner_std_xy_px)
+
+    def enlarged(self, up: tuple[float, float], moving_up: tuple[float, float]) -> "JointResult":
+        """The same of images that are larger by these factors (x, y)."""
+        return replace(
+            self,
+            fixed_to_moving=geometry.rescale(self.fixed_to_moving, up, moving_up),
+            corner_std_xy_px=tuple((x * up[0], y * up[1]) for x, y in self.corner_std_xy_px),
+            last_step_px=self.last_step_px * up[0],
+        )
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Local shifts that an alignment leaves, measured independently of how it was found."""
+
+    centres_px: NDArray[np.float64]
+    """(n, 2) tile centres on the reference grid."""
+    shifts_px: NDArray[np.float64]
+    """(n, 2) where the moving band's structure lies minus where the reference's does; nan where not measured."""
+    median_px: float
+    p95_px: float
+    coverage: float
+    """Share of the tiles with enough structure in which a shift could be measured."""
+    peaks_sigma: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    """(n,) how far each tile's correlation peak stands out, in standard deviations: the error of a shift falls with its
+    square."""
+
+    def enlarged(self, up: tuple[float, float]) -> "Residual":
+        """The same on an image that is larger by these factors (x, y)."""
+        return replace(
+            self,
+            centres_px=(self.centres_px + 0.5) * up - 0.5,
+            shifts_px=self.shifts_px * up,
+            median_px=self.median_px * up[0],
+            p95_px=self.p95_px * up[0],
+        )
+
+
+@dataclass(frozen=True)
+class LocalField:
+    """A smooth field of displacements on an image, px, by its values on a lattice."""
+
+    step_px: float
+    displacements_px: NDArray[np.float64]
+    """(rows, columns, 2); the first lies at (0, 0)."""
+
+    def __call__(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The displacement (..., 2) at points (..., 2), by cubic splines; beyond the lattice that of its edge."""
+        points = np.asarray(points_px)
+        at = points.reshape(-1, 2)[:, ::-1].T / self.step_px
+        planes = np.moveaxis(self.displacements_px, -1, 0)
+        found = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
+        return np.stack(found, axis=-1).reshape(points.shape)
+
+    def plus(self, other: "LocalField") -> "LocalField":
+        """X -> x + d(x) with this field, measured again under it: d(x) + other(x)."""
+        return LocalField(self.step_px, self.displacements_px + other.displacements_px)
+
+
+@dataclass(frozen=True)
+class LocalResult:
+    """A field of displacements, where it gains something, and what it gains on windows it was not fitted to."""
+
+    field: LocalField | None
+    before_p95_px: float
+    after_p95_px: float
+
+    def enlarged(self, up: tuple[float, float]) -> "LocalResult":
+        """The same on an image that is larger by these factors (x, y)."""
+        # The lattice's first node lies at the centre of a pixel; half a reduced pixel is nothing to a smooth field.
+        larger = None
+        if self.field is not None:
+            larger = LocalField(self.field.step_px * up[0], self.field.displacements_px * up)
+        return LocalResult(larger, self.before_p95_px * up[0], self.after_p95_px * up[0])
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The mapping found for one band pair and everything known about it."""
+
+    fixed_to_moving: Matrix
+    """Between undistorted pixels where both lenses are known, else between raw pixels."""
+    space: Space
+    status: PairStatus
+    doubts: tuple[Doubt, ...]
+    """What speaks against it, the plainest first; none where it is `aligned`."""
+    seed: Seed
+    joint: JointResult | None
+    residual: Residual | None
+    seconds: float
+    before: Mapping[str, float] = field(default_factory=dict)
+    after: Mapping[str, float] = field(default_factory=dict)
+    local: LocalResult | None = None
+    """Displacements in raw px of the reference, before the homography; None where they were not asked for."""
+
+    def between_files(self, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> "Alignment":
+        """An alignment of images that were reduced by these scales (x, y) as one of their files."""
+        if fixed_scale == moving_scale == (1.0, 1.0):
+            return self
+        up, there = ((1 / x, 1 / y) for x, y in (fixed_scale, moving_scale))
+        return replace(
+            self,
+            fixed_to_moving=geometry.rescale(self.fixed_to_moving, up, there),
+            seed=replace(self.seed, fixed_to_moving=geometry.rescale(self.seed.fixed_to_moving, up, there)),
+            joint=None if self.joint is None else self.joint.enlarged(up, there),
+            residual=None if self.residual is None else self.residual.enlarged(up),
+            local=None if self.local is None else self.local.enlarged(up),
+        )
+
+    @property
+    def reason(self) -> str | None:
+        """Why it is not aligned, in words; None where it is."""
+        told = explanation(self.doubts)
+        if told is None or self.status == "aligned":
+            return None
+        if self.status == "seed_only":
+            return f"{told}; the {self.seed.kind} seed is used as it is"
+        if self.doubts[-1].kind == "seed_does_not_fit":
+            return f"{told}; the {self.seed.kind} seed is used as it is, {sentence(self.doubts[-1])}"
+        return told

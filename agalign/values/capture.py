@@ -1,0 +1,148 @@
+"""What a camera's files hold, as their tags say: the bands of a moment, their lenses and places."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from agalign.values.geometry import Matrix
+from agalign.values.lens import Lens
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Where a raster lies: `transform` maps (column, row, 1) with (0, 0) the CORNER of the top-left pixel,
+    as GDAL and rasterio have it, to map units of `crs_wkt`.
+    """
+
+    transform: Matrix
+    crs_wkt: str
+
+
+@dataclass(frozen=True)
+class Radiometry:
+    """What turns a band's raw numbers into a physical quantity; `radiometry` has the equation."""
+
+    quantity: Literal["reflectance", "relative reflectance", "radiance"]
+    """Reflectance by the light sensor, 0 to 1, or up to a factor that all bands share; without a light sensor
+    radiance, W / m^2 / sr / nm or the maker's own unit.
+    """
+    black_level: float
+    full_scale: float
+    gain: float
+    vignetting_centre_px: tuple[float, float] = (0.0, 0.0)
+    vignetting: tuple[float, ...] = ()
+    """k1 ... k6, per px, px^2 ..."""
+    vignetting_divides: bool = True
+    row_gradient: float = 0.0
+    """Share of the signal that each row has more than the one above it."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """One band of a capture: where its pixels are and what the camera says of them."""
+
+    name: str
+    path: Path
+    band_index: int
+    """Index within the file, from 1."""
+    width_px: int
+    height_px: int
+    dtype: str
+    nodata: float | None = None
+    has_mask: bool = False
+    """True where the file has a mask or an alpha band beside the pixels."""
+    wavelength_nm: float | None = None
+    bandwidth_nm: float | None = None
+    saturation_value: float | None = None
+    """Raw value at and above which a pixel is taken as saturated."""
+    lens: Lens | None = None
+    to_rig: Matrix | None = None
+    """Homography from this file's undistorted pixels (raw ones without a lens model) to a plane that all bands of the
+    rig share, as far as the tags tell."""
+    one_lens: bool = False
+    """The file's bands come through one lens and are aligned as one."""
+    companion: bool = False
+    """Of a colour photograph beside the capture: takes part only where asked for."""
+    georeference: Georeference | None = None
+    scale_offset: tuple[float, float] = (1.0, 0.0)
+    """What the file says that its numbers are to be multiplied by, and what to be added then."""
+    overviews: tuple[int, ...] = ()
+    """Reductions at which the file holds the band too."""
+    radiometry: Radiometry | None = None
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self.width_px, self.height_px
+
+    @property
+    def address(self) -> str:
+        """The file's name, with the band's index where the file has several."""
+        return self.path.name if self.band_index == 1 else f"{self.path.name}[{self.band_index}]"
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where the camera was: WGS 84, degrees, and metres as the camera has them."""
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None = None
+
+
+@dataclass(frozen=True)
+class CameraIdentity:
+    """What made the images, as far as their tags say."""
+
+    make: str = ""
+    model: str = ""
+    serial: str = ""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """All bands of one moment, of which one is the reference."""
+
+    name: str
+    folder: Path
+    """Folder below the input folder, relative to it: where the outputs go below the output folder."""
+    bands: tuple[Band, ...]
+    reference_index: int
+    camera: CameraIdentity = field(default_factory=CameraIdentity)
+    capture_id: str = ""
+    flight_id: str = ""
+    captured_at: str = ""
+    position: Position | None = None
+    missing_bands: tuple[str, ...] = ()
+
+    @property
+    def reference(self) -> Band:
+        """The reference band."""
+        return self.bands[self.reference_index]
+
+    @property
+    def moving(self) -> tuple[Band, ...]:
+        """All bands but the reference."""
+        return tuple(b for i, b in enumerate(self.bands) if i != self.reference_index)
+
+    @property
+    def moving_lenses(self) -> list[tuple[Band, ...]]:
+        """The moving bands, those together that one lens took; without those that the reference's own lens took."""
+        groups: dict[object, list[Band]] = {}
+        for index, band in enumerate(self.moving):
+            if not self._is_of_the_references_lens(band):
+                groups.setdefault(band.path if band.one_lens else index, []).append(band)
+        return [tuple(group) for group in groups.values()]
+
+    @property
+    def bands_of_the_references_lens(self) -> list[Band]:
+        """Moving bands that lie on the reference by construction."""
+        return [b for b in self.moving if self._is_of_the_references_lens(b)]
+
+    def _is_of_the_references_lens(self, band: Band) -> bool:
+        return band.one_lens and band.path == self.reference.path
+
+    @property
+    def label(self) -> str:
+        """The capture's name below its folder, with forward slashes."""
+        return (self.folder / self.name).as_posix()

@@ -1,0 +1,120 @@
+"""Homographies on pixel coordinates.
+
+Every matrix is a 3x3 float64 array that maps homogeneous column vectors (x, y, 1): x right, y down, and
+(0, 0) is the CENTRE of the top-left pixel (OpenCV's convention). Names state the direction: `fixed_to_moving`
+maps a pixel of the fixed (reference) image to a pixel of the moving image.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agalign.errors import GeometryError
+
+Matrix = NDArray[np.float64]
+Points = NDArray[np.float64]
+
+
+def identity() -> Matrix:
+    """The 3x3 identity homography."""
+    return np.eye(3)
+
+
+def translation(dx_px: float, dy_px: float) -> Matrix:
+    """The homography that adds (dx_px, dy_px) to a pixel position."""
+    matrix = np.eye(3)
+    matrix[:2, 2] = dx_px, dy_px
+    return matrix
+
+
+def normalised(matrix: ArrayLike) -> Matrix:
+    """The same homography with its bottom-right element equal to 1.
+
+    Raises GeometryError where the matrix is not 3x3, not finite, singular, or sends the origin to infinity.
+    """
+    h = np.asarray(matrix, dtype=np.float64)
+    if h.shape != (3, 3) or not np.isfinite(h).all():
+        raise GeometryError(f"a homography is a finite 3x3 matrix, not one of shape {h.shape}: {h.tolist()}")
+    if _is_singular(h) or abs(h[2, 2]) < 1e-12 * np.abs(h[2]).max():
+        raise GeometryError(f"the homography is singular: {h.tolist()}")
+    return np.asarray(h / h[2, 2])
+
+
+def _is_singular(h: Matrix) -> bool:
+    """Whatever the units of either side: rows and columns are brought to one length first."""
+    for axis in (0, 1, 0, 1):
+        lengths = np.linalg.norm(h, axis=axis, keepdims=True)
+        if not lengths.all():
+            return True
+        h = h / lengths
+    return bool(abs(np.linalg.det(h)) < 1e-12)
+
+
+def apply(matrix: Matrix, points_px: ArrayLike) -> Points:
+    """Map points of shape (..., 2) in pixels through a homography; points on its horizon become inf or nan."""
+    xy = np.asarray(points_px, dtype=np.float64)
+    mapped = xy @ matrix[:, :2].T + matrix[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(mapped[..., :2] / mapped[..., 2:])
+
+
+def compose(*matrices: Matrix) -> Matrix:
+    """The homography that applies the LAST argument first, as the matrix product does."""
+    product = np.eye(3)
+    for matrix in matrices:
+        product = product @ matrix
+    return normalised(product)
+
+
+def invert(matrix: Matrix) -> Matrix:
+    """The inverse homography. Raises GeometryError where it is singular."""
+    return normalised(np.linalg.inv(normalised(matrix)))
+
+
+def resolution_change(scale_x: float, scale_y: float) -> Matrix:
+    """Maps full-resolution pixels to pixels of an image resized by (scale_x, scale_y).
+
+    With centres at integers, x_small = (x + 0.5) * scale_x - 0.5: the outer edges of both images coincide.
+    """
+    return np.array([[scale_x, 0.0, 0.5 * scale_x - 0.5], [0.0, scale_y, 0.5 * scale_y - 0.5], [0.0, 0.0, 1.0]])
+
+
+def rescale(fixed_to_moving: Matrix, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> Matrix:
+    """The same mapping between images resized by `fixed_scale` and `moving_scale` (each x, y; 0.5 halves)."""
+    to_full = invert(resolution_change(*fixed_scale))
+    return compose(resolution_change(*moving_scale), fixed_to_moving, to_full)
+
+
+def overlay(fixed_size_px: tuple[int, int], moving_size_px: tuple[int, int]) -> Matrix:
+    """fixed_to_moving that lays the outline of one image (width, height) on the other's: identity for equal sizes."""
+    return resolution_change(moving_size_px[0] / fixed_size_px[0], moving_size_px[1] / fixed_size_px[1])
+
+
+def corners(width_px: int, height_px: int) -> Points:
+    """Centres of the four corner pixels, (4, 2), clockwise from the top left."""
+    right, bottom = width_px - 1.0, height_px - 1.0
+    return np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
+
+
+def lattice(width_px: int, height_px: int, columns: int, rows: int) -> Points:
+    """A regular lattice over an image, (rows * columns, 2), row by row, corner pixels included."""
+    x, y = np.meshgrid(np.linspace(0, width_px - 1, columns), np.linspace(0, height_px - 1, rows))
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def corner_error_px(one: Matrix, other: Matrix, width_px: int, height_px: int) -> float:
+    """Largest distance in px between the images of the four corners under two homographies."""
+    points = corners(width_px, height_px)
+    distance = np.linalg.norm(apply(one, points) - apply(other, points), axis=1)
+    return float(np.nan_to_num(distance, nan=np.inf).max())
+
+
+def local_scale(matrix: Matrix, width_px: int, height_px: int) -> Points:
+    """Square root of the mapping's area change at the corners and the centre, (5,); negative where it folds.
+
+    The determinant of the Jacobian of a homography H at p is det(H) / (h31 x + h32 y + h33)^3.
+    """
+    points = np.vstack([corners(width_px, height_px), [[(width_px - 1) / 2, (height_px - 1) / 2]]])
+    denominator = points @ matrix[2, :2] + matrix[2, 2]
+    with np.errstate(divide="ignore"):
+        area = np.linalg.det(matrix) / denominator**3
+    return np.asarray(np.sign(area) * np.sqrt(np.abs(area)))

@@ -1,0 +1,114 @@
+"""Camera models: between raw pixels of a file and the pixels that a camera without distortion would have given.
+
+Brown-Conrady in OpenCV's convention, on normalised coordinates x = (u - cx) / fx, y = (v - cy) / fy, r^2 = x^2 + y^2:
+
+    radial = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+    x_d = x radial + 2 p1 x y + p2 (r^2 + 2 x^2)
+    y_d = y radial + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+The undistorted image has the same camera matrix K as the raw one. Fisheyes are expressed the same way: for the angles
+that drone cameras see the quotient follows them to a hundredth of a pixel (`radial_coefficients`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from agalign.values.geometry import Matrix, Points
+
+_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera's intrinsics in raw pixels: x_px = fx * x / z + cx, after Brown-Conrady distortion.
+
+    `distortion` is k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order and for normalised coordinates; what is left out at
+    the end is 0, and empty means none.
+    """
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def matrix(self) -> Matrix:
+        """The 3x3 camera matrix K."""
+        return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
+
+
+def is_distorting(lens: Lens | None) -> bool:
+    """True where raw and undistorted pixels differ."""
+    return lens is not None and any(lens.distortion)
+
+
+def distort(lens: Lens | None, undistorted_px: ArrayLike) -> Points:
+    """Raw pixel positions of undistorted ones, both (..., 2); None is a lens without distortion."""
+    points = np.asarray(undistorted_px, dtype=np.float64)
+    if lens is None or not is_distorting(lens):
+        return points
+    return np.stack(distorted(lens, points[..., 0], points[..., 1]), axis=-1)
+
+
+def distorted(lens: Lens, u: Any, v: Any) -> tuple[Any, Any]:
+    """`distort` on separate coordinates, for anything with arithmetic: arrays or tensors."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = _eight(lens)
+    x, y = (u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px
+    xx, yy, xy = x * x, y * y, x * y
+    r2 = xx + yy
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if k4 or k5 or k6:
+        radial = radial / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    x_d = x * radial + (2.0 * p1) * xy + p2 * (r2 + 2.0 * xx)
+    y_d = y * radial + p1 * (r2 + 2.0 * yy) + (2.0 * p2) * xy
+    return lens.fx_px * x_d + lens.cx_px, lens.fy_px * y_d + lens.cy_px
+
+
+def undistort(lens: Lens | None, raw_px: ArrayLike) -> Points:
+    """Undistorted pixel positions of raw ones, both (..., 2): the inverse of `distort`, by iteration."""
+    points = np.asarray(raw_px, dtype=np.float64)
+    if lens is None or not is_distorting(lens) or points.size == 0:
+        return points
+    flat = np.ascontiguousarray(points.reshape(-1, 1, 2))
+    coefficients = np.array(_eight(lens))
+    straight = cv2.undistortPoints(flat, lens.matrix, coefficients, P=lens.matrix, criteria=_UNDISTORT_CRITERIA)
+    return np.asarray(straight, dtype=np.float64).reshape(points.shape)
+
+
+def rescaled(lens: Lens | None, scale: tuple[float, float]) -> Lens | None:
+    """The same lens on an image resized by (scale_x, scale_y), outer edges coinciding."""
+    if lens is None or scale == (1.0, 1.0):
+        return lens
+    sx, sy = scale
+    return replace(
+        lens,
+        fx_px=lens.fx_px * sx,
+        fy_px=lens.fy_px * sy,
+        cx_px=(lens.cx_px + 0.5) * sx - 0.5,
+        cy_px=(lens.cy_px + 0.5) * sy - 0.5,
+    )
+
+
+def radial_coefficients(bent: Callable[[Points], Points], reach: float) -> tuple[float, ...]:
+    """The distortion (k1, k2, 0, 0, k3, k4, k5, k6) of a lens that puts a ray at distance r from the axis, in focal
+    lengths, to `bent(r)`; fitted for r up to `reach`.
+
+    bent(r) / r (1 + k4 r^2 + k5 r^4 + k6 r^6) = 1 + k1 r^2 + k2 r^4 + k3 r^6 is linear in k.
+    """
+    r = np.linspace(reach / 256, reach, 256)
+    ratio = bent(r) / r
+    powers = np.stack([r**2, r**4, r**6], axis=1)
+    k = np.linalg.lstsq(np.hstack([powers, -ratio[:, None] * powers]), ratio - 1.0, rcond=None)[0]
+    k1, k2, k3, k4, k5, k6 = k.tolist()
+    return k1, k2, 0.0, 0.0, k3, k4, k5, k6
+
+
+def _eight(lens: Lens) -> tuple[float, float, float, float, float, float, float, float]:
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*lens.distortion, *(0.0,) * 8)[:8]
+    return k1, k2, p1, p2, k3, k4, k5, k6

@@ -1,0 +1,110 @@
+"""The complete mapping between the raw pixels of two images, and where it sends every pixel of a grid."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+
+from agalign.values import geometry, lens
+from agalign.values.alignment import Alignment, LocalField
+from agalign.values.capture import Band
+from agalign.values.geometry import Matrix, Points
+from agalign.values.image import Tile
+from agalign.values.lens import Lens
+
+_LATTICE_STEP_PX = 32
+"""Curved mappings are evaluated this far apart and splined between: with real lenses below 0.0001 px of error."""
+_LOCAL_LATTICE_STEP_PX = 12
+"""The same where displacements change from place to place."""
+
+
+@dataclass(frozen=True)
+class PixelMapping:
+    """raw reference px -> undistorted -> homography -> undistorted -> raw moving px."""
+
+    fixed_to_moving: Matrix
+    fixed_lens: Lens | None = None
+    moving_lens: Lens | None = None
+    pre_distortion: Lens | None = None
+    """Lens through which the given pixels go first, where they are undistorted ones of the reference."""
+    local: LocalField | None = None
+    """Displacements of raw reference px before anything else; `local_scale` is px of its image for one of these."""
+    local_scale: tuple[float, float] = (1.0, 1.0)
+
+    def __call__(self, reference_px: ArrayLike) -> Points:
+        """(..., 2) raw reference pixels to raw moving pixels."""
+        raw = lens.distort(self.pre_distortion, reference_px)
+        if self.local is not None:
+            raw = raw + self.local((raw + 0.5) * self.local_scale - 0.5) / self.local_scale
+        undistorted = lens.undistort(self.fixed_lens, raw)
+        return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, undistorted))
+
+    def from_undistorted(self, reference_lens: Lens) -> "PixelMapping":
+        """The mapping for undistorted pixels of the reference instead of its raw ones."""
+        if self.fixed_lens is not None and self.local is None:
+            return replace(self, fixed_lens=None)
+        return replace(self, pre_distortion=reference_lens)
+
+    def rescaled(self, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> "PixelMapping":
+        """The same mapping between images resized by `fixed_scale` and `moving_scale` (each x, y)."""
+        return PixelMapping(
+            geometry.rescale(self.fixed_to_moving, fixed_scale, moving_scale),
+            lens.rescaled(self.fixed_lens, fixed_scale),
+            lens.rescaled(self.moving_lens, moving_scale),
+            lens.rescaled(self.pre_distortion, fixed_scale),
+            self.local,
+            (self.local_scale[0] / fixed_scale[0], self.local_scale[1] / fixed_scale[1]),
+        )
+
+    @property
+    def bends(self) -> bool:
+        """True where the mapping is not just a homography: a lens model or a local field takes part."""
+        return self.local is not None or any(
+            map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion))
+        )
+
+    def positions(self, tile: Tile) -> Points:
+        """Where each pixel of a tile lies in the moving image, (height, width, 2) raw px."""
+        if self.bends:
+            return splined(self, tile, _LATTICE_STEP_PX if self.local is None else _LOCAL_LATTICE_STEP_PX)
+        x = np.arange(tile.x0, tile.x0 + tile.width, dtype=np.float64)
+        y = np.arange(tile.y0, tile.y0 + tile.height, dtype=np.float64)
+        h = self.fixed_to_moving
+        found = np.empty((tile.height, tile.width, 2))
+        denominator = (h[2, 0] * x)[None, :] + (h[2, 1] * y + h[2, 2])[:, None]
+        for k in (0, 1):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                found[..., k] = ((h[k, 0] * x)[None, :] + (h[k, 1] * y + h[k, 2])[:, None]) / denominator
+        return found
+
+
+def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> PixelMapping:
+    """The complete mapping between the raw pixels of two files, of which an alignment was found."""
+    local = None if alignment.local is None else alignment.local.field
+    if alignment.space == "pixel":
+        return PixelMapping(alignment.fixed_to_moving, local=local)
+    return PixelMapping(alignment.fixed_to_moving, reference.lens, moving.lens, local=local)
+
+
+def splined(mapping: Callable[[Points], Points], tile: Tile, step_px: int = _LATTICE_STEP_PX) -> Points:
+    """A smooth mapping of points (..., 2) at every pixel of a tile, (height, width, 2): a bicubic spline through its
+    values on a lattice. The spline is linear in those values, so it is two products of matrices.
+    """
+    knots_x, weights_x = _spline_weights(tile.x0, tile.width, step_px)
+    knots_y, weights_y = _spline_weights(tile.y0, tile.height, step_px)
+    values = mapping(np.stack(np.meshgrid(knots_x, knots_y), axis=-1))
+    across = np.ascontiguousarray(weights_x.T)
+    found = np.empty((tile.height, tile.width, 2))
+    for k in (0, 1):
+        found[..., k] = (weights_y @ values[..., k]) @ across
+    return found
+
+
+def _spline_weights(start: int, length: int, step_px: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(knots (k,), weights (length, k)): what each pixel takes of the value at each knot."""
+    count = max(4, 1 + -(-(length - 1) // step_px))
+    knots = np.linspace(start, start + max(length - 1, 3), count)
+    weights = CubicSpline(knots, np.eye(count))(np.arange(start, start + length, dtype=np.float64))
+    return knots, np.asarray(weights)

@@ -1,0 +1,220 @@
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from distributed import LocalCluster
+
+import agalign
+from agalign.batch import RunOptions, dask_executor, run_flight, workers
+from agalign.batch.learn import learn_flight, learning_fingerprint, median_mapping
+from agalign.cameras.discover import discover
+from agalign.config import FastRecipe, FlightSettings, JointSettings, Settings
+from agalign.errors import ConfigurationError, InputError
+from agalign.flight.groups import camera_key, flights_of, model_names
+from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.products.sidecar import find_sidecars, read_sidecar
+from agalign.synthetic.score import score_against_truth
+from agalign.values import geometry
+from agalign.values.capture import Capture
+
+SETTINGS = Settings(flight=FlightSettings(captures=1))
+
+
+def cpu() -> torch.device:
+    return torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def model(flight: Path) -> FlightModel:
+    captures = flights_of(discover(flight).captures)[0]
+    found = learn_flight(captures, SETTINGS, lambda *_: None)
+    assert found is not None
+    return found
+
+
+def test_a_frozen_network_aligns_a_capture_that_it_has_never_seen(flight: Path, tmp_path: Path) -> None:
+    reports = list(run_flight(discover(flight), tmp_path, SETTINGS))
+    bands = [b for r in reports for b in r.sidecar.bands if b.joint]
+    assert {b.joint.recipe for b in bands} == {"flight"}
+    assert {b.joint.iterations for b in bands} == {0}
+    scores = score_against_truth(reports, flight / "truth.json")
+    assert len(scores) == 8
+    assert max(s.median_px for s in scores) < 0.2
+    assert [p.name for p in (tmp_path / "models").iterdir()] == ["RedEdge-M_SY01-0000001-AG.safetensors"]
+
+
+def test_saved_and_loaded_it_is_the_same(model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "models" / "m.safetensors"
+    save_model(model, path)
+    again = load_model(path, cpu)
+    assert (again.camera, again.bands, again.fingerprint) == (model.camera, model.bands, model.fingerprint)
+    for name, matrix in model.mappings.items():
+        np.testing.assert_array_equal(again.mappings[name], matrix)
+    patches = torch.randn(5, 1, 16, 16)
+    for side in range(5):
+        torch.testing.assert_close(again.net(patches, side), model.net(patches, side))
+
+
+def test_what_is_no_model_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    with pytest.raises(InputError, match=r"m\.safetensors"):
+        load_model(path, cpu)
+    path.write_bytes(b"nonsense" * 100)
+    with pytest.raises(InputError, match=r"m\.safetensors"):
+        load_model(path, cpu)
+    from safetensors.torch import save_file
+
+    save_file({"x": torch.zeros(1)}, path)
+    with pytest.raises(InputError, match="no model of agalign"):
+        load_model(path, cpu)
+
+
+def test_a_model_is_used_again_and_refused_for_another_camera(flight: Path, model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    steps = FastRecipe(start="random", most_steps=1)  # nothing could be learnt in one step
+    settings = Settings(joint=JointSettings(fast=steps), flight=FlightSettings(captures=1))
+    reports = list(run_flight(discover(flight), tmp_path / "out", settings, model=path))
+    assert all(r.good for r in reports)
+    save_model(replace(model, camera="Another 1 [Green 10x10]"), path)
+    with pytest.raises(ConfigurationError, match=r"m\.safetensors: was learnt for Another 1"):
+        list(run_flight(discover(flight), tmp_path / "out2", settings, model=path))
+
+
+def test_several_processes_give_the_same_numbers(flight: Path, tmp_path: Path) -> None:
+    found = []
+    for jobs in (1, 2):
+        out = tmp_path / str(jobs)
+        agalign.align_folder(flight, out, settings=SETTINGS, run=RunOptions(jobs=jobs))
+        sidecars = [read_sidecar(p) for p in find_sidecars(out)]
+        found.append([(b.grid, b.metrics, b.joint) for s in sidecars for b in s.bands])
+    assert len(found[0]) == 10
+    assert found[0] == found[1]
+
+
+def test_a_second_run_learns_nothing_anew(flight: Path, tmp_path: Path) -> None:
+    list(run_flight(discover(flight), tmp_path, SETTINGS))
+    path = next((tmp_path / "models").iterdir())
+    before = path.stat().st_mtime_ns
+    next(iter(find_sidecars(tmp_path))).unlink()
+    states = [r.state for r in run_flight(discover(flight), tmp_path, SETTINGS)]
+    assert sorted(states) == ["done", "kept"]
+    assert path.stat().st_mtime_ns == before
+
+
+def test_cameras_and_flights_are_kept_apart(flight: Path) -> None:
+    captures = discover(flight).captures
+    other = replace(captures[1], camera=replace(captures[1].camera, serial="X9"))
+    later = replace(captures[1], flight_id="another")
+    assert len(flights_of(captures)) == 1
+    groups = flights_of([*captures, other, later])
+    assert [len(g) for g in groups] == [2, 1, 1]
+    assert camera_key(captures[0]) == camera_key(later) != camera_key(other)
+    stem = "RedEdge-M_SY01-0000001-AG"
+    assert model_names([*groups, [later]]) == [
+        f"{stem}.safetensors", "RedEdge-M_X9.safetensors", f"{stem}-2.safetensors", f"{stem}-3.safetensors",
+    ]  # fmt: skip
+
+
+def test_a_model_is_learnt_anew_where_what_it_depends_on_has_changed(flight: Path) -> None:
+    captures = discover(flight).captures
+    before = learning_fingerprint(captures, SETTINGS)
+    assert learning_fingerprint(discover(flight).captures, SETTINGS) == before
+    no_lens = [replace(c, bands=tuple(replace(b, lens=None) for b in c.bands)) for c in captures]
+    other_reference = [replace(c, reference_index=0) for c in captures]
+    elsewhere = Settings(flight=FlightSettings(captures=1, start="another network"))
+    assert len({learning_fingerprint(c, SETTINGS) for c in (captures, no_lens, other_reference)}) == 3
+    assert learning_fingerprint(captures, elsewhere) != before
+
+
+def test_a_capture_is_done_again_with_another_model(flight: Path, model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    out = tmp_path / "out"
+    assert [r.state for r in run_flight(discover(flight), out, SETTINGS)] == ["done", "done"]
+    assert [r.state for r in run_flight(discover(flight), out, SETTINGS, model=path)] == ["done", "done"]
+    assert [r.state for r in run_flight(discover(flight), out, SETTINGS, model=path)] == ["kept", "kept"]
+
+
+def test_a_model_of_no_use_is_refused(flight: Path, model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    alone = Settings(flight=FlightSettings(together=False))
+    with pytest.raises(ConfigurationError, match="of use only where one network is learnt"):
+        list(run_flight(discover(flight), tmp_path / "out", alone, model=path))
+
+
+def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:
+    good = geometry.translation(10, 5)
+    wrong = geometry.translation(-80, 90)
+    near = geometry.translation(10.1, 5.1)
+    found = median_mapping([good, wrong, near], (400, 300))
+    assert geometry.corner_error_px(found, good, 400, 300) < 0.2
+
+
+def test_any_executor_will_do(flight: Path, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        reports = agalign.align_folder(flight, tmp_path, settings=SETTINGS, run=RunOptions(executor=executor))
+    assert sorted(r.label for r in reports) == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
+    assert all(r.good for r in reports)
+
+
+def test_a_dask_cluster_does_the_captures(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(flight.parent)
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        dask_executor(cluster.scheduler_address) as executor,
+    ):
+        reports = agalign.align_folder(flight.name, tmp_path, settings=SETTINGS, run=RunOptions(executor=executor))
+    assert all(r.good for r in reports)
+    assert len(reports) == 2
+
+
+def test_a_scheduler_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_DASK_ANSWERS_WITHIN_S", 0.5)
+    with (
+        pytest.raises(ConfigurationError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "),
+        dask_executor("tcp://127.0.0.1:1"),
+    ):
+        pass
+
+
+def test_one_broken_reference_stops_neither_learning_nor_the_others(flight: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "in"
+    shutil.copytree(flight, copy)
+    for pattern in ("IMG_0001_2.tif", "IMG_0002_4.tif"):
+        path = next(copy.rglob(pattern))
+        data = path.read_bytes()
+        path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+    reports = {r.label[-8:]: r for r in run_flight(discover(copy), tmp_path / "out", Settings())}
+    statuses = {b.band: b.status for b in reports["IMG_0002"].sidecar.bands}
+    assert statuses["Blue"] == statuses["Red"] == "aligned"
+
+
+def test_a_fault_in_one_capture_costs_no_other(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = workers.process_capture
+
+    def faulty(capture: Capture, *arguments: object) -> object:
+        if capture.name == "IMG_0001":
+            raise ZeroDivisionError("of nothing")
+        return real(capture, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(workers, "process_capture", faulty)
+    reports = {r.label: r for r in agalign.align_folder(flight, tmp_path)}
+    assert reports["0000SET/000/IMG_0002"].good
+    problem = reports["0000SET/000/IMG_0001"].error
+    assert problem is not None
+    assert "please report this" in problem
+
+
+def test_a_want_of_memory_is_said_so(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def greedy(*_: object) -> object:
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory")
+
+    monkeypatch.setattr(workers, "process_capture", greedy)
+    with pytest.raises(MemoryError, match="not enough memory"):
+        agalign.align_folder(flight, tmp_path, settings=Settings(flight=FlightSettings(together=False)))

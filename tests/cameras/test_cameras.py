@@ -1,0 +1,146 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agalign.cameras import default_reference, known_cameras, rig_seed
+from agalign.cameras.base import rotation
+from agalign.cameras.generic import Generic
+from agalign.cameras.metadata import Tags, read_tags
+from agalign.cameras.micasense import MicaSense
+from agalign.errors import ConfigurationError
+from agalign.pixels.raster import RasterInfo, probe
+from agalign.synthetic import rig
+from agalign.values import geometry
+from agalign.values.capture import Band
+
+
+def micasense_bands(flight: Path) -> dict[str, Band]:
+    bands = {}
+    for path in sorted((flight / "0000SET" / "000").glob("IMG_0001_*.tif")):
+        (band,) = MicaSense().bands(path, read_tags(path), probe(path))
+        bands[band.name] = band
+    return bands
+
+
+def test_micasense_lens_is_the_generators(flight: Path) -> None:
+    bands = micasense_bands(flight)
+    for spec in rig.BANDS:
+        expected, found = spec.lens(480, 360), bands[spec.name].lens
+        assert found is not None
+        np.testing.assert_allclose(
+            [found.fx_px, found.cx_px, found.cy_px], [expected.fx_px, expected.cx_px, expected.cy_px], atol=1e-4
+        )
+        np.testing.assert_allclose(found.distortion, expected.distortion)
+
+
+def test_rig_seed_is_the_truth_at_infinity(flight: Path) -> None:
+    bands = micasense_bands(flight)
+    far = rig.Pose(1e4, 0.0, 0.0, 0.0, 0.0, 0.0)
+    reference = rig.BANDS[rig.REFERENCE]
+    for spec in rig.BANDS:
+        seed = rig_seed(bands["Green"], bands[spec.name])
+        assert seed is not None
+        truth = rig.true_homography(reference, spec, far, (480, 360))
+        assert geometry.corner_error_px(seed, truth, 480, 360) < 0.01
+
+
+def test_rotation_order_and_hand() -> None:
+    np.testing.assert_allclose(rotation(90, 0, 0) @ [0, 1, 0], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(rotation(0, 90, 0) @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(rotation(0, 0, 90) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(rotation(30, 40, 50), rotation(30, 0, 0) @ rotation(0, 40, 0) @ rotation(0, 0, 50))
+
+
+INFO = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
+
+
+def tags(**camera: str) -> Tags:
+    exif = {"FocalPlaneXResolution": (266666667, 1000000), "FocalPlaneResolutionUnit": 4, "FocalLength": (55, 10)}
+    return Tags(make="MicaSense", xmp={("Camera", k): (v,) for k, v in camera.items()}, exif=exif)
+
+
+def test_focal_length_of_old_firmware_is_in_pixels() -> None:
+    old = tags(PerspectiveFocalLength="1451.8", PrincipalPoint="2.4,1.8")
+    new = tags(PerspectiveFocalLength="5.45", PrincipalPoint="2.4,1.8", PerspectiveFocalLengthUnits="mm")
+    for found, expected in ((old, 1451.8), (new, 5.45 * 266.666667)):
+        (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), found, INFO)
+        assert band.lens is not None
+        assert band.lens.fx_px == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("rig", ["", "a, b, c", "1.0, 2.0", "inf"])
+def test_malformed_rig_tags_leave_the_principal_points(rig: str) -> None:
+    both = [tags(PerspectiveFocalLength="5.45", PrincipalPoint=p, RigRelatives=rig) for p in ("2.4,1.8", "2.5,1.8")]
+    (one,), (other,) = (MicaSense().bands(Path("IMG_0001_4.tif"), t, INFO) for t in both)
+    seed = rig_seed(one, other)
+    np.testing.assert_allclose(seed, geometry.translation(26.6666667, 0), atol=1e-9)
+
+
+def test_without_a_lens_there_is_no_rig_seed() -> None:
+    (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), Tags(make="MicaSense"), INFO)
+    assert band.lens is None
+    assert band.name == "band_4"
+    assert rig_seed(band, band) is None
+
+
+@pytest.mark.parametrize(
+    ("tags", "name"),
+    [
+        (Tags(make="MicaSense"), "MicaSense"),
+        (Tags(xmp={("MicaSense", "CaptureId"): ("a",)}), "MicaSense"),
+        (Tags(make="DJI"), "DJI"),
+        (Tags(make="Parrot"), "Parrot Sequoia"),
+        (Tags(xmp={("Camera", "RigName"): ("Sequoia",)}), "Parrot Sequoia"),
+        (Tags(make="Sentera"), "Sentera"),
+        (Tags(xmp={("Sentera", "AlignMatrix"): ("1",)}), "Sentera"),
+        (Tags(make="MAPIR"), "MAPIR"),
+        (Tags(model="LATT-M3M-L41-F550"), "MAPIR"),
+        (Tags(), "generic"),
+    ],
+)
+def test_who_recognises_what(tags: Tags, name: str) -> None:
+    assert next(c for c in known_cameras() if c.recognises(tags)).name == name
+
+
+def test_a_pattern_is_above_all_cameras() -> None:
+    assert [c.name for c in known_cameras("{capture}_{band}.tif")] == ["generic"]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("field_red.tif", ("field", "red")),
+        ("field-3_RedEdge.tif", ("field-3", "RedEdge")),
+        ("IMG_0007_4.tif", ("IMG_0007", "4")),
+        ("plot 12 NIR.tif", ("plot 12", "NIR")),
+        ("north_840nm.tif", ("north", "840nm")),
+        ("north_b3.tif", ("north", "b3")),
+        ("fieldGreen.tif", ("field", "Green")),
+        ("ortho_red_edge.tif", ("ortho", "red_edge")),
+        ("orchard.tif", ("orchard", "")),
+        ("été_nir.tif", ("été", "nir")),
+        ("nir.tif", ("", "nir")),
+    ],
+)
+def test_names_of_files(name: str, expected: tuple[str, str]) -> None:
+    assert Generic().split(Path(name)) == expected
+
+
+def test_pattern() -> None:
+    generic = Generic("cap{capture}-of-{band}.tif")
+    assert generic.split(Path("cap12-of-X.tif")) == ("12", "X")
+    assert generic.split(Path("other.tif")) == ("other", "")
+    for bad in ("{capture}.tif", "{band}", "x", "{capture}{capture}{band}"):
+        with pytest.raises(ConfigurationError, match="pattern"):
+            Generic(bad)
+
+
+def test_default_reference() -> None:
+    def band(name: str, wavelength: float | None = None) -> Band:
+        return Band(name, Path("x"), 1, 1, 1, "uint8", wavelength_nm=wavelength)
+
+    assert default_reference([band("Blue"), band("Green-560"), band("NIR")]) == 1
+    assert default_reference([band("band_1", 840), band("band_2", 560), band("band_3", 475)]) == 1
+    assert default_reference([band("LWIR", 11000), band("Red", 668)]) == 1
+    assert default_reference([band("a"), band("b")]) == 0

@@ -1,0 +1,240 @@
+"""Aligned bands as other programs see them."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import tifffile
+from PIL import Image
+
+import agalign
+from agalign.cameras import rig_seed
+from agalign.cameras.carried_tags import band_tags
+from agalign.cameras.metadata import Tags, read_tags
+from agalign.cameras.micasense import MicaSense
+from agalign.cameras.parrot import Sequoia
+from agalign.cameras.tiff_directory import (
+    EXIF,
+    GPS,
+    XMP,
+    add_directories,
+    byte_string,
+    rational,
+    read_directories,
+    short,
+    text,
+)
+from agalign.config import Settings, WriteSettings
+from agalign.pixels.raster import probe
+from agalign.values import geometry, lens
+from agalign.values.capture import Band
+from agalign.values.image import OutputGrid
+
+from .test_vendors import SIZE, VENDORS, packet, write_capture
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+@pytest.fixture(scope="module")
+def both(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Stacks and single bands of the synthetic flight's first capture."""
+    out = tmp_path_factory.mktemp("both")
+    agalign.align_folder(flight, out, settings=Settings(write=WriteSettings(layout="both")))
+    return out / "0000SET" / "000"
+
+
+def bands_in(folder: Path) -> dict[str, Band]:
+    found = {}
+    for path in sorted(folder.glob("IMG_0001_*.tif")):
+        (band,) = MicaSense().bands(path, read_tags(path), probe(path))
+        found[band.name] = band
+    return found
+
+
+def test_aligned_bands_look_like_one_camera(flight: Path, both: Path) -> None:
+    before, after = bands_in(flight / "0000SET" / "000"), bands_in(both)
+    assert set(after) == {"Blue", "Green", "Red", "NIR", "Red edge"}
+    x0, y0, width, height = json.loads((both / "IMG_0001.json").read_text())["output"]["crop"]
+    reference = before["Green"].lens
+    assert reference is not None
+    for name, band in after.items():
+        assert band.size_px == (width, height)
+        assert band.wavelength_nm == before[name].wavelength_nm
+        assert band.lens is not None
+        assert band.lens.cx_px == pytest.approx(reference.cx_px - x0, abs=1e-4)
+        assert band.lens.cy_px == pytest.approx(reference.cy_px - y0, abs=1e-4)
+        assert band.lens.distortion == pytest.approx(reference.distortion)
+        np.testing.assert_allclose(rig_seed(after["Green"], band), geometry.identity(), atol=1e-9)
+
+
+def test_vignetting_lies_where_the_band_was_moved_to(flight: Path, both: Path) -> None:
+    data = json.loads((both / "IMG_0001.json").read_text())
+    truth = json.loads((flight / "truth.json").read_text())["IMG_0001"]["bands"]["IMG_0001_4.tif"]
+    centre = np.array(read_tags(flight / "0000SET" / "000" / "IMG_0001_4.tif").numbers("Camera", "VignettingCenter"))
+    bands = bands_in(flight / "0000SET" / "000")
+    back = geometry.apply(
+        geometry.invert(np.array(truth["fixed_to_moving"])), lens.undistort(bands["NIR"].lens, centre)
+    )
+    expected = lens.distort(bands["Green"].lens, back) - data["output"]["crop"][:2]
+    found = read_tags(both / "IMG_0001_4.tif").numbers("Camera", "VignettingCenter")
+    np.testing.assert_allclose(found, expected, atol=0.2)
+    assert np.linalg.norm(np.array(found) - centre) > 3
+
+
+def test_three_readers_agree_on_place_time_and_band(flight: Path, both: Path) -> None:
+    source, path = flight / "0000SET" / "000" / "IMG_0001_4.tif", both / "IMG_0001_4.tif"
+    before, after = read_directories(source), read_directories(path)
+    assert after[GPS] == before[GPS]
+    assert {k: v for k, v in after[EXIF].items() if k in before[EXIF]} == before[EXIF]
+    for tag in (271, 272, 305, 306, 50714):
+        assert after[0][tag] == before[0][tag]
+    with Image.open(path) as image:
+        exif = image.getexif()
+        assert exif[271] == "MicaSense"
+        assert exif.get_ifd(GPS)[2][0] == 52.0
+        assert exif.get_ifd(EXIF)[36867] == "2026:06:21 10:00:01"
+    with tifffile.TiffFile(path) as tiff:
+        assert b"NIR" in tiff.pages[0].tags[700].value
+    with rasterio.open(path) as dataset:
+        assert dataset.descriptions == ("NIR",)
+        assert dataset.tags(1)["wavelength"] == "840"
+        assert dataset.tags(ns="EXIF")["EXIF_GPSLatitudeRef"] == "N"
+        assert dataset.crs is None
+        assert dataset.compression.name == "deflate"
+
+
+def test_the_stack_says_what_is_true_of_all_its_bands(both: Path) -> None:
+    found = read_directories(both / "IMG_0001.tif")
+    assert found[GPS][1].data == b"N\0"
+    assert 36867 in found[EXIF]
+    assert 33434 not in found[EXIF]  # each band was exposed for a time of its own
+    assert 700 not in found[0]
+    assert found[0][272].data == b"RedEdge-M\0"
+
+
+def test_the_bands_pixels_are_the_stacks(both: Path) -> None:
+    data = json.loads((both / "IMG_0001.json").read_text())
+    with rasterio.open(both / "IMG_0001.tif") as stack:
+        for index, band in enumerate(data["bands"], start=1):
+            assert band["place"] == {"file": "IMG_0001.tif", "band_index": index}
+            with rasterio.open(both / band["file"]) as single:
+                np.testing.assert_array_equal(single.read(1), stack.read(index))
+    assert [f["file"] for f in data["output"]["band_files"]] == [b["file"] for b in data["bands"]]
+
+
+def carried(tmp_path: Path, vendor: str, file: str, reference: str, grid: OutputGrid, **options: bool) -> Tags:
+    """The tags of a file that got what is carried from `file`."""
+    write_capture(tmp_path, VENDORS[vendor])
+    band = Band("reference", tmp_path / reference, 1, *SIZE, "uint16")
+    tags = band_tags(tmp_path / file, band, grid, lambda x, y: (x, y), **options)
+    out = tmp_path / "out.tif"
+    tifffile.imwrite(out, np.zeros((grid.height, grid.width), np.uint16), photometric="minisblack", metadata=None)
+    add_directories(out, tags.first, tags.exif, tags.gps)
+    return read_tags(out)
+
+
+def test_djis_geometry_is_the_references(tmp_path: Path) -> None:
+    grid = OutputGrid(20, 10, 200, 180, scale_xy=(2.0, 2.0))
+    prefix = "DJI_20230607112233_0001_MS_"
+    found = carried(tmp_path, "Mavic 3", f"{prefix}NIR.TIF", f"{prefix}G.TIF", grid)
+    assert found.text("Camera", "BandName") == "NIR"
+    assert found.number("drone-dji", "CalibratedOpticalCenterX") == 2 * 80.5 - 0.5 - 20
+    assert found.number("drone-dji", "CalibratedOpticalCenterY") == 2 * 60.5 - 0.5 - 10
+    assert found.text("drone-dji", "DewarpData") == "2022-09-08;340,340,3,-5,-0.1,0.05,0,0,0"
+    assert found.numbers("drone-dji", "CalibratedHMatrix")[2] == 0.5
+
+
+def test_an_upside_down_principal_point_counts_from_the_other_end(tmp_path: Path) -> None:
+    files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
+    found = carried(tmp_path, "Sequoia", *files, OutputGrid(30, 20, 120, 90))
+    # Stored: (160 - 80, 120 - 58.67) - (30, 20); seen upright it counts from 120, 90.
+    x, y = (v * 266.67 for v in found.numbers("Camera", "PrincipalPoint"))
+    assert (x, y) == pytest.approx((120 - (160 - 80.0 - 30), 90 - (120 - 58.667 - 20)), abs=0.01)
+    assert found.orientation == 3
+
+
+def test_undistorted_pixels_have_no_distortion(tmp_path: Path) -> None:
+    found = carried(
+        tmp_path, "RedEdge", "IMG_0007_4.tif", "IMG_0007_2.tif", OutputGrid(0, 0, 160, 120, undistorted=True)
+    )
+    assert found.numbers("Camera", "PerspectiveDistortion") == (0.0,) * 5
+
+
+def test_radiometry_takes_what_it_used(tmp_path: Path) -> None:
+    write_capture(tmp_path, VENDORS["RedEdge"])
+    values = {("Camera", "VignettingCenter"): ("80", "60"), ("Camera", "BandName"): ("NIR",),
+              ("MicaSense", "RadiometricCalibration"): ("1", "2", "3")}  # fmt: skip
+    add_directories(
+        tmp_path / "IMG_0007_4.tif", {XMP: byte_string(packet(values, "sequences")), 50714: short(5)}, {}, {}
+    )
+    for radiometry in (False, True):
+        found = carried_from(tmp_path, radiometry=radiometry)
+        assert (("Camera", "VignettingCenter") in found.xmp) != radiometry
+        assert (("MicaSense", "RadiometricCalibration") in found.xmp) != radiometry
+        assert (found.black_level is None) == radiometry
+
+
+def carried_from(folder: Path, *, radiometry: bool) -> Tags:
+    grid = OutputGrid(0, 0, 160, 120)
+    reference = Band("Green", folder / "IMG_0007_2.tif", 1, *SIZE, "uint16")
+    tags = band_tags(folder / "IMG_0007_4.tif", reference, grid, lambda x, y: (x, y), radiometry=radiometry)
+    out = folder / "out.tiff"
+    tifffile.imwrite(out, np.zeros((120, 160), np.float32), photometric="minisblack", metadata=None)
+    add_directories(out, tags.first, tags.exif, tags.gps)
+    return read_tags(out)
+
+
+def test_a_source_that_cannot_be_followed_gives_nothing(tmp_path: Path) -> None:
+    (tmp_path / "broken.tif").write_bytes(b"II*\0\xff\xff\xff\xff")
+    band = Band("broken", tmp_path / "broken.tif", 1, 9, 9, "uint16")
+    tags = band_tags(tmp_path / "broken.tif", band, OutputGrid(0, 0, 9, 9), lambda x, y: (x, y))
+    assert (tags.first, tags.exif, tags.gps) == ({}, {}, {})
+    assert text("x").count == 2
+
+
+def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
+    write_capture(tmp_path, VENDORS["Sequoia"])
+    path = tmp_path / "IMG_180413_080658_0000_GRE.TIF"
+    (reference,) = Sequoia().bands(path, read_tags(path), probe(path))
+    tags = band_tags(path, reference, OutputGrid(0, 0, *SIZE, undistorted=True), lambda x, y: (x, y))
+    out = tmp_path / "out_GRE.TIF"
+    tifffile.imwrite(out, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
+    add_directories(out, tags.first, tags.exif, tags.gps)
+    (found,) = Sequoia().bands(out, read_tags(out), probe(out))
+    assert found.lens is not None
+    assert reference.lens is not None
+    assert not any(found.lens.distortion)
+    assert found.lens.fx_px == pytest.approx(reference.lens.fx_px, rel=1e-6)
+    assert found.lens.cx_px == pytest.approx(reference.lens.cx_px, abs=1e-3)
+
+
+def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
+    values = {("Camera", "PrincipalPoint"): ("2.4", "1.8"), ("Camera", "PerspectiveFocalLength"): ("1451.8",)}
+    path = tmp_path / "IMG_0001_2.tif"
+    tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
+    exif = {37386: rational(5.45)}
+    add_directories(path, {271: text("MicaSense"), 700: byte_string(packet(values, "elements"))}, exif, {})
+    (before,) = MicaSense().bands(path, read_tags(path), probe(path))
+    tags = band_tags(path, before, OutputGrid(40, 30, 200, 150, scale_xy=(2.0, 2.0)), lambda x, y: (x, y))
+    out = tmp_path / "IMG_0002_2.tif"
+    tifffile.imwrite(out, np.zeros((150, 200), np.uint16), photometric="minisblack", metadata=None)
+    add_directories(out, tags.first, tags.exif, tags.gps)
+    (after,) = MicaSense().bands(out, read_tags(out), probe(out))
+    assert before.lens is not None
+    assert after.lens is not None
+    assert after.lens.fx_px == pytest.approx(2 * before.lens.fx_px)
+    assert after.lens.cx_px == pytest.approx(2 * (before.lens.cx_px + 0.5) - 0.5 - 40, abs=1e-3)
+
+
+@pytest.mark.parametrize("centre", [("1e30", "1e30"), ("nan", "0"), ("99999", "99999")])
+def test_a_centre_of_vignetting_that_lies_nowhere_is_left_out(tmp_path: Path, centre: tuple[str, str]) -> None:
+    values = {("Camera", "VignettingCenter"): centre, ("Camera", "VignettingPolynomial"): ("1e-4",)}
+    path = tmp_path / "IMG_0001_2.tif"
+    tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
+    add_directories(path, {271: text("MicaSense"), 700: byte_string(packet(values, "elements"))}, {}, {})
+    band = Band("Green", path, 1, *SIZE, "uint16")
+    tags = band_tags(path, band, OutputGrid(0, 0, *SIZE), lambda x, y: (math.nan, math.nan))
+    assert b"VignettingCenter" not in tags.first[XMP].data or centre[0] == "nan"

@@ -1,0 +1,151 @@
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.errors import InputError
+from agalign.synthetic import flight as synthetic
+
+
+def write(path: Path, seed: int = 0, bands: int = 1) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(seed)
+    shape = (64, 80) if bands == 1 else (bands, 64, 80)
+    planar = None if bands == 1 else "separate"
+    pixels = rng.integers(1, 4000, shape, dtype=np.uint16)
+    tifffile.imwrite(path, pixels, photometric="minisblack", planarconfig=planar)
+
+
+def labels(folder: Path, **options: object) -> list[str]:
+    return [c.label for c in discover(folder, DiscoverOptions(**options)).captures]  # type: ignore[arg-type]
+
+
+def test_a_micasense_flight(flight: Path) -> None:
+    found = discover(flight)
+    assert [c.label for c in found.captures] == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
+    assert found.problems == ()
+    first = found.captures[0]
+    assert [b.name for b in first.bands] == ["Blue", "Green", "Red", "NIR", "Red edge"]
+    assert first.reference.name == "Green"
+    assert first.capture_id == "synthetic00000000001"
+    assert all(b.lens is not None and b.to_rig is not None for b in first.bands)
+
+
+def test_ignoring_metadata_keeps_the_captures_but_not_the_lenses(flight: Path) -> None:
+    found = discover(flight, DiscoverOptions(ignore_metadata=True))
+    assert len(found.captures) == 2
+    assert all(b.lens is None and b.to_rig is None for c in found.captures for b in c.bands)
+
+
+def test_names_that_repeat_in_sub_folders_are_different_captures(flight: Path, tmp_path: Path) -> None:
+    for name in ("0000SET", "0001SET mit Größe"):
+        shutil.copytree(flight / "0000SET" / "000", tmp_path / name / "000")
+    found = discover(tmp_path)
+    assert len(found.captures) == 4
+    assert len({c.label for c in found.captures}) == 4
+    assert all(len(c.bands) == 5 for c in found.captures)
+
+
+def test_missing_bands_and_unreadable_files_are_told(flight: Path, tmp_path: Path) -> None:
+    shutil.copytree(flight, tmp_path / "f")
+    images = tmp_path / "f" / "0000SET" / "000"
+    (images / "IMG_0002_3.tif").unlink()
+    (images / "IMG_0002_5.tif").write_bytes(b"II*\0 cut short")
+    found = discover(tmp_path)
+    assert found.captures[0].missing_bands == ()
+    assert set(found.captures[1].missing_bands) == {"Red", "Red edge"}
+    assert [p.path.name for p in found.problems] == ["IMG_0002_5.tif"]
+    assert "IMG_0002_5.tif" in found.problems[0].text
+
+
+def test_one_file_a_band(tmp_path: Path) -> None:
+    for name in ("north_red", "north_nir", "north_green", "south_red", "south_nir"):
+        write(tmp_path / f"{name}.tif")
+    found = discover(tmp_path)
+    assert [(c.name, c.reference.name, len(c.bands)) for c in found.captures] == [
+        ("north", "green", 3),
+        ("south", "nir", 2),
+    ]
+
+
+def test_bands_alone_in_their_folder_are_named_by_it(tmp_path: Path) -> None:
+    for name in ("red", "nir"):
+        write(tmp_path / "plot 7" / f"{name}.tif")
+    (capture,) = discover(tmp_path).captures
+    assert capture.label == "plot 7/plot 7"
+
+
+def test_a_multiband_file_is_a_capture(tmp_path: Path) -> None:
+    write(tmp_path / "stack.tif", bands=4)
+    (capture,) = discover(tmp_path).captures
+    assert capture.name == "stack"
+    assert [(b.name, b.band_index) for b in capture.bands] == [(f"band_{i}", i) for i in range(1, 5)]
+
+
+def test_pattern(tmp_path: Path) -> None:
+    for name in ("A-of-7", "B-of-7", "A-of-8", "B-of-8"):
+        write(tmp_path / f"{name}.tif")
+    assert labels(tmp_path, pattern="{band}-of-{capture}.tif") == ["7", "8"]
+
+
+def test_a_band_without_companions_is_a_problem_not_a_capture(tmp_path: Path) -> None:
+    write(tmp_path / "lonely_red.tif")
+    found = discover(tmp_path)
+    assert found.captures == ()
+    assert "lonely_red.tif" in found.problems[0].text
+    assert "--pattern" in found.problems[0].text
+
+
+def test_two_captures_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
+    write(tmp_path / "field.tif", bands=3)
+    for name in ("field_red", "field_nir"):
+        write(tmp_path / f"{name}.tif")
+    assert labels(tmp_path) == ["field", "field-2"]
+
+
+def test_reference_by_name(flight: Path) -> None:
+    assert discover(flight, DiscoverOptions(reference="nir")).captures[0].reference.name == "NIR"
+    found = discover(flight, DiscoverOptions(reference="swir"))
+    assert found.captures == ()
+    assert "swir" in found.problems[0].text
+
+
+def test_output_folders_are_not_looked_into(flight: Path, tmp_path: Path) -> None:
+    shutil.copytree(flight, tmp_path / "f")
+    write(tmp_path / "f" / "out" / "x.tif", bands=2)
+    assert "out/x" in labels(tmp_path / "f")
+    assert "out/x" not in labels(tmp_path / "f", skip=(tmp_path / "f" / "out",))
+    for name in ("summary.csv", "index.html"):
+        (tmp_path / "f" / "out" / name).touch()
+    assert "out/x" not in labels(tmp_path / "f")
+
+
+def test_bands_sort_by_number(tmp_path: Path) -> None:
+    for k in (1, 2, 10):
+        write(tmp_path / f"IMG_0001_{k}.tif")
+    (capture,) = discover(tmp_path).captures
+    assert [b.path.name for b in capture.bands] == ["IMG_0001_1.tif", "IMG_0001_2.tif", "IMG_0001_10.tif"]
+    assert capture.name == "IMG_0001"
+
+
+def test_where_there_is_nothing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no \.tif"):
+        discover(tmp_path)
+    with pytest.raises(InputError, match="does not exist"):
+        discover(tmp_path / "nowhere")
+    write(tmp_path / "a.tif")
+    with pytest.raises(InputError, match="is a file"):
+        discover(tmp_path / "a.tif")
+
+
+def test_a_panel_of_another_flight_is_a_capture_of_its_own(flight: Path, tmp_path: Path) -> None:
+    shutil.copytree(flight, tmp_path / "f")
+    synthetic.make_flight(tmp_path / "other", captures=1, size_px=(480, 360), rng_seed=9)
+    for path in (tmp_path / "other" / "0000SET" / "000").iterdir():
+        shutil.copy(path, tmp_path / "f" / "0000SET" / "000" / path.name.replace("IMG_0001", "IMG_0000"))
+    # Same CaptureId as IMG_0001 in this folder: real cameras never repeat one, so files are told apart by name.
+    found = discover(tmp_path / "f")
+    assert sum(len(c.bands) for c in found.captures) == 15

@@ -1,0 +1,88 @@
+from pathlib import Path
+
+import pytest
+
+from agalign.cameras.metadata import Tags, rational, read_tags
+from agalign.cameras.xmp import Packet
+from agalign.errors import UnreadableFileError
+
+ENVELOPE = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">
+<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"
+ xmlns:Camera="{camera}" xmlns:other="http://example.org/other/">{body}</rdf:RDF></x:xmpmeta><?xpacket end="w"?>"""
+
+
+def packet(body: str, camera: str = "http://pix4d.com/camera/1.0") -> bytes:
+    return ENVELOPE.format(body=body, camera=camera).encode()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '<rdf:Description Camera:PrincipalPoint="2.4,1.8"/>',
+        "<rdf:Description><Camera:PrincipalPoint>2.4, 1.8</Camera:PrincipalPoint></rdf:Description>",
+        "<rdf:Description><Camera:PrincipalPoint><rdf:Seq><rdf:li>+2.4</rdf:li><rdf:li>1.8</rdf:li></rdf:Seq>"
+        "</Camera:PrincipalPoint></rdf:Description>",
+        "<rdf:Description><Camera:PrincipalPoint><rdf:Bag><rdf:li>2.4</rdf:li><rdf:li>1.80</rdf:li></rdf:Bag>"
+        "</Camera:PrincipalPoint></rdf:Description>",
+        '<rdf:Description Camera:BandName="NIR"/><rdf:Description Camera:PrincipalPoint="2.4,1.8"/>',
+    ],
+)
+def test_a_value_may_be_attribute_element_sequence_or_bag(body: str) -> None:
+    assert Tags(xmp=Packet.parse(packet(body)).values()).numbers("Camera", "PrincipalPoint") == (2.4, 1.8)
+
+
+@pytest.mark.parametrize("uri", ["http://pix4d.com/camera/1.0/", "http://pix4d.com/1.0", "http://pix4d.com/camera/1.0"])
+def test_namespaces_are_compared_without_their_slash(uri: str) -> None:
+    assert Packet.parse(packet('<rdf:Description Camera:BandName="Red"/>', uri)).values() == {
+        ("Camera", "BandName"): ("Red",)
+    }
+
+
+def test_the_same_name_in_another_namespace_is_another_tag() -> None:
+    assert Packet.parse(packet('<rdf:Description other:Yaw="1"/>')).values() == {}
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        b"", b"\0\0\0", b"<x:xmpmeta", packet("<rdf:Description>"), b"not xml at all",
+        packet('<rdf:Description Camera:BandName=""/>'), "<x:xmpmeta></x:xmpmeta>",
+    ],
+)  # fmt: skip
+def test_malformed_or_empty_xmp_is_no_xmp(bad: bytes) -> None:
+    assert Packet.parse(bad).values() == {}
+
+
+def test_an_xml_bomb_is_refused() -> None:
+    bomb = b'<x:xmpmeta xmlns:x="a"><!DOCTYPE l [<!ENTITY a "b"><!ENTITY c "&a;&a;">]>&c;</x:xmpmeta>'
+    assert Packet.parse(bomb).values() == {}
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"), [((1, 4), 0.25), (3, 3.0), ((1, 0), None), (None, None), ("x", None), (float("inf"), None)]
+)
+def test_rational(value: object, expected: float | None) -> None:
+    assert rational(value) == expected
+
+
+@pytest.mark.parametrize(("unit", "density"), [(4, 266.0), (3, 26.6), (2, 266 / 25.4), (5, 266_000.0), (9, None)])
+def test_pixel_density_by_unit(unit: int, density: float | None) -> None:
+    tags = Tags(exif={"FocalPlaneXResolution": (266, 1), "FocalPlaneResolutionUnit": unit})
+    assert tags.pixels_per_mm == (None if density is None else pytest.approx(density))
+
+
+def test_reading_a_file(flight: Path) -> None:
+    tags = read_tags(flight / "0000SET" / "000" / "IMG_0002_4.tif")
+    assert (tags.make, tags.model, tags.serial) == ("MicaSense", "RedEdge-M", "SY01-0000001-AG")
+    assert tags.captured_at == "2026-06-21T10:00:02.000000"
+    assert tags.text("Camera", "BandName") == "NIR"
+    assert tags.numbers("Camera", "RigRelatives") == (0.55, -0.16, 0.21)
+    assert tags.pixels_per_mm == pytest.approx(266.666667 * 480 / 1280, rel=1e-6)
+
+
+@pytest.mark.parametrize("content", [b"", b"II*\0", b"hello", b"II*\0\x08\0\0\0\xff\xff"])
+def test_what_is_no_tiff_is_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "broken.tif"
+    path.write_bytes(content)
+    with pytest.raises(UnreadableFileError, match=r"broken\.tif"):
+        read_tags(path)

@@ -1,0 +1,346 @@
+"""Every vendor's naming and tags, in every dialect of XMP, whole and damaged."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from agalign.cameras import rig_seed
+from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.cameras.dji import Dji
+from agalign.cameras.metadata import Tags, read_tags
+from agalign.cameras.parrot import Sequoia
+from agalign.cameras.tiff_directory import Entry, add_directories, byte_string, rational, short, text
+from agalign.pixels.raster import probe
+from agalign.values import geometry, lens
+from agalign.values.capture import Band, Capture
+
+URIS = {
+    "Camera": "http://pix4d.com/camera/1.0/", "MicaSense": "http://micasense.com/MicaSense/1.0/",
+    "drone-dji": "http://www.dji.com/drone-dji/1.0/", "Sentera": "https://www.sentera.com/schemas/",
+}  # fmt: skip
+SIZE = 160, 120
+
+Values = Mapping[tuple[str, str], Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Vendor:
+    """Files of one capture: name below the folder, band, and its XMP values."""
+
+    make: str
+    model: str
+    files: Mapping[str, tuple[str, float, Values]]
+    names_without_xmp: frozenset[str]
+    orientation: int = 1
+    has_rig: bool = True
+
+
+def pinhole(k: int) -> Values:
+    return {
+        ("Camera", "PrincipalPoint"): (f"{2.4 + 0.01 * k}", "1.8"), ("Camera", "PerspectiveFocalLength"): ("5.45",),
+        ("Camera", "PerspectiveFocalLengthUnits"): ("mm",), ("Camera", "RigRelatives"): (f"{0.1 * k}", "0", "0.05"),
+        ("Camera", "PerspectiveDistortion"): ("-0.1", "0.1", "0", "0", "0"),
+    }  # fmt: skip
+
+
+MICASENSE_BANDS = {"Blue": 475, "Green": 560, "Red": 668, "NIR": 840, "Red edge": 717}
+DJI_BANDS = {"Blue": 450, "Green": 560, "Red": 650, "RedEdge": 730, "NIR": 840}
+SEQUOIA_BANDS = {"GRE": ("Green", 550), "RED": ("Red", 660), "REG": ("Red edge", 735), "NIR": ("NIR", 790)}
+MAVIC_BANDS = {"G": ("Green", 560), "R": ("Red", 650), "RE": ("RedEdge", 730), "NIR": ("NIR", 860)}
+
+VENDORS = {
+    "RedEdge": Vendor("MicaSense", "RedEdge-M", {
+        f"IMG_0007_{k}.tif": (band, nm, {("MicaSense", "CaptureId"): ("abc",), **pinhole(k)})
+        for k, (band, nm) in enumerate(MICASENSE_BANDS.items(), start=1)
+    }, frozenset(f"band_{k}" for k in range(1, 6))),
+    "Phantom 4": Vendor("DJI", "FC6360", {
+        f"DJI_001{k}.TIF": (band, nm, {
+            ("drone-dji", "CaptureUUID"): ("abc",), ("drone-dji", "RelativeOpticalCenterX"): (f"+{k}.5",),
+            ("drone-dji", "RelativeOpticalCenterY"): (f"-{k}.25",),
+        }) for k, (band, nm) in enumerate(DJI_BANDS.items(), start=1)
+    }, frozenset(DJI_BANDS)),
+    "Mavic 3": Vendor("DJI", "M3M", {
+        f"DJI_20230607112233_0001_MS_{k}.TIF": (band, nm, {
+            ("drone-dji", "CaptureUUID"): ("abc",), ("drone-dji", "CalibratedOpticalCenterX"): ("80",),
+            ("drone-dji", "CalibratedOpticalCenterY"): ("60",),
+            ("drone-dji", "CalibratedHMatrix"): (f"1,0,{n}.5,0,1,-2,0,0,1",),
+            ("drone-dji", "DewarpData"): ("2022-09-08;170,170,1.5,-2.5,-0.1,0.05,0,0,0",),
+        }) for n, (k, (band, nm)) in enumerate(MAVIC_BANDS.items())
+    }, frozenset(band for band, _ in MAVIC_BANDS.values())),
+    "Sequoia": Vendor("Parrot", "Sequoia", {
+        f"IMG_180413_080658_0000_{k}.TIF": (band, nm, {
+            ("Camera", "CaptureUUID"): ("abc",), ("Camera", "ModelType"): ("fisheye",),
+            ("Camera", "PrincipalPoint"): ("0.3", "0.22"), ("Camera", "FisheyeAffineMatrix"): ("207", "0", "0", "207"),
+            ("Camera", "FisheyePolynomial"): ("0", "1", "0.0096", "-0.1455"),
+            ("Camera", "RigRelatives"): ("-0.17", f"{0.1 * len(band)}", "0"),
+        }) for k, (band, nm) in SEQUOIA_BANDS.items()
+    }, frozenset(band for band, _ in SEQUOIA_BANDS.values()), orientation=3),
+    "6X": Vendor("Sentera", "6X", {
+        f"{k}-{band}-{nm}-30/IMG_00012_{nm}_30.tif": (band, nm, {
+            ("Camera", "CaptureUUID"): ("abc",),
+            ("Sentera", "AlignMatrix"): ("1", "0.001", f"{k}", "-0.001", "1", "5", "0", "0", "1"),
+        }) for k, (band, nm) in enumerate({"Blue": 475, "Green": 550, "Red": 670, "RedEdge": 715, "NIR": 840}.items())
+    }, frozenset({"Blue", "Green", "Red", "RedEdge", "NIR"})),
+}  # fmt: skip
+
+
+def packet(values: Values, dialect: str) -> bytes:
+    """An XMP packet with values as attributes, as elements of text, or as sequences."""
+    attributes, elements = "", ""
+    for (namespace, name), items in values.items():
+        if dialect == "attributes":
+            attributes += f' {namespace}:{name}="{",".join(items)}"'
+        elif dialect == "elements":
+            elements += f"<{namespace}:{name}>{', '.join(items)}</{namespace}:{name}>\n"
+        else:
+            listed = "".join(f"<rdf:li>{item}</rdf:li>" for item in items)
+            elements += f"<{namespace}:{name}><rdf:Seq>{listed}</rdf:Seq></{namespace}:{name}>\n"
+    declared = " ".join(f'xmlns:{k}="{v}"' for k, v in URIS.items())
+    return (
+        '<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<rdf:Description rdf:about="" {declared}{attributes}>{elements}</rdf:Description></rdf:RDF></x:xmpmeta>'
+        '<?xpacket end="w"?>'
+    ).encode()
+
+
+def write_capture(folder: Path, vendor: Vendor, dialect: str = "attributes", damage: str = "") -> None:
+    for name, (band, nm, values) in vendor.files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tifffile.imwrite(path, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
+        spectral = {("Camera", "BandName"): (band,), ("Camera", "CentralWavelength"): (f"{nm}",)}
+        xmp = packet({**spectral, **values}, dialect)
+        if damage == "empty":
+            xmp = packet(dict.fromkeys({**spectral, **values}, ("",)), dialect)
+        elif damage == "malformed":
+            xmp = xmp[: len(xmp) // 2]
+        elif damage == "no numbers":
+            keep = {("Camera", "BandName"), ("MicaSense", "CaptureId"), ("drone-dji", "CaptureUUID"),
+                    ("Camera", "CaptureUUID")}  # fmt: skip
+            xmp = packet({k: v if k in keep else ("-inf;nan",) for k, v in {**spectral, **values}.items()}, dialect)
+        first = {271: text(vendor.make), 272: text(vendor.model), 274: short(vendor.orientation)}
+        if damage != "missing":
+            first[700] = byte_string(xmp)
+        exif: dict[int, Entry] = {0xA20E: rational(266.67), 0xA20F: rational(266.67), 0xA210: short(4)}
+        add_directories(path, first, exif, {})
+
+
+def only_capture(folder: Path, options: DiscoverOptions | None = None) -> Capture:
+    found = discover(folder, options)
+    assert not found.problems
+    (capture,) = found.captures
+    return capture
+
+
+@pytest.mark.parametrize("dialect", ["attributes", "elements", "sequences"])
+@pytest.mark.parametrize("name", VENDORS)
+def test_a_capture_is_grouped_named_and_seeded(tmp_path: Path, name: str, dialect: str) -> None:
+    vendor = VENDORS[name]
+    write_capture(tmp_path, vendor, dialect)
+    capture = only_capture(tmp_path)
+    assert {b.name: b.wavelength_nm for b in capture.bands} == {band: nm for band, nm, _ in vendor.files.values()}
+    assert capture.reference.name == "Green"
+    assert capture.capture_id == "abc"
+    for band in capture.moving:
+        seed = rig_seed(capture.reference, band)
+        assert seed is not None
+        # A rig's bands lie some pixels apart, not some images.
+        assert 0.01 < geometry.corner_error_px(seed, geometry.identity(), *SIZE) < 30
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "malformed", "no numbers"])
+@pytest.mark.parametrize("name", VENDORS)
+def test_damaged_tags_leave_the_names_of_the_files(tmp_path: Path, name: str, damage: str) -> None:
+    vendor = VENDORS[name]
+    write_capture(tmp_path, vendor, damage=damage)
+    capture = only_capture(tmp_path)
+    found = {b.name for b in capture.bands}
+    assert found == (
+        {band for band, _, _ in vendor.files.values()} if damage == "no numbers" else set(vendor.names_without_xmp)
+    )
+    assert all(b.lens is None or np.isfinite(b.lens.matrix).all() for b in capture.bands)
+
+
+def test_one_file_with_damaged_tags_finds_its_capture(tmp_path: Path) -> None:
+    for name in ("RedEdge", "Phantom 4", "Sequoia"):
+        folder = tmp_path / name
+        write_capture(folder, VENDORS[name])
+        stray = sorted(folder.iterdir())[-1]
+        stray.unlink()
+        tifffile.imwrite(stray, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
+        add_directories(stray, {271: text(VENDORS[name].make)}, {}, {})
+        assert len(only_capture(folder).bands) == len(VENDORS[name].files)
+
+
+def test_names_of_captures(tmp_path: Path) -> None:
+    expected = {
+        "RedEdge": "IMG_0007", "Phantom 4": "DJI_001", "Mavic 3": "DJI_20230607112233_0001",
+        "Sequoia": "IMG_180413_080658_0000", "6X": "IMG_00012",
+    }  # fmt: skip
+    for name, label in expected.items():
+        write_capture(tmp_path / name, VENDORS[name])
+        assert only_capture(tmp_path / name).label == label
+
+
+def test_phantom_4_shifts_by_its_optical_centres(tmp_path: Path) -> None:
+    write_capture(tmp_path, VENDORS["Phantom 4"])
+    bands = {b.name: b for b in only_capture(tmp_path).bands}
+    np.testing.assert_allclose(rig_seed(bands["Green"], bands["NIR"]), geometry.translation(3, -3), atol=1e-12)
+
+
+def test_mavic_3_goes_through_the_common_plane(tmp_path: Path) -> None:
+    write_capture(tmp_path, VENDORS["Mavic 3"])
+    bands = {b.name: b for b in only_capture(tmp_path).bands}
+    np.testing.assert_allclose(rig_seed(bands["Green"], bands["NIR"]), geometry.translation(-3, 0), atol=1e-9)
+    found = bands["NIR"].lens
+    assert found is not None
+    assert (found.fx_px, found.cx_px, found.cy_px, found.distortion[0]) == (170, 81.5, 57.5, -0.1)
+
+
+def test_sequoia_fisheye_is_the_vendors_formula(tmp_path: Path) -> None:
+    write_capture(tmp_path, VENDORS["Sequoia"])
+    (path,) = tmp_path.glob("*_RED.TIF")
+    upright = Tags(**{**vars(read_tags(path)), "orientation": 1})
+    (band,) = Sequoia().bands(path, upright, probe(path))
+    assert band.lens is not None
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-0.5, 0.5, (2, 200))
+    theta = 2 / np.pi * np.arctan(np.hypot(x, y))
+    rho = theta + 0.0096 * theta**2 - 0.1455 * theta**3
+    expected = 207 * rho * np.stack([x, y]) / np.hypot(x, y) + [[0.3 * 266.67], [0.22 * 266.67]]
+    pinhole_px = np.stack([x * band.lens.fx_px + band.lens.cx_px, y * band.lens.fy_px + band.lens.cy_px], axis=1)
+    assert band.lens.fx_px == pytest.approx(2 * 207 / np.pi)
+    np.testing.assert_allclose(lens.distort(band.lens, pinhole_px), expected.T, atol=0.01)
+    np.testing.assert_allclose(lens.undistort(band.lens, expected.T), pinhole_px, atol=0.02)
+
+
+def test_orientation_3_turns_lens_and_rig(tmp_path: Path) -> None:
+    write_capture(tmp_path, VENDORS["Sequoia"])
+    seeds = {}
+    for orientation in (1, 3):
+        bands: dict[str, Band] = {}
+        for path in tmp_path.glob("*.TIF"):
+            tags = Tags(**{**vars(read_tags(path)), "orientation": orientation})
+            (band,) = Sequoia().bands(path, tags, probe(path))
+            bands[band.name] = band
+        seeds[orientation] = rig_seed(bands["Green"], bands["NIR"])
+    # A point p of the upright image is stored at size - p.
+    turn = np.array([[-1.0, 0, SIZE[0]], [0, -1, SIZE[1]], [0, 0, 1]])
+    assert geometry.corner_error_px(seeds[3], geometry.compose(turn, seeds[1], turn), *SIZE) < 1e-6
+    assert geometry.corner_error_px(seeds[3], seeds[1], *SIZE) > 0.3
+
+
+def test_mapir_groups_by_what_follows_the_serial(tmp_path: Path) -> None:
+    for serial, nm in (("A1", 450), ("B2", 550), ("C3", 850)):
+        path = tmp_path / f"capture_{serial}_0001_20260101_101010_123.tiff"
+        tifffile.imwrite(path, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
+        add_directories(path, {272: text(f"LATT-M3M-L41-F{nm}")}, {}, {})
+    capture = only_capture(tmp_path)
+    assert {b.name: b.wavelength_nm for b in capture.bands} == {"Blue": 450, "Green": 550, "NIR": 850}
+    assert capture.name == "capture_0001_20260101_101010_123"
+
+
+def photograph(path: Path, make: str, values: Values | None = None) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[271] = make
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(cv2.GaussianBlur(pixels, (0, 0), 2)).save(path, exif=exif, xmp=packet(values or {}, "attributes"))
+
+
+def test_the_colour_photograph_takes_part_where_asked(tmp_path: Path) -> None:
+    write_capture(tmp_path, VENDORS["Phantom 4"])
+    photograph(tmp_path / "DJI_0010.JPG", "DJI", {
+        ("drone-dji", "CaptureUUID"): ("abc",), ("drone-dji", "RelativeOpticalCenterX"): ("4",),
+        ("drone-dji", "RelativeOpticalCenterY"): ("6",),
+    })  # fmt: skip
+    assert len(only_capture(tmp_path).bands) == 5
+    capture = only_capture(tmp_path, DiscoverOptions(with_rgb=True))
+    assert [b.name for b in capture.bands[5:]] == ["RGB Red", "RGB Green", "RGB Blue"]
+    assert capture.reference.name == "Green"
+    np.testing.assert_allclose(
+        rig_seed(capture.reference, capture.bands[5]), geometry.translation(1.5, 8.25), atol=1e-12
+    )
+
+
+def test_double_4k_is_a_capture_of_two_photographs(tmp_path: Path) -> None:
+    for folder in ("RGB", "NDRE"):
+        photograph(tmp_path / folder / "IMG_00042.jpg", "Sentera")
+    capture = only_capture(tmp_path)
+    assert [b.name for b in capture.bands] == ["Red edge", "NIR", "RGB Red", "RGB Green", "RGB Blue"]
+    assert [b.band_index for b in capture.bands] == [1, 3, 1, 2, 3]
+
+
+def test_three_bands_of_one_lens_are_no_capture(tmp_path: Path) -> None:
+    path = tmp_path / "survey.tif"
+    tifffile.imwrite(path, np.zeros((120, 160, 3), np.uint8), photometric="rgb", metadata=None)
+    add_directories(path, {271: text("MAPIR"), 272: text("Survey3W_RGN")}, {}, {})
+    found = discover(tmp_path)
+    assert not found.captures
+    assert "one lens" in found.problems[0].text
+
+
+def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
+    values = {
+        "SensorGain": "2", "ExposureTime": "1000", "BlackLevel": "4096", "Irradiance": "5000",
+        "SensorGainAdjustment": "0.9", "CalibratedOpticalCenterX": "80", "CalibratedOpticalCenterY": "60",
+        "VignettingData": "1e-4,0,0,0,0,0",
+    }  # fmt: skip
+    tags = Tags(make="DJI", xmp={("drone-dji", k): (v,) for k, v in values.items()})
+    write_capture(tmp_path, VENDORS["Phantom 4"])
+    path = tmp_path / "DJI_0012.TIF"
+    (band,) = Dji().bands(path, tags, probe(path))
+    assert band.radiometry is not None
+    assert band.radiometry.gain == pytest.approx(0.9 / (2 * 1e-3) / 5000)
+    assert not band.radiometry.vignetting_divides
+
+
+def test_one_damaged_file_makes_no_band_that_others_lack(tmp_path: Path) -> None:
+    for number in range(3):
+        folder = tmp_path / f"{number:03d}"
+        write_capture(folder, VENDORS["RedEdge"])
+    stray = tmp_path / "001" / "IMG_0007_3.tif"
+    stray.unlink()
+    tifffile.imwrite(stray, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
+    add_directories(stray, {271: text("MicaSense"), 272: text("RedEdge-M")}, {}, {})
+    missing = {c.folder.name: c.missing_bands for c in discover(tmp_path).captures}
+    assert missing == {"000": (), "001": ("Red",), "002": ()}
+
+
+def test_a_stack_with_a_vendors_make_is_a_stack(tmp_path: Path) -> None:
+    for make in ("MicaSense", "DJI", "Parrot", "Sentera", "MAPIR"):
+        path = tmp_path / f"{make}.tif"
+        pixels = np.zeros((5, 120, 160), np.uint16)
+        tifffile.imwrite(path, pixels, photometric="minisblack", planarconfig="separate", metadata=None)
+        add_directories(path, {271: text(make)}, {}, {})
+    found = discover(tmp_path)
+    assert not found.problems
+    assert [len(c.bands) for c in found.captures] == [5] * 5
+
+
+@pytest.mark.parametrize("folder", ["NDVI 2024", "NDVI"])
+def test_a_flat_folder_named_like_a_band(tmp_path: Path, folder: str) -> None:
+    for k, nm in enumerate((475, 550, 840)):
+        path = tmp_path / folder / f"IMG_0001_{nm}_30.tif"
+        path.parent.mkdir(exist_ok=True)
+        tifffile.imwrite(path, np.zeros((120, 160), np.uint16), photometric="minisblack", metadata=None)
+        name = ("Blue", "Green", "NIR")[k]
+        xmp = packet({("Camera", "BandName"): (name,)}, "attributes")
+        add_directories(path, {271: text("Sentera"), 700: byte_string(xmp)}, {}, {})
+    (capture,) = discover(tmp_path / folder).captures
+    assert {b.name for b in capture.bands} == {"Blue", "Green", "NIR"}
+    assert capture.label == "IMG_0001"
+
+
+def test_black_levels_may_be_fractions(tmp_path: Path) -> None:
+    path = tmp_path / "x.tif"
+    tifffile.imwrite(path, np.zeros((120, 160), np.uint16), photometric="minisblack", metadata=None)
+    add_directories(path, {50714: rational(4800, 4801, 4799, 4800)}, {}, {})
+    assert read_tags(path).black_level == pytest.approx(4800)

@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+
+from agalign.capture.band_pair import BandPair, Candidates
+from agalign.capture.seeding import best_seed
+from agalign.capture.tag_seeds import geo_seed
+from agalign.config import SeedSettings, Settings
+from agalign.errors import GeometryError
+from agalign.values import geometry
+from agalign.values.alignment import Seed
+from agalign.values.capture import Band, Georeference
+from agalign.values.image import Raster
+
+from ..conftest import mean_error_px, textured_image, textured_pair
+
+SHIFTED = np.array([[1.01, 0.01, 31.0], [-0.01, 1.0, -18.0], [0, 0, 1.0]])
+
+
+def rasters(matrix: np.ndarray, seed: int = 0) -> tuple[Raster, Raster]:
+    fixed, moving = textured_pair(matrix, seed=seed)
+    valid = np.ones(fixed.shape, bool)
+    return Raster(fixed, valid), Raster(moving, valid)
+
+
+def best(images: tuple[Raster, Raster], candidates: Candidates, seeds: SeedSettings | None = None) -> Seed:
+    settings = Settings(seed=seeds or SeedSettings())
+    return best_seed(BandPair.of_images("moving", *images, candidates, settings), candidates)
+
+
+def test_structure_finds_a_shift_that_nothing_told() -> None:
+    seed = best(rasters(SHIFTED), {"identity": np.eye(3)})
+    assert seed.kind == "structure"
+    assert seed.trusted
+    assert mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 3
+
+
+def test_the_true_rig_wins_over_a_wrong_one_and_is_kept_as_it_is() -> None:
+    wrong = geometry.translation(-40, 25)
+    seed = best(rasters(SHIFTED), {"rig": SHIFTED, "geo": wrong, "identity": np.eye(3)})
+    assert seed.kind == "rig"
+    np.testing.assert_array_equal(seed.fixed_to_moving, SHIFTED)
+
+
+def test_an_aligned_input_keeps_its_identity() -> None:
+    rig = geometry.translation(12, 3)
+    seed = best(rasters(np.eye(3)), {"rig": rig, "identity": np.eye(3)})
+    np.testing.assert_array_equal(seed.fixed_to_moving, np.eye(3))
+
+
+@pytest.mark.parametrize("kind", ["identity", "rig"])
+def test_a_forced_seed_is_used_whatever_its_score(kind: str) -> None:
+    candidates = {"rig": geometry.translation(5, 5), "identity": np.eye(3)}
+    seed = best(rasters(SHIFTED), candidates, SeedSettings(force=kind))
+    assert seed.kind == kind
+    np.testing.assert_array_equal(seed.fixed_to_moving, candidates[kind])
+
+
+def test_unrelated_images_give_no_trusted_seed() -> None:
+    valid = np.ones((320, 400), bool)
+    one, other = (Raster(textured_image(400, 320, s), valid) for s in (5, 6))
+    assert not best((one, other), {"identity": np.eye(3)}).trusted
+
+
+def band(width: int, height: int, georeference: Georeference | None = None) -> Band:
+    from pathlib import Path
+
+    return Band("b", Path("b.tif"), 1, width, height, "uint16", georeference=georeference)
+
+
+def test_geo_seed_maps_the_same_ground_to_the_same_ground() -> None:
+    # 10 cm pixels from corner (500, 900); and 20 cm ones from (501, 899).
+    fine = Georeference(np.array([[0.1, 0, 500], [0, -0.1, 900], [0, 0, 1.0]]), "crs")
+    coarse = Georeference(np.array([[0.2, 0, 501], [0, -0.2, 899], [0, 0, 1.0]]), "crs")
+    seed = geo_seed(band(100, 100, fine), band(50, 50, coarse))
+    assert seed is not None
+    # Pixel (20, 20) of the fine one has its centre at x = 502.05: (502.05 - 501) / 0.2 - 0.5 = 4.75.
+    np.testing.assert_allclose(geometry.apply(seed, [20, 20]), [4.75, 4.75])
+    far = np.array([[1, 0, 499_500], [0, 1, 5_799_100], [0, 0, 1.0]])  # where UTM coordinates are
+    moved = [Georeference(far @ g.transform, "crs") for g in (fine, coarse)]
+    seed = geo_seed(band(100, 100, moved[0]), band(50, 50, moved[1]))
+    assert seed is not None
+    np.testing.assert_allclose(geometry.apply(seed, [20, 20]), [4.75, 4.75], atol=1e-6)
+    other = Georeference(coarse.transform, "no crs at all")
+    with pytest.raises(GeometryError, match="cannot be transformed"):
+        geo_seed(band(100, 100, fine), band(50, 50, other))
+
+
+def test_the_flights_mapping_is_enough_where_it_leaves_no_doubt() -> None:
+    near = geometry.compose(SHIFTED, geometry.translation(0.3, 0.1))
+    seed = best(rasters(SHIFTED), {"model": near, "identity": np.eye(3)})
+    assert seed.kind in ("model", "structure")
+    assert mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 1
+    lost = best(rasters(SHIFTED), {"model": geometry.translation(300, 0), "rig": SHIFTED})
+    assert mean_error_px(lost.fixed_to_moving, SHIFTED, 400, 320) < 1

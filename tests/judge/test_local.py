@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+
+from agalign.capture.reference import Reference
+from agalign.config import LocalSettings, Settings
+from agalign.judge.local import Shifts, _is_one_to_one, fitted_field
+from agalign.values import geometry
+from agalign.values.alignment import LocalField
+from agalign.values.image import Raster, Tile
+from agalign.values.mapping import PixelMapping
+
+from ..conftest import textured_pair
+
+SETTINGS = LocalSettings()
+SIZE = 640, 480
+
+
+def bump(points: np.ndarray, height: float = 1.5) -> np.ndarray:
+    """A smooth hill of displacement around (300, 220)."""
+    fall = np.exp(-(((points - (300, 220)) / 90) ** 2).sum(-1))
+    return height * fall[..., None] * np.array([1.0, -0.6])
+
+
+def centres() -> np.ndarray:
+    return np.stack(np.meshgrid(np.arange(32, 640, 32.0), np.arange(32, 480, 32.0)), -1).reshape(-1, 2)
+
+
+def test_a_smooth_field_is_found_through_noise_and_wrong_peaks() -> None:
+    rng = np.random.default_rng(0)
+    at = centres()
+    shifts = bump(at) + 0.08 * rng.normal(size=at.shape)
+    wrong = rng.random(len(at)) < 0.05
+    shifts[wrong] += rng.uniform(-20, 20, (wrong.sum(), 2))
+    field = fitted_field(Shifts(at, shifts, np.ones(len(at))), 1.0, SETTINGS, SIZE)
+    error = np.linalg.norm(field(at) - bump(at), axis=1)
+    assert np.sqrt((error**2).mean()) < 0.08
+    assert np.linalg.norm(bump(at), axis=1).max() > 1.2
+
+
+def test_far_from_all_measurements_the_field_goes_to_nothing() -> None:
+    at = centres()
+    near = at[at[:, 0] < 200]
+    field = fitted_field(
+        Shifts(near, np.tile([2.0, 0.0], (len(near), 1)), np.ones(len(near))), 1.0, SETTINGS, (6400, 480)
+    )
+    assert field(np.array([[100.0, 240.0]]))[0, 0] == pytest.approx(2.0, abs=0.05)
+    assert abs(field(np.array([[6000.0, 240.0]]))[0]).max() < 0.2
+
+
+def test_folding_is_seen() -> None:
+    flat = np.zeros((16, 21, 2))
+    assert _is_one_to_one(LocalField(32.0, flat), SIZE)
+    steep = flat.copy()
+    steep[:, 10, 0] = -60
+    assert not _is_one_to_one(LocalField(32.0, steep), SIZE)
+
+
+def bent_pair(height: float) -> tuple[Raster, Raster]:
+    """A pair whose moving image is displaced by the bump, and that bump as local displacement of the reference."""
+    import cv2
+
+    fixed, moving = textured_pair(geometry.translation(0, 0), *SIZE, seed=4)
+    grid = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1).astype(np.float64)
+    # moving(x + d(x)) shows what fixed(x) does: sample the other way round, to first order twice.
+    back = grid - bump(grid - bump(grid, height), height)
+    bent = cv2.remap(moving, back.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    valid = np.ones(fixed.shape, bool)
+    return Raster(fixed, valid), Raster(bent, valid)
+
+
+def test_displacements_between_bands_are_followed() -> None:
+    fixed, moving = bent_pair(1.5)
+    found = Reference(fixed, Settings()).local.refine(moving, PixelMapping(geometry.identity()))
+    assert found.field is not None
+    at = geometry.lattice(*SIZE, 17, 13)
+    before, after = (np.linalg.norm(d, axis=1) for d in (bump(at), found.field(at) - bump(at)))
+    assert np.percentile(after, 95) < 0.35 * np.percentile(before, 95)
+    assert found.after_p95_px < found.before_p95_px
+
+
+def test_where_a_homography_is_enough_nothing_is_added() -> None:
+    fixed, moving = bent_pair(0.0)
+    found = Reference(fixed, Settings()).local.refine(moving, PixelMapping(geometry.identity()))
+    assert found.field is None or np.abs(found.field(geometry.lattice(*SIZE, 17, 13))).max() < 0.05
+
+
+def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:
+    at = centres()
+    field = fitted_field(Shifts(at, bump(at), np.ones(len(at))), 1.0, SETTINGS, SIZE)
+    mapping = PixelMapping(geometry.translation(5, 3), local=field)
+    points = geometry.lattice(*SIZE, 9, 7)
+    np.testing.assert_allclose(mapping(points), points + field(points) + (5, 3))
+    twice = mapping.rescaled((2.0, 2.0), (1.0, 1.0))
+    np.testing.assert_allclose(twice((points + 0.5) * 2 - 0.5), mapping(points), atol=1e-9)
+    dense = mapping.positions(Tile(200, 150, 200, 150))
+    direct = mapping(np.stack(np.meshgrid(np.arange(200, 400), np.arange(150, 300)), -1).astype(float))
+    np.testing.assert_allclose(dense, direct, atol=0.01)

@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agalign.config import CheckSettings
+from agalign.judge.verdict import doubts_of, is_as_it_was, status_of
+from agalign.values import geometry
+from agalign.values.alignment import Alignment, JointResult, Residual, Seed
+from agalign.values.doubts import Doubt, sentence
+
+SEED = Seed("rig", np.eye(3), 100.0, 100.0, 5.0)
+GOOD_JOINT = JointResult(np.eye(3), 0.1, 0.95, 0.004, 75, (0.5, 1.0), "fast", "homography", 0.05, ((0.07, 0.07),) * 4)
+GOOD_RESIDUAL = Residual(np.zeros((50, 2)), np.zeros((50, 2)), 0.05, 0.2, 1.0)
+HALF_WRONG = np.vstack([np.zeros((20, 2)), np.full((30, 2), 5.0)])
+SIZE = (1280, 960)
+
+
+def kinds(joint: JointResult = GOOD_JOINT, residual: Residual = GOOD_RESIDUAL) -> list[str]:
+    return [d.kind for d in doubts_of(joint, residual, SIZE, CheckSettings())]
+
+
+def test_all_well() -> None:
+    assert kinds() == []
+    assert status_of((), GOOD_RESIDUAL, CheckSettings(), seed=False) == "aligned"
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("joint", "residual", "expected"),
+    [
+        (replace(GOOD_JOINT, retrieval=0.1), GOOD_RESIDUAL, ["retrieval"]),
+        (replace(GOOD_JOINT, corner_std_xy_px=((0.1, 0.1), (3.0, 4.0))), GOOD_RESIDUAL, ["corner_std_px"]),
+        (replace(GOOD_JOINT, fixed_to_moving=np.diag([-1.0, 1, 1])), GOOD_RESIDUAL, ["folds"]),
+        (
+            replace(GOOD_JOINT, fixed_to_moving=np.array([[1, 0, 0], [0, 1, 0], [-7e-4, 0, 1.0]])),
+            GOOD_RESIDUAL,
+            ["folds"],
+        ),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, centres_px=np.zeros((2, 2))), ["few_windows"]),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, coverage=0.4), ["coverage"]),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, median_px=2.5), ["residual_px"]),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, median_px=float("inf")), ["residual_px"]),
+        (GOOD_JOINT, replace(GOOD_RESIDUAL, shifts_px=HALF_WRONG), ["close_windows"]),
+        (replace(GOOD_JOINT, retrieval=NAN), GOOD_RESIDUAL, ["retrieval"]),
+        (replace(GOOD_JOINT, retrieval=0.3, chance=1 / 16), GOOD_RESIDUAL, ["retrieval"]),
+        (replace(GOOD_JOINT, corner_std_xy_px=((NAN, 0.1),) * 4), GOOD_RESIDUAL, ["corner_std_px"]),
+        (replace(GOOD_JOINT, retrieval=0.1), replace(GOOD_RESIDUAL, median_px=2.5), ["retrieval", "residual_px"]),
+    ],
+)
+def test_any_doubt_is_enough_and_each_is_named(joint: JointResult, residual: Residual, expected: list[str]) -> None:
+    assert kinds(joint, residual) == expected
+    doubts = doubts_of(joint, residual, SIZE, CheckSettings())
+    assert status_of(doubts, GOOD_RESIDUAL, CheckSettings(), seed=True) == "seed_only"
+    assert status_of(doubts, GOOD_RESIDUAL, CheckSettings(), seed=False) == "failed"
+    assert all(sentence(d) for d in doubts)
+
+
+def test_a_doubt_has_its_value_and_limit() -> None:
+    (doubt,) = doubts_of(replace(GOOD_JOINT, retrieval=0.1), GOOD_RESIDUAL, SIZE, CheckSettings())
+    assert doubt == Doubt("retrieval", 0.1, 0.2)
+    assert "0.10" in sentence(doubt)
+
+
+def test_a_seed_that_does_not_fit_is_not_used() -> None:
+    doubts = (Doubt("retrieval", 0.1, 0.2),)
+    off = replace(GOOD_RESIDUAL, median_px=9.0)
+    assert status_of(doubts, off, CheckSettings(), seed=True) == "failed"
+    failed = Alignment(np.eye(3), "pixel", "failed", (*doubts, Doubt("seed_does_not_fit")), SEED, None, off, 0.0)
+    assert failed.reason is not None
+    assert "rig seed is used as it is, but it does not fit either" in failed.reason
+
+
+def test_an_aligned_input_is_left_as_it_is() -> None:
+    within = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.1, 0.1))
+    beyond = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.4, 0.1))
+    precise = replace(within, corner_std_xy_px=((0.01, 0.0),) * 4)
+    assert is_as_it_was(within, np.eye(3), SIZE, CheckSettings())
+    assert not is_as_it_was(beyond, np.eye(3), SIZE, CheckSettings())
+    assert not is_as_it_was(precise, np.eye(3), SIZE, CheckSettings())
+    # A quarter of a pixel of the file is less of an image that was reduced to a third.
+    assert not is_as_it_was(within, np.eye(3), SIZE, CheckSettings(), scale=1 / 3)

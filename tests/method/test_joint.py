@@ -1,0 +1,144 @@
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+
+from agalign.config import FastRecipe, JointSettings, PaperRecipe
+from agalign.method.fast import learn, learn_scales
+from agalign.method.joint import align_from_scratch
+from agalign.method.refine import refine
+from agalign.method.state import JointState
+from agalign.method.subject import Subject
+from agalign.values import geometry
+from agalign.values.alignment import JointResult
+from agalign.values.doubts import Doubt
+from agalign.values.image import Raster
+
+from ..conftest import mean_error_px, textured_image, textured_pair
+
+TRUTH = np.array([[1.004, 0.006, 6.0], [-0.005, 0.998, -4.0], [4e-6, -6e-6, 1.0]])
+NEAR = geometry.translation(7.5, -5.5)
+
+
+def rasters(matrix: np.ndarray, seed: int = 0) -> tuple[Raster, Raster]:
+    fixed, moving = textured_pair(matrix, seed=seed)
+    valid = np.ones(fixed.shape, bool)
+    return Raster(fixed, valid), Raster(moving, valid)
+
+
+def scratch(fixed: Raster, moving: Raster, seed: np.ndarray, settings: JointSettings) -> JointResult | Doubt:
+    return align_from_scratch(Subject.of_one(fixed, moving, seed, trusted=True), settings, lambda *_: None)[0]
+
+
+def run(settings: JointSettings, seed: np.ndarray = NEAR, **kwargs: int) -> JointResult:
+    result = scratch(*rasters(TRUTH, **kwargs), seed, settings)
+    assert isinstance(result, JointResult)
+    return result
+
+
+@pytest.mark.parametrize("start", ["random", "starter"])
+def test_fast_recovers_a_homography_through_reversed_contrast(start: Literal["random", "starter"]) -> None:
+    result = run(JointSettings(fast=FastRecipe(start=start)))
+    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.08
+    assert result.retrieval > 0.8
+    assert result.chance < 0.01
+    assert result.model_family == "homography"
+
+
+def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> None:
+    short = FastRecipe(start="random", most_steps=50, final_steps=1)
+    one, same = (run(JointSettings(fast=short, rng_seed=4)) for _ in range(2))
+    other = run(JointSettings(fast=short, rng_seed=5))
+    np.testing.assert_array_equal(one.fixed_to_moving, same.fixed_to_moving)
+    assert one.retrieval == same.retrieval
+    assert not np.array_equal(one.fixed_to_moving, other.fixed_to_moving)
+
+
+def test_the_global_random_state_is_left_alone() -> None:
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    run(JointSettings(fast=FastRecipe(start="random", most_steps=50, final_steps=1)))
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_a_translation_stays_a_translation() -> None:
+    start = geometry.translation(4.0, -2.0)
+    fixed, moving = rasters(geometry.translation(6.0, -4.0))
+    settings = JointSettings(model_family="translation")
+    result = scratch(fixed, moving, start, settings)
+    assert isinstance(result, JointResult)
+    np.testing.assert_allclose(result.fixed_to_moving[:2, :2], np.eye(2), atol=1e-6)
+    np.testing.assert_allclose(result.fixed_to_moving[2], [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(result.fixed_to_moving[:2, 2], [6, -4], atol=0.08)
+
+
+def test_unrelated_images_are_not_told_apart() -> None:
+    valid = np.ones((320, 400), bool)
+    pair = [Raster(textured_image(400, 320, s), valid) for s in (8, 9)]
+    result = scratch(*pair, np.eye(3), JointSettings())
+    assert isinstance(result, JointResult)
+    assert result.retrieval < 0.1
+
+
+def test_rgb_against_a_single_band() -> None:
+    fixed, moving = rasters(TRUTH)
+    rgb = np.stack([fixed.pixels, 0.5 * fixed.pixels + 1, textured_image(400, 320, 3)])
+    result = scratch(Raster(rgb, fixed.valid), moving, NEAR, JointSettings())
+    assert isinstance(result, JointResult)
+    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
+
+
+def test_nothing_to_learn_from() -> None:
+    fixed, moving = rasters(TRUTH)
+    flat = Raster(np.zeros_like(fixed.pixels), fixed.valid)
+    assert scratch(flat, moving, NEAR, JointSettings()) == Doubt("no_contrast")
+    apart = geometry.translation(390, 0)
+    found = scratch(fixed, moving, apart, JointSettings())
+    assert isinstance(found, Doubt)
+    assert found.kind == "few_keypoints"
+
+
+def test_one_network_for_two_bands_and_one_that_does_not_belong() -> None:
+    fixed, moving = rasters(TRUTH)
+    stranger = Raster(textured_image(400, 320, 9), fixed.valid)
+    other = Raster(np.tanh(fixed.pixels), fixed.valid)
+    subject = Subject(fixed, [moving, stranger, other], [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
+    found = align_from_scratch(subject, JointSettings(), lambda *_: None)
+    assert all(isinstance(r, JointResult) for r in found)
+    assert mean_error_px(found[0].fixed_to_moving, TRUTH, 400, 320) < 0.1
+    assert found[1].retrieval < 0.1
+    assert mean_error_px(found[2].fixed_to_moving, np.eye(3), 400, 320) < 0.1
+
+
+@pytest.mark.parametrize(("sharing", "left"), [("siamese", 0.35), ("pseudo-siamese", 0.35), ("unshared", 0.9)])
+def test_paper_recipe_lowers_the_error(sharing: str, left: float) -> None:
+    # Fully unshared networks learn slowest, as the paper expects; three epochs are few.
+    settings = JointSettings(recipe="paper", sharing=sharing, paper=PaperRecipe(epochs=3, keypoints=2000))
+    fixed, moving = textured_pair(TRUTH)
+    # The paper's siamese network is for one modality: give it the same contrast.
+    valid = np.ones(fixed.shape, bool)
+    moving = -moving if sharing == "siamese" else moving
+    result = scratch(Raster(fixed, valid), Raster(moving, valid), NEAR, settings)
+    assert isinstance(result, JointResult)
+    assert result.recipe == "paper"
+    assert result.levels == (0.25, 0.5, 1.0)
+    start = mean_error_px(NEAR, TRUTH, 400, 320)
+    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < left * start
+
+
+def test_levels_halve_down_to_the_coarsest() -> None:
+    assert learn_scales(JointState(JointSettings(), lambda *_: None), 1280) == [0.25, 0.5]
+
+
+def test_a_start_far_off_is_searched_for_along_the_loss() -> None:
+    """An eighth of the image off, and no seeding: beyond what a step on psi can see."""
+    truth = geometry.translation(6.0, -4.0)
+    fixed, moving = rasters(truth)
+    state = JointState(JointSettings(device="cpu"), lambda *_: None)
+    net = state.fast_descriptor([1, 1])
+    subject = Subject.of_one(fixed, moving, geometry.translation(46.0, 26.0))
+    learn(state, [subject], net)
+    found = refine(state, net, subject)[0]
+    assert isinstance(found, JointResult)
+    assert np.abs(geometry.apply(found.fixed_to_moving, [[200.0, 160.0]]) - [206.0, 156.0]).max() < 0.2

@@ -1,0 +1,114 @@
+import numpy as np
+import torch
+
+from agalign.method.levels import Level, Sampler, footprints_inside, make_level, make_view
+from agalign.method.patches import Keypoints, patch_positions, transform
+from agalign.values import lens
+from agalign.values.image import Raster
+from agalign.values.lens import Lens
+
+from ..conftest import textured_image
+
+CPU = torch.device("cpu")
+
+
+def rasters() -> tuple[Raster, Raster]:
+    fixed, moving = textured_image(320, 240), textured_image(320, 240, 1)
+    valid = np.ones((240, 320), bool)
+    hole = valid.copy()
+    hole[90:150, 140:200] = False
+    return Raster(fixed, valid), Raster(np.where(hole, moving, 1e6).astype(np.float32), hole)
+
+
+def level_of(fixed: Raster, *moving: Raster) -> Level:
+    return make_level(fixed, moving, [np.eye(3)] * len(moving), 1.0, 0.05, torch.Generator().manual_seed(0), CPU)
+
+
+def test_images_are_standardised_over_their_valid_pixels_only() -> None:
+    level = level_of(*rasters())
+    valid = torch.from_numpy(rasters()[1].valid)
+    inside = level.moving[0].image[0][valid]
+    assert abs(float(inside.mean())) < 1e-4
+    assert abs(float(inside.std()) - 1) < 1e-3
+    assert float(level.moving[0].image[0][~valid].abs().max()) == 0
+
+
+def test_keypoints_never_touch_invalid_pixels() -> None:
+    level = level_of(*rasters())
+    h = torch.tensor([[1.0, 0, 7.0], [0, 1.0, -4.0], [0, 0, 1.0]])
+    p, inside = Sampler(torch.Generator().manual_seed(0)).draw(level, level.anywhere, [h], 500, 1.0)
+    assert len(p) == 500
+    assert bool(inside.all())
+    touched = transform(h, patch_positions(p)).reshape(-1, 2)
+    assert (touched >= 0).all()
+    assert (touched <= torch.tensor([319.0, 239.0])).all()
+    valid = torch.from_numpy(rasters()[1].valid)
+    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        x, y = touched.floor().long().unbind(dim=1)
+        assert valid[(y + dy).clamp(max=239), (x + dx).clamp(max=319)].all()
+
+
+def test_no_held_out_patch_shares_a_pixel_with_one_that_is_learnt_from() -> None:
+    level = level_of(*rasters())
+    assert len(level.held_out) > 500
+    seen = []
+    for pool in (level.trainable, level.held_out):
+        sampler = Sampler(torch.Generator().manual_seed(0))
+        p, _ = sampler.draw(level, pool, [torch.eye(3)], 400, octaves=1.0)
+        assert len(p) > 100
+        assert float(p.scale.max()) > 1.5
+        pixels = patch_positions(p).reshape(-1, 2)
+        # A sample between pixels takes of all four.
+        seen.append({(x + dx, y + dy) for x, y in pixels.floor().int().tolist() for dx in (0, 1) for dy in (0, 1)})
+    train, held = seen
+    assert not train & held
+
+
+def test_keypoints_lie_where_there_is_contrast() -> None:
+    fixed, moving = rasters()
+    flat = fixed.pixels.copy()
+    flat[:, :160] = 0.3
+    level = level_of(Raster(flat, fixed.valid), moving)
+    assert int((level.anywhere.xy[:, 0] < 158).sum()) == 0
+
+
+def test_points_beyond_the_horizon_are_outside() -> None:
+    level = level_of(*rasters())
+    p = Keypoints(torch.tensor([[160.0, 60.0]]), torch.zeros(1), torch.ones(1))
+    away = torch.tensor([[1.0, 0, 1e9], [0, 1.0, 0], [0, 0, 1.0]])
+    assert not bool(footprints_inside(level, 0, p, away)[0])
+    singular = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [-1 / 160, 0, 1.0]])
+    assert not bool(footprints_inside(level, 0, p, singular)[0])
+
+
+def test_keypoints_that_lie_in_the_most_images_come_first() -> None:
+    fixed, moving = rasters()
+    level = level_of(fixed, moving, moving)
+    near, far = torch.eye(3), torch.tensor([[1.0, 0, 200.0], [0, 1.0, 0], [0, 0, 1.0]])
+    p, inside = Sampler(torch.Generator().manual_seed(0)).draw(level, level.anywhere, [near, far], 100, 1.0)
+    assert inside.shape == (100, 2)
+    in_both = inside.all(dim=1)
+    assert int(in_both.sum()) > 0
+    assert bool((in_both[:-1] >= in_both[1:]).all())
+    for band, h in enumerate((near, far)):
+        torch.testing.assert_close(inside[:, band], footprints_inside(level, band, p, h))
+
+
+def test_patches_are_sampled_through_the_lens() -> None:
+    # A raw image whose value is its own undistorted x coordinate: undistorted positions must find their x there.
+    model = Lens(300.0, 300.0, 158.0, 121.0, (-0.1, 0.15, 0.0004, -0.0003, -0.03))
+    x, y = np.meshgrid(np.arange(320.0), np.arange(240.0))
+    raw = lens.undistort(model, np.stack([x, y], axis=-1))[..., 0].astype(np.float32)
+    valid = np.ones(raw.shape, bool)
+    view = make_view(Raster(raw, valid, model), 1.0, CPU)
+    xy = torch.tensor([[60.0, 50.0], [200.0, 180.0]])
+    positions = patch_positions(Keypoints(xy, torch.tensor([0.3, 2.0]), torch.ones(2)))
+    found = view.patches(positions)[:, 0] * float(raw.std()) + float(raw.mean())
+    torch.testing.assert_close(found, positions[..., 0], atol=0.02, rtol=0)
+
+
+def test_level_matrices_go_to_full_resolution_and_back() -> None:
+    matrix = np.array([[1.01, 0.02, 5.0], [-0.01, 0.99, -3.0], [1e-5, -2e-5, 1.0]])
+    fixed, moving = rasters()
+    level = make_level(fixed, [moving], [matrix], 0.5, 0.05, torch.Generator().manual_seed(0), CPU)
+    np.testing.assert_allclose(level.full_matrix(level.homography(matrix, 0), 0), matrix, atol=1e-4)

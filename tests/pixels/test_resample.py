@@ -1,0 +1,200 @@
+from pathlib import Path
+from typing import get_args
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from agalign.pixels.resample import resample, resample_tile, tiles, warped
+from agalign.products.layout import _largest_rectangle, common_area
+from agalign.synthetic import rig
+from agalign.values import geometry, lens
+from agalign.values.capture import Band
+from agalign.values.choices import Interpolation
+from agalign.values.image import Raster, Tile
+from agalign.values.mapping import PixelMapping
+
+from ..conftest import textured_image, textured_pair
+
+H = np.array([[1.002, 0.004, 6.3], [-0.003, 0.999, -4.7], [3e-6, -2e-6, 1.0]])
+
+
+def write_band(path: Path, pixels: np.ndarray, nodata: float | None = None) -> Band:
+    height, width = pixels.shape
+    profile = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": pixels.dtype, "nodata": nodata}
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(path, "w", **profile) as dataset:
+        dataset.write(pixels, 1)
+    return Band("b", path, 1, width, height, str(pixels.dtype), nodata=nodata)
+
+
+def test_source_positions_are_the_mapping(flight: Path) -> None:
+    lenses = [rig.BANDS[k].lens(480, 360) for k in (1, 3)]
+    for mapping in (PixelMapping(H), PixelMapping(H, *lenses), PixelMapping(H, None, lenses[1])):
+        tile = Tile(100, 40, 211, 97)
+        positions = mapping.positions(tile)
+        x, y = np.meshgrid(np.arange(100, 311), np.arange(40, 137))
+        np.testing.assert_allclose(positions, mapping(np.stack([x, y], axis=-1)), atol=1e-3)
+
+
+def test_undistorted_pixels_of_the_reference_reach_the_same_place() -> None:
+    own, other = (rig.BANDS[k].lens(480, 360) for k in (1, 3))
+    straight = np.array([[50.0, 60.0], [400.0, 300.0]])
+    raw = lens.distort(own, straight)
+    for mapping in (PixelMapping(H, own, other), PixelMapping(H)):
+        np.testing.assert_allclose(mapping.from_undistorted(own)(straight), mapping(raw), atol=1e-4)
+
+
+def test_tiles_cover_the_area_once() -> None:
+    covered = np.zeros((90, 70), int)
+    for t in tiles(Tile(10, 20, 55, 61), 16):
+        covered[t.y0 : t.y0 + t.height, t.x0 : t.x0 + t.width] += 1
+    assert covered.sum() == 55 * 61
+    assert (covered[20:81, 10:65] == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("interpolation", "tolerance"), [("nearest", 0.8), ("bilinear", 0.02), ("lanczos", 0.05), ("cubic", 0.06)]
+)
+def test_a_ramp_stays_a_ramp(tmp_path: Path, interpolation: str, tolerance: float) -> None:
+    x, y = np.meshgrid(np.arange(300.0), np.arange(200.0))
+    band = write_band(tmp_path / "b.tif", (x + 1000 * y).astype(np.float64))
+    tile = Tile(30, 30, 200, 120)
+    got, valid = resample_tile(band, PixelMapping(geometry.translation(6.3, -4.0)), tile, interpolation)
+    expected = (x + 6.3 + 1000 * (y - 4.0))[30:150, 30:230]
+    assert valid.all()
+    assert np.abs(got - expected).max() < tolerance
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "float32", "uint32"])
+def test_the_type_is_kept_rounded_and_clipped(tmp_path: Path, dtype: str) -> None:
+    image = textured_image(120, 90) * 400
+    limits = (np.iinfo(dtype).min, np.iinfo(dtype).max) if dtype != "float32" else (-1e9, 1e9)
+    pixels = np.clip(image, *limits).astype(dtype)
+    got, _ = resample_tile(write_band(tmp_path / "b.tif", pixels), PixelMapping(H), Tile(20, 20, 60, 50), "cubic")
+    assert got.dtype == dtype
+    reference = cv2.warpPerspective(
+        pixels.astype(np.float64),
+        H,
+        (120, 90),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )[20:70, 20:80]
+    expected = reference if dtype == "float32" else np.clip(np.rint(reference), *limits)
+    assert np.abs(got.astype(float) - expected).max() <= (0.05 if dtype == "float32" else 1)
+
+
+def test_tiles_join_without_a_seam(tmp_path: Path) -> None:
+    band = write_band(tmp_path / "b.tif", (textured_image(300, 220) * 100).astype(np.float32))
+    mapping = PixelMapping(H, rig.BANDS[1].lens(300, 220), rig.BANDS[3].lens(300, 220))
+    # Not lanczos: there OpenCV rounds positions to 1/32 px, and a thousandth more or less tips it over.
+    whole, whole_valid = resample_tile(band, mapping, Tile(0, 0, 300, 220), "cubic")
+    for tile in tiles(Tile(0, 0, 300, 220), 64):
+        window = np.s_[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
+        part, valid = resample_tile(band, mapping, tile, "cubic")
+        np.testing.assert_array_equal(valid, whole_valid[window])
+        assert np.abs(part - whole[window])[valid].max() < 0.5  # 0.005 of the contrast: spline knots differ by tile
+
+
+def test_outside_is_invalid_and_nodata_does_not_bleed(tmp_path: Path) -> None:
+    pixels = np.full((100, 140), 500, np.uint16)
+    pixels[40:50, 60:70] = 0
+    band = write_band(tmp_path / "b.tif", pixels, nodata=0)
+    got, valid = resample_tile(band, PixelMapping(geometry.translation(10.5, 0)), Tile(0, 0, 140, 100), "lanczos")
+    assert not valid[:, 130:].any()  # column 129 reads 139.5, outside the last pixel's centre
+    assert valid[:, :128][:35].all()
+    assert not valid[42:48, 51:58].any()
+    assert (got[valid] == 500).all()
+
+
+def test_far_away_nothing_is_valid(tmp_path: Path) -> None:
+    band = write_band(tmp_path / "b.tif", np.ones((100, 140), np.uint16))
+    got, valid = resample_tile(band, PixelMapping(geometry.translation(500, 0)), Tile(0, 0, 30, 20), "cubic")
+    assert got.shape == (20, 30)
+    assert not valid.any()
+
+
+def test_nearest_takes_every_pixel_that_is_nearest() -> None:
+    pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    positions = np.stack(np.meshgrid(np.array([-0.4, 0.4, 3.4, 3.6]), np.array([0.0])), axis=-1)
+    got, valid = resample(pixels, np.ones((3, 4), bool), positions, (4, 3), (0, 0), "nearest")
+    assert got[0].tolist()[:3] == [0, 0, 3]
+    assert valid[0].tolist() == [True, True, True, False]
+
+
+@settings(max_examples=60, deadline=None)
+@given(arrays(bool, st.tuples(st.integers(1, 7), st.integers(1, 7))))
+def test_largest_rectangle_is_the_largest(cells: np.ndarray) -> None:
+    rows, columns = cells.shape
+    best = max(
+        (
+            (b - t) * (r - left)
+            for t in range(rows) for b in range(t + 1, rows + 1)
+            for left in range(columns) for r in range(left + 1, columns + 1)
+            if cells[t:b, left:r].all()
+        ),
+        default=0,
+    )  # fmt: skip
+    found = _largest_rectangle(cells, np.ones(columns, int), np.ones(rows, int))
+    if found is None:
+        assert best == 0
+    else:
+        top, bottom, left, right = found
+        assert cells[top:bottom, left:right].all()
+        assert (bottom - top) * (right - left) == best
+
+
+def test_common_area_lies_inside_every_band() -> None:
+    bands = [
+        (PixelMapping(geometry.translation(*t)), Band("b", Path("b"), 1, 200, 150, "uint8")) for t in ((12, 0), (-5, 7))
+    ]
+    area = common_area(bands, 200, 150)
+    assert area is not None
+    assert area.x0 >= 5
+    assert area.x0 + area.width <= 188
+    assert area.y0 + area.height <= 143
+    assert area.width * area.height > 0.9 * 183 * 143
+    away = [(PixelMapping(geometry.translation(500, 0)), bands[0][1])]
+    assert common_area(away, 200, 150) is None
+
+
+def test_the_source_file_is_read_once_as_it_is(tmp_path: Path) -> None:
+    pixels = (np.random.default_rng(0).random((60, 80)) * 60000).astype(np.uint16)
+    band = write_band(tmp_path / "b.tif", pixels)
+    got, valid = resample_tile(band, PixelMapping(np.eye(3)), Tile(0, 0, 80, 60), "lanczos")
+    np.testing.assert_array_equal(got, tifffile.imread(tmp_path / "b.tif"))
+    assert valid.all()
+
+
+def test_warped_shows_the_moving_image_on_the_fixed_grid() -> None:
+    shifted = np.array([[1.01, 0.01, 31.0], [-0.01, 1.0, -18.0], [0, 0, 1.0]])
+    images = textured_pair(shifted)
+    fixed, moving = (Raster(image, np.ones(image.shape, bool)) for image in images)
+    there = warped(moving, PixelMapping(shifted), fixed.size_px)
+    inside = there.valid & fixed.valid
+    assert np.corrcoef(fixed.pixels[inside], there.pixels[inside])[0, 1] < -0.9
+    half = warped(moving, PixelMapping(shifted), (200, 160), (0.5, 0.5))
+    assert half.size_px == (200, 160)
+
+
+def test_an_identity_between_grids_of_two_scales_is_not_taken_for_nothing() -> None:
+    """The moving image has as many pixels as the reduced grid, and shows but a quarter of the fixed image."""
+    image = textured_image(200, 160)
+    moving = Raster(image, np.ones(image.shape, bool))
+    there = warped(moving, PixelMapping(np.eye(3)), (200, 160), (0.5, 0.5))
+    assert not there.valid[100:].any()
+    assert there.valid[2:78, 2:98].all()
+
+
+def test_booleans_stay_booleans() -> None:
+    mask = np.zeros((60, 80), bool)
+    mask[20:40, 30:60] = True
+    positions = PixelMapping(geometry.translation(3, 2)).positions(Tile(0, 0, 80, 60))
+    for interpolation in get_args(Interpolation):
+        found, valid = resample(mask, np.ones_like(mask), positions, (80, 60), (0, 0), interpolation)
+        assert found.dtype == bool
+        np.testing.assert_array_equal(found[:58, :77][valid[:58, :77]], mask[2:, 3:][valid[:58, :77]])

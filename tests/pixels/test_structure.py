@@ -1,0 +1,65 @@
+import cv2
+import numpy as np
+import pytest
+
+from agalign.pixels.resample import shrink, textured
+from agalign.pixels.structure import correlation_surface, find_peak, structure_field
+from agalign.values.image import Raster
+
+from ..conftest import textured_image
+
+EVERYWHERE = np.ones((240, 320), bool)
+
+
+def test_contrast_reversal_does_not_change_the_field() -> None:
+    image = textured_image(320, 240)
+    one = structure_field(Raster(image, EVERYWHERE))
+    other = structure_field(Raster(-image, EVERYWHERE))
+    np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+@pytest.mark.parametrize("shift", [(7.0, -4.0), (-20.5, 11.25)])
+def test_the_peak_is_at_the_shift(shift: tuple[float, float]) -> None:
+    big = textured_image(480, 400)
+    matrix = np.array([[1, 0, -shift[0]], [0, 1, -shift[1]]])
+    moved = -cv2.warpAffine(big, matrix, (480, 400), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP)
+    crop = np.s_[80:320, 80:400]
+    fields = [structure_field(Raster(i[crop], EVERYWHERE)) for i in (big, moved)]
+    peak = find_peak(correlation_surface(*fields), 16)
+    # cv2.WARP_INVERSE_MAP reads moved(p) = big(p - shift): content at p lies at p + shift.
+    np.testing.assert_allclose(peak.shift_px, shift, atol=0.15)
+    assert peak.sigma > 3 * peak.runner_up_sigma
+
+
+def test_unrelated_images_have_no_outstanding_peak() -> None:
+    fields = [structure_field(Raster(textured_image(320, 240, s), EVERYWHERE)) for s in (1, 2)]
+    peak = find_peak(correlation_surface(*fields), 16)
+    assert peak.sigma < 8
+    assert peak.sigma < 1.4 * peak.runner_up_sigma
+
+
+def test_invalid_pixels_leave_no_edge() -> None:
+    valid = EVERYWHERE.copy()
+    valid[100:140, 100:180] = False
+    image = np.where(valid, textured_image(320, 240), -50).astype(np.float32)
+    whole = structure_field(Raster(textured_image(320, 240), EVERYWHERE))
+    holed = structure_field(Raster(image, valid))
+    assert np.abs(holed[~valid]).max() == 0
+    far = cv2.erode(valid.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    assert np.abs(holed - whole)[far].mean() < 0.02
+
+
+def test_shrinking_averages_and_keeps_invalid_pixels_out() -> None:
+    pixels = np.arange(64, dtype=np.float32).reshape(8, 8)
+    valid = np.ones((8, 8), bool)
+    valid[0, 0] = False
+    small = shrink(Raster(pixels, valid), (4, 4))
+    assert not small.valid[0, 0]
+    assert small.valid.sum() == 15
+    assert small.pixels[1, 1] == pytest.approx(pixels[2:4, 2:4].mean())
+
+
+def test_textured() -> None:
+    assert textured(Raster(textured_image(320, 240), EVERYWHERE))
+    assert not textured(Raster(np.full((240, 320), 7, np.float32), EVERYWHERE))
+    assert not textured(Raster(textured_image(320, 240), ~EVERYWHERE))

@@ -1,0 +1,117 @@
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from agalign.cameras.discover import discover
+from agalign.pixels.raster import read_for_alignment
+from agalign.synthetic import flight as synthetic
+from agalign.synthetic import rig
+from agalign.synthetic.ground import paint_ground, reflectance
+from agalign.values import geometry, lens
+
+
+def test_the_truth_follows_from_rays_and_the_plane() -> None:
+    # Independent of the generator's homographies: shoot a ray from the reference, hit the ground, look from the band.
+    pose = rig.Pose(30.0, 40.0, 1.5, -2.0, 3.0, -4.0)
+    size = (1280, 960)
+    reference, band = rig.BANDS[rig.REFERENCE], rig.BANDS[3]
+    attitude = rig._rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
+    ground = paint_ground(np.random.default_rng(0), [pose], (320, 240))
+    ties = np.array(synthetic.true_ties(ground, reference, band, pose, size))
+    for x_ref, y_ref, x_mov, y_mov in ties[::37]:
+        u, v = lens.undistort(reference.lens(*size), (x_ref, y_ref))
+        model = reference.lens(*size)
+        ray = (
+            attitude
+            @ rig._rotation(*reference.rig_degrees)
+            @ [(u - model.cx_px) / model.fx_px, (v - model.cy_px) / model.fy_px, 1]
+        )
+        place = attitude @ [*reference.baseline_m, 0] + [pose.east_m, pose.north_m, -pose.altitude_m]
+        below = place - ray * place[2] / ray[2]
+        other = attitude @ [*band.baseline_m, 0] + [pose.east_m, pose.north_m, -pose.altitude_m]
+        seen = (attitude @ rig._rotation(*band.rig_degrees)).T @ (below - other)
+        model = band.lens(*size)
+        straight = (seen[0] / seen[2] * model.fx_px + model.cx_px, seen[1] / seen[2] * model.fy_px + model.cy_px)
+        np.testing.assert_allclose(lens.distort(model, straight), (x_mov, y_mov), atol=2e-3)
+
+
+def test_parallax_depends_on_the_altitude() -> None:
+    poses = [rig.Pose(h, 0.0, 0.0, 0.0, 0.0, 0.0) for h in (20.0, 40.0)]
+    low, high = (rig.true_homography(rig.BANDS[1], rig.BANDS[3], p, (1280, 960)) for p in poses)
+    assert geometry.corner_error_px(low, high, 1280, 960) > 0.5
+
+
+def test_the_images_show_what_the_truth_says(flight: Path) -> None:
+    """Red and green look alike: along the true mapping they correlate, and a pixel beside it less."""
+    truth = json.loads((flight / "truth.json").read_text())["IMG_0001"]
+    bands = {b.path.name: b for b in discover(flight).captures[0].bands}
+    green = read_for_alignment(bands[truth["reference"]], 4096).pixels
+    pixels = read_for_alignment(bands["IMG_0001_3.tif"], 4096).pixels
+    ties = np.array(truth["bands"]["IMG_0001_3.tif"]["ties"])
+    here = ties[:, :2].round().astype(int)
+    shift = (ties[:, 2:] - ties[:, :2]).mean(axis=0).round().astype(int)
+    offsets = np.array([(dx, dy) for dx in range(-25, 26) for dy in range(-25, 26)])
+
+    def correlation(extra: np.ndarray) -> float:
+        values = []
+        for x, y in here:
+            if 40 <= x < 440 and 40 <= y < 320:
+                a = green[y + offsets[:, 1], x + offsets[:, 0]]
+                b = pixels[
+                    (y + shift[1] + extra[1] + offsets[:, 1]).clip(0, 359),
+                    (x + shift[0] + extra[0] + offsets[:, 0]).clip(0, 479),
+                ]
+                values.append(np.corrcoef(a, b)[0, 1])
+        return float(np.median(values))
+
+    best = correlation(np.array([0, 0]))
+    assert best > 0.6
+    assert all(correlation(np.array(e)) < best for e in ((4, 0), (-4, 0), (0, 4), (0, -4)))
+
+
+def test_contrast_reverses_between_green_and_near_infra_red(flight: Path) -> None:
+    ground = paint_ground(np.random.default_rng(0), [rig.Pose(30, 0, 0, 0, 0, 0)], (320, 240))
+    by_name = {b.name: reflectance(ground, b).ravel() for b in rig.BANDS}
+    assert np.corrcoef(by_name["Red"], by_name["NIR"])[0, 1] < -0.25
+    assert np.corrcoef(by_name["Green"], by_name["Red"])[0, 1] > 0.5
+
+
+def test_the_same_seed_gives_the_same_flight(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        synthetic.make_flight(tmp_path / name, captures=1, size_px=(160, 120), rng_seed=1)
+    files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*.*"))
+    assert len(files) == 6
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+@pytest.mark.parametrize("band", rig.BANDS, ids=lambda b: b.name)
+def test_bands_are_well_exposed(flight: Path, band: rig.BandSpec) -> None:
+    (found,) = [b for b in discover(flight).captures[0].bands if b.name == band.name]
+    raster = read_for_alignment(found, 4096)
+    assert raster.valid.mean() > 0.95
+    assert raster.pixels[raster.valid].std() > 1000
+
+
+def test_relief_moves_what_stands_up(tmp_path: Path) -> None:
+    truths = {}
+    for relief_m in (0.0, 3.0):
+        path = synthetic.make_flight(tmp_path / str(relief_m), 1, (320, 240), rng_seed=2, relief_m=relief_m)
+        bands = json.loads(path.read_text())["IMG_0001"]["bands"]
+        truths[relief_m] = {(x, y): (u, v) for x, y, u, v in bands["IMG_0001_4.tif"]["ties"]}
+    capture = discover(tmp_path / "3.0").captures[0]
+    assert capture.reference.name == "Green"
+    # Ties over relief lie on no plane: the nearest homography leaves some of what the heights do.
+    points = np.array([[*k, *v] for k, v in truths[3.0].items()])
+    flat = np.array([[*k, *v] for k, v in truths[0.0].items()])
+    left = {}
+    for name, ties in (("relief", points), ("plane", flat)):
+        spec = [rig.BANDS[i].lens(320, 240) for i in (rig.REFERENCE, 3)]
+        here, there = lens.undistort(spec[0], ties[:, :2]), lens.undistort(spec[1], ties[:, 2:])
+        fitted, _ = cv2.findHomography(here, there, 0)
+        left[name] = np.linalg.norm(geometry.apply(fitted, here) - there, axis=1)
+    assert left["plane"].max() < 1e-3
+    assert 0.03 < np.percentile(left["relief"], 95) < 0.5

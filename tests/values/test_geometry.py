@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from agalign.errors import GeometryError
+from agalign.values import geometry
+
+small = st.floats(-0.2, 0.2)
+matrices = st.builds(
+    lambda a, b, c, d, tx, ty, p, q: np.array([[1 + a, b, tx * 100], [c, 1 + d, ty * 100], [p * 1e-3, q * 1e-3, 1]]),
+    *[small] * 8,
+)
+points = np.array([[0.0, 0.0], [100.0, 0.0], [37.5, 80.0], [120.0, 90.0]])
+
+
+@given(matrices)
+def test_inverse_undoes(matrix: np.ndarray) -> None:
+    back = geometry.apply(geometry.invert(matrix), geometry.apply(matrix, points))
+    assert_allclose(back, points, atol=1e-6)
+
+
+@given(matrices, matrices)
+def test_compose_applies_the_last_first(one: np.ndarray, other: np.ndarray) -> None:
+    assert_allclose(
+        geometry.apply(geometry.compose(one, other), points),
+        geometry.apply(one, geometry.apply(other, points)),
+        atol=1e-6,
+    )
+
+
+@given(matrices, st.sampled_from([0.25, 0.5, 2.0]), st.sampled_from([0.5, 1.0]))
+def test_rescale_commutes_with_resizing(matrix: np.ndarray, fixed_scale: float, moving_scale: float) -> None:
+    scaled = geometry.rescale(matrix, (fixed_scale, fixed_scale), (moving_scale, moving_scale))
+    small_points = (points + 0.5) * fixed_scale - 0.5
+    expected = (geometry.apply(matrix, points) + 0.5) * moving_scale - 0.5
+    assert_allclose(geometry.apply(scaled, small_points), expected, atol=1e-6)
+
+
+def test_halving_keeps_the_outer_edges() -> None:
+    # Edges of a 10 px row lie at -0.5 and 9.5; of its 5 px half at -0.5 and 4.5.
+    half = geometry.resolution_change(0.5, 0.5)
+    assert_allclose(geometry.apply(half, [[-0.5, -0.5], [9.5, 9.5]]), [[-0.5, -0.5], [4.5, 4.5]])
+
+
+@pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.eye(2), np.full((3, 3), np.nan), np.diag([1.0, 1.0, 0.0])])
+def test_what_is_no_homography_is_refused(bad: np.ndarray) -> None:
+    with pytest.raises(GeometryError):
+        geometry.normalised(bad)
+
+
+@given(matrices)
+def test_local_scale_is_the_jacobian_determinant(matrix: np.ndarray) -> None:
+    e = 1e-4
+    centre = np.array([50.0, 40.0])
+    steps = np.array([[e, 0], [-e, 0], [0, e], [0, -e]])
+    px, mx, py, my = geometry.apply(matrix, centre + steps)
+    jacobian = np.stack([(px - mx), (py - my)], axis=1) / (2 * e)
+    assert_allclose(geometry.local_scale(matrix, 101, 81)[4], np.sqrt(np.linalg.det(jacobian)), rtol=1e-5)
+
+
+def test_corner_error_is_the_worst_corner() -> None:
+    assert geometry.corner_error_px(np.eye(3), geometry.translation(3, 4), 100, 80) == pytest.approx(5)
+    stretched = np.diag([1.1, 1.0, 1.0])
+    assert geometry.corner_error_px(np.eye(3), stretched, 101, 80) == pytest.approx(10)
+
+
+def test_overlay_matches_the_outlines() -> None:
+    np.testing.assert_allclose(geometry.overlay((100, 80), (100, 80)), np.eye(3))
+    edges = geometry.apply(geometry.overlay((100, 80), (50, 40)), [[-0.5, -0.5], [99.5, 79.5]])
+    np.testing.assert_allclose(edges, [[-0.5, -0.5], [49.5, 39.5]])
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_what_can_be_inverted_does_not_depend_on_the_units(unit: float) -> None:
+    """Geotransforms have centimetres a pixel beside metres in the millions; rays have small numbers throughout."""
+    on_map = np.array([[0.02, 0.0, 500_000.0], [0.0, -0.02, 5_800_000.0], [0.0, 0.0, 1.0]])
+    scaled = np.diag([unit, unit, 1.0]) @ on_map
+    np.testing.assert_allclose(geometry.apply(geometry.invert(scaled), geometry.apply(scaled, [[7.0, 9.0]])), [[7, 9]])
+    flat = np.diag([unit, unit, 1.0]) @ np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [0.0, 0.0, 1.0]])
+    with pytest.raises(GeometryError, match="singular"):
+        geometry.invert(flat)
