@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
+import torch
 
 import agalign
 from agalign.errors import GeometryError, InputError
+from agalign.method import joint
 from agalign.values import geometry
 
 from .conftest import mean_error_px, textured_image, textured_pair
@@ -94,3 +96,40 @@ def test_warp_onto() -> None:
     assert np.corrcoef(pixels[valid], fixed[valid])[0, 1] < -0.9
     with pytest.raises(InputError):
         agalign.warp_onto(np.zeros((3, 50, 50)), np.eye(3), (50, 50))
+
+
+def test_undeclared_fill_costs_a_good_pair_nothing() -> None:
+    fixed, moving = textured_pair(TRUTH)
+    spoiled = moving.copy()
+    spoiled[60:140, 200:300] = -9999
+    found = agalign.align(fixed, spoiled)
+    assert found.status == "aligned"
+    assert mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
+
+
+def test_alignment_takes_one_thread_and_gives_the_others_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    real = joint.learn
+
+    def learn(*arguments: object) -> object:
+        seen.append(torch.get_num_threads())
+        return real(*arguments)
+
+    monkeypatch.setattr(joint, "learn", learn)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        agalign.align(*textured_pair(TRUTH))
+        assert seen == [1]
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_warp_onto_takes_masks() -> None:
+    mask = np.zeros((60, 80), bool)
+    mask[20:40, 30:60] = True
+    found, valid = agalign.warp_onto(mask, geometry.translation(3, 2), (80, 60))
+    assert found.dtype == bool
+    np.testing.assert_array_equal(found[:58, :77], mask[2:, 3:])
+    assert valid[:58, :77].all()

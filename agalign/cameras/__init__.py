@@ -1,16 +1,6 @@
-"""One module a vendor; the first that recognises a file has it, and `generic` takes the rest."""
+"""What the files of a folder say: tags, one module a vendor, and captures found by them."""
 
 from agalign.cameras.base import Camera, default_reference, rig_seed
-from agalign.cameras.dji import Dji
-from agalign.cameras.generic import Generic
-from agalign.cameras.mapir import Mapir
-from agalign.cameras.micasense import MicaSense
-from agalign.cameras.parrot import Sequoia
-from agalign.cameras.sentera import Sentera
+from agalign.cameras.known import camera_of, known_cameras
 
-__all__ = ["Camera", "default_reference", "known_cameras", "rig_seed"]
-
-
-def known_cameras(pattern: str | None = None) -> tuple[Camera, ...]:
-    """The cameras in the order they are asked. With a `pattern` the names of files decide, not their tags."""
-    return (Generic(pattern),) if pattern else (MicaSense(), Dji(), Sequoia(), Sentera(), Mapir(), Generic())
+__all__ = ["Camera", "camera_of", "default_reference", "known_cameras", "rig_seed"]

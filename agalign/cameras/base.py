@@ -1,17 +1,19 @@
-"""What agalign asks of a camera, and what several of them have in common.
+"""What agalign asks of a camera, and what all of them have in common.
 
-A new camera is one module with one class of the shape of `Camera`, and one test.
+A new camera is one module with one subclass of `Camera`, named in `known.py`, and one entry in the test of vendors.
 """
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from agalign.cameras.metadata import Tags
+from agalign.cameras.pix4d import Carrying
+from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError
 from agalign.pixels.raster import RasterInfo
 from agalign.values import geometry
@@ -21,43 +23,55 @@ from agalign.values.lens import Lens
 
 _PREFERRED_REFERENCES = ("green", "gre", "g")
 _THERMAL = ("lwir", "thermal")
+_SHORTEST_THERMAL_NM = 3000.0
 _COLOURS = ("Red", "Green", "Blue")
 
 
-class Camera(Protocol):
+class Camera(ABC):
     """How one family of cameras groups and names its bands, and what its tags say of lenses and rig."""
 
     name: str
+    capture_ids: tuple[Name, ...] = ()
+    """Where an id stands that the bands of a capture share."""
+    flight_ids: tuple[Name, ...] = ()
+    """Where one stands that a flight shares."""
+    carrying: Carrying = Carrying()
+    """What becomes of its tags when a band is written on the reference's grid."""
 
+    @abstractmethod
     def recognises(self, tags: Tags) -> bool:
         """True for files of this camera."""
-        ...
 
+    @abstractmethod
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
         """The bands in one of its files, with their lens and their place in the rig."""
-        ...
+
+    @abstractmethod
+    def capture_name(self, path: Path) -> str:
+        """The part of a file's name that the bands of its capture share."""
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         """Files with the same key (and the same camera and folder) are one capture."""
-        ...
+        return tags.first_text(self.capture_ids) or self.capture_name(path)
 
     def capture_folder(self, path: Path) -> Path:
         """The folder of the capture that a file belongs to."""
         return path.parent
 
-    def capture_name(self, path: Path) -> str:
-        """The part of a file's name that the bands of its capture share."""
-        ...
-
 
 def default_reference(bands: Sequence[Band]) -> int:
     """Index of the green band; else of the one nearest to 550 nm; else the first. Never a thermal one."""
-    for index, band in enumerate(bands):
-        if re.split(r"[-_ ]", band.name.lower())[0] in _PREFERRED_REFERENCES:
+    seeing = [i for i, b in enumerate(bands) if not _is_thermal(b)]
+    for index in seeing:
+        if re.split(r"[-_ ]", bands[index].name.lower())[0] in _PREFERRED_REFERENCES:
             return index
-    known = [(abs(b.wavelength_nm - 550), i) for i, b in enumerate(bands) if b.wavelength_nm is not None]
-    seeing = [i for i, b in enumerate(bands) if not b.name.lower().startswith(_THERMAL)]
+    known = [(abs(nm - 550), i) for i in seeing if (nm := bands[i].wavelength_nm) is not None]
     return min(known)[1] if known else next(iter(seeing), 0)
+
+
+def _is_thermal(band: Band) -> bool:
+    long = band.wavelength_nm is not None and band.wavelength_nm >= _SHORTEST_THERMAL_NM
+    return long or band.name.lower().startswith(_THERMAL)
 
 
 def rig_seed(reference: Band, moving: Band) -> Matrix | None:
@@ -113,39 +127,9 @@ def rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
     return np.asarray(about_x @ about_y @ about_z)
 
 
-def rig_rotation(tags: Tags) -> Matrix:
-    """R of Camera:RigRelatives in degrees; no rotation where they are missing."""
-    angles = tags.numbers("Camera", "RigRelatives")
-    return rotation(*angles) if len(angles) == 3 else np.eye(3)
-
-
 def rays_to_rig(lens: Lens | None, camera_to_rig: Matrix) -> Matrix | None:
     """to_rig of a band whose camera is turned by R: R K^-1; None where the tags make no camera."""
     try:
         return None if lens is None else np.asarray(camera_to_rig @ geometry.invert(lens.matrix))
     except GeometryError:
         return None
-
-
-def perspective_lens(tags: Tags) -> Lens | None:
-    """K = [f r, f r, ppx r, ppy r] with r in px/mm; Camera:PerspectiveDistortion is k1, k2, k3, p1, p2."""
-    density = tags.pixels_per_mm
-    focal = tags.number("Camera", "PerspectiveFocalLength")
-    centre = tags.numbers("Camera", "PrincipalPoint")
-    if focal is None or focal <= 0 or len(centre) != 2:
-        return None
-    if density is None:
-        return None
-    focal_px = focal if tags.focal_length_is_in_px else focal * density
-    k = tags.numbers("Camera", "PerspectiveDistortion")
-    distortion = (k[0], k[1], k[3], k[4], k[2]) if len(k) == 5 else ()
-    return Lens(focal_px, focal_px, centre[0] * density, centre[1] * density, distortion)
-
-
-def spectral(band: Band, tags: Tags) -> Band:
-    """The band with the wavelength and width that its tags give, nm."""
-    return replace(
-        band,
-        wavelength_nm=tags.number("Camera", "CentralWavelength"),
-        bandwidth_nm=tags.number("Camera", "WavelengthFWHM"),
-    )

@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from agalign.cameras import Camera, default_reference, known_cameras
-from agalign.cameras.metadata import CAPTURE_IDS, FLIGHT_IDS, Tags, read_tags
-from agalign.errors import ConfigurationError, InputError, UnreadableFileError
+from agalign.cameras.base import Camera, default_reference
+from agalign.cameras.known import camera_of, known_cameras
+from agalign.cameras.metadata import Tags, read_tags
+from agalign.errors import AgalignError, ConfigurationError, InputError, NoSuchBandError, UnreadableFileError
 from agalign.pixels.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, RasterInfo, probe
 from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.choices import BandOrder
@@ -18,10 +19,15 @@ from agalign.values.choices import BandOrder
 
 @dataclass(frozen=True)
 class Problem:
-    """A file or capture that cannot take part, and why, in one line."""
+    """A file or capture that cannot take part, and why."""
 
     path: Path
-    text: str
+    error: AgalignError
+
+    @property
+    def text(self) -> str:
+        """One line that names the file and says what to do."""
+        return str(self.error)
 
 
 @dataclass(frozen=True)
@@ -90,11 +96,12 @@ def discover(
         except UnreadableFileError as error:
             # A colour photograph that does not take part does no harm either.
             if options.with_rgb or path.suffix.lower() in TIFF_SUFFIXES:
-                problems.append(Problem(path, str(error)))
+                problems.append(Problem(path, error))
         if progress is not None:
             progress(number, len(paths))
     captures: list[Capture] = []
     for group in _groups(files):
+        problems += _alike(group, options)
         found = _capture(folder, group, options)
         if isinstance(found, Problem):
             problems.append(found)
@@ -126,7 +133,8 @@ def _images(folder: Path, skip: Sequence[Path]) -> list[Path]:
 
 def _natural(name: str) -> list[tuple[bool, int, str]]:
     """Sorts `_2` before `_10`."""
-    return [(part.isdigit(), int(part) if part.isdigit() else 0, part.lower()) for part in re.split(r"(\d+)", name)]
+    parts = re.split(r"(\d+)", name)
+    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part.lower()) for part in parts]
 
 
 def _is_output(folder: Path) -> bool:
@@ -175,6 +183,23 @@ def _groups(files: Iterable[_File]) -> list[list[_File]]:
     return list(groups.values())
 
 
+def _alike(files: Sequence[_File], options: DiscoverOptions) -> list[Problem]:
+    """Names that a pattern takes for the same band of the same capture: it splits them in the wrong place."""
+    if options.pattern is None:
+        return []
+    first: dict[str, Path] = {}
+    found = []
+    for file in files:
+        for name in {b.name for b in file.bands}:
+            if first.setdefault(name, file.path) != file.path:
+                text = (
+                    f"{file.path}: is band '{name}' of one capture with {first[name].name} by the pattern "
+                    f"'{options.pattern}'; give one that tells them apart"
+                )
+                found.append(Problem(file.path, InputError(text)))
+    return found
+
+
 def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capture | Problem:
     # Narrow bands first: the capture is theirs, and the colour photograph's name comes before them.
     files = sorted(files, key=lambda f: f.bands[0].companion)
@@ -184,21 +209,25 @@ def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capt
         wanted = {name.lower() for name in options.bands}
         bands = [b for b in bands if b.name.lower() in wanted]
         if len(bands) < 2:
-            return Problem(first.path, f"{first.path}: of this capture, --bands leaves {_names(bands) or 'nothing'}")
+            left = _names(bands) or "nothing"
+            return Problem(first.path, InputError(f"{first.path}: of this capture, --bands leaves {left}"))
     if len(bands) > 1 and len(files) == 1 and first.bands[0].one_lens:
-        return Problem(first.path, f"{first.path}: its bands come through one lens; there is nothing to align")
+        text = f"{first.path}: its bands come through one lens; there is nothing to align"
+        return Problem(first.path, InputError(text))
     if len(bands) < 2:
         text = f"{first.path}: a band with no companion; name files '<capture>_<band>.tif' or give --pattern"
-        return Problem(first.path, text)
+        return Problem(first.path, InputError(text))
     bands = _with_unique_band_names(bands)
     if options.ignore_metadata:
         bands = [replace(b, lens=None, to_rig=None) for b in bands]
     try:
         reference = bands[_reference_index(bands, options.reference, first.path)]
-    except ConfigurationError as error:
-        return Problem(first.path, str(error))
+    except NoSuchBandError as error:
+        return Problem(first.path, error)
     bands = _ordered(bands, options.order)
-    tags = first.tags
+    # What is said of the capture is said of its reference; a damaged file says nothing.
+    tags = next((f.tags for f in files if f.path == reference.path and f.tags != Tags()), first.tags)
+    camera = camera_of(tags)
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
     return Capture(
         name=first.path.stem if len(files) == 1 else first.camera.capture_name(first.path),
@@ -206,8 +235,8 @@ def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capt
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),
         camera=CameraIdentity(tags.make, tags.model, "+".join(serials)),
-        capture_id=tags.first_text(CAPTURE_IDS),
-        flight_id=tags.first_text(FLIGHT_IDS),
+        capture_id=tags.first_text(camera.capture_ids),
+        flight_id=tags.first_text(camera.flight_ids),
         captured_at=tags.captured_at,
         position=tags.position,
     )
@@ -219,7 +248,7 @@ def _reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> i
     for index, band in enumerate(bands):
         if band.name.lower() == wanted.lower():
             return index
-    raise ConfigurationError(f"{path}: no band '{wanted}' for the reference; this capture has {_names(bands)}")
+    raise NoSuchBandError(f"{path}: no band '{wanted}' for the reference; this capture has {_names(bands)}")
 
 
 def _below(folder: Path, of_capture: Path) -> Path:

@@ -15,13 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from agalign.cameras.base import Camera, band_of, colour_bands, spectral
+from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
+from agalign.cameras.pix4d import BAND_NAME, CAMERA, Carrying, number_text, spectral
+from agalign.cameras.xmp import Name, Packet
 from agalign.errors import GeometryError
 from agalign.pixels.raster import RasterInfo
 from agalign.values import geometry
 from agalign.values.capture import Band, Radiometry
 from agalign.values.geometry import Matrix
+from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 
 _PHANTOM_4_BANDS = {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}
@@ -29,26 +32,61 @@ _MAVIC_3_BANDS = {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}
 _MAVIC_3_NAME = re.compile(r"^(?P<capture>.*?)_(?:MS_(?P<band>G|RE?|NIR)|D)$", re.IGNORECASE)
 
 
+_DJI = "dji.com/drone-dji"
+_CAPTURE_UUID: Name = (_DJI, "CaptureUUID")
+_DEWARP_DATA: Name = (_DJI, "DewarpData")
+_CENTRE: tuple[Name, Name] = ((_DJI, "CalibratedOpticalCenterX"), (_DJI, "CalibratedOpticalCenterY"))
+_RELATIVE_CENTRE: tuple[Name, Name] = ((_DJI, "RelativeOpticalCenterX"), (_DJI, "RelativeOpticalCenterY"))
+_FOCAL_LENGTH_PX: Name = (_DJI, "CalibratedFocalLength")
+_H_MATRIX: Name = (_DJI, "CalibratedHMatrix")
+_VIGNETTING: Name = (_DJI, "VignettingData")
+
+
+class _Carrying(Carrying):
+    geometry = Carrying.geometry | {
+        *_CENTRE, *_RELATIVE_CENTRE, _DEWARP_DATA, _FOCAL_LENGTH_PX, _H_MATRIX, (_DJI, "DewarpFlag"),
+        (_DJI, "DewarpHMatrix"),
+    }  # fmt: skip
+    of_the_sensor = Carrying.of_the_sensor | {_VIGNETTING}
+    radiometry = Carrying.radiometry | {(_DJI, "BlackLevel")}
+    in_px = (_FOCAL_LENGTH_PX, *_RELATIVE_CENTRE)
+
+    def put_geometry(self, packet: Packet, theirs: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
+        super().put_geometry(packet, theirs, reference, tags, grid)
+        centre = _pair(tags, _CENTRE)
+        if centre is not None:
+            for name, value in zip(_CENTRE, grid.px(*centre), strict=True):
+                packet.put(name, [number_text(value)])
+        date, terms = _dewarp_data(tags)
+        if terms:
+            scaled = [v * grid.scale for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]
+            packet.put(_DEWARP_DATA, [f"{date};" + ",".join(map(number_text, scaled))])
+
+    def pixels_per_mm(self, tags: Tags) -> float | None:
+        focal_px = tags.number(*_FOCAL_LENGTH_PX)
+        by_focal_lengths = focal_px / tags.focal_length_mm if focal_px and tags.focal_length_mm else None
+        return tags.pixels_per_mm or by_focal_lengths or super().pixels_per_mm(tags)
+
+
 class Dji(Camera):
     """The multispectral cameras of DJI."""
 
     name = "DJI"
+    capture_ids = (_CAPTURE_UUID,)
+    carrying = _Carrying()
 
     def recognises(self, tags: Tags) -> bool:
-        return tags.make.upper() == "DJI" or ("drone-dji", "CaptureUUID") in tags.xmp
+        return tags.make.upper() == "DJI" or _CAPTURE_UUID in tags.xmp
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        calibrated = _matrix(tags, "CalibratedHMatrix")
+        calibrated = _calibrated_h_matrix(tags)
         lens = _lens(tags) if calibrated is not None else None
         to_rig = _shift_to_rig(tags) if lens is None else calibrated
         if len(info.dtypes) > 1:
             return colour_bands(path, info, lens, to_rig)
-        name = tags.text("Camera", "BandName") or tags.text("drone-dji", "BandName") or _band_in_name(path)
+        name = tags.text(*BAND_NAME) or tags.text(_DJI, "BandName") or _band_in_name(path)
         band = spectral(band_of(path, info, name), tags)
         return (replace(band, lens=lens, to_rig=to_rig, radiometry=_radiometry(tags)),)
-
-    def capture_key(self, path: Path, tags: Tags) -> str:
-        return tags.text("drone-dji", "CaptureUUID") or self.capture_name(path)
 
     def capture_name(self, path: Path) -> str:
         mavic = _MAVIC_3_NAME.match(path.stem)
@@ -59,19 +97,17 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     """The signal is (raw - black) / 65536 (1 + k1 r + ... + k6 r^6) / (gain exposure), and as DJI's guide has
     it, signal SensorGainAdjustment / Irradiance is reflectance up to a factor that all bands share.
     """
-    gain, exposure_us = tags.number("drone-dji", "SensorGain"), tags.number("drone-dji", "ExposureTime")
-    black = tags.number("drone-dji", "BlackLevel") or tags.number("Camera", "BlackCurrent") or tags.black_level
+    gain, exposure_us = tags.number(_DJI, "SensorGain"), tags.number(_DJI, "ExposureTime")
+    black = tags.number(_DJI, "BlackLevel") or tags.number(CAMERA, "BlackCurrent") or tags.black_level
     if not gain or not exposure_us or black is None:
         return None
-    irradiance = tags.number("drone-dji", "Irradiance")
-    adjusted = tags.number("drone-dji", "SensorGainAdjustment") or 1.0
-    centre = [tags.number("drone-dji", f"CalibratedOpticalCenter{axis}") for axis in "XY"]
-    k = tags.numbers("drone-dji", "VignettingData")
-    known = centre[0] is not None and centre[1] is not None
+    irradiance = tags.number(_DJI, "Irradiance")
+    adjusted = tags.number(_DJI, "SensorGainAdjustment") or 1.0
+    centre, k = _pair(tags, _CENTRE), tags.numbers(*_VIGNETTING)
     return Radiometry(
         "relative reflectance" if irradiance else "radiance", black, 65536.0,
         adjusted / (gain * exposure_us / 1e6) / (irradiance or 1.0),
-        (centre[0] or 0.0, centre[1] or 0.0), k if known else (), False,
+        centre or (0.0, 0.0), k if centre else (), False,
     )  # fmt: skip
 
 
@@ -83,14 +119,17 @@ def _band_in_name(path: Path) -> str:
 
 
 def _shift_to_rig(tags: Tags) -> Matrix | None:
-    centre = [tags.number("drone-dji", f"RelativeOpticalCenter{axis}") for axis in "XY"]
-    if centre[0] is None or centre[1] is None:
-        return None
-    return geometry.translation(-centre[0], -centre[1])
+    centre = _pair(tags, _RELATIVE_CENTRE)
+    return None if centre is None else geometry.translation(-centre[0], -centre[1])
 
 
-def _matrix(tags: Tags, name: str) -> Matrix | None:
-    values = tags.numbers("drone-dji", name)
+def _pair(tags: Tags, names: tuple[Name, Name]) -> tuple[float, float] | None:
+    x, y = (tags.number(*name) for name in names)
+    return None if x is None or y is None else (x, y)
+
+
+def _calibrated_h_matrix(tags: Tags) -> Matrix | None:
+    values = tags.numbers(*_H_MATRIX)
     if len(values) != 9:
         return None
     matrix = np.array(values).reshape(3, 3)
@@ -102,13 +141,21 @@ def _matrix(tags: Tags, name: str) -> Matrix | None:
 
 
 def _lens(tags: Tags) -> Lens | None:
-    """K = [fx, fy, COCx + cx, COCy + cy] from DewarpData 'date;fx,fy,cx,cy,k1,k2,p1,p2,k3'."""
-    _, _, text = tags.text("drone-dji", "DewarpData").rpartition(";")
-    centre = [tags.number("drone-dji", f"CalibratedOpticalCenter{axis}") for axis in "XY"]
-    try:
-        fx, fy, cx, cy, *k = (float(part) for part in text.split(","))
-    except ValueError:
+    """K = [fx, fy, COCx + cx, COCy + cy] from DewarpData."""
+    (_, terms), centre = _dewarp_data(tags), _pair(tags, _CENTRE)
+    if centre is None or not terms or not (terms[0] > 0 and terms[1] > 0):
         return None
-    if len(k) != 5 or not (fx > 0 and fy > 0) or centre[0] is None or centre[1] is None:
-        return None
+    fx, fy, cx, cy, *k = terms
     return Lens(fx, fy, centre[0] + cx, centre[1] + cy, tuple(k))
+
+
+def _dewarp_data(tags: Tags) -> tuple[str, list[float]]:
+    """(date, fx, fy, cx, cy, k1, k2, p1, p2, k3) of DewarpData 'date;fx,fy,…', px and OpenCV's order; no terms where
+    it says something else.
+    """
+    date, _, text = tags.text(*_DEWARP_DATA).rpartition(";")
+    try:
+        terms = [float(part) for part in text.split(",")]
+    except ValueError:
+        terms = []
+    return date, terms if len(terms) == 9 else []

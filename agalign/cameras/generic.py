@@ -6,6 +6,7 @@ from pathlib import Path
 
 from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
+from agalign.cameras.pix4d import BAND_NAME, CAMERA
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import JPEG_SUFFIXES, RasterInfo
 from agalign.values.capture import Band
@@ -21,13 +22,17 @@ _SUFFIX = re.compile(
 )
 
 
+_DATE = re.compile(r"(?:19|20)\d\d([-_.])\d{1,2}\1\d{1,2}$")
+"""At a name's end: its last number is a day, not a band."""
+
+
 class Generic(Camera):
     """Files that no vendor claims. `pattern` holds {capture} and {band}, as in '{capture}_{band}.tif'."""
 
     name = "generic"
 
     def __init__(self, pattern: str | None = None) -> None:
-        self._pattern = compile_pattern(pattern) if pattern else None
+        self._patterns = compile_pattern(pattern) if pattern else ()
 
     def recognises(self, tags: Tags) -> bool:
         return True
@@ -35,13 +40,13 @@ class Generic(Camera):
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
         if path.suffix.lower() in JPEG_SUFFIXES:
             return colour_bands(path, info)
-        own_name = tags.text("Camera", "BandName") or self.split(path)[1]
+        own_name = tags.text(*BAND_NAME) or self.split(path)[1]
         indexes = [i for i in range(1, len(info.dtypes) + 1) if i != info.alpha_index]
         found = []
         for i in indexes:
             name = info.descriptions[i - 1] or (own_name if len(indexes) == 1 else "") or f"band_{i}"
             wavelength = (
-                info.wavelengths_nm[i - 1] or tags.number("Camera", "CentralWavelength") or _wavelength_in(own_name)
+                info.wavelengths_nm[i - 1] or tags.number(CAMERA, "CentralWavelength") or _wavelength_in(own_name)
             )
             found.append(replace(band_of(path, info, name, i), wavelength_nm=wavelength))
         return tuple(found)
@@ -55,23 +60,30 @@ class Generic(Camera):
 
     def split(self, path: Path) -> tuple[str, str]:
         """(capture, band) as the file's name has them; the band is empty where the name does not tell."""
-        if self._pattern is not None:
-            match = self._pattern.fullmatch(path.name)
-            return (match["capture"], match["band"]) if match else (path.stem, "")
-        match = _SUFFIX.fullmatch(path.stem)
+        for pattern in self._patterns:
+            match = pattern.fullmatch(path.name)
+            if match:
+                return match["capture"], match["band"]
+        match = None if self._patterns or _DATE.search(path.stem) else _SUFFIX.fullmatch(path.stem)
         if match:
             return match["capture"].rstrip("_-. "), match["band"] or match["glued"]
         return path.stem, ""
 
 
-def compile_pattern(pattern: str) -> re.Pattern[str]:
-    """A --pattern as a regular expression. Raises ConfigurationError where {capture} or {band} is missing."""
+def compile_pattern(pattern: str) -> tuple[re.Pattern[str], ...]:
+    """A --pattern as regular expressions, to be tried in turn. Raises ConfigurationError where {capture} or {band} is
+    missing.
+
+    A name may be split in several places: `IMG_0007_red_edge` where the band is a word that is known, else as late as
+    the pattern allows, so that the band is `1` in `IMG_0007_1`.
+    """
     if pattern.count("{capture}") != 1 or pattern.count("{band}") != 1:
         raise ConfigurationError(
             f"pattern '{pattern}' needs {{capture}} and {{band}} once each, as in '{{capture}}_{{band}}.tif'"
         )
-    escaped = re.escape(pattern).replace(r"\{capture\}", "(?P<capture>.+?)").replace(r"\{band\}", "(?P<band>[^/]+?)")
-    return re.compile(escaped.replace(r"\*", ".*"), re.IGNORECASE)
+    escaped = re.escape(pattern).replace(r"\{capture\}", "(?P<capture>.+)").replace(r"\*", ".*")
+    bands = rf"(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm", "[^/]+?"
+    return tuple(re.compile(escaped.replace(r"\{band\}", f"(?P<band>{band})"), re.IGNORECASE) for band in bands)
 
 
 def _wavelength_in(name: str) -> float | None:

@@ -10,23 +10,13 @@ from typing import Any
 import tifffile
 from PIL import ExifTags, Image
 
-from agalign.cameras.xmp import Namespace, Packet
+from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
 from agalign.values.capture import Position
 
-CAPTURE_IDS: tuple[tuple[Namespace, str], ...] = (
-    ("MicaSense", "CaptureId"), ("drone-dji", "CaptureUUID"), ("Camera", "CaptureUUID"), ("Sentera", "CaptureUUID"),
-    ("Sentera", "ImageUniqueID"),
-)  # fmt: skip
-"""Where cameras write an id that the bands of a capture share."""
-FLIGHT_IDS: tuple[tuple[Namespace, str], ...] = (
-    ("MicaSense", "FlightId"), ("Camera", "FlightUUID"), ("Sentera", "FlightUUID"), ("Sentera", "FlightUniqueID"),
-)  # fmt: skip
-"""Where they write one that a flight shares."""
 _RATIONAL_TYPES = (5, 10)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
-_LONGEST_FOCAL_LENGTH_MM = 100.0
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -44,48 +34,39 @@ class Tags:
     """EXIF's: how the stored image is to be turned to be seen upright."""
     black_level: float | None = None
     """Mean of the tag's values."""
-    xmp: Mapping[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
+    xmp: Mapping[Name, tuple[str, ...]] = field(default_factory=dict)
     exif: Mapping[str, Any] = field(default_factory=dict)
 
-    def text(self, namespace: Namespace, name: str) -> str:
-        """An XMP value as text; a sequence's items are joined by commas."""
+    def text(self, namespace: str, name: str) -> str:
+        """An XMP value as text, by its namespace as `xmp.Name` has it; a sequence's items are joined by commas."""
         return ",".join(self.xmp.get((namespace, name), ()))
 
-    def first_text(self, names: Iterable[tuple[Namespace, str]]) -> str:
+    def first_text(self, names: Iterable[Name]) -> str:
         """The text of the first of some names that has one."""
         return next((text for name in names if (text := self.text(*name))), "")
 
-    def numbers(self, namespace: Namespace, name: str) -> tuple[float, ...]:
+    def numbers(self, namespace: str, name: str) -> tuple[float, ...]:
         """The finite numbers in an XMP value, whether it is one text, a list in a text, or a sequence."""
         numbers = (float(n) for n in _NUMBER.findall(self.text(namespace, name)))
         return tuple(n for n in numbers if math.isfinite(n))
 
-    def number(self, namespace: Namespace, name: str) -> float | None:
+    def number(self, namespace: str, name: str) -> float | None:
         """The first number in an XMP value."""
         numbers = self.numbers(namespace, name)
         return numbers[0] if numbers else None
 
     @property
     def pixels_per_mm(self) -> float | None:
-        """Density of the pixels in the focal plane, from EXIF FocalPlaneXResolution and its unit, else from a focal
-        length in px and EXIF's in mm.
-        """
+        """Density of the pixels in the focal plane, from EXIF FocalPlaneXResolution and its unit."""
         resolution = rational(self.exif.get("FocalPlaneXResolution"))
         unit = self.exif.get("FocalPlaneResolutionUnit", 2)
         mm = _MM_PER_UNIT.get(int(unit)) if isinstance(unit, int) else None
-        if resolution and mm:
-            return resolution / mm
-        focal_px, focal_mm = self.number("drone-dji", "CalibratedFocalLength"), rational(self.exif.get("FocalLength"))
-        if not focal_px and self.focal_length_is_in_px:
-            focal_px = self.number("Camera", "PerspectiveFocalLength")
-        return focal_px / focal_mm if focal_px and focal_mm else None
+        return resolution / mm if resolution and mm else None
 
     @property
-    def focal_length_is_in_px(self) -> bool:
-        """True where Camera:PerspectiveFocalLength is in px: old firmware gives them without saying so."""
-        units = self.text("Camera", "PerspectiveFocalLengthUnits").lower()
-        length = self.number("Camera", "PerspectiveFocalLength")
-        return "px" in units or "pixel" in units or (length is not None and length > _LONGEST_FOCAL_LENGTH_MM)
+    def focal_length_mm(self) -> float | None:
+        """EXIF's."""
+        return rational(self.exif.get("FocalLength"))
 
 
 def rational(value: Any) -> float | None:

@@ -10,8 +10,19 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import Camera, band_of, largest_value, perspective_lens, rays_to_rig, rig_rotation, spectral
+from agalign.cameras.base import Camera, band_of, largest_value, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, rational
+from agalign.cameras.pix4d import (
+    BAND_NAME,
+    CAMERA,
+    VIGNETTING_CENTRE,
+    VIGNETTING_POLYNOMIAL,
+    Carrying,
+    perspective_lens,
+    rig_degrees,
+    spectral,
+)
+from agalign.cameras.xmp import Name
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Radiometry
 
@@ -19,23 +30,32 @@ _TWELVE_BIT_TOP = 65520.0
 """RedEdge cameras store 12 bits in the upper bits of uint16."""
 
 
+_MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
+_CAPTURE_ID: Name = (_MICASENSE, "CaptureId")
+_CALIBRATION: Name = (_MICASENSE, "RadiometricCalibration")
+
+
+class _Carrying(Carrying):
+    radiometry = Carrying.radiometry | {_CALIBRATION, (_MICASENSE, "DarkRowValue")}
+
+
 class MicaSense(Camera):
     """The MicaSense family."""
 
     name = "MicaSense"
+    capture_ids = (_CAPTURE_ID,)
+    flight_ids = ((_MICASENSE, "FlightId"),)
+    carrying = _Carrying()
 
     def recognises(self, tags: Tags) -> bool:
-        return tags.make.lower() == "micasense" or ("MicaSense", "CaptureId") in tags.xmp
+        return tags.make.lower() == "micasense" or _CAPTURE_ID in tags.xmp
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        band = spectral(band_of(path, info, tags.text("Camera", "BandName") or _index_in_name(path) or path.stem), tags)
+        band = spectral(band_of(path, info, tags.text(*BAND_NAME) or _index_in_name(path) or path.stem), tags)
         lens = perspective_lens(tags)
         top = _TWELVE_BIT_TOP if band.dtype == "uint16" else largest_value(band.dtype)
-        to_rig = rays_to_rig(lens, rig_rotation(tags))
+        to_rig = rays_to_rig(lens, rotation(*rig_degrees(tags)))
         return (replace(band, saturation_value=top, lens=lens, to_rig=to_rig, radiometry=_radiometry(tags)),)
-
-    def capture_key(self, path: Path, tags: Tags) -> str:
-        return tags.text("MicaSense", "CaptureId") or self.capture_name(path)
 
     def capture_name(self, path: Path) -> str:
         return re.sub(r"_\d+$", "", path.stem)
@@ -45,7 +65,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     """L = V a1 / g (p - p_black) / (t + a2 y - a3 t y) with p = raw / 65536, g = ISO / 100 and the exposure time t;
     reflectance = pi L / E with the light sensor's irradiance E on a horizontal plane.
     """
-    a = tags.numbers("MicaSense", "RadiometricCalibration")
+    a = tags.numbers(*_CALIBRATION)
     exposure_s = rational(tags.exif.get("ExposureTime"))
     sensitivity = next(
         (tags.exif[n] for n in ("ISOSpeed", "ISOSpeedRatings", "PhotographicSensitivity") if n in tags.exif), None
@@ -54,7 +74,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         return None
     gain = a[0] / (sensitivity / 100) / exposure_s
     irradiance = _irradiance(tags)
-    centre, k = (tags.numbers("Camera", f"Vignetting{part}") for part in ("Center", "Polynomial"))
+    centre, k = tags.numbers(*VIGNETTING_CENTRE), tags.numbers(*VIGNETTING_POLYNOMIAL)
     known = len(centre) == 2
     return Radiometry(
         "reflectance" if irradiance else "radiance", tags.black_level, 65536.0,
@@ -67,11 +87,11 @@ def _irradiance(tags: Tags) -> float | None:
     """W / m^2 / nm: HorizontalIrradiance, which is in hundredths of that unless a scale is given, else what the older
     light sensor measured in its own plane.
     """
-    scale = tags.number("DLS", "IrradianceScaleToSIUnits")
-    horizontal = tags.number("DLS", "HorizontalIrradiance")
+    scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
+    horizontal = tags.number(_DLS, "HorizontalIrradiance")
     if horizontal:
         return horizontal * (scale or 0.01)
-    measured = tags.number("DLS", "SpectralIrradiance") or tags.number("Camera", "Irradiance")
+    measured = tags.number(_DLS, "SpectralIrradiance") or tags.number(CAMERA, "Irradiance")
     return measured * (scale or 1.0) if measured else None
 
 

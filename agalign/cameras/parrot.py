@@ -13,64 +13,98 @@ from pathlib import Path
 
 import numpy as np
 
-from agalign.cameras.base import Camera, band_of, colour_bands, perspective_lens, rays_to_rig, rig_rotation, spectral
+from agalign.cameras.base import Camera, band_of, colour_bands, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags
+from agalign.cameras.pix4d import (
+    BAND_NAME,
+    CAMERA,
+    CAPTURE_UUID,
+    FLIGHT_UUID,
+    FOCAL_LENGTH,
+    FOCAL_LENGTH_UNITS,
+    MODEL_TYPE,
+    Carrying,
+    number_text,
+    perspective_lens,
+    principal_point_px,
+    rig_degrees,
+    spectral,
+    turned,
+)
+from agalign.cameras.xmp import Name, Packet
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band
 from agalign.values.geometry import Matrix
+from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens, radial_coefficients
 
 _NAMES = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
 _SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
-_UPSIDE_DOWN = 3
-"""EXIF Orientation of an image that is stored turned by 180 degrees."""
 _WIDEST_RAY = 3.0
 """tan of the largest angle from the axis that is looked for in an image: 72 degrees."""
 _MOST_SHEAR = 1e-3
 """Of a fisheye's affine matrix, relative to its scale: more cannot be expressed and leaves the lens out."""
 
 
+_POLYNOMIAL: Name = (CAMERA, "FisheyePolynomial")
+_AFFINE: Name = (CAMERA, "FisheyeAffineMatrix")
+_FISHEYE: tuple[Name, ...] = (_POLYNOMIAL, _AFFINE, (CAMERA, "FisheyeAffineSymmetric"))
+
+
+class _Carrying(Carrying):
+    geometry = Carrying.geometry | {*_FISHEYE}
+    in_px = (_AFFINE,)
+    turned_where_orientation_is_3 = True
+
+    def put_geometry(self, packet: Packet, theirs: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
+        super().put_geometry(packet, theirs, reference, tags, grid)
+        density = self.pixels_per_mm(tags)
+        if grid.undistorted and tags.numbers(*_AFFINE) and density and reference.lens is not None:
+            # What was a fisheye is a pinhole now.
+            packet.remove(_FISHEYE)
+            packet.put(MODEL_TYPE, ["perspective"])
+            packet.add(FOCAL_LENGTH, number_text(reference.lens.fx_px / density))
+            packet.add(FOCAL_LENGTH_UNITS, "mm")
+
+
 class Sequoia(Camera):
     """Parrot Sequoia and Sequoia+."""
 
     name = "Parrot Sequoia"
+    capture_ids = (CAPTURE_UUID,)
+    flight_ids = (FLIGHT_UUID,)
+    carrying = _Carrying()
 
     def recognises(self, tags: Tags) -> bool:
-        return tags.make.lower() == "parrot" or tags.text("Camera", "RigName").lower().startswith("sequoia")
+        return tags.make.lower() == "parrot" or tags.text(CAMERA, "RigName").lower().startswith("sequoia")
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        fisheye = "fisheye" in tags.text("Camera", "ModelType").lower()
+        fisheye = "fisheye" in tags.text(*MODEL_TYPE).lower()
         lens = _fisheye_lens(tags, info) if fisheye else perspective_lens(tags)
-        turned = tags.orientation == _UPSIDE_DOWN
-        if lens is not None and turned:
-            lens = _upside_down(lens, info)
-        to_rig = rays_to_rig(lens, rig_rotation(tags) @ (np.diag([-1.0, -1.0, 1.0]) if turned else np.eye(3)))
+        to_camera = np.eye(3)
+        if self.carrying.is_turned(tags):
+            lens, to_camera = lens and _upside_down(lens, info), np.diag([-1.0, -1.0, 1.0])
+        to_rig = rays_to_rig(lens, rotation(*rig_degrees(tags)) @ to_camera)
         if len(info.dtypes) > 1:
             return colour_bands(path, info, lens, to_rig)
         suffix = _SUFFIX.search(path.stem)
-        name = _NAMES.get(suffix[1].upper(), suffix[1]) if suffix else tags.text("Camera", "BandName") or path.stem
+        name = _NAMES.get(suffix[1].upper(), suffix[1]) if suffix else tags.text(*BAND_NAME) or path.stem
         return (replace(spectral(band_of(path, info, name), tags), lens=lens, to_rig=to_rig),)
-
-    def capture_key(self, path: Path, tags: Tags) -> str:
-        return tags.text("Camera", "CaptureUUID") or self.capture_name(path)
 
     def capture_name(self, path: Path) -> str:
         return _SUFFIX.sub("", path.stem)
 
 
 def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
-    polynomial = tags.numbers("Camera", "FisheyePolynomial")
-    affine = tags.numbers("Camera", "FisheyeAffineMatrix")
-    centre_mm = tags.numbers("Camera", "PrincipalPoint")
-    density = tags.pixels_per_mm
-    if len(polynomial) != 4 or len(affine) != 4 or len(centre_mm) != 2 or density is None:
+    polynomial, affine, centre_px = tags.numbers(*_POLYNOMIAL), tags.numbers(*_AFFINE), principal_point_px(tags)
+    if len(polynomial) != 4 or len(affine) != 4 or centre_px is None:
         return None
     c, d, e, f = affine
     slope = polynomial[1]
     if not (c > 0 and f > 0 and slope > 0) or polynomial[0] != 0 or max(abs(d), abs(e)) > _MOST_SHEAR * c:
         return None
     fx, fy = slope * 2 * c / math.pi, slope * 2 * f / math.pi
-    cx, cy = (v * density for v in centre_mm)
+    cx, cy = centre_px
     reach = math.hypot(max(cx, info.width_px - cx) / fx, max(cy, info.height_px - cy) / fy)
 
     def bent(r: Matrix) -> Matrix:
@@ -84,7 +118,8 @@ def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
 
 
 def _upside_down(lens: Lens, info: RasterInfo) -> Lens:
-    """The lens in pixels of the stored image: principal points count from the image's outer edge."""
+    """The lens in pixels of the stored image, which is turned by 180 degrees."""
     k = lens.distortion
     flipped = (*k[:2], -k[2], -k[3], *k[4:]) if len(k) > 3 else k
-    return replace(lens, cx_px=info.width_px - lens.cx_px, cy_px=info.height_px - lens.cy_px, distortion=flipped)
+    cx, cy = turned((lens.cx_px, lens.cy_px), (info.width_px, info.height_px))
+    return replace(lens, cx_px=cx, cy_px=cy, distortion=flipped)

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from agalign.cameras.base import Camera, band_of, colour_bands, perspective_lens, spectral
-from agalign.cameras.metadata import CAPTURE_IDS, Tags
+from agalign.cameras.base import Camera, band_of, colour_bands
+from agalign.cameras.metadata import Tags
+from agalign.cameras.pix4d import BAND_NAME, CAPTURE_UUID, FLIGHT_UUID, perspective_lens, spectral
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band
 
@@ -22,16 +23,21 @@ _CHANNELS = {"NDRE": {1: ("Red edge", 720.0), 3: ("NIR", 840.0)}, "NDVI": {1: ("
 """Of the one-lens cameras: the channels that hold a band, with their centre wavelengths in nm."""
 
 
+_SENTERA = "sentera.com"
+
+
 class Sentera(Camera):
     """Sentera 6X and Double 4K."""
 
     name = "Sentera"
+    capture_ids = (CAPTURE_UUID, (_SENTERA, "CaptureUUID"), (_SENTERA, "ImageUniqueID"))
+    flight_ids = (FLIGHT_UUID, (_SENTERA, "FlightUUID"), (_SENTERA, "FlightUniqueID"))
 
     def recognises(self, tags: Tags) -> bool:
-        return "sentera" in tags.make.lower() or any(namespace == "Sentera" for namespace, _ in tags.xmp)
+        return "sentera" in tags.make.lower() or any(namespace == _SENTERA for namespace, _ in tags.xmp)
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        matrix = tags.numbers("Sentera", "AlignMatrix")
+        matrix = tags.numbers(_SENTERA, "AlignMatrix")
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
         if len(info.dtypes) > 1:
             kind = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), "")
@@ -44,15 +50,12 @@ class Sentera(Camera):
                 if index <= len(info.dtypes)
             )
         folder = _BAND_FOLDER.match(path.parent.name)
-        name = tags.text("Camera", "BandName") or (folder["name"] if folder else path.stem)
+        name = tags.text(*BAND_NAME) or (folder["name"] if folder else path.stem)
         band = spectral(band_of(path, info, name), tags)
         if folder and band.wavelength_nm is None:
             width = float(folder["width"]) if folder["width"] else None
             band = replace(band, wavelength_nm=float(folder["wavelength"]), bandwidth_nm=width)
         return (replace(band, lens=perspective_lens(tags) if to_rig is None else None, to_rig=to_rig),)
-
-    def capture_key(self, path: Path, tags: Tags) -> str:
-        return tags.first_text(CAPTURE_IDS) or self.capture_name(path)
 
     def capture_folder(self, path: Path) -> Path:
         return path.parent.parent if _ANY_BAND_FOLDER.match(path.parent.name) else path.parent

@@ -4,24 +4,20 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, ParseError
 
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 
-Namespace = Literal["Camera", "MicaSense", "DLS", "drone-dji", "Sentera"]
-Name = tuple[Namespace, str]
-
-_NAMESPACES: dict[str, Namespace] = {
-    "http://pix4d.com/camera/1.0": "Camera",
-    "http://pix4d.com/1.0": "Camera",
-    "http://micasense.com/MicaSense/1.0": "MicaSense",
-    "http://micasense.com/DLS/1.0": "DLS",
-    "http://www.dji.com/drone-dji/1.0": "drone-dji",
-}
+Name = tuple[str, str]
+"""(namespace, name). A namespace is a domain, such as `micasense.com`, or a place in it, such as `micasense.com/DLS`:
+its URI without scheme, `www.`, version and closing slash, which firmware changes.
+"""
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
+_DEEPEST = 4
+_AROUND = re.compile(r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$", re.IGNORECASE)
 _PREFIX = re.compile(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""")
 
 
@@ -50,23 +46,25 @@ class Packet:
                 ElementTree.register_namespace(prefix, uri)  # so that it is written under the name it came with
         return cls(root)
 
-    def values(self) -> dict[tuple[str, str], tuple[str, ...]]:
-        """{(namespace, name): values} from all rdf:Description blocks; the first of two counts."""
-        found: dict[tuple[str, str], tuple[str, ...]] = {}
+    def values(self) -> dict[Name, tuple[str, ...]]:
+        """{(namespace, name): values} from all rdf:Description blocks; the first of two counts. A value is found by
+        its own namespace and by those that it lies in.
+        """
+        found: dict[Name, tuple[str, ...]] = {}
         for description in self._descriptions():
             attributes = [(tag, (value,)) for tag, value in description.attrib.items()]
             for tag, raw in [*attributes, *((child.tag, _texts(child)) for child in description)]:
-                name, cleaned = _name(tag), tuple(v.strip() for v in raw)
-                if name and any(cleaned):
+                cleaned = tuple(v.strip() for v in raw)
+                for name in _names(tag) if any(cleaned) else ():
                     found.setdefault(name, cleaned)
         return found
 
     def remove(self, names: Collection[Name]) -> None:
         """Take values out."""
         for description in self._descriptions():
-            for tag in [t for t in description.attrib if _name(t) in names]:
+            for tag in [t for t in description.attrib if _is_one_of(t, names)]:
                 del description.attrib[tag]
-            for child in [c for c in description if _name(c.tag) in names]:
+            for child in [c for c in description if _is_one_of(c.tag, names)]:
                 description.remove(child)
 
     def take(self, other: "Packet", names: Collection[Name]) -> None:
@@ -76,15 +74,15 @@ class Packet:
         if mine is None:
             return
         for description in other._descriptions():
-            mine.attrib.update({t: v for t, v in description.attrib.items() if _name(t) in names})
-            mine.extend(deepcopy(child) for child in description if _name(child.tag) in names)
+            mine.attrib.update({t: v for t, v in description.attrib.items() if _is_one_of(t, names)})
+            mine.extend(deepcopy(child) for child in description if _is_one_of(child.tag, names))
 
     def put(self, name: Name, values: Sequence[str]) -> None:
         """Change a value that is there, in the form in which it is there."""
         for description in self._descriptions():
-            for tag in [t for t in description.attrib if _name(t) == name]:
+            for tag in [t for t in description.attrib if _is_one_of(t, [name])]:
                 description.attrib[tag] = ",".join(values)
-            for child in [c for c in description if _name(c.tag) == name]:
+            for child in [c for c in description if _is_one_of(c.tag, [name])]:
                 items = list(child.iter(f"{_RDF}li"))
                 if not items:
                     child.text = ",".join(values)
@@ -95,12 +93,14 @@ class Packet:
                     items[0].text = ",".join(values)
 
     def add(self, name: Name, value: str) -> None:
-        """Give it a value that it does not have."""
+        """Give it a value that it does not have, in a namespace in which it has others."""
         self.remove([name])
-        mine = next(self._descriptions(), None)
-        if mine is not None:
-            uri = next(uri for uri, namespace in _NAMESPACES.items() if namespace == name[0])
-            ElementTree.SubElement(mine, f"{{{uri}}}{name[1]}").text = value
+        for description in self._descriptions():
+            for tag in [*description.attrib, *(child.tag for child in description)]:
+                uri, _, _ = tag.removeprefix("{").rpartition("}")
+                if name[0] in _namespaces(uri):
+                    ElementTree.SubElement(description, f"{{{uri}}}{name[1]}").text = value
+                    return
 
     def serialised(self) -> bytes:
         """As it stands in a file; nothing for an empty packet."""
@@ -119,7 +119,19 @@ def _texts(element: Element) -> tuple[str, ...]:
     return tuple(items) if items else (element.text or "",)
 
 
-def _name(tag: str) -> Name | None:
+def _names(tag: str) -> list[Name]:
+    """A tag's name in its namespace and in those that it lies in; none for RDF's own and for one without a place."""
     uri, _, name = tag.removeprefix("{").rpartition("}")
-    namespace: Namespace | None = "Sentera" if "sentera" in uri.lower() else _NAMESPACES.get(uri.rstrip("/"))
-    return (namespace, name) if namespace else None
+    return [(namespace, name) for namespace in _namespaces(uri)]
+
+
+def _is_one_of(tag: str, names: Collection[Name]) -> bool:
+    return any(name in names for name in _names(tag))
+
+
+def _namespaces(uri: str) -> list[str]:
+    if uri.startswith("http://www.w3.org/"):
+        return []
+    place = _AROUND.sub("", uri)
+    parts = place.split("/")[:_DEEPEST]
+    return ["/".join(parts[:count]) for count in range(len(parts), 0, -1)] if place else []

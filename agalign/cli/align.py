@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
-from agalign.errors import ConfigurationError
+from agalign.errors import NoSuchBandError
 from agalign.values.choices import (
     BandOrder,
     Compression,
@@ -186,8 +186,8 @@ def find_captures(folder: Path, options: "DiscoverOptions", voice: Voice, *, sil
         for problem in flight.problems:
             voice.problem(problem.text, file=problem.path)
     if not flight.captures:
-        if any("for the reference; this capture has" in p.text for p in flight.problems):
-            raise ConfigurationError(f"{folder}: no capture has a band '{options.reference}'")
+        if any(isinstance(p.error, NoSuchBandError) for p in flight.problems):
+            raise NoSuchBandError(f"{folder}: no capture has a band '{options.reference}'")
         raise InputError(
             f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' shows what was found"
         )

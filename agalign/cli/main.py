@@ -26,7 +26,7 @@ from agalign.cli.align import (
     band_names,
     find_captures,
 )
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits, in_json
 
 if TYPE_CHECKING:
     from agalign.values.capture import Capture
@@ -204,7 +204,7 @@ def _facts(capture: "Capture") -> dict[str, Any]:
     bands = [
         {
             "name": b.name, "file": str(b.path), "band_index": b.band_index, "wavelength_nm": b.wavelength_nm,
-            "width": b.width_px, "height": b.height_px, "dtype": b.dtype, "nodata": b.nodata,
+            "width": b.width_px, "height": b.height_px, "dtype": b.dtype, "nodata": in_json(b.nodata),
             "lens_model": b.lens is not None, "reference": b is capture.reference,
         }
         for b in capture.bands

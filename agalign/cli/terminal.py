@@ -18,9 +18,9 @@ _PLAIN_WIDTH = 160
 _OUT_OF_MEMORY = "out of memory; close other programs or try a smaller image"
 
 
-def _finite(fields: dict[str, Any]) -> dict[str, Any]:
-    """JSON has no nan."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in fields.items()}
+def in_json(value: Any) -> Any:
+    """A field's value; JSON has no nan and no infinity, which are told in words."""
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Voice:
@@ -35,7 +35,11 @@ class Voice:
     def event(self, kind: str, text: str = "", /, **fields: Any) -> None:
         """One line of progress: JSON with --log-json, else the text unless --quiet."""
         if self.log_json:
-            print(json.dumps({"event": kind, **_finite(fields)}, default=str), file=sys.stderr, flush=True)
+            print(
+                json.dumps({"event": kind, **{k: in_json(v) for k, v in fields.items()}}, default=str),
+                file=sys.stderr,
+                flush=True,
+            )
         elif text and not self.quiet:
             self.err.print(escape(text))
 
@@ -72,10 +76,5 @@ def exits(voice: Voice, on_interrupt: str = "interrupted") -> Iterator[None]:
         voice.problem(str(error))
         raise typer.Exit(EXIT_NOTHING) from None
     except MemoryError:
-        voice.problem(_OUT_OF_MEMORY)
-        raise typer.Exit(EXIT_NOTHING) from None
-    except RuntimeError as error:  # torch's, on the CPU and on CUDA
-        if "out of memory" not in str(error) and "not enough memory" not in str(error):
-            raise
         voice.problem(_OUT_OF_MEMORY)
         raise typer.Exit(EXIT_NOTHING) from None

@@ -9,6 +9,9 @@ from agalign.values.image import Mask, Raster
 
 _LEAST_SIDE_PX = 48
 _MOST_CHANNELS = 16
+_USUAL_FILLS = (-9999.0, -99999.0, -32767.0, -32768.0)
+_LARGEST_MEASURED = 1e15
+"""No sensor's unit reaches this; the fills of netCDF, GIS and C programs (1e20, 9.97e36, 3.4e38) do."""
 _LEAST_FILL_SHARE = 0.002
 """A constant patch at the border smaller than this share of the image is content, not fill."""
 _LEAST_SATURATED_PX = 7
@@ -16,10 +19,14 @@ _LEAST_SATURATED_PX = 7
 
 
 def data_mask(pixels: NDArray[np.generic], nodata: float | None) -> Mask:
-    """(height, width), False where the pixels are nodata or not finite."""
+    """(height, width), False where the pixels are nodata or not finite, and where they are what programs fill gaps of
+    floats with, if nothing is declared.
+    """
     valid: Mask = np.isfinite(pixels) if pixels.dtype.kind == "f" else np.ones(pixels.shape, dtype=bool)
     if nodata is not None and np.isfinite(nodata):
         valid &= pixels != nodata
+    if nodata is None and pixels.dtype.kind == "f":
+        valid &= (np.abs(pixels) < _LARGEST_MEASURED) & ~np.isin(pixels, _USUAL_FILLS)
     return valid
 
 

@@ -21,7 +21,8 @@ from rasterio.shutil import copy as copy_dataset
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from agalign.cameras.carried_tags import CarriedTags, FromSource, band_tags, capture_tags
+from agalign.cameras.carried_tags import CarriedTags, band_tags, capture_tags
+from agalign.cameras.pix4d import FromSource
 from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
 from agalign.errors import OutputError

@@ -1,8 +1,10 @@
+import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,10 +12,11 @@ from distributed import LocalCluster
 
 import agalign
 from agalign.batch import RunOptions, dask_executor, run_flight, workers
+from agalign.batch import learn as batch_learn
 from agalign.batch.learn import learn_flight, learning_fingerprint, median_mapping
 from agalign.cameras.discover import discover
 from agalign.config import FastRecipe, FlightSettings, JointSettings, Settings
-from agalign.errors import ConfigurationError, InputError
+from agalign.errors import ConfigurationError, GeometryError, InputError
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.products.sidecar import find_sidecars, read_sidecar
@@ -218,3 +221,49 @@ def test_a_want_of_memory_is_said_so(flight: Path, tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(workers, "process_capture", greedy)
     with pytest.raises(MemoryError, match="not enough memory"):
         agalign.align_folder(flight, tmp_path, settings=Settings(flight=FlightSettings(together=False)))
+
+
+@pytest.mark.parametrize("fault", [cv2.error("of OpenCV"), GeometryError("no homography")])
+def test_a_fault_while_learning_costs_the_flights_network_and_nothing_else(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Exception
+) -> None:
+    def faulty(*_: object) -> object:
+        raise fault
+
+    monkeypatch.setattr(batch_learn, "learn", faulty)
+    reports = list(run_flight(discover(flight), tmp_path, SETTINGS))
+    assert all(r.good for r in reports)
+    assert {b.joint.recipe for r in reports for b in r.sidecar.bands if b.joint} == {"fast"}
+
+
+def test_a_name_that_another_cameras_number_takes_is_not_taken_twice(flight: Path) -> None:
+    def named(model: str, flight_id: str) -> Capture:
+        capture = discover(flight).captures[0]
+        return replace(capture, camera=replace(capture.camera, model=model, serial=""), flight_id=flight_id)
+
+    names = model_names([[named("X", "1")], [named("X", "2")], [named("X-2", "1")], [named("x", "1")]])
+    assert names == ["X.safetensors", "X-2.safetensors", "X-2-2.safetensors", "x-3.safetensors"]
+    assert len({n.lower() for n in names}) == 4
+
+
+def test_an_old_sidecar_deletes_nothing_beyond_its_folder(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    list(run_flight(discover(flight), out, SETTINGS))
+    precious = tmp_path / "precious.tif"
+    precious.write_text("not ours")
+    sidecar = out / "0000SET" / "000" / "IMG_0001.json"
+    data = json.loads(sidecar.read_text())
+    data["output"]["band_files"] = [{"file": "../../../precious.tif", "bytes": 1}, {"file": str(precious), "bytes": 1}]
+    sidecar.write_text(json.dumps(data))
+    reports = list(run_flight(discover(flight), out, SETTINGS, RunOptions(overwrite=True)))
+    assert all(r.good for r in reports)
+    assert precious.read_text() == "not ours"
+
+
+def test_an_output_that_cannot_be_replaced_costs_its_capture_only(flight: Path, tmp_path: Path) -> None:
+    (tmp_path / "0000SET" / "000" / "IMG_0001.tif" / "below").mkdir(parents=True)
+    reports = {r.label: r for r in run_flight(discover(flight), tmp_path, SETTINGS)}
+    assert reports["0000SET/000/IMG_0002"].good
+    lost = reports["0000SET/000/IMG_0001"]
+    assert lost.state == "error"
+    assert "IMG_0001.tif: cannot be written" in (lost.error or "")

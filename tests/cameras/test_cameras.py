@@ -8,6 +8,7 @@ from agalign.cameras.base import rotation
 from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
+from agalign.cameras.pix4d import CAMERA
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import RasterInfo, probe
 from agalign.synthetic import rig
@@ -52,12 +53,13 @@ def test_rotation_order_and_hand() -> None:
     np.testing.assert_allclose(rotation(30, 40, 50), rotation(30, 0, 0) @ rotation(0, 40, 0) @ rotation(0, 0, 50))
 
 
+MICASENSE, SENTERA = "micasense.com/MicaSense", "sentera.com"
 INFO = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
 
 
 def tags(**camera: str) -> Tags:
     exif = {"FocalPlaneXResolution": (266666667, 1000000), "FocalPlaneResolutionUnit": 4, "FocalLength": (55, 10)}
-    return Tags(make="MicaSense", xmp={("Camera", k): (v,) for k, v in camera.items()}, exif=exif)
+    return Tags(make="MicaSense", xmp={(CAMERA, k): (v,) for k, v in camera.items()}, exif=exif)
 
 
 def test_focal_length_of_old_firmware_is_in_pixels() -> None:
@@ -88,12 +90,12 @@ def test_without_a_lens_there_is_no_rig_seed() -> None:
     ("tags", "name"),
     [
         (Tags(make="MicaSense"), "MicaSense"),
-        (Tags(xmp={("MicaSense", "CaptureId"): ("a",)}), "MicaSense"),
+        (Tags(xmp={(MICASENSE, "CaptureId"): ("a",)}), "MicaSense"),
         (Tags(make="DJI"), "DJI"),
         (Tags(make="Parrot"), "Parrot Sequoia"),
-        (Tags(xmp={("Camera", "RigName"): ("Sequoia",)}), "Parrot Sequoia"),
+        (Tags(xmp={(CAMERA, "RigName"): ("Sequoia",)}), "Parrot Sequoia"),
         (Tags(make="Sentera"), "Sentera"),
-        (Tags(xmp={("Sentera", "AlignMatrix"): ("1",)}), "Sentera"),
+        (Tags(xmp={(SENTERA, "AlignMatrix"): ("1",)}), "Sentera"),
         (Tags(make="MAPIR"), "MAPIR"),
         (Tags(model="LATT-M3M-L41-F550"), "MAPIR"),
         (Tags(), "generic"),
@@ -144,3 +146,6 @@ def test_default_reference() -> None:
     assert default_reference([band("band_1", 840), band("band_2", 560), band("band_3", 475)]) == 1
     assert default_reference([band("LWIR", 11000), band("Red", 668)]) == 1
     assert default_reference([band("a"), band("b")]) == 0
+    # Thermal is never it, also where no other band's wavelength is known.
+    assert default_reference([band("LWIR", 11000), band("a"), band("b")]) == 1
+    assert default_reference([band("band_1", 11000), band("band_2")]) == 1

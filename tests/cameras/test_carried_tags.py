@@ -16,6 +16,7 @@ from agalign.cameras.carried_tags import band_tags
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.parrot import Sequoia
+from agalign.cameras.pix4d import CAMERA
 from agalign.cameras.tiff_directory import (
     EXIF,
     GPS,
@@ -33,7 +34,7 @@ from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 
-from .test_vendors import SIZE, VENDORS, packet, write_capture
+from .test_vendors import DJI, MICASENSE, SIZE, VENDORS, packet, write_capture
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -73,13 +74,13 @@ def test_aligned_bands_look_like_one_camera(flight: Path, both: Path) -> None:
 def test_vignetting_lies_where_the_band_was_moved_to(flight: Path, both: Path) -> None:
     data = json.loads((both / "IMG_0001.json").read_text())
     truth = json.loads((flight / "truth.json").read_text())["IMG_0001"]["bands"]["IMG_0001_4.tif"]
-    centre = np.array(read_tags(flight / "0000SET" / "000" / "IMG_0001_4.tif").numbers("Camera", "VignettingCenter"))
+    centre = np.array(read_tags(flight / "0000SET" / "000" / "IMG_0001_4.tif").numbers(CAMERA, "VignettingCenter"))
     bands = bands_in(flight / "0000SET" / "000")
     back = geometry.apply(
         geometry.invert(np.array(truth["fixed_to_moving"])), lens.undistort(bands["NIR"].lens, centre)
     )
     expected = lens.distort(bands["Green"].lens, back) - data["output"]["crop"][:2]
-    found = read_tags(both / "IMG_0001_4.tif").numbers("Camera", "VignettingCenter")
+    found = read_tags(both / "IMG_0001_4.tif").numbers(CAMERA, "VignettingCenter")
     np.testing.assert_allclose(found, expected, atol=0.2)
     assert np.linalg.norm(np.array(found) - centre) > 3
 
@@ -140,18 +141,18 @@ def test_djis_geometry_is_the_references(tmp_path: Path) -> None:
     grid = OutputGrid(20, 10, 200, 180, scale_xy=(2.0, 2.0))
     prefix = "DJI_20230607112233_0001_MS_"
     found = carried(tmp_path, "Mavic 3", f"{prefix}NIR.TIF", f"{prefix}G.TIF", grid)
-    assert found.text("Camera", "BandName") == "NIR"
-    assert found.number("drone-dji", "CalibratedOpticalCenterX") == 2 * 80.5 - 0.5 - 20
-    assert found.number("drone-dji", "CalibratedOpticalCenterY") == 2 * 60.5 - 0.5 - 10
-    assert found.text("drone-dji", "DewarpData") == "2022-09-08;340,340,3,-5,-0.1,0.05,0,0,0"
-    assert found.numbers("drone-dji", "CalibratedHMatrix")[2] == 0.5
+    assert found.text(CAMERA, "BandName") == "NIR"
+    assert found.number(DJI, "CalibratedOpticalCenterX") == 2 * 80.5 - 0.5 - 20
+    assert found.number(DJI, "CalibratedOpticalCenterY") == 2 * 60.5 - 0.5 - 10
+    assert found.text(DJI, "DewarpData") == "2022-09-08;340,340,3,-5,-0.1,0.05,0,0,0"
+    assert found.numbers(DJI, "CalibratedHMatrix")[2] == 0.5
 
 
 def test_an_upside_down_principal_point_counts_from_the_other_end(tmp_path: Path) -> None:
     files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
     found = carried(tmp_path, "Sequoia", *files, OutputGrid(30, 20, 120, 90))
     # Stored: (160 - 80, 120 - 58.67) - (30, 20); seen upright it counts from 120, 90.
-    x, y = (v * 266.67 for v in found.numbers("Camera", "PrincipalPoint"))
+    x, y = (v * 266.67 for v in found.numbers(CAMERA, "PrincipalPoint"))
     assert (x, y) == pytest.approx((120 - (160 - 80.0 - 30), 90 - (120 - 58.667 - 20)), abs=0.01)
     assert found.orientation == 3
 
@@ -160,20 +161,20 @@ def test_undistorted_pixels_have_no_distortion(tmp_path: Path) -> None:
     found = carried(
         tmp_path, "RedEdge", "IMG_0007_4.tif", "IMG_0007_2.tif", OutputGrid(0, 0, 160, 120, undistorted=True)
     )
-    assert found.numbers("Camera", "PerspectiveDistortion") == (0.0,) * 5
+    assert found.numbers(CAMERA, "PerspectiveDistortion") == (0.0,) * 5
 
 
 def test_radiometry_takes_what_it_used(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["RedEdge"])
-    values = {("Camera", "VignettingCenter"): ("80", "60"), ("Camera", "BandName"): ("NIR",),
-              ("MicaSense", "RadiometricCalibration"): ("1", "2", "3")}  # fmt: skip
+    values = {(CAMERA, "VignettingCenter"): ("80", "60"), (CAMERA, "BandName"): ("NIR",),
+              (MICASENSE, "RadiometricCalibration"): ("1", "2", "3")}  # fmt: skip
     add_directories(
         tmp_path / "IMG_0007_4.tif", {XMP: byte_string(packet(values, "sequences")), 50714: short(5)}, {}, {}
     )
     for radiometry in (False, True):
         found = carried_from(tmp_path, radiometry=radiometry)
-        assert (("Camera", "VignettingCenter") in found.xmp) != radiometry
-        assert (("MicaSense", "RadiometricCalibration") in found.xmp) != radiometry
+        assert ((CAMERA, "VignettingCenter") in found.xmp) != radiometry
+        assert ((MICASENSE, "RadiometricCalibration") in found.xmp) != radiometry
         assert (found.black_level is None) == radiometry
 
 
@@ -212,7 +213,7 @@ def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
 
 
 def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
-    values = {("Camera", "PrincipalPoint"): ("2.4", "1.8"), ("Camera", "PerspectiveFocalLength"): ("1451.8",)}
+    values = {(CAMERA, "PrincipalPoint"): ("2.4", "1.8"), (CAMERA, "PerspectiveFocalLength"): ("1451.8",)}
     path = tmp_path / "IMG_0001_2.tif"
     tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
     exif = {37386: rational(5.45)}
@@ -231,10 +232,20 @@ def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("centre", [("1e30", "1e30"), ("nan", "0"), ("99999", "99999")])
 def test_a_centre_of_vignetting_that_lies_nowhere_is_left_out(tmp_path: Path, centre: tuple[str, str]) -> None:
-    values = {("Camera", "VignettingCenter"): centre, ("Camera", "VignettingPolynomial"): ("1e-4",)}
+    values = {(CAMERA, "VignettingCenter"): centre, (CAMERA, "VignettingPolynomial"): ("1e-4",)}
     path = tmp_path / "IMG_0001_2.tif"
     tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
     add_directories(path, {271: text("MicaSense"), 700: byte_string(packet(values, "elements"))}, {}, {})
     band = Band("Green", path, 1, *SIZE, "uint16")
     tags = band_tags(path, band, OutputGrid(0, 0, *SIZE), lambda x, y: (math.nan, math.nan))
     assert b"VignettingCenter" not in tags.first[XMP].data or centre[0] == "nan"
+
+
+def test_a_turned_principal_point_stays_on_its_pixel_at_any_resolution(tmp_path: Path) -> None:
+    """The centre of a pixel is at whole numbers: turned by 180 degrees, pixel p is size - 1 - p."""
+    files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
+    density, seen = 266.67, (80.0, 58.667)
+    found = carried(tmp_path, "Sequoia", *files, OutputGrid(0, 0, 320, 240, scale_xy=(2.0, 2.0)))
+    x, y = (v * 2 * density for v in found.numbers(CAMERA, "PrincipalPoint"))
+    # Of an image of twice as many pixels: 2 (p + 0.5) - 0.5, whichever way it is seen.
+    assert (x, y) == pytest.approx((2 * (seen[0] + 0.5) - 0.5, 2 * (seen[1] + 0.5) - 0.5), abs=0.02)

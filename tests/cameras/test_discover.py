@@ -6,7 +6,9 @@ import pytest
 import tifffile
 
 from agalign.cameras.discover import DiscoverOptions, discover
-from agalign.errors import InputError
+from agalign.cameras.metadata import read_tags
+from agalign.cameras.tiff_directory import EXIF, add_directories, rational, read_directories, text
+from agalign.errors import InputError, NoSuchBandError
 from agalign.synthetic import flight as synthetic
 
 
@@ -149,3 +151,55 @@ def test_a_panel_of_another_flight_is_a_capture_of_its_own(flight: Path, tmp_pat
     # Same CaptureId as IMG_0001 in this folder: real cameras never repeat one, so files are told apart by name.
     found = discover(tmp_path / "f")
     assert sum(len(c.bands) for c in found.captures) == 15
+
+
+def test_a_pattern_splits_names_where_the_band_begins(tmp_path: Path) -> None:
+    for name in ("IMG_0007_1", "IMG_0007_2", "IMG_0009_1", "IMG_0009_2", "north_red_edge", "north_red"):
+        write(tmp_path / f"{name}.tif")
+    found = discover(tmp_path, DiscoverOptions(pattern="{capture}_{band}.tif"))
+    bands = {c.name: [b.name for b in c.bands] for c in found.captures}
+    assert bands == {"IMG_0007": ["1", "2"], "IMG_0009": ["1", "2"], "north": ["red", "red_edge"]}
+    assert found.problems == ()
+
+
+def test_a_pattern_that_makes_one_band_of_two_files_is_told(tmp_path: Path) -> None:
+    for name in ("a_1_red", "a_2_red", "a_1_nir"):
+        write(tmp_path / f"{name}.tif")
+    found = discover(tmp_path, DiscoverOptions(pattern="{capture}_*_{band}.tif"))
+    (problem,) = found.problems
+    assert "a_2_red.tif: is band 'red' of one capture with a_1_red.tif" in problem.text
+
+
+def test_the_day_of_a_date_is_no_band(tmp_path: Path) -> None:
+    for name in ("field_2023-05-12", "field_2023-06-03"):
+        write(tmp_path / f"{name}.tif")
+    found = discover(tmp_path)
+    assert not found.captures
+    assert all("no companion" in p.text for p in found.problems)
+    write(tmp_path / "field_2023-05-12_red.tif")
+    write(tmp_path / "field_2023-05-12_nir.tif")
+    assert [c.name for c in discover(tmp_path).captures] == ["field_2023-05-12"]
+
+
+def test_digits_that_are_no_numbers_are_sorted_all_the_same(tmp_path: Path) -> None:
+    for name in ("1²2_red", "1²2_nir", "10_red", "10_nir"):
+        write(tmp_path / f"{name}.tif")
+    assert len(discover(tmp_path).captures) == 2
+
+
+def test_a_capture_lies_where_its_reference_says(flight: Path, tmp_path: Path) -> None:
+    shutil.copytree(flight / "0000SET" / "000", tmp_path / "in")
+    path = tmp_path / "in" / "IMG_0001_1.tif"  # blue, the first file
+    elsewhere = {1: text("S"), 2: rational(10, 0, 0), 3: text("W"), 4: rational(20, 0, 0)}
+    add_directories(path, {}, read_directories(path)[EXIF], elsewhere)
+    assert read_tags(path).position.latitude == -10
+    capture = discover(tmp_path / "in").captures[0]
+    assert capture.reference.name == "Green"
+    assert capture.position is not None
+    assert capture.position.latitude == pytest.approx(52, abs=0.01)
+
+
+def test_a_reference_that_no_capture_has_is_an_error_of_its_own_class(flight: Path) -> None:
+    found = discover(flight, DiscoverOptions(reference="SWIR"))
+    assert not found.captures
+    assert {type(p.error) for p in found.problems} == {NoSuchBandError}

@@ -15,15 +15,18 @@ from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.parrot import Sequoia
+from agalign.cameras.pix4d import CAMERA
 from agalign.cameras.tiff_directory import Entry, add_directories, byte_string, rational, short, text
 from agalign.pixels.raster import probe
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Capture
 
+DJI, MICASENSE, SENTERA = "dji.com/drone-dji", "micasense.com/MicaSense", "sentera.com"
 URIS = {
     "Camera": "http://pix4d.com/camera/1.0/", "MicaSense": "http://micasense.com/MicaSense/1.0/",
     "drone-dji": "http://www.dji.com/drone-dji/1.0/", "Sentera": "https://www.sentera.com/schemas/",
 }  # fmt: skip
+PREFIXES = {CAMERA: "Camera", MICASENSE: "MicaSense", DJI: "drone-dji", SENTERA: "Sentera"}
 SIZE = 160, 120
 
 Values = Mapping[tuple[str, str], Sequence[str]]
@@ -43,9 +46,9 @@ class Vendor:
 
 def pinhole(k: int) -> Values:
     return {
-        ("Camera", "PrincipalPoint"): (f"{2.4 + 0.01 * k}", "1.8"), ("Camera", "PerspectiveFocalLength"): ("5.45",),
-        ("Camera", "PerspectiveFocalLengthUnits"): ("mm",), ("Camera", "RigRelatives"): (f"{0.1 * k}", "0", "0.05"),
-        ("Camera", "PerspectiveDistortion"): ("-0.1", "0.1", "0", "0", "0"),
+        (CAMERA, "PrincipalPoint"): (f"{2.4 + 0.01 * k}", "1.8"), (CAMERA, "PerspectiveFocalLength"): ("5.45",),
+        (CAMERA, "PerspectiveFocalLengthUnits"): ("mm",), (CAMERA, "RigRelatives"): (f"{0.1 * k}", "0", "0.05"),
+        (CAMERA, "PerspectiveDistortion"): ("-0.1", "0.1", "0", "0", "0"),
     }  # fmt: skip
 
 
@@ -56,35 +59,35 @@ MAVIC_BANDS = {"G": ("Green", 560), "R": ("Red", 650), "RE": ("RedEdge", 730), "
 
 VENDORS = {
     "RedEdge": Vendor("MicaSense", "RedEdge-M", {
-        f"IMG_0007_{k}.tif": (band, nm, {("MicaSense", "CaptureId"): ("abc",), **pinhole(k)})
+        f"IMG_0007_{k}.tif": (band, nm, {(MICASENSE, "CaptureId"): ("abc",), **pinhole(k)})
         for k, (band, nm) in enumerate(MICASENSE_BANDS.items(), start=1)
     }, frozenset(f"band_{k}" for k in range(1, 6))),
     "Phantom 4": Vendor("DJI", "FC6360", {
         f"DJI_001{k}.TIF": (band, nm, {
-            ("drone-dji", "CaptureUUID"): ("abc",), ("drone-dji", "RelativeOpticalCenterX"): (f"+{k}.5",),
-            ("drone-dji", "RelativeOpticalCenterY"): (f"-{k}.25",),
+            (DJI, "CaptureUUID"): ("abc",), (DJI, "RelativeOpticalCenterX"): (f"+{k}.5",),
+            (DJI, "RelativeOpticalCenterY"): (f"-{k}.25",),
         }) for k, (band, nm) in enumerate(DJI_BANDS.items(), start=1)
     }, frozenset(DJI_BANDS)),
     "Mavic 3": Vendor("DJI", "M3M", {
         f"DJI_20230607112233_0001_MS_{k}.TIF": (band, nm, {
-            ("drone-dji", "CaptureUUID"): ("abc",), ("drone-dji", "CalibratedOpticalCenterX"): ("80",),
-            ("drone-dji", "CalibratedOpticalCenterY"): ("60",),
-            ("drone-dji", "CalibratedHMatrix"): (f"1,0,{n}.5,0,1,-2,0,0,1",),
-            ("drone-dji", "DewarpData"): ("2022-09-08;170,170,1.5,-2.5,-0.1,0.05,0,0,0",),
+            (DJI, "CaptureUUID"): ("abc",), (DJI, "CalibratedOpticalCenterX"): ("80",),
+            (DJI, "CalibratedOpticalCenterY"): ("60",),
+            (DJI, "CalibratedHMatrix"): (f"1,0,{n}.5,0,1,-2,0,0,1",),
+            (DJI, "DewarpData"): ("2022-09-08;170,170,1.5,-2.5,-0.1,0.05,0,0,0",),
         }) for n, (k, (band, nm)) in enumerate(MAVIC_BANDS.items())
     }, frozenset(band for band, _ in MAVIC_BANDS.values())),
     "Sequoia": Vendor("Parrot", "Sequoia", {
         f"IMG_180413_080658_0000_{k}.TIF": (band, nm, {
-            ("Camera", "CaptureUUID"): ("abc",), ("Camera", "ModelType"): ("fisheye",),
-            ("Camera", "PrincipalPoint"): ("0.3", "0.22"), ("Camera", "FisheyeAffineMatrix"): ("207", "0", "0", "207"),
-            ("Camera", "FisheyePolynomial"): ("0", "1", "0.0096", "-0.1455"),
-            ("Camera", "RigRelatives"): ("-0.17", f"{0.1 * len(band)}", "0"),
+            (CAMERA, "CaptureUUID"): ("abc",), (CAMERA, "ModelType"): ("fisheye",),
+            (CAMERA, "PrincipalPoint"): ("0.3", "0.22"), (CAMERA, "FisheyeAffineMatrix"): ("207", "0", "0", "207"),
+            (CAMERA, "FisheyePolynomial"): ("0", "1", "0.0096", "-0.1455"),
+            (CAMERA, "RigRelatives"): ("-0.17", f"{0.1 * len(band)}", "0"),
         }) for k, (band, nm) in SEQUOIA_BANDS.items()
     }, frozenset(band for band, _ in SEQUOIA_BANDS.values()), orientation=3),
     "6X": Vendor("Sentera", "6X", {
         f"{k}-{band}-{nm}-30/IMG_00012_{nm}_30.tif": (band, nm, {
-            ("Camera", "CaptureUUID"): ("abc",),
-            ("Sentera", "AlignMatrix"): ("1", "0.001", f"{k}", "-0.001", "1", "5", "0", "0", "1"),
+            (CAMERA, "CaptureUUID"): ("abc",),
+            (SENTERA, "AlignMatrix"): ("1", "0.001", f"{k}", "-0.001", "1", "5", "0", "0", "1"),
         }) for k, (band, nm) in enumerate({"Blue": 475, "Green": 550, "Red": 670, "RedEdge": 715, "NIR": 840}.items())
     }, frozenset({"Blue", "Green", "Red", "RedEdge", "NIR"})),
 }  # fmt: skip
@@ -93,7 +96,8 @@ VENDORS = {
 def packet(values: Values, dialect: str) -> bytes:
     """An XMP packet with values as attributes, as elements of text, or as sequences."""
     attributes, elements = "", ""
-    for (namespace, name), items in values.items():
+    for (place, name), items in values.items():
+        namespace = PREFIXES[place]
         if dialect == "attributes":
             attributes += f' {namespace}:{name}="{",".join(items)}"'
         elif dialect == "elements":
@@ -115,15 +119,15 @@ def write_capture(folder: Path, vendor: Vendor, dialect: str = "attributes", dam
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         tifffile.imwrite(path, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
-        spectral = {("Camera", "BandName"): (band,), ("Camera", "CentralWavelength"): (f"{nm}",)}
+        spectral = {(CAMERA, "BandName"): (band,), (CAMERA, "CentralWavelength"): (f"{nm}",)}
         xmp = packet({**spectral, **values}, dialect)
         if damage == "empty":
             xmp = packet(dict.fromkeys({**spectral, **values}, ("",)), dialect)
         elif damage == "malformed":
             xmp = xmp[: len(xmp) // 2]
         elif damage == "no numbers":
-            keep = {("Camera", "BandName"), ("MicaSense", "CaptureId"), ("drone-dji", "CaptureUUID"),
-                    ("Camera", "CaptureUUID")}  # fmt: skip
+            keep = {(CAMERA, "BandName"), (MICASENSE, "CaptureId"), (DJI, "CaptureUUID"),
+                    (CAMERA, "CaptureUUID")}  # fmt: skip
             xmp = packet({k: v if k in keep else ("-inf;nan",) for k, v in {**spectral, **values}.items()}, dialect)
         first = {271: text(vendor.make), 272: text(vendor.model), 274: short(vendor.orientation)}
         if damage != "missing":
@@ -231,8 +235,8 @@ def test_orientation_3_turns_lens_and_rig(tmp_path: Path) -> None:
             (band,) = Sequoia().bands(path, tags, probe(path))
             bands[band.name] = band
         seeds[orientation] = rig_seed(bands["Green"], bands["NIR"])
-    # A point p of the upright image is stored at size - p.
-    turn = np.array([[-1.0, 0, SIZE[0]], [0, -1, SIZE[1]], [0, 0, 1]])
+    # The pixel p of the upright image is stored at size - 1 - p.
+    turn = np.array([[-1.0, 0, SIZE[0] - 1], [0, -1, SIZE[1] - 1], [0, 0, 1]])
     assert geometry.corner_error_px(seeds[3], geometry.compose(turn, seeds[1], turn), *SIZE) < 1e-6
     assert geometry.corner_error_px(seeds[3], seeds[1], *SIZE) > 0.3
 
@@ -258,8 +262,8 @@ def photograph(path: Path, make: str, values: Values | None = None) -> None:
 def test_the_colour_photograph_takes_part_where_asked(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["Phantom 4"])
     photograph(tmp_path / "DJI_0010.JPG", "DJI", {
-        ("drone-dji", "CaptureUUID"): ("abc",), ("drone-dji", "RelativeOpticalCenterX"): ("4",),
-        ("drone-dji", "RelativeOpticalCenterY"): ("6",),
+        (DJI, "CaptureUUID"): ("abc",), (DJI, "RelativeOpticalCenterX"): ("4",),
+        (DJI, "RelativeOpticalCenterY"): ("6",),
     })  # fmt: skip
     assert len(only_capture(tmp_path).bands) == 5
     capture = only_capture(tmp_path, DiscoverOptions(with_rgb=True))
@@ -293,7 +297,7 @@ def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
         "SensorGainAdjustment": "0.9", "CalibratedOpticalCenterX": "80", "CalibratedOpticalCenterY": "60",
         "VignettingData": "1e-4,0,0,0,0,0",
     }  # fmt: skip
-    tags = Tags(make="DJI", xmp={("drone-dji", k): (v,) for k, v in values.items()})
+    tags = Tags(make="DJI", xmp={(DJI, k): (v,) for k, v in values.items()})
     write_capture(tmp_path, VENDORS["Phantom 4"])
     path = tmp_path / "DJI_0012.TIF"
     (band,) = Dji().bands(path, tags, probe(path))
@@ -332,7 +336,7 @@ def test_a_flat_folder_named_like_a_band(tmp_path: Path, folder: str) -> None:
         path.parent.mkdir(exist_ok=True)
         tifffile.imwrite(path, np.zeros((120, 160), np.uint16), photometric="minisblack", metadata=None)
         name = ("Blue", "Green", "NIR")[k]
-        xmp = packet({("Camera", "BandName"): (name,)}, "attributes")
+        xmp = packet({(CAMERA, "BandName"): (name,)}, "attributes")
         add_directories(path, {271: text("Sentera"), 700: byte_string(xmp)}, {}, {})
     (capture,) = discover(tmp_path / folder).captures
     assert {b.name for b in capture.bands} == {"Blue", "Green", "NIR"}

@@ -316,6 +316,27 @@ def test_seeds_alone_are_no_alignment(flight: Path, tmp_path: Path) -> None:
     assert (tmp_path / "0000SET" / "000" / "IMG_0001.png").is_file()
 
 
+def test_info_is_json_whatever_the_nodata(tmp_path: Path) -> None:
+    for name in ("red", "nir"):
+        profile = {"driver": "GTiff", "width": 80, "height": 60, "count": 1, "dtype": "float32", "nodata": np.nan}
+        (tmp_path / "in").mkdir(exist_ok=True)
+        with rasterio.open(tmp_path / "in" / f"field_{name}.tif", "w", **profile) as dataset:
+            dataset.write(textured_image(80, 60)[None])
+
+    def no_constant(name: str) -> None:
+        raise ValueError(f"{name} is no JSON")
+
+    found = json.loads(agalign("info", tmp_path / "in", "--json").stdout, parse_constant=no_constant)
+    assert [b["nodata"] for b in found["captures"][0]["bands"]] == ["nan", "nan"]
+
+
+def test_a_seed_that_there_is_not_is_told(tmp_path: Path) -> None:
+    write_pair(tmp_path / "in")
+    done = agalign(tmp_path / "in", "-o", tmp_path / "out", "--seed", "rig")
+    assert done.returncode == 3
+    assert "there is no rig seed for it; leave --seed out" in done.stderr
+
+
 def test_wrong_words_are_usage_errors(flight: Path, tmp_path: Path) -> None:
     for options in (("--layout", "pile"), ("--order", "size"), ("--seed", "luck"), ("--compression", "lzma")):
         done = agalign(flight, "-o", tmp_path, *options)

@@ -3,7 +3,7 @@ import pytest
 
 from agalign.capture.reference import Reference
 from agalign.config import LocalSettings, Settings
-from agalign.judge.local import Shifts, _is_one_to_one, fitted_field
+from agalign.judge.local import Shifts, _folds, _Gain, _is_one_to_one, _overlap, fitted_field
 from agalign.values import geometry
 from agalign.values.alignment import LocalField
 from agalign.values.image import Raster, Tile
@@ -95,3 +95,23 @@ def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:
     dense = mapping.positions(Tile(200, 150, 200, 150))
     direct = mapping(np.stack(np.meshgrid(np.arange(200, 400), np.arange(150, 300)), -1).astype(float))
     np.testing.assert_allclose(dense, direct, atol=0.01)
+
+
+def test_no_window_is_explained_by_one_that_shares_a_pixel_with_it() -> None:
+    at = centres()
+    fold = _folds(at)
+    assert set(fold) == set(range(16))
+    for k in range(16):
+        out = at[fold == k]
+        kept = at[(fold != k) & ~_overlap(at, out, 64)]
+        assert len(kept) > len(at) / 3
+        apart = np.abs(out[:, None] - kept[None]).max(axis=-1)
+        assert apart.min() >= 64
+
+
+def test_a_field_that_makes_the_worst_windows_worse_is_not_kept() -> None:
+    better = _Gain(1.0, before_p95_px=1.62, after_p95_px=1.59, left=0.1, sigma=9.0)
+    worse = _Gain(1.0, before_p95_px=1.59, after_p95_px=1.62, left=0.1, sigma=9.0)
+    assert better.is_plain(4.0)
+    assert not worse.is_plain(4.0)
+    assert not _Gain(1.0).is_plain(4.0)

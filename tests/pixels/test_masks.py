@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from agalign.pixels.masks import data_mask, learnable, undeclared_fill
 
@@ -38,3 +39,12 @@ def test_saturated_areas_and_their_neighbours_are_not_learnt_from() -> None:
     assert (~mask).sum() == 12 * 12
     assert not mask[4:16, 4:16].any()
     assert learnable(everywhere, pixels, None).all()
+
+
+@pytest.mark.parametrize("fill", [-9999, -32767, -32768, -99999, 1e20, -1e20, -3.4028235e38, 9.96921e36])
+def test_what_programs_fill_floats_with_is_no_data(fill: float) -> None:
+    pixels = np.array([[0.2, fill, -3.0, 60_000.0]], np.float32)
+    assert data_mask(pixels, None).tolist() == [[True, False, True, True]]
+    # Where a value is declared, nothing is guessed; and integers are what they are.
+    assert data_mask(np.array([[-9999.0, 7.0]]), 7.0).tolist() == [[True, False]]
+    assert data_mask(np.array([[-9999]], np.int16), None).all()

@@ -69,7 +69,7 @@ def test_without_a_light_sensor_it_is_radiance(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
     path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
     tags = read_tags(path)
-    xmp = {k: v for k, v in tags.xmp.items() if k[0] != "DLS"}
+    xmp = {k: v for k, v in tags.xmp.items() if k[0] != "micasense.com/DLS"}
     (band,) = MicaSense().bands(path, Tags(**{**vars(tags), "xmp": xmp}), probe(path))
     assert band.radiometry is not None
     assert band.radiometry.quantity == "radiance"

@@ -90,7 +90,7 @@ def test_a_finer_grid_has_the_same_outline_on_the_map() -> None:
     one = Band("a", Path("a"), 1, 100, 80, "uint8", georeference=place)
     pan = Band("pan", Path("b"), 1, 200, 160, "uint8")
     seed = Seed("identity", geometry.resolution_change(2, 2), 0.0)
-    alignment = Alignment(seed.fixed_to_moving, "pixel", "aligned", None, seed, None, None, 0.0)
+    alignment = Alignment(seed.fixed_to_moving, "pixel", "aligned", (), seed, None, None, 0.0)
     capture = Capture("c", Path(), (one, pan), 0)
     layers, grid = lay_out(capture, {"pan": alignment}, WriteSettings(resolution="finest", crop="none"))
     assert (grid.width, grid.height, grid.scale) == (200, 160, 2.0)
@@ -359,3 +359,18 @@ def relief_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("relief")
     synthetic.make_flight(folder, 1, (640, 480), rng_seed=5, relief_m=6.0)
     return folder
+
+
+@pytest.mark.parametrize(("factor", "written"), [(1.0, True), (60_000.0, False)])
+def test_floats_without_a_unit_are_reflectance_only_where_they_can_be(
+    tmp_path: Path, factor: float, written: bool
+) -> None:
+    scene = (textured_image(320, 240, 5) * 0.05 + 0.4).clip(0, 1) * factor
+    for name in ("red", "nir"):
+        write_band(tmp_path / "in" / f"field_{name}.tif", scene.astype(np.float32))
+    agalign.align_folder(tmp_path / "in", tmp_path / "out")
+    by_name = {r.index: r for r in write_indices(tmp_path / "out", [INDICES["savi"], INDICES["ndvi"]])}
+    assert (by_name["savi"].path is not None) == written
+    assert "needs reflectance, and the bands are raw numbers" in by_name["savi"].problem or written
+    assert by_name["ndvi"].path is not None
+    assert by_name["ndvi"].raw_numbers != written

@@ -1,13 +1,18 @@
 import json
+import math
 from pathlib import Path
 
 import jsonschema
+import numpy as np
 import pytest
 
 import agalign
+from agalign.config import Settings
 from agalign.errors import OutputError, SidecarError
+from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.sidecar import (
     CameraPart,
+    DoubtPart,
     OutputPart,
     ReferencePart,
     Sidecar,
@@ -15,6 +20,10 @@ from agalign.products.sidecar import (
     read_sidecar,
     write_sidecar,
 )
+from agalign.values import geometry
+from agalign.values.alignment import Alignment, JointResult, Residual, Seed
+from agalign.values.capture import Band, Capture
+from agalign.values.doubts import Doubt
 
 SHIPPED = Path(agalign.__file__).with_name("sidecar.schema.json")
 
@@ -79,3 +88,25 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="file"):
         write_sidecar(tmp_path / "file" / "IMG_1.json", example())
+
+
+def test_a_rejected_solution_says_so() -> None:
+    """The homography of a `seed_only` band is the seed's; `joint` describes what was doubted."""
+    joint = JointResult(np.eye(3), 0.1, 0.1, 0.004, 75, (1.0,), "fast", "homography", 0.05, ((0.07, 0.07),) * 4)
+    residual = Residual(np.zeros((50, 2)), np.zeros((50, 2)), 0.05, 0.2, 1.0)
+    seed = Seed("rig", geometry.translation(3, 4), 30.0)
+    bands = tuple(Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("green", "nir"))
+    capture = Capture("c", Path(), bands, 0)
+    doubts = (Doubt("retrieval", 0.1, 0.2), Doubt("coverage", math.nan, 0.6))
+    for status, doubt in (("seed_only", doubts), ("aligned", ())):
+        alignment = Alignment(seed.fixed_to_moving, "pixel", status, doubt, seed, joint, residual, 0.0)
+        part = sidecar_of(capture, {"nir": alignment}, None, Settings()).bands[1]
+        assert part.joint is not None
+        assert part.joint.accepted == (status == "aligned")
+        assert [d.kind for d in part.doubts] == [d.kind for d in doubt]
+    assert "retrieval" in (alignment.reason or "retrieval")
+
+
+def test_a_doubt_that_could_not_be_measured_is_null_in_json() -> None:
+    part = DoubtPart(kind="retrieval", value=None, limit=0.2)
+    assert json.loads(part.model_dump_json()) == {"kind": "retrieval", "value": None, "limit": 0.2}

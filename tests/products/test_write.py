@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import rasterio
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.products.layout import Layer
-from agalign.products.write import write_raster
+from agalign.products.write import write_capture, write_raster
 from agalign.values import geometry
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference
 from agalign.values.image import OutputGrid
@@ -180,3 +181,48 @@ def test_a_folder_where_the_file_should_be(tmp_path: Path) -> None:
     (tmp_path / "out.tif").mkdir()
     with pytest.raises(OutputError, match=r"out\.tif"):
         write_raster(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())
+
+
+def test_nodata_is_a_value_that_copied_pixels_do_not_have(tmp_path: Path) -> None:
+    """The reference's zeros are measurements, and it is copied as it is."""
+    capture = make_capture(tmp_path)
+    reference = np.zeros((150, 200), np.uint16)
+    reference[:, ::3], reference[0, 0] = 7, 65535
+    with rasterio.open(capture.reference.path, "r+") as dataset:
+        dataset.write(reference, 1)
+    layers = [Layer(capture.bands[0], None), *layers_of(capture)[1:]]
+    out = tmp_path / "out.tif"
+    nodata = write_raster(capture, layers, OutputGrid(0, 0, 200, 150), out, WriteSettings())
+    with rasterio.open(out) as written:
+        assert written.nodata == nodata
+        assert nodata not in (None, 0, 7, 65535)
+        np.testing.assert_array_equal(written.read(2), reference)
+        assert written.read_masks(2).all()
+        assert not written.read_masks(1).any()
+        assert not written.read_masks(3)[-1, -1]
+
+
+def test_undeclared_fill_of_the_reference_is_nodata_in_the_stack(tmp_path: Path) -> None:
+    capture = make_capture(tmp_path, "float32")
+    with rasterio.open(capture.reference.path, "r+") as dataset:
+        pixels = dataset.read(1)
+        pixels[:, :20] = -9999
+        dataset.write(pixels, 1)
+    out = tmp_path / "out.tif"
+    write_raster(capture, layers_of(capture), CROP, out, WriteSettings())
+    with rasterio.open(out) as written:
+        assert np.isnan(written.nodata)
+        assert np.isnan(written.read(2)[:, :16]).all()
+        np.testing.assert_array_equal(written.read(2)[:, 16:], pixels[6:136, 20:184])
+
+
+def test_files_of_bands_have_each_their_own_nodata(tmp_path: Path) -> None:
+    capture = make_capture(tmp_path)
+    (tmp_path / "floats").mkdir()
+    floats = make_capture(tmp_path / "floats", "float32").bands[2]
+    capture = replace(capture, bands=(*capture.bands[:2], floats))
+    grid, settings = OutputGrid(0, 0, 200, 150), WriteSettings(layout="bands")
+    written = write_capture(capture, layers_of(capture), grid, tmp_path / "out" / "c.tif", settings)
+    by_name = {path.name: value for path, value in written.nodata.items()}
+    assert by_name["f_0.tif"] == 0
+    assert np.isnan(by_name["f_2.tif"])

@@ -1,0 +1,178 @@
+"""The tags that most makers share, in the namespace that Pix4D gave them: lens, rig, band, and vignetting.
+
+What they mean for a band that is written on the reference's grid is here too (`Carrying`); a maker with tags of its own
+adds to it.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from agalign.cameras.metadata import Tags
+from agalign.cameras.xmp import Name, Packet
+from agalign.values.capture import Band
+from agalign.values.image import OutputGrid
+from agalign.values.lens import Lens
+
+CAMERA = "pix4d.com"
+"""Firmware writes `pix4d.com/camera/1.0`, and older one `pix4d.com/1.0`."""
+BAND_NAME: Name = (CAMERA, "BandName")
+CAPTURE_UUID: Name = (CAMERA, "CaptureUUID")
+FLIGHT_UUID: Name = (CAMERA, "FlightUUID")
+PRINCIPAL_POINT: Name = (CAMERA, "PrincipalPoint")
+FOCAL_LENGTH: Name = (CAMERA, "PerspectiveFocalLength")
+FOCAL_LENGTH_UNITS: Name = (CAMERA, "PerspectiveFocalLengthUnits")
+DISTORTION: Name = (CAMERA, "PerspectiveDistortion")
+MODEL_TYPE: Name = (CAMERA, "ModelType")
+RIG_RELATIVES: Name = (CAMERA, "RigRelatives")
+VIGNETTING_CENTRE: Name = (CAMERA, "VignettingCenter")
+VIGNETTING_POLYNOMIAL: Name = (CAMERA, "VignettingPolynomial")
+
+_LONGEST_FOCAL_LENGTH_MM = 100.0
+_MOST_MAGNIFICATION = 1.02
+"""Beyond this a polynomial of vignetting in the band's own pixels is dropped."""
+
+FromSource = Callable[[float, float], tuple[float, float]]
+"""Where a pixel of the band's own file lies in the reference's pixels; nan where that cannot be told."""
+
+
+# ---- what they say
+
+
+def perspective_lens(tags: Tags) -> Lens | None:
+    """K = [f r, f r, ppx r, ppy r] with r in px/mm; Camera:PerspectiveDistortion is k1, k2, k3, p1, p2."""
+    focal_px, centre_px = _focal_length_px(tags), principal_point_px(tags)
+    if focal_px is None or focal_px <= 0 or centre_px is None:
+        return None
+    k = tags.numbers(*DISTORTION)
+    distortion = (k[0], k[1], k[3], k[4], k[2]) if len(k) == 5 else ()
+    return Lens(focal_px, focal_px, *centre_px, distortion)
+
+
+def principal_point_px(tags: Tags) -> tuple[float, float] | None:
+    """(x, y) with the centre of the top-left pixel at (0, 0), as makers' libraries take millimetres times density."""
+    density, point_mm = pixels_per_mm(tags), tags.numbers(*PRINCIPAL_POINT)
+    return (point_mm[0] * density, point_mm[1] * density) if density and len(point_mm) == 2 else None
+
+
+def pixels_per_mm(tags: Tags) -> float | None:
+    """EXIF's density, else from a focal length in px beside EXIF's in mm."""
+    if tags.pixels_per_mm:
+        return tags.pixels_per_mm
+    focal_px = tags.number(*FOCAL_LENGTH) if focal_length_is_in_px(tags) else None
+    return focal_px / tags.focal_length_mm if focal_px and tags.focal_length_mm else None
+
+
+def focal_length_is_in_px(tags: Tags) -> bool:
+    """True where Camera:PerspectiveFocalLength is in px: old firmware gives them without saying so."""
+    units, length = tags.text(*FOCAL_LENGTH_UNITS).lower(), tags.number(*FOCAL_LENGTH)
+    return "px" in units or "pixel" in units or (length is not None and length > _LONGEST_FOCAL_LENGTH_MM)
+
+
+def _focal_length_px(tags: Tags) -> float | None:
+    focal, density = tags.number(*FOCAL_LENGTH), pixels_per_mm(tags)
+    if focal is None or density is None:
+        return None
+    return focal if focal_length_is_in_px(tags) else focal * density
+
+
+def rig_degrees(tags: Tags) -> tuple[float, ...]:
+    """The three angles of Camera:RigRelatives; none where they are missing."""
+    angles = tags.numbers(*RIG_RELATIVES)
+    return angles if len(angles) == 3 else (0.0, 0.0, 0.0)
+
+
+def spectral(band: Band, tags: Tags) -> Band:
+    """The band with the wavelength and width that its tags give, nm."""
+    return replace(
+        band,
+        wavelength_nm=tags.number(CAMERA, "CentralWavelength"),
+        bandwidth_nm=tags.number(CAMERA, "WavelengthFWHM"),
+    )
+
+
+# ---- what becomes of them
+
+
+class Carrying:
+    """How XMP values follow a band onto the reference's grid."""
+
+    geometry: frozenset[Name] = frozenset({
+        PRINCIPAL_POINT, FOCAL_LENGTH, FOCAL_LENGTH_UNITS, DISTORTION, MODEL_TYPE, RIG_RELATIVES,
+        (CAMERA, "RigTranslations"), (CAMERA, "RigRelativesReferenceRigCameraIndex"),
+    })  # fmt: skip
+    """Of the lens and the rig: the reference's take their place."""
+    of_the_sensor: frozenset[Name] = frozenset({
+        (CAMERA, "InvalidPixel"), (CAMERA, "VignettingPolynomial2D"), (CAMERA, "VignettingPolynomial2DName"),
+    })  # fmt: skip
+    """True of the sensor's own pixels only: they are left out."""
+    radiometry: frozenset[Name] = frozenset({VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL, (CAMERA, "BlackCurrent")})
+    """What is taken out of the pixels where reflectance is written."""
+    in_px: tuple[Name, ...] = ()
+    """Lengths in px, which grow with the resolution."""
+    turned_where_orientation_is_3 = False
+    """The principal point is of the image as EXIF's Orientation makes it, not as it is stored."""
+
+    def put_geometry(self, packet: Packet, theirs: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
+        """Replace a band's geometry by the reference's on a grid; `theirs` and `tags` are the reference's file's."""
+        packet.take(theirs, self.geometry)
+        packet.remove(self.of_the_sensor)
+        point_px, density = principal_point_px(tags), self.pixels_per_mm(tags)
+        if point_px is not None and density is not None:
+            if self.is_turned(tags):
+                stored = turned(point_px, reference.size_px)
+                point_px = turned(grid.px(*stored), (grid.width, grid.height))
+            else:
+                point_px = grid.px(*point_px)
+            packet.put(PRINCIPAL_POINT, [number_text(v / (density * grid.scale)) for v in point_px])
+        for name in (*self.in_px, *([FOCAL_LENGTH] if focal_length_is_in_px(tags) else [])):
+            values = tags.numbers(*name)
+            if values and grid.scale != 1:
+                packet.put(name, [number_text(v * grid.scale) for v in values])
+        if grid.undistorted:
+            packet.put(DISTORTION, ["0"] * len(tags.numbers(*DISTORTION)))
+
+    def put_vignetting(
+        self, packet: Packet, tags: Tags, grid: OutputGrid, from_source: FromSource, *, radiometry: bool
+    ) -> None:
+        """The centre where it lies now, and the polynomial in the pixels that are written; `tags` are the band's own.
+
+        With `radiometry` nothing of it, because the pixels have been corrected.
+        """
+        centre, k = tags.numbers(*VIGNETTING_CENTRE), tags.numbers(*VIGNETTING_POLYNOMIAL)
+        if radiometry:
+            packet.remove(self.radiometry)
+            return
+        if len(centre) != 2:
+            return
+        here, beside = from_source(*centre), from_source(centre[0] + 1, centre[1])
+        magnification = math.dist(here, beside)
+        # Written so that nan passes nowhere.
+        if not 1 / _MOST_MAGNIFICATION < magnification < _MOST_MAGNIFICATION:
+            packet.remove([VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL])
+            return
+        packet.put(VIGNETTING_CENTRE, [number_text(v) for v in grid.px(*here)])
+        scaled = [v / (grid.scale * magnification) ** i for i, v in enumerate(k, start=1)]
+        packet.put(VIGNETTING_POLYNOMIAL, [f"{v:.9e}" for v in scaled])
+
+    def pixels_per_mm(self, tags: Tags) -> float | None:
+        """Of the focal plane."""
+        return pixels_per_mm(tags)
+
+    def is_turned(self, tags: Tags) -> bool:
+        """True where the principal point is of the image turned by 180 degrees."""
+        return self.turned_where_orientation_is_3 and tags.orientation == UPSIDE_DOWN
+
+
+UPSIDE_DOWN = 3
+"""EXIF Orientation of an image that is stored turned by 180 degrees."""
+
+
+def turned(point_px: Sequence[float], size_px: tuple[int, int]) -> tuple[float, float]:
+    """A position of an image (width, height) in the image turned by 180 degrees, centres of pixels at whole numbers."""
+    return size_px[0] - 1 - point_px[0], size_px[1] - 1 - point_px[1]
+
+
+def number_text(value: float) -> str:
+    """As it stands in a tag."""
+    return f"{value:.10g}"

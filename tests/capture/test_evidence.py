@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+
+from agalign.capture import evidence
+from agalign.capture.band_pair import BandPair
+from agalign.capture.evidence import judged
+from agalign.config import LocalSettings, Settings
+from agalign.values import geometry
+from agalign.values.alignment import JointResult, LocalField, LocalResult, Residual, Seed
+from agalign.values.doubts import Doubt
+from agalign.values.image import Raster
+
+from ..conftest import textured_image, textured_pair
+
+SETTINGS = Settings(local=LocalSettings(use=True))
+SEED = Seed("rig", geometry.translation(5, -3), 30.0, 30.0, 5.0, trusted=True)
+
+
+def pair_of(fixed: np.ndarray, moving: np.ndarray) -> BandPair:
+    images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, moving))
+    return BandPair.of_images("nir", *images, {"rig": SEED.fixed_to_moving}, SETTINGS)
+
+
+def result(matrix: np.ndarray, retrieval: float = 0.9) -> JointResult:
+    return JointResult(matrix, 0.1, retrieval, 0.004, 0, (1.0,), "fast", "homography", 0.01, ((0.05, 0.05),) * 4)
+
+
+@pytest.fixture(scope="module")
+def pair() -> BandPair:
+    return pair_of(*textured_pair(geometry.translation(6, -4)))
+
+
+def test_what_passes_is_aligned_and_measured(pair: BandPair) -> None:
+    found = judged(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
+    assert (found.status, found.doubts, found.reason) == ("aligned", (), None)
+    assert found.residual.median_px < 0.1
+    assert found.after["overlap"] > 0.9
+
+
+def test_a_doubted_result_leaves_the_seed_and_its_windows(pair: BandPair) -> None:
+    found = judged(pair, SEED, result(geometry.translation(6, -4), retrieval=0.01), SETTINGS)
+    assert found.status == "seed_only"
+    assert found.doubts[0].kind == "retrieval"
+    np.testing.assert_array_equal(found.fixed_to_moving, SEED.fixed_to_moving)
+    assert found.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.15)
+
+
+def test_no_result_at_all_is_told_in_its_own_words(pair: BandPair) -> None:
+    found = judged(pair, SEED, Doubt("few_keypoints", 3, 16), SETTINGS)
+    assert found.status == "seed_only"
+    assert found.reason == "only 3 keypoints lie on the common valid area; the rig seed is used as it is"
+
+
+def test_an_unrelated_image_is_failed_seed_or_not() -> None:
+    found = judged(
+        pair_of(textured_image(400, 320), textured_image(400, 320, 9)), SEED, result(np.eye(3), 0.01), SETTINGS
+    )
+    assert found.status == "failed"
+    assert found.reason is not None
+    assert found.reason.endswith("but it does not fit either")
+
+
+def test_the_verdict_is_asked_again_under_a_local_field(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A field that is kept though the windows then lie apart must not be written."""
+    wild = np.zeros((11, 14, 2))
+    wild[..., 0] = 3.0
+    monkeypatch.setattr(pair.reference.local, "refine", lambda *_: LocalResult(LocalField(32.0, wild), 1.0, 0.5))
+    found = judged(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
+    assert found.status == "aligned"
+    assert found.local == LocalResult(None, 1.0, 0.5)
+    assert found.residual.median_px < 0.1
+    monkeypatch.setattr(evidence, "doubts_of", lambda *_: ())
+    assert judged(pair, SEED, result(geometry.translation(6, -4)), SETTINGS).local.field is not None
+
+
+def test_residuals_of_a_reduced_image_are_given_in_px_of_the_file() -> None:
+    residual = Residual(np.array([[10.0, 20.0]]), np.array([[0.5, 0.0]]), 0.5, 0.5, 1.0).enlarged((4.0, 4.0))
+    np.testing.assert_allclose(residual.centres_px, [[41.5, 81.5]])
+    assert (residual.median_px, residual.shifts_px[0, 0]) == (2.0, 2.0)

@@ -1,0 +1,53 @@
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from agalign.errors import OutputError
+from agalign.values.files import complete_file, write_text
+
+
+def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "below" / "a.png"
+    write_text(path, "before")
+
+    def half() -> None:
+        with complete_file(path) as partial:
+            partial.write_text("half")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        half()
+    assert path.read_text() == "before"
+    with complete_file(path) as partial:
+        assert partial.suffix == ".png"
+        assert partial.name.startswith(".")
+        partial.write_text("after")
+    assert path.read_text() == "after"
+    assert [p.name for p in path.parent.iterdir()] == ["a.png"]
+
+
+def test_two_threads_at_a_time_do_not_meet(tmp_path: Path) -> None:
+    path, both = tmp_path / "a.txt", threading.Barrier(2)
+
+    def write(text: str) -> Path:
+        with complete_file(path) as partial:
+            both.wait(5)
+            partial.write_text(text)
+        return partial
+
+    with ThreadPoolExecutor(2) as pool:
+        one, other = pool.map(write, ("one", "other"))
+    assert one != other
+    assert path.read_text() in ("one", "other")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_what_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"file/a\.txt: cannot be written \("):
+        write_text(tmp_path / "file" / "a.txt", "x")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OutputError, match="folder: cannot be written"):
+        write_text(tmp_path / "folder", "x")
