@@ -192,7 +192,7 @@ class LocalSettings(Stage):
     most_windows: Positive = 4000
     """In larger images they lie farther apart."""
     lattice_px: Positive = 32
-    smoothness: tuple[float, ...] = (0.3, 1.0, 4.0, 16.0)
+    smoothness: tuple[float, ...] = (0.3, 1.0, 4.0, 16.0, 64.0)
     """Weights of the field's second differences beside one window's shift, of which the windows left out of a fit
     choose."""
     pull: float = 0.003

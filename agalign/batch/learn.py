@@ -17,8 +17,7 @@ from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import learn
 from agalign.method.refine import refine
 from agalign.method.starter import start_from
-from agalign.method.state import JointState, Progress
-from agalign.method.subject import Subject
+from agalign.method.state import JointState, Progress, Subject
 from agalign.pixels.raster import read_for_alignment
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed

@@ -11,7 +11,7 @@ from agalign.config import Settings
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
 from agalign.method.joint import Results, align_from_scratch, refine_with
-from agalign.method.subject import Subject
+from agalign.method.state import Subject
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Capture

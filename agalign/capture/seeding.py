@@ -8,7 +8,7 @@ from agalign.capture.band_pair import BandPair, Candidates
 from agalign.config import SeedSettings
 from agalign.flight.model import FlightModel
 from agalign.method.match import match_seed, starter_for_matching
-from agalign.method.subject import Subject
+from agalign.method.state import Subject
 from agalign.pixels.resample import single, textured, warped
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry

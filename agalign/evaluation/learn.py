@@ -25,8 +25,7 @@ from agalign.method.device import one_memory_error, one_thread
 from agalign.method.levels import Level
 from agalign.method.patches import Keypoints, far_apart, patch_positions
 from agalign.method.refine import MovingBand
-from agalign.method.state import JointState
-from agalign.method.subject import Subject
+from agalign.method.state import JointState, Subject
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 

@@ -32,8 +32,7 @@ from agalign.method.match import matching_network
 from agalign.method.paper import align_by_paper
 from agalign.method.patches import Keypoints, patch_positions, transform
 from agalign.method.refine import MovingBand, describe_fixed, refine
-from agalign.method.state import JointState
-from agalign.method.subject import Subject
+from agalign.method.state import JointState, Subject
 from agalign.pixels.resample import single, warped
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed

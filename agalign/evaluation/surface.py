@@ -12,8 +12,7 @@ from agalign.config import JointSettings
 from agalign.errors import NoContrastError, NotEnoughTextureError
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.paper import descend
-from agalign.method.state import JointState
-from agalign.method.subject import Subject
+from agalign.method.state import JointState, Subject
 from agalign.products.picture import write_png
 from agalign.values import geometry
 from agalign.values.geometry import Matrix

@@ -39,10 +39,14 @@ class LocalRefiner:
         """
         field: LocalField | None = None
         first = self._measure(moving, mapping)
-        some = [self._held_out_gain(first, s, _SOME_FOLDS) for s in self.settings.smoothness]
-        smoothness = min(some, key=lambda g: g.left).smoothness
-        gain = self._held_out_gain(first, smoothness, _ALL_FOLDS)
-        if not gain.is_plain(self.settings.least_gain_sigma):
+        some = [self._held_out_gain(first, s, _SOME_FOLDS, apart_px=0) for s in self.settings.smoothness]
+        finest = min(some, key=lambda g: g.left).smoothness
+        # Windows that lie farther from those of the fit may know a smoother field only.
+        for smoothness in (s for s in self.settings.smoothness if s >= finest):
+            gain = self._held_out_gain(first, smoothness, _ALL_FOLDS, apart_px=self.windows.side)
+            if gain.is_plain(self.settings.least_gain_sigma):
+                break
+        else:
             return LocalResult(None, gain.before_p95_px, gain.after_p95_px)
         for _ in range(self.settings.rounds):
             found = first if field is None else self._measure(moving, replace(mapping, local=field))
@@ -53,8 +57,8 @@ class LocalRefiner:
             field = total
         return LocalResult(field, gain.before_p95_px, gain.after_p95_px)
 
-    def _held_out_gain(self, residual: Residual, smoothness: float, folds: Iterable[int]) -> "_Gain":
-        """Windows are left out in turn, and with them from the fit all that overlap one of them."""
+    def _held_out_gain(self, residual: Residual, smoothness: float, folds: Iterable[int], apart_px: float) -> "_Gain":
+        """Windows are left out in turn, and with them from the fit all nearer than `apart_px` to one of them."""
         found = Shifts.of(residual)
         if len(found) < self.settings.least_windows:
             return _Gain(smoothness)
@@ -62,7 +66,7 @@ class LocalRefiner:
         left = np.full(len(found), np.nan)
         for k in folds:
             out = fold == k
-            kept = ~out & ~_overlap(found.centres_px, found.centres_px[out], self.windows.side)
+            kept = ~out & ~_near(found.centres_px, found.centres_px[out], apart_px)
             if kept.sum() >= self.settings.least_windows // 2:
                 field = fitted_field(found.some(kept), smoothness, self.settings, self.size_px)
                 left[out] = np.linalg.norm(found.shifts_px[out] - field(found.centres_px[out]), axis=1)
@@ -146,13 +150,14 @@ def _folds(centres_px: Points) -> NDArray[np.int64]:
     return np.asarray(column % 4 + 4 * (row % 4))
 
 
-def _overlap(centres_px: Points, others_px: Points, side_px: int) -> NDArray[np.bool_]:
-    """(n,) True for windows (n, 2) that share a pixel with one of the others (m, 2), all `side_px` wide."""
+def _near(centres_px: Points, others_px: Points, apart_px: float) -> NDArray[np.bool_]:
+    """(n,) True for windows (n, 2) nearer than this, along both axes, to one of the others (m, 2): two windows share a
+    pixel where they are nearer than their side.
+    """
     if not len(others_px):
         return np.zeros(len(centres_px), dtype=bool)
-    # Largest difference along an axis, to the nearest of the others.
     nearest, _ = cKDTree(others_px).query(centres_px, p=np.inf)
-    return np.asarray(nearest < side_px)
+    return np.asarray(nearest < apart_px)
 
 
 def fitted_field(found: Shifts, smoothness: float, settings: LocalSettings, size_px: tuple[int, int]) -> LocalField:

@@ -26,8 +26,7 @@ from agalign.method.refine import (
     moved,
     retrieval,
 )
-from agalign.method.state import JointState
-from agalign.method.subject import Subject
+from agalign.method.state import JointState, Subject
 
 
 def learn(state: JointState, subjects: Sequence[Subject], net: Descriptor) -> tuple[int, float]:

@@ -21,8 +21,7 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.fast import learn
 from agalign.method.paper import align_by_paper
 from agalign.method.refine import refine
-from agalign.method.state import JointState, Progress
-from agalign.method.subject import Subject
+from agalign.method.state import JointState, Progress, Subject
 from agalign.values.alignment import JointResult
 from agalign.values.doubts import Doubt
 

@@ -27,8 +27,7 @@ from agalign.method.patches import (
     warp_keypoints,
 )
 from agalign.method.refine import refine
-from agalign.method.state import JointState
-from agalign.method.subject import Subject
+from agalign.method.state import JointState, Subject
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.doubts import Doubt

@@ -19,8 +19,7 @@ from agalign.method.device import exact
 from agalign.method.gauss_newton import PatchEquations, Step, shift_gradient, solve
 from agalign.method.levels import Level, footprints_inside
 from agalign.method.patches import Keypoints, far_apart, patch_positions, transform, translation
-from agalign.method.state import JointState
-from agalign.method.subject import Subject
+from agalign.method.state import JointState, Subject
 from agalign.values.alignment import JointResult
 from agalign.values.choices import ModelFamily
 from agalign.values.doubts import Doubt

@@ -1,6 +1,7 @@
-"""What a joint optimisation carries along: its settings, where theta starts, and the random numbers."""
+"""What a joint optimisation works on, the images of a capture, and what it carries along: settings, random numbers."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 
@@ -10,10 +11,30 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.device import choose_device
 from agalign.method.levels import Level, Sampler, make_level
 from agalign.method.starter import start_from_starter
-from agalign.method.subject import Subject
+from agalign.values.geometry import Matrix
+from agalign.values.image import Raster
 
 Progress = Callable[[str, float], None]
 """Called with the name of what is being done and the share of it that is behind, 0 to 1."""
+
+
+@dataclass
+class Subject:
+    """The images of one capture and where their alignment stands."""
+
+    fixed: Raster
+    moving: Sequence[Raster]
+    mappings: list[Matrix]
+    """fixed_to_moving of each moving image, undistorted px; moved along by the optimisation."""
+    sides: Sequence[int]
+    """Which of the network's sides describes each moving image."""
+    trusted: Sequence[bool]
+    """Seeds that are good to a few pixels: recipe fast leaves the coarse levels out."""
+
+    @classmethod
+    def of_one(cls, fixed: Raster, moving: Raster, fixed_to_moving: Matrix, *, trusted: bool = False) -> "Subject":
+        """A single pair, described by the network's first two sides."""
+        return cls(fixed, [moving], [fixed_to_moving], [1], [trusted])
 
 
 class JointState:

@@ -3,7 +3,7 @@ import pytest
 
 from agalign.capture.reference import Reference
 from agalign.config import LocalSettings, Settings
-from agalign.judge.local import Shifts, _folds, _Gain, _is_one_to_one, _overlap, fitted_field
+from agalign.judge.local import Shifts, _folds, _Gain, _is_one_to_one, _near, fitted_field
 from agalign.values import geometry
 from agalign.values.alignment import LocalField
 from agalign.values.image import Raster, Tile
@@ -103,7 +103,7 @@ def test_no_window_is_explained_by_one_that_shares_a_pixel_with_it() -> None:
     assert set(fold) == set(range(16))
     for k in range(16):
         out = at[fold == k]
-        kept = at[(fold != k) & ~_overlap(at, out, 64)]
+        kept = at[(fold != k) & ~_near(at, out, 64)]
         assert len(kept) > len(at) / 3
         apart = np.abs(out[:, None] - kept[None]).max(axis=-1)
         assert apart.min() >= 64

@@ -8,8 +8,7 @@ from agalign.config import FastRecipe, JointSettings, PaperRecipe
 from agalign.method.fast import learn, learn_scales
 from agalign.method.joint import align_from_scratch
 from agalign.method.refine import refine
-from agalign.method.state import JointState
-from agalign.method.subject import Subject
+from agalign.method.state import JointState, Subject
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.doubts import Doubt
