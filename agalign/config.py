@@ -127,6 +127,10 @@ class FlightSettings(Stage):
     """False learns every capture alone."""
     captures: Positive = 3
     """How many the network is learnt on, spread over the flight."""
+    rig_captures: Positive = 48
+    """The rig is learnt on an eighth of the flight, but on no more than these,"""
+    least_rig_captures: Positive = 8
+    """and on no fewer than these, or all."""
     start: str = ""
     """Fingerprint of the network that theta starts from, where one is given: results depend on it."""
 
@@ -178,6 +182,12 @@ class CheckSettings(Stage):
     """The same as `most_residual_px` for a seed that is used as it is."""
     most_corner_std_px: float = 2.0
     """Standard deviation of the mapped corners."""
+    most_unexpected_px: float = 3.0
+    """An alignment farther than this from what the flight's rig says is not believed,"""
+    most_unexpected_std: float = 5.0
+    """where that is also so many of the prediction's standard deviations."""
+    accept_predicted_px: Annotated[float, Field(ge=0)] = 1.0
+    """A band whose place the rig predicts this well counts as delivered."""
     most_snap_px: float = 0.25
     """An input already aligned is left untouched where the result is within three standard deviations of no change,
     and within this."""

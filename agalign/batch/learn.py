@@ -2,17 +2,22 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
+from agalign.capture.align import align_pairs
 from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.prediction import observed, seconds_of
 from agalign.capture.seeding import find_seed, subject_of
 from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.fingerprint import fingerprint, hashed
 from agalign.flight.groups import camera_key
 from agalign.flight.model import FlightModel
+from agalign.flight.rig import Observation, Rig, learn_rig
+from agalign.judge.local import common_field
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import learn
 from agalign.method.refine import refine
@@ -20,7 +25,7 @@ from agalign.method.starter import start_from
 from agalign.method.state import JointState, Progress, Subject
 from agalign.pixels.raster import read_for_alignment
 from agalign.values import geometry
-from agalign.values.alignment import JointResult, Seed
+from agalign.values.alignment import JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 
@@ -62,7 +67,49 @@ def learn_flight(
         return None
     size = captures[0].reference.size_px
     mappings = {name: median_mapping(matrices, size) for name, matrices in found.items()}
-    return FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings))
+    model = FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings))
+    rig = _learn_rig(captures, settings, model, progress)
+    if rig is None:
+        rig = None if start is None else start.rig
+    return replace(model, rig=rig, mappings=mappings if rig is None else {**mappings, **rig.mean})
+
+
+def _learn_rig(captures: Sequence[Capture], settings: Settings, model: FlightModel, progress: Progress) -> Rig | None:
+    """What captures spread over the flight, refined with its network, have in common."""
+    stage = settings.flight
+    count = min(stage.rig_captures, max(stage.least_rig_captures, len(captures) // 8))
+    chosen = [captures[i] for i in sorted({*np.linspace(0, len(captures) - 1, count).round().astype(int).tolist()})]
+    plain = settings.model_copy(update={"local": settings.local.model_copy(update={"use": False})})
+    seen: list[Observation] = []
+    residuals: dict[str, list[Residual]] = {}
+    for number, capture in enumerate(chosen):
+        progress("the rig", number / len(chosen))
+        try:
+            pairs, _ = read_pairs(capture, plain, model)
+            found = align_pairs(pairs, plain, lambda *_: None, model, scratch=False)
+        except (AgalignError, cv2.error) as why_not:
+            _LOG.debug("%s says nothing of the rig: %s", capture.label, why_not)
+            continue
+        wanted = "pixel" if capture.reference.lens is None else "undistorted"
+        pairs = [p for p in pairs if p.space == wanted]
+        seen.append(observed(pairs, found, seconds_of(capture.captured_at)))
+        for pair in pairs:
+            alignment = found[pair.name].between_files(*pair.scales)
+            if alignment.status == "aligned" and alignment.residual is not None:
+                residuals.setdefault(pair.name, []).append(alignment.residual)
+    size = captures[0].reference.size_px
+    rig = learn_rig(seen, size, _layout(captures[0]))
+    if rig is None:
+        return None
+    fields = {band: common_field(some, settings.local, size) for band, some in residuals.items() if band in rig.mean}
+    return replace(rig, fields={band: field for band, field in fields.items() if field is not None})
+
+
+def _layout(capture: Capture) -> dict[str, tuple[float, float]]:
+    """Where the lenses stand beside the reference's, as far as the camera knows."""
+    here = capture.reference.parallax
+    known = {b.name: b.parallax for b in capture.moving if b.parallax is not None}
+    return {} if here is None else {name: (x - here[0], y - here[1]) for name, (x, y) in known.items()}
 
 
 def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:

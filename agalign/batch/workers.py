@@ -53,13 +53,13 @@ class CaptureReport:
 
     @property
     def good(self) -> bool:
-        """True where every band pair of the capture is aligned and none is missing."""
+        """True where every band pair of the capture is aligned, or predicted well enough, and none is missing."""
         return self.sidecar is not None and self.sidecar.status == "ok"
 
     @property
     def useful(self) -> bool:
-        """True where at least one band pair is aligned."""
-        return self.sidecar is not None and any(b.status == "aligned" for b in self.sidecar.bands)
+        """True where at least one band pair is aligned or predicted."""
+        return self.sidecar is not None and any(b.status in ("aligned", "predicted") for b in self.sidecar.bands)
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,14 @@ def rig_degrees(tags: Tags) -> tuple[float, ...]:
     return angles if len(angles) == 3 else (0.0, 0.0, 0.0)
 
 
+def parallax_of(tags: Tags) -> tuple[float, float] | None:
+    """Direction in which a band's pixels move as the ground comes nearer, from Camera:RigTranslations, where the lens
+    stands right of and below the rig's origin, metres or millimetres: the other way.
+    """
+    place = tags.numbers(CAMERA, "RigTranslations")
+    return (-place[0], -place[1]) if len(place) == 3 else None
+
+
 def spectral(band: Band, tags: Tags) -> Band:
     """The band with the wavelength and width that its tags give, nm."""
     return replace(

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.evidence import judged, without_result
+from agalign.capture.prediction import seconds_of, with_predictions
 from agalign.capture.seeding import find_seed, subject_of, unscored
 from agalign.config import Settings
 from agalign.flight.model import FlightModel
@@ -32,8 +33,10 @@ def align_capture_bands(
     """
     reference = capture.reference
     progress(reference.name, "reading", 0.0)
-    pairs, left_out = read_pairs(capture, settings, None if model is None else model.mappings)
+    pairs, left_out = read_pairs(capture, settings, model)
     aligned = align_pairs(pairs, settings, progress, model)
+    if model is not None and model.rig is not None and not settings.seed.only:
+        aligned = with_predictions(pairs, aligned, model.rig, seconds_of(capture.captured_at), settings.check)
     found: dict[str, Alignment] = {}
     for band in capture.bands_of_the_references_lens:
         unmoved = Seed("identity", geometry.identity(), 0.0)
@@ -51,11 +54,13 @@ def align_capture_bands(
 
 @one_thread()
 def align_pairs(
-    pairs: Sequence[BandPair], settings: Settings, progress: PairProgress, model: FlightModel | None = None
-) -> dict[str, Alignment]:
+    pairs: Sequence[BandPair], settings: Settings, progress: PairProgress, model: FlightModel | None = None, *,
+    scratch: bool = True,
+) -> dict[str, Alignment]:  # fmt: skip
     """Align the pairs of one capture, which share a reference, by name.
 
-    Those that the flight's network cannot align are learnt from scratch, together.
+    Those that the flight's network cannot align are learnt from scratch, together; with a rig at hand, which says where
+    the others lie, only those whose images show a structure in common, and without `scratch` none.
     """
     watch = _Watch()
     found: dict[str, Alignment] = {}
@@ -88,6 +93,11 @@ def align_pairs(
         sides = [model.side(pair.name) or 0 for pair, _ in known]
         attempt(known, sides, lambda subject, report: refine_with(net, subject, settings.joint, report))
     left = [s for s in starts if s[0].name not in found or found[s[0].name].status != "aligned"]
+    if model is not None and model.rig is not None:
+        hopeless = [(pair, seed) for pair, seed in left if pair.name in found and not seed.trusted]
+        left = [s for s in left if s not in hopeless]
+    if not scratch:
+        left = [s for s in left if s[0].name not in found]
     attempt(left, [], lambda subject, report: align_from_scratch(subject, settings.joint, report))
     return watch.timed(found)
 

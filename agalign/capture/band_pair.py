@@ -9,6 +9,7 @@ from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import seed_candidates
 from agalign.config import Settings
 from agalign.errors import AgalignError
+from agalign.flight.model import FlightModel
 from agalign.pixels.raster import read_for_alignment
 from agalign.pixels.resample import single, warped
 from agalign.values import geometry
@@ -38,6 +39,8 @@ class BandPair:
     """The moving bands: one, but for colour photographs; none where the images are arrays."""
     scales: tuple[tuple[float, float], tuple[float, float]] = _NOT_REDUCED
     """(x, y) of the fixed and of the moving image relative to their files."""
+    field: LocalField | None = None
+    """Displacements before any homography, px of the fixed image: what the flight's rig knows of the lenses."""
 
     @classmethod
     def of_images(
@@ -63,8 +66,8 @@ class BandPair:
         return self.moving_image if self.space == "undistorted" else replace(self.moving_image, lens=None)
 
     def mapping(self, fixed_to_moving: Matrix, local: LocalField | None = None) -> PixelMapping:
-        """The complete mapping between the raw pixels of the two images."""
-        return PixelMapping(fixed_to_moving, self.fixed.lens, self.moving.lens, local=local)
+        """The complete mapping between the raw pixels of the two images, by all displacements or else the rig's."""
+        return PixelMapping(fixed_to_moving, self.fixed.lens, self.moving.lens, local=local or self.field)
 
     def laid(self, mapping: PixelMapping) -> Raster:
         """The moving image, one channel, on the reference's pixels."""
@@ -76,11 +79,11 @@ class BandPair:
 
 
 def read_pairs(
-    capture: Capture, settings: Settings, known: Mapping[str, Matrix] | None = None
+    capture: Capture, settings: Settings, model: FlightModel | None = None
 ) -> tuple[list[BandPair], dict[str, Doubt]]:
     """(the pairs, one for each lens; {band: why it cannot take part}).
 
-    `known` are mappings by band, undistorted px of the files, to try before what the tags say.
+    What a flight's `model` knows is tried before what the tags say.
     Raises UnreadableFileError where the reference cannot be read.
     """
     longest = settings.joint.longest_side_px
@@ -89,8 +92,9 @@ def read_pairs(
     left_out: dict[str, Doubt] = {}
     for bands in capture.moving_lenses:
         candidates = seed_candidates(capture.reference, bands[0], settings.seed)
-        if known is not None and bands[0].name in known and settings.seed.force is None:
-            candidates = {"model": known[bands[0].name], **candidates}
+        name = bands[0].name
+        if model is not None and name in model.mappings and settings.seed.force is None:
+            candidates = {"model": model.mappings[name], **candidates}
         if not candidates:
             absent = Doubt("no_such_seed", detail=str(settings.seed.force))
             left_out |= dict.fromkeys((b.name for b in bands), absent)
@@ -102,7 +106,9 @@ def read_pairs(
             continue
         scales = _scale(reference.image, capture.reference), _scale(moving, bands[0])
         down: Candidates = {kind: geometry.rescale(m, *scales) for kind, m in candidates.items()}
-        pairs.append(BandPair(bands[0].name, reference, moving, down, bands, scales))
+        field = None if model is None or model.rig is None else model.rig.fields.get(name)
+        field = None if field is None else field.rescaled(scales[0])
+        pairs.append(BandPair(name, reference, moving, down, bands, scales, field))
     return pairs, left_out
 
 

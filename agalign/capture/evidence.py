@@ -7,7 +7,7 @@ from agalign.config import CheckSettings, Settings
 from agalign.judge.verdict import doubts_of, is_as_it_was, seed_fits, status_of
 from agalign.pixels.resample import single
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, LocalResult, Residual, Seed
+from agalign.values.alignment import Alignment, JointResult, LocalResult, Prediction, Residual, Seed
 from agalign.values.choices import SeedKind, Space
 from agalign.values.doubts import Doubt
 from agalign.values.image import Raster
@@ -27,43 +27,51 @@ def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Se
     check, size_px = settings.check, pair.fixed.size_px
     joint: JointResult | None = None
     doubts: tuple[Doubt, ...] = (result,) if isinstance(result, Doubt) else ()
-    matrix = seed.fixed_to_moving
+    mapping = pair.mapping(seed.fixed_to_moving)
     if isinstance(result, JointResult):
         joint = _snapped(result, pair, check)
-        there, residual = _laid(pair, pair.mapping(joint.fixed_to_moving))
+        found = pair.mapping(joint.fixed_to_moving)
+        there, residual = _laid(pair, found)
         doubts = doubts_of(joint, residual, size_px, check)
-        matrix = seed.fixed_to_moving if doubts else joint.fixed_to_moving
+        mapping = mapping if doubts else found
     if doubts:
-        there, residual = _laid(pair, pair.mapping(matrix))
+        there, residual = _laid(pair, mapping)
     usable = seed.trusted or settings.seed.only
     status = status_of(doubts, residual, check, seed=usable)
     if usable and doubts and not seed_fits(residual, check):
         doubts = (*doubts, Doubt("seed_does_not_fit"))
     local = None
     if settings.local.use and status == "aligned" and joint is not None:
-        local = pair.reference.local.refine(single(pair.moving_image), pair.mapping(matrix))
+        local = pair.reference.local.refine(single(pair.moving_image), mapping)
         if local.field is not None:
-            bent, left = _laid(pair, pair.mapping(matrix, local.field))
+            bent = replace(mapping, local=local.field)
+            laid, left = _laid(pair, bent)
             # What a field makes worse is not aligned by it: the verdict is asked again.
             if doubts_of(joint, left, size_px, check):
                 local = LocalResult(None, local.before_p95_px, local.after_p95_px)
             else:
-                there, residual = bent, left
-    before = pair.laid(PixelMapping(geometry.overlay(size_px, pair.moving_image.size_px)))
+                there, residual, mapping = laid, left, bent
+    alignment = Alignment(
+        mapping.fixed_to_moving, pair.space, status, doubts, seed, joint, residual, 0.0, local=local,
+        field=mapping.local,
+    )  # fmt: skip
+    return _with_metrics(alignment, pair, there)
+
+
+def as_predicted(alignment: Alignment, pair: BandPair, prediction: Prediction) -> Alignment:
+    """The alignment of a pair whose own images do not say where it lies, by what the rig says, px of the images."""
+    there, residual = _laid(pair, pair.mapping(prediction.fixed_to_moving))
+    moved = replace(
+        alignment, fixed_to_moving=prediction.fixed_to_moving, status="predicted", residual=residual, local=None,
+        field=pair.field, prediction=prediction,
+    )  # fmt: skip
+    return _with_metrics(moved, pair, there)
+
+
+def _with_metrics(alignment: Alignment, pair: BandPair, there: Raster) -> Alignment:
+    before = pair.laid(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
     similarity = pair.reference.similarity
-    return Alignment(
-        matrix,
-        pair.space,
-        status,
-        doubts,
-        seed,
-        joint,
-        residual,
-        0.0,
-        similarity.to(before),
-        similarity.to(there),
-        local,
-    )
+    return replace(alignment, before=similarity.to(before), after=similarity.to(there))
 
 
 def _laid(pair: BandPair, mapping: PixelMapping) -> tuple[Raster, Residual]:

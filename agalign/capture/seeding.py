@@ -41,7 +41,11 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
 def subject_of(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> Subject:
     """What the method works on: pairs of one capture and one space, their seeds, and the network's side for each."""
     mappings = [s.fixed_to_moving for s in seeds]
-    return Subject(pairs[0].fixed, [p.moving for p in pairs], mappings, sides, [s.trusted for s in seeds])
+    fields = [p.field for p in pairs]
+    return Subject(
+        pairs[0].fixed, [p.moving for p in pairs], mappings, sides, [s.trusted for s in seeds],
+        fields if any(f is not None for f in fields) else (),
+    )  # fmt: skip
 
 
 def best_seed(pair: BandPair, candidates: Candidates) -> Seed:

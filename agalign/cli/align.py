@@ -110,6 +110,14 @@ def align(
         bool,
         typer.Option("--local", help="Follow parallax over trees and buildings: a smooth field over the homography."),
     ] = False,
+    accept_predicted: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            help="A band whose own image cannot say where it lies counts as delivered where the flight's rig "
+            "predicts it this well, px.",
+        ),
+    ] = 1.0,
     radiometry: Annotated[
         bool,
         typer.Option(
@@ -144,7 +152,15 @@ def align(
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(voice, GOES_ON):
         from agalign.cameras.discover import DiscoverOptions
-        from agalign.config import FlightSettings, JointSettings, LocalSettings, SeedSettings, Settings, WriteSettings
+        from agalign.config import (
+            CheckSettings,
+            FlightSettings,
+            JointSettings,
+            LocalSettings,
+            SeedSettings,
+            Settings,
+            WriteSettings,
+        )
         from agalign.products.stac import need_stac
 
         target = out or folder.absolute().parent / f"{folder.absolute().name}-aligned"
@@ -154,6 +170,7 @@ def align(
                 recipe=recipe, sharing=sharing, model_family=model_family, device=device, rng_seed=rng_seed
             ),
             flight=FlightSettings(together=not each_alone),
+            check=CheckSettings(accept_predicted_px=accept_predicted),
             local=LocalSettings(use=local),
             write=WriteSettings(
                 interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
@@ -311,10 +328,11 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
         voice.problem(f"{report.label}: {report.error}", capture=report.label)
         return
     pairs = [b for b in report.sidecar.bands if b.status != "reference"]
-    aligned = sum(b.status == "aligned" for b in pairs)
+    aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
+    also = f", {predicted} predicted" if predicted else ""
     kept = ", kept from an earlier run" if report.state == "kept" else ""
     seconds = sum(b.seconds for b in pairs)
-    text = f"[{number}/{count}] {report.label}: {aligned} of {len(pairs)} aligned, {seconds:.1f} s{kept}"
+    text = f"[{number}/{count}] {report.label}: {aligned} of {len(pairs)} aligned{also}, {seconds:.1f} s{kept}"
     if voice.verbose or not voice.err.is_terminal or voice.log_json:
         voice.event(
             "capture",
@@ -323,6 +341,7 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
             state=report.state,
             status=report.sidecar.status,
             aligned=aligned,
+            predicted=predicted,
             pairs=len(pairs),
         )
     for band in pairs:
@@ -334,7 +353,7 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
                 capture=report.label, band=band.band, status=band.status, reason=band.reason,
                 residual_px=residual, seconds=band.seconds,
             )  # fmt: skip
-        if band.status in ("seed_only", "failed"):
+        if band.status in ("predicted", "seed_only", "failed"):
             voice.problem(
                 f"{report.label} {band.band}: {band.status}: {band.reason}", capture=report.label, band=band.band
             )
@@ -346,13 +365,13 @@ def conclude(flight: "Flight", reports: "list[CaptureReport]", out: Path, voice:
 
     pairs = [b for r in reports if r.sidecar for b in r.sidecar.bands if b.status != "reference"]
     table = Table("Band", title=f"{sum(b.status == 'aligned' for b in pairs)} of {len(pairs)} band pairs aligned")
-    for name in ("Aligned", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair"):
+    for name in ("Aligned", "Predicted", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair"):
         table.add_column(name, justify="right")
     for name in dict.fromkeys(b.band for b in pairs):
         mine = [b for b in pairs if b.band == name]
         residuals = [b.metrics.after.residual_px for b in mine if b.status == "aligned" and b.metrics]
         known = [r for r in residuals if r is not None]
-        counts = [str(sum(b.status == s for b in mine)) for s in ("aligned", "seed_only", "failed")]
+        counts = [str(sum(b.status == s for b in mine)) for s in ("aligned", "predicted", "seed_only", "failed")]
         worst = (f"{median(known):.3f}", f"{max(known):.3f}") if known else ("-", "-")
         table.add_row(escape(name), *counts, *worst, f"{median(b.seconds for b in mine):.1f}")
     voice.result(table)

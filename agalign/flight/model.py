@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 
 from agalign._version import __version__
 from agalign.errors import InputError, OutputError
+from agalign.flight.rig import Rig
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import matching_network
 from agalign.values.files import complete_file
@@ -36,6 +37,8 @@ class FlightModel:
     """Median fixed_to_moving of the bands whose held-out patches were told apart, undistorted px of the files."""
     fingerprint: str
     """Of what it was learnt from, and how."""
+    rig: Rig | None = None
+    """What the flight knows of the camera's geometry; None where too few captures said something of it."""
 
     def side(self, band: str) -> int | None:
         """The network's side for a moving band; None where it knows none of that name."""
@@ -50,9 +53,12 @@ def save_model(model: FlightModel, path: Path) -> None:
     """Write a model, complete or not at all. Raises OutputError."""
     tensors = {f"theta.{k}": v.detach().cpu().contiguous() for k, v in model.net.state_dict().items()}
     tensors |= {f"mapping.{k}": torch.tensor(m) for k, m in model.mappings.items()}
+    if model.rig is not None:
+        tensors |= {f"field.{k}": torch.tensor(f.displacements_px).contiguous() for k, f in model.rig.fields.items()}
     facts = {
         "format": _FORMAT, "agalign": __version__, "camera": model.camera, "bands": json.dumps(model.bands),
         "sharing": model.net.sharing, "channels": json.dumps(model.net.channels), "fingerprint": model.fingerprint,
+        "rig": "" if model.rig is None else model.rig.as_json(),
     }  # fmt: skip
     try:
         with complete_file(path) as partial:
@@ -74,7 +80,9 @@ def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
         net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
         net.load_state_dict({k.removeprefix("theta."): v for k, v in tensors.items() if k.startswith("theta.")})
         net.learnt = True
-    except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:
+        fields = {k.removeprefix("field."): v.numpy() for k, v in tensors.items() if k.startswith("field.")}
+        rig = Rig.from_json(facts["rig"], fields) if facts.get("rig") else None
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read as a model ({str(error).splitlines()[0]})") from None
     mappings = {k.removeprefix("mapping."): v.numpy() for k, v in tensors.items() if k.startswith("mapping.")}
-    return FlightModel(net.to(device()), facts["camera"], bands, mappings, facts["fingerprint"])
+    return FlightModel(net.to(device()), facts["camera"], bands, mappings, facts["fingerprint"], rig)

@@ -3,7 +3,7 @@ the two bands still show. It is kept only where it explains windows that it was 
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,11 +33,12 @@ class LocalRefiner:
         self.windows = FixedWindows(valid, structure, small, step)
 
     def refine(self, moving: Raster, mapping: PixelMapping) -> LocalResult:
-        """The field over a mapping, and what it gains on windows that it was not fitted to.
+        """The field over a mapping, with the displacements that it has already, and what it gains on windows that it
+        was not fitted to.
 
         The shifts are measured again after each round, under the field so far: windows over steps sharpen so.
         """
-        field: LocalField | None = None
+        before = None if mapping.local is None else mapping.local.on_lattice(self.settings.lattice_px, self.size_px)
         first = self._measure(moving, mapping)
         some = [self._held_out_gain(first, s, _SOME_FOLDS, apart_px=0) for s in self.settings.smoothness]
         finest = min(some, key=lambda g: g.left).smoothness
@@ -48,14 +49,15 @@ class LocalRefiner:
                 break
         else:
             return LocalResult(None, gain.before_p95_px, gain.after_p95_px)
-        for _ in range(self.settings.rounds):
-            found = first if field is None else self._measure(moving, replace(mapping, local=field))
+        field = before
+        for number in range(self.settings.rounds):
+            found = first if number == 0 else self._measure(moving, replace(mapping, local=field))
             more = fitted_field(Shifts.of(found), gain.smoothness, self.settings, self.size_px)
             total = more if field is None else field.plus(more)
             if not _is_one_to_one(total, self.size_px):
                 break
             field = total
-        return LocalResult(field, gain.before_p95_px, gain.after_p95_px)
+        return LocalResult(None if field is before else field, gain.before_p95_px, gain.after_p95_px)
 
     def _held_out_gain(self, residual: Residual, smoothness: float, folds: Iterable[int], apart_px: float) -> "_Gain":
         """Windows are left out in turn, and with them from the fit all nearer than `apart_px` to one of them."""
@@ -77,6 +79,10 @@ class LocalRefiner:
 
 
 _FAR_PX = 0.1
+_LEAST_CAPTURES = 3
+_COMMON_FOLDS = 4
+_COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
+"""Of what is the lenses' own, beside one window of each capture."""
 _ALL_FOLDS = range(16)
 _SOME_FOLDS = (0, 2, 8, 10)
 """Far enough apart to say how smooth a field should be."""
@@ -100,6 +106,14 @@ class Shifts:
         sigma = residual.peaks_sigma[known]
         trust = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
         return cls(residual.centres_px[known], residual.shifts_px[known], trust)
+
+    @classmethod
+    def together(cls, several: Sequence["Shifts"]) -> "Shifts":
+        """The windows of several captures as one's."""
+        return cls(
+            np.concatenate([s.centres_px for s in several]), np.concatenate([s.shifts_px for s in several]),
+            np.concatenate([s.trust for s in several]),
+        )  # fmt: skip
 
     def some(self, which: NDArray[np.bool_]) -> "Shifts":
         return Shifts(self.centres_px[which], self.shifts_px[which], self.trust[which])
@@ -158,6 +172,32 @@ def _near(centres_px: Points, others_px: Points, apart_px: float) -> NDArray[np.
         return np.zeros(len(centres_px), dtype=bool)
     nearest, _ = cKDTree(others_px).query(centres_px, p=np.inf)
     return np.asarray(nearest < apart_px)
+
+
+def common_field(residuals: Sequence[Residual], settings: LocalSettings, size_px: tuple[int, int]) -> LocalField | None:
+    """The smooth field that the windows of several captures have in common, on an image (width, height).
+
+    None where it does not explain captures that are left out of its fit: what is the lenses' is the same in all.
+    """
+    captures = [s for s in map(Shifts.of, residuals) if len(s)]
+    if len(captures) < _LEAST_CAPTURES:
+        return None
+    folds = [captures[k :: min(len(captures), _COMMON_FOLDS)] for k in range(min(len(captures), _COMMON_FOLDS))]
+    out = Shifts.together([c for fold in folds for c in fold])
+
+    def gain(smoothness: float) -> _Gain:
+        left = []
+        for fold in folds:
+            rest = Shifts.together([c for other in folds if other is not fold for c in other])
+            field = fitted_field(rest, smoothness * len(captures), settings, size_px)
+            left += [np.linalg.norm(c.shifts_px - field(c.centres_px), axis=1) for c in fold]
+        return _gain_of(out, np.concatenate(left), smoothness)
+
+    best = min(map(gain, _COMMON_SMOOTHNESS), key=lambda g: g.left)
+    if not best.is_plain(settings.least_gain_sigma):
+        return None
+    field = fitted_field(out, best.smoothness * len(captures), settings, size_px)
+    return field if _is_one_to_one(field, size_px) else None
 
 
 def fitted_field(found: Shifts, smoothness: float, settings: LocalSettings, size_px: tuple[int, int]) -> LocalField:

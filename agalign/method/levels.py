@@ -2,23 +2,26 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from agalign.method.patches import FOOTPRINT_PX, Keypoints, bilinear, footprint_radius, transform
 from agalign.pixels.resample import shrink
 from agalign.values import geometry, lens
+from agalign.values.alignment import LocalField
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.lens import Lens
 
 _HELD_OUT_CELLS = 8
 """Cells along the longer side; every fifth cell, in a diagonal pattern, is kept from training."""
+_FIELD_COLUMNS = 65
 _LEAST_CELL_PX = 4 * FOOTPRINT_PX
 """Less than this across, a cell has no room for the patches of recipe fast, twice the smallest one's size."""
 _POOL = 16_384
@@ -89,6 +92,34 @@ class Level:
     around the others."""
     anywhere: Pool
     """Both together, their patches unbounded."""
+    fields: tuple[Tensor | None, ...] = ()
+    """(1, 2, rows, columns) for a moving image before whose homography positions of I are displaced: px of the level
+    on a lattice from corner to corner of I; empty where none is.
+    """
+
+    def bent_by(self, fields: "Sequence[LocalField | None]") -> "Level":
+        """The same level with displacements, px of the image that I was reduced from."""
+        width, height = self.fixed.size_px
+        nodes = geometry.lattice(width, height, _FIELD_COLUMNS, round(_FIELD_COLUMNS * height / width) + 1)
+        scale = np.array(self.fixed.scale)
+        shape = (-1, _FIELD_COLUMNS, 2)
+
+        def on_lattice(field: LocalField) -> Tensor:
+            shift = field((nodes + 0.5) / scale - 0.5) * scale
+            values = np.moveaxis(shift.reshape(shape), -1, 0)[None].astype(np.float32)
+            return torch.from_numpy(np.ascontiguousarray(values)).to(self.fixed.image.device)
+
+        return replace(self, fields=tuple(None if f is None else on_lattice(f) for f in fields))
+
+    def displacement(self, band: int, xy: Tensor) -> Tensor | None:
+        """(N, 2) px by which positions (N, 2) of I are displaced before a moving image's homography; None for none."""
+        field = self.fields[band] if self.fields else None
+        if field is None:
+            return None
+        size = xy.new_tensor(self.fixed.size_px) - 1
+        at = (2 * self.fixed.raw(xy) / size - 1)[None, :, None]
+        found = functional.grid_sample(field, at, padding_mode="border", align_corners=True)
+        return found[0, :, :, 0].T
 
     def homography(self, matrix: Matrix, band: int) -> Tensor:
         """A full-resolution fixed_to_moving matrix of a moving image as one between the level's, (3, 3) float32."""

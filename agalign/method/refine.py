@@ -45,7 +45,11 @@ class MovingBand:
 
     def patches(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
         """B(w(x; psi); I'), (N, C, 16, 16): every sample goes through the homography, not only the keypoint's frame."""
-        return self.level.moving[self.index].patches(transform(homography, patch_positions(keypoints)))
+        positions = patch_positions(keypoints)
+        displacement = self.level.displacement(self.index, keypoints.xy)
+        if displacement is not None:
+            positions = positions + displacement[:, None, None]
+        return self.level.moving[self.index].patches(transform(homography, positions))
 
     def describe(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
         """f(w(x; psi)) for keypoints x of I, (N, 256)."""

@@ -11,6 +11,7 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.device import choose_device
 from agalign.method.levels import Level, Sampler, make_level
 from agalign.method.starter import start_from_starter
+from agalign.values.alignment import LocalField
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
@@ -30,6 +31,8 @@ class Subject:
     """Which of the network's sides describes each moving image."""
     trusted: Sequence[bool]
     """Seeds that are good to a few pixels: recipe fast leaves the coarse levels out."""
+    fields: Sequence[LocalField | None] = ()
+    """Displacements of the reference's positions before each homography, px of `fixed`; empty for none at all."""
 
     @classmethod
     def of_one(cls, fixed: Raster, moving: Raster, fixed_to_moving: Matrix, *, trusted: bool = False) -> "Subject":
@@ -53,6 +56,8 @@ class JointState:
             subject.fixed, [subject.moving[b] for b in bands], [subject.mappings[b] for b in bands], scale,
             self.settings.paper.least_gradient, self.sampler.generator, self.device,
         )  # fmt: skip
+        if subject.fields:
+            level = level.bent_by([subject.fields[b] for b in bands])
         if len(level.trainable) == 0:
             raise NoContrastError
         return level

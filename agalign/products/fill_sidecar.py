@@ -1,7 +1,7 @@
 """A capture's outcome as its sidecar."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 
 import numpy as np
@@ -24,6 +24,7 @@ from agalign.products.sidecar import (
     OutputPart,
     PlacePart,
     PositionPart,
+    PredictionPart,
     ReferencePart,
     ResidualTile,
     SeedPart,
@@ -32,7 +33,7 @@ from agalign.products.sidecar import (
 )
 from agalign.products.write import Written
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, LocalResult, Residual
+from agalign.values.alignment import Alignment, JointResult, LocalResult, Prediction, Residual
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Matrix
@@ -43,12 +44,19 @@ _LOCAL_GRID = 65, 49
 """Local displacements need more points than a lens."""
 
 
-def capture_status(statuses: list[str]) -> CaptureStatus:
-    """Ok where every moving band is aligned, failed where none is of use, else degraded."""
-    moving = [s for s in statuses if s != "reference"]
-    if all(s == "aligned" for s in moving):
+def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:
+    """Ok where every moving band is delivered, failed where none is of use, else degraded."""
+    moving = [b for b in bands if b.status != "reference"]
+    if all(is_delivered(b, accept_predicted_px) for b in moving):
         return "ok"
-    return "failed" if all(s == "failed" for s in moving) else "degraded"
+    return "failed" if all(b.status == "failed" for b in moving) else "degraded"
+
+
+def is_delivered(band: BandPart, accept_predicted_px: float) -> bool:
+    """True for a band that is aligned, or predicted this well."""
+    if band.status == "predicted" and band.prediction is not None:
+        return band.prediction.std_px <= accept_predicted_px
+    return band.status in ("reference", "aligned")
 
 
 def sidecar_of(
@@ -74,7 +82,7 @@ def sidecar_of(
             parts.append(_band_part(reference, band, alignments[band.name]))
     if written is not None:
         parts = [p.model_copy(update={"place": _place(written, p.band)}) for p in parts]
-    status = capture_status([p.status for p in parts])
+    status = capture_status(parts, settings.check.accept_predicted_px)
     return Sidecar(
         agalign=__version__,
         capture=capture.name,
@@ -133,7 +141,7 @@ def _place(written: Written, band: str) -> PlacePart | None:
 def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
     joint, residual = alignment.joint, alignment.residual
     local = alignment.local
-    bent = local is not None and local.field is not None
+    bent = alignment.field is not None
     grid_px = geometry.lattice(reference.width_px, reference.height_px, *(_LOCAL_GRID if bent else _GRID))
     there_px = mapping_of(reference, band, alignment)(grid_px)
     after = dict(alignment.after)
@@ -162,8 +170,14 @@ def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
             before=_similarity_part(alignment.before), after=_similarity_part(after), tiles=_tile_parts(residual)
         ),
         local=None if local is None else _local_part(local),
+        prediction=None if alignment.prediction is None else _prediction_part(alignment.prediction),
         seconds=round(alignment.seconds, 3),
     )
+
+
+def _prediction_part(prediction: Prediction) -> PredictionPart:
+    off_px = None if prediction.off_px is None else round(prediction.off_px, 4)
+    return PredictionPart(source=prediction.source, std_px=round(prediction.std_px, 4), off_px=off_px)
 
 
 def _finite(value: float | None) -> float | None:

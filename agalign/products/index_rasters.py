@@ -18,6 +18,7 @@ from rasterio.windows import Window
 
 from agalign.errors import AgalignError, InputError, OutputError
 from agalign.pixels.raster import open_raster
+from agalign.products.fill_sidecar import is_delivered
 from agalign.products.indices import Index, bands_for, compute
 from agalign.products.picture import write_png
 from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
@@ -33,6 +34,8 @@ _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 1
 """Water, soil, and the greens, red green blue, over an index's span."""
 _NODATA_COLOUR = (225, 225, 225)
 _RAW = "raw numbers"
+_MOST_PREDICTED_PX = 1.0
+"""A band that the rig predicts no better than this is left out of indices."""
 _MOST_REFLECTANCE = 2.0
 """Glints and specular leaves exceed 1; raw numbers of any sensor exceed this."""
 _SAMPLE_PX = 512
@@ -82,7 +85,7 @@ def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> 
     parts = sidecar.bands
     chosen = [parts[i] for i in bands_for(index, [p.band for p in parts], [p.wavelength_nm for p in parts])]
     for part in chosen:
-        if part.status not in ("reference", "aligned") or part.place is None:
+        if not is_delivered(part, _MOST_PREDICTED_PX) or part.place is None:
             raise InputError(f"{index.name} is left out: {part.band} is {part.status} ({part.reason})")
     target = path.with_name(f"{path.stem}_{index.name}.tif")
     counts, edges = np.zeros(_BINS, np.int64), np.linspace(*index.span, _BINS + 1)

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from agalign.errors import SidecarError
-from agalign.values.choices import CaptureStatus, ModelFamily, PairStatus, SeedKind, Space
+from agalign.values.choices import CaptureStatus, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.doubts import DoubtKind
 from agalign.values.files import write_text
 
@@ -141,6 +141,17 @@ class LocalPart(_Part):
     after_p95_px: float | None
 
 
+class PredictionPart(_Part):
+    """Where the flight's rig says that the band lies: from the capture's other bands, from the captures before and
+    after, or from the flight's mean. `std_px` is the root mean square error to be expected; `off_px` how far from there
+    the band's own image has it, null where it does not say.
+    """
+
+    source: Annotated[PredictionSource, Field(alias="from")]
+    std_px: float
+    off_px: float | None
+
+
 class PlacePart(_Part):
     """A file beside the sidecar that holds a band's aligned pixels, and the band's index there, from 1."""
 
@@ -165,6 +176,7 @@ class BandPart(_Part):
     joint: JointPart | None = None
     metrics: MetricsPart | None = None
     local: LocalPart | None = None
+    prediction: PredictionPart | None = None
     place: PlacePart | None = None
     seconds: float
 
@@ -194,7 +206,7 @@ class OutputPart(_Part):
 
 
 class Sidecar(_Part):
-    """One capture."""
+    """One capture. `status` is ok where every moving band is aligned, or predicted as well as was asked for."""
 
     schema_: Annotated[Literal["agalign/1"], Field(alias="schema")] = "agalign/1"
     agalign: str

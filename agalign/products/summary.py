@@ -12,7 +12,8 @@ from agalign.values.files import write_text
 SUMMARY_COLUMNS = (
     "folder", "capture", "band", "wavelength_nm", "status", "reason", "seed", "retrieval", "corner_std_px",
     "residual_px", "residual_p95_px", "residual_coverage", "local_applied", "local_p95_before_px",
-    "local_p95_after_px", "mattes_mi_before", "mattes_mi_after", "nmi_before",
+    "local_p95_after_px", "prediction_from", "prediction_std_px", "prediction_off_px",
+    "mattes_mi_before", "mattes_mi_after", "nmi_before",
     "nmi_after", "ncc_before", "ncc_after", "gradient_correlation_before", "gradient_correlation_after",
     "structure_ssim_before", "structure_ssim_after", "seconds",
 )  # fmt: skip
@@ -63,6 +64,10 @@ def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:
         local = band.local
         before_px, after_px = _short(local.before_p95_px), _short(local.after_p95_px)
         row |= {"local_applied": local.applied, "local_p95_before_px": before_px, "local_p95_after_px": after_px}
+    if band.prediction is not None:
+        prediction = band.prediction
+        std_px, off_px = _short(prediction.std_px), _short(prediction.off_px)
+        row |= {"prediction_from": prediction.source, "prediction_std_px": std_px, "prediction_off_px": off_px}
     if band.metrics is not None:
         before, after = band.metrics.before.model_dump(), band.metrics.after.model_dump()
         row |= {k: _short(after[k]) for k in ("residual_px", "residual_p95_px", "residual_coverage")}

@@ -1,15 +1,16 @@
 """What alignment finds of a band pair, and how sure it is."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from agalign.values import geometry
-from agalign.values.choices import ModelFamily, PairStatus, SeedKind, Space
+from agalign.values.choices import ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.doubts import Doubt, explanation, sentence
 from agalign.values.geometry import Matrix
 
@@ -77,7 +78,7 @@ class Residual:
     p95_px: float
     coverage: float
     """Share of the tiles with enough structure in which a shift could be measured."""
-    peaks_sigma: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    peaks_sigma: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.empty(0))
     """(n,) how far each tile's correlation peak stands out, in standard deviations: the error of a shift falls with its
     square."""
 
@@ -108,6 +109,17 @@ class LocalField:
         found = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
         return np.stack(found, axis=-1).reshape(points.shape)
 
+    def rescaled(self, scale: tuple[float, float]) -> "LocalField":
+        """The same on an image that is larger by these factors (x, y), which are all but equal."""
+        # The lattice's first node lies at the centre of a pixel; half a pixel is nothing to a smooth field.
+        return LocalField(self.step_px * scale[0], self.displacements_px * scale)
+
+    def on_lattice(self, step_px: float, size_px: tuple[int, int]) -> "LocalField":
+        """The same by its values on another lattice, which covers an image (width, height)."""
+        columns, rows = (math.ceil(n / step_px) + 1 for n in size_px)
+        nodes = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64) * step_px
+        return LocalField(float(step_px), self(nodes))
+
     def plus(self, other: "LocalField") -> "LocalField":
         """X -> x + d(x) with this field, measured again under it: d(x) + other(x)."""
         return LocalField(self.step_px, self.displacements_px + other.displacements_px)
@@ -123,11 +135,26 @@ class LocalResult:
 
     def enlarged(self, up: tuple[float, float]) -> "LocalResult":
         """The same on an image that is larger by these factors (x, y)."""
-        # The lattice's first node lies at the centre of a pixel; half a reduced pixel is nothing to a smooth field.
-        larger = None
-        if self.field is not None:
-            larger = LocalField(self.field.step_px * up[0], self.field.displacements_px * up)
+        larger = None if self.field is None else self.field.rescaled(up)
         return LocalResult(larger, self.before_p95_px * up[0], self.after_p95_px * up[0])
+
+
+_SOURCES: dict[PredictionSource, str] = {
+    "bands": "the capture's other bands", "neighbours": "the captures around it", "flight": "the flight's mean",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where the rig of a flight says that a band lies."""
+
+    fixed_to_moving: Matrix
+    source: PredictionSource
+    """From the capture's other bands, from the captures before and after, or from the flight's mean."""
+    std_px: float
+    """Root mean square error that is to be expected over the image."""
+    off_px: float | None = None
+    """Root mean square distance of what the band's own image says; None where it says nothing."""
 
 
 @dataclass(frozen=True)
@@ -144,10 +171,14 @@ class Alignment:
     joint: JointResult | None
     residual: Residual | None
     seconds: float
-    before: Mapping[str, float] = field(default_factory=dict)
-    after: Mapping[str, float] = field(default_factory=dict)
+    before: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    after: Mapping[str, float] = dataclasses.field(default_factory=dict)
     local: LocalResult | None = None
-    """Displacements in raw px of the reference, before the homography; None where they were not asked for."""
+    """What a field of displacements of this capture's own gains; None where it was not asked for."""
+    field: LocalField | None = None
+    """All displacements in raw px of the reference, before the homography: the rig's and the capture's own."""
+    prediction: Prediction | None = None
+    """What the flight's rig says of it; None without a rig."""
 
     def between_files(self, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> "Alignment":
         """An alignment of images that were reduced by these scales (x, y) as one of their files."""
@@ -161,6 +192,7 @@ class Alignment:
             joint=None if self.joint is None else self.joint.enlarged(up, there),
             residual=None if self.residual is None else self.residual.enlarged(up),
             local=None if self.local is None else self.local.enlarged(up),
+            field=None if self.field is None else self.field.rescaled(up),
         )
 
     @property
@@ -169,6 +201,9 @@ class Alignment:
         told = explanation(self.doubts)
         if told is None or self.status == "aligned":
             return None
+        if self.status == "predicted" and self.prediction is not None:
+            known = f"known to {self.prediction.std_px:.2f} px from {_SOURCES[self.prediction.source]}"
+            return f"{told}; the rig of the flight says where it lies, {known}"
         if self.status == "seed_only":
             return f"{told}; the {self.seed.kind} seed is used as it is"
         if self.doubts[-1].kind == "seed_does_not_fit":

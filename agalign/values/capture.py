@@ -59,6 +59,9 @@ class Band:
     to_rig: Matrix | None = None
     """Homography from this file's undistorted pixels (raw ones without a lens model) to a plane that all bands of the
     rig share, as far as the tags tell."""
+    parallax: tuple[float, float] | None = None
+    """Direction in which its pixels move as the ground comes nearer, right and down, relative to the rig's other bands;
+    in any unit."""
     one_lens: bool = False
     """The file's bands come through one lens and are aligned as one."""
     companion: bool = False

@@ -8,7 +8,7 @@ DoubtKind = Literal[
     "unreadable", "blank_reference", "blank_moving", "no_such_seed", "seed_asked_for",
     "no_contrast", "few_keypoints", "not_invertible", "corners_unknown",
     "folds", "retrieval", "corner_std_px", "few_windows", "coverage", "close_windows", "residual_px",
-    "seed_does_not_fit",
+    "seed_does_not_fit", "unexpected_px",
 ]  # fmt: skip
 
 
@@ -43,6 +43,7 @@ _SENTENCES: dict[DoubtKind, str] = {
     "close_windows": "the structures lie within {detail} in only {value:.0%} of the windows",
     "residual_px": "the structures still lie {value:.1f} px apart",
     "seed_does_not_fit": "but it does not fit either",
+    "unexpected_px": "it lies {value:.1f} px from where the rig of the flight has it",
 }
 
 

@@ -82,7 +82,7 @@ class PixelMapping:
 
 def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> PixelMapping:
     """The complete mapping between the raw pixels of two files, of which an alignment was found."""
-    local = None if alignment.local is None else alignment.local.field
+    local = alignment.field
     if alignment.space == "pixel":
         return PixelMapping(alignment.fixed_to_moving, local=local)
     return PixelMapping(alignment.fixed_to_moving, reference.lens, moving.lens, local=local)

@@ -1,0 +1,64 @@
+"""What the flight's rig says of each band of a capture: where it lies, and whether its images are to be believed."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from datetime import datetime
+
+from agalign.capture.band_pair import BandPair
+from agalign.capture.evidence import as_predicted
+from agalign.config import CheckSettings
+from agalign.flight.rig import Observation, Rig, distance_px
+from agalign.values import geometry
+from agalign.values.alignment import Alignment, Prediction
+from agalign.values.doubts import Doubt
+
+
+def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], seconds: float) -> Observation:
+    """The mappings of a capture that are aligned, as the rig takes them."""
+    good = {p.name: (p, a) for p in pairs if (a := found[p.name]).status == "aligned" and a.joint is not None}
+    return Observation(
+        seconds,
+        {name: pair.in_file_px(a.fixed_to_moving) for name, (pair, a) in good.items()},
+        {name: a.joint.corner_std_px / min(pair.scales[0]) for name, (pair, a) in good.items() if a.joint is not None},
+    )
+
+
+def with_predictions(
+    pairs: Sequence[BandPair], found: Mapping[str, Alignment], rig: Rig, seconds: float, check: CheckSettings
+) -> dict[str, Alignment]:
+    """Each alignment with what the rig says beside it; a band that is not aligned lies where the rig says.
+
+    A band that lies where the rig has it impossible is not aligned either: of a scene that repeats, the images agree
+    whole periods away.
+    """
+    # Of bands with and without lenses the rig knows the first.
+    wanted = "undistorted" if any(p.space == "undistorted" for p in pairs) else "pixel"
+    known = observed([p for p in pairs if p.space == wanted], found, seconds)
+    checked = dict(found)
+    for pair in pairs:
+        alignment = checked[pair.name]
+        if pair.name not in rig.mean or pair.space != wanted:
+            continue
+        prediction = rig.predict(pair.name, known)
+        if pair.name in known.mappings:
+            off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
+            prediction = replace(prediction, off_px=off_px)
+            limit_px = max(check.most_unexpected_px, check.most_unexpected_std * prediction.std_px)
+            if off_px <= limit_px:
+                checked[pair.name] = replace(alignment, prediction=_in_image_px(prediction, pair))
+                continue
+            alignment = replace(alignment, doubts=(Doubt("unexpected_px", off_px, limit_px),))
+        checked[pair.name] = as_predicted(alignment, pair, _in_image_px(prediction, pair))
+    return checked
+
+
+def seconds_of(captured_at: str) -> float:
+    """Seconds since 1970 of an ISO 8601 time; 0 where there is none."""
+    with suppress(ValueError):
+        return datetime.fromisoformat(captured_at).timestamp()
+    return 0.0
+
+
+def _in_image_px(prediction: Prediction, pair: BandPair) -> Prediction:
+    return replace(prediction, fixed_to_moving=geometry.rescale(prediction.fixed_to_moving, *pair.scales))

@@ -1,0 +1,135 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agalign.flight.rig import Observation, Rig, distance_px, learn_rig
+from agalign.values import geometry
+from agalign.values.alignment import LocalField
+
+SIZE = 1280, 960
+BASELINES = {"Blue": (0.9, 0.0), "Red": (0.0, 0.65), "NIR": (0.9, 0.7), "Red edge": (0.4, 0.35)}
+"""As a RedEdge-M's lenses stand, in any unit."""
+
+
+def mappings(distance_px: float, tilt: tuple[float, float] = (0.0, 0.0), noise: float = 0.0, seed: int = 0) -> dict:
+    """Homographies of a rig over a plane: A_b + e_b nu^T, the baselines in px at the image's middle."""
+    rng = np.random.default_rng(seed)
+    found = {}
+    for k, (name, (bx, by)) in enumerate(BASELINES.items()):
+        own = np.array([[1.001, 0.002 * k, 20.0 + k], [-0.002 * k, 0.999, -8.0 * k], [1e-6, -2e-6, 1.0]])
+        nu = np.array([tilt[0] / SIZE[0], tilt[1] / SIZE[1], distance_px - sum(tilt) / 2])
+        moved = own + np.outer([bx, by, 0.0], nu)
+        moved[:2, 2] += noise * rng.normal(size=2)
+        found[name] = geometry.normalised(moved)
+    return found
+
+
+def observation(seconds: float, *plane: object, without: tuple[str, ...] = (), **options: object) -> Observation:
+    known = {b: m for b, m in mappings(*plane, **options).items() if b not in without}
+    return Observation(seconds, known, dict.fromkeys(known, 0.05))
+
+
+def flight(count: int = 8, spread_px: float = 1.0, noise: float = 0.03) -> list[Observation]:
+    rng = np.random.default_rng(1)
+    return [observation(float(k), spread_px * rng.normal(), noise=noise, seed=k) for k in range(count)]
+
+
+def error_px(rig: Rig, band: str, known: Observation, truth: np.ndarray) -> tuple[float, float]:
+    prediction = rig.predict(band, known)
+    return distance_px(prediction.fixed_to_moving, truth, SIZE), prediction.std_px
+
+
+def test_the_baselines_are_found_up_to_a_factor() -> None:
+    rig = learn_rig(flight(), SIZE, {})
+    assert rig is not None
+    assert rig.factors >= 1
+    found, wanted = (np.array([b[name] for name in BASELINES]) for b in (rig.baselines, BASELINES))
+    wanted = wanted / np.linalg.norm(wanted)
+    assert abs((found * wanted).sum()) > 0.995
+    assert np.linalg.norm(found) == pytest.approx(1)
+
+
+def test_a_band_without_evidence_is_where_the_others_say() -> None:
+    rig = learn_rig(flight(), SIZE, {})
+    assert rig is not None
+    low = observation(9.0, 4.0, without=("NIR",))
+    error, std = error_px(rig, "NIR", low, mappings(4.0)["NIR"])
+    assert error < 0.3
+    assert error < 2 * std
+    assert rig.predict("NIR", low).source == "bands"
+    assert distance_px(rig.mean["NIR"], mappings(4.0)["NIR"], SIZE) > 3
+
+
+def test_tilt_counts_where_the_ground_tilts() -> None:
+    rng = np.random.default_rng(3)
+    tilted = [observation(float(k), rng.normal(), tuple(2 * rng.normal(size=2))) for k in range(10)]
+    rig = learn_rig(tilted, SIZE, {})
+    assert rig is not None
+    assert rig.factors == 3
+    known = observation(20.0, 0.5, (3.0, -2.0), without=("Red",))
+    assert error_px(rig, "Red", known, mappings(0.5, (3.0, -2.0))["Red"])[0] < 0.3
+
+
+def test_where_nothing_is_shared_no_factor_is() -> None:
+    still = [observation(float(k), 0.0, noise=0.05, seed=k) for k in range(8)]
+    rig = learn_rig(still, SIZE, {})
+    assert rig is not None
+    assert rig.factors == 0
+    assert rig.predict("Red", observation(3.5, 0.0, without=("Red",))).source == "flight"
+
+
+def test_a_known_layout_is_enough_for_a_height_that_nobody_has_seen() -> None:
+    level = [observation(float(k), 0.2 * np.sin(k), noise=0.05, seed=k) for k in range(4)]
+    low = observation(9.0, 9.0, without=("NIR",))
+    truth = mappings(9.0)["NIR"]
+    with_layout, without = (learn_rig(level, SIZE, layout) for layout in (BASELINES, {}))
+    assert with_layout is not None
+    assert without is not None
+    error, std = error_px(with_layout, "NIR", low, truth)
+    assert error < 1.0
+    assert error < 2 * std
+    # Without it the prediction may be wrong by pixels, and says so.
+    error, std = error_px(without, "NIR", low, truth)
+    assert error < 2.5 * std
+
+
+def test_a_band_whole_periods_away_does_not_carry_the_others() -> None:
+    rig = learn_rig(flight(), SIZE, {})
+    assert rig is not None
+    known = observation(9.0, 1.0)
+    wrong = geometry.compose(geometry.translation(40.0, 0.0), known.mappings["Blue"])
+    spoiled = Observation(9.0, {**known.mappings, "Blue": wrong}, known.std_px)
+    for band in ("Red", "NIR", "Red edge"):
+        assert error_px(rig, band, spoiled, mappings(1.0)[band])[0] < 1.0
+    assert error_px(rig, "Blue", spoiled, wrong)[0] > 35
+
+
+def test_a_capture_without_evidence_lies_between_its_neighbours() -> None:
+    """A drone that sinks steadily: the captures before and after say more than the flight's mean."""
+    sinking = [observation(10.0 * k, 0.5 * k) for k in range(9)]
+    rig = learn_rig(sinking, SIZE, {})
+    assert rig is not None
+    nothing = Observation(35.0, {}, {})
+    prediction = rig.predict("NIR", nothing)
+    assert prediction.source == "neighbours"
+    assert distance_px(prediction.fixed_to_moving, mappings(1.75)["NIR"], SIZE) < 0.3
+
+
+def test_few_captures_are_no_rig() -> None:
+    assert learn_rig(flight(2), SIZE, {}) is None
+    assert learn_rig([], SIZE, BASELINES) is None
+
+
+def test_written_and_read_it_is_the_same(tmp_path: Path) -> None:
+    import dataclasses
+
+    rig = learn_rig(flight(), SIZE, {})
+    assert rig is not None
+    field = LocalField(32.0, np.random.default_rng(0).normal(size=(31, 41, 2)))
+    rig = dataclasses.replace(rig, fields={"Red": field})
+    again = Rig.from_json(rig.as_json(), {"Red": field.displacements_px})
+    np.testing.assert_array_equal(again.mean["NIR"], rig.mean["NIR"])
+    np.testing.assert_array_equal(again.fields["Red"].displacements_px, field.displacements_px)
+    for name in ("baselines", "baseline_std", "centres", "factors", "seen", "from_bands_px", "size_px"):
+        assert getattr(again, name) == getattr(rig, name)
