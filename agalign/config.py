@@ -49,7 +49,7 @@ class FastRecipe(Stage):
     first_updates: Positive = 5
     """Most steps on psi before the first on weights that are not random."""
     steps_between_updates: Positive = 10
-    hopeless_steps: Positive = 50
+    hopeless_steps: Positive = 30
     """Steps after which a level is given up where no held-out patches could be told apart."""
     step_gate: float = 0.2
     """Held-out retrieval below which psi does not move."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from agalign.capture.align import align_pairs
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.prediction import observed, seconds_of
+from agalign.capture.prediction import observed
 from agalign.capture.seeding import find_seed, subject_of
 from agalign.config import Settings
 from agalign.errors import AgalignError
@@ -92,7 +92,7 @@ def _learn_rig(captures: Sequence[Capture], settings: Settings, model: FlightMod
             continue
         wanted = "pixel" if capture.reference.lens is None else "undistorted"
         pairs = [p for p in pairs if p.space == wanted]
-        seen.append(observed(pairs, found, seconds_of(capture.captured_at)))
+        seen.append(observed(pairs, found, capture))
         for pair in pairs:
             alignment = found[pair.name].between_files(*pair.scales)
             if alignment.status == "aligned" and alignment.residual is not None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.evidence import judged, without_result
-from agalign.capture.prediction import seconds_of, with_predictions
+from agalign.capture.prediction import with_predictions
 from agalign.capture.seeding import find_seed, subject_of, unscored
 from agalign.config import Settings
 from agalign.flight.model import FlightModel
@@ -36,7 +36,7 @@ def align_capture_bands(
     pairs, left_out = read_pairs(capture, settings, model)
     aligned = align_pairs(pairs, settings, progress, model)
     if model is not None and model.rig is not None and not settings.seed.only:
-        aligned = with_predictions(pairs, aligned, model.rig, seconds_of(capture.captured_at), settings.check)
+        aligned = with_predictions(pairs, aligned, model.rig, capture, settings.check)
     found: dict[str, Alignment] = {}
     for band in capture.bands_of_the_references_lens:
         unmoved = Seed("identity", geometry.identity(), 0.0)

@@ -11,21 +11,23 @@ from agalign.config import CheckSettings
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction
+from agalign.values.capture import Capture
 from agalign.values.doubts import Doubt
 
 
-def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], seconds: float) -> Observation:
+def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], capture: Capture) -> Observation:
     """The mappings of a capture that are aligned, as the rig takes them."""
     good = {p.name: (p, a) for p in pairs if (a := found[p.name]).status == "aligned" and a.joint is not None}
     return Observation(
-        seconds,
+        _seconds_of(capture.captured_at),
         {name: pair.in_file_px(a.fixed_to_moving) for name, (pair, a) in good.items()},
         {name: a.joint.corner_std_px / min(pair.scales[0]) for name, (pair, a) in good.items() if a.joint is not None},
+        None if capture.position is None else capture.position.altitude_m,
     )
 
 
 def with_predictions(
-    pairs: Sequence[BandPair], found: Mapping[str, Alignment], rig: Rig, seconds: float, check: CheckSettings
+    pairs: Sequence[BandPair], found: Mapping[str, Alignment], rig: Rig, capture: Capture, check: CheckSettings
 ) -> dict[str, Alignment]:
     """Each alignment with what the rig says beside it; a band that is not aligned lies where the rig says.
 
@@ -34,7 +36,7 @@ def with_predictions(
     """
     # Of bands with and without lenses the rig knows the first.
     wanted = "undistorted" if any(p.space == "undistorted" for p in pairs) else "pixel"
-    known = observed([p for p in pairs if p.space == wanted], found, seconds)
+    known = observed([p for p in pairs if p.space == wanted], found, capture)
     checked = dict(found)
     for pair in pairs:
         alignment = checked[pair.name]
@@ -53,7 +55,7 @@ def with_predictions(
     return checked
 
 
-def seconds_of(captured_at: str) -> float:
+def _seconds_of(captured_at: str) -> float:
     """Seconds since 1970 of an ISO 8601 time; 0 where there is none."""
     with suppress(ValueError):
         return datetime.fromisoformat(captured_at).timestamp()

@@ -44,7 +44,7 @@ def subject_of(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence
     fields = [p.field for p in pairs]
     return Subject(
         pairs[0].fixed, [p.moving for p in pairs], mappings, sides, [s.trusted for s in seeds],
-        fields if any(f is not None for f in fields) else (),
+        fields=fields if any(f is not None for f in fields) else (),
     )  # fmt: skip
 
 

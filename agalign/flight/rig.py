@@ -35,6 +35,9 @@ _LEAST_STD_PX = 0.05
 """Of a mapping: what its own uncertainty does not know."""
 _FACTOR_STD_PX = (20.0, 3.0, 3.0)
 """How far from the mean a capture may be before its own bands are doubted: wide, for heights that nobody has seen."""
+_CLIMB_STD_PX_PER_M = 1.5
+"""What a metre of climb may do to the factor of the ground's distance: 0.03 m of baseline 20 m above it."""
+_LEAST_CLIMB_SPREAD_PX = 0.5
 _LAYOUT_STD = 0.04
 """Of a camera model's known layout of lenses, in lengths of all baselines together."""
 _OUTLIER_PX = 0.3
@@ -53,6 +56,8 @@ class Observation:
     """fixed_to_moving by band, undistorted px of the files."""
     std_px: Mapping[str, float]
     """How sure each is."""
+    altitude_m: float | None = None
+    """As the camera has it, above anything."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +76,8 @@ class Rig:
     """Mean of nu over the captures that showed a band: there its mean is best known."""
     factors: int
     """How many numbers a capture adds: 0, 1 or 3."""
-    seen: tuple[tuple[float, tuple[float, float, float]], ...]
-    """(seconds, nu) of the captures that it was learnt on, in their order."""
+    seen: tuple[tuple[float, float | None, tuple[float, float, float]], ...]
+    """(seconds, altitude in m, nu) of the captures that it was learnt on, in their order."""
     from_bands_px: Mapping[str, float]
     """Root mean square error of each band as the other bands of captures left out predict it."""
     from_neighbours_px: Mapping[str, float]
@@ -98,7 +103,7 @@ class Rig:
             size_px=(int(width), int(height)), mean={b: np.array(m) for b, m in facts["mean"].items()},
             baselines={b: (x, y) for b, (x, y) in facts["baselines"].items()}, baseline_std=facts["baseline_std"],
             centres={b: (x, y, z) for b, (x, y, z) in facts["centres"].items()}, factors=int(facts["factors"]),
-            seen=tuple((s, (x, y, z)) for s, (x, y, z) in facts["seen"]), from_bands_px=facts["from_bands_px"],
+            seen=tuple((s, a, (x, y, z)) for s, a, (x, y, z) in facts["seen"]), from_bands_px=facts["from_bands_px"],
             from_neighbours_px=facts["from_neighbours_px"], from_flight_px=facts["from_flight_px"],
             fields={b: LocalField(steps[b], values) for b, values in fields.items()},
         )  # fmt: skip
@@ -121,10 +126,26 @@ class Rig:
                 error = np.sqrt(variance + self.from_bands_px[band] ** 2 + off**2)
                 return Prediction(_moved(mean, np.outer(t, nu), g, self.size_px), "bands", float(error))
             return Prediction(mean, "flight", float(np.hypot(self.from_flight_px[band], off)))
+        climb_px = self._unknown_climb_px(known) * float(np.linalg.norm(self.baselines[band]))
         if self.factors and self.from_neighbours_px[band] < self.from_flight_px[band]:
             shift = np.outer(self.baselines[band], self._around(known.seconds))
-            return Prediction(_moved(mean, shift, g, self.size_px), "neighbours", self.from_neighbours_px[band])
-        return Prediction(mean, "flight", self.from_flight_px[band])
+            error = float(np.hypot(self.from_neighbours_px[band], climb_px))
+            return Prediction(_moved(mean, shift, g, self.size_px), "neighbours", error)
+        return Prediction(mean, "flight", float(np.hypot(self.from_flight_px[band], climb_px)))
+
+    def _unknown_climb_px(self, known: Observation) -> float:
+        """Standard deviation of the distance's factor at an altitude that the captures it is taken from do not have:
+        how much it changes with a metre is known as well as they have shown it.
+        """
+        seen = [(a, n[0]) for _, a, n in self.seen if a is not None]
+        if known.altitude_m is None or len(seen) < LEAST_CAPTURES:
+            return 0.0
+        altitudes, nu = (np.array(v) for v in zip(*seen, strict=True))
+        slope, offset = np.polyfit(altitudes, nu, 1) if np.ptp(altitudes) > 0 else (0.0, float(nu.mean()))
+        spread = max(float((nu - slope * altitudes - offset).std()), _LEAST_CLIMB_SPREAD_PX)
+        information = 1 / _CLIMB_STD_PX_PER_M**2 + float(((altitudes - altitudes.mean()) ** 2).sum()) / spread**2
+        nearest = float(np.abs(altitudes - known.altitude_m).min())
+        return nearest / float(np.sqrt(information)) + abs(float(slope)) * nearest
 
     def _factors_of(self, known: Observation, bands: Sequence[str]) -> tuple[Array, float, float]:
         """(nu, its variance over all factors, what it leaves of most of these bands, px)."""
@@ -137,7 +158,7 @@ class Rig:
 
     def _around(self, seconds: float) -> Array:
         """Factors between those of the captures before and after."""
-        moments, nu = np.array([s for s, _ in self.seen]), np.array([n for _, n in self.seen])
+        moments, nu = np.array([s for s, _, _ in self.seen]), np.array([n for _, _, n in self.seen])
         order = np.argsort(moments, kind="stable")
         return np.array([np.interp(seconds, moments[order], nu[order, k]) for k in range(3)])
 
@@ -167,7 +188,10 @@ def learn_rig(
         {b: (float(t[0]), float(t[1])) for b, t in zip(bands, fitted.t, strict=True)},
         dict(zip(bands, fitted.t_std.tolist(), strict=True)),
         {b: (float(c[0]), float(c[1]), float(c[2])) for b, c in zip(bands, fitted.centre, strict=True)}, best,
-        tuple((c.seconds, (float(n[0]), float(n[1]), float(n[2]))) for c, n in zip(captures, fitted.nu, strict=True)),
+        tuple(
+            (c.seconds, c.altitude_m, (float(n[0]), float(n[1]), float(n[2])))
+            for c, n in zip(captures, fitted.nu, strict=True)
+        ),
         errors[best], neighbours, flight,
     )  # fmt: skip
 

@@ -38,7 +38,7 @@ def learn(state: JointState, subjects: Sequence[Subject], net: Descriptor) -> tu
     steps, loss = 0, float("nan")
     for number, scale in enumerate(scales):
         last = number == len(scales) - 1
-        wanted = [(s, [b for b in range(len(s.moving)) if last or not s.trusted[b]]) for s in subjects]
+        wanted = [(s, [b for b in s.hopeful if last or not s.trusted[b]]) for s in subjects]
         at_level = [_AtLevel(net, s, bands, state.level(s, scale, bands)) for s, bands in wanted if bands]
         if number == 0 and net.learnt:
             for a in at_level:
@@ -72,11 +72,14 @@ class _AtLevel:
     h: list[Tensor] = field(init=False)
     settled: list[bool] = field(init=False)
     """Those whose psi has been at rest once; it is moved on all the same."""
-    told_apart: bool = False
-    """Held-out patches of some image have been, so that its psi could move."""
+    told_apart: list[bool] = field(init=False)
+    """Those whose held-out patches have been, so that psi could move."""
+    retrieved: list[float] = field(init=False)
+    """Share of the held-out patches that were retrieved when it was last looked at."""
 
     def __post_init__(self) -> None:
-        self.settled = [False] * len(self.which)
+        self.settled, self.told_apart = ([False] * len(self.which) for _ in range(2))
+        self.retrieved = [0.0] * len(self.which)
         self.h = [self.level.homography(self.subject.mappings[b], i) for i, b in enumerate(self.which)]
 
     @property
@@ -85,6 +88,7 @@ class _AtLevel:
 
     def hand_on(self) -> None:
         """Give what was found to the subject; a homography that cannot be inverted is not handed on."""
+        self.subject.given_up |= {b: self.retrieved[i] for i, b in enumerate(self.which) if not self.told_apart[i]}
         for i, b in enumerate(self.which):
             with suppress(GeometryError):
                 self.subject.mappings[b] = self.level.full_matrix(self.h[i], i)
@@ -136,7 +140,7 @@ def _learn_level(state: JointState, net: Descriptor, at_level: Sequence[_AtLevel
         if all(settled):
             break
         hopeless = step >= warm_up + recipe.hopeless_steps * len(at_level)
-        if hopeless and not any(a.told_apart for a in at_level):
+        if hopeless and not any(any(a.told_apart) for a in at_level):
             break
     net.learnt = True
     return step, loss_value
@@ -174,9 +178,10 @@ def _move_psi(state: JointState, at: _AtLevel) -> bool:
     solver = Solver(state.family, recipe)
     for i, band in enumerate(at.bands):
         retrieved, _ = retrieval(band, at.h[i], test, f_test, recipe.least_negative_px)
+        at.retrieved[i] = retrieved
         if retrieved < recipe.step_gate:
             continue
-        at.told_apart = True
+        at.told_apart[i] = True
         with suppress(NotEnoughTextureError):
             step = solver.step(band, at.h[i], anchors)
             at.h[i] = moved(at.h[i], step)

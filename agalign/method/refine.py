@@ -25,6 +25,7 @@ from agalign.values.choices import ModelFamily
 from agalign.values.doubts import Doubt
 
 LEAST_KEYPOINTS = 16
+_FIRST_PATCHES, _LIKELY_SHIFTS = 32, 128
 _PLAIN_GAIN = 3.0
 """Standard errors by which a loss must be less to count."""
 
@@ -157,23 +158,31 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach
     lengths = shifts.norm(dim=1)
     shifts = shifts[lengths <= reach_px]
 
-    def loss(shift: Tensor) -> Tensor:
-        """L0 of each keypoint, nan where its patch leaves an image."""
-        there = homography @ translation(shift)
-        apart = losses.distance(f, band.describe(keypoints, there))
-        inside = footprints_inside(band.level, band.index, keypoints, there)
-        return apart.masked_fill(~inside, float("nan"))
+    def table_of(some: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """(losses (shifts, count) of the first keypoints, nan where a patch leaves an image; their means)."""
+        p = keypoints[torch.arange(min(count, len(keypoints)), device=homography.device)]
+        table = torch.stack([_loss_moved(band, homography @ translation(s), p, f[: len(p)]) for s in some])
+        enough = table.isfinite().sum(dim=1) >= LEAST_KEYPOINTS
+        return table, table.nanmean(dim=1).masked_fill(~enough, float("inf"))
 
-    table = torch.stack([loss(s) for s in shifts])
-    enough = table.isfinite().sum(dim=1) >= LEAST_KEYPOINTS
-    means = table.nanmean(dim=1).masked_fill(~enough, float("inf"))
-    best, start = int(means.argmin()), int(lengths[lengths <= reach_px].argmin())
-    gain = table[start] - table[best]
+    # A part of the patches tells which shifts are worth all of them.
+    _, rough = table_of(shifts, _FIRST_PATCHES)
+    likely = shifts[rough.argsort()[:_LIKELY_SHIFTS]]
+    table, means = table_of(torch.cat([homography.new_zeros(1, 2), likely]), len(keypoints))
+    best = int(means.argmin())
+    gain = table[0] - table[best]
     gain = gain[gain.isfinite()]
-    if not bool(enough[best]) or len(gain) < LEAST_KEYPOINTS:
+    if not bool(means[best].isfinite()) or len(gain) < LEAST_KEYPOINTS:
         return homography.new_zeros(2)
     plain = float(gain.mean()) > _PLAIN_GAIN * float(gain.std()) / math.sqrt(len(gain))
-    return shifts[best] if plain else homography.new_zeros(2)
+    return likely[best - 1] if plain and best > 0 else homography.new_zeros(2)
+
+
+def _loss_moved(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor) -> Tensor:
+    """L0 of each keypoint, nan where its patch leaves an image."""
+    apart = losses.distance(f, band.describe(keypoints, homography))
+    inside = footprints_inside(band.level, band.index, keypoints, homography)
+    return apart.masked_fill(~inside, float("nan"))
 
 
 @torch.no_grad()
@@ -210,7 +219,12 @@ def refine(state: JointState, net: Descriptor, subject: Subject, *, move: bool =
             matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
         )  # fmt: skip
 
-    return [result(MovingBand(net, level, b, side), h[b]) for b, side in enumerate(subject.sides)]
+    return [
+        Doubt("retrieval", subject.given_up[b], recipe.step_gate)
+        if b in subject.given_up
+        else result(MovingBand(net, level, b, side), h[b])
+        for b, side in enumerate(subject.sides)
+    ]
 
 
 def _complete_std(step: Step, recipe: FastRecipe) -> tuple[tuple[float, float], ...]:

@@ -1,7 +1,7 @@
 """What a joint optimisation works on, the images of a capture, and what it carries along: settings, random numbers."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -31,8 +31,16 @@ class Subject:
     """Which of the network's sides describes each moving image."""
     trusted: Sequence[bool]
     """Seeds that are good to a few pixels: recipe fast leaves the coarse levels out."""
+    given_up: dict[int, float] = field(default_factory=dict)
+    """Moving images whose patches could not be told apart at some level, and the retrieval there: nothing is learnt or
+    refined for them."""
     fields: Sequence[LocalField | None] = ()
     """Displacements of the reference's positions before each homography, px of `fixed`; empty for none at all."""
+
+    @property
+    def hopeful(self) -> list[int]:
+        """The moving images that are not given up."""
+        return [b for b in range(len(self.moving)) if b not in self.given_up]
 
     @classmethod
     def of_one(cls, fixed: Raster, moving: Raster, fixed_to_moving: Matrix, *, trusted: bool = False) -> "Subject":
