@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from agalign.values.choices import (
     Compression,
@@ -10,12 +10,14 @@ from agalign.values.choices import (
     FamilyChoice,
     Interpolation,
     Layout,
+    LocalUse,
     RasterFormat,
     Recipe,
     Resolution,
     SeedKind,
     Sharing,
 )
+from agalign.values.doubts import Doubt
 
 Positive = Annotated[int, Field(gt=0)]
 
@@ -173,8 +175,12 @@ class CheckSettings(Stage):
     """Median length of the windows' residual shifts."""
     least_coverage: float = 0.6
     """Share of the windows with structure in which a shift could be measured."""
-    least_close: float = 0.5
-    """Share of all these windows in which the shift is at most `most_residual_px`."""
+    least_close: float = 0.9
+    """Share of the windows in which a shift was measured where it is at most `most_residual_px`."""
+    least_cluster: Positive = 5
+    """So many windows beside each other that lie farther apart are a place that is not aligned,"""
+    most_cluster: float = 0.04
+    """where they are also this share of those measured."""
     least_windows: Positive = 4
     least_seed_coverage: float = 0.3
     """The same as `least_coverage` for a seed that is used as it is."""
@@ -196,7 +202,8 @@ class CheckSettings(Stage):
 class LocalSettings(Stage):
     """A smooth field of displacements over the homography, for parallax over trees, terraces and buildings."""
 
-    use: bool = False
+    use: LocalUse = "auto"
+    """auto fits a field where nothing but some windows that lie apart stands against an alignment."""
     window_px: Positive = 64
     """Side of the windows in which shifts are measured, half of which they overlap."""
     most_windows: Positive = 4000
@@ -216,6 +223,16 @@ class LocalSettings(Stage):
     least_gain_sigma: float = 4.0
     """A field is kept where the squared shifts of windows left out of its fit fall by so many standard errors, and
     their 95th percentile does not rise."""
+
+    @field_validator("use", mode="before")
+    @classmethod
+    def _yes_or_no(cls, value: object) -> object:
+        return {True: "always", False: "never"}.get(value, value) if isinstance(value, bool) else value
+
+    def is_wanted_for(self, doubts: tuple[Doubt, ...]) -> bool:
+        """True where a field is to be tried for a result that has these doubts."""
+        mendable = all(d.kind in ("close_windows", "cluster") for d in doubts)
+        return mendable and (self.use == "always" or (self.use == "auto" and bool(doubts)))
 
 
 class WriteSettings(Stage):

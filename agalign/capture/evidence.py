@@ -26,6 +26,7 @@ def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Se
     """The alignment with its verdict and metrics, px of the images. A result that is doubted leaves the seed."""
     check, size_px = settings.check, pair.fixed.size_px
     joint: JointResult | None = None
+    local: LocalResult | None = None
     doubts: tuple[Doubt, ...] = (result,) if isinstance(result, Doubt) else ()
     mapping = pair.mapping(seed.fixed_to_moving)
     if isinstance(result, JointResult):
@@ -33,6 +34,17 @@ def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Se
         found = pair.mapping(joint.fixed_to_moving)
         there, residual = _laid(pair, found)
         doubts = doubts_of(joint, residual, size_px, check)
+        if settings.local.is_wanted_for(doubts):
+            local = pair.reference.local.refine(single(pair.moving_image), found)
+            if local.field is not None:
+                bent = replace(found, local=local.field)
+                laid, left = _laid(pair, bent)
+                still = doubts_of(joint, left, size_px, check)
+                # The verdict is asked again: what a field makes worse, or no better, is not aligned by it.
+                if still:
+                    local = LocalResult(None, local.before_p95_px, local.after_p95_px)
+                else:
+                    there, residual, found, doubts = laid, left, bent, ()
         mapping = mapping if doubts else found
     if doubts:
         there, residual = _laid(pair, mapping)
@@ -40,17 +52,6 @@ def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Se
     status = status_of(doubts, residual, check, seed=usable)
     if usable and doubts and not seed_fits(residual, check):
         doubts = (*doubts, Doubt("seed_does_not_fit"))
-    local = None
-    if settings.local.use and status == "aligned" and joint is not None:
-        local = pair.reference.local.refine(single(pair.moving_image), mapping)
-        if local.field is not None:
-            bent = replace(mapping, local=local.field)
-            laid, left = _laid(pair, bent)
-            # What a field makes worse is not aligned by it: the verdict is asked again.
-            if doubts_of(joint, left, size_px, check):
-                local = LocalResult(None, local.before_p95_px, local.after_p95_px)
-            else:
-                there, residual, mapping = laid, left, bent
     alignment = Alignment(
         mapping.fixed_to_moving, pair.space, status, doubts, seed, joint, residual, 0.0, local=local,
         field=mapping.local,

@@ -22,6 +22,7 @@ from agalign.values.choices import (
     FamilyChoice,
     Interpolation,
     Layout,
+    LocalUse,
     RasterFormat,
     Recipe,
     Resolution,
@@ -107,9 +108,12 @@ def align(
         Layout, typer.Option(help="A stack of all bands, a file for each input file with its tags, or both.")
     ] = "stack",
     local: Annotated[
-        bool,
-        typer.Option("--local", help="Follow parallax over trees and buildings: a smooth field over the homography."),
-    ] = False,
+        LocalUse,
+        typer.Option(
+            help="Follow parallax over trees and buildings by a smooth field over the homography: where it is needed, "
+            "wherever it helps, or not at all. --local alone is always."
+        ),
+    ] = "auto",
     accept_predicted: Annotated[
         float,
         typer.Option(

@@ -5,7 +5,7 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from rich.markup import escape
@@ -27,6 +27,7 @@ from agalign.cli.align import (
     find_captures,
 )
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits, in_json
+from agalign.values.choices import LocalUse
 
 if TYPE_CHECKING:
     from agalign.values.capture import Capture
@@ -227,6 +228,11 @@ def main() -> None:
     arguments = sys.argv[1:]
     if arguments and arguments[0] not in _COMMANDS and not _is_root_option(arguments[0]):
         arguments = ["align", *arguments]
+    if "--local" in arguments:
+        # It was a flag before it had values.
+        after = arguments.index("--local") + 1
+        if arguments[after : after + 1] not in [[use] for use in get_args(LocalUse)]:
+            arguments.insert(after, "always")
     # Threads that spin while they wait cost a multiple of the time where another program wants the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # The matrices here are small: a second BLAS thread does nothing but spin.

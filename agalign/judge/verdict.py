@@ -3,14 +3,19 @@
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.sparse import identity
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from agalign.config import CheckSettings
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.choices import PairStatus
 from agalign.values.doubts import Doubt
-from agalign.values.geometry import Matrix
+from agalign.values.geometry import Matrix, Points
 
+_NEIGHBOUR = 1.6
+"""Diagonal neighbours count, in distances between windows."""
 _MOST_STRETCH = 4.0
 """Largest over smallest magnification within an image."""
 
@@ -54,12 +59,30 @@ def _of_the_windows(residual: Residual, settings: CheckSettings) -> Iterator[Dou
         return
     if not residual.coverage >= settings.least_coverage:
         yield Doubt("coverage", residual.coverage, settings.least_coverage)
-    close = float((np.linalg.norm(residual.shifts_px, axis=1) <= settings.most_residual_px).mean())
+    measured = np.isfinite(residual.shifts_px[:, 0])
+    off = measured & (np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > settings.most_residual_px)
+    close = 1 - float(off.sum()) / max(int(measured.sum()), 1)
     if not close >= settings.least_close:
         within = f"{settings.most_residual_px:g} px"
         yield Doubt("close_windows", close, settings.least_close, within)
+    together = _largest_cluster(residual.centres_px[off], residual.centres_px)
+    most = max(settings.least_cluster, round(settings.most_cluster * int(measured.sum())))
+    if not together < most:
+        yield Doubt("cluster", together / max(int(measured.sum()), 1), most / max(int(measured.sum()), 1))
     if not residual.median_px <= settings.most_residual_px:
         yield Doubt("residual_px", residual.median_px, settings.most_residual_px)
+
+
+def _largest_cluster(off_px: Points, all_px: Points) -> int:
+    """How many of some windows (n, 2) hang together, each beside the next on the grid of all (m, 2)."""
+    if len(off_px) == 0 or len(all_px) < 2:
+        return len(off_px)
+    # Windows lie about as far apart as each one's nearest neighbour does.
+    distance, _ = cKDTree(all_px).query(all_px, k=2)
+    reach = _NEIGHBOUR * float(np.median(distance[:, 1]))
+    beside = cKDTree(off_px).sparse_distance_matrix(cKDTree(off_px), reach)
+    _, labels = connected_components(beside.tocsr() + identity(len(off_px)), directed=False)
+    return int(np.bincount(labels).max())
 
 
 def is_as_it_was(

@@ -7,7 +7,7 @@ from typing import Literal
 DoubtKind = Literal[
     "unreadable", "blank_reference", "blank_moving", "no_such_seed", "seed_asked_for",
     "no_contrast", "few_keypoints", "not_invertible", "corners_unknown",
-    "folds", "retrieval", "corner_std_px", "few_windows", "coverage", "close_windows", "residual_px",
+    "folds", "retrieval", "corner_std_px", "few_windows", "coverage", "close_windows", "cluster", "residual_px",
     "seed_does_not_fit", "unexpected_px",
 ]  # fmt: skip
 
@@ -41,6 +41,7 @@ _SENTENCES: dict[DoubtKind, str] = {
     "few_windows": "too little structure in common to check the result",
     "coverage": "the structures agree in only {value:.0%} of the windows",
     "close_windows": "the structures lie within {detail} in only {value:.0%} of the windows",
+    "cluster": "{value:.0%} of the windows, beside each other, lie apart",
     "residual_px": "the structures still lie {value:.1f} px apart",
     "seed_does_not_fit": "but it does not fit either",
     "unexpected_px": "it lies {value:.1f} px from where the rig of the flight has it",

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 
@@ -77,3 +78,40 @@ def test_residuals_of_a_reduced_image_are_given_in_px_of_the_file() -> None:
     residual = Residual(np.array([[10.0, 20.0]]), np.array([[0.5, 0.0]]), 0.5, 0.5, 1.0).enlarged((4.0, 4.0))
     np.testing.assert_allclose(residual.centres_px, [[41.5, 81.5]])
     assert (residual.median_px, residual.shifts_px[0, 0]) == (2.0, 2.0)
+
+
+def bent_pair(height_px: float) -> BandPair:
+    """A pair of which the middle is displaced by a smooth bump: no homography explains it."""
+    fixed, moving = textured_pair(np.eye(3), 640, 480, seed=4)
+    grid = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
+
+    def bump(points: np.ndarray) -> np.ndarray:
+        fall = np.exp(-(((points - (320, 240)) / 110) ** 2).sum(-1))
+        return height_px * fall[..., None] * np.array([1.0, -0.6])
+
+    back = grid - bump(grid - bump(grid))
+    bent = cv2.remap(moving, back.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, bent))
+    return BandPair.of_images("nir", *images, {"rig": np.eye(3)}, Settings())
+
+
+@pytest.mark.parametrize(("use", "status"), [("auto", "aligned"), ("always", "aligned"), ("never", "seed_only")])
+def test_a_field_starts_by_itself_where_a_part_of_the_image_lies_apart(use: str, status: str) -> None:
+    seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
+    settings = Settings(local=LocalSettings(use=use))
+    found = judged(bent_pair(4.0), seed, result(np.eye(3)), settings)
+    assert found.status == status
+    assert (found.field is not None) == (status == "aligned")
+    plain = judged(bent_pair(0.0), seed, result(np.eye(3)), Settings())
+    assert (plain.status, plain.local, plain.field) == ("aligned", None, None)
+
+
+def test_what_a_field_cannot_mend_is_named(pair: BandPair) -> None:
+    """A third of the image 15 px off."""
+    fixed, moving = textured_pair(geometry.translation(6, -4))
+    torn = moving.copy()
+    torn[:, 270:] = np.roll(moving, 15, axis=0)[:, 270:]
+    found = judged(pair_of(fixed, torn), SEED, result(geometry.translation(6, -4)), Settings())
+    assert found.status != "aligned"
+    assert {"close_windows", "cluster"} & {d.kind for d in found.doubts}
+    assert "of the windows" in (found.reason or "")

@@ -342,3 +342,18 @@ def test_wrong_words_are_usage_errors(flight: Path, tmp_path: Path) -> None:
         done = agalign(flight, "-o", tmp_path, *options)
         assert done.returncode == 2
         assert "is not one of" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "use"),
+    [(["--local"], "always"), (["--local", "never"], "never"), (["--local", "-q"], "always"), ([], "auto")],
+)
+def test_local_was_a_flag_and_still_may_be(arguments: list[str], use: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from agalign.cli import main
+
+    seen: list[str] = []
+    monkeypatch.setattr(main, "app", lambda args, prog_name: seen.extend(args))
+    monkeypatch.setattr(sys, "argv", ["agalign", "flight", *arguments])
+    main.main()
+    value = seen[seen.index("--local") + 1] if "--local" in seen else "auto"
+    assert value == use

@@ -82,3 +82,27 @@ def test_an_aligned_input_is_left_as_it_is() -> None:
     assert not is_as_it_was(precise, np.eye(3), SIZE, CheckSettings())
     # A quarter of a pixel of the file is less of an image that was reduced to a third.
     assert not is_as_it_was(within, np.eye(3), SIZE, CheckSettings(), scale=1 / 3)
+
+
+def windows(off: np.ndarray) -> Residual:
+    """12 x 9 windows, 112 px apart, of which some lie 3 px off."""
+    centres = np.stack(np.meshgrid(np.arange(12), np.arange(9)), axis=-1).reshape(-1, 2) * 112.0 + 56
+    shifts = np.where(off.reshape(-1, 1), [3.0, 0.0], [0.05, 0.0])
+    return Residual(centres, shifts, 0.05, 0.2, 1.0)
+
+
+def test_a_part_of_the_image_that_lies_apart_is_a_doubt_and_scattered_windows_are_none() -> None:
+    scattered, corner, third = (np.zeros((9, 12), bool) for _ in range(3))
+    scattered[::4, ::3] = True
+    scattered[0, 0] = scattered[8, 9] = False
+    corner[:2, :3] = True
+    third[:, 8:] = True
+    assert kinds(residual=windows(scattered)) == []
+    assert kinds(residual=windows(corner)) == ["cluster"]
+    assert kinds(residual=windows(third)) == ["close_windows", "cluster"]
+
+
+def test_windows_that_could_not_be_measured_are_no_tail() -> None:
+    residual = windows(np.zeros((9, 12), bool))
+    residual.shifts_px[:20] = np.nan
+    assert kinds(residual=residual) == []
