@@ -18,7 +18,7 @@ from agalign.products.summary import write_summary
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
-from agalign.values.choices import Interpolation
+from agalign.values.choices import Interpolation, SeedKind
 from agalign.values.image import Mask, Tile
 from agalign.values.mapping import PixelMapping
 
@@ -28,6 +28,7 @@ def align(
     moving: ArrayLike,
     *,
     seed: ArrayLike | None = None,
+    seed_std_px: float | None = None,
     fixed_valid: ArrayLike | None = None,
     moving_valid: ArrayLike | None = None,
     settings: Settings | None = None,
@@ -38,6 +39,8 @@ def align(
         are taken as saturated at their type's largest value; constant fill that runs in from the border, and nan,
         is left aside.
     seed: 3x3 fixed_to_moving to start from, good to some 10 % of the image; None starts from the images themselves.
+    seed_std_px: how well the seed is known, standard deviation in px of `fixed`. Where a scene repeats, the place
+        within three of these is taken; without it such a scene is not aligned.
     fixed_valid, moving_valid: (H, W), False where pixels must not be used.
 
     Returns an Alignment whose `fixed_to_moving` (3x3) maps a pixel of `fixed` to a pixel of `moving`: x right, y down,
@@ -51,7 +54,8 @@ def align(
     candidates: Candidates = {"identity": geometry.overlay(one.size_px, other.size_px)}
     if seed is not None:
         candidates = {"user": geometry.normalised(seed)}
-    pair = BandPair.of_images("moving", one, other, candidates, settings)
+    known: dict[SeedKind, float] = {} if seed_std_px is None else {"user": seed_std_px}
+    pair = BandPair.of_images("moving", one, other, candidates, settings, known)
     return align_pairs([pair], settings, quiet)["moving"]
 
 

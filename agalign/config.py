@@ -181,6 +181,8 @@ class CheckSettings(Stage):
     """So many windows beside each other that lie farther apart are a place that is not aligned,"""
     most_cluster: float = 0.04
     """where they are also this share of those measured."""
+    most_rival: float = 0.75
+    """Height of the next correlation peak over that of the place found, from which the scene is taken to repeat."""
     least_windows: Positive = 4
     least_seed_coverage: float = 0.3
     """The same as `least_coverage` for a seed that is used as it is."""

@@ -1,5 +1,6 @@
 """A moving image beside the reference, as the estimation sees the two, with the mappings that its tags offer."""
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -23,6 +24,10 @@ from agalign.values.mapping import PixelMapping
 
 Candidates = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of trust."""
+_STANDARD_DEVIATIONS = 3.0
+_TAGS_STD_PX = 5.0
+"""Rig tags are off by 2 px in the median and 12 at most on five cameras (docs/cameras.md)."""
+_LEAST_MODEL_STD_PX = 1.0
 _NOT_REDUCED = (1.0, 1.0), (1.0, 1.0)
 
 
@@ -39,15 +44,18 @@ class BandPair:
     """The moving bands: one, but for colour photographs; none where the images are arrays."""
     scales: tuple[tuple[float, float], tuple[float, float]] = _NOT_REDUCED
     """(x, y) of the fixed and of the moving image relative to their files."""
+    known_to_px: Mapping[SeedKind, float] = dataclasses.field(default_factory=dict)
+    """Standard deviation of candidates of which one is known: px of the fixed image."""
     field: LocalField | None = None
     """Displacements before any homography, px of the fixed image: what the flight's rig knows of the lenses."""
 
     @classmethod
     def of_images(
-        cls, name: str, fixed: Raster, moving: Raster, candidates: Candidates, settings: Settings
-    ) -> "BandPair":
+        cls, name: str, fixed: Raster, moving: Raster, candidates: Candidates, settings: Settings,
+        known_to_px: Mapping[SeedKind, float] | None = None,
+    ) -> "BandPair":  # fmt: skip
         """A single pair of images that are no files' reductions."""
-        return cls(name, Reference(fixed, settings), moving, candidates)
+        return cls(name, Reference(fixed, settings), moving, candidates, known_to_px=known_to_px or {})
 
     @property
     def space(self) -> Space:
@@ -72,6 +80,17 @@ class BandPair:
     def laid(self, mapping: PixelMapping) -> Raster:
         """The moving image, one channel, on the reference's pixels."""
         return warped(single(self.moving_image), mapping, self.fixed.size_px)
+
+    def is_expected(self, fixed_to_moving: Matrix, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
+        """True where some candidate has a mapping, moved by a shift of the fixed image, within what it is known to."""
+        moved = geometry.compose(fixed_to_moving, geometry.translation(*shift_px))
+        middle = (np.array(self.fixed.size_px) - 1) / 2
+        return any(
+            np.linalg.norm(geometry.apply(moved, middle) - geometry.apply(self.candidates[kind], middle))
+            <= _STANDARD_DEVIATIONS * std_px
+            for kind, std_px in self.known_to_px.items()
+            if kind in self.candidates
+        )
 
     def in_file_px(self, fixed_to_moving: Matrix) -> Matrix:
         """A homography between the images as one between their files."""
@@ -108,8 +127,17 @@ def read_pairs(
         down: Candidates = {kind: geometry.rescale(m, *scales) for kind, m in candidates.items()}
         field = None if model is None or model.rig is None else model.rig.fields.get(name)
         field = None if field is None else field.rescaled(scales[0])
-        pairs.append(BandPair(name, reference, moving, down, bands, scales, field))
+        known = _known_to_px(name, model, scales[0])
+        pairs.append(BandPair(name, reference, moving, down, bands, scales, known, field))
     return pairs, left_out
+
+
+def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float]) -> dict[SeedKind, float]:
+    """Tags are as good as their makers' parallax; the flight's mean as captures left out of it showed."""
+    known: dict[SeedKind, float] = {"rig": _TAGS_STD_PX * scale[0]}
+    if model is not None and model.rig is not None and band in model.rig.from_flight_px:
+        known["model"] = max(model.rig.from_flight_px[band], _LEAST_MODEL_STD_PX) * scale[0]
+    return known
 
 
 def _mean(rasters: Iterable[Raster]) -> Raster:

@@ -1,11 +1,14 @@
 """A pair's alignment with everything that speaks for and against it, measured on the images laid on each other."""
 
+import math
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
 from agalign.config import CheckSettings, Settings
+from agalign.judge.repeats import rival_of
 from agalign.judge.verdict import doubts_of, is_as_it_was, seed_fits, status_of
-from agalign.pixels.resample import single
+from agalign.pixels.resample import shrink, single
+from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, LocalResult, Prediction, Residual, Seed
 from agalign.values.choices import SeedKind, Space
@@ -33,7 +36,7 @@ def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Se
         joint = _snapped(result, pair, check)
         found = pair.mapping(joint.fixed_to_moving)
         there, residual = _laid(pair, found)
-        doubts = doubts_of(joint, residual, size_px, check)
+        doubts = (*_repeats(pair, joint, there, check), *doubts_of(joint, residual, size_px, check))
         if settings.local.is_wanted_for(doubts):
             local = pair.reference.local.refine(single(pair.moving_image), found)
             if local.field is not None:
@@ -67,6 +70,19 @@ def as_predicted(alignment: Alignment, pair: BandPair, prediction: Prediction) -
         field=pair.field, prediction=prediction,
     )  # fmt: skip
     return _with_metrics(moved, pair, there)
+
+
+def _repeats(pair: BandPair, joint: JointResult, there: Raster, check: CheckSettings) -> tuple[Doubt, ...]:
+    """A doubt where another place fits nearly as well and nothing that was known beforehand rules it out."""
+    small = shrink(there, pair.reference.seed_size_px)
+    spectrum = windowed_spectra(structure_field(small, pair.reference.settings.seed.smoothing_px))
+    rival = rival_of(pair.reference.seed_spectrum, spectrum)
+    if rival.share <= check.most_rival:
+        return ()
+    x, y = (s / scale for s, scale in zip(rival.shift_px, pair.reference.seed_scale, strict=True))
+    if pair.is_expected(joint.fixed_to_moving) and not pair.is_expected(joint.fixed_to_moving, (x, y)):
+        return ()
+    return (Doubt("repeats", math.hypot(x, y)),)
 
 
 def _with_metrics(alignment: Alignment, pair: BandPair, there: Raster) -> Alignment:

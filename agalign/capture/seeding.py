@@ -76,7 +76,10 @@ def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[See
         return [Seed(kind, fixed_to_moving, 0.0)]
     spectrum = windowed_spectra(structure_field(small_moving, settings.smoothing_px))
     surface = correlation_surfaces(reference.seed_spectrum, spectrum)
-    peak = find_peak(surface, apart_px=max(size) // 16)
+    # Where a candidate's place is known to some px, a period farther away is another place.
+    known_px = pair.known_to_px.get(kind) if kind == "user" else None
+    within_px = np.inf if known_px is None else max(_SAME_PEAK_PX, 3 * known_px * max(scale))
+    peak = find_peak(surface, apart_px=max(size) // 16, within_px=within_px)
 
     def seed(kind: SeedKind, matrix: Matrix, sigma: float, rival: float) -> Seed:
         return Seed(kind, matrix, sigma, sigma, rival, _leaves_no_doubt(sigma, rival, settings))

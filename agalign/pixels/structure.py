@@ -81,18 +81,19 @@ def correlation_surfaces(fixed: Field, moving: Field) -> NDArray[np.float32]:
     return np.asarray(fft.ifft2(cross, overwrite_x=True).real)
 
 
-def find_peak(surface: NDArray[np.float32], apart_px: int) -> Peak:
+def find_peak(surface: NDArray[np.float32], apart_px: int, within_px: float = np.inf) -> Peak:
     """The highest point of a correlation surface (height, width), to a fraction of a pixel.
 
-    `apart_px` is how far away the runner-up must lie.
+    `apart_px` is how far away the runner-up must lie, `within_px` how far from no shift the highest point may.
     """
     height, width = surface.shape
     spread = float(surface.std())
     if spread <= 0:
         return Peak((0.0, 0.0), 0.0, 0.0, 0.0)
     z = np.fft.fftshift((surface - surface.mean()) / spread)
-    row, column = np.unravel_index(int(z.argmax()), z.shape)
     zero_row, zero_column = height // 2, width // 2
+    far = np.hypot(*np.ogrid[-zero_row : height - zero_row, -zero_column : width - zero_column]) > within_px
+    row, column = np.unravel_index(int(np.where(far, -np.inf, z).argmax()), z.shape)
     dx = column - zero_column + _vertex(z[row, (column - 1) % width], z[row, column], z[row, (column + 1) % width])
     dy = row - zero_row + _vertex(z[(row - 1) % height, column], z[row, column], z[(row + 1) % height, column])
     sigma = float(z[row, column])

@@ -33,6 +33,7 @@ from agalign.values.geometry import Points
 from agalign.values.image import Tile
 from agalign.values.mapping import splined
 
+ALTITUDE_M = 22.0, 34.0
 _BLACK_LEVEL = 4800.0
 _WHITE_LEVEL = 52000.0
 _TIES, _TIES_OVER_RELIEF = (25, 19), (65, 49)
@@ -46,15 +47,17 @@ _IRRADIANCE = 0.8
 def make_flight(
     folder: Path, captures: int = 3, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0,
     bands: Sequence[BandSpec] = BANDS, relief_m: float = 0.0,
+    altitude_m: tuple[float, float] = ALTITUDE_M,
 ) -> Path:  # fmt: skip
     """Write `captures` captures of all bands into folder/0000SET/000 and the truth into folder/truth.json.
 
     The truth is {capture: {"reference": file, "bands": {file: {"fixed_to_moving": [[...]], "ties": [[x_ref, y_ref,
     x_mov, y_mov], ...]}}}}: the homography between undistorted pixels, and ties in raw pixels, exact to 0.001 px; the
     centre of the top-left pixel is (0, 0). With `relief_m` the ground has terraces of that height and trees half as
-    high: the homography then is the plane's below them, and the ties are true. Returns the path of truth.json.
+    high: the homography then is the plane's below them, and the ties are true. `altitude_m` is between what heights
+    above the plane the captures are taken. Returns the path of truth.json.
     """
-    poses, ground, rng = lay_out_flight(captures, size_px, rng_seed, relief_m)
+    poses, ground, rng = lay_out_flight(captures, size_px, rng_seed, relief_m, altitude_m)
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
     truth: dict[str, Any] = {}
@@ -83,11 +86,15 @@ def make_flight(
 
 
 def lay_out_flight(
-    captures: int, size_px: tuple[int, int], rng_seed: int = 0, relief_m: float = 0.0
+    captures: int,
+    size_px: tuple[int, int],
+    rng_seed: int = 0,
+    relief_m: float = 0.0,
+    altitude_m: tuple[float, float] = ALTITUDE_M,
 ) -> tuple[list[Pose], Ground, np.random.Generator]:
     """(poses, ground, generator of the noise that follows) of the flight that `make_flight` writes."""
     rng = np.random.default_rng(rng_seed)
-    poses = [_pose(rng, number) for number in range(captures)]
+    poses = [_pose(rng, number, altitude_m) for number in range(captures)]
     return poses, paint_ground(rng, poses, size_px, relief_m), rng
 
 
@@ -143,9 +150,9 @@ def render(
     return np.asarray((np.clip(np.rint(levels / 16), 0, 4095) * 16).astype(np.uint16))
 
 
-def _pose(rng: np.random.Generator, number: int) -> Pose:
+def _pose(rng: np.random.Generator, number: int, altitude_m: tuple[float, float]) -> Pose:
     return Pose(
-        altitude_m=float(rng.uniform(22, 34)), yaw_deg=float(rng.uniform(-180, 180)),
+        altitude_m=float(rng.uniform(*altitude_m)), yaw_deg=float(rng.uniform(-180, 180)),
         roll_deg=float(rng.normal(0, 2)), pitch_deg=float(rng.normal(0, 2)),
         east_m=4.0 * (number % 10), north_m=4.0 * (number // 10),
     )  # fmt: skip
@@ -162,7 +169,8 @@ def _write_band(
         cx=model.cx_px / density, cy=model.cy_px / density, focal=FOCAL_LENGTH_MM,
         k1=band.distortion[0], k2=band.distortion[1], k3=band.distortion[4],
         p1=band.distortion[2], p2=band.distortion[3],
-        rig=", ".join(f"{v:.6f}" for v in band.rig_degrees), index=band.rig_index, reference=REFERENCE,
+        rig=", ".join(f"{v:.6f}" for v in band.rig_degrees),
+        place=f"{band.baseline_m[0]:.4f}, {band.baseline_m[1]:.4f}, 0", index=band.rig_index, reference=REFERENCE,
         capture=f"synthetic{number:011d}", altitude=pose.altitude_m,
         middle_x=size_px[0] / 2, middle_y=size_px[1] / 2,
         fall=-_VIGNETTING / ((size_px[0] / 2) ** 2 + (size_px[1] / 2) ** 2),
@@ -219,6 +227,7 @@ _XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
     </rdf:Seq>
    </Camera:VignettingPolynomial>
    <Camera:RigRelatives>{rig}</Camera:RigRelatives>
+   <Camera:RigTranslations>{place}</Camera:RigTranslations>
    <Camera:RigCameraIndex>{index}</Camera:RigCameraIndex>
    <Camera:RigRelativesReferenceRigCameraIndex>{reference}</Camera:RigRelativesReferenceRigCameraIndex>
   </rdf:Description>

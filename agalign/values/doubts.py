@@ -8,7 +8,7 @@ DoubtKind = Literal[
     "unreadable", "blank_reference", "blank_moving", "no_such_seed", "seed_asked_for",
     "no_contrast", "few_keypoints", "not_invertible", "corners_unknown",
     "folds", "retrieval", "corner_std_px", "few_windows", "coverage", "close_windows", "cluster", "residual_px",
-    "seed_does_not_fit", "unexpected_px",
+    "seed_does_not_fit", "unexpected_px", "repeats",
 ]  # fmt: skip
 
 
@@ -44,6 +44,7 @@ _SENTENCES: dict[DoubtKind, str] = {
     "cluster": "{value:.0%} of the windows, beside each other, lie apart",
     "residual_px": "the structures still lie {value:.1f} px apart",
     "seed_does_not_fit": "but it does not fit either",
+    "repeats": "the scene repeats: {value:.0f} px away it fits nearly as well, and nothing says which place is right",
     "unexpected_px": "it lies {value:.1f} px from where the rig of the flight has it",
 }
 

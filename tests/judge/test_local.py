@@ -3,9 +3,9 @@ import pytest
 
 from agalign.capture.reference import Reference
 from agalign.config import LocalSettings, Settings
-from agalign.judge.local import Shifts, _folds, _Gain, _is_one_to_one, _near, fitted_field
+from agalign.judge.local import Shifts, _folds, _Gain, _is_one_to_one, _near, common_field, fitted_field
 from agalign.values import geometry
-from agalign.values.alignment import LocalField
+from agalign.values.alignment import LocalField, Residual
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping
 
@@ -115,3 +115,24 @@ def test_a_field_that_makes_the_worst_windows_worse_is_not_kept() -> None:
     assert better.is_plain(4.0)
     assert not worse.is_plain(4.0)
     assert not _Gain(1.0).is_plain(4.0)
+
+
+def of_captures(count: int, height: float, seed: int) -> list[Residual]:
+    """Windows of several captures that have a bump in common, each with noise of its own."""
+    at = centres()
+    rng = np.random.default_rng(seed)
+    shifts = [bump(at, height) + 0.1 * rng.normal(size=at.shape) for _ in range(count)]
+    return [Residual(at, s, 0.1, 0.3, 1.0, np.full(len(at), 15.0)) for s in shifts]
+
+
+def test_what_captures_have_in_common_is_the_lenses() -> None:
+    field = common_field(of_captures(6, 0.4, 1), SETTINGS, SIZE)
+    assert field is not None
+    at = geometry.lattice(*SIZE, 17, 13)
+    left = np.linalg.norm(field(at) - bump(at, 0.4), axis=1)
+    assert np.sqrt((left**2).mean()) < 0.5 * np.sqrt((bump(at, 0.4) ** 2).sum(-1).mean())
+    assert common_field(of_captures(6, 0.0, 1), SETTINGS, SIZE) is None
+    assert common_field(of_captures(2, 0.4, 1), SETTINGS, SIZE) is None
+    # What each capture has of its own is none of the lenses'.
+    own = [of_captures(1, h, k)[0] for k, h in enumerate((0.4, -0.4, 0.4, -0.4))]
+    assert common_field(own, SETTINGS, SIZE) is None

@@ -4,6 +4,7 @@ import torch
 from agalign.method.levels import Level, Sampler, footprints_inside, make_level, make_view
 from agalign.method.patches import Keypoints, patch_positions, transform
 from agalign.values import lens
+from agalign.values.alignment import LocalField
 from agalign.values.image import Raster
 from agalign.values.lens import Lens
 
@@ -112,3 +113,16 @@ def test_level_matrices_go_to_full_resolution_and_back() -> None:
     fixed, moving = rasters()
     level = make_level(fixed, [moving], [matrix], 0.5, 0.05, torch.Generator().manual_seed(0), CPU)
     np.testing.assert_allclose(level.full_matrix(level.homography(matrix, 0), 0), matrix, atol=1e-4)
+
+
+def test_positions_are_displaced_by_the_field_of_their_place() -> None:
+    """The rig's own field lies on the full image: at half the resolution it is half as long."""
+    fixed, moving = rasters()
+    nodes = np.stack(np.meshgrid(np.arange(12) * 32.0, np.arange(9) * 32.0), axis=-1)
+    field = LocalField(32.0, np.stack([0.01 * nodes[..., 0], -0.02 * nodes[..., 1]], axis=-1))
+    level = make_level(fixed, [moving], [np.eye(3)], 0.5, 0.05, torch.Generator().manual_seed(0), CPU)
+    assert level.displacement(0, torch.zeros(1, 2)) is None
+    xy = torch.tensor([[40.0, 30.0], [100.0, 90.0]])
+    found = level.bent_by([field]).displacement(0, xy)
+    full = (xy + 0.5) * 2 - 0.5
+    torch.testing.assert_close(found, full * torch.tensor([0.005, -0.01]), atol=0.01, rtol=0)

@@ -1,0 +1,102 @@
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+import agalign
+from agalign.batch.learn import learn_flight
+from agalign.cameras.discover import discover
+from agalign.capture.align import align_capture_bands
+from agalign.config import CheckSettings, Settings
+from agalign.flight.model import FlightModel
+from agalign.products.fill_sidecar import capture_status
+from agalign.synthetic import make_flight
+from agalign.values import geometry
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+@pytest.fixture(scope="module")
+def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five captures of which the third has lost its NIR to noise, and the fifth lies over water."""
+    folder = tmp_path_factory.mktemp("five")
+    make_flight(folder, captures=5, size_px=(400, 300), rng_seed=5, altitude_m=(12.0, 30.0))
+    rng = np.random.default_rng(0)
+    images = folder / "0000SET" / "000"
+    for path in [images / "IMG_0003_4.tif", *images.glob("IMG_0005_*.tif")]:
+        with rasterio.open(path, "r+") as dataset:
+            dataset.write((20_000 + 1500 * rng.normal(size=(1, 300, 400))).astype(np.uint16))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(five: Path) -> FlightModel:
+    found = learn_flight(discover(five).captures, Settings(), lambda *_: None)
+    assert found is not None
+    return found
+
+
+def error_px(five: Path, capture: str, file: str, matrix: np.ndarray) -> float:
+    truth = json.loads((five / "truth.json").read_text())[capture]["bands"][file]
+    return geometry.corner_error_px(matrix, np.array(truth["fixed_to_moving"]), 400, 300)
+
+
+def test_the_rig_of_the_flight_is_learnt(model: FlightModel) -> None:
+    assert model.rig is not None
+    assert model.rig.factors >= 1
+    assert set(model.rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
+
+
+def test_a_lost_band_is_predicted_with_an_error_bar_and_never_called_aligned(five: Path, model: FlightModel) -> None:
+    capture = discover(five).captures[2]
+    found = align_capture_bands(capture, Settings(), model, lambda *_: None)
+    assert {b: a.status for b, a in found.items()} == {
+        "Blue": "aligned", "Red": "aligned", "NIR": "predicted", "Red edge": "aligned",
+    }  # fmt: skip
+    nir = found["NIR"]
+    assert nir.prediction is not None
+    assert nir.prediction.source == "bands"
+    assert error_px(five, "IMG_0003", "IMG_0003_4.tif", nir.fixed_to_moving) < 3 * nir.prediction.std_px
+    assert "from the capture's other bands" in (nir.reason or "")
+    assert found["Red"].prediction is not None
+    assert found["Red"].prediction.off_px is not None
+
+
+def test_a_capture_over_water_costs_little_and_is_written(five: Path, tmp_path: Path) -> None:
+    settings = Settings(check=CheckSettings(accept_predicted_px=0.0))
+    reports = {r.label[-8:]: r for r in agalign.align_folder(five, tmp_path, settings=settings)}
+    water = reports["IMG_0005"].sidecar
+    assert water is not None
+    assert {b.status for b in water.bands} == {"reference", "predicted"}
+    assert {b.prediction.source for b in water.bands if b.prediction} <= {"neighbours", "flight"}
+    assert (tmp_path / "0000SET" / "000" / "IMG_0005.tif").is_file()
+    others = [b.seconds for b in reports["IMG_0001"].sidecar.bands if b.status == "aligned"]
+    assert max(b.seconds for b in water.bands) < 3 * max(others)
+    # What counts as delivered is the user's choice: here no prediction is good enough.
+    assert [reports[f"IMG_000{k}"].sidecar.status for k in (1, 3, 5)] == ["ok", "degraded", "degraded"]
+    bands = reports["IMG_0003"].sidecar.bands
+    assert capture_status(bands, 0.0) == "degraded"
+    assert capture_status(bands, 50.0) == "ok"
+    rows = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
+    (nir,) = [r for r in rows if r["capture"] == "IMG_0003" and r["band"] == "NIR"]
+    assert (nir["status"], nir["prediction_from"]) == ("predicted", "bands")
+    assert float(nir["prediction_std_px"]) > 0
+    assert "predicted by the rig" in (tmp_path / "index.html").read_text()
+
+
+def test_an_alignment_where_the_rig_cannot_be_is_not_believed(five: Path, model: FlightModel) -> None:
+    """The images agree a period away; the other bands say that it is impossible."""
+    assert model.rig is not None
+    moved = {
+        b: geometry.compose(geometry.translation(25, 0), m) if b == "NIR" else m for b, m in model.rig.mean.items()
+    }
+    wrong = replace(model, rig=replace(model.rig, mean=moved))
+    found = align_capture_bands(discover(five).captures[0], Settings(), wrong, lambda *_: None)
+    assert found["NIR"].status == "predicted"
+    assert found["NIR"].doubts[0].kind == "unexpected_px"
+    assert found["NIR"].doubts[0].value == pytest.approx(25, abs=3)
+    assert found["Red"].status == "aligned"
