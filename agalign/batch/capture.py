@@ -44,7 +44,7 @@ def process_capture(
     With the flight's `model` only what it cannot align is learnt anew.
     Raises UnreadableFileError where the reference itself cannot be read, and OutputError.
     """
-    reference = capture.reference
+    reference, rig = capture.reference, None if model is None else model.rig
     if settings.write.radiometry:
         _need_radiometry(capture)
     alignments = align_capture_bands(capture, settings, model, progress)
@@ -55,7 +55,7 @@ def process_capture(
     discard_outputs(stack_path, sidecar_path)
     written = None
     if usable:
-        layers, grid = lay_out(capture, {b.name: alignments[b.name] for b in usable}, settings.write)
+        layers, grid = lay_out(capture, {b.name: alignments[b.name] for b in usable}, settings.write, rig)
         written = write_capture(capture, layers, grid, stack_path, settings.write)
         # The picture is a convenience: a full disk must not cost the sidecar.
         with suppress(AgalignError):

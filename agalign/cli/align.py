@@ -96,8 +96,12 @@ def align(
     ] = "auto",
     interpolation: Annotated[Interpolation, typer.Option(help="Resampling of the moving bands.")] = "lanczos",
     crop: Annotated[
-        Crop, typer.Option(help="Cut to the area all bands share, or keep the reference's frame.")
-    ] = "common",
+        Crop,
+        typer.Option(
+            help="Cut to the area all bands share, alike for all captures of a flight or for each by itself, or keep "
+            "the reference's frame."
+        ),
+    ] = "flight",
     undistort: Annotated[
         bool, typer.Option("--undistort", help="Write the lens-corrected grid of the reference.")
     ] = False,

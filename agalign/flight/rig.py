@@ -133,6 +133,14 @@ class Rig:
             return Prediction(_moved(mean, shift, g, self.size_px), "neighbours", error)
         return Prediction(mean, "flight", float(np.hypot(self.from_flight_px[band], climb_px)))
 
+    def extremes(self, band: str) -> list[Matrix]:
+        """The mapping of a band where the ground was nearest and farthest in the captures that were learnt from."""
+        g, nu = _coordinates(self.size_px), np.array([n for _, _, n in self.seen])
+        if not self.factors:
+            return [self.mean[band]]
+        ends = nu[[int(nu[:, 0].argmin()), int(nu[:, 0].argmax())]]
+        return [_moved(self.mean[band], np.outer(self.baselines[band], n), g, self.size_px) for n in ends]
+
     def _unknown_climb_px(self, known: Observation) -> float:
         """Standard deviation of the distance's factor at an altitude that the captures it is taken from do not have:
         how much it changes with a metre is known as well as they have shown it.

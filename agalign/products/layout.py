@@ -8,11 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.config import WriteSettings
+from agalign.flight.rig import Rig
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping, mapping_of
+
+_FLIGHT_MARGIN_PX = 2
+"""What captures that the rig was not learnt on may differ by."""
+_BORDER_POINTS = 64
 
 
 @dataclass(frozen=True)
@@ -39,31 +44,74 @@ class Layer:
 
 
 def lay_out(
-    capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings
+    capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings, rig: Rig | None = None
 ) -> tuple[list[Layer], OutputGrid]:
-    """The layers of a capture, whose usable moving bands have these alignments, and the grid they are written on."""
+    """The layers of a capture, whose usable moving bands have these alignments, and the grid they are written on.
+
+    With the flight's `rig` the grid is that of all its captures: one flight, one geometry.
+    """
     reference = capture.reference
     mappings = {b.name: mapping_of(reference, b, alignments[b.name]) for b in capture.moving if b.name in alignments}
     scale = _finest_scale(mappings.values(), reference) if settings.resolution == "finest" else 1.0
     own = PixelMapping(geometry.identity())
     undistorted = settings.undistort and reference.lens is not None
-    if reference.lens is not None and undistorted:
-        own = PixelMapping(geometry.identity(), None, reference.lens)
-        mappings = {name: mapping.from_undistorted(reference.lens) for name, mapping in mappings.items()}
     size_px = round(reference.width_px * scale), round(reference.height_px * scale)
     scales = size_px[0] / reference.width_px, size_px[1] / reference.height_px
-    if scale != 1.0:
-        own = own.rescaled(scales, (1.0, 1.0))
-        mappings = {name: mapping.rescaled(scales, (1.0, 1.0)) for name, mapping in mappings.items()}
+
+    def on_grid(mapping: PixelMapping) -> PixelMapping:
+        """A mapping of the reference's raw pixels as one of the pixels that are written."""
+        if reference.lens is not None and undistorted:
+            mapping = mapping.from_undistorted(reference.lens)
+        return mapping if scale == 1.0 else mapping.rescaled(scales, (1.0, 1.0))
+
+    mappings = {name: on_grid(mapping) for name, mapping in mappings.items()}
     copied = scale == 1.0 and not undistorted
     layers = [
-        Layer(b, None if copied else own, is_reference=True) if b is reference else Layer(b, mappings.get(b.name))
+        Layer(b, None if copied else on_grid(own), is_reference=True)
+        if b is reference
+        else Layer(b, mappings.get(b.name))
         for b in capture.bands
     ]
     moved = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
-    common = common_area(moved, *size_px)
-    crop = common if settings.crop == "common" and common is not None else Tile(0, 0, *size_px)
-    return layers, OutputGrid(crop.x0, crop.y0, crop.width, crop.height, scales, undistorted, crop != common)
+    crop = Tile(0, 0, *size_px)
+    if settings.crop != "none":
+        whole = [] if rig is None or settings.crop == "common" else _of_the_flight(capture, rig)
+        given = [(on_grid(mapping), band) for mapping, band in whole]
+        # The reference's own border takes part where it is resampled too.
+        given += [(m, b) for m, b in moved if b is reference]
+        found = common_area(given if whole else moved, *size_px)
+        crop = crop if found is None else _inset(found, _FLIGHT_MARGIN_PX if whole else 0)
+    grid = OutputGrid(crop.x0, crop.y0, crop.width, crop.height, scales, undistorted, not _covers(moved, crop))
+    return layers, grid
+
+
+def _of_the_flight(capture: Capture, rig: Rig) -> list[tuple[PixelMapping, Band]]:
+    """Where the rig has the capture's bands in the nearest and the farthest captures of the flight."""
+    reference = capture.reference
+    return [
+        (PixelMapping(matrix, reference.lens, band.lens if reference.lens is not None else None), band)
+        for band in capture.moving
+        if band.name in rig.mean and (band.lens is None) == (reference.lens is None)
+        for matrix in rig.extremes(band.name)
+    ]
+
+
+def _inset(tile: Tile, margin_px: int) -> Tile:
+    if 2 * margin_px >= min(tile.width, tile.height) // 2:
+        return tile
+    return Tile(tile.x0 + margin_px, tile.y0 + margin_px, tile.width - 2 * margin_px, tile.height - 2 * margin_px)
+
+
+def _covers(mappings: list[tuple[PixelMapping, Band]], tile: Tile) -> bool:
+    """True where every pixel of a tile lies inside every moving image: where those along its border do."""
+    x, y = (np.linspace(a, a + n - 1, _BORDER_POINTS) for a, n in ((tile.x0, tile.width), (tile.y0, tile.height)))
+    sides = [(x, np.full_like(x, v)) for v in y[[0, -1]]] + [(np.full_like(y, v), y) for v in x[[0, -1]]]
+    border = np.concatenate([np.stack(side, axis=-1) for side in sides])
+    for mapping, band in mappings:
+        there = mapping(border)
+        if not ((there >= 0) & (there <= np.subtract(band.size_px, 1))).all():
+            return False
+    return True
 
 
 def _finest_scale(mappings: Iterable[PixelMapping], reference: Band) -> float:

@@ -15,7 +15,7 @@ CaptureStatus = Literal["ok", "degraded", "failed"]
 
 BandOrder = Literal["index", "wavelength", "name"]
 Interpolation = Literal["nearest", "bilinear", "cubic", "lanczos"]
-Crop = Literal["common", "none"]
+Crop = Literal["flight", "common", "none"]
 LocalUse = Literal["auto", "always", "never"]
 Layout = Literal["stack", "bands", "both"]
 Resolution = Literal["reference", "finest"]

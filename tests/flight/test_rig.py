@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -122,14 +123,25 @@ def test_few_captures_are_no_rig() -> None:
 
 
 def test_written_and_read_it_is_the_same(tmp_path: Path) -> None:
-    import dataclasses
-
     rig = learn_rig(flight(), SIZE, {})
     assert rig is not None
     field = LocalField(32.0, np.random.default_rng(0).normal(size=(31, 41, 2)))
-    rig = dataclasses.replace(rig, fields={"Red": field})
+    rig = replace(rig, fields={"Red": field})
     again = Rig.from_json(rig.as_json(), {"Red": field.displacements_px})
     np.testing.assert_array_equal(again.mean["NIR"], rig.mean["NIR"])
     np.testing.assert_array_equal(again.fields["Red"].displacements_px, field.displacements_px)
     for name in ("baselines", "baseline_std", "centres", "factors", "seen", "from_bands_px", "size_px"):
         assert getattr(again, name) == getattr(rig, name)
+
+
+def test_an_altitude_that_nobody_has_seen_widens_the_error_bar() -> None:
+    level = [
+        replace(observation(float(k), 0.2 * np.sin(k), noise=0.05, seed=k), altitude_m=100.0 + 0.5 * k)
+        for k in range(5)
+    ]
+    rig = learn_rig(level, SIZE, BASELINES)
+    assert rig is not None
+    bars = [rig.predict("NIR", Observation(2.5, {}, {}, altitude_m)).std_px for altitude_m in (101.0, 90.0, None)]
+    assert bars[0] < 0.6
+    assert bars[1] > 2.0
+    assert bars[2] < 0.6

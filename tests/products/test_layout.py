@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 import rasterio
 
 from agalign.config import WriteSettings
+from agalign.flight.rig import Rig
 from agalign.products.layout import lay_out
 from agalign.products.write import write_raster
 from agalign.values import geometry
@@ -52,3 +54,36 @@ def test_where_all_bands_show_everything_no_nodata_is_declared(tmp_path: Path) -
     _, whole = lay_out(capture, {"nir": aligned_by(9.0)}, WriteSettings(crop="none"))
     assert whole.has_gaps
     assert write_raster(capture, moved, cut, tmp_path / "out.tif", WriteSettings()) is None
+
+
+def rig_between(low_px: float, high_px: float) -> Rig:
+    """One band that moves to the right as the ground comes nearer."""
+    middle = (low_px + high_px) / 2
+    nu = tuple((float(k), None, (v - middle, 0.0, 0.0)) for k, v in enumerate((low_px, middle, high_px)))
+    bars = {"nir": 0.1}
+    return Rig(
+        (120, 90), {"nir": geometry.translation(middle, 0)}, {"nir": (1.0, 0.0)}, bars, {"nir": (0.0, 0.0, 0.0)}, 1, nu,
+        bars, bars, bars,
+    )  # fmt: skip
+
+
+def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
+    capture, rig = capture_of(tmp_path), rig_between(2.0, 12.0)
+    grids = [lay_out(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig)[1] for shift in (2.0, 7.0, 12.0)]
+    assert len(set(grids)) == 1
+    assert not grids[0].has_gaps
+    # The farthest band leaves 12 px at the right; two more are left for captures that the rig has not seen.
+    assert 120 - (grids[0].x0 + grids[0].width) in range(13, 17)
+    alone = [
+        lay_out(capture, {"nir": aligned_by(shift)}, WriteSettings(crop="common"), rig)[1] for shift in (2.0, 12.0)
+    ]
+    assert alone[0].width > alone[1].width
+
+
+def test_a_capture_beyond_its_flight_keeps_the_geometry_and_declares_nodata(tmp_path: Path) -> None:
+    capture, rig = capture_of(tmp_path), rig_between(2.0, 12.0)
+    (_, within), (_, beyond) = (
+        lay_out(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig) for shift in (5.0, 30.0)
+    )
+    assert replace(beyond, has_gaps=False) == within
+    assert beyond.has_gaps
