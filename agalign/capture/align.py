@@ -94,8 +94,7 @@ def align_pairs(
         attempt(known, sides, lambda subject, report: refine_with(net, subject, settings.joint, report))
     left = [s for s in starts if s[0].name not in found or found[s[0].name].status != "aligned"]
     if model is not None and model.rig is not None:
-        hopeless = [(pair, seed) for pair, seed in left if pair.name in found and not seed.trusted]
-        left = [s for s in left if s not in hopeless]
+        left = [(pair, seed) for pair, seed in left if seed.trusted or pair.name not in found]
     if not scratch:
         left = [s for s in left if s[0].name not in found]
     attempt(left, [], lambda subject, report: align_from_scratch(subject, settings.joint, report))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.evidence import as_predicted
@@ -56,9 +56,10 @@ def with_predictions(
 
 
 def _seconds_of(captured_at: str) -> float:
-    """Seconds since 1970 of an ISO 8601 time; 0 where there is none."""
+    """Seconds since 1970 of an ISO 8601 time, UTC where it names no zone; 0 where there is none."""
     with suppress(ValueError):
-        return datetime.fromisoformat(captured_at).timestamp()
+        moment = datetime.fromisoformat(captured_at)
+        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
     return 0.0
 
 
