@@ -1,11 +1,10 @@
 """The command line: parses, calls the library, prints."""
 
-import json
 import logging
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import Annotated, get_args
 
 import typer
 from rich.markup import escape
@@ -14,23 +13,10 @@ from rich.table import Table
 from agalign._version import __version__
 from agalign.cli import align as cli_align
 from agalign.cli import evaluate as cli_evaluate
-from agalign.cli.align import (
-    BandNames,
-    FolderArgument,
-    IgnoreMetadata,
-    Jobs,
-    Order,
-    Pattern,
-    Reference,
-    WithRgb,
-    band_names,
-    find_captures,
-)
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits, in_json
+from agalign.cli import info as cli_info
+from agalign.cli.align import Jobs, find_captures
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
 from agalign.values.choices import LocalUse
-
-if TYPE_CHECKING:
-    from agalign.values.capture import Capture
 
 app = typer.Typer(
     name="agalign",
@@ -89,39 +75,7 @@ def demo(
         raise typer.Exit(cli_align.conclude(flight, reports, target, voice))
 
 
-@app.command()
-def info(
-    folder: FolderArgument,
-    pattern: Pattern = None,
-    reference: Reference = None,
-    bands: BandNames = None,
-    order: Order = "index",
-    with_rgb: WithRgb = False,
-    ignore_metadata: IgnoreMetadata = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
-    """Show what was found: cameras, captures, bands, seeds, and what is missing."""
-    voice = Voice(quiet=False, verbose=False, log_json=False)
-    with exits(voice):
-        from agalign.cameras.discover import DiscoverOptions
-
-        options = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
-        flight = find_captures(folder, options, voice, silent=as_json)
-        rows = [_facts(c) for c in flight.captures]
-        if as_json:
-            problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
-            typer.echo(json.dumps({"folder": str(folder), "captures": rows, "problems": problems}, indent=1))
-        else:
-            table = Table("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
-            for row in rows:
-                bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
-                size = "{width} x {height}".format(**row["bands"][0])
-                cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
-                table.add_row(*(escape(c) for c in cells), escape(", ".join(row["missing_bands"])))
-            voice.result(table)
-            found = f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {len(flight.problems)} problems"
-            voice.result(found)
-        raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
+cli_info.register(app)
 
 
 @app.command()
@@ -194,33 +148,6 @@ def ndvi(
 
 cli_evaluate.register(app)
 _COMMANDS = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
-
-
-def _facts(capture: "Capture") -> dict[str, Any]:
-    """What `info` shows of a capture."""
-    from agalign.capture.tag_seeds import seed_candidates
-    from agalign.config import SeedSettings
-
-    offered = {kind for b in capture.moving for kind in seed_candidates(capture.reference, b, SeedSettings())}
-    bands = [
-        {
-            "name": b.name, "file": str(b.path), "band_index": b.band_index, "wavelength_nm": b.wavelength_nm,
-            "width": b.width_px, "height": b.height_px, "dtype": b.dtype, "nodata": in_json(b.nodata),
-            "lens_model": b.lens is not None, "reference": b is capture.reference,
-        }
-        for b in capture.bands
-    ]  # fmt: skip
-    return {
-        "label": capture.label,
-        "camera": f"{capture.camera.make} {capture.camera.model}".strip() or "unknown",
-        "serial": capture.camera.serial,
-        "captured_at": capture.captured_at,
-        "capture_id": capture.capture_id,
-        "flight_id": capture.flight_id,
-        "bands": bands,
-        "seeds": [kind for kind in ("rig", "geo") if kind in offered] + ["structure", "identity"],
-        "missing_bands": list(capture.missing_bands),
-    }
 
 
 def main() -> None:

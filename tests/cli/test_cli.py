@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jsonschema
@@ -18,6 +19,10 @@ import tifffile
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign as agalign_package
+from agalign.flight.model import FlightModel, save_model
+from agalign.flight.rig import Observation, Rig, learn_rig
+from agalign.method.descriptor import Descriptor
+from agalign.values.geometry import translation
 
 from ..conftest import textured_image
 
@@ -225,6 +230,51 @@ def test_info(flight: Path) -> None:
     table = agalign("info", flight)
     assert "IMG_0002" in table.stdout
     assert "[Green]" in table.stdout
+
+
+@pytest.fixture
+def model_file(tmp_path: Path) -> Callable[[Rig | None], Path]:
+    def save(rig: Rig | None) -> Path:
+        net = Descriptor("pseudo-siamese", (1, 1, 1), half_rectified=True, unit_length=True)
+        path = tmp_path / "model.safetensors"
+        save_model(FlightModel(net, "Camera 7", ("NIR", "[Red]"), {}, "", rig), path)
+        return path
+
+    return save
+
+
+def test_info_shows_the_rig_of_a_model(model_file: Callable[[Rig | None], Path]) -> None:
+    captures = []
+    for k, height in enumerate((-2.0, 0.5, 3.0, 6.0)):
+        mappings = {"NIR": translation(8 + 0.8 * height, 6), "[Red]": translation(-3, 4 + 0.6 * height)}
+        captures.append(Observation(float(k), mappings, dict.fromkeys(mappings, 0.05)))
+    path = model_file(learn_rig(captures, (640, 480), {}))
+    rig = json.loads(agalign("info", path, "--json").stdout)["rig"]
+    nir, red = rig["bands"]
+    assert (rig["captures"], rig["factors"]) == (4, 1)
+    assert nir["offset_px"] == pytest.approx([8 + 0.8 * 1.875, 6], abs=0.1)
+    assert np.abs(nir["baseline"]) == pytest.approx([0.8, 0], abs=0.02)
+    assert np.abs(red["baseline"]) == pytest.approx([0, 0.6], abs=0.02)
+    assert nir["from_bands_px"] < 0.5 < nir["from_flight_px"]
+    assert nir["field_px"] is None
+    table = agalign("info", path).stdout
+    assert "[Red]" in table
+    assert "+9.5, +6.0" in table
+
+
+def test_info_of_a_model_without_a_rig(model_file: Callable[[Rig | None], Path]) -> None:
+    done = agalign("info", model_file(None))
+    assert done.returncode == 0
+    assert "no rig" in done.stdout
+
+
+def test_info_of_what_is_no_model_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "broken.safetensors"
+    path.write_bytes(b"nothing")
+    done = agalign("info", path)
+    assert done.returncode == 1
+    assert str(path) in done.stderr.replace("\n", "")
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,148 @@
+"""The command that shows what was found: the captures of a folder, or what a model knows of its camera."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from agalign.cli.align import (
+    BandNames,
+    IgnoreMetadata,
+    Order,
+    Pattern,
+    Reference,
+    WithRgb,
+    band_names,
+    find_captures,
+)
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Voice, exits, in_json
+
+if TYPE_CHECKING:
+    from agalign.flight.rig import Rig
+    from agalign.values.capture import Capture
+
+_MODEL_SUFFIX = ".safetensors"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command()(info)
+
+
+def info(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder with the images, or a model that a run wrote (OUT/models/….safetensors).", show_default=False
+        ),
+    ],
+    pattern: Pattern = None,
+    reference: Reference = None,
+    bands: BandNames = None,
+    order: Order = "index",
+    with_rgb: WithRgb = False,
+    ignore_metadata: IgnoreMetadata = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """Show what was found: cameras, captures, bands, seeds, and what is missing; of a model, the rig that it knows."""
+    voice = Voice(quiet=False, verbose=False, log_json=False)
+    with exits(voice):
+        if folder.is_file() and folder.suffix == _MODEL_SUFFIX:
+            _show_model(folder, voice, as_json=as_json)
+            raise typer.Exit(EXIT_OK)
+        from agalign.cameras.discover import DiscoverOptions
+
+        options = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
+        flight = find_captures(folder, options, voice, silent=as_json)
+        rows = [_facts(c) for c in flight.captures]
+        if as_json:
+            problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
+            typer.echo(json.dumps({"folder": str(folder), "captures": rows, "problems": problems}, indent=1))
+        else:
+            table = Table("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
+            for row in rows:
+                bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
+                size = "{width} x {height}".format(**row["bands"][0])
+                cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
+                table.add_row(*(escape(c) for c in cells), escape(", ".join(row["missing_bands"])))
+            voice.result(table)
+            found = f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {len(flight.problems)} problems"
+            voice.result(found)
+        raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
+
+
+def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
+    """What a model knows of its camera. Raises InputError where it is none."""
+    from agalign.flight.model import load_model
+    from agalign.method.device import choose_device
+
+    model = load_model(path, lambda: choose_device("cpu"))
+    rows = [] if model.rig is None else _rig_rows(model.rig)
+    captures, factors = (0, 0) if model.rig is None else (len(model.rig.seen), model.rig.factors)
+    if as_json:
+        rig = {"captures": captures, "factors": factors, "bands": rows} if rows else None
+        facts = {"model": str(path), "camera": model.camera, "bands": list(model.bands), "rig": rig}
+        typer.echo(json.dumps(facts, indent=1))
+        return
+    voice.result(escape(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}"))
+    if not rows:
+        voice.result("no rig: too few captures said something of it")
+        return
+    table = Table("Band", title="The rig: where each band lies, and how far off it is where only predicted (rms, px)")
+    for name in ("Offset of the middle", "Baseline", "By bands", "By neighbours", "By the flight", "Lens field up to"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        (dx, dy), (bx, by) = row["offset_px"], row["baseline"]
+        errors = (f"{row[k]:.2f}" for k in ("from_bands_px", "from_neighbours_px", "from_flight_px"))
+        field = "none" if row["field_px"] is None else f"{row['field_px']:.2f}"
+        table.add_row(escape(row["band"]), f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field)
+    voice.result(table)
+    voice.result(f"rig learnt on {captures} captures; factors that the bands of a capture share: {factors}")
+
+
+def _rig_rows(rig: "Rig") -> list[dict[str, Any]]:
+    """A band each: where its middle lies in the moving image, how it moves, and how well it is predicted."""
+    from agalign.values.geometry import apply
+
+    middle = (np.array(rig.size_px, float) - 1) / 2
+    return [
+        {
+            "band": band, "offset_px": (apply(mean, middle[None])[0] - middle).tolist(),
+            "baseline": rig.baselines[band], "from_bands_px": rig.from_bands_px[band],
+            "from_neighbours_px": rig.from_neighbours_px[band], "from_flight_px": rig.from_flight_px[band],
+            "field_px": float(np.hypot(*np.moveaxis(rig.fields[band].displacements_px, -1, 0)).max())
+            if band in rig.fields else None,
+        }
+        for band, mean in rig.mean.items()
+    ]  # fmt: skip
+
+
+def _facts(capture: "Capture") -> dict[str, Any]:
+    """What `info` shows of a capture."""
+    from agalign.capture.tag_seeds import seed_candidates
+    from agalign.config import SeedSettings
+
+    offered = {kind for b in capture.moving for kind in seed_candidates(capture.reference, b, SeedSettings())}
+    bands = [
+        {
+            "name": b.name, "file": str(b.path), "band_index": b.band_index, "wavelength_nm": b.wavelength_nm,
+            "width": b.width_px, "height": b.height_px, "dtype": b.dtype, "nodata": in_json(b.nodata),
+            "lens_model": b.lens is not None, "reference": b is capture.reference,
+        }
+        for b in capture.bands
+    ]  # fmt: skip
+    return {
+        "label": capture.label,
+        "camera": f"{capture.camera.make} {capture.camera.model}".strip() or "unknown",
+        "serial": capture.camera.serial,
+        "captured_at": capture.captured_at,
+        "capture_id": capture.capture_id,
+        "flight_id": capture.flight_id,
+        "bands": bands,
+        "seeds": [kind for kind in ("rig", "geo") if kind in offered] + ["structure", "identity"],
+        "missing_bands": list(capture.missing_bands),
+    }
