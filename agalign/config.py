@@ -274,3 +274,8 @@ class Settings(Stage):
     check: CheckSettings = CheckSettings()
     local: LocalSettings = LocalSettings()
     write: WriteSettings = WriteSettings()
+
+    @property
+    def learns_flights(self) -> bool:
+        """True where one network is learnt for a flight before its captures."""
+        return self.joint.recipe == "fast" and self.flight.together and not self.seed.only

@@ -16,7 +16,7 @@ from agalign.errors import AgalignError
 from agalign.flight.fingerprint import fingerprint, hashed
 from agalign.flight.groups import camera_key
 from agalign.flight.model import FlightModel
-from agalign.flight.rig import Observation, Rig, learn_rig
+from agalign.flight.rig import Observation, Rig, learn_rig, median_mapping
 from agalign.judge.local import common_field
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import learn
@@ -24,7 +24,6 @@ from agalign.method.refine import refine
 from agalign.method.starter import start_from
 from agalign.method.state import JointState, Progress, Subject
 from agalign.pixels.raster import read_for_alignment
-from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
@@ -79,7 +78,7 @@ def _learn_rig(captures: Sequence[Capture], settings: Settings, model: FlightMod
     stage = settings.flight
     count = min(stage.rig_captures, max(stage.least_rig_captures, len(captures) // 8))
     chosen = [captures[i] for i in sorted({*np.linspace(0, len(captures) - 1, count).round().astype(int).tolist()})]
-    plain = settings.model_copy(update={"local": settings.local.model_copy(update={"use": False})})
+    plain = settings.model_copy(update={"local": settings.local.model_copy(update={"use": "never"})})
     seen: list[Observation] = []
     residuals: dict[str, list[Residual]] = {}
     for number, capture in enumerate(chosen):
@@ -116,16 +115,6 @@ def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str
     """Changes when the captures that would be learnt from, or the settings, do."""
     stages = settings.joint, settings.seed, settings.flight
     return hashed(camera_key(captures[0]), *(fingerprint(c, *stages) for c in captures))
-
-
-def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matrix:
-    """The homography through the median of where each point of a lattice is sent."""
-    if len(matrices) == 1:
-        return matrices[0]
-    points = geometry.lattice(*size_px, 9, 7)
-    there = np.median([geometry.apply(m, points) for m in matrices], axis=0)
-    fitted, _ = cv2.findHomography(points, there, 0)
-    return geometry.normalised(fitted)
 
 
 def _choose(captures: Sequence[Capture], count: int) -> list[Capture]:

@@ -122,7 +122,7 @@ def run_flight(
 
 def _given_model(path: Path, flight: Flight, settings: Settings) -> FlightModel:
     """The model to start from. Raises ConfigurationError where it is of no use here."""
-    if settings.joint.recipe != "fast" or not settings.flight.together or settings.seed.only:
+    if not settings.learns_flights:
         raise ConfigurationError("a model is of use only where one network is learnt for a flight, by recipe fast")
     model = load_model(path, lambda: choose_device(settings.joint.device))
     if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
@@ -137,7 +137,7 @@ def _learn(
     captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, known: FlightModel | None
 ) -> Path | None:
     """The path of the flight's model, learnt now or found from an earlier run; None where none could be learnt."""
-    if settings.joint.recipe != "fast" or not settings.flight.together or settings.seed.only:
+    if not settings.learns_flights:
         return None
     start = known if known is not None and known.camera in ("", camera_key(captures[0])) else None
     device = settings.joint.device

@@ -225,7 +225,7 @@ def _fit(
     """Means, baselines and factors in turn, each by least squares with the others known. A band that a capture lacks
     says nothing of it: its mean is at the same factors as the others'.
     """
-    start = [_median([c.mappings[b] for c in captures if b in c.mappings], size_px) for b in bands]
+    start = [median_mapping([c.mappings[b] for c in captures if b in c.mappings], size_px) for b in bands]
     affine = np.zeros((len(captures), len(bands), 2, 3))
     weights = np.zeros((len(captures), len(bands)))
     for i, capture in enumerate(captures):
@@ -350,7 +350,7 @@ def distance_px(one: Matrix, other: Matrix, size_px: tuple[int, int]) -> float:
     return float(np.sqrt((apart**2).sum(axis=1).mean()))
 
 
-def _median(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matrix:
+def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matrix:
     """The homography through the median of where each point of a lattice is sent."""
     if len(matrices) == 1:
         return matrices[0]

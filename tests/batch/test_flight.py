@@ -13,7 +13,7 @@ from distributed import LocalCluster
 import agalign
 from agalign.batch import RunOptions, dask_executor, run_flight, workers
 from agalign.batch import learn as batch_learn
-from agalign.batch.learn import learn_flight, learning_fingerprint, median_mapping
+from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.cameras.discover import discover
 from agalign.config import FastRecipe, FlightSettings, JointSettings, Settings
 from agalign.errors import ConfigurationError, GeometryError, InputError
@@ -21,7 +21,6 @@ from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.products.sidecar import find_sidecars, read_sidecar
 from agalign.synthetic.score import score_against_truth
-from agalign.values import geometry
 from agalign.values.capture import Capture
 
 SETTINGS = Settings(flight=FlightSettings(captures=1))
@@ -149,14 +148,6 @@ def test_a_model_of_no_use_is_refused(flight: Path, model: FlightModel, tmp_path
     alone = Settings(flight=FlightSettings(together=False))
     with pytest.raises(ConfigurationError, match="of use only where one network is learnt"):
         list(run_flight(discover(flight), tmp_path / "out", alone, model=path))
-
-
-def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:
-    good = geometry.translation(10, 5)
-    wrong = geometry.translation(-80, 90)
-    near = geometry.translation(10.1, 5.1)
-    found = median_mapping([good, wrong, near], (400, 300))
-    assert geometry.corner_error_px(found, good, 400, 300) < 0.2
 
 
 def test_any_executor_will_do(flight: Path, tmp_path: Path) -> None:

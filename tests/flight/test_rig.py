@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agalign.flight.rig import Observation, Rig, distance_px, learn_rig
+from agalign.flight.rig import Observation, Rig, distance_px, learn_rig, median_mapping
 from agalign.values import geometry
 from agalign.values.alignment import LocalField
 
@@ -145,3 +145,28 @@ def test_an_altitude_that_nobody_has_seen_widens_the_error_bar() -> None:
     assert bars[0] < 0.6
     assert bars[1] > 2.0
     assert bars[2] < 0.6
+
+
+def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:
+    good = geometry.translation(10, 5)
+    wrong = geometry.translation(-80, 90)
+    near = geometry.translation(10.1, 5.1)
+    found = median_mapping([good, wrong, near], (400, 300))
+    assert geometry.corner_error_px(found, good, 400, 300) < 0.2
+
+
+def test_the_error_bar_holds_what_captures_left_out_missed() -> None:
+    rig = learn_rig(flight(), SIZE, {})
+    assert rig is not None
+    worse = replace(rig, from_bands_px={**rig.from_bands_px, "NIR": 2.0})
+    known = observation(9.0, 0.5, without=("NIR",))
+    assert rig.predict("NIR", known).std_px < 0.2
+    assert worse.predict("NIR", known).std_px >= 2.0
+
+
+def test_the_error_bar_grows_where_the_other_bands_of_a_capture_disagree() -> None:
+    rig = learn_rig(flight(), SIZE, {})
+    assert rig is not None
+    alike, unlike = (observation(9.0, 0.5, without=("NIR",), noise=noise, seed=3) for noise in (0.0, 3.0))
+    assert rig.predict("NIR", alike).std_px < 0.2
+    assert rig.predict("NIR", unlike).std_px > 1
