@@ -205,12 +205,13 @@ class LocalSettings(Stage):
     """A smooth field of displacements over the homography, for parallax over trees, terraces and buildings."""
 
     use: LocalUse = "auto"
-    """auto fits a field where nothing but some windows that lie apart stands against an alignment."""
+    """auto fits a field where nothing but some windows that lie apart stands against an alignment, and where no rig of
+    a flight knows what the lenses leave."""
     window_px: Positive = 64
     """Side of the windows in which shifts are measured, half of which they overlap."""
     most_windows: Positive = 4000
     """In larger images they lie farther apart."""
-    lattice_px: Positive = 32
+    lattice_px: Positive = 48
     smoothness: tuple[float, ...] = (0.3, 1.0, 4.0, 16.0, 64.0)
     """Weights of the field's second differences beside one window's shift, of which the windows left out of a fit
     choose."""
@@ -231,10 +232,10 @@ class LocalSettings(Stage):
     def _yes_or_no(cls, value: object) -> object:
         return {True: "always", False: "never"}.get(value, value) if isinstance(value, bool) else value
 
-    def is_wanted_for(self, doubts: tuple[Doubt, ...]) -> bool:
+    def is_wanted_for(self, doubts: tuple[Doubt, ...], *, rig_known: bool) -> bool:
         """True where a field is to be tried for a result that has these doubts."""
         mendable = all(d.kind in ("close_windows", "cluster") for d in doubts)
-        return mendable and (self.use == "always" or (self.use == "auto" and bool(doubts)))
+        return mendable and (self.use == "always" or (self.use == "auto" and (bool(doubts) or not rig_known)))
 
 
 class WriteSettings(Stage):

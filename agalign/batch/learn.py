@@ -16,7 +16,7 @@ from agalign.errors import AgalignError
 from agalign.flight.fingerprint import fingerprint, hashed
 from agalign.flight.groups import camera_key
 from agalign.flight.model import FlightModel
-from agalign.flight.rig import Observation, Rig, learn_rig, median_mapping
+from agalign.flight.rig import LEAST_CAPTURES, Observation, Rig, learn_rig, median_mapping
 from agalign.judge.local import common_field
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import learn
@@ -78,6 +78,8 @@ def _learn_rig(captures: Sequence[Capture], settings: Settings, model: FlightMod
     stage = settings.flight
     count = min(stage.rig_captures, max(stage.least_rig_captures, len(captures) // 8))
     chosen = [captures[i] for i in sorted({*np.linspace(0, len(captures) - 1, count).round().astype(int).tolist()})]
+    if len(chosen) < LEAST_CAPTURES:
+        return None
     plain = settings.model_copy(update={"local": settings.local.model_copy(update={"use": "never"})})
     seen: list[Observation] = []
     residuals: dict[str, list[Residual]] = {}
@@ -89,8 +91,7 @@ def _learn_rig(captures: Sequence[Capture], settings: Settings, model: FlightMod
         except (AgalignError, cv2.error) as why_not:
             _LOG.debug("%s says nothing of the rig: %s", capture.label, why_not)
             continue
-        wanted = "pixel" if capture.reference.lens is None else "undistorted"
-        pairs = [p for p in pairs if p.space == wanted]
+        pairs = [p for p in pairs if p.is_the_rigs]
         seen.append(observed(pairs, found, capture))
         for pair in pairs:
             alignment = found[pair.name].between_files(*pair.scales)
@@ -151,9 +152,8 @@ def read_subject(
         pairs, _ = read_pairs(capture, settings)
     except AgalignError:
         return None
-    wanted = "pixel" if capture.reference.lens is None else "undistorted"
     sides = _sides(capture)
-    seeds = [(p, find_seed(p, start)) for p in pairs if p.space == wanted]
+    seeds = [(p, find_seed(p, start)) for p in pairs if p.is_the_rigs]
     usable = [(p, seed) for p, seed in seeds if isinstance(seed, Seed)]
     if not usable:
         return None

@@ -5,9 +5,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.evidence import judged, without_result
+from agalign.capture.evidence import judged, windows_under, without_result
 from agalign.capture.prediction import with_predictions
 from agalign.capture.seeding import find_seed, subject_of, unscored
+from agalign.capture.whole import most_probable
 from agalign.config import Settings
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
@@ -80,7 +81,7 @@ def align_pairs(
         return watch.timed(found)
 
     def attempt(some: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
-        results = _results(some, sides, align, progress)
+        results = _whole(some, _results(some, sides, align, progress), model, settings)
         watch.lap([pair.name for pair, _ in some])
         for (pair, seed), result in zip(some, results, strict=True):
             progress(pair.name, "checking", 0.0)
@@ -123,6 +124,19 @@ def _results(
 
         found |= dict(zip(group, align(subject_of(pairs, seeds, own_sides), report), strict=True))
     return [found[i] for i in range(len(starts))]
+
+
+def _whole(
+    starts: Sequence[Start], results: Sequence[JointResult | Doubt], model: FlightModel | None, settings: Settings
+) -> list[JointResult | Doubt]:
+    """The results moved to what is most probable of all bands of the capture together."""
+    if settings.joint.model_family not in ("auto", "homography"):
+        return list(results)  # what was asked for is not left
+    pairs = {pair.name: pair for pair, _ in starts}
+    found = {name: r for name, r in zip(pairs, results, strict=True) if isinstance(r, JointResult)}
+    shown = {name: windows_under(pairs[name], result) for name, result in found.items()}
+    better = most_probable(list(pairs.values()), found, shown, None if model is None else model.rig)
+    return [better[name] if isinstance(r, JointResult) else r for name, r in zip(pairs, results, strict=True)]
 
 
 class _Watch:

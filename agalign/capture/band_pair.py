@@ -64,6 +64,18 @@ class BandPair:
         return "undistorted" if both else "pixel"
 
     @property
+    def is_known_to_a_rig(self) -> bool:
+        """True where the captures of a flight told where this band lies."""
+        return "model" in self.known_to_px
+
+    @property
+    def is_the_rigs(self) -> bool:
+        """True where the homographies are between the pixels of the flight's rig: of a reference whose lens is known,
+        undistorted ones.
+        """
+        return self.space == ("pixel" if self.reference.image.lens is None else "undistorted")
+
+    @property
     def fixed(self) -> Raster:
         """The reference's image, with its lens where the homographies are between undistorted pixels."""
         return self.reference.image if self.space == "undistorted" else self.reference.raw

@@ -37,7 +37,7 @@ def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Se
         found = pair.mapping(joint.fixed_to_moving)
         there, residual = _laid(pair, found)
         doubts = (*_repeats(pair, joint, there, check), *doubts_of(joint, residual, size_px, check))
-        if settings.local.is_wanted_for(doubts):
+        if settings.local.is_wanted_for(doubts, rig_known=pair.is_known_to_a_rig):
             local = pair.reference.local.refine(single(pair.moving_image), found)
             if local.field is not None:
                 bent = replace(found, local=local.field)
@@ -60,6 +60,11 @@ def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Se
         field=mapping.local,
     )  # fmt: skip
     return _with_metrics(alignment, pair, there)
+
+
+def windows_under(pair: BandPair, joint: JointResult) -> Residual:
+    """The shifts that the windows of a pair show under a result."""
+    return _laid(pair, pair.mapping(joint.fixed_to_moving))[1]
 
 
 def as_predicted(alignment: Alignment, pair: BandPair, prediction: Prediction) -> Alignment:

@@ -34,13 +34,11 @@ def with_predictions(
     A band that lies where the rig has it impossible is not aligned either: of a scene that repeats, the images agree
     whole periods away.
     """
-    # Of bands with and without lenses the rig knows the first.
-    wanted = "undistorted" if any(p.space == "undistorted" for p in pairs) else "pixel"
-    known = observed([p for p in pairs if p.space == wanted], found, capture)
+    known = observed([p for p in pairs if p.is_the_rigs], found, capture)
     checked = dict(found)
     for pair in pairs:
         alignment = checked[pair.name]
-        if pair.name not in rig.mean or pair.space != wanted:
+        if pair.name not in rig.mean or not pair.is_the_rigs:
             continue
         prediction = rig.predict(pair.name, known)
         if pair.name in known.mappings:

@@ -33,7 +33,7 @@ LEAST_CAPTURES = 3
 _LATTICE = 7, 5
 _LEAST_STD_PX = 0.05
 """Of a mapping: what its own uncertainty does not know."""
-_FACTOR_STD_PX = (20.0, 3.0, 3.0)
+FACTOR_STD_PX = (20.0, 3.0, 3.0)
 """How far from the mean a capture may be before its own bands are doubted: wide, for heights that nobody has seen."""
 _CLIMB_STD_PX_PER_M = 1.5
 """What a metre of climb may do to the factor of the ground's distance: 0.03 m of baseline 20 m above it."""
@@ -58,6 +58,25 @@ class Observation:
     """How sure each is."""
     altitude_m: float | None = None
     """As the camera has it, above anything."""
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """Where the corners of the reference should move beside some mapping of a band, px of the reference, clockwise from
+    the top left, (x, y) in turn: corners + by_factor nu, with a covariance.
+    """
+
+    corners: Array
+    """(8,)"""
+    by_factor: Array
+    """(8, 3)"""
+    covariance: Array
+    """(8, 8)"""
+
+    def rescaled(self, scale: tuple[float, float]) -> "Expectation":
+        """The same on an image that is larger by these factors (x, y)."""
+        up = np.tile(scale, 4)
+        return Expectation(self.corners * up, self.by_factor * up[:, None], self.covariance * np.outer(up, up))
 
 
 @dataclass(frozen=True)
@@ -132,6 +151,26 @@ class Rig:
             error = float(np.hypot(self.from_neighbours_px[band], climb_px))
             return Prediction(_moved(mean, shift, g, self.size_px), "neighbours", error)
         return Prediction(mean, "flight", float(np.hypot(self.from_flight_px[band], climb_px)))
+
+    def expectation(self, band: str, fixed_to_moving: Matrix) -> Expectation:
+        """Where a band should lie beside a mapping close to it, whatever the factors of its capture.
+
+        What captures left out missed is spread over all homographies alike: each with the same mean square is as
+        likely. Raises KeyError for a band that the rig does not know.
+        """
+        points, corners = geometry.lattice(*self.size_px, *_LATTICE), geometry.corners(*self.size_px)
+        back = geometry.invert(fixed_to_moving)
+        # A step along the baseline, px of the moving image, as one of the reference.
+        middle = points.mean(axis=0)
+        ends = geometry.apply(fixed_to_moving, middle) + np.vstack([np.zeros(2), self.baselines[band]])
+        step = np.subtract(*geometry.apply(back, ends)[::-1])
+        g = _coordinates(self.size_px, corners)
+        by_factor = (step[None, :, None] * g[:, None, :]).reshape(8, 3) * (np.arange(3) < self.factors)
+        over = geometry.over_corners(points, *self.size_px).reshape(-1, 8)
+        square = over.T @ over / len(points)
+        std_px = max(self.from_bands_px[band], _LEAST_STD_PX)
+        corners_px = (geometry.apply(back, geometry.apply(self.mean[band], corners)) - corners).reshape(8)
+        return Expectation(corners_px, by_factor, np.asarray(std_px**2 / 8 * np.linalg.inv(square)))
 
     def extremes(self, band: str) -> list[Matrix]:
         """The mapping of a band where the ground was nearest and farthest in the captures that were learnt from."""
@@ -266,7 +305,7 @@ def _first_baselines(affine: Array, weights: Array) -> Array:
 def _solve_factors(affine: Array, t: Array, weights: Array, factors: int) -> tuple[Array, Array]:
     """(nu (3,), its covariance (3, 3)) of a capture from its bands' (bands, 2, 3), a band that disagrees left aside."""
     used = np.arange(3) < factors
-    precision = 1 / np.square(_FACTOR_STD_PX)
+    precision = 1 / np.square(FACTOR_STD_PX)
     nu, vote = np.zeros(3), np.ones(len(weights))
     for _ in range(6):
         w = weights * vote
@@ -320,11 +359,13 @@ def _errors_of_neighbours(
 # ---- mappings as numbers
 
 
-def _coordinates(size_px: tuple[int, int]) -> Array:
-    """The g (points, 3) on a lattice over the image, each column with variance 1 but the first, which is 1."""
-    points = geometry.lattice(*size_px, *_LATTICE)
-    middle, spread = points.mean(axis=0), points.std(axis=0)
-    return np.column_stack([np.ones(len(points)), (points - middle) / spread])
+def _coordinates(size_px: tuple[int, int], points_px: Points | None = None) -> Array:
+    """The g (points, 3) of points (points, 2), by default of a lattice over the image, over which each column has
+    variance 1 but the first, which is 1.
+    """
+    lattice = geometry.lattice(*size_px, *_LATTICE)
+    points = lattice if points_px is None else points_px
+    return np.column_stack([np.ones(len(points)), (points - lattice.mean(axis=0)) / lattice.std(axis=0)])
 
 
 def _affine(mean: Matrix, mapping: Matrix, size_px: tuple[int, int]) -> Array:

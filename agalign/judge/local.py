@@ -5,6 +5,7 @@ the two bands still show. It is kept only where it explains windows that it was 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -211,10 +212,7 @@ def fitted_field(found: Shifts, smoothness: float, settings: LocalSettings, size
     step = settings.lattice_px
     columns, rows = (int(np.ceil(n / step)) + 1 for n in size_px)
     design = _interpolation(found.centres_px / step, columns, rows)
-    bend = vstack([
-        kron(identity(rows), _second_differences(columns)), kron(_second_differences(rows), identity(columns)),
-    ])  # fmt: skip
-    penalty = smoothness * (bend.T @ bend) + settings.pull * identity(rows * columns)
+    penalty = smoothness * _bending(columns, rows) + settings.pull * identity(rows * columns)
     weight = np.ones(len(found))
     nodes = np.zeros((rows * columns, 2))
     for _ in range(settings.reweightings):
@@ -237,6 +235,15 @@ def _interpolation(at: Points, columns: int, rows: int) -> csr_matrix:
             entries.append((weight, np.arange(len(at)), (cell[:, 1] + dy) * columns + cell[:, 0] + dx))
     weights, which, nodes = (np.concatenate(column) for column in zip(*entries, strict=True))
     return coo_matrix((weights, (which, nodes)), shape=(len(at), rows * columns)).tocsr()
+
+
+@lru_cache(maxsize=8)
+def _bending(columns: int, rows: int) -> csr_matrix:
+    """(rows columns, rows columns): the quadratic form of the squared second differences along both axes."""
+    bend = vstack([
+        kron(identity(rows), _second_differences(columns)), kron(_second_differences(rows), identity(columns)),
+    ])  # fmt: skip
+    return (bend.T @ bend).tocsr()
 
 
 def _second_differences(count: int) -> dia_matrix:

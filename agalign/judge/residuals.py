@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from agalign.config import CheckSettings
-from agalign.pixels.structure import Field, correlation_surfaces, structure_field, windowed_spectra
+from agalign.pixels.structure import Field, half_whitened, structure_field, tops, windowed_spectra
 from agalign.values.alignment import Residual
 from agalign.values.image import Mask, Raster
 
@@ -43,9 +44,8 @@ class FixedWindows:
             and _strength(self._cut(field, o)) >= self.settings.least_strength
         ]  # fmt: skip
         origins = [self.origins[i] for i in tried]
-        surfaces = correlation_surfaces(self.spectra[tried], windowed_spectra(self._windows(field, origins)))
-        peaks = np.array([_peak(surface, self.settings) for surface in surfaces], dtype=np.float64).reshape(-1, 3)
-        found = peaks[:, :2]
+        cross = half_whitened(self.spectra[tried], windowed_spectra(self._windows(field, origins)))
+        found, sigma = _peaks(cross, self.settings.least_peak_sigma)
         measured = np.isfinite(found[:, 0])
         length = np.linalg.norm(found[measured], axis=1)
         some = bool(measured.any())
@@ -55,7 +55,7 @@ class FixedWindows:
             median_px=float(np.median(length)) if some else float("inf"),
             p95_px=float(np.percentile(length, 95)) if some else float("inf"),
             coverage=float(measured.mean()) if tried else 0.0,
-            peaks_sigma=peaks[:, 2],
+            peaks_sigma=sigma,
         )
 
     def _cut(self, image: NDArray[Any], origin: tuple[int, int]) -> NDArray[Any]:
@@ -82,33 +82,18 @@ def _starts(length: int, side: int, step: int | None) -> list[int]:
     return [round(v) for v in np.linspace(0, max(0, length - side), count)]
 
 
-def _peak(surface: NDArray[np.float32], settings: CheckSettings) -> tuple[float, float, float]:
-    """(x, y, height in standard deviations) of a correlation surface's peak; x and y nan where none stands out."""
-    height, width = surface.shape
-    row, column = divmod(int(surface.argmax()), width)
-    # Its mean is 0: the windows have none.
-    spread = math.sqrt(float(np.vdot(surface, surface)) / surface.size)
-    sigma = float(surface[row, column]) / spread if spread > 0 else 0.0
-    if sigma < settings.least_peak_sigma:
-        return math.nan, math.nan, sigma
-    patch = np.take(
-        np.take(surface, range(row - 1, row + 2), 0, mode="wrap"), range(column - 1, column + 2), 1, mode="wrap"
-    )
-    dx, dy = _paraboloid_top(patch)
-    x = (column + width // 2) % width - width // 2 + dx
-    y = (row + height // 2) % height - height // 2 + dy
-    return float(x), float(y), sigma
-
-
-def _paraboloid_top(patch: NDArray[np.float32]) -> tuple[float, float]:
-    """(x, y) of the top of the quadratic surface fitted to 3 x 3 samples, each within a pixel of the centre."""
-    offset = np.array([-1.0, 0.0, 1.0])
-    slope_x, slope_y = (patch @ offset).sum() / 6, (offset @ patch).sum() / 6
-    curve = np.array([1.0, -2.0, 1.0])
-    xx, yy = (patch @ curve).sum() / 3, (curve @ patch).sum() / 3
-    xy = (patch[0, 0] + patch[2, 2] - patch[0, 2] - patch[2, 0]) / 4
-    determinant = xx * yy - xy * xy
-    if xx >= 0 or determinant <= 0:
-        return 0.0, 0.0
-    x, y = (xy * slope_y - yy * slope_x) / determinant, (xy * slope_x - xx * slope_y) / determinant
-    return float(np.clip(x, -1, 1)), float(np.clip(y, -1, 1))
+def _peaks(cross: Field, least_sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """((n, 2) shifts, nan where no peak stands out; (n,) heights in standard deviations) of cross spectra."""
+    count, height, width = cross.shape
+    surfaces = fft.ifft2(cross).real.reshape(count, -1)
+    highest = surfaces.argmax(axis=1)
+    # Their means are 0: the windows have none.
+    spread = np.sqrt(np.einsum("ni,ni->n", surfaces, surfaces) / (height * width))
+    sigma = surfaces[np.arange(count), highest] / np.where(spread > 0, spread, np.inf)
+    row, column = np.divmod(highest, width)
+    # Shifts are circular: beyond half a window they are negative.
+    at = np.stack([(column + width // 2) % width - width // 2, (row + height // 2) % height - height // 2], axis=1)
+    found = np.full((count, 2), np.nan)
+    plain = sigma >= least_sigma
+    found[plain] = tops(cross[plain], at[plain].astype(np.float64))
+    return found, sigma.astype(np.float64)

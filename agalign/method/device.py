@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 import cv2
 import torch
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from agalign.errors import ConfigurationError
@@ -41,19 +42,21 @@ def limit_threads(count: int) -> None:
 _lock = threading.Lock()
 _inside, _before = 0, 1
 """How many are in `one_thread` at the moment, and the number of torch threads before the first came."""
+_blas: threadpool_limits | None = None
+"""What holds numpy's and scipy's threads while somebody is inside."""
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One torch thread inside: the networks are too small to gain from more, sums do not depend on how many processes
-    share the machine, and other programs keep their cores.
+    """One thread inside, of torch and of BLAS: the networks and matrices are too small to gain from more, sums do not
+    depend on how many processes share the machine, and other programs keep their cores.
 
     Callers in several threads share one setting: the last to leave gives back what the first one found.
     """
-    global _inside, _before
+    global _inside, _before, _blas
     with _lock:
         if _inside == 0:
-            _before = torch.get_num_threads()
+            _before, _blas = torch.get_num_threads(), threadpool_limits(1, user_api="blas")
             torch.set_num_threads(1)
         _inside += 1
     try:
@@ -63,6 +66,8 @@ def one_thread() -> Iterator[None]:
             _inside -= 1
             if _inside == 0:
                 torch.set_num_threads(_before)
+                if _blas is not None:
+                    _blas.restore_original_limits()
 
 
 @contextmanager

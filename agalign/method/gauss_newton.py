@@ -6,7 +6,7 @@ psi is the descriptor's gradient with respect to a shift, (256, 2), times the sh
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -36,6 +36,9 @@ class Step:
     """Standard deviations along x and y of where each corner is mapped to, clockwise from the top left, px of the
     level."""
     family: ModelFamily
+    corner_covariance_px2: Tensor
+    """(8, 8) of (x, y) of the corners in turn, for a homography whatever the family: what the patches do not say is
+    unknown there."""
 
     @property
     def corner_std_px(self) -> float:
@@ -101,12 +104,12 @@ def solve(equations: PatchEquations, family: ModelFamily | None, recipe: FastRec
     With `family` None the richest family is taken whose corners are known to `recipe.most_corner_std_px`.
     """
     families = FAMILIES if family is None else (family,)
-    step = _solve_family(equations, families[0], recipe.longest_step_px)
+    step = richest = _solve_family(equations, families[0], recipe.longest_step_px)
     for simpler in families[1:]:
         if step.corner_std_px <= recipe.most_corner_std_px:
             break
         step = _solve_family(equations, simpler, recipe.longest_step_px)
-    return step
+    return replace(step, corner_covariance_px2=richest.corner_covariance_px2)
 
 
 def _solve_family(equations: PatchEquations, family: ModelFamily, longest_step_px: float) -> Step:
@@ -130,8 +133,9 @@ def _solve_family(equations: PatchEquations, family: ModelFamily, longest_step_p
     psi[parameters] = delta
     corner_points = pull.new_tensor(geometry.corners(*size_px))
     corner_jacobian = shift_over_psi(corner_points, *size_px)[:, :, parameters]
-    variance = torch.einsum("cki,mij,ckj->mck", corner_jacobian, covariances, corner_jacobian).amax(dim=0)
-    std_xy = tuple((float(x), float(y)) for x, y in variance.clamp_min(0).sqrt())
+    over_corners = corner_jacobian.reshape(8, -1)
+    of_corners = max((over_corners @ c @ over_corners.T for c in covariances), key=lambda c: float(c.trace()))
+    std_xy = tuple((float(x), float(y)) for x, y in of_corners.diagonal().clamp_min(0).sqrt().reshape(4, 2))
 
     change = homography_from_psi(psi, *size_px)
     length_px = float((transform(change, corner_points) - corner_points).norm(dim=1).max())
@@ -139,7 +143,7 @@ def _solve_family(equations: PatchEquations, family: ModelFamily, longest_step_p
         change, length_px = torch.eye(3, dtype=torch.float64, device=psi.device), math.inf
     elif length_px > longest_step_px:
         change = homography_from_psi(psi * (longest_step_px / length_px), *size_px)
-    return Step(change, length_px, std_xy, family)
+    return Step(change, length_px, std_xy, family, of_corners)
 
 
 def _covariances(normal: Tensor, score: Tensor, cell: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ import itertools
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -217,6 +218,7 @@ def refine(state: JointState, net: Descriptor, subject: Subject, *, move: bool =
         held_out, chance = retrieval(band, found, test, f_test, recipe.least_negative_px)
         return JointResult(
             matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
+            step.corner_covariance_px2.cpu().numpy() + recipe.systematic_std_px**2 * np.eye(8),
         )  # fmt: skip
 
     return [

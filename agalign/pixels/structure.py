@@ -72,13 +72,59 @@ def windowed_spectra(fields: Field) -> Field:
 
 def correlation_surfaces(fixed: Field, moving: Field) -> NDArray[np.float32]:
     """`correlation_surface` of fields given by their `windowed_spectra`, (..., height, width)."""
+    return np.asarray(fft.ifft2(half_whitened(fixed, moving), overwrite_x=True).real)
+
+
+def half_whitened(fixed: Field, moving: Field) -> Field:
+    """The cross spectrum of which `correlation_surfaces` are the inverse transform."""
     cross = np.conj(fixed)
     cross *= moving
     power = cross.real**2 + cross.imag**2
     floor = np.maximum(power.max(axis=(-2, -1), keepdims=True) * 1e-18, 1e-30)
     # The fourth root as two square roots: far quicker than a power.
     cross /= np.sqrt(np.sqrt(np.maximum(power, floor)))
-    return np.asarray(fft.ifft2(cross, overwrite_x=True).real)
+    return cross
+
+
+def tops(cross: Field, near_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The highest points (n, 2) of the surfaces of `half_whitened` spectra (n, height, width), each near the given one.
+
+    A surface is a trigonometric polynomial, evaluated between its samples on finer and finer lattices of 3 x 3: a
+    paraboloid through the samples themselves takes a shift of a fifth of a px for an eighth.
+    """
+    height, width = cross.shape[-2:]
+    found = near_px.copy()
+    offset = np.array([-1.0, 0.0, 1.0])
+    for step in _LATTICE_STEPS_PX:
+        at_x, at_y = (found[:, axis, None] + step * offset for axis in (0, 1))
+        rows = _waves(at_y, height) @ cross
+        patches = (rows @ _waves(at_x, width).transpose(0, 2, 1)).real
+        found += step * paraboloid_tops(patches.astype(np.float64))
+    return found
+
+
+_LATTICE_STEPS_PX = (0.5, 0.25)
+
+
+def _waves(at_px: NDArray[np.float64], length: int) -> Field:
+    """(n, m, length): the waves of an inverse transform at m places each."""
+    frequencies = np.fft.fftfreq(length)
+    return np.asarray(np.exp(2j * np.pi * at_px[..., None] * frequencies), np.complex64)
+
+
+def paraboloid_tops(patches: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 2): (x, y) of the tops of the quadratic surfaces fitted to (n, 3, 3) samples, each within one of the centre;
+    0 where a surface has none.
+    """
+    offset, curve = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -2.0, 1.0])
+    slope_x, slope_y = (patches @ offset).sum(axis=1) / 6, (offset @ patches).sum(axis=1) / 6
+    xx, yy = (patches @ curve).sum(axis=1) / 3, (curve @ patches).sum(axis=1) / 3
+    xy = (patches[:, 0, 0] + patches[:, 2, 2] - patches[:, 0, 2] - patches[:, 2, 0]) / 4
+    determinant = xx * yy - xy * xy
+    has_top = (xx < 0) & (determinant > 0)
+    divisor = np.where(has_top, determinant, 1.0)
+    top = np.stack([xy * slope_y - yy * slope_x, xy * slope_x - xx * slope_y], axis=1) / divisor[:, None]
+    return np.asarray(np.clip(np.where(has_top[:, None], top, 0.0), -1, 1))
 
 
 def find_peak(surface: NDArray[np.float32], apart_px: int, within_px: float = np.inf) -> Peak:

@@ -193,7 +193,7 @@ def _joint_part(joint: JointResult, *, accepted: bool) -> JointPart:
     return JointPart(
         accepted=accepted, loss=_finite(joint.loss), retrieval=joint.retrieval, chance=joint.chance,
         iterations=joint.iterations, levels=list(joint.levels), recipe=joint.recipe, model_family=joint.model_family,
-        last_step_px=joint.last_step_px, corner_std_px=joint.corner_std_px,
+        last_step_px=joint.last_step_px, corner_std_px=round(joint.corner_std_px, 6),
         corner_std_xy_px=[(round(x, 4), round(y, 4)) for x, y in joint.corner_std_xy_px],
     )  # fmt: skip
 

@@ -50,6 +50,8 @@ class JointResult:
     corner_std_xy_px: tuple[tuple[float, float], ...]
     """Standard deviations along x and y of the mapping at the corners of the reference, clockwise from the top left,
     px of the reference: from the curvature at the solution and what the patches disagree by."""
+    corner_covariance_px2: NDArray[np.float64] | None = None
+    """(8, 8) of (x, y) of those corners, for a homography whatever the family; None where it is not known."""
 
     @property
     def corner_std_px(self) -> float:
@@ -63,6 +65,7 @@ class JointResult:
             fixed_to_moving=geometry.rescale(self.fixed_to_moving, up, moving_up),
             corner_std_xy_px=tuple((x * up[0], y * up[1]) for x, y in self.corner_std_xy_px),
             last_step_px=self.last_step_px * up[0],
+            corner_covariance_px2=None,
         )
 
 

@@ -118,3 +118,31 @@ def local_scale(matrix: Matrix, width_px: int, height_px: int) -> Points:
     with np.errstate(divide="ignore"):
         area = np.linalg.det(matrix) / denominator**3
     return np.asarray(np.sign(area) * np.sqrt(np.abs(area)))
+
+
+def over_corners(points_px: ArrayLike, width_px: int, height_px: int) -> NDArray[np.float64]:
+    """How far points (n, 2) move with the image's corners under a homography close to the identity: (n, 2, 8), the
+    derivative over (dx, dy) of each corner, clockwise from the top left (DeTone et al. 2016, Sec. 3).
+    """
+    of_corners = _over_elements(corners(width_px, height_px), width_px, height_px).reshape(8, 8)
+    return np.asarray(_over_elements(np.asarray(points_px), width_px, height_px) @ np.linalg.inv(of_corners))
+
+
+def moving_corners(displacements_px: ArrayLike, width_px: int, height_px: int) -> Matrix:
+    """The homography close to the identity that moves an image's corners so, (8,) as in `over_corners`; to first order:
+    half a px at most is right to 0.001 px.
+    """
+    of_corners = _over_elements(corners(width_px, height_px), width_px, height_px).reshape(8, 8)
+    e = np.linalg.solve(of_corners, np.asarray(displacements_px, dtype=np.float64))
+    change = np.eye(3) + np.array([[e[0], e[1], e[2]], [e[3], e[4], e[5]], [e[6], e[7], 0.0]])
+    to_unit = np.diag([1 / width_px, 1 / height_px, 1.0])
+    return normalised(np.linalg.inv(to_unit) @ change @ to_unit)
+
+
+def _over_elements(points_px: Points, width_px: int, height_px: int) -> NDArray[np.float64]:
+    """Derivative (n, 2, 8) of points over a homography's elements but the last, in units of the image's sides."""
+    u, v = points_px[:, 0] / width_px, points_px[:, 1] / height_px
+    zero, one = np.zeros_like(u), np.ones_like(u)
+    along_x = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], axis=1) * width_px
+    along_y = np.stack([zero, zero, zero, u, v, one, -u * v, -v * v], axis=1) * height_px
+    return np.stack([along_x, along_y], axis=1)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -102,8 +104,15 @@ def test_a_field_starts_by_itself_where_a_part_of_the_image_lies_apart(use: str,
     found = judged(bent_pair(4.0), seed, result(np.eye(3)), settings)
     assert found.status == status
     assert (found.field is not None) == (status == "aligned")
-    plain = judged(bent_pair(0.0), seed, result(np.eye(3)), Settings())
-    assert (plain.status, plain.local, plain.field) == ("aligned", None, None)
+
+
+@pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])
+def test_what_needs_no_field_gets_none_and_with_a_rig_none_is_tried(rig_known: bool, tried: bool) -> None:
+    pair = bent_pair(0.0)
+    pair = replace(pair, known_to_px={"model": 1.0} if rig_known else {})
+    seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
+    plain = judged(pair, seed, result(np.eye(3)), Settings())
+    assert (plain.status, plain.local is not None, plain.field) == ("aligned", tried, None)
 
 
 def test_what_a_field_cannot_mend_is_named(pair: BandPair) -> None:

@@ -33,7 +33,7 @@ def test_a_smooth_field_is_found_through_noise_and_wrong_peaks() -> None:
     shifts[wrong] += rng.uniform(-20, 20, (wrong.sum(), 2))
     field = fitted_field(Shifts(at, shifts, np.ones(len(at))), 1.0, SETTINGS, SIZE)
     error = np.linalg.norm(field(at) - bump(at), axis=1)
-    assert np.sqrt((error**2).mean()) < 0.08
+    assert np.sqrt((error**2).mean()) < 0.09
     assert np.linalg.norm(bump(at), axis=1).max() > 1.2
 
 

@@ -81,3 +81,13 @@ def test_what_can_be_inverted_does_not_depend_on_the_units(unit: float) -> None:
     flat = np.diag([unit, unit, 1.0]) @ np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [0.0, 0.0, 1.0]])
     with pytest.raises(GeometryError, match="singular"):
         geometry.invert(flat)
+
+
+def test_corners_move_a_homography_and_all_points_with_them() -> None:
+    moved_px = np.array([0.3, -0.2, 0.1, 0.4, -0.5, 0.2, 0.0, -0.1])
+    change = geometry.moving_corners(moved_px, 1280, 960)
+    corners = geometry.corners(1280, 960)
+    np.testing.assert_allclose((geometry.apply(change, corners) - corners).ravel(), moved_px, atol=1e-3)
+    points = geometry.lattice(1280, 960, 6, 5)
+    there = points + geometry.over_corners(points, 1280, 960) @ moved_px
+    np.testing.assert_allclose(geometry.apply(change, points), there, atol=1e-3)

@@ -1,0 +1,102 @@
+"""What a capture's images and its flight's rig say together."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from agalign.capture.band_pair import BandPair
+from agalign.capture.evidence import windows_under
+from agalign.capture.whole import most_probable
+from agalign.config import Settings
+from agalign.flight.rig import Rig
+from agalign.values import geometry
+from agalign.values.alignment import JointResult, Residual
+from agalign.values.image import Raster
+
+from ..conftest import textured_pair
+
+SIZE = 640, 480
+MEAN = geometry.translation(30.0, -12.0)
+NOTHING = Residual(np.empty((0, 2)), np.empty((0, 2)), np.inf, np.inf, 0.0)
+
+
+def rig(std_px: float = 0.1, factors: int = 1) -> Rig:
+    bands = "red", "nir"
+    return Rig(
+        SIZE, dict.fromkeys(bands, MEAN), {"red": (0.6, 0.0), "nir": (0.0, 0.8)}, dict.fromkeys(bands, 0.01),
+        dict.fromkeys(bands, (0.0, 0.0, 0.0)), factors, (), dict.fromkeys(bands, std_px),
+        dict.fromkeys(bands, std_px), dict.fromkeys(bands, std_px),
+    )  # fmt: skip
+
+
+def pairs() -> list[BandPair]:
+    blank = Raster(np.zeros(SIZE[::-1], np.float32), np.ones(SIZE[::-1], bool))
+    return [BandPair.of_images(name, blank, blank, {"identity": np.eye(3)}, Settings()) for name in ("red", "nir")]
+
+
+def result(corners_px: np.ndarray, std_px: np.ndarray) -> JointResult:
+    """One whose corners lie beside the rig's mean and are known so well, both (4, 2) px of the reference."""
+    moved = geometry.compose(MEAN, geometry.moving_corners(corners_px.ravel(), *SIZE))
+    covariance = np.diag(std_px.ravel() ** 2)
+    std = tuple((float(x), float(y)) for x, y in std_px)
+    return JointResult(moved, 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, std, covariance)
+
+
+def corners_beside_the_mean(found: JointResult) -> np.ndarray:
+    points = geometry.corners(*SIZE)
+    return np.asarray(geometry.apply(found.fixed_to_moving, points) - geometry.apply(MEAN, points))
+
+
+def found_together(red: JointResult, nir: JointResult, the_rig: Rig | None) -> dict[str, JointResult]:
+    found = {"red": red, "nir": nir}
+    return most_probable(pairs(), found, dict.fromkeys(found, NOTHING), the_rig)
+
+
+def test_corners_without_evidence_lie_where_the_rig_has_them_and_say_how_well() -> None:
+    off = np.array([[0.0, 0.0], [2.5, -1.5], [-2.0, 3.0], [0.0, 0.0]])
+    known = np.array([[0.03] * 2, [4.0] * 2, [4.0] * 2, [0.03] * 2])
+    both = found_together(result(np.zeros((4, 2)), np.full((4, 2), 0.03)), result(off, known), rig())
+    assert np.abs(corners_beside_the_mean(both["nir"])).max() < 0.15
+    std = np.array(both["nir"].corner_std_xy_px)
+    assert (std[[0, 3]] < 0.04).all()
+    assert ((std[[1, 2]] > 0.05) & (std[[1, 2]] < 0.3)).all()
+
+
+def test_the_ground_s_distance_is_learnt_from_the_band_that_shows_it() -> None:
+    """Red moved by 3 px along its baseline: near infra-red, which says nothing, by as much along its own."""
+    red = result(np.tile([3.0, 0.0], (4, 1)), np.full((4, 2), 0.03))
+    blind = result(np.zeros((4, 2)), np.full((4, 2), 50.0))
+    both = found_together(red, blind, rig())
+    np.testing.assert_allclose(corners_beside_the_mean(both["nir"]), np.tile([0.0, 4.0], (4, 1)), atol=0.1)
+    np.testing.assert_allclose(corners_beside_the_mean(both["red"]), np.tile([3.0, 0.0], (4, 1)), atol=0.02)
+
+
+def test_a_band_that_is_sure_of_another_place_is_free_of_the_rig() -> None:
+    there = np.array([[1.2, 0.0], [0.0, 1.4], [-1.2, 0.0], [1.0, 1.0]])
+    both = found_together(
+        result(np.zeros((4, 2)), np.full((4, 2), 0.03)), result(there, np.full((4, 2), 0.03)), rig(0.05)
+    )
+    np.testing.assert_allclose(corners_beside_the_mean(both["nir"]), there, atol=0.05)
+
+
+def test_without_a_rig_what_was_found_stays() -> None:
+    there = np.array([[0.2, 0.0], [0.0, 0.1], [-0.3, 0.0], [0.0, 0.0]])
+    red = result(there, np.full((4, 2), 0.05))
+    both = found_together(red, replace(red), None)
+    np.testing.assert_allclose(both["red"].fixed_to_moving, red.fixed_to_moving, atol=1e-9)
+    np.testing.assert_allclose(both["red"].corner_std_xy_px, red.corner_std_xy_px, atol=1e-6)
+
+
+def test_windows_mend_what_the_descriptors_left() -> None:
+    truth = geometry.translation(5.0, -3.0)
+    fixed, moving = textured_pair(truth, *SIZE)
+    images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, moving))
+    pair = BandPair.of_images("nir", *images, {"identity": np.eye(3)}, Settings())
+    found = result(np.zeros((4, 2)), np.full((4, 2), 0.2))
+    left_px = np.array([0.2, -0.15, 0.1, 0.2, -0.2, 0.1, 0.15, -0.1])
+    off = geometry.compose(truth, geometry.moving_corners(left_px, *SIZE))
+    before = replace(found, fixed_to_moving=off)
+    after = most_probable([pair], {"nir": before}, {"nir": windows_under(pair, before)}, None)["nir"]
+    assert geometry.corner_error_px(off, truth, *SIZE) > 0.2
+    assert geometry.corner_error_px(after.fixed_to_moving, truth, *SIZE) < 0.08
+    assert after.corner_std_px < 0.1
