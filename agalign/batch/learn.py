@@ -15,8 +15,9 @@ from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.fingerprint import fingerprint, hashed
 from agalign.flight.groups import camera_key
+from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
-from agalign.flight.rig import LEAST_CAPTURES, Observation, Rig, learn_rig, median_mapping
+from agalign.flight.rig import LEAST_CAPTURES, Observation, Rig, median_mapping
 from agalign.judge.local import common_field
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import learn

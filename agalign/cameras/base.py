@@ -54,6 +54,12 @@ class Camera(ABC):
         """Files with the same key (and the same camera and folder) are one capture."""
         return tags.first_text(self.capture_ids) or self.capture_name(path)
 
+    def motion(self, tags: Tags) -> tuple[float, float] | None:
+        """How fast the ground passes through the image, right and down, in focal lengths a second; None where the tags
+        do not tell.
+        """
+        return None
+
     def capture_folder(self, path: Path) -> Path:
         """The folder of the capture that a file belongs to."""
         return path.parent

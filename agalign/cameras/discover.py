@@ -239,6 +239,7 @@ def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capt
         flight_id=tags.first_text(camera.flight_ids),
         captured_at=tags.captured_at,
         position=tags.position,
+        motion=camera.motion(tags),
     )
 
 

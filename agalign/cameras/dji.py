@@ -9,6 +9,7 @@ H(reference -> band) = C_band^-1 C_reference. Firmware without it: the rule of t
 after another, so that in motion a seed is off by tens of pixels.
 """
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +40,7 @@ _CENTRE: tuple[Name, Name] = ((_DJI, "CalibratedOpticalCenterX"), (_DJI, "Calibr
 _RELATIVE_CENTRE: tuple[Name, Name] = ((_DJI, "RelativeOpticalCenterX"), (_DJI, "RelativeOpticalCenterY"))
 _FOCAL_LENGTH_PX: Name = (_DJI, "CalibratedFocalLength")
 _H_MATRIX: Name = (_DJI, "CalibratedHMatrix")
+_SPEED = "FlightXSpeed", "FlightYSpeed", "GimbalYawDegree", "RelativeAltitude"
 _VIGNETTING: Name = (_DJI, "VignettingData")
 
 
@@ -87,6 +89,18 @@ class Dji(Camera):
         name = tags.text(*BAND_NAME) or tags.text(_DJI, "BandName") or _band_in_name(path)
         band = spectral(band_of(path, info, name), tags)
         return (replace(band, lens=lens, to_rig=to_rig, radiometry=_radiometry(tags)),)
+
+    def motion(self, tags: Tags) -> tuple[float, float] | None:
+        """From the speed over ground (north, east, m/s), the gimbal's yaw, which is the image's upward direction, and
+        the height above the take-off point.
+        """
+        north, east, yaw_deg, height_m = (tags.number(_DJI, name) for name in _SPEED)
+        if north is None or east is None or yaw_deg is None or height_m is None or height_m <= 0:
+            return None
+        yaw = math.radians(yaw_deg)
+        forward = north * math.cos(yaw) + east * math.sin(yaw)
+        right = east * math.cos(yaw) - north * math.sin(yaw)
+        return -right / height_m, forward / height_m
 
     def capture_name(self, path: Path) -> str:
         mavic = _MAVIC_3_NAME.match(path.stem)

@@ -36,13 +36,13 @@ def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Se
         joint = _snapped(result, pair, check)
         found = pair.mapping(joint.fixed_to_moving)
         there, residual = _laid(pair, found)
-        doubts = (*_repeats(pair, joint, there, check), *doubts_of(joint, residual, size_px, check))
+        doubts = doubts_of(joint, residual, size_px, check) or _repeats(pair, joint, there, check)
         if settings.local.is_wanted_for(doubts, rig_known=pair.is_known_to_a_rig):
             local = pair.reference.local.refine(single(pair.moving_image), found)
             if local.field is not None:
                 bent = replace(found, local=local.field)
                 laid, left = _laid(pair, bent)
-                still = doubts_of(joint, left, size_px, check)
+                still = doubts_of(joint, left, size_px, check) or _repeats(pair, joint, laid, check)
                 # The verdict is asked again: what a field makes worse, or no better, is not aligned by it.
                 if still:
                     local = LocalResult(None, local.before_p95_px, local.after_p95_px)

@@ -23,6 +23,7 @@ def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], capture:
         {name: pair.in_file_px(a.fixed_to_moving) for name, (pair, a) in good.items()},
         {name: a.joint.corner_std_px / min(pair.scales[0]) for name, (pair, a) in good.items() if a.joint is not None},
         None if capture.position is None else capture.position.altitude_m,
+        capture.motion,
     )
 
 

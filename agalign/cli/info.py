@@ -82,7 +82,7 @@ def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
 
     model = load_model(path, lambda: choose_device("cpu"))
     rows = [] if model.rig is None else _rig_rows(model.rig)
-    captures, factors = (0, 0) if model.rig is None else (len(model.rig.seen), model.rig.factors)
+    captures, factors = (0, ()) if model.rig is None else (len(model.rig.seen), model.rig.factors)
     if as_json:
         rig = {"captures": captures, "factors": factors, "bands": rows} if rows else None
         facts = {"model": str(path), "camera": model.camera, "bands": list(model.bands), "rig": rig}
@@ -101,7 +101,8 @@ def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
         field = "none" if row["field_px"] is None else f"{row['field_px']:.2f}"
         table.add_row(escape(row["band"]), f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field)
     voice.result(table)
-    voice.result(f"rig learnt on {captures} captures; factors that the bands of a capture share: {factors}")
+    shared = ", ".join(factors) or "nothing"
+    voice.result(f"rig learnt on {captures} captures; what the bands of a capture share: {shared}")
 
 
 def _rig_rows(rig: "Rig") -> list[dict[str, Any]]:

@@ -153,7 +153,7 @@ class Prediction:
 
     fixed_to_moving: Matrix
     source: PredictionSource
-    """From the capture's other bands, from the captures before and after, or from the flight's mean."""
+    """From the capture's other bands, from the captures around it, or from the flight's mean."""
     std_px: float
     """Root mean square error that is to be expected over the image."""
     off_px: float | None = None

@@ -116,6 +116,8 @@ class Capture:
     flight_id: str = ""
     captured_at: str = ""
     position: Position | None = None
+    motion: tuple[float, float] | None = None
+    """How fast the ground passes through the image, right and down, focal lengths a second, as far as the tags tell."""
     missing_bands: tuple[str, ...] = ()
 
     @property

@@ -8,7 +8,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.evidence import windows_under
 from agalign.capture.whole import most_probable
 from agalign.config import Settings
-from agalign.flight.rig import Rig
+from agalign.flight.rig import NO_FACTORS, Rig
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.image import Raster
@@ -20,12 +20,12 @@ MEAN = geometry.translation(30.0, -12.0)
 NOTHING = Residual(np.empty((0, 2)), np.empty((0, 2)), np.inf, np.inf, 0.0)
 
 
-def rig(std_px: float = 0.1, factors: int = 1) -> Rig:
+def rig(std_px: float = 0.1) -> Rig:
     bands = "red", "nir"
     return Rig(
-        SIZE, dict.fromkeys(bands, MEAN), {"red": (0.6, 0.0), "nir": (0.0, 0.8)}, dict.fromkeys(bands, 0.01),
-        dict.fromkeys(bands, (0.0, 0.0, 0.0)), factors, (), dict.fromkeys(bands, std_px),
-        dict.fromkeys(bands, std_px), dict.fromkeys(bands, std_px),
+        SIZE, dict.fromkeys(bands, MEAN), {"red": (0.6, 0.0), "nir": (0.0, 0.8)}, dict.fromkeys(bands, 0.0),
+        dict.fromkeys(bands, 0.01), dict.fromkeys(bands, NO_FACTORS), ("distance",), (),
+        *[dict.fromkeys(bands, std_px)] * 4,
     )  # fmt: skip
 
 

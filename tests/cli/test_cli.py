@@ -19,8 +19,9 @@ import tifffile
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign as agalign_package
+from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel, save_model
-from agalign.flight.rig import Observation, Rig, learn_rig
+from agalign.flight.rig import Observation, Rig
 from agalign.method.descriptor import Descriptor
 from agalign.values.geometry import translation
 
@@ -251,7 +252,7 @@ def test_info_shows_the_rig_of_a_model(model_file: Callable[[Rig | None], Path])
     path = model_file(learn_rig(captures, (640, 480), {}))
     rig = json.loads(agalign("info", path, "--json").stdout)["rig"]
     nir, red = rig["bands"]
-    assert (rig["captures"], rig["factors"]) == (4, 1)
+    assert (rig["captures"], rig["factors"]) == (4, ["distance"])
     assert nir["offset_px"] == pytest.approx([8 + 0.8 * 1.875, 6], abs=0.1)
     assert np.abs(nir["baseline"]) == pytest.approx([0.8, 0], abs=0.02)
     assert np.abs(red["baseline"]) == pytest.approx([0, 0.6], abs=0.02)

@@ -6,7 +6,7 @@ import pytest
 import rasterio
 
 from agalign.config import WriteSettings
-from agalign.flight.rig import Rig
+from agalign.flight.rig import NO_FACTORS, Rig, Seen
 from agalign.products.layout import lay_out
 from agalign.products.write import write_raster
 from agalign.values import geometry
@@ -59,11 +59,12 @@ def test_where_all_bands_show_everything_no_nodata_is_declared(tmp_path: Path) -
 def rig_between(low_px: float, high_px: float) -> Rig:
     """One band that moves to the right as the ground comes nearer."""
     middle = (low_px + high_px) / 2
-    nu = tuple((float(k), None, (v - middle, 0.0, 0.0)) for k, v in enumerate((low_px, middle, high_px)))
+    factors = [(v - middle, *NO_FACTORS[1:]) for v in (low_px, middle, high_px)]
+    seen = tuple(Seen(float(k), None, None, f) for k, f in enumerate(factors))
     bars = {"nir": 0.1}
     return Rig(
-        (120, 90), {"nir": geometry.translation(middle, 0)}, {"nir": (1.0, 0.0)}, bars, {"nir": (0.0, 0.0, 0.0)}, 1, nu,
-        bars, bars, bars,
+        (120, 90), {"nir": geometry.translation(middle, 0)}, {"nir": (1.0, 0.0)}, {"nir": 0.0}, bars,
+        {"nir": NO_FACTORS}, ("distance",), seen, bars, bars, bars, bars,
     )  # fmt: skip
 
 

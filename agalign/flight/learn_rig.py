@@ -1,0 +1,231 @@
+"""Fitting the rig of a flight to the mappings of some of its captures, and what it misses of captures left out."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.flight.rig import (
+    LEAST_CAPTURES,
+    Factor,
+    Observation,
+    Rig,
+    Seen,
+    affine,
+    around_in_time,
+    design,
+    median_mapping,
+    moved,
+    of_motion,
+    solve_factors,
+    used,
+    weight,
+)
+from agalign.values.geometry import Matrix
+
+Array = NDArray[np.float64]
+
+_SETS: tuple[tuple[Factor, ...], ...] = (
+    (), ("distance",), ("motion",), ("distance", "tilt"), ("distance", "motion"), ("distance", "tilt", "motion"),
+)  # fmt: skip
+_LAYOUT_STD = 0.04
+"""Of a camera model's known layout of lenses, in lengths of all baselines together."""
+_ROUNDS = 20
+_MOST_FOLDS = 12
+_PLAINLY_BETTER = 0.9
+"""Further factors must leave at most this share of the error that captures left out show without them."""
+
+
+def learn_rig(
+    captures: Sequence[Observation], size_px: tuple[int, int], layout: Mapping[str, tuple[float, float]]
+) -> Rig | None:
+    """The rig that some captures show; None where fewer than three show the same band.
+
+    `layout` is what is known of where each band's lens stands, in any unit; empty where nothing is.
+    """
+    counts = {b: sum(b in c.mappings for c in captures) for b in dict.fromkeys(b for c in captures for b in c.mappings)}
+    bands = tuple(b for b, count in counts.items() if count >= LEAST_CAPTURES)
+    if not bands:
+        return None
+    captures = [c for c in captures if any(b in c.mappings for b in bands)]
+    table = _Table.of(captures, bands, size_px, _normalised_layout(layout, bands))
+    errors = {factors: table.errors_left_out(factors) for factors in _SETS}
+    best = _SETS[0]
+    for more in _SETS[1:]:
+        if len(bands) > 1 and _rms(errors[more].values()) < _PLAINLY_BETTER * _rms(errors[best].values()):
+            best = more
+    fitted = table.fit(np.ones(len(captures)), best or ("distance",))
+    seen = tuple(
+        Seen(c.seconds, c.altitude_m, c.motion, tuple(f))
+        for c, f in zip(captures, fitted.factors.tolist(), strict=True)
+    )
+    return Rig(
+        size_px, {b: moved(s, o, size_px) for b, s, o in zip(bands, table.start, fitted.offset, strict=True)},
+        {b: (float(t[0]), float(t[1])) for b, t in zip(bands, fitted.t, strict=True)},
+        dict(zip(bands, fitted.delay.tolist(), strict=True)), dict(zip(bands, fitted.t_std.tolist(), strict=True)),
+        {b: tuple(c) for b, c in zip(bands, fitted.centre.tolist(), strict=True)}, best, seen, errors[best],
+        table.errors_of(fitted, seen, lambda out, rest: around_in_time(out.seconds, rest)),
+        table.errors_of(fitted, seen, _with_motion), errors[()],
+    )  # fmt: skip
+
+
+def _with_motion(out: Seen, rest: Sequence[Seen]) -> Array | None:
+    if out.motion is None or sum(s.motion is not None for s in rest) < LEAST_CAPTURES:
+        return None
+    return np.concatenate([around_in_time(out.seconds, rest)[:3], of_motion(out.motion, rest)])
+
+
+@dataclass(frozen=True)
+class _Fit:
+    offset: Array
+    """(bands, 2, 3) of the means beside where the fit started, in terms of g."""
+    t: Array
+    """(bands, 2)"""
+    delay: Array
+    """(bands,)"""
+    t_std: Array
+    """(bands,)"""
+    factors: Array
+    """(captures, 5)"""
+    centre: Array
+    """(bands, 5) mean factors of the captures that show a band."""
+
+
+@dataclass(frozen=True)
+class _Table:
+    """The mappings of all captures as numbers."""
+
+    bands: tuple[str, ...]
+    start: list[Matrix]
+    """The median mapping of each band."""
+    there: Array
+    """(captures, bands, 2, 3) beside it, in terms of g, px."""
+    weights: Array
+    """(captures, bands), 0 where a capture does not show a band."""
+    prior: Array | None
+    """(bands, 2) baselines, of length 1 together."""
+
+    @classmethod
+    def of(
+        cls, captures: Sequence[Observation], bands: tuple[str, ...], size_px: tuple[int, int], prior: Array | None
+    ) -> "_Table":
+        start = [median_mapping([c.mappings[b] for c in captures if b in c.mappings], size_px) for b in bands]
+        there, weights = np.zeros((len(captures), len(bands), 2, 3)), np.zeros((len(captures), len(bands)))
+        for i, capture in enumerate(captures):
+            for j, band in enumerate(bands):
+                if band in capture.mappings:
+                    there[i, j] = affine(start[j], capture.mappings[band], size_px)
+                    weights[i, j] = weight(capture.std_px[band])
+        return cls(bands, start, there, weights, prior)
+
+    def fit(self, kept: Array, factors: Sequence[Factor]) -> _Fit:
+        """Means, baselines and delays, and factors in turn, each by least squares with the others known.
+
+        `kept` (captures,) is 0 for captures that are left out. A band that a capture lacks says nothing of it: its mean
+        is at the same factors as the others'.
+        """
+        weights, counts = self.weights * kept[:, None], used(factors)
+        t, delay = self._first(weights) if self.prior is None else (self.prior, self._first(weights)[1])
+        offset = np.zeros((len(self.bands), 2, 3))
+        pull = 0.0 if self.prior is None else 1 / _LAYOUT_STD**2
+        for _ in range(_ROUNDS):
+            designs = np.stack([design(a, d) for a, d in zip(t, delay, strict=True)])
+            found, _ = solve_factors(self.there - offset, designs, weights, counts)
+            found -= np.average(found, axis=0, weights=weights.sum(axis=1))
+            for j in range(len(self.bands)):
+                prior = t[j] if self.prior is None else self.prior[j]
+                offset[j], t_j, delay[j] = _band(self.there[:, j], weights[:, j], found, prior, delay[j], pull)
+                t = np.vstack([t[:j], t_j, t[j + 1 :]])
+            t, delay = _unit(t), _unit(delay)
+        total = np.maximum(weights.sum(axis=0), 1e-12)
+        centre = np.einsum("ij,ik->jk", weights, found) / total[:, None]
+        information = np.einsum("ij,ijk->j", weights, (found[:, None, :3] - centre[None, :, :3]) ** 2)
+        # What a baseline is unsure by, relative to the length of all of them, which is 1.
+        t_std = np.minimum(1 / np.sqrt(np.maximum(information + pull, 1e-9)), 1.0)
+        return _Fit(offset, t, delay, t_std, found, centre)
+
+    def errors_left_out(self, factors: Sequence[Factor]) -> dict[str, float]:
+        """Root mean square error by band, px, of captures that are predicted from rigs learnt on the others."""
+        count, counts = len(self.there), used(factors)
+        folds = min(count, _MOST_FOLDS)
+        squares: dict[str, list[float]] = {b: [] for b in self.bands}
+        for fold in range(folds):
+            out = np.arange(count) % folds == fold
+            if not (self.weights[~out].sum(axis=0) > 0).all():
+                continue
+            fit = self.fit(1.0 - out, factors or ("distance",))
+            designs = np.stack([design(a, d) for a, d in zip(fit.t, fit.delay, strict=True)])
+            left = self.there[out] - fit.offset
+            for j, band in enumerate(self.bands):
+                others = self.weights[out].copy()
+                others[:, j] = 0.0
+                found, _ = solve_factors(left, designs, others, counts)
+                error = left[:, j] - np.einsum("akf,cf->cak", designs[j] * counts, found)
+                squares[band] += (error**2).sum(axis=(1, 2))[self.weights[out, j] > 0].tolist()
+        return _root_mean(squares)
+
+    def errors_of(
+        self, fit: _Fit, seen: Sequence[Seen], guess: Callable[[Seen, Sequence[Seen]], Array | None]
+    ) -> dict[str, float]:
+        """The same of captures whose factors are guessed from the others'."""
+        squares: dict[str, list[float]] = {b: [] for b in self.bands}
+        for i, out in enumerate(seen):
+            factors = guess(out, [*seen[:i], *seen[i + 1 :]])
+            if factors is None:
+                continue
+            for j, band in enumerate(self.bands):
+                if self.weights[i, j] > 0:
+                    left = self.there[i, j] - fit.offset[j] - design(fit.t[j], float(fit.delay[j])) @ factors
+                    squares[band].append(float((left**2).sum()))
+        return _root_mean(squares)
+
+    def _first(self, weights: Array) -> tuple[Array, Array]:
+        """The baselines and delays that explain most by themselves: first singular vectors of all bands' coordinates
+        over all captures.
+        """
+        table = self.there * np.sqrt(weights)[:, :, None, None]
+        along = table.transpose(1, 2, 0, 3).reshape(2 * len(self.bands), -1)
+        later = table[..., 0].transpose(1, 0, 2).reshape(len(self.bands), -1)
+        t, delay = (np.linalg.svd(a, full_matrices=False)[0][:, 0] for a in (along, later))
+        return np.asarray(t.reshape(-1, 2)), np.asarray(delay)
+
+
+def _band(
+    there: Array, weights: Array, factors: Array, t: Array, delay: float, pull: float
+) -> tuple[Array, Array, float]:
+    """(offset (2, 3), t (2,), delay) of one band: a linear regression of what it shows, (captures, 2, 3), on the
+    factors (captures, 5), with t pulled to the given one.
+    """
+    count = len(there)
+    by_place = np.zeros((count, 2, 3, 9))
+    by_place[:, (0, 0, 0, 1, 1, 1), (0, 1, 2, 0, 1, 2), range(6)] = 1.0
+    by_place[:, 0, :, 6] = by_place[:, 1, :, 7] = factors[:, :3]
+    by_place[:, :, 0, 8] = factors[:, 3:]
+    x = by_place.reshape(count, 6, 9)
+    # What the factors do not say of a baseline or a delay stays as it was.
+    ridge = np.array([1e-9] * 6 + [pull + 1e-6] * 2 + [1e-6])
+    normal = np.einsum("c,cif,cig->fg", weights, x, x) + np.diag(ridge)
+    wanted = np.einsum("c,cif,ci->f", weights, x, there.reshape(count, 6)) + ridge * np.array([0.0] * 6 + [*t, delay])
+    found = np.linalg.solve(normal, wanted)
+    return found[:6].reshape(2, 3), found[6:8], float(found[8])
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / max(float(np.linalg.norm(vectors)), 1e-12))
+
+
+def _normalised_layout(layout: Mapping[str, tuple[float, float]], bands: Sequence[str]) -> Array | None:
+    if not all(b in layout for b in bands):
+        return None
+    found = np.array([layout[b] for b in bands], dtype=np.float64)
+    return _unit(found) if np.linalg.norm(found) > 0 else None
+
+
+def _root_mean(squares: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    return {b: float(np.sqrt(np.mean(s))) if s else float("inf") for b, s in squares.items()}
+
+
+def _rms(values: Iterable[float]) -> float:
+    found = np.array([v for v in values if np.isfinite(v)])
+    return float(np.sqrt((found**2).mean())) if len(found) else float("inf")
