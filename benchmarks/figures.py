@@ -34,8 +34,10 @@ GREEN, RED = (80, 200, 60), (60, 60, 230)
 
 def straight_pair(folder: Path) -> tuple[Raster, Raster, Matrix]:
     """Green and near infra-red of one synthetic capture without lens distortion, and the truth between them."""
-    straight = [replace(b, distortion=(0.0,) * 5) for b in rig.BANDS]
-    capture = json.loads(synthetic.make_flight(folder, 1, SIZE_PX, rng_seed=11, bands=straight).read_text())["IMG_0001"]
+    straight = replace(rig.REDEDGE, bands=tuple(replace(b, distortion=(0.0,) * 5) for b in rig.BANDS))
+    capture = json.loads(synthetic.make_flight(folder, 1, SIZE_PX, rng_seed=11, camera=straight).read_text())[
+        "IMG_0001"
+    ]
     fixed, moving = capture["reference"], "IMG_0001_4.tif"
     images = [read_image(folder / "0000SET" / "000" / name) for name in (fixed, moving)]
     return *images, np.array(capture["bands"][moving]["fixed_to_moving"])

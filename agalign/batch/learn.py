@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,7 +24,6 @@ from agalign.method.fast import learn
 from agalign.method.refine import refine
 from agalign.method.starter import start_from
 from agalign.method.state import JointState, Progress, Subject
-from agalign.pixels.raster import read_for_alignment
 from agalign.values.alignment import JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
@@ -41,12 +40,11 @@ def learn_flight(
 
     With `start`, its network is where theta starts; its last side is where bands start that it does not know.
     """
-    chosen = _choose(captures, settings.flight.captures)
-    loaded = [s for c in chosen if (s := read_subject(c, settings, start)) is not None]
+    loaded = _load(captures, settings, start)
     if not loaded:
         return None
     state = JointState(settings.joint, progress)
-    subjects = [subject for subject, _ in loaded]
+    subjects = [one.subject for one in loaded]
     bands = _sides(captures[0])
     net = state.fast_descriptor([1] * (1 + len(bands)))
     if start is not None:
@@ -59,8 +57,8 @@ def learn_flight(
         _LOG.debug("the flight could not be learnt from: %s", why_not)
         return None
     found: dict[str, list[Matrix]] = {}
-    for (_, pairs), of_subject in zip(loaded, results, strict=True):
-        for pair, result in zip(pairs, of_subject, strict=True):
+    for one, of_subject in zip(loaded, results, strict=True):
+        for pair, result in zip(one.pairs, of_subject, strict=True):
             if isinstance(result, JointResult) and result.retrieval >= settings.joint.fast.step_gate:
                 found.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
     if not found:
@@ -78,14 +76,15 @@ def _learn_rig(captures: Sequence[Capture], settings: Settings, model: FlightMod
     """What captures spread over the flight, refined with its network, have in common."""
     stage = settings.flight
     count = min(stage.rig_captures, max(stage.least_rig_captures, len(captures) // 8))
-    chosen = [captures[i] for i in sorted({*np.linspace(0, len(captures) - 1, count).round().astype(int).tolist()})]
-    if len(chosen) < LEAST_CAPTURES:
+    if len(captures) < LEAST_CAPTURES:
         return None
     plain = settings.model_copy(update={"local": settings.local.model_copy(update={"use": "never"})})
     seen: list[Observation] = []
     residuals: dict[str, list[Residual]] = {}
-    for number, capture in enumerate(chosen):
-        progress("the rig", number / len(chosen))
+    for capture in _spread(captures, count):
+        if len(residuals) and min(map(len, residuals.values())) >= count:
+            break
+        progress("the rig", min(1.0, len(seen) / count))
         try:
             pairs, _ = read_pairs(capture, plain, model)
             found = align_pairs(pairs, plain, lambda *_: None, model, scratch=False)
@@ -106,6 +105,12 @@ def _learn_rig(captures: Sequence[Capture], settings: Settings, model: FlightMod
     return replace(rig, fields={band: field for band, field in fields.items() if field is not None})
 
 
+def _spread(captures: Sequence[Capture], count: int) -> list[Capture]:
+    """So many captures all over a flight, then as many between them, for where some of the first show nothing."""
+    places = np.unique(np.linspace(0, len(captures) - 1, 2 * count - 1).round().astype(int))
+    return [captures[i] for i in (*places[::2], *places[1::2])]
+
+
 def _layout(capture: Capture) -> dict[str, tuple[float, float]]:
     """Where the lenses stand beside the reference's, as far as the camera knows."""
     here = capture.reference.parallax
@@ -119,33 +124,40 @@ def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str
     return hashed(camera_key(captures[0]), *(fingerprint(c, *stages) for c in captures))
 
 
-def _choose(captures: Sequence[Capture], count: int) -> list[Capture]:
-    """Of each of `count` stretches of the flight, the most textured of three captures."""
-    chosen = []
-    for stretch in np.array_split(np.arange(len(captures)), min(count, len(captures))):
-        some = stretch[np.unique(np.linspace(0, len(stretch) - 1, 3).round().astype(int))]
-        candidates = [captures[i] for i in some]
-        chosen.append(candidates[0] if len(candidates) == 1 else max(candidates, key=_texture))
-    return chosen
+@dataclass(frozen=True)
+class _Loaded:
+    """A capture to learn from."""
+
+    subject: Subject
+    pairs: list[BandPair]
+    seeds: list[Seed]
+
+    @property
+    def shows(self) -> float:
+        """How plainly its bands show the same, in standard deviations of their seeds' peaks."""
+        return float(np.median([s.peak_sigma for s in self.seeds]))
 
 
-def _texture(capture: Capture) -> float:
-    """Median gradient of the reference relative to its spread; 0 where it cannot be read."""
-    try:
-        raster = read_for_alignment(capture.reference, 640)
-    except AgalignError:
-        return 0.0
-    if raster.valid.mean() < 0.5:
-        return 0.0
-    inside = raster.pixels[raster.valid]
-    gx, gy = (cv2.Sobel(raster.pixels, cv2.CV_32F, *d, scale=1 / 8) for d in ((1, 0), (0, 1)))
-    return float(np.median(cv2.magnitude(gx, gy)[raster.valid]) / max(float(inside.std()), 1e-12))
+def _load(captures: Sequence[Capture], settings: Settings, start: FlightModel | None) -> list[_Loaded]:
+    """Of each stretch of the flight, one capture: the first of three whose bands plainly show the same, else the one
+    that shows it best. Water and fog teach nothing.
+    """
+    loaded = []
+    for stretch in np.array_split(np.arange(len(captures)), min(settings.flight.captures, len(captures))):
+        best: _Loaded | None = None
+        for k in dict.fromkeys((len(stretch) // 2, 0, len(stretch) - 1)):
+            found = _read(captures[stretch[k]], settings, start)
+            if found is not None and (best is None or found.shows > best.shows):
+                best = found
+            if best is not None and all(s.trusted for s in best.seeds):
+                break
+        if best is not None:
+            loaded.append(best)
+    return loaded
 
 
-def read_subject(
-    capture: Capture, settings: Settings, start: FlightModel | None = None
-) -> tuple[Subject, list[BandPair]] | None:
-    """A capture to learn from and its pairs; None where there is none that can be read.
+def _read(capture: Capture, settings: Settings, start: FlightModel | None) -> _Loaded | None:
+    """None where there is nothing that can be read.
 
     `start` is the network with which a seed of kind `match` is found.
     """
@@ -154,13 +166,11 @@ def read_subject(
     except AgalignError:
         return None
     sides = _sides(capture)
-    seeds = [(p, find_seed(p, start)) for p in pairs if p.is_the_rigs]
-    usable = [(p, seed) for p, seed in seeds if isinstance(seed, Seed)]
-    if not usable:
+    found = [(p, seed) for p in pairs if p.is_the_rigs and isinstance(seed := find_seed(p, start), Seed)]
+    if not found:
         return None
-    of_subject = [p for p, _ in usable]
-    numbers = [sides.index(p.name) + 1 for p in of_subject]
-    return subject_of(of_subject, [seed for _, seed in usable], numbers), of_subject
+    usable, seeds = [p for p, _ in found], [seed for _, seed in found]
+    return _Loaded(subject_of(usable, seeds, [sides.index(p.name) + 1 for p in usable]), usable, seeds)
 
 
 def _sides(capture: Capture) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.evidence import judged, windows_under, without_result
-from agalign.capture.prediction import with_predictions
+from agalign.capture.prediction import with_predictions, worth_learning
 from agalign.capture.seeding import find_seed, subject_of, unscored
 from agalign.capture.whole import most_probable
 from agalign.config import Settings
@@ -35,7 +35,7 @@ def align_capture_bands(
     reference = capture.reference
     progress(reference.name, "reading", 0.0)
     pairs, left_out = read_pairs(capture, settings, model)
-    aligned = align_pairs(pairs, settings, progress, model)
+    aligned = align_pairs(pairs, settings, progress, model, capture)
     if model is not None and model.rig is not None and not settings.seed.only:
         aligned = with_predictions(pairs, aligned, model.rig, capture, settings.check)
     found: dict[str, Alignment] = {}
@@ -55,13 +55,13 @@ def align_capture_bands(
 
 @one_thread()
 def align_pairs(
-    pairs: Sequence[BandPair], settings: Settings, progress: PairProgress, model: FlightModel | None = None, *,
-    scratch: bool = True,
+    pairs: Sequence[BandPair], settings: Settings, progress: PairProgress, model: FlightModel | None = None,
+    capture: Capture | None = None, *, scratch: bool = True,
 ) -> dict[str, Alignment]:  # fmt: skip
-    """Align the pairs of one capture, which share a reference, by name.
+    """Align the pairs of one `capture`, which share a reference, by name.
 
-    Those that the flight's network cannot align are learnt from scratch, together; with a rig at hand, which says where
-    the others lie, only those whose images show a structure in common, and without `scratch` none.
+    Those that the flight's network cannot align are learnt from scratch, together; with a rig at hand only those that
+    are worth it, and without `scratch` none.
     """
     watch = _Watch()
     found: dict[str, Alignment] = {}
@@ -94,8 +94,9 @@ def align_pairs(
         sides = [model.side(pair.name) or 0 for pair, _ in known]
         attempt(known, sides, lambda subject, report: refine_with(net, subject, settings.joint, report))
     left = [s for s in starts if s[0].name not in found or found[s[0].name].status != "aligned"]
-    if model is not None and model.rig is not None:
-        left = [(pair, seed) for pair, seed in left if seed.trusted or pair.name not in found]
+    if model is not None and model.rig is not None and capture is not None:
+        worth = worth_learning(pairs, found, model.rig, capture, settings.check)
+        left = [s for s in left if s[0].name in worth]
     if not scratch:
         left = [s for s in left if s[0].name not in found]
     attempt(left, [], lambda subject, report: align_from_scratch(subject, settings.joint, report))

@@ -14,6 +14,9 @@ from agalign.values.alignment import Alignment, Prediction
 from agalign.values.capture import Capture
 from agalign.values.doubts import Doubt
 
+_PLAINLY_MORE = 5.0
+"""Times what guessing tells of held-out patches: there is something in common."""
+
 
 def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], capture: Capture) -> Observation:
     """The mappings of a capture that are aligned, as the rig takes them."""
@@ -52,6 +55,32 @@ def with_predictions(
             alignment = replace(alignment, doubts=(Doubt("unexpected_px", off_px, limit_px),))
         checked[pair.name] = as_predicted(alignment, pair, _in_image_px(prediction, pair))
     return checked
+
+
+def worth_learning(
+    pairs: Sequence[BandPair], found: Mapping[str, Alignment], rig: Rig, capture: Capture, check: CheckSettings
+) -> set[str]:
+    """The bands that are to be learnt from scratch where the flight's network did not align them: those that show
+    something in common with the reference, and that the rig does not place well enough. A low capture shows much that
+    the flight has not seen; water shows nothing, and the rig knows where blurred bands lie.
+    """
+    known = observed([p for p in pairs if p.is_the_rigs and p.name in found], found, capture)
+    worth = set()
+    for pair in pairs:
+        tried = found.get(pair.name)
+        if (
+            tried is None
+            or pair.name not in rig.mean
+            or not pair.is_the_rigs
+            or (rig.predict(pair.name, known).std_px > check.accept_predicted_px and _shows_something(tried))
+        ):
+            worth.add(pair.name)
+    return worth
+
+
+def _shows_something(alignment: Alignment) -> bool:
+    joint = alignment.joint
+    return alignment.seed.trusted or (joint is not None and joint.retrieval >= _PLAINLY_MORE * joint.chance)
 
 
 def _seconds_of(captured_at: str) -> float:

@@ -29,6 +29,10 @@ Array = NDArray[np.float64]
 _SETS: tuple[tuple[Factor, ...], ...] = (
     (), ("distance",), ("motion",), ("distance", "tilt"), ("distance", "motion"), ("distance", "tilt", "motion"),
 )  # fmt: skip
+_SETS_IN_MOTION: tuple[tuple[Factor, ...], ...] = (
+    (), ("motion",), ("distance", "motion"), ("distance", "tilt", "motion"), ("distance",), ("distance", "tilt"),
+)  # fmt: skip
+"""Where the tags tell how the ground passes: to and fro along one line it looks like another distance."""
 _LAYOUT_STD = 0.04
 """Of a camera model's known layout of lenses, in lengths of all baselines together."""
 _ROUNDS = 20
@@ -50,9 +54,10 @@ def learn_rig(
         return None
     captures = [c for c in captures if any(b in c.mappings for b in bands)]
     table = _Table.of(captures, bands, size_px, _normalised_layout(layout, bands))
-    errors = {factors: table.errors_left_out(factors) for factors in _SETS}
-    best = _SETS[0]
-    for more in _SETS[1:]:
+    sets = _SETS_IN_MOTION if sum(c.motion is not None for c in captures) >= LEAST_CAPTURES else _SETS
+    errors = {factors: table.errors_left_out(factors) for factors in sets}
+    best = sets[0]
+    for more in sets[1:]:
         if len(bands) > 1 and _rms(errors[more].values()) < _PLAINLY_BETTER * _rms(errors[best].values()):
             best = more
     fitted = table.fit(np.ones(len(captures)), best or ("distance",))
@@ -123,10 +128,12 @@ class _Table:
         """Means, baselines and delays, and factors in turn, each by least squares with the others known.
 
         `kept` (captures,) is 0 for captures that are left out. A band that a capture lacks says nothing of it: its mean
-        is at the same factors as the others'.
+        is at the same factors as the others'. Where delays count, what of the baselines goes with them is theirs: a
+        step of all bands by their delays is the same, whether it is called distance or motion.
         """
         weights, counts = self.weights * kept[:, None], used(factors)
-        t, delay = self._first(weights) if self.prior is None else (self.prior, self._first(weights)[1])
+        t, delay = self._first(weights, counts)
+        with_delays = counts[3] > 0
         offset = np.zeros((len(self.bands), 2, 3))
         pull = 0.0 if self.prior is None else 1 / _LAYOUT_STD**2
         for _ in range(_ROUNDS):
@@ -137,7 +144,8 @@ class _Table:
                 prior = t[j] if self.prior is None else self.prior[j]
                 offset[j], t_j, delay[j] = _band(self.there[:, j], weights[:, j], found, prior, delay[j], pull)
                 t = np.vstack([t[:j], t_j, t[j + 1 :]])
-            t, delay = _unit(t), _unit(delay)
+            delay = _unit(delay)
+            t = _unit(t - np.outer(delay, delay @ t) if with_delays else t)
         total = np.maximum(weights.sum(axis=0), 1e-12)
         centre = np.einsum("ij,ik->jk", weights, found) / total[:, None]
         information = np.einsum("ij,ijk->j", weights, (found[:, None, :3] - centre[None, :, :3]) ** 2)
@@ -180,15 +188,21 @@ class _Table:
                     squares[band].append(float((left**2).sum()))
         return _root_mean(squares)
 
-    def _first(self, weights: Array) -> tuple[Array, Array]:
-        """The baselines and delays that explain most by themselves: first singular vectors of all bands' coordinates
-        over all captures.
+    def _first(self, weights: Array, counts: Array) -> tuple[Array, Array]:
+        """Baselines and delays to start from: the prior, or what explains most of all bands' coordinates over all
+        captures, a first singular vector; the baselines of what delays leave, where those count.
         """
-        table = self.there * np.sqrt(weights)[:, :, None, None]
-        along = table.transpose(1, 2, 0, 3).reshape(2 * len(self.bands), -1)
-        later = table[..., 0].transpose(1, 0, 2).reshape(len(self.bands), -1)
-        t, delay = (np.linalg.svd(a, full_matrices=False)[0][:, 0] for a in (along, later))
-        return np.asarray(t.reshape(-1, 2)), np.asarray(delay)
+        scale, left = np.sqrt(weights)[:, :, None, None], self.there
+        later = (left * scale)[..., 0].transpose(1, 0, 2).reshape(len(self.bands), -1)
+        delay = np.asarray(np.linalg.svd(later, full_matrices=False)[0][:, 0])
+        if self.prior is not None:
+            return self.prior, delay
+        if counts[3] > 0:
+            designs = np.stack([design(np.zeros(2), d) for d in delay])
+            found, _ = solve_factors(left, designs, weights, used(("motion",)))
+            left = left - np.einsum("bakf,cf->cbak", designs, found)
+        along = (left * scale).transpose(1, 2, 0, 3).reshape(2 * len(self.bands), -1)
+        return np.asarray(np.linalg.svd(along, full_matrices=False)[0][:, 0].reshape(-1, 2)), delay
 
 
 def _band(

@@ -15,6 +15,8 @@ from agalign.values.geometry import Points
 Field = NDArray[np.float32]
 
 _TERRACE_M = 8.0
+_FINE_GRAINS_M, _LEAST_GRAIN_PX = (0.02, 0.005), 3.0
+"""Clods and leaves, where the camera is low enough to see them."""
 _RAY_STEPS = 40
 """A ray falls on relief by repeated intersection with the height below its last place."""
 _MAP_PX_PER_IMAGE_PX = 1.25
@@ -62,8 +64,12 @@ def paint_ground(
     crop = crop * (1 - tree)
     ruts = np.clip(1.5 - np.abs(edge - 0.18 * metre) / (0.05 * metre), 0, 1)
     brightness = 1 + 0.22 * _noise(rng, side, 2.5 * metre) + 0.16 * _noise(rng, side, 0.08 * metre)
-    brightness = np.clip(brightness + 0.25 * (edge < 0.35 * metre) - 0.3 * ruts, 0.3, 2.2)
     vigour = 0.5 * _noise(rng, side, 3 * metre) + 0.45 * _noise(rng, side, 0.12 * metre)
+    for grain_m in _FINE_GRAINS_M:
+        if grain_m * metre >= _LEAST_GRAIN_PX:
+            brightness = brightness + 0.12 * _noise(rng, side, grain_m * metre)
+            vigour = vigour + 0.3 * _noise(rng, side, grain_m * metre)
+    brightness = np.clip(brightness + 0.25 * (edge < 0.35 * metre) - 0.3 * ruts, 0.3, 2.2)
     return Ground(
         crop.astype(np.float32),
         tree,

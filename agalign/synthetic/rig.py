@@ -1,6 +1,7 @@
 """The synthetic camera: the lenses of its bands, their places and angles in the rig, and what they are sensitive to."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -33,6 +34,8 @@ class BandSpec:
     """k1, k2, p1, p2, k3."""
     centre_offset_px: tuple[float, float]
     """Of the principal point from the middle of a 1280 x 960 sensor."""
+    delay_s: float = 0.0
+    """How much later than the first band it is exposed."""
 
     @property
     def exposure(self) -> float:
@@ -64,6 +67,32 @@ REFERENCE = 1
 
 
 @dataclass(frozen=True)
+class CameraSpec:
+    """A camera, and whose tags it writes."""
+
+    maker: Literal["MicaSense", "DJI"]
+    bands: tuple[BandSpec, ...]
+    reference: int
+    """Index of the band that the others are aligned to."""
+
+
+REDEDGE = CameraSpec("MicaSense", BANDS, REFERENCE)
+MAVIC = CameraSpec("DJI", (
+    BandSpec("Green", 560, 32, 0.125, 0.105, 0.070, 1, (0.0, 0.0, 0.0), (-0.012, -0.009),
+             (-0.081, 0.095, 0.0002, -0.0003, -0.02), (-5.1, 3.4), 0.0),
+    BandSpec("Red", 650, 32, 0.175, 0.060, 0.045, 2, (-0.21, 0.17, -0.11), (0.012, -0.009),
+             (-0.084, 0.098, -0.0001, 0.0002, -0.02), (4.6, 8.2), 0.025),
+    BandSpec("RedEdge", 730, 32, 0.230, 0.310, 0.240, 3, (-0.12, -0.24, 0.08), (-0.012, 0.009),
+             (-0.079, 0.091, 0.0003, -0.0001, -0.03), (-7.7, -2.9), 0.050),
+    BandSpec("NIR", 860, 52, 0.270, 0.510, 0.420, 4, (0.26, -0.09, 0.14), (0.012, 0.009),
+             (-0.086, 0.101, -0.0002, 0.0003, -0.03), (9.3, 5.5), 0.075),
+), 0)  # fmt: skip
+"""Its bands are exposed one after another: at 8 m/s and 28 m up they are as far apart as 31 px between opposite
+headings.
+"""
+
+
+@dataclass(frozen=True)
 class Pose:
     """Where the rig is at a capture, and its attitude."""
 
@@ -73,6 +102,8 @@ class Pose:
     pitch_deg: float
     east_m: float
     north_m: float
+    velocity_m_s: tuple[float, float] = (0.0, 0.0)
+    """East and south."""
 
 
 def true_homography(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
@@ -86,15 +117,22 @@ def _pixel_to_ground(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Ma
     """Undistorted pixel -> metres east and south on the plane below: the ray from the lens, cut with the plane."""
     place, rays = place_and_rays(band, pose, size_px)
     # ground = place + ray * (-place_z / ray_z): linear in the homogeneous pixel once multiplied by ray_z.
-    to_plane = np.array([[-place[2], 0.0, place[0]], [0.0, -place[2], place[1]], [0.0, 0.0, 1.0]])
-    return geometry.normalised(to_plane @ rays)
+    cut = np.array([[-place[2], 0.0, place[0]], [0.0, -place[2], place[1]], [0.0, 0.0, 1.0]])
+    return geometry.normalised(cut @ rays)
+
+
+def to_plane(reference: BandSpec, band: BandSpec, size_px: tuple[int, int]) -> Matrix:
+    """Undistorted pixels of a band -> those of the reference, were both lenses in one place."""
+    rays = _rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
+    return np.asarray(reference.lens(*size_px).matrix @ _rotation(*reference.rig_degrees).T @ rays)
 
 
 def place_and_rays(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> tuple[NDArray[np.float64], Matrix]:
     """(where the lens is, metres east, south and down of the origin; undistorted pixel -> direction of its ray)."""
     attitude = _rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
     rays = attitude @ _rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
-    place = attitude @ np.array([*band.baseline_m, 0.0]) + (pose.east_m, pose.north_m, -pose.altitude_m)
+    flown = band.delay_s * np.array([*pose.velocity_m_s, 0.0])
+    place = attitude @ np.array([*band.baseline_m, 0.0]) + flown + (pose.east_m, pose.north_m, -pose.altitude_m)
     return place, rays
 
 
