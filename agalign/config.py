@@ -262,6 +262,8 @@ class WriteSettings(Stage):
     """The reference's own pixels, or as many more as the finest band has."""
     stac: bool = False
     """A STAC item beside each capture's files."""
+    error_map: bool = False
+    """A raster of the error to be expected at every pixel, beside them."""
     radiometry: bool = False
     """Write reflectance or radiance (float32) instead of raw numbers, where the camera's tags tell how."""
 

@@ -8,6 +8,7 @@ from agalign.capture.align import PairProgress, align_capture_bands
 from agalign.config import Settings
 from agalign.errors import AgalignError, InputError, SidecarError
 from agalign.flight.model import FlightModel
+from agalign.products.error_map import write_error_map
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.layout import lay_out
 from agalign.products.picture import write_picture
@@ -35,6 +36,11 @@ def output_paths(capture: Capture, out: Path) -> tuple[Path, Path]:
     return folder / f"{capture.name}.tif", folder / f"{capture.name}.json"
 
 
+def error_map_path(stack: Path) -> Path:
+    """The raster of expected errors beside a stack."""
+    return stack.with_suffix(".error.tif")
+
+
 def process_capture(
     capture: Capture, out: Path, settings: Settings, progress: PairProgress = quiet,
     model: FlightModel | None = None,
@@ -60,6 +66,8 @@ def process_capture(
         # The picture is a convenience: a full disk must not cost the sidecar.
         with suppress(AgalignError):
             write_picture(capture, written.places, grid, usable, picture)
+        if settings.write.error_map:
+            write_error_map(capture, {b.name: alignments[b.name] for b in usable}, grid, error_map_path(stack_path))
         if settings.write.stac:
             write_item(capture, written, sidecar_path, picture)
     sidecar = sidecar_of(capture, alignments, written, settings)
@@ -73,7 +81,7 @@ def discard_outputs(stack: Path, sidecar: Path) -> None:
 
     What cannot be removed is written over, or told by the writing that fails.
     """
-    old = [sidecar, stack, stack.with_suffix(".png"), stack.with_suffix(".stac.json")]
+    old = [sidecar, stack, stack.with_suffix(".png"), stack.with_suffix(".stac.json"), error_map_path(stack)]
     with suppress(SidecarError):
         output = read_sidecar(sidecar).output
         old += [sidecar.parent / part.file for part in output.band_files] if output else []

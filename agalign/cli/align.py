@@ -133,6 +133,9 @@ def align(
         ),
     ] = False,
     stac: Annotated[bool, typer.Option("--stac", help="A STAC item beside each capture's files.")] = False,
+    error_map: Annotated[
+        bool, typer.Option("--error-map", help="A raster of the error to expect at every pixel, <capture>.error.tif.")
+    ] = False,
     format: Annotated[RasterFormat, typer.Option(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
     compression: Annotated[
         Compression, typer.Option(help="Lossless; auto is zstd for stacks and deflate for single bands.")
@@ -182,7 +185,7 @@ def align(
             local=LocalSettings(use=local),
             write=WriteSettings(
                 interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
-                radiometry=radiometry, stac=stac,
+                radiometry=radiometry, stac=stac, error_map=error_map,
                 format=format, compression=compression,
             ),
         )  # fmt: skip

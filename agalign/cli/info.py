@@ -114,7 +114,8 @@ def _rig_rows(rig: "Rig") -> list[dict[str, Any]]:
         {
             "band": band, "offset_px": (apply(mean, middle[None])[0] - middle).tolist(),
             "baseline": rig.baselines[band], "from_bands_px": rig.from_bands_px[band],
-            "from_neighbours_px": rig.from_neighbours_px[band], "from_flight_px": rig.from_flight_px[band],
+            "from_neighbours_px": rig.missed_px(band, by_neighbours=True),
+            "from_flight_px": rig.missed_px(band, by_neighbours=False),
             "field_px": float(np.hypot(*np.moveaxis(rig.fields[band].displacements_px, -1, 0)).max())
             if band in rig.fields else None,
         }

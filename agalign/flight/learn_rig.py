@@ -1,6 +1,6 @@
 """Fitting the rig of a flight to the mappings of some of its captures, and what it misses of captures left out."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,11 +13,9 @@ from agalign.flight.rig import (
     Rig,
     Seen,
     affine,
-    around_in_time,
     design,
     median_mapping,
     moved,
-    of_motion,
     solve_factors,
     used,
     weight,
@@ -70,15 +68,7 @@ def learn_rig(
         {b: (float(t[0]), float(t[1])) for b, t in zip(bands, fitted.t, strict=True)},
         dict(zip(bands, fitted.delay.tolist(), strict=True)), dict(zip(bands, fitted.t_std.tolist(), strict=True)),
         {b: tuple(c) for b, c in zip(bands, fitted.centre.tolist(), strict=True)}, best, seen, errors[best],
-        table.errors_of(fitted, seen, lambda out, rest: around_in_time(out.seconds, rest)),
-        table.errors_of(fitted, seen, _with_motion), errors[()],
     )  # fmt: skip
-
-
-def _with_motion(out: Seen, rest: Sequence[Seen]) -> Array | None:
-    if out.motion is None or sum(s.motion is not None for s in rest) < LEAST_CAPTURES:
-        return None
-    return np.concatenate([around_in_time(out.seconds, rest)[:3], of_motion(out.motion, rest)])
 
 
 @dataclass(frozen=True)
@@ -139,7 +129,8 @@ class _Table:
         for _ in range(_ROUNDS):
             designs = np.stack([design(a, d) for a, d in zip(t, delay, strict=True)])
             found, _ = solve_factors(self.there - offset, designs, weights, counts)
-            found -= np.average(found, axis=0, weights=weights.sum(axis=1))
+            # Of a flight that was low here and there, what is typical.
+            found -= np.median(found[kept > 0], axis=0)
             for j in range(len(self.bands)):
                 prior = t[j] if self.prior is None else self.prior[j]
                 offset[j], t_j, delay[j] = _band(self.there[:, j], weights[:, j], found, prior, delay[j], pull)
@@ -171,21 +162,6 @@ class _Table:
                 found, _ = solve_factors(left, designs, others, counts)
                 error = left[:, j] - np.einsum("akf,cf->cak", designs[j] * counts, found)
                 squares[band] += (error**2).sum(axis=(1, 2))[self.weights[out, j] > 0].tolist()
-        return _root_mean(squares)
-
-    def errors_of(
-        self, fit: _Fit, seen: Sequence[Seen], guess: Callable[[Seen, Sequence[Seen]], Array | None]
-    ) -> dict[str, float]:
-        """The same of captures whose factors are guessed from the others'."""
-        squares: dict[str, list[float]] = {b: [] for b in self.bands}
-        for i, out in enumerate(seen):
-            factors = guess(out, [*seen[:i], *seen[i + 1 :]])
-            if factors is None:
-                continue
-            for j, band in enumerate(self.bands):
-                if self.weights[i, j] > 0:
-                    left = self.there[i, j] - fit.offset[j] - design(fit.t[j], float(fit.delay[j])) @ factors
-                    squares[band].append(float((left**2).sum()))
         return _root_mean(squares)
 
     def _first(self, weights: Array, counts: Array) -> tuple[Array, Array]:

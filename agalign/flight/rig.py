@@ -17,7 +17,7 @@ band by band from its other bands. What that misses is the error bar of a predic
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -46,6 +46,8 @@ _CLIMB_STD_PX_PER_M = 1.5
 """What a metre of climb may do to the factor of the ground's distance: 0.03 m of baseline 20 m above it."""
 _LEAST_CLIMB_SPREAD_PX = 0.5
 _OUTLIER_PX = 0.3
+_UNLIKE, _LEAST_UNLIKE_PX = 6.0, 3.0
+"""A capture whose factors are so many times as far from the typical one's as most are does not set the crop."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +118,6 @@ class Rig:
     """The captures that it was learnt on, in their order."""
     from_bands_px: Mapping[str, float]
     """Root mean square error of each band as the other bands of captures left out predict it."""
-    from_neighbours_px: Mapping[str, float]
-    """The same from the captures before and after."""
-    from_motion_px: Mapping[str, float]
-    """The same, with what the ground's motion says of w; infinite where it is not known."""
-    from_flight_px: Mapping[str, float]
-    """The same from the mean of the others."""
     fields: Mapping[str, LocalField] = field(default_factory=dict)
     """What no homography explains and all captures have in common, raw px of the reference's file, by band."""
 
@@ -156,26 +152,50 @@ class Rig:
         if others:
             found, covariance, off = self._factors_of(known, others)
             if not self.factors:
-                return Prediction(mean, "flight", float(np.hypot(self.from_flight_px[band], off)))
+                return Prediction(mean, "flight", float(np.hypot(self.from_bands_px[band], off)))
             # What bands missed in captures left out, errors of these factors, those of the baseline at factors beyond
             # any seen, and what the others of this capture leave: one unlike all others shows there.
             spread = float(np.einsum("akf,fg,akg->", here, covariance, here))
             beyond = 2 * self.baseline_std[band] ** 2 * self._beyond(band, found)
             error = float(np.sqrt(self.from_bands_px[band] ** 2 + spread + beyond + off**2))
             return Prediction(moved(mean, here @ found, self.size_px), "bands", error)
-        climb_px = self._unknown_climb_px(known) * float(np.linalg.norm(self.baselines[band]))
-        errors = {
-            "flight": self.from_flight_px[band], "neighbours": self.from_neighbours_px[band],
-            "motion": np.inf if known.motion is None else self.from_motion_px[band],
-        }  # fmt: skip
-        source = min(errors, key=lambda k: errors[k]) if self.factors else "flight"
-        std_px = float(np.hypot(errors[source], climb_px))
-        if source == "flight":
-            return Prediction(mean, "flight", std_px)
-        around = around_in_time(known.seconds, self.seen)
-        if source == "motion":
-            around[3:] = of_motion(known.motion, self.seen)
-        return Prediction(moved(mean, here @ around, self.size_px), "neighbours", std_px)
+        like = Seen(known.seconds, known.altitude_m, known.motion, NO_FACTORS)
+        guess, error_px = min((self._told(g, like, band) for g in _GUESSES), key=lambda told: told[1])
+        if not self.factors or guess is None:
+            return Prediction(mean, "flight", error_px)
+        return Prediction(moved(mean, here @ guess, self.size_px), "neighbours", error_px)
+
+    def missed_px(self, band: str, *, by_neighbours: bool) -> float:
+        """Root mean square error of a band in captures of which nothing is known but when, how high and how fast they
+        were flown, or not even that: by captures around them, else by the flight's typical one.
+        """
+        here, squares = self._design(band), []
+        for i, seen in enumerate(self.seen):
+            rest = [*self.seen[:i], *self.seen[i + 1 :]]
+            guess = around_in_time(seen, rest) if by_neighbours else None
+            off = here @ (np.array(seen.factors) - (0.0 if guess is None else guess.factors))
+            squares.append(float((off**2).sum()))
+        return float(np.sqrt(np.mean(squares or [0.0]) + self.from_bands_px[band] ** 2))
+
+    def _told(self, guess: "_Guess | None", like: Seen, band: str) -> tuple[Array | None, float]:
+        """(factors of a capture from what is known of those around it, its error bar for a band, px): what the same
+        guess misses of captures that lie as far from the others as this one does.
+        """
+        here = self._design(band)
+        found = _TYPICAL if guess is None else guess(like, self.seen)
+        if found is None:
+            return None, np.inf
+        missed: list[tuple[float, float]] = []
+        for i, seen in enumerate(self.seen):
+            other = _TYPICAL if guess is None else guess(seen, [*self.seen[:i], *self.seen[i + 1 :]])
+            if other is not None:
+                missed.append((other.gap, float(((here @ (np.array(seen.factors) - other.factors)) ** 2).sum())))
+        missed.sort()
+        alike = [m for gap, m in missed if gap <= _AS_FAR * found.gap]
+        enough = alike if len(alike) >= LEAST_CAPTURES else [m for _, m in missed[:LEAST_CAPTURES]]
+        climb_px = self._unknown_climb_px(like.altitude_m) * float(np.linalg.norm(self.baselines[band]))
+        square = np.mean(enough or [0.0]) + self.from_bands_px[band] ** 2 + climb_px**2
+        return None if guess is None else found.factors, float(np.sqrt(square))
 
     def expectation(self, band: str, fixed_to_moving: Matrix) -> Expectation:
         """Where a band should lie beside a mapping close to it, whatever the factors of its capture.
@@ -198,10 +218,14 @@ class Rig:
         return Expectation(corners_px, np.asarray(by_factor.reshape(8, FACTORS)), covariance)
 
     def extremes(self, band: str) -> list[Matrix]:
-        """The mapping of a band in the captures that were learnt from at whose factors it lies farthest out."""
+        """The mapping of a band in the captures that were learnt from at whose factors it lies farthest out; without
+        those that are unlike all others, as a panel's from a metre up is.
+        """
         if not self.factors:
             return [self.mean[band]]
         factors = np.array([s.factors for s in self.seen])
+        spread = np.median(np.abs(factors), axis=0)
+        factors = factors[(np.abs(factors) <= _UNLIKE * np.maximum(spread, _LEAST_UNLIKE_PX)).all(axis=1)]
         ends = {int(pick) for column in factors.T for pick in (column.argmin(), column.argmax())}
         return [moved(self.mean[band], self._design(band) @ factors[i], self.size_px) for i in sorted(ends)]
 
@@ -214,18 +238,18 @@ class Rig:
         seen = np.array([s.factors for s in self.seen]) - self.centres[band]
         return max(0.0, float(((found - self.centres[band]) ** 2).sum() - (seen**2).sum(axis=1).mean()))
 
-    def _unknown_climb_px(self, known: Observation) -> float:
+    def _unknown_climb_px(self, altitude_m: float | None) -> float:
         """Standard deviation of the distance's factor at an altitude that the captures it is taken from do not have:
         how much it changes with a metre is known as well as they have shown it.
         """
         seen = [(s.altitude_m, s.factors[0]) for s in self.seen if s.altitude_m is not None]
-        if known.altitude_m is None or len(seen) < LEAST_CAPTURES:
+        if altitude_m is None or len(seen) < LEAST_CAPTURES:
             return 0.0
         altitudes, nu = (np.array(v) for v in zip(*seen, strict=True))
         slope, offset = np.polyfit(altitudes, nu, 1) if np.ptp(altitudes) > 0 else (0.0, float(nu.mean()))
         spread = max(float((nu - slope * altitudes - offset).std()), _LEAST_CLIMB_SPREAD_PX)
         information = 1 / _CLIMB_STD_PX_PER_M**2 + float(((altitudes - altitudes.mean()) ** 2).sum()) / spread**2
-        nearest = float(np.abs(altitudes - known.altitude_m).min())
+        nearest = float(np.abs(altitudes - altitude_m).min())
         return nearest / float(np.sqrt(information)) + abs(float(slope)) * nearest
 
     def _factors_of(self, known: Observation, bands: Sequence[str]) -> tuple[Array, Array, float]:
@@ -285,24 +309,59 @@ def solve_factors(there: Array, designs: Array, weights: Array, counts: Array) -
     return found, covariance * np.outer(counts, counts)
 
 
-def around_in_time(seconds: float, seen: Sequence[Seen]) -> Array:
-    """(5,) factors between those of the captures before and after."""
-    order = sorted(seen, key=lambda s: s.seconds)
-    moments = [s.seconds for s in order]
-    return np.array([np.interp(seconds, moments, [s.factors[k] for s in order]) for k in range(FACTORS)])
+@dataclass(frozen=True)
+class Guessed:
+    """The factors of a capture of which no band is known."""
+
+    factors: Array
+    """(5,)"""
+    gap: float
+    """How far it lies from the captures that they are taken from, in what they are taken by."""
 
 
-def of_motion(motion: tuple[float, float] | None, seen: Sequence[Seen]) -> Array:
-    """(2,) w as a linear function of the ground's motion, fitted to captures whose motion is known."""
+_Guess = Callable[[Seen, Sequence[Seen]], Guessed | None]
+_TYPICAL = Guessed(np.zeros(FACTORS), 0.0)
+
+
+def around_in_time(like: Seen, seen: Sequence[Seen]) -> Guessed:
+    """Factors between those of the captures before and after."""
+    return _between([s.seconds for s in seen], like.seconds, seen)
+
+
+def around_in_height(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
+    """The distance between those of the captures below and above, the rest in time; None where no height is known."""
+    known = [s for s in seen if s.altitude_m is not None]
+    if like.altitude_m is None or len(known) < LEAST_CAPTURES:
+        return None
+    by_height = _between([s.altitude_m or 0.0 for s in known], like.altitude_m, known)
+    factors = around_in_time(like, seen).factors
+    factors[0] = by_height.factors[0]
+    return Guessed(factors, by_height.gap)
+
+
+def by_motion(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
+    """W as a linear function of the ground's motion, the rest in time; None where no motion is known."""
     known = [s for s in seen if s.motion is not None]
-    if motion is None or len(known) < LEAST_CAPTURES:
-        return np.zeros(2)
+    if like.motion is None or len(known) < LEAST_CAPTURES:
+        return None
     x = np.array([(1.0, *s.motion) for s in known if s.motion is not None])
-    y = np.array([s.factors[3:] for s in known])
     # Where all flew alike nothing is said of other motions: the least slope that fits.
     scale = np.maximum(np.abs(x).max(axis=0), 1e-12)
-    slope = np.linalg.lstsq(x / scale, y, rcond=1e-3)[0]
-    return np.asarray((np.array([1.0, *motion]) / scale) @ slope)
+    slope = np.linalg.lstsq(x / scale, np.array([s.factors[3:] for s in known]), rcond=1e-3)[0]
+    factors = around_in_time(like, seen).factors
+    factors[3:] = (np.array([1.0, *like.motion]) / scale) @ slope
+    return Guessed(factors, float(np.linalg.norm(x[:, 1:] - like.motion, axis=1).min()))
+
+
+_GUESSES: tuple[_Guess | None, ...] = (None, around_in_time, around_in_height, by_motion)
+_AS_FAR = 2.0
+
+
+def _between(places: Sequence[float], place: float, seen: Sequence[Seen]) -> Guessed:
+    order = np.argsort(places, kind="stable")
+    at, factors = np.array(places)[order], np.array([s.factors for s in seen])[order]
+    found = np.array([np.interp(place, at, column) for column in factors.T])
+    return Guessed(found, float(np.abs(at - place).min()))
 
 
 # ---- mappings as numbers

@@ -301,7 +301,7 @@ def _profile(
         profile |= {"compress": compression, "predictor": 3 if dtype.kind == "f" else 2}
         profile |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
     if reference.georeference is not None:
-        profile |= _georeference(reference.georeference, grid)
+        profile |= georeferenced(reference.georeference, grid)
     return profile
 
 
@@ -312,7 +312,8 @@ def _compression(settings: WriteSettings, *, whole: bool) -> str:
     return "zstd" if whole else "deflate"
 
 
-def _georeference(georeference: Georeference, grid: OutputGrid) -> dict[str, Any]:
+def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any]:
+    """What rasterio needs to know of where an output grid lies."""
     # Only where the source has one: an identity transform would be an invented georeference.
     # Geotransforms count from corners, where a change of resolution is a mere factor.
     shrunk = np.diag([1 / grid.scale_xy[0], 1 / grid.scale_xy[1], 1.0])

@@ -65,7 +65,9 @@ class JointResult:
             fixed_to_moving=geometry.rescale(self.fixed_to_moving, up, moving_up),
             corner_std_xy_px=tuple((x * up[0], y * up[1]) for x, y in self.corner_std_xy_px),
             last_step_px=self.last_step_px * up[0],
-            corner_covariance_px2=None,
+            corner_covariance_px2=None
+            if self.corner_covariance_px2 is None
+            else self.corner_covariance_px2 * np.outer(np.tile(up, 4), np.tile(up, 4)),
         )
 
 

@@ -25,7 +25,7 @@ def rig(std_px: float = 0.1) -> Rig:
     return Rig(
         SIZE, dict.fromkeys(bands, MEAN), {"red": (0.6, 0.0), "nir": (0.0, 0.8)}, dict.fromkeys(bands, 0.0),
         dict.fromkeys(bands, 0.01), dict.fromkeys(bands, NO_FACTORS), ("distance",), (),
-        *[dict.fromkeys(bands, std_px)] * 4,
+        dict.fromkeys(bands, std_px),
     )  # fmt: skip
 
 

@@ -64,7 +64,7 @@ def rig_between(low_px: float, high_px: float) -> Rig:
     bars = {"nir": 0.1}
     return Rig(
         (120, 90), {"nir": geometry.translation(middle, 0)}, {"nir": (1.0, 0.0)}, {"nir": 0.0}, bars,
-        {"nir": NO_FACTORS}, ("distance",), seen, bars, bars, bars, bars,
+        {"nir": NO_FACTORS}, ("distance",), seen, bars,
     )  # fmt: skip
 
 

@@ -374,3 +374,17 @@ def test_floats_without_a_unit_are_reflectance_only_where_they_can_be(
     assert "needs reflectance, and the bands are raw numbers" in by_name["savi"].problem or written
     assert by_name["ndvi"].path is not None
     assert by_name["ndvi"].raw_numbers != written
+
+
+def test_the_error_map_lies_on_the_stack_s_grid_and_goes_when_not_asked_for(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path / "in", 1, (480, 360), rng_seed=3)
+    out, settings = tmp_path / "out", Settings(write=WriteSettings(error_map=True))
+    (report,) = agalign.align_folder(tmp_path / "in", out, settings=settings)
+    (path,) = out.rglob("*.error.tif")
+    with rasterio.open(path) as errors, rasterio.open(path.with_name("IMG_0001.tif")) as aligned:
+        assert (errors.width, errors.height) == (aligned.width, aligned.height)
+        assert list(errors.descriptions) == [b.band for b in report.sidecar.bands if b.status == "aligned"]
+        values = errors.read()
+    assert ((values > 0) & (values < 1)).all()
+    agalign.align_folder(tmp_path / "in", out)
+    assert not list(out.rglob("*.error.tif"))

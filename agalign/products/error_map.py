@@ -1,0 +1,58 @@
+"""A raster of the error to be expected at every pixel, a band for each moving band, beside the aligned files."""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+from agalign.errors import OutputError
+from agalign.judge.expected_error import expected_error_px
+from agalign.products.write import georeferenced
+from agalign.values.alignment import Alignment
+from agalign.values.capture import Capture
+from agalign.values.files import complete_file
+from agalign.values.image import OutputGrid
+
+_LATTICE_PX = 16
+_STEP_PX = 0.001
+"""Errors are rounded to this: what is known no better compresses better."""
+
+
+def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid: OutputGrid, path: Path) -> None:
+    """Write (bands, height, width) float32, px of the reference's file, on the grid of the capture's aligned files,
+    complete or not at all. Raises OutputError.
+    """
+    size_px, georeference = capture.reference.size_px, capture.reference.georeference
+    profile = {
+        "driver": "GTiff", "width": grid.width, "height": grid.height, "count": len(alignments), "dtype": "float32",
+        "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate", "predictor": 3, "nodata": np.nan,
+    }  # fmt: skip
+    profile |= {} if georeference is None else georeferenced(georeference, grid)
+    try:
+        with complete_file(path) as partial, warnings.catch_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO"):
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(partial, "w", **profile) as dataset:
+                for index, (name, alignment) in enumerate(alignments.items(), start=1):
+                    dataset.write(_map_of(alignment, size_px, grid), index)
+                    dataset.set_band_description(index, name)
+                    dataset.update_tags(index, units="px of the reference", STATUS=alignment.status)
+    except RasterioError as error:
+        raise OutputError(f"{path}: cannot be written ({error})") from None
+
+
+def _map_of(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
+    """(height, width): the error on a lattice over the grid, between whose nodes it is linear; nan where unknown."""
+    columns, rows = (max(2, -(-n // _LATTICE_PX)) for n in (grid.width, grid.height))
+    x = (grid.x0 + np.linspace(0, grid.width - 1, columns) + 0.5) / grid.scale_xy[0] - 0.5
+    y = (grid.y0 + np.linspace(0, grid.height - 1, rows) + 0.5) / grid.scale_xy[1] - 0.5
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    nodes = expected_error_px(alignment, size_px, points).reshape(rows, columns)
+    nodes = np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
+    at_x, at_y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in ((columns, grid.width), (rows, grid.height)))
+    found = cv2.remap(nodes, *np.meshgrid(at_x, at_y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(np.round(found / _STEP_PX) * _STEP_PX, np.float32)

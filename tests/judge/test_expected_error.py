@@ -1,0 +1,46 @@
+"""What is to be expected where there is evidence, and where there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from agalign.judge.expected_error import expected_error_px
+from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed
+
+SIZE = 640, 480
+LEFT, RIGHT = np.array([[60.0, 240.0]]), np.array([[620.0, 240.0]])
+
+
+def alignment(corner_std_px: list[float], residual: Residual | None) -> Alignment:
+    std = np.repeat(corner_std_px, 2)
+    joint = JointResult(
+        np.eye(3), 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, ((0.1, 0.1),) * 4, np.diag(std**2)
+    )
+    return Alignment(np.eye(3), "pixel", "aligned", (), Seed("identity", np.eye(3), 1.0), joint, residual, 0.0)
+
+
+def windows(columns: int, shift_px: float) -> Residual:
+    centres = np.stack(np.meshgrid(50.0 + 100 * np.arange(columns), 50.0 + 100 * np.arange(4)), -1).reshape(-1, 2)
+    shifts = np.full_like(centres, 0.0)
+    shifts[:, 0] = shift_px
+    return Residual(centres, shifts, shift_px, 2.0, 1.0)
+
+
+def test_the_corners_covariance_is_what_the_corners_show() -> None:
+    found = expected_error_px(alignment([0.1, 0.5, 0.5, 0.1], None), SIZE, np.array([[0.0, 0.0], [639.0, 0.0]]))
+    np.testing.assert_allclose(found, np.sqrt(2) * np.array([0.1, 0.5]), rtol=1e-6)
+
+
+def test_windows_tell_of_their_places_and_far_from_all_of_them_the_worst_is_to_be_expected() -> None:
+    known = alignment([0.01] * 4, windows(3, 0.3))
+    assert 0.25 < expected_error_px(known, SIZE, LEFT)[0] < 0.35
+    assert 1.9 < expected_error_px(known, SIZE, RIGHT)[0] < 2.1
+    everywhere = alignment([0.01] * 4, windows(7, 0.3))
+    assert 0.25 < expected_error_px(everywhere, SIZE, RIGHT)[0] < 0.35
+
+
+def test_a_prediction_is_as_good_as_it_says_and_a_seed_says_nothing() -> None:
+    known = alignment([0.01] * 4, None)
+    predicted = replace(known, status="predicted", prediction=Prediction(np.eye(3), "bands", 0.4))
+    np.testing.assert_allclose(expected_error_px(predicted, SIZE, LEFT), 0.4)
+    assert np.isinf(expected_error_px(replace(known, status="seed_only"), SIZE, LEFT)).all()
