@@ -109,7 +109,8 @@ def _solve(own: Sequence[Witness], priors: Sequence[Expectation | None]) -> list
                 apart = float(off @ np.linalg.solve(prior.covariance, off))
                 weights[b] = (_FREEDOM + 8) / (_FREEDOM + apart)
     blocks = [slice(8 * b, 8 * b + 8) for b in range(len(own))]
-    return [(solution[s], covariance[s, s]) for s in blocks]
+    # In which order sums are taken is the machine's: the last bits must not reach what is written.
+    return [(np.round(solution[s], 6), np.round(covariance[s, s], 12)) for s in blocks]
 
 
 def _of_descriptors(result: JointResult) -> Witness:

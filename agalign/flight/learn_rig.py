@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from agalign.flight.rig import (
     LEAST_CAPTURES,
+    LEAST_STD_PX,
     Factor,
     Observation,
     Rig,
@@ -25,13 +26,14 @@ from agalign.values.geometry import Matrix
 Array = NDArray[np.float64]
 
 _SETS: tuple[tuple[Factor, ...], ...] = (
-    (), ("distance",), ("motion",), ("distance", "tilt"), ("distance", "motion"), ("distance", "tilt", "motion"),
+    (), ("distance",), ("distance", "tilt"), ("distance", "reference"), ("distance", "tilt", "reference"),
+    ("distance", "motion"), ("distance", "tilt", "motion"),
 )  # fmt: skip
 _SETS_IN_MOTION: tuple[tuple[Factor, ...], ...] = (
     (), ("motion",), ("distance", "motion"), ("distance", "tilt", "motion"), ("distance",), ("distance", "tilt"),
 )  # fmt: skip
 """Where the tags tell how the ground passes: to and fro along one line it looks like another distance."""
-_LAYOUT_STD = 0.04
+_LAYOUT_STD = 0.015
 """Of a camera model's known layout of lenses, in lengths of all baselines together."""
 _ROUNDS = 20
 _MOST_FOLDS = 12
@@ -122,8 +124,7 @@ class _Table:
         step of all bands by their delays is the same, whether it is called distance or motion.
         """
         weights, counts = self.weights * kept[:, None], used(factors)
-        t, delay = self._first(weights, counts)
-        with_delays = counts[3] > 0
+        t, delay = self._first(weights, factors)
         offset = np.zeros((len(self.bands), 2, 3))
         pull = 0.0 if self.prior is None else 1 / _LAYOUT_STD**2
         for _ in range(_ROUNDS):
@@ -131,12 +132,17 @@ class _Table:
             found, _ = solve_factors(self.there - offset, designs, weights, counts)
             # Of a flight that was low here and there, what is typical.
             found -= np.median(found[kept > 0], axis=0)
-            for j in range(len(self.bands)):
-                prior = t[j] if self.prior is None else self.prior[j]
-                offset[j], t_j, delay[j] = _band(self.there[:, j], weights[:, j], found, prior, delay[j], pull)
-                t = np.vstack([t[:j], t_j, t[j + 1 :]])
-            delay = _unit(delay)
-            t = _unit(t - np.outer(delay, delay @ t) if with_delays else t)
+            # What lies far from typical factors is off by errors of the baselines: it tells less of the means.
+            vote = 1 / (1 + (_LAYOUT_STD / LEAST_STD_PX) ** 2 * (found[:, :3] ** 2).sum(axis=1))
+            towards = t if self.prior is None else self._beside(self.prior, delay, counts)
+            each = [
+                _band(self.there[:, j], weights[:, j] * vote, found, towards[j], delay[j], pull)
+                for j in range(len(self.bands))
+            ]
+            offset = np.stack([o for o, _, _ in each])
+            if "motion" in factors:
+                delay = _unit(np.array([d for _, _, d in each]))
+            t = self._beside(np.stack([v for _, v, _ in each]), delay, counts)
         total = np.maximum(weights.sum(axis=0), 1e-12)
         centre = np.einsum("ij,ik->jk", weights, found) / total[:, None]
         information = np.einsum("ij,ijk->j", weights, (found[:, None, :3] - centre[None, :, :3]) ** 2)
@@ -164,21 +170,29 @@ class _Table:
                 squares[band] += (error**2).sum(axis=(1, 2))[self.weights[out, j] > 0].tolist()
         return _root_mean(squares)
 
-    def _first(self, weights: Array, counts: Array) -> tuple[Array, Array]:
+    @staticmethod
+    def _beside(t: Array, delay: Array, counts: Array) -> Array:
+        """Baselines of length 1 together, without what goes with the delays where those count."""
+        return _unit(t - np.outer(delay, delay @ t) if counts[3] > 0 else t)
+
+    def _first(self, weights: Array, factors: Sequence[Factor]) -> tuple[Array, Array]:
         """Baselines and delays to start from: the prior, or what explains most of all bands' coordinates over all
         captures, a first singular vector; the baselines of what delays leave, where those count.
         """
-        scale, left = np.sqrt(weights)[:, :, None, None], self.there
+        scale, left, counts = np.sqrt(weights)[:, :, None, None], self.there, used(factors)
         later = (left * scale)[..., 0].transpose(1, 0, 2).reshape(len(self.bands), -1)
         delay = np.asarray(np.linalg.svd(later, full_matrices=False)[0][:, 0])
+        if "reference" in factors:
+            delay = np.full(len(self.bands), len(self.bands) ** -0.5)
         if self.prior is not None:
-            return self.prior, delay
+            return self._beside(self.prior, delay, counts), delay
         if counts[3] > 0:
             designs = np.stack([design(np.zeros(2), d) for d in delay])
             found, _ = solve_factors(left, designs, weights, used(("motion",)))
             left = left - np.einsum("bakf,cf->cbak", designs, found)
         along = (left * scale).transpose(1, 2, 0, 3).reshape(2 * len(self.bands), -1)
-        return np.asarray(np.linalg.svd(along, full_matrices=False)[0][:, 0].reshape(-1, 2)), delay
+        t = np.asarray(np.linalg.svd(along, full_matrices=False)[0][:, 0].reshape(-1, 2))
+        return self._beside(t, delay, counts), delay
 
 
 def _band(

@@ -30,7 +30,7 @@ from agalign.values.alignment import LocalField, Prediction
 from agalign.values.geometry import Matrix, Points
 
 Array = NDArray[np.float64]
-Factor = Literal["distance", "tilt", "motion"]
+Factor = Literal["distance", "tilt", "motion", "reference"]
 
 FACTORS = 5
 """nu and w together."""
@@ -40,7 +40,7 @@ FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
 LEAST_CAPTURES = 3
 LEAST_STD_PX = 0.05
 """Of a mapping: what its own uncertainty does not know."""
-_COLUMNS: dict[Factor, tuple[int, ...]] = {"distance": (0,), "tilt": (1, 2), "motion": (3, 4)}
+_COLUMNS: dict[Factor, tuple[int, ...]] = {"distance": (0,), "tilt": (1, 2), "motion": (3, 4), "reference": (3, 4)}
 _LATTICE = 7, 5
 _CLIMB_STD_PX_PER_M = 1.5
 """What a metre of climb may do to the factor of the ground's distance: 0.03 m of baseline 20 m above it."""
@@ -160,7 +160,8 @@ class Rig:
             error = float(np.sqrt(self.from_bands_px[band] ** 2 + spread + beyond + off**2))
             return Prediction(moved(mean, here @ found, self.size_px), "bands", error)
         like = Seen(known.seconds, known.altitude_m, known.motion, NO_FACTORS)
-        guess, error_px = min((self._told(g, like, band) for g in _GUESSES), key=lambda told: told[1])
+        guesses = _GUESSES if len(self.seen) >= _LEAST_FOR_A_CHOICE else _GUESSES[:2]
+        guess, error_px = min((self._told(g, like, band) for g in guesses), key=lambda told: told[1])
         if not self.factors or guess is None:
             return Prediction(mean, "flight", error_px)
         return Prediction(moved(mean, here @ guess, self.size_px), "neighbours", error_px)
@@ -194,7 +195,9 @@ class Rig:
         alike = [m for gap, m in missed if gap <= _AS_FAR * found.gap]
         enough = alike if len(alike) >= LEAST_CAPTURES else [m for _, m in missed[:LEAST_CAPTURES]]
         climb_px = self._unknown_climb_px(like.altitude_m) * float(np.linalg.norm(self.baselines[band]))
-        square = np.mean(enough or [0.0]) + self.from_bands_px[band] ** 2 + climb_px**2
+        # Of few captures the mean square may be small by chance.
+        few = (len(enough) + 1) / max(len(enough) - 1, 1)
+        square = few * np.mean(enough or [0.0]) + self.from_bands_px[band] ** 2 + climb_px**2
         return None if guess is None else found.factors, float(np.sqrt(square))
 
     def expectation(self, band: str, fixed_to_moving: Matrix) -> Expectation:
@@ -355,6 +358,8 @@ def by_motion(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
 
 _GUESSES: tuple[_Guess | None, ...] = (None, around_in_time, around_in_height, by_motion)
 _AS_FAR = 2.0
+_LEAST_FOR_A_CHOICE = 6
+"""With fewer captures the best of several guesses is best by chance."""
 
 
 def _between(places: Sequence[float], place: float, seen: Sequence[Seen]) -> Guessed:

@@ -84,6 +84,8 @@ _LEAST_CAPTURES = 3
 _COMMON_FOLDS = 4
 _COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
 """Of what is the lenses' own, beside one window of each capture."""
+_LEAST_COMMON_GAIN_SIGMA, _NO_WORSE = 2.5, 1.05
+"""Less than of one capture's windows: whole captures that are left out share nothing but their lenses."""
 _ALL_FOLDS = range(16)
 _SOME_FOLDS = (0, 2, 8, 10)
 """Far enough apart to say how smooth a field should be."""
@@ -195,7 +197,7 @@ def common_field(residuals: Sequence[Residual], settings: LocalSettings, size_px
         return _gain_of(out, np.concatenate(left), smoothness)
 
     best = min(map(gain, _COMMON_SMOOTHNESS), key=lambda g: g.left)
-    if not best.is_plain(settings.least_gain_sigma):
+    if best.sigma < _LEAST_COMMON_GAIN_SIGMA or best.after_p95_px > _NO_WORSE * best.before_p95_px:
         return None
     field = fitted_field(out, best.smoothness * len(captures), settings, size_px)
     return field if _is_one_to_one(field, size_px) else None
