@@ -202,10 +202,15 @@ class Sampler:
 
 def footprints_inside(level: Level, band: int, keypoints: Keypoints, homography: Tensor) -> Tensor:
     """(N,) True where a keypoint's patch touches only valid pixels in both images."""
-    radius = footprint_radius(keypoints.scale) + 1
+    here = level.fixed.room_at(keypoints.xy) > footprint_radius(keypoints.scale) + 1
+    return here & footprints_inside_moving(level, band, keypoints, homography)
+
+
+def footprints_inside_moving(level: Level, band: int, keypoints: Keypoints, homography: Tensor) -> Tensor:
+    """(N,) the same in the moving image alone."""
     there = transform(homography, keypoints.xy)
     jacobian_scale = homography[:2, :2].det().abs().sqrt()
-    return (level.fixed.room_at(keypoints.xy) > radius) & (level.moving[band].room_at(there) > radius * jacobian_scale)
+    return level.moving[band].room_at(there) > (footprint_radius(keypoints.scale) + 1) * jacobian_scale
 
 
 def _room_px(valid: Mask) -> NDArray[np.float32]:

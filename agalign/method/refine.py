@@ -18,15 +18,15 @@ from agalign.method import losses
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.device import exact
 from agalign.method.gauss_newton import PatchEquations, Step, shift_gradient, solve
-from agalign.method.levels import Level, footprints_inside
-from agalign.method.patches import Keypoints, far_apart, patch_positions, transform, translation
+from agalign.method.levels import Level, footprints_inside, footprints_inside_moving
+from agalign.method.patches import Keypoints, far_apart, patch_positions, transform
 from agalign.method.state import JointState, Subject
 from agalign.values.alignment import JointResult
 from agalign.values.choices import ModelFamily
 from agalign.values.doubts import Doubt
 
 LEAST_KEYPOINTS = 16
-_FIRST_PATCHES, _LIKELY_SHIFTS = 32, 128
+_FIRST_PATCHES, _LIKELY_SHIFTS, _AT_ONCE = 32, 64, 16
 _PLAIN_GAIN = 3.0
 """Standard errors by which a loss must be less to count."""
 
@@ -162,7 +162,7 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach
     def table_of(some: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """(losses (shifts, count) of the first keypoints, nan where a patch leaves an image; their means)."""
         p = keypoints[torch.arange(min(count, len(keypoints)), device=homography.device)]
-        table = torch.stack([_loss_moved(band, homography @ translation(s), p, f[: len(p)]) for s in some])
+        table = torch.cat([_losses_moved(band, homography, p, f[: len(p)], s) for s in torch.split(some, _AT_ONCE)])
         enough = table.isfinite().sum(dim=1) >= LEAST_KEYPOINTS
         return table, table.nanmean(dim=1).masked_fill(~enough, float("inf"))
 
@@ -179,11 +179,14 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach
     return likely[best - 1] if plain and best > 0 else homography.new_zeros(2)
 
 
-def _loss_moved(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor) -> Tensor:
-    """L0 of each keypoint, nan where its patch leaves an image."""
-    apart = losses.distance(f, band.describe(keypoints, homography))
-    inside = footprints_inside(band.level, band.index, keypoints, homography)
-    return apart.masked_fill(~inside, float("nan"))
+def _losses_moved(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor, shifts: Tensor) -> Tensor:
+    """L0 of each keypoint under each shift (K, 2) of the fixed side, (K, N), nan where its patch leaves an image."""
+    count = len(shifts)
+    xy = (keypoints.xy + shifts[:, None]).reshape(-1, 2)
+    shifted = Keypoints(xy, keypoints.angle.repeat(count), keypoints.scale.repeat(count))
+    apart = losses.distance(f.repeat(count, 1), band.describe(shifted, homography))
+    inside = footprints_inside_moving(band.level, band.index, shifted, homography)
+    return apart.masked_fill(~inside, float("nan")).reshape(count, -1)
 
 
 @torch.no_grad()
