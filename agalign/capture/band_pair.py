@@ -64,6 +64,11 @@ class BandPair:
         return "undistorted" if both else "pixel"
 
     @property
+    def reach_px(self) -> float:
+        """How far from its seed it may lie, px of the fixed image: what a user knows is not left."""
+        return _STANDARD_DEVIATIONS * self.known_to_px.get("user", np.inf)
+
+    @property
     def is_known_to_a_rig(self) -> bool:
         """True where the captures of a flight told where this band lies."""
         return "model" in self.known_to_px

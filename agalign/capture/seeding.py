@@ -44,7 +44,7 @@ def subject_of(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence
     fields = [p.field for p in pairs]
     return Subject(
         pairs[0].fixed, [p.moving for p in pairs], mappings, sides, [s.trusted for s in seeds],
-        fields=fields if any(f is not None for f in fields) else (),
+        [p.reach_px for p in pairs], fields=fields if any(f is not None for f in fields) else (),
     )  # fmt: skip
 
 
@@ -77,8 +77,7 @@ def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[See
     spectrum = windowed_spectra(structure_field(small_moving, settings.smoothing_px))
     surface = correlation_surfaces(reference.seed_spectrum, spectrum)
     # Where a candidate's place is known to some px, a period farther away is another place.
-    known_px = pair.known_to_px.get(kind) if kind == "user" else None
-    within_px = np.inf if known_px is None else max(_SAME_PEAK_PX, 3 * known_px * max(scale))
+    within_px = max(_SAME_PEAK_PX, pair.reach_px * max(scale)) if kind == "user" else np.inf
     peak = find_peak(surface, apart_px=max(size) // 16, within_px=within_px)
 
     def seed(kind: SeedKind, matrix: Matrix, sigma: float, rival: float) -> Seed:

@@ -106,6 +106,8 @@ def _search(state: JointState, at: _AtLevel) -> None:
         if at.subject.trusted[at.which[i]]:
             continue
         reach = recipe.search_share * max(level.fixed.size_px)
+        if at.subject.reach_px:
+            reach = min(reach, at.subject.reach_px[at.which[i]] * level.fixed.scale[0])
         shift = best_shift(band, at.h[i], p, reach, recipe.search_step_px)
         at.h[i] = at.h[i] @ translation(shift).to(at.h[i])
 

@@ -31,6 +31,8 @@ class Subject:
     """Which of the network's sides describes each moving image."""
     trusted: Sequence[bool]
     """Seeds that are good to a few pixels: recipe fast leaves the coarse levels out."""
+    reach_px: Sequence[float] = ()
+    """How far from its mapping each may lie, px of `fixed`; empty where nothing is known of that."""
     given_up: dict[int, float] = field(default_factory=dict)
     """Moving images whose patches could not be told apart at some level, and the retrieval there: nothing is learnt or
     refined for them."""
