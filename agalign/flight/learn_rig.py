@@ -168,7 +168,11 @@ class _Table:
                 found, _ = solve_factors(left, designs, others, counts)
                 error = left[:, j] - np.einsum("akf,cf->cak", designs[j] * counts, found)
                 squares[band] += (error**2).sum(axis=(1, 2))[self.weights[out, j] > 0].tolist()
-        return _root_mean(squares)
+        # The rig is learnt on one capture more than those that tell its errors.
+        seen = (self.weights > 0).sum(axis=0)
+        gained = np.sqrt((1 + 1 / seen) / (1 + 1 / np.maximum(seen - 1, 1)))
+        errors = _root_mean(squares)
+        return {b: errors[b] * float(g) for b, g in zip(self.bands, gained, strict=True)}
 
     @staticmethod
     def _beside(t: Array, delay: Array, counts: Array) -> Array:

@@ -153,9 +153,11 @@ class Rig:
             found, covariance, off = self._factors_of(known, others)
             if not self.factors:
                 return Prediction(mean, "flight", float(np.hypot(self.from_bands_px[band], off)))
-            # What bands missed in captures left out, errors of these factors, those of the baseline at factors beyond
-            # any seen, and what the others of this capture leave: one unlike all others shows there.
-            spread = float(np.einsum("akf,fg,akg->", here, covariance, here))
+            # What bands missed in captures left out, where all others were known; what these factors are known less,
+            # errors of the baseline at factors beyond any seen, and what the others of this capture leave: one unlike
+            # all others shows there.
+            spread = float(np.einsum("akf,fg,akg->", here, covariance - self._usual_covariance(band), here))
+            spread = max(0.0, spread)
             beyond = 2 * self.baseline_std[band] ** 2 * self._beyond(band, found)
             error = float(np.sqrt(self.from_bands_px[band] ** 2 + spread + beyond + off**2))
             return Prediction(moved(mean, here @ found, self.size_px), "bands", error)
@@ -254,6 +256,14 @@ class Rig:
         information = 1 / _CLIMB_STD_PX_PER_M**2 + float(((altitudes - altitudes.mean()) ** 2).sum()) / spread**2
         nearest = float(np.abs(altitudes - altitude_m).min())
         return nearest / float(np.sqrt(information)) + abs(float(slope)) * nearest
+
+    def _usual_covariance(self, band: str) -> Array:
+        """(5, 5) of the factors where all other bands of a capture are known well."""
+        bands = [b for b in self.mean if b != band]
+        designs = np.stack([self._design(b) for b in bands]) if bands else np.zeros((0, 2, 3, FACTORS))
+        weights = np.array([[weight(LEAST_STD_PX, self.from_bands_px[b]) for b in bands]])
+        _, covariance = solve_factors(np.zeros((1, len(bands), 2, 3)), designs, weights, used(self.factors))
+        return np.asarray(covariance[0])
 
     def _factors_of(self, known: Observation, bands: Sequence[str]) -> tuple[Array, Array, float]:
         """(factors (5,), their covariance (5, 5), by how much more they leave of most of these bands than of captures
