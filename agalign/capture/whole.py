@@ -35,6 +35,8 @@ _SPREADS = 2.0
 """A window that lies so many times farther out than most has half a vote."""
 _LEAST_SPREAD_PX = 0.05
 _REWEIGHTINGS = 6
+_NOTHING = 1e-9
+"""Of all that is known: what directions get of which nothing is."""
 _FREEDOM = 4.0
 """Of the t distribution by which a band may lie beside where the rig has it."""
 
@@ -137,8 +139,11 @@ def _of_windows(pair: BandPair, residual: Residual) -> Witness | None:
     if not np.abs(mean).max() <= _FARTHEST_PX:
         return None
     score = np.einsum("n,nki,nk->ni", weight, design, left)
-    inverse = np.linalg.pinv(normal, hermitian=True)
-    return Witness.of(mean, inverse @ (score.T @ score) @ inverse + _WINDOWS_STD_PX**2 * np.eye(8))
+    # Windows in a line agree, and say nothing of what lies beside it.
+    inverse = np.linalg.inv(normal + _NOTHING * np.trace(normal) * np.eye(8))
+    disagreement = inverse @ (score.T @ score) @ inverse
+    covariance = disagreement + (_LEAST_SPREAD_PX**2 / np.median(weight)) * inverse
+    return Witness.of(mean, np.asarray(covariance + _WINDOWS_STD_PX**2 * np.eye(8)))
 
 
 def _undistorted(pair: BandPair, raw_px: Array) -> Array:

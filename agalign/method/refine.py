@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from agalign.config import FastRecipe
@@ -221,7 +222,7 @@ def refine(state: JointState, net: Descriptor, subject: Subject, *, move: bool =
         held_out, chance = retrieval(band, found, test, f_test, recipe.least_negative_px)
         return JointResult(
             matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
-            step.corner_covariance_px2.cpu().numpy() + recipe.systematic_std_px**2 * np.eye(8),
+            _complete_covariance(step, recipe),
         )  # fmt: skip
 
     return [
@@ -236,3 +237,9 @@ def _complete_std(step: Step, recipe: FastRecipe) -> tuple[tuple[float, float], 
     """Random and systematic parts together."""
     systematic = recipe.systematic_std_px
     return tuple((math.hypot(x, systematic), math.hypot(y, systematic)) for x, y in step.corner_std_xy_px)
+
+
+def _complete_covariance(step: Step, recipe: FastRecipe) -> NDArray[np.float64] | None:
+    """The same of all corners together; None where it is not finite."""
+    random = step.corner_covariance_px2.cpu().numpy()
+    return random + recipe.systematic_std_px**2 * np.eye(8) if np.isfinite(random).all() else None

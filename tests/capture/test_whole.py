@@ -100,3 +100,16 @@ def test_windows_mend_what_the_descriptors_left() -> None:
     assert geometry.corner_error_px(off, truth, *SIZE) > 0.2
     assert geometry.corner_error_px(after.fixed_to_moving, truth, *SIZE) < 0.08
     assert after.corner_std_px < 0.1
+
+
+def test_windows_in_a_line_say_nothing_of_what_lies_beside_it() -> None:
+    x = np.linspace(40.0, 600.0, 20)
+    centres = np.column_stack([x, np.full(20, 240.0)])
+    rng = np.random.default_rng(0)
+    shifts = np.array([0.3, 0.0]) + 0.02 * rng.normal(size=(20, 2))
+    shown = Residual(centres, shifts, 0.3, 0.35, 1.0, np.full(20, 20.0))
+    unsure = result(np.zeros((4, 2)), np.full((4, 2), 2.0))
+    found = most_probable(pairs()[:1], {"red": unsure}, {"red": shown}, None)["red"]
+    middle = geometry.apply(found.fixed_to_moving, [320.0, 240.0]) - geometry.apply(MEAN, [320.0, 240.0])
+    np.testing.assert_allclose(middle, [0.3, 0.0], atol=0.05)
+    assert found.corner_std_px > 0.5
