@@ -183,10 +183,6 @@ class CheckSettings(Stage):
     """where they are also this share of those measured."""
     most_rival: float = 0.75
     """Height of the next correlation peak over that of the place found, from which the scene is taken to repeat."""
-    least_rival: float = 0.4
-    """The same from which it is taken to repeat if what is known beforehand leaves one place only."""
-    most_repeating_px: float = 4.0
-    """How far windows of a scene that repeats are looked for, once its place is known."""
     least_windows: Positive = 4
     least_seed_coverage: float = 0.3
     """The same as `least_coverage` for a seed that is used as it is."""

@@ -19,8 +19,6 @@ from agalign.values.mapping import PixelMapping
 _AS_FILES_LIE: tuple[SeedKind, ...] = ("geo", "identity")
 """Seeds that change nothing: an input aligned already is left untouched, not resampled by a hundredth of a pixel."""
 
-_OF_WINDOWS = ("few_windows", "coverage", "close_windows", "cluster", "residual_px")
-
 
 def without_result(seed: Seed, space: Space, doubt: Doubt) -> Alignment:
     """The failed alignment of a pair that could not be tried."""
@@ -38,15 +36,13 @@ def judged(pair: BandPair, seed: Seed, result: JointResult | Doubt, settings: Se
         joint = _snapped(result, pair, check)
         found = pair.mapping(joint.fixed_to_moving)
         there, residual = _laid(pair, found)
-        doubts = doubts_of(joint, residual, size_px, check)
-        if all(d.kind in _OF_WINDOWS for d in doubts):
-            doubts, residual = _in_a_scene_that_repeats(pair, joint, there, doubts, residual, check)
+        doubts = doubts_of(joint, residual, size_px, check) or _repeats(pair, joint, there, check)
         if settings.local.is_wanted_for(doubts, rig_known=pair.is_known_to_a_rig):
             local = pair.reference.local.refine(single(pair.moving_image), found)
             if local.field is not None:
                 bent = replace(found, local=local.field)
                 laid, left = _laid(pair, bent)
-                still = doubts_of(joint, left, size_px, check)
+                still = doubts_of(joint, left, size_px, check) or _repeats(pair, joint, laid, check)
                 # The verdict is asked again: what a field makes worse, or no better, is not aligned by it.
                 if still:
                     local = LocalResult(None, local.before_p95_px, local.after_p95_px)
@@ -81,25 +77,17 @@ def as_predicted(alignment: Alignment, pair: BandPair, prediction: Prediction) -
     return _with_metrics(moved, pair, there)
 
 
-def _in_a_scene_that_repeats(
-    pair: BandPair, joint: JointResult, there: Raster, doubts: tuple[Doubt, ...], residual: Residual,
-    check: CheckSettings,
-) -> tuple[tuple[Doubt, ...], Residual]:  # fmt: skip
-    """A doubt more where another place fits nearly as well and nothing that was known beforehand rules it out.
-
-    Where it is ruled out, windows are looked at again within a part of the period: they see it repeat too.
-    """
+def _repeats(pair: BandPair, joint: JointResult, there: Raster, check: CheckSettings) -> tuple[Doubt, ...]:
+    """A doubt where another place fits nearly as well and nothing that was known beforehand rules it out."""
     small = shrink(there, pair.reference.seed_size_px)
     spectrum = windowed_spectra(structure_field(small, pair.reference.settings.seed.smoothing_px))
     rival = rival_of(pair.reference.seed_spectrum, spectrum)
-    if rival.share <= check.least_rival:
-        return doubts, residual
+    if rival.share <= check.most_rival:
+        return ()
     x, y = (s / scale for s, scale in zip(rival.shift_px, pair.reference.seed_scale, strict=True))
-    if not pair.is_expected(joint.fixed_to_moving) or pair.is_expected(joint.fixed_to_moving, (x, y)):
-        told = (Doubt("repeats", math.hypot(x, y)),) if rival.share > check.most_rival else ()
-        return (*doubts, *told), residual
-    near = pair.reference.windows.residuals(there, within_px=min(check.most_repeating_px, 0.4 * math.hypot(x, y)))
-    return doubts_of(joint, near, pair.fixed.size_px, check), near
+    if pair.is_expected(joint.fixed_to_moving) and not pair.is_expected(joint.fixed_to_moving, (x, y)):
+        return ()
+    return (Doubt("repeats", math.hypot(x, y)),)
 
 
 def _with_metrics(alignment: Alignment, pair: BandPair, there: Raster) -> Alignment:

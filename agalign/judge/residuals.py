@@ -30,9 +30,8 @@ class FixedWindows:
         self.origins = [o for o, s in zip(origins, strengths, strict=False) if s >= settings.least_strength]
         self.spectra = windowed_spectra(self._windows(structure, self.origins))
 
-    def residuals(self, moving: Raster, least_valid: float = 0.9, within_px: float = np.inf) -> Residual:
-        """The shift of each window's content; a window counts as measured where its peak stands out. Where a scene
-        repeats, shifts are looked for `within_px` only.
+    def residuals(self, moving: Raster, least_valid: float = 0.9) -> Residual:
+        """The shift of each window's content; a window counts as measured where its peak stands out.
 
         It is looked at where this share of it is valid in both. What is not valid holds no structure, but its outline
         pulls at the shift: by some tenths of a px in windows of 64 px of which a twentieth is missing.
@@ -46,7 +45,7 @@ class FixedWindows:
         ]  # fmt: skip
         origins = [self.origins[i] for i in tried]
         cross = half_whitened(self.spectra[tried], windowed_spectra(self._windows(field, origins)))
-        found, sigma = _peaks(cross, self.settings.least_peak_sigma, within_px)
+        found, sigma = _peaks(cross, self.settings.least_peak_sigma)
         measured = np.isfinite(found[:, 0])
         length = np.linalg.norm(found[measured], axis=1)
         some = bool(measured.any())
@@ -83,12 +82,11 @@ def _starts(length: int, side: int, step: int | None) -> list[int]:
     return [round(v) for v in np.linspace(0, max(0, length - side), count)]
 
 
-def _peaks(cross: Field, least_sigma: float, within_px: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _peaks(cross: Field, least_sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """((n, 2) shifts, nan where no peak stands out; (n,) heights in standard deviations) of cross spectra."""
     count, height, width = cross.shape
     surfaces = fft.ifft2(cross).real.reshape(count, -1)
-    far = np.hypot(np.fft.fftfreq(height, 1 / height)[:, None], np.fft.fftfreq(width, 1 / width)).ravel() > within_px
-    highest = np.where(far, -np.inf, surfaces).argmax(axis=1) if far.any() else surfaces.argmax(axis=1)
+    highest = surfaces.argmax(axis=1)
     # Their means are 0: the windows have none.
     spread = np.sqrt(np.einsum("ni,ni->n", surfaces, surfaces) / (height * width))
     sigma = surfaces[np.arange(count), highest] / np.where(spread > 0, spread, np.inf)
