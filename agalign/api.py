@@ -10,6 +10,7 @@ from agalign.batch.capture import CaptureOutcome, process_capture, quiet
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.align import align_pairs
 from agalign.capture.band_pair import BandPair, Candidates
+from agalign.capture.evidence import with_metrics
 from agalign.config import Settings
 from agalign.errors import InputError
 from agalign.pixels.masks import raster_of
@@ -56,7 +57,7 @@ def align(
         candidates = {"user": geometry.normalised(seed)}
     known: dict[SeedKind, float] = {} if seed_std_px is None else {"user": seed_std_px}
     pair = BandPair.of_images("moving", one, other, candidates, settings, known)
-    return align_pairs([pair], settings, quiet)["moving"]
+    return with_metrics(align_pairs([pair], settings, quiet)["moving"], pair)
 
 
 def warp_onto(

@@ -74,7 +74,7 @@ class FastRecipe(Stage):
     first_patches: Positive = 200
     """Patches at full resolution while psi is not at rest."""
     final_steps: Positive = 10
-    final_rest_px: float = 0.01
+    final_rest_px: float = 0.03
     """psi has converged when a step moves no corner by more than this."""
     systematic_std_px: float = 0.035
     """Added in quadrature to the standard deviations along x and y: what the curvature cannot see, such as a bias

@@ -19,7 +19,7 @@ from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import LEAST_CAPTURES, Observation, Rig, median_mapping
 from agalign.judge.local import common_field
-from agalign.method.device import one_memory_error, one_thread
+from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
 from agalign.method.refine import refine
 from agalign.method.starter import start_from
@@ -40,6 +40,7 @@ def learn_flight(
 
     With `start`, its network is where theta starts; its last side is where bands start that it does not know.
     """
+    keep_freed_memory()
     loaded = _load(captures, settings, start)
     if not loaded:
         return None

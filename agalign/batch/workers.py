@@ -19,7 +19,7 @@ from agalign.capture.align import PairProgress
 from agalign.config import Settings
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.flight.model import FlightModel, load_model
-from agalign.method.device import choose_device, limit_threads, one_memory_error, one_thread
+from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
 from agalign.products.sidecar import Sidecar
 from agalign.values.capture import Capture
 
@@ -81,6 +81,7 @@ class Task:
 def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     """Do one capture; what can go wrong with it is in the report."""
     label = task.capture.label
+    keep_freed_memory()
     try:
         device = task.settings.joint.device
         model = None if task.model is None else loaded_model(task.model, device, stamp(task.model))

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.evidence import judged, windows_under, without_result
+from agalign.capture.evidence import Look, judged, with_metrics, without_result
 from agalign.capture.prediction import with_predictions, worth_learning
 from agalign.capture.seeding import find_seed, subject_of, unscored
 from agalign.capture.whole import most_probable
@@ -38,6 +38,7 @@ def align_capture_bands(
     aligned = align_pairs(pairs, settings, progress, model, capture)
     if model is not None and model.rig is not None and not settings.seed.only:
         aligned = with_predictions(pairs, aligned, model.rig, capture, settings.check)
+    aligned = _measured(pairs, aligned)
     found: dict[str, Alignment] = {}
     for band in capture.bands_of_the_references_lens:
         unmoved = Seed("identity", geometry.identity(), 0.0)
@@ -51,6 +52,15 @@ def align_capture_bands(
             lying = Seed("identity", geometry.overlay(reference.size_px, band.size_px), 0.0)
             found[band.name] = without_result(lying, "pixel", left_out[band.name])
     return {band.name: found[band.name] for band in capture.moving}
+
+
+def _measured(pairs: Sequence[BandPair], found: dict[str, Alignment]) -> dict[str, Alignment]:
+    """With metrics, whose time is the pair's too."""
+    watch, measured = _Watch(), {}
+    for pair in pairs:
+        measured[pair.name] = with_metrics(found[pair.name], pair)
+        watch.lap([pair.name])
+    return watch.added_to(measured)
 
 
 @one_thread()
@@ -78,14 +88,19 @@ def align_pairs(
         asked = Doubt("seed_asked_for")
         found |= {pair.name: judged(pair, seed, asked, settings) for pair, seed in starts}
         watch.lap([pair.name for pair, _ in starts])
-        return watch.timed(found)
+        return watch.added_to(found)
 
     def attempt(some: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
-        results = _whole(some, _results(some, sides, align, progress), model, settings)
+        results = _results(some, sides, align, progress)
+        looks = [
+            Look.at(pair, pair.mapping(result.fixed_to_moving)) if isinstance(result, JointResult) else None
+            for (pair, _), result in zip(some, results, strict=True)
+        ]
+        results = _whole(some, results, looks, model, settings)
         watch.lap([pair.name for pair, _ in some])
-        for (pair, seed), result in zip(some, results, strict=True):
+        for (pair, seed), result, look in zip(some, results, looks, strict=True):
             progress(pair.name, "checking", 0.0)
-            found[pair.name] = judged(pair, seed, result, settings)
+            found[pair.name] = judged(pair, seed, result, settings, look)
             watch.lap([pair.name])
 
     if model is not None and settings.joint.recipe == "fast":
@@ -94,13 +109,13 @@ def align_pairs(
         sides = [model.side(pair.name) or 0 for pair, _ in known]
         attempt(known, sides, lambda subject, report: refine_with(net, subject, settings.joint, report))
     left = [s for s in starts if s[0].name not in found or found[s[0].name].status != "aligned"]
-    if model is not None and model.rig is not None and capture is not None:
+    if left and model is not None and model.rig is not None and capture is not None:
         worth = worth_learning(pairs, found, model.rig, capture, settings.check)
         left = [s for s in left if s[0].name in worth]
     if not scratch:
         left = [s for s in left if s[0].name not in found]
     attempt(left, [], lambda subject, report: align_from_scratch(subject, settings.joint, report))
-    return watch.timed(found)
+    return watch.added_to(found)
 
 
 def _results(
@@ -128,16 +143,18 @@ def _results(
 
 
 def _whole(
-    starts: Sequence[Start], results: Sequence[JointResult | Doubt], model: FlightModel | None, settings: Settings
-) -> list[JointResult | Doubt]:
+    starts: Sequence[Start], results: Sequence[JointResult | Doubt], looks: Sequence[Look | None],
+    model: FlightModel | None, settings: Settings,
+) -> list[JointResult | Doubt]:  # fmt: skip
     """The results moved to what is most probable of all bands of the capture together."""
     if settings.joint.model_family not in ("auto", "homography"):
         return list(results)  # what was asked for is not left
-    pairs = {pair.name: pair for pair, _ in starts}
-    found = {name: r for name, r in zip(pairs, results, strict=True) if isinstance(r, JointResult)}
-    shown = {name: windows_under(pairs[name], result) for name, result in found.items()}
-    better = most_probable(list(pairs.values()), found, shown, None if model is None else model.rig)
-    return [better[name] if isinstance(r, JointResult) else r for name, r in zip(pairs, results, strict=True)]
+    names = [pair.name for pair, _ in starts]
+    found = {name: r for name, r in zip(names, results, strict=True) if isinstance(r, JointResult)}
+    shown = {name: look.residual for name, look in zip(names, looks, strict=True) if look is not None}
+    rig = None if model is None else model.rig
+    better = most_probable([pair for pair, _ in starts], found, shown, rig)
+    return [better[name] if isinstance(r, JointResult) else r for name, r in zip(names, results, strict=True)]
 
 
 class _Watch:
@@ -154,5 +171,5 @@ class _Watch:
             self._seconds[name] = self._seconds.get(name, 0.0) + (now - self._since) / len(names)
         self._since = now
 
-    def timed(self, found: dict[str, Alignment]) -> dict[str, Alignment]:
-        return {name: replace(a, seconds=self._seconds.get(name, 0.0)) for name, a in found.items()}
+    def added_to(self, found: dict[str, Alignment]) -> dict[str, Alignment]:
+        return {name: replace(a, seconds=a.seconds + self._seconds.get(name, 0.0)) for name, a in found.items()}

@@ -1,7 +1,11 @@
 """How alike two bands on one grid are, by the measures that Elastix and others have made common.
 
-All of them are deterministic and use every pixel of the common valid area.
+All of them are deterministic. Gradients and local moments are those of the images at full resolution; sums run over
+the common valid pixels, of large images those of a regular lattice, which holds a quarter of a million or more.
 """
+
+from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -14,7 +18,10 @@ _RANGE_MARGIN = 0.01
 _FINE = 64
 """Moving values are counted in 64ths of a bin before the spline is applied: exact to 1/128 bin."""
 _LEAST_PIXELS = 256
+_ENOUGH_PIXELS = 250_000
 _SSIM_WINDOW_PX = 11
+_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
+"""Of SSIM, for a range of 1."""
 
 
 class FixedSimilarity:
@@ -22,8 +29,10 @@ class FixedSimilarity:
 
     def __init__(self, fixed: Raster) -> None:
         self.fixed = fixed
-        self.gradient = _Gradient(fixed.pixels)
-        self.bins = fixed_bins(fixed.pixels, _range(fixed.pixels[fixed.valid]))
+        step = max(1, int((fixed.pixels.size / _ENOUGH_PIXELS) ** 0.5))
+        self.lattice = np.s_[step // 2 :: step, step // 2 :: step]
+        self.gradient = _Gradient.of(fixed.pixels, self.lattice)
+        self.bins = fixed_bins(fixed.pixels[self.lattice], _range(fixed.pixels, fixed.valid))
 
     def to(self, moving: Raster) -> dict[str, float]:
         """All similarity metrics over the pixels that are valid in both.
@@ -33,30 +42,24 @@ class FixedSimilarity:
         gradient_correlation is Pearson's coefficient of the gradient magnitudes, structure_ssim the SSIM (Wang et
         al. 2004, 11 px Gaussian window) of the standardised ones: contrast reversal lowers neither.
         """
-        valid = self.fixed.valid & moving.valid
-        overlap = float(valid.mean())
+        both = self.fixed.valid & moving.valid
+        overlap = float(both.mean())
+        valid = both[self.lattice]
         if np.count_nonzero(valid) < _LEAST_PIXELS:
             return {"overlap": overlap}
-        one, other = (_inside(r.pixels, valid) for r in (self.fixed, moving))
-        joint = joint_histogram(self.bins.ravel() if valid.all() else self.bins[valid], other)
-        gradient = _Gradient(moving.pixels)
-        beside = _eroded(valid, 3)
+        one, other = (r.pixels[self.lattice][valid] for r in (self.fixed, moving))
+        joint = joint_histogram(self.bins[valid], other, _range(moving.pixels, both))
+        gradient = _Gradient.of(moving.pixels, self.lattice)
+        beside = _eroded(both, 3)[self.lattice]
         some = bool(beside.any())
         return {
             "mattes_mi": -mutual_information(joint),
             "nmi": normalised_mutual_information(joint),
             "ncc": correlation(one, other),
-            "gradient_correlation": correlation(
-                _inside(self.gradient.magnitude, beside), _inside(gradient.magnitude, beside)
-            ) if some else 0.0,
-            "structure_ssim": _ssim(self.gradient, gradient, valid),
+            "gradient_correlation": correlation(self.gradient.here[beside], gradient.here[beside]) if some else 0.0,
+            "structure_ssim": _ssim(self.gradient, gradient, valid, _eroded(both, _SSIM_WINDOW_PX)[self.lattice]),
             "overlap": overlap,
         }  # fmt: skip
-
-
-def _inside(image: FloatImage, valid: Mask) -> NDArray[np.float32]:
-    """The valid pixels, (n,)."""
-    return image.ravel() if valid.all() else image[valid]
 
 
 def _eroded(valid: Mask, side_px: int) -> Mask:
@@ -71,24 +74,35 @@ def fixed_bins(fixed: NDArray[np.float32], limits: tuple[float, float]) -> NDArr
     return (_bin_position(fixed, limits, padding=0) + 0.5).astype(np.int32)
 
 
-def joint_histogram(bins: NDArray[np.int32], moving: NDArray[np.float32]) -> NDArray[np.float64]:
+def joint_histogram(
+    bins: NDArray[np.int32], moving: NDArray[np.float32], limits: tuple[float, float]
+) -> NDArray[np.float64]:
     """Elastix's joint density of two samples (n,): (32, 32), sums to 1, fixed along rows.
 
-    `bins` are the `fixed_bins` of the fixed sample. Each range is widened by 1 % on both sides. The fixed kernel is of
+    `bins` are the `fixed_bins` of the fixed sample, `limits` the moving image's smallest and largest values. Each range is widened by 1 % on both sides. The fixed kernel is of
     order 0 (a box), the moving one the cubic B-spline, whose support costs the moving axis a bin of padding at either
     end (Klein et al. 2010; Mattes 2003).
     """
-    moving_fine = (_bin_position(moving, _range(moving), padding=1) * _FINE).astype(np.int32)
+    moving_fine = (_bin_position(moving, limits, padding=1) * _FINE).astype(np.int32)
     counts = np.bincount(bins * (_BINS * _FINE) + moving_fine, minlength=_BINS * _BINS * _FINE)
     counts = counts.reshape(_BINS, _BINS * _FINE)
-    occupied = (np.arange(_BINS * _FINE) + 0.5) / _FINE
-    kernel = cubic_spline(occupied[:, None] - np.arange(_BINS)[None, :])
-    density = counts @ kernel
+    density = counts @ _kernel()
     return np.asarray(density / density.sum())
 
 
-def _range(values: NDArray[np.float32]) -> tuple[float, float]:
-    return (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
+@cache
+def _kernel() -> NDArray[np.float64]:
+    """(32 x 64, 32): what a value counted in a 64th of a bin gives to each bin."""
+    occupied = (np.arange(_BINS * _FINE) + 0.5) / _FINE
+    return cubic_spline(occupied[:, None] - np.arange(_BINS)[None, :])
+
+
+def _range(image: FloatImage, valid: Mask) -> tuple[float, float]:
+    """The smallest and the largest valid value; (0, 1) where there is none."""
+    if not valid.any():
+        return 0.0, 1.0
+    low, high, _, _ = cv2.minMaxLoc(image, mask=valid.view(np.uint8))
+    return low, high
 
 
 def _bin_position(values: NDArray[np.float32], limits: tuple[float, float], padding: int) -> NDArray[np.float32]:
@@ -126,39 +140,49 @@ def _entropy(p: NDArray[np.float64]) -> float:
 def correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     """Pearson's coefficient of two samples (n,); 0 where either is constant."""
     centred = [x - np.float32(x.mean(dtype=np.float64)) for x in (a, b)]
-    aa, bb, ab = (np.einsum("i,i->", centred[i], centred[j], dtype=np.float64) for i, j in ((0, 0), (1, 1), (0, 1)))
+    aa, bb, ab = (float(centred[i] @ centred[j]) for i, j in ((0, 0), (1, 1), (0, 1)))
     spread = float(np.sqrt(aa * bb))
     return float(ab / spread) if spread > 0 else 0.0
 
 
+@dataclass(frozen=True)
 class _Gradient:
-    """An image's gradient magnitude with its local mean and variance."""
+    """An image's gradient magnitude; on the lattice, its local mean and variance too."""
 
-    def __init__(self, image: FloatImage) -> None:
+    lattice: tuple[slice, slice]
+    magnitude: FloatImage
+    here: FloatImage
+    local_mean: FloatImage
+    local_variance: FloatImage
+
+    @classmethod
+    def of(cls, image: FloatImage, lattice: tuple[slice, slice]) -> "_Gradient":
         gx, gy = (cv2.Sobel(image, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
-        self.magnitude = np.asarray(cv2.magnitude(gx, gy), np.float32)
-        self.local_mean = _blur(self.magnitude)
-        self.local_variance = _blur(self.magnitude * self.magnitude) - self.local_mean * self.local_mean
+        magnitude = np.asarray(cv2.magnitude(gx, gy), np.float32)
+        mean, square = (_blur(x)[lattice] for x in (magnitude, magnitude * magnitude))
+        return cls(lattice, magnitude, magnitude[lattice], mean, square - mean * mean)
 
 
-def _ssim(one: _Gradient, other: _Gradient, valid: Mask) -> float:
-    """SSIM of the two magnitudes, each brought to mean 0 and standard deviation 1 over the valid pixels; the local
-    moments of the standardised images follow from those of the images.
+def _ssim(one: _Gradient, other: _Gradient, valid: Mask, inside: Mask) -> float:
+    """SSIM of the two magnitudes, each brought to mean 0 and standard deviation 1 over the `valid` pixels, where its
+    windows lie `inside` both images; the standardised images' local moments follow from those of the images.
     """
-    inside = _eroded(valid, _SSIM_WINDOW_PX).view(np.uint8)
-    moments = [cv2.meanStdDev(g.magnitude, mask=valid.view(np.uint8)) for g in (one, other)]
-    means = [float(mean.item()) for mean, _ in moments]
-    deviations = [max(float(deviation.item()), 1e-12) for _, deviation in moments]
-    mean_a, mean_b = (
-        (g.local_mean - np.float32(m)) / np.float32(s) for g, m, s in zip((one, other), means, deviations, strict=True)
-    )
-    covariance = _blur(one.magnitude * other.magnitude) - one.local_mean * other.local_mean
-    covariance /= np.float32(deviations[0] * deviations[1])
-    c1, c2 = np.float32(0.01**2), np.float32(0.03**2)
-    ssim = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
-    variances = sum(g.local_variance / np.float32(s * s) for g, s in zip((one, other), deviations, strict=True))
-    ssim /= (mean_a * mean_a + mean_b * mean_b + c1) * (variances + c2)
-    return float(cv2.mean(ssim, mask=inside)[0])
+    if not inside.any():
+        return 0.0
+    (mean_a, by_a), (mean_b, by_b) = (_standard(g.here[valid]) for g in (one, other))
+    a, b = (g.local_mean[inside] for g in (one, other))
+    product = _blur(one.magnitude * other.magnitude)[one.lattice][inside]
+    covariance = (by_a * by_b) * (product - a * b)
+    a, b = by_a * (a - mean_a), by_b * (b - mean_b)
+    variances = by_a**2 * one.local_variance[inside] + by_b**2 * other.local_variance[inside]
+    ssim = (2 * a * b + _C1) * (2 * covariance + _C2) / ((a * a + b * b + _C1) * (variances + _C2))
+    return float(ssim.mean(dtype=np.float64))
+
+
+def _standard(values: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
+    """(mean, 1 / standard deviation)."""
+    mean, deviation = values.mean(dtype=np.float64), values.std(dtype=np.float64)
+    return np.float32(mean), np.float32(1 / max(deviation, 1e-12))
 
 
 def _blur(image: FloatImage) -> FloatImage:

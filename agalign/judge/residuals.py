@@ -11,6 +11,9 @@ from agalign.config import CheckSettings
 from agalign.pixels.structure import Field, half_whitened, structure_field, tops, windowed_spectra
 from agalign.values.alignment import Residual
 from agalign.values.image import Mask, Raster
+from agalign.values.mapping import PixelMapping
+
+_Origin = tuple[int, int]
 
 
 class FixedWindows:
@@ -25,10 +28,8 @@ class FixedWindows:
         height, width = valid.shape
         self.side = max(32, min(settings.tile_px, width // 4, height // 4))
         origins = [(x, y) for y in _starts(height, self.side, step_px) for x in _starts(width, self.side, step_px)]
-        fits = min(width, height) >= self.side
-        strengths = [_strength(self._cut(structure, o)) for o in origins] if fits else []
-        self.origins = [o for o, s in zip(origins, strengths, strict=False) if s >= settings.least_strength]
-        self.spectra = windowed_spectra(self._windows(structure, self.origins))
+        self.origins, windows = self._strong(structure, origins if min(width, height) >= self.side else [])
+        self.spectra = windowed_spectra(windows)
 
     def residuals(self, moving: Raster, least_valid: float = 0.9) -> Residual:
         """The shift of each window's content; a window counts as measured where its peak stands out.
@@ -38,43 +39,45 @@ class FixedWindows:
         """
         both = self.valid & moving.valid
         field = structure_field(moving, self.settings.smoothing_px)
-        tried = [
-            i for i, o in enumerate(self.origins)
-            if self._cut(both, o).mean() >= least_valid
-            and _strength(self._cut(field, o)) >= self.settings.least_strength
-        ]  # fmt: skip
-        origins = [self.origins[i] for i in tried]
-        cross = half_whitened(self.spectra[tried], windowed_spectra(self._windows(field, origins)))
+        least = least_valid * self.side**2
+        valid = [o for o in self.origins if np.count_nonzero(self._cut(both, o)) >= least]
+        origins, windows = self._strong(field, valid)
+        rows = {o: i for i, o in enumerate(self.origins)}
+        tried = self.spectra if len(origins) == len(rows) else self.spectra[[rows[o] for o in origins]]
+        cross = half_whitened(tried, windowed_spectra(windows))
         found, sigma = _peaks(cross, self.settings.least_peak_sigma)
-        measured = np.isfinite(found[:, 0])
-        length = np.linalg.norm(found[measured], axis=1)
-        some = bool(measured.any())
-        return Residual(
-            centres_px=np.array(origins, dtype=np.float64).reshape(-1, 2) + (self.side - 1) / 2,
-            shifts_px=found,
-            median_px=float(np.median(length)) if some else float("inf"),
-            p95_px=float(np.percentile(length, 95)) if some else float("inf"),
-            coverage=float(measured.mean()) if tried else 0.0,
-            peaks_sigma=sigma,
-        )
+        centres_px = np.array(origins, dtype=np.float64).reshape(-1, 2) + (self.side - 1) / 2
+        return Residual.of(centres_px, found, sigma)
 
-    def _cut(self, image: NDArray[Any], origin: tuple[int, int]) -> NDArray[Any]:
+    def _cut(self, image: NDArray[Any], origin: _Origin) -> NDArray[Any]:
         x, y = origin
         return image[y : y + self.side, x : x + self.side]
 
-    def _windows(self, field: Field, origins: list[tuple[int, int]]) -> Field:
-        """(n, side, side), each without its mean: the mean orientation of a row crop is the same everywhere and tells
-        no place from another.
+    def _strong(self, field: Field, origins: list[_Origin]) -> tuple[list[_Origin], Field]:
+        """(those of the windows that hold structure; their content (n, side, side), each without its mean: the mean
+        orientation of a row crop is the same everywhere and tells no place from another).
         """
         cut = np.empty((len(origins), self.side, self.side), np.complex64)
         for window, origin in zip(cut, origins, strict=True):
-            piece = self._cut(field, origin)
-            np.subtract(piece, piece.mean(), out=window)
-        return cut
+            window[:] = self._cut(field, origin)
+        strong = np.abs(cut[:, ::2, ::2]).mean(axis=(1, 2)) >= self.settings.least_strength
+        if not strong.all():
+            cut = cut[strong]
+        cut -= cut.mean(axis=(1, 2), keepdims=True)
+        return [o for o, s in zip(origins, strong, strict=True) if s], cut
 
 
-def _strength(window: Field) -> float:
-    return float(np.abs(window[::2, ::2]).mean())
+def moved(residual: Residual, before: PixelMapping, after: PixelMapping) -> Residual:
+    """The shifts of windows that were looked at under one mapping, as another one that is all but equal leaves them.
+
+    What lies at p + s of the fixed image under the one lies at p + s - d under the other, with before(p + s) =
+    after(p + s - d); d to first order in the difference of the two.
+    """
+    shifts = residual.shifts_px
+    at = residual.centres_px + np.nan_to_num(shifts)
+    slopes = np.stack([before(at + e) - before(at - e) for e in 0.5 * np.eye(2)], axis=-1)
+    farther = np.linalg.solve(slopes, (after(at) - before(at))[..., None])[..., 0]
+    return Residual.of(residual.centres_px, shifts - farther, residual.peaks_sigma)
 
 
 def _starts(length: int, side: int, step: int | None) -> list[int]:

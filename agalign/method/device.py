@@ -1,8 +1,10 @@
 """Where the tensors live, with how many threads, and what to make of it when they do not fit."""
 
+import ctypes
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 
 import cv2
 import torch
@@ -37,6 +39,21 @@ def limit_threads(count: int) -> None:
     """Let torch and OpenCV use this many threads from now on."""
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
+
+
+_LARGEST_KEPT_BYTES, _MOST_KEPT_BYTES = 32 << 20, 256 << 20
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+
+
+@cache
+def keep_freed_memory() -> None:
+    """Let this process keep what arrays leave: glibc gives large ones back to the system at once, and a new one costs
+    a page fault every 4 KB, which takes longer than to fill it. Other systems' allocators are left as they are.
+    """
+    with suppress(OSError, AttributeError, TypeError):
+        allocator = ctypes.CDLL(None)
+        allocator.mallopt(_M_MMAP_THRESHOLD, _LARGEST_KEPT_BYTES)
+        allocator.mallopt(_M_TRIM_THRESHOLD, _MOST_KEPT_BYTES)
 
 
 _lock = threading.Lock()

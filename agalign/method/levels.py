@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -162,9 +163,9 @@ def make_level(
     gradient = _gradient_magnitude(fixed_view.image.cpu().numpy())
     room = fixed_view.room_px.cpu().numpy()
     usable_px = (gradient > least_gradient) & (room > FOOTPRINT_PX)
-    reserved = _reserved_cells(*fixed_view.size_px)
     trainable, held_out = (
-        _pool(usable_px, cells, fixed_view.lens, generator, device) for cells in (~reserved, reserved)
+        _pool(usable_px, reach_px, fixed_view.lens, generator, device)
+        for reach_px in _reach_within_cells(*fixed_view.size_px)
     )
     xy = torch.cat([trainable.xy, held_out.xy])
     anywhere = Pool(xy, torch.full_like(xy[:, 0], math.inf))
@@ -237,9 +238,23 @@ def _reserved_cells(width_px: int, height_px: int) -> Mask:
     return np.asarray(column[None, :] == (-2 * row % 5)[:, None])
 
 
-def _pool(usable: Mask, cells: Mask, model: Lens | None, generator: torch.Generator, device: torch.device) -> Pool:
-    """Up to _POOL of the usable pixels in some cells, at least as far from all others as the smallest patch reaches."""
-    reach_px = np.asarray(cv2.distanceTransform(cells.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+@lru_cache(maxsize=2)
+def _reach_within_cells(width_px: int, height_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Distance from each pixel, (height, width), to the nearest one of the other kind of cells: in the cells for
+    training, and in the reserved ones; 0 elsewhere.
+    """
+    reserved = _reserved_cells(width_px, height_px)
+    training, held_out = (
+        np.asarray(cv2.distanceTransform(c.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+        for c in (~reserved, reserved)
+    )
+    return training, held_out
+
+
+def _pool(
+    usable: Mask, reach_px: NDArray[np.float32], model: Lens | None, generator: torch.Generator, device: torch.device
+) -> Pool:
+    """Up to _POOL of the usable pixels from which the smallest patch, and some more, can reach so far."""
     found = np.flatnonzero(usable & (reach_px > FOOTPRINT_PX + 1))
     if len(found) > _POOL:
         found = found[torch.randint(len(found), (_POOL,), generator=generator).numpy()]

@@ -28,6 +28,8 @@ from agalign.values.doubts import Doubt
 
 LEAST_KEYPOINTS = 16
 _FIRST_PATCHES, _LIKELY_SHIFTS, _AT_ONCE = 32, 64, 16
+_MOST_RATIO = 0.6
+"""Of one step to the one before, for what follows to be believed a geometric series."""
 _PLAIN_GAIN = 3.0
 """Standard errors by which a loss must be less to count."""
 
@@ -113,22 +115,26 @@ class Solver:
     def converge(self, band: MovingBand, start: Tensor, anchors: Anchors) -> tuple[Tensor, Step]:
         """Steps from `start` until one moves no corner by more than `final_rest_px`.
 
-        While the steps are long, a part of the anchors tells where to go.
+        While the steps are long, a part of the anchors tells where to go. Steps of all of them become shorter by a
+        constant ratio, so that every second one is lengthened by what those to come would add (Aitken 1926).
         """
-        h, some = start, anchors.head(self.recipe.first_patches)
+        h, some, before = start, anchors.head(self.recipe.first_patches), math.inf
         for _ in range(self.recipe.final_steps):
             step = self.step(band, h, some)
-            h = moved(h, step)
+            ratio = min(step.length_px / before, _MOST_RATIO)
+            h = moved(h, step, 1 / (1 - ratio))
             if step.length_px < self.recipe.final_rest_px and some is anchors:
                 break
+            before = step.length_px if some is anchors and ratio == 0 else math.inf
             if step.length_px < self.recipe.rest_px:
                 some = anchors
         return h, step
 
 
-def moved(homography: Tensor, step: Step) -> Tensor:
-    """H <- H @ change, (3, 3) float32."""
-    return (exact(homography) @ step.change).to(homography)
+def moved(homography: Tensor, step: Step, times: float = 1.0) -> Tensor:
+    """H <- H @ change, (3, 3) float32; psi, in which the change is linear, so many times as far."""
+    unmoved = torch.eye(3, dtype=step.change.dtype, device=step.change.device)
+    return (exact(homography) @ (unmoved + times * (step.change - unmoved))).to(homography)
 
 
 @torch.no_grad()

@@ -28,6 +28,8 @@ _FLAGS: dict[str, int] = {
 _SUPPORT_PX = 4
 """Half width of the widest interpolation kernel."""
 _SAMPLE_PX = 16
+_NOWHERE = -1e6
+"""Where points on the horizon of a homography are taken to lie."""
 
 
 def tiles(area: Tile, side_px: int) -> Iterator[Tile]:
@@ -84,14 +86,17 @@ def resample(
     source = _for_remap(pixels if everything else _filled(pixels, valid), interpolation)
     sampled = cv2.remap(source, map_xy, None, _FLAGS[interpolation], borderMode=cv2.BORDER_REPLICATE)
     half = 0.5 if interpolation == "nearest" else 0.0
-    inside = np.ones(positions.shape[:2], dtype=bool)
-    for along, start, end in zip((positions[..., 0], positions[..., 1]), sensor_start, sensor_end, strict=True):
-        inside &= (along >= start - half) & (along <= end - 1 + half)
+    inside = _between(positions, np.subtract(sensor_start, half), np.subtract(sensor_end, 1 - half))
     if not everything:
         flag = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
         weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)
         inside &= weight > 0.999
     return _as_type(sampled, pixels.dtype), np.asarray(inside)
+
+
+def _between(positions: Points, least: Points, most: Points) -> Mask:
+    """(H, W) True where positions (H, W, 2) lie within a rectangle, its border included."""
+    return cv2.inRange(positions, tuple(map(float, least)), tuple(map(float, most))).view(bool)
 
 
 def _for_remap(pixels: NDArray[np.generic], interpolation: Interpolation) -> NDArray[np.generic]:
@@ -139,12 +144,14 @@ def warped(
     moving_size = max(8, round(moving.size_px[0] * reduce)), max(8, round(moving.size_px[1] * reduce))
     moving_scale = moving_size[0] / moving.size_px[0], moving_size[1] / moving.size_px[1]
     small = shrink(moving, moving_size)
-    positions = mapping.rescaled(fixed_scale, moving_scale).positions(Tile(0, 0, *size_px)).astype(np.float32)
-    positions = np.nan_to_num(positions, nan=-1e6)
+    positions = mapping.rescaled(fixed_scale, moving_scale).positions(Tile(0, 0, *size_px), np.float32)
+    cv2.patchNaNs(positions, _NOWHERE)
     pixels = cv2.remap(small.pixels, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    known = small.valid.astype(np.uint8) * 255
-    valid = cv2.remap(known, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return Raster(np.asarray(pixels, np.float32), np.asarray(valid == 255))
+    valid = _between(positions, np.zeros(2), np.subtract(small.size_px, 1))
+    if not small.valid.all():
+        known = small.valid.astype(np.uint8) * 255
+        valid &= cv2.remap(known, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) == 255
+    return Raster(np.asarray(pixels, np.float32), np.asarray(valid))
 
 
 def single(raster: Raster) -> Raster:

@@ -129,10 +129,9 @@ def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height
     step = max(1, min(8, width_px // 64, height_px // 64))
     x = _cell_edges(width_px, step)
     y = _cell_edges(height_px, step)
-    points = np.stack(np.meshgrid(x, y), axis=-1)
-    inside = np.ones(points.shape[:2], dtype=bool)
+    inside = np.ones((len(y), len(x)), dtype=bool)
     for mapping, band in mappings:
-        there = mapping(points)
+        there = mapping.at_crossings(x, y)
         with np.errstate(invalid="ignore"):
             inside &= (there >= 0).all(axis=-1) & (there <= np.subtract(band.size_px, 1)).all(axis=-1)
     # A cell counts where its four corners do: between them the mapping is all but straight.
@@ -145,30 +144,38 @@ def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height
     return Tile(x0, y0, int(x[right]) - x0 + 1, int(y[bottom]) - y0 + 1)
 
 
-def _cell_edges(length_px: int, step: int) -> NDArray[np.int64]:
-    return np.append(np.arange(0, length_px - 1, step), length_px - 1)
+def _cell_edges(length_px: int, step: int) -> NDArray[np.float64]:
+    return np.append(np.arange(0, length_px - 1, step), length_px - 1).astype(np.float64)
 
 
 def _largest_rectangle(
-    cells: Mask, widths: NDArray[np.int64], heights: NDArray[np.int64]
+    cells: Mask, widths: NDArray[np.float64], heights: NDArray[np.float64]
 ) -> tuple[int, int, int, int] | None:
-    """(top, bottom, left, right) in cell edges of the all-True rectangle of the largest area: a histogram with a
-    stack, row by row.
+    """(top, bottom, left, right) in cell edges of the all-True rectangle of the largest area.
+
+    A histogram with a stack, row by row; rows and columns like the one before them are taken as one with it.
     """
-    best_area, best = 0, None
-    left_edge = np.concatenate([[0], np.cumsum(widths)])
-    tall = np.zeros(cells.shape[1], dtype=np.int64)
-    first_row = np.zeros(cells.shape[1], dtype=np.int64)
-    for row in range(cells.shape[0]):
-        first_row = np.where(cells[row] & (tall > 0), first_row, row)
-        tall = np.where(cells[row], tall + heights[row], 0)
-        stack: list[tuple[int, int, int]] = []
-        for column, (height, top) in enumerate([*zip(tall.tolist(), first_row.tolist(), strict=True), (0, row)]):
-            start = column
+    first_rows, first_columns = _changes(cells), _changes(cells.T)
+    rows, columns = ([*firsts.tolist(), n] for firsts, n in zip((first_rows, first_columns), cells.shape, strict=True))
+    left_edge = np.concatenate([[0.0], np.cumsum(widths)])[columns].tolist()
+    top_edge = np.concatenate([[0.0], np.cumsum(heights)])[rows].tolist()
+    best_area, best = 0.0, None
+    since = [0] * len(first_columns)
+    for row, line in enumerate(cells[np.ix_(first_rows, first_columns)].tolist()):
+        since = [begun if one else row + 1 for begun, one in zip(since, line, strict=True)]
+        bottom = top_edge[row + 1]
+        stack: list[tuple[int, float, int]] = []
+        for column, top in enumerate([*since, row + 1]):
+            start, height = column, bottom - top_edge[top]
             while stack and stack[-1][1] >= height:
                 start, stacked, stacked_top = stack.pop()
-                area = stacked * int(left_edge[column] - left_edge[start])
+                area = stacked * (left_edge[column] - left_edge[start])
                 if area > best_area:
-                    best_area, best = area, (stacked_top, row + 1, start, column)
+                    best_area, best = area, (rows[stacked_top], rows[row + 1], columns[start], columns[column])
             stack.append((start, height, top))
     return best
+
+
+def _changes(cells: Mask) -> NDArray[np.int64]:
+    """The rows that differ from the one before, the first among them."""
+    return np.flatnonzero(np.append(True, (cells[1:] != cells[:-1]).any(axis=1)))

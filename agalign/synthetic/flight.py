@@ -152,7 +152,7 @@ def view(painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tu
 
     y, x = np.arange(height), np.arange(width)
     if ground.height_m is None:
-        positions = splined(on_map, Tile(0, 0, width, height)).astype(np.float32)
+        positions = splined(on_map, *(np.arange(n, dtype=np.float64) for n in (width, height)), dtype=np.float32)
     else:
         positions = on_map(np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)).astype(np.float32)
     seen = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)

@@ -87,6 +87,17 @@ class Residual:
     """(n,) how far each tile's correlation peak stands out, in standard deviations: the error of a shift falls with its
     square."""
 
+    @classmethod
+    def of(
+        cls, centres_px: NDArray[np.float64], shifts_px: NDArray[np.float64], peaks_sigma: NDArray[np.float64]
+    ) -> "Residual":
+        """What (n, 2) shifts say of all windows together."""
+        measured = np.isfinite(shifts_px[:, 0])
+        length = np.linalg.norm(shifts_px[measured], axis=1)
+        median, p95 = np.percentile(length, (50, 95)) if len(length) else (np.inf, np.inf)
+        coverage = float(measured.mean()) if len(measured) else 0.0
+        return cls(centres_px, shifts_px, float(median), float(p95), coverage, peaks_sigma)
+
     def enlarged(self, up: tuple[float, float]) -> "Residual":
         """The same on an image that is larger by these factors (x, y)."""
         return replace(

@@ -1,10 +1,12 @@
 """The complete mapping between the raw pixels of two images, and where it sends every pixel of a grid."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from agalign.values import geometry, lens
@@ -65,19 +67,26 @@ class PixelMapping:
             map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion))
         )
 
-    def positions(self, tile: Tile) -> Points:
+    def positions(self, tile: Tile, dtype: DTypeLike = np.float64) -> Points:
         """Where each pixel of a tile lies in the moving image, (height, width, 2) raw px."""
+        return self.at_crossings(_along(tile.x0, tile.width), _along(tile.y0, tile.height), dtype)
+
+    def at_crossings(self, x_px: Points, y_px: Points, dtype: DTypeLike = np.float64) -> Points:
+        """The same for pixels of the columns x (n,) and the rows y (m,), in ascending order: (m, n, 2)."""
         if self.bends:
-            return splined(self, tile, _LATTICE_STEP_PX if self.local is None else _LOCAL_LATTICE_STEP_PX)
-        x = np.arange(tile.x0, tile.x0 + tile.width, dtype=np.float64)
-        y = np.arange(tile.y0, tile.y0 + tile.height, dtype=np.float64)
+            step = _LATTICE_STEP_PX if self.local is None else _LOCAL_LATTICE_STEP_PX
+            return splined(self, x_px, y_px, step, dtype)
         h = self.fixed_to_moving
-        found = np.empty((tile.height, tile.width, 2))
-        denominator = (h[2, 0] * x)[None, :] + (h[2, 1] * y + h[2, 2])[:, None]
+        found = np.empty((len(y_px), len(x_px), 2), dtype)
+        denominator = (h[2, 0] * x_px)[None, :] + (h[2, 1] * y_px + h[2, 2])[:, None]
         for k in (0, 1):
             with np.errstate(divide="ignore", invalid="ignore"):
-                found[..., k] = ((h[k, 0] * x)[None, :] + (h[k, 1] * y + h[k, 2])[:, None]) / denominator
+                found[..., k] = ((h[k, 0] * x_px)[None, :] + (h[k, 1] * y_px + h[k, 2])[:, None]) / denominator
         return found
+
+
+def _along(start: int, length: int) -> Points:
+    return np.arange(start, start + length, dtype=np.float64)
 
 
 def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> PixelMapping:
@@ -88,23 +97,32 @@ def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> PixelMapp
     return PixelMapping(alignment.fixed_to_moving, reference.lens, moving.lens, local=local)
 
 
-def splined(mapping: Callable[[Points], Points], tile: Tile, step_px: int = _LATTICE_STEP_PX) -> Points:
-    """A smooth mapping of points (..., 2) at every pixel of a tile, (height, width, 2): a bicubic spline through its
-    values on a lattice. The spline is linear in those values, so it is two products of matrices.
+def splined(
+    mapping: Callable[[Points], Points], x_px: Points, y_px: Points, step_px: int = _LATTICE_STEP_PX,
+    dtype: DTypeLike = np.float64,
+) -> Points:  # fmt: skip
+    """A smooth mapping of points (..., 2) at all crossings of columns x (n,) and rows y (m,): (m, n, 2).
+
+    It is a bicubic spline through the mapping's values on a lattice, and linear in those values: two products of
+    matrices. The last one, by far the larger, is in `dtype`.
     """
-    knots_x, weights_x = _spline_weights(tile.x0, tile.width, step_px)
-    knots_y, weights_y = _spline_weights(tile.y0, tile.height, step_px)
+    (knots_x, weights_x), (knots_y, weights_y) = (
+        _spline_weights(np.asarray(at, np.float64).tobytes(), step_px) for at in (x_px, y_px)
+    )
     values = mapping(np.stack(np.meshgrid(knots_x, knots_y), axis=-1))
-    across = np.ascontiguousarray(weights_x.T)
-    found = np.empty((tile.height, tile.width, 2))
+    across = np.ascontiguousarray(weights_x.T, dtype)
+    found = np.empty((len(y_px), len(x_px), 2), dtype)
     for k in (0, 1):
-        found[..., k] = (weights_y @ values[..., k]) @ across
+        found[..., k] = (weights_y @ values[..., k]).astype(dtype, copy=False) @ across
     return found
 
 
-def _spline_weights(start: int, length: int, step_px: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(knots (k,), weights (length, k)): what each pixel takes of the value at each knot."""
-    count = max(4, 1 + -(-(length - 1) // step_px))
-    knots = np.linspace(start, start + max(length - 1, 3), count)
-    weights = CubicSpline(knots, np.eye(count))(np.arange(start, start + length, dtype=np.float64))
-    return knots, np.asarray(weights)
+@lru_cache(maxsize=32)
+def _spline_weights(at_px: bytes, step_px: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(knots (k,), weights (length, k)): what each place takes of the value at each knot. All bands of all captures of
+    a flight are asked for the same places (float64, as bytes).
+    """
+    places = np.frombuffer(at_px)
+    first, length = places[0], places[-1] - places[0]
+    knots = np.linspace(first, first + max(length, 3), max(4, 1 + math.ceil(length / step_px)))
+    return knots, np.asarray(CubicSpline(knots, np.eye(len(knots)))(places))

@@ -6,7 +6,7 @@ import pytest
 
 from agalign.capture import evidence
 from agalign.capture.band_pair import BandPair
-from agalign.capture.evidence import judged
+from agalign.capture.evidence import Look, judged, with_metrics
 from agalign.config import LocalSettings, Settings
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, LocalField, LocalResult, Residual, Seed
@@ -37,7 +37,20 @@ def test_what_passes_is_aligned_and_measured(pair: BandPair) -> None:
     found = judged(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
     assert (found.status, found.doubts, found.reason) == ("aligned", (), None)
     assert found.residual.median_px < 0.1
-    assert found.after["overlap"] > 0.9
+    measured = with_metrics(found, pair)
+    assert measured.after["overlap"] > 0.9
+    assert measured.after["mattes_mi"] < measured.before["mattes_mi"]
+
+
+def test_a_look_under_a_mapping_that_is_all_but_equal_is_what_looking_again_shows(pair: BandPair) -> None:
+    look = Look.at(pair, pair.mapping(geometry.translation(5.95, -3.95)))
+    mapping = pair.mapping(np.array([[1.0001, 0, 6.0], [0, 0.9999, -4.0], [0, 0, 1.0]]))
+    near, again = look.under(mapping), Look.at(pair, mapping)
+    assert near.there is look.there
+    np.testing.assert_allclose(near.residual.shifts_px, again.residual.shifts_px, atol=0.04)
+    assert near.residual.median_px == pytest.approx(again.residual.median_px, abs=0.04)
+    far = pair.mapping(geometry.translation(9, -4))
+    assert look.under(far).there is not look.there
 
 
 def test_a_doubted_result_leaves_the_seed_and_its_windows(pair: BandPair) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.evidence import windows_under
+from agalign.capture.evidence import Look
 from agalign.capture.whole import most_probable
 from agalign.config import Settings
 from agalign.flight.rig import NO_FACTORS, Rig
@@ -96,7 +96,9 @@ def test_windows_mend_what_the_descriptors_left() -> None:
     left_px = np.array([0.2, -0.15, 0.1, 0.2, -0.2, 0.1, 0.15, -0.1])
     off = geometry.compose(truth, geometry.moving_corners(left_px, *SIZE))
     before = replace(found, fixed_to_moving=off)
-    after = most_probable([pair], {"nir": before}, {"nir": windows_under(pair, before)}, None)["nir"]
+    after = most_probable(
+        [pair], {"nir": before}, {"nir": Look.at(pair, pair.mapping(before.fixed_to_moving)).residual}, None
+    )["nir"]
     assert geometry.corner_error_px(off, truth, *SIZE) > 0.2
     assert geometry.corner_error_px(after.fixed_to_moving, truth, *SIZE) < 0.08
     assert after.corner_std_px < 0.1

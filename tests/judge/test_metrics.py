@@ -60,7 +60,9 @@ def test_mattes_is_that_of_the_definition() -> None:
     fixed = textured_image(90, 70).ravel().astype(np.float64)
     moving = np.sin(fixed) + 0.3 * textured_image(90, 70, 1).ravel()
     bins = fixed_bins(fixed.astype(np.float32), (float(fixed.min()), float(fixed.max())))
-    mine = mutual_information(joint_histogram(bins, moving.astype(np.float32)))
+    mine = mutual_information(
+        joint_histogram(bins, moving.astype(np.float32), (float(moving.min()), float(moving.max())))
+    )
     assert mine == pytest.approx(elastix_mattes(fixed, moving), rel=1e-3)
 
 
