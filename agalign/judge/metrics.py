@@ -79,9 +79,9 @@ def joint_histogram(
 ) -> NDArray[np.float64]:
     """Elastix's joint density of two samples (n,): (32, 32), sums to 1, fixed along rows.
 
-    `bins` are the `fixed_bins` of the fixed sample, `limits` the moving image's smallest and largest values. Each range is widened by 1 % on both sides. The fixed kernel is of
-    order 0 (a box), the moving one the cubic B-spline, whose support costs the moving axis a bin of padding at either
-    end (Klein et al. 2010; Mattes 2003).
+    `bins` are the `fixed_bins` of the fixed sample, `limits` the moving image's smallest and largest values. Each range
+    is widened by 1 % on both sides. The fixed kernel is of order 0 (a box), the moving one the cubic B-spline, whose
+    support costs the moving axis a bin of padding at either end (Klein et al. 2010; Mattes 2003).
     """
     moving_fine = (_bin_position(moving, limits, padding=1) * _FINE).astype(np.int32)
     counts = np.bincount(bins * (_BINS * _FINE) + moving_fine, minlength=_BINS * _BINS * _FINE)

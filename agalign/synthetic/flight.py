@@ -28,7 +28,6 @@ from agalign.synthetic.rig import (
 )
 from agalign.values import geometry, lens
 from agalign.values.geometry import Points
-from agalign.values.image import Tile
 from agalign.values.mapping import splined
 
 ALTITUDE_M = 22.0, 34.0
