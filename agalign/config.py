@@ -49,7 +49,7 @@ class FastRecipe(Stage):
     warm_up_steps: int = 50
     """Steps on random weights before psi may move."""
     first_updates: Positive = 5
-    """Most steps on psi before the first on weights that are not random."""
+    """Steps on psi before the first on weights that are not random; twice as many where those suffice."""
     steps_between_updates: Positive = 10
     hopeless_steps: Positive = 30
     """Steps after which a level is given up where no held-out patches could be told apart."""

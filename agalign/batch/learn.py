@@ -1,15 +1,16 @@
 """Learning a flight: one network on a few of its captures, to be frozen for all of them."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from agalign.capture.align import align_pairs
+from agalign.capture.align import align_pairs, judge_together
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.prediction import observed
+from agalign.capture.prediction import observed, with_predictions
 from agalign.capture.seeding import find_seed, subject_of
 from agalign.config import Settings
 from agalign.errors import AgalignError
@@ -21,10 +22,11 @@ from agalign.flight.rig import LEAST_CAPTURES, Observation, Rig, median_mapping
 from agalign.judge.local import common_field
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
-from agalign.method.refine import refine
+from agalign.method.joint import Results, refine_with
 from agalign.method.starter import start_from
 from agalign.method.state import JointState, Progress, Subject
-from agalign.values.alignment import JointResult, Residual, Seed
+from agalign.pixels.raster import without_warnings
+from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 
@@ -33,14 +35,20 @@ _LOG = logging.getLogger(__name__)
 
 @one_thread()
 @one_memory_error()
+@without_warnings()
 def learn_flight(
-    captures: Sequence[Capture], settings: Settings, progress: Progress, start: FlightModel | None = None
-) -> FlightModel | None:
+    captures: Sequence[Capture], settings: Settings, progress: Progress, start: FlightModel | None = None,
+    at_once: int = 1,
+) -> FlightModel | None:  # fmt: skip
     """Learn one network on a few captures spread over the flight; None where none of them could be aligned.
 
-    With `start`, its network is where theta starts; its last side is where bands start that it does not know.
+    So many captures are worked on at a time, each in a thread; on how many, nothing depends. `start` is the flight's
+    model where some captures are aligned by it as its rig expects; else its network is where theta starts, and its last
+    side where bands start that it does not know.
     """
     keep_freed_memory()
+    if start is not None and _still_holds(start, captures, settings, at_once):
+        return replace(start, fingerprint=learning_fingerprint(captures, settings))
     loaded = _load(captures, settings, start)
     if not loaded:
         return None
@@ -51,8 +59,9 @@ def learn_flight(
     if start is not None:
         start_from(net, start.net.state_dict())
     try:
-        learn(state, subjects, net)
-        results = [refine(state, net, subject) for subject in subjects]
+        learn(state, subjects, net, at_once)
+        with ThreadPoolExecutor(at_once) as pool:
+            results = list(pool.map(lambda s: refine_with(net, s, settings.joint, progress), subjects))
     except (AgalignError, cv2.error) as why_not:
         # What one capture does to the others' learning must not cost the flight: each is learnt alone then.
         _LOG.debug("the flight could not be learnt from: %s", why_not)
@@ -67,37 +76,76 @@ def learn_flight(
     size = captures[0].reference.size_px
     mappings = {name: median_mapping(matrices, size) for name, matrices in found.items()}
     model = FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings))
-    rig = _learn_rig(captures, settings, model, progress)
+    known = {one.capture.label: _Refined(one, of) for one, of in zip(loaded, results, strict=True)}
+    rig = _learn_rig(captures, settings, model, known, progress, at_once)
     if rig is None:
         rig = None if start is None else start.rig
     return replace(model, rig=rig, mappings=mappings if rig is None else {**mappings, **rig.mean})
 
 
-def _learn_rig(captures: Sequence[Capture], settings: Settings, model: FlightModel, progress: Progress) -> Rig | None:
-    """What captures spread over the flight, refined with its network, have in common."""
+def _still_holds(model: FlightModel, captures: Sequence[Capture], settings: Settings, at_once: int) -> bool:
+    """True where captures spread over a flight, of which some can be aligned, lie where a model's rig has them."""
+    rig = model.rig
+    if rig is None or model.bands != _sides(captures[0]):
+        return False
+    plain = _without_local(settings)
+
+    def fits(capture: Capture) -> tuple[int, int]:
+        """(bands that are aligned, those of which lie where the rig expects them)."""
+        try:
+            pairs, _ = read_pairs(capture, plain, model)
+            found = align_pairs(pairs, plain, lambda *_: None, model, scratch=False)
+            expected = with_predictions(pairs, found, rig, capture, settings.check)
+        except (AgalignError, cv2.error):
+            return 0, 0
+        return _aligned(found), _aligned(expected)
+
+    with ThreadPoolExecutor(at_once) as pool:
+        some = [captures[len(captures) * k // 3] for k in (1, 2)]
+        counts = list(pool.map(fits, some))
+    return sum(aligned for aligned, _ in counts) >= len(model.bands) and all(a == e for a, e in counts)
+
+
+def _aligned(found: Mapping[str, Alignment]) -> int:
+    return sum(a.status == "aligned" for a in found.values())
+
+
+def _without_local(settings: Settings) -> Settings:
+    return settings.model_copy(update={"local": settings.local.model_copy(update={"use": "never"})})
+
+
+def _learn_rig(
+    captures: Sequence[Capture], settings: Settings, model: FlightModel, known: Mapping[str, "_Refined"],
+    progress: Progress, at_once: int,
+) -> Rig | None:  # fmt: skip
+    """What captures spread over the flight, refined with its network, have in common; some, by label, are already."""
     stage = settings.flight
     count = min(stage.rig_captures, max(stage.least_rig_captures, len(captures) // 8))
     if len(captures) < LEAST_CAPTURES:
         return None
-    plain = settings.model_copy(update={"local": settings.local.model_copy(update={"use": "never"})})
-    seen: list[Observation] = []
-    residuals: dict[str, list[Residual]] = {}
-    for capture in _spread(captures, count):
-        if len(residuals) and min(map(len, residuals.values())) >= count:
-            break
-        progress("the rig", min(1.0, len(seen) / count))
+    plain = _without_local(settings)
+
+    def look_at(capture: Capture) -> "_Shown | None":
         try:
-            pairs, _ = read_pairs(capture, plain, model)
-            found = align_pairs(pairs, plain, lambda *_: None, model, scratch=False)
+            return _shown(capture, plain, model, known.get(capture.label))
         except (AgalignError, cv2.error) as why_not:
             _LOG.debug("%s says nothing of the rig: %s", capture.label, why_not)
-            continue
-        pairs = [p for p in pairs if p.is_the_rigs]
-        seen.append(observed(pairs, found, capture))
-        for pair in pairs:
-            alignment = found[pair.name].between_files(*pair.scales)
-            if alignment.status == "aligned" and alignment.residual is not None:
-                residuals.setdefault(pair.name, []).append(alignment.residual)
+            return None
+
+    seen: list[Observation] = []
+    residuals: dict[str, list[Residual]] = {}
+    with ThreadPoolExecutor(at_once) as pool:
+        # Those that were learnt from cost little.
+        learnt = [c for c in captures if c.label in known]
+        for shown in pool.map(look_at, [*learnt, *(c for c in _spread(captures, count) if c.label not in known)]):
+            if shown is None:
+                continue
+            seen.append(shown.observation)
+            for band, residual in shown.residuals.items():
+                residuals.setdefault(band, []).append(residual)
+            progress("the rig", min(1.0, len(seen) / count))
+            if residuals and min(map(len, residuals.values())) >= count:
+                break
     size = captures[0].reference.size_px
     rig = learn_rig(seen, size, _layout(captures[0]))
     if rig is None:
@@ -129,6 +177,7 @@ def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str
 class _Loaded:
     """A capture to learn from."""
 
+    capture: Capture
     subject: Subject
     pairs: list[BandPair]
     seeds: list[Seed]
@@ -137,6 +186,37 @@ class _Loaded:
     def shows(self) -> float:
         """How plainly its bands show the same, in standard deviations of their seeds' peaks."""
         return float(np.median([s.peak_sigma for s in self.seeds]))
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """A capture that was learnt from, with what was found."""
+
+    loaded: _Loaded
+    results: Results
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What a capture says of the rig: its mappings, and the shifts that its windows still show."""
+
+    observation: Observation
+    residuals: dict[str, Residual]
+
+
+def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Refined | None) -> _Shown:
+    """Raises UnreadableFileError where the reference cannot be read."""
+    if known is None:
+        pairs, _ = read_pairs(capture, settings, model)
+        found = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
+    else:
+        pairs = known.loaded.pairs
+        starts = list(zip(pairs, known.loaded.seeds, strict=True))
+        found = dict(judge_together(starts, known.results, model, settings))
+    pairs = [p for p in pairs if p.is_the_rigs]
+    in_file_px = {p.name: found[p.name].between_files(*p.scales) for p in pairs}
+    good = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
+    return _Shown(observed(pairs, found, capture), good)
 
 
 def _load(captures: Sequence[Capture], settings: Settings, start: FlightModel | None) -> list[_Loaded]:
@@ -171,7 +251,7 @@ def _read(capture: Capture, settings: Settings, start: FlightModel | None) -> _L
     if not found:
         return None
     usable, seeds = [p for p, _ in found], [seed for _, seed in found]
-    return _Loaded(subject_of(usable, seeds, [sides.index(p.name) + 1 for p in usable]), usable, seeds)
+    return _Loaded(capture, subject_of(usable, seeds, [sides.index(p.name) + 1 for p in usable]), usable, seeds)
 
 
 def _sides(capture: Capture) -> tuple[str, ...]:

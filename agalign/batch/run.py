@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -30,10 +30,14 @@ from agalign.flight.fingerprint import fingerprint
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.method.device import choose_device
+from agalign.pixels.raster import without_warnings
 from agalign.products.sidecar import Sidecar, read_sidecar
 from agalign.products.write import band_file_names
 from agalign.values.capture import Capture
 from agalign.values.choices import Layout
+
+_CAPTURES_WORTH_A_PROCESS = 4
+"""To start one takes as long as these."""
 
 
 def prepare_output(out: Path) -> None:
@@ -55,7 +59,7 @@ class RunOptions:
     overwrite: bool = False
     """Do captures again that an earlier run finished."""
     jobs: int = 1
-    """Captures at a time, each in a process of its own where there are several."""
+    """Captures at a time, each in a process of its own, or a thread where they are few; 0 is one a core."""
     executor: Executor | None = None
     """Where the captures are done instead: any executor whose workers see the same folders (`dask_executor` is one)."""
 
@@ -88,36 +92,70 @@ def run_flight(
     if known is not None:
         used = settings.flight.model_copy(update={"start": known.fingerprint})
         settings = settings.model_copy(update={"flight": used})
-    waiting: list[Task] = []
+    left: list[tuple[Sequence[Capture], str, list[Capture]]] = []
     groups = flights_of(flight.captures)
     for group, name in zip(groups, model_names(groups), strict=True):
-        left = []
+        mine = []
         for capture in group:
             earlier = None if options.overwrite else finished_before(capture, out, settings)
             if earlier is None:
-                left.append(capture)
+                mine.append(capture)
             else:
                 yield CaptureReport(capture.label, "kept", earlier)
-        if left:
-            path = _learn(group, out / "models" / name, settings, listener, known)
-            waiting += [Task(c, out, settings, path) for c in left]
+        if mine:
+            left.append((group, name, mine))
+    with _executor(sum(len(mine) for _, _, mine in left), options, settings) as (executor, most):
+        waiting: list[Task] = []
+        for whole, name, mine in left:
+            path = _learn(whole, out / "models" / name, settings, listener, known, _cores(options, settings))
+            waiting += [Task(c, out, settings, path) for c in mine]
+        if executor is None:
+            yield from _one_by_one(waiting, listener)
+        else:
+            yield from on_executor([t.absolute() for t in waiting], executor, most)
+
+
+def _one_by_one(tasks: Sequence[Task], listener: Listener) -> Iterator[CaptureReport]:
+    """In this process; the next capture's files are read meanwhile."""
+    with ThreadPoolExecutor(1) as reader:
+        for number, task in enumerate(tasks, start=1):
+            listener.on_start(task.capture)
+            for following in tasks[number : number + 1]:
+                reader.submit(read_ahead, following.capture)
+            yield do_capture(task, listener.on_pair)
+
+
+@contextmanager
+def _executor(captures: int, options: RunOptions, settings: Settings) -> Iterator[tuple[Executor | None, int]]:
+    """(what does so many captures at a time, how many it is handed); None where they are done one by one.
+
+    Processes of our own load what they need while the flight is learnt; few captures are done by threads instead.
+    """
     if options.executor is not None:
-        yield from on_executor([t.absolute() for t in waiting], options.executor, MOST_HANDED_OVER)
-    elif options.jobs > 1 and len(waiting) > 1:
-        jobs = min(options.jobs, len(waiting))
-        threads = max(1, (os.cpu_count() or 1) // jobs)
-        with (
-            threads_of_children(threads),
-            ProcessPoolExecutor(jobs, get_context("spawn"), start_worker, (threads,)) as pool,
-        ):
-            yield from on_executor(waiting, pool, 2 * jobs)
-    else:
-        with ThreadPoolExecutor(1) as reader:
-            for number, task in enumerate(waiting, start=1):
-                listener.on_start(task.capture)
-                for following in waiting[number : number + 1]:
-                    reader.submit(read_ahead, following.capture)
-                yield do_capture(task, listener.on_pair)
+        yield options.executor, MOST_HANDED_OVER
+        return
+    jobs = min(_cores(options, settings), captures)
+    if jobs <= 1:
+        yield None, 0
+        return
+    if captures < jobs * _CAPTURES_WORTH_A_PROCESS:
+        with without_warnings(), ThreadPoolExecutor(jobs) as pool:
+            yield pool, jobs
+        return
+    threads = max(1, (os.cpu_count() or 1) // jobs)
+    with (
+        threads_of_children(threads),
+        ProcessPoolExecutor(jobs, get_context("spawn"), start_worker, (threads,)) as pool,
+    ):
+        for _ in range(jobs):
+            pool.submit(quiet)
+        yield pool, 2 * jobs
+
+
+def _cores(options: RunOptions, settings: Settings) -> int:
+    """How many captures are worked on at a time where that costs nothing: one where a GPU does the work."""
+    on_cpu = choose_device(settings.joint.device).type == "cpu"
+    return options.jobs or ((os.cpu_count() or 1) if on_cpu else 1)
 
 
 def _given_model(path: Path, flight: Flight, settings: Settings) -> FlightModel:
@@ -134,8 +172,9 @@ def _given_model(path: Path, flight: Flight, settings: Settings) -> FlightModel:
 
 
 def _learn(
-    captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, known: FlightModel | None
-) -> Path | None:
+    captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, known: FlightModel | None,
+    at_once: int,
+) -> Path | None:  # fmt: skip
     """The path of the flight's model, learnt now or found from an earlier run; None where none could be learnt."""
     if not settings.learns_flights:
         return None
@@ -149,7 +188,7 @@ def _learn(
     def progress(_stage: str, share: float) -> None:
         listener.on_learning(path.stem, share)
 
-    model = learn_flight(captures, settings, progress, start)
+    model = learn_flight(captures, settings, progress, start, at_once)
     if model is None:
         return None
     save_model(model, path)

@@ -1,7 +1,7 @@
 """The band pairs of one capture: seeded, aligned together, each one checked."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
@@ -54,6 +54,21 @@ def align_capture_bands(
     return {band.name: found[band.name] for band in capture.moving}
 
 
+def judge_together(
+    starts: Sequence[Start], results: Sequence[JointResult | Doubt], model: FlightModel | None, settings: Settings
+) -> Iterator[tuple[str, Alignment]]:
+    """The alignments of a capture's pairs, by name, of which these results were found: moved to what is most probable
+    of all bands together, each one checked.
+    """
+    looks = [
+        Look.at(pair, pair.mapping(result.fixed_to_moving)) if isinstance(result, JointResult) else None
+        for (pair, _), result in zip(starts, results, strict=True)
+    ]
+    better = _whole(starts, results, looks, model, settings)
+    for (pair, seed), result, look in zip(starts, better, looks, strict=True):
+        yield pair.name, judged(pair, seed, result, settings, look)
+
+
 def _measured(pairs: Sequence[BandPair], found: dict[str, Alignment]) -> dict[str, Alignment]:
     """With metrics, whose time is the pair's too."""
     watch, measured = _Watch(), {}
@@ -92,16 +107,11 @@ def align_pairs(
 
     def attempt(some: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
         results = _results(some, sides, align, progress)
-        looks = [
-            Look.at(pair, pair.mapping(result.fixed_to_moving)) if isinstance(result, JointResult) else None
-            for (pair, _), result in zip(some, results, strict=True)
-        ]
-        results = _whole(some, results, looks, model, settings)
         watch.lap([pair.name for pair, _ in some])
-        for (pair, seed), result, look in zip(some, results, looks, strict=True):
-            progress(pair.name, "checking", 0.0)
-            found[pair.name] = judged(pair, seed, result, settings, look)
-            watch.lap([pair.name])
+        for name, alignment in judge_together(some, results, model, settings):
+            found[name] = alignment
+            progress(name, "checking", 0.0)
+            watch.lap([name])
 
     if model is not None and settings.joint.recipe == "fast":
         net = model.net

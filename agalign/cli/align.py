@@ -1,6 +1,5 @@
 """The command that aligns a folder, and what `demo` shares with it."""
 
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -237,18 +236,14 @@ def run(
     """Align the captures, saying how far it has come; their reports in the flight's order."""
     from agalign.batch import Listener, RunOptions, run_flight
     from agalign.batch.workers import dask_executor
-    from agalign.method.device import choose_device
 
-    # One process feeds a GPU; and to start one costs as much as two captures.
-    on_cpu = choose_device(settings.joint.device).type == "cpu"
-    worth_starting = min(os.cpu_count() or 1, len(flight.captures) // 4) if on_cpu else 1
     reports: list[CaptureReport] = []
     done_pairs, all_pairs = 0, sum(len(c.moving) for c in flight.captures)
     pairs = {c.label: len(c.moving) for c in flight.captures}
     started = time.monotonic()
     cluster = nullcontext() if dask is None else dask_executor(dask)
     with cluster as executor, _progress(voice, all_pairs) as show, _interruptible() as check_interrupt:
-        options = RunOptions(overwrite, jobs or max(1, worth_starting), executor)
+        options = RunOptions(overwrite, jobs, executor)
         current: Capture | None = None
 
         def on_start(capture: "Capture") -> None:

@@ -316,7 +316,7 @@ def solve_factors(there: Array, designs: Array, weights: Array, counts: Array) -
     for _ in range(6):
         w = weights * vote
         covariance = np.linalg.inv(np.einsum("cb,bif,big->cfg", w, x, x) + prior)
-        found = np.einsum("cfg,cb,big,cbi->cf", covariance, w, x, y, optimize=True)
+        found = np.einsum("cfg,cg->cf", covariance, np.einsum("cbi,big->cg", w[:, :, None] * y, x))
         off2 = ((y - np.einsum("bif,cf->cbi", x, found)) ** 2).sum(axis=2)
         vote = 1 / (1 + off2 / _OUTLIER_PX**2)
     return found, covariance * np.outer(counts, counts)

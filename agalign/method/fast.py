@@ -4,7 +4,8 @@ One theta for as many captures as are given, each pair with its own psi (the pap
 what each choice gained.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from agalign.errors import GeometryError, NotEnoughTextureError
 from agalign.method import losses
+from agalign.method.adam import Adam
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.levels import Level
 from agalign.method.patches import far_apart, patch_positions, translation
@@ -29,25 +31,31 @@ from agalign.method.refine import (
 from agalign.method.state import JointState, Subject
 
 
-def learn(state: JointState, subjects: Sequence[Subject], net: Descriptor) -> tuple[int, float]:
+def learn(state: JointState, subjects: Sequence[Subject], net: Descriptor, at_once: int = 1) -> tuple[int, float]:
     """Theta and every psi of all subjects, coarse to fine; theta is carried from level to level.
 
-    Returns the steps taken and the last loss. Raises NoContrastError.
+    The psi of so many subjects move at a time, each in a thread; on how many, nothing depends. Returns the steps taken
+    and the last loss. Raises NoContrastError.
     """
     scales = learn_scales(state, max(max(s.fixed.size_px) for s in subjects))
     steps, loss = 0, float("nan")
-    for number, scale in enumerate(scales):
-        last = number == len(scales) - 1
-        wanted = [(s, [b for b in s.hopeful if last or not s.trusted[b]]) for s in subjects]
-        at_level = [_AtLevel(net, s, bands, state.level(s, scale, bands)) for s, bands in wanted if bands]
-        if number == 0 and net.learnt:
+    # Random numbers of its own each: what is drawn for one does not depend on the others.
+    states = [JointState(state.settings, state.progress) for _ in subjects]
+    with ThreadPoolExecutor(at_once) as pool:
+        for number, scale in enumerate(scales):
+            last = number == len(scales) - 1
+            wanted = [[b for b in s.hopeful if last or not s.trusted[b]] for s in subjects]
+            at_level = [
+                _AtLevel(own, net, s, bands, own.level(s, scale, bands))
+                for own, s, bands in zip(states, subjects, wanted, strict=True) if bands
+            ]  # fmt: skip
+            if number == 0 and net.learnt:
+                list(pool.map(_search, at_level))
+            if at_level:
+                taken, loss = _learn_level(state, net, at_level, lambda some: list(pool.map(_move_psi, some)))
+                steps += taken
             for a in at_level:
-                _search(state, a)
-        if at_level:
-            taken, loss = _learn_level(state, net, at_level)
-            steps += taken
-        for a in at_level:
-            a.hand_on()
+                a.hand_on()
     return steps, loss
 
 
@@ -64,6 +72,8 @@ def learn_scales(state: JointState, longer_side_px: int) -> list[float]:
 class _AtLevel:
     """Some moving images of a subject at one level, with their psi as homographies of that level."""
 
+    state: JointState
+    """The subject's own."""
     net: Descriptor
     subject: Subject
     which: Sequence[int]
@@ -86,6 +96,12 @@ class _AtLevel:
     def bands(self) -> list[MovingBand]:
         return [MovingBand(self.net, self.level, i, self.subject.sides[b]) for i, b in enumerate(self.which)]
 
+    @property
+    def is_on_its_way(self) -> bool:
+        """True where the patches of all psi that are not at rest are told apart well: more steps are all they need."""
+        enough = self.state.settings.fast.enough_retrieval
+        return all(r > enough for r, settled in zip(self.retrieved, self.settled, strict=True) if not settled)
+
     def hand_on(self) -> None:
         """Give what was found to the subject; a homography that cannot be inverted is not handed on."""
         self.subject.given_up |= {b: self.retrieved[i] for i, b in enumerate(self.which) if not self.told_apart[i]}
@@ -95,12 +111,13 @@ class _AtLevel:
 
 
 @torch.no_grad()
-def _search(state: JointState, at: _AtLevel) -> None:
+def _search(at: _AtLevel) -> None:
     """Move each untrusted psi by the translation under which the patches' loss is least.
 
     Around the truth the loss is a funnel (paper, Fig. 2) that is wider than what one Gauss-Newton step sees.
     """
-    recipe, level = state.settings.fast, at.level
+    state, level = at.state, at.level
+    recipe = state.settings.fast
     p, _ = state.sampler.draw(level, level.anywhere, at.h, recipe.search_patches, recipe.octaves)
     for i, band in enumerate(at.bands):
         if at.subject.trusted[at.which[i]]:
@@ -112,7 +129,10 @@ def _search(state: JointState, at: _AtLevel) -> None:
         at.h[i] = at.h[i] @ translation(shift).to(at.h[i])
 
 
-def _learn_level(state: JointState, net: Descriptor, at_level: Sequence[_AtLevel]) -> tuple[int, float]:
+def _learn_level(
+    state: JointState, net: Descriptor, at_level: Sequence[_AtLevel],
+    move_psi: Callable[[Sequence[_AtLevel]], list[bool]],
+) -> tuple[int, float]:  # fmt: skip
     """Theta by Adam, a capture at a time; each psi by Gauss-Newton once held-out patches are told apart.
 
     A network that is learnt already needs no step where its first ones on psi are enough.
@@ -123,23 +143,23 @@ def _learn_level(state: JointState, net: Descriptor, at_level: Sequence[_AtLevel
     between = recipe.steps_between_updates * len(at_level)
     warm_up = 0 if net.learnt else recipe.warm_up_steps
     if net.learnt:
-        for _ in range(recipe.first_updates):
-            settled = [_move_psi(state, a) for a in at_level]
-            if all(settled):
+        restless = at_level
+        for update in range(2 * recipe.first_updates):
+            restless = [a for a, settled in zip(restless, move_psi(restless), strict=True) if not settled]
+            if not restless:
                 return 0, loss_value
-    optimiser = torch.optim.Adam(net.parameters(), recipe.learning_rate)
+            if update >= recipe.first_updates - 1 and not all(a.is_on_its_way for a in restless):
+                break
+    optimiser = Adam(net.parameters(), recipe.learning_rate)
     for step in range(1, most_steps + 1):
-        loss = _loss(state, at_level[step % len(at_level)])
+        loss = _loss(at_level[step % len(at_level)])
         if loss is not None:
-            optimiser.zero_grad()
-            torch.autograd.backward(loss)
-            optimiser.step()
+            optimiser.step(loss)
             loss_value = float(loss.detach())
         if step < warm_up or step % between:
             continue
         state.progress("learning", step / most_steps)
-        settled = [_move_psi(state, a) for a in at_level]
-        if all(settled):
+        if all(move_psi(at_level)):
             break
         hopeless = step >= warm_up + recipe.hopeless_steps * len(at_level)
         if hopeless and not any(any(a.told_apart) for a in at_level):
@@ -148,9 +168,10 @@ def _learn_level(state: JointState, net: Descriptor, at_level: Sequence[_AtLevel
     return step, loss_value
 
 
-def _loss(state: JointState, at: _AtLevel) -> Tensor | None:
+def _loss(at: _AtLevel) -> Tensor | None:
     """The in-batch loss of one capture's pairs on keypoints that are drawn anew; None where none can be drawn."""
-    recipe, level = state.settings.fast, at.level
+    state, level = at.state, at.level
+    recipe = state.settings.fast
     p, inside = state.sampler.draw(level, level.trainable, at.h, recipe.batch, recipe.octaves)
     rows = [inside[:, i].nonzero()[:, 0] for i in range(len(at.h))]
     taking_part = [band for band in at.bands if len(rows[band.index]) >= LEAST_KEYPOINTS]
@@ -168,9 +189,10 @@ def _loss(state: JointState, at: _AtLevel) -> Tensor | None:
 
 
 @torch.no_grad()
-def _move_psi(state: JointState, at: _AtLevel) -> bool:
+def _move_psi(at: _AtLevel) -> bool:
     """One step on each psi of a capture whose held-out patches are retrieved; True where all have settled."""
-    recipe, level = state.settings.fast, at.level
+    state, level = at.state, at.level
+    recipe = state.settings.fast
     test, _ = state.sampler.draw(level, level.held_out, at.h, recipe.test_keypoints, recipe.octaves)
     p, _ = state.sampler.draw(level, level.anywhere, at.h, recipe.learn_patches, recipe.octaves)
     if len(p) < LEAST_KEYPOINTS:

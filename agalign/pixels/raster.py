@@ -45,13 +45,23 @@ class RasterInfo:
 
 
 @contextmanager
+def without_warnings() -> Iterator[None]:
+    """Rasterio warns of images without a georeference, which is what drone images are.
+
+    Filters are the process's: around several threads that read, one more of these keeps each from giving back what
+    another still needs.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        yield
+
+
+@contextmanager
 def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
     """A rasterio dataset for reading. Raises UnreadableFileError, naming the file, where GDAL cannot."""
     try:
-        with warnings.catch_warnings(), rasterio.Env(**_GDAL_ENVIRONMENT):
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as dataset:
-                yield dataset
+        with without_warnings(), rasterio.Env(**_GDAL_ENVIRONMENT), rasterio.open(path) as dataset:
+            yield dataset
     except (RasterioIOError, RasterioError, UnicodeEncodeError) as error:
         text = str(error).replace(str(path), "").strip(" :'").splitlines()[0]
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None

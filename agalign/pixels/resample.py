@@ -96,7 +96,7 @@ def resample(
 
 def _between(positions: Points, least: Points, most: Points) -> Mask:
     """(H, W) True where positions (H, W, 2) lie within a rectangle, its border included."""
-    return cv2.inRange(positions, tuple(map(float, least)), tuple(map(float, most))).view(bool)
+    return np.asarray(cv2.inRange(positions, tuple(map(float, least)), tuple(map(float, most))) != 0)
 
 
 def _for_remap(pixels: NDArray[np.generic], interpolation: Interpolation) -> NDArray[np.generic]:

@@ -1,6 +1,5 @@
 """A raster of the error to be expected at every pixel, a band for each moving band, beside the aligned files."""
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -8,10 +7,11 @@ import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 
 from agalign.errors import OutputError
 from agalign.judge.expected_error import expected_error_px
+from agalign.pixels.raster import without_warnings
 from agalign.products.write import georeferenced
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
@@ -34,13 +34,14 @@ def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid:
     }  # fmt: skip
     profile |= {} if georeference is None else georeferenced(georeference, grid)
     try:
-        with complete_file(path) as partial, warnings.catch_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO"):
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(partial, "w", **profile) as dataset:
-                for index, (name, alignment) in enumerate(alignments.items(), start=1):
-                    dataset.write(_map_of(alignment, size_px, grid), index)
-                    dataset.set_band_description(index, name)
-                    dataset.update_tags(index, units="px of the reference", STATUS=alignment.status)
+        with (
+            complete_file(path) as partial, without_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO"),
+            rasterio.open(partial, "w", **profile) as dataset,
+        ):  # fmt: skip
+            for index, (name, alignment) in enumerate(alignments.items(), start=1):
+                dataset.write(_map_of(alignment, size_px, grid), index)
+                dataset.set_band_description(index, name)
+                dataset.update_tags(index, units="px of the reference", STATUS=alignment.status)
     except RasterioError as error:
         raise OutputError(f"{path}: cannot be written ({error})") from None
 

@@ -1,7 +1,6 @@
 """Vegetation indices of the captures below an output folder: a float32 raster and a picture each."""
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -13,11 +12,11 @@ import numpy as np
 import rasterio
 import tifffile
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from agalign.errors import AgalignError, InputError, OutputError
-from agalign.pixels.raster import open_raster
+from agalign.pixels.raster import open_raster, without_warnings
 from agalign.products.fill_sidecar import is_delivered
 from agalign.products.indices import Index, bands_for, compute
 from agalign.products.picture import write_png
@@ -175,9 +174,7 @@ def _create(stack: ExitStack, path: Path, like: rasterio.DatasetReader, index: I
     if like.crs is not None and not like.transform.is_identity:
         profile |= {"crs": like.crs, "transform": like.transform}
     stack.enter_context(rasterio.Env(GDAL_PAM_ENABLED="NO"))
-    caught = stack.enter_context(warnings.catch_warnings())
-    assert caught is None
-    warnings.simplefilter("ignore", NotGeoreferencedWarning)
+    stack.enter_context(without_warnings())
     dataset = stack.enter_context(rasterio.open(path, "w", **profile))
     dataset.set_band_description(1, index.name)
     kept = {k: v for k, v in like.tags().items() if k in ("CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY")}

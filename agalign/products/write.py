@@ -5,7 +5,6 @@ file, or both.
 import errno
 import itertools
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import rasterio
 import tifffile
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 from rasterio.shutil import copy as copy_dataset
 from rasterio.transform import Affine
 from rasterio.windows import Window
@@ -27,7 +26,7 @@ from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import TIFF_SUFFIXES, open_raster, read_window
+from agalign.pixels.raster import TIFF_SUFFIXES, open_raster, read_window, without_warnings
 from agalign.pixels.resample import resample_tile, tiles
 from agalign.products.layout import Layer
 from agalign.values import geometry
@@ -149,8 +148,7 @@ def write_raster(
     profile = _profile(capture.reference, len(layers), grid, dtype, nodata, compression, settings.tile_px)
     try:
         with complete_file(path) as partial:
-            with warnings.catch_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO", GDAL_NUM_THREADS="ALL_CPUS"):
-                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with without_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO", GDAL_NUM_THREADS="ALL_CPUS"):
                 with rasterio.open(partial, "w", **profile) as dataset:
                     _describe(dataset, capture, layers, settings)
                     for index, layer in enumerate(layers, start=1):

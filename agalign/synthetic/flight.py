@@ -149,11 +149,11 @@ def view(painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tu
     def on_map(raw_px: Points) -> Points:
         return map_px(ground, on_ground(ground, band, pose, size_px, raw_px)[..., :2])
 
-    y, x = np.arange(height), np.arange(width)
+    x, y = np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)
     if ground.height_m is None:
-        positions = splined(on_map, *(np.arange(n, dtype=np.float64) for n in (width, height)), dtype=np.float32)
+        positions = splined(on_map, x, y, dtype=np.float32)
     else:
-        positions = on_map(np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)).astype(np.float32)
+        positions = on_map(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
     seen = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     return np.asarray(seen, np.float32)
 
