@@ -131,7 +131,7 @@ class FlightSettings(Stage):
     """How many the network is learnt on, spread over the flight."""
     rig_captures: Positive = 48
     """The rig is learnt on an eighth of the flight, but on no more than these,"""
-    least_rig_captures: Positive = 8
+    least_rig_captures: Positive = 6
     """and on no fewer than these, or all."""
     start: str = ""
     """Fingerprint of the network that theta starts from, where one is given: results depend on it."""

@@ -150,8 +150,10 @@ def _learn_rig(
     rig = learn_rig(seen, size, _layout(captures[0]))
     if rig is None:
         return None
-    fields = {band: common_field(some, settings.local, size) for band, some in residuals.items() if band in rig.mean}
-    return replace(rig, fields={band: field for band, field in fields.items() if field is not None})
+    bands = [band for band in residuals if band in rig.mean]
+    with ThreadPoolExecutor(at_once) as pool:
+        fields = list(pool.map(lambda band: common_field(residuals[band], settings.local, size), bands))
+    return replace(rig, fields={b: field for b, field in zip(bands, fields, strict=True) if field is not None})
 
 
 def _spread(captures: Sequence[Capture], count: int) -> list[Capture]:

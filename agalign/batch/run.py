@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 from agalign.batch.capture import output_paths, quiet
@@ -21,6 +20,7 @@ from agalign.batch.workers import (
     stamp,
     start_worker,
     threads_of_children,
+    worker_context,
 )
 from agalign.cameras.discover import Flight
 from agalign.capture.align import PairProgress
@@ -145,10 +145,11 @@ def _executor(captures: int, options: RunOptions, settings: Settings) -> Iterato
     threads = max(1, (os.cpu_count() or 1) // jobs)
     with (
         threads_of_children(threads),
-        ProcessPoolExecutor(jobs, get_context("spawn"), start_worker, (threads,)) as pool,
+        ProcessPoolExecutor(jobs, worker_context(), start_worker, (threads,)) as pool,
+        ThreadPoolExecutor(1) as meanwhile,
     ):
         for _ in range(jobs):
-            pool.submit(quiet)
+            meanwhile.submit(pool.submit, quiet)
         yield pool, 2 * jobs
 
 

@@ -9,6 +9,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
+from multiprocessing import get_all_start_methods, get_context
+from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Literal
 
@@ -157,6 +159,15 @@ def start_worker(threads: int) -> None:
     """The interrupt key is for the main process, which lets the workers finish what they have begun."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     limit_threads(threads)
+
+
+def worker_context() -> BaseContext:
+    """How processes are started: from one that has loaded this module, where the system can, else each anew."""
+    if "forkserver" not in get_all_start_methods():
+        return get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    return context
 
 
 @contextmanager
