@@ -7,6 +7,7 @@ from agalign.config import Settings
 from agalign.judge.local import LocalRefiner
 from agalign.judge.metrics import FixedSimilarity
 from agalign.judge.residuals import FixedWindows
+from agalign.pixels.landmarks import Landmarks, View, landmarks
 from agalign.pixels.resample import shrink, single, textured
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values.image import Raster
@@ -18,6 +19,7 @@ class Reference:
     def __init__(self, image: Raster, settings: Settings) -> None:
         self.image = image
         self.settings = settings
+        self._landmarks: dict[View, Landmarks] = {}
 
     @cached_property
     def grey(self) -> Raster:
@@ -53,6 +55,12 @@ class Reference:
         """Windowed spectrum of the structure at that size."""
         small = shrink(self.grey, self.seed_size_px)
         return windowed_spectra(structure_field(small, self.settings.seed.smoothing_px))
+
+    def landmarks(self, view: View) -> Landmarks:
+        """What is recognised however a moving image is turned, raw px."""
+        if view not in self._landmarks:
+            self._landmarks[view] = landmarks(self.image, view)
+        return self._landmarks[view]
 
     # ---- for checks and metrics
 

@@ -1,14 +1,16 @@
 """Where a pair's alignment starts: candidates scored on the images, the best kept; and the method's subject of it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair, Candidates
 from agalign.config import SeedSettings
 from agalign.flight.model import FlightModel
+from agalign.method.descriptor import Descriptor
 from agalign.method.match import match_seed, starter_for_matching
 from agalign.method.state import Subject
+from agalign.pixels.landmarks import VIEWS, agreed_homography, landmarks
 from agalign.pixels.resample import single, textured, warped
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry
@@ -17,6 +19,11 @@ from agalign.values.choices import SeedKind
 from agalign.values.doubts import Doubt
 from agalign.values.geometry import Matrix
 
+_PLAIN_SIGMA = 120.0
+"""A peak that only images reach which lie on each other everywhere: turned by one degree they have one of 60 to 120, by
+three degrees of 17."""
+_MOST_KEYPOINTS = 1000
+"""Where learnt descriptors are the last resort."""
 _SAME_PEAK_PX = 2.0
 """A candidate no farther from the peak than this, in working px, is on its flank."""
 
@@ -29,13 +36,44 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
         return Doubt("blank_moving")
     candidates = pair.candidates
     if pair.reference.settings.seed.force == "match":
-        channels = pair.fixed.channels, pair.moving.channels
-        net = starter_for_matching(channels) if model is None else model.matching_network(pair.name, channels)
-        found = match_seed(net, pair.fixed, pair.moving)
+        found = match_seed(_network(pair, model), pair.fixed, pair.moving)
         if found is None:
             return Doubt("no_such_seed", detail="match")
         candidates = {"match": found}
-    return best_seed(pair, candidates)
+    best = best_seed(pair, candidates)
+    if best.score >= _PLAIN_SIGMA or _is_known(pair):
+        return best
+    for found in _by_landmarks(pair):
+        best = max(best, best_seed(pair, {"match": found}), key=lambda seed: seed.score)
+        if best.score >= _PLAIN_SIGMA:
+            return best
+    if best.trusted:
+        return best
+    learnt = match_seed(_network(pair, model), pair.fixed, pair.moving, _MOST_KEYPOINTS)
+    if learnt is not None:
+        best = max(best, best_seed(pair, {"match": learnt}), key=lambda seed: seed.score)
+    return best
+
+
+def _is_known(pair: BandPair) -> bool:
+    """True where it is told, by the flight or by the user, where a pair lies: what is found elsewhere is wrong."""
+    forced = pair.reference.settings.seed.force is not None
+    return forced or pair.is_known_to_a_rig or "user" in pair.candidates
+
+
+def _by_landmarks(pair: BandPair) -> Iterator[Matrix]:
+    """Mappings, however turned, scaled or far apart, that landmarks of both images agree on."""
+    for view in VIEWS:
+        here = pair.reference.landmarks(view).undistorted(pair.fixed.lens)
+        there = landmarks(pair.moving, view).undistorted(pair.moving.lens)
+        found = agreed_homography(here, there, pair.fixed.size_px)
+        if found is not None:
+            yield found
+
+
+def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
+    channels = pair.fixed.channels, pair.moving.channels
+    return starter_for_matching(channels) if model is None else model.matching_network(pair.name, channels)
 
 
 def subject_of(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> Subject:

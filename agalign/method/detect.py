@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from agalign.method.descriptor import PATCH_PX
 from agalign.method.patches import Keypoints, patch_positions, transform
+from agalign.pixels.landmarks import eight_bit
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Raster
 
@@ -28,9 +29,7 @@ def grey(image: FloatImage) -> FloatImage:
 
 def to_8_bit(raster: Raster) -> NDArray[np.uint8]:
     """(H, W), grey, between the 1st and the 99th percentile of the valid pixels."""
-    image = grey(raster.pixels)
-    low, high = np.percentile(image[raster.valid], (1, 99)) if raster.valid.any() else (0.0, 1.0)
-    return np.asarray((np.clip((image - low) / max(high - low, 1e-9), 0, 1) * 255).round().astype(np.uint8))
+    return eight_bit(grey(raster.pixels), raster.valid)
 
 
 def sift_keypoints(raster: Raster, most: int = MOST_KEYPOINTS) -> Keypoints:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from agalign.errors import GeometryError
 from agalign.method.descriptor import REFERENCE, Descriptor
-from agalign.method.detect import sift_keypoints
+from agalign.method.detect import MOST_KEYPOINTS, sift_keypoints
 from agalign.method.levels import View, make_view
 from agalign.method.patches import Keypoints, footprint_radius, patch_positions
 from agalign.method.starter import start_from, start_from_starter
@@ -42,13 +42,14 @@ def starter_for_matching(channels: tuple[int, int]) -> Descriptor:
 
 
 @torch.no_grad()
-def match_seed(net: Descriptor, fixed: Raster, moving: Raster) -> Matrix | None:
+def match_seed(net: Descriptor, fixed: Raster, moving: Raster, most: int = MOST_KEYPOINTS) -> Matrix | None:
     """fixed_to_moving between undistorted px, from matches of a `matching_network`'s descriptors.
 
-    None where fewer than twelve mutual nearest neighbours agree on one homography.
+    So many keypoints of each image are tried. None where fewer than twelve mutual nearest neighbours agree on one
+    homography.
     """
     device = next(net.parameters()).device
-    here, there = (_keypoints(raster, device) for raster in (fixed, moving))
+    here, there = (_keypoints(raster, device, most) for raster in (fixed, moving))
     if min(len(here[1]), len(there[1])) < _LEAST_MATCHES:
         return None
     f = net(here[0].patches(patch_positions(here[1])), REFERENCE)
@@ -69,12 +70,12 @@ def match_seed(net: Descriptor, fixed: Raster, moving: Raster) -> Matrix | None:
         return None
 
 
-def _keypoints(raster: Raster, device: torch.device) -> tuple[View, Keypoints]:
+def _keypoints(raster: Raster, device: torch.device, most: int) -> tuple[View, Keypoints]:
     """An image at the resolution at which it is matched, and its keypoints as undistorted positions."""
     scale = min(1.0, _LONGEST_SIDE_PX / max(raster.size_px))
     view = make_view(raster, scale, device)
     small = shrink(raster, view.size_px)
-    found = sift_keypoints(small)
+    found = sift_keypoints(small, most)
     xy = torch.from_numpy(lens.undistort(view.lens, found.xy.numpy()).astype(np.float32))
     straight = Keypoints(xy, found.angle, found.scale).to(device)
     rows = (view.room_at(straight.xy) > footprint_radius(straight.scale)).nonzero()[:, 0]

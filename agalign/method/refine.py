@@ -27,7 +27,7 @@ from agalign.values.choices import ModelFamily
 from agalign.values.doubts import Doubt
 
 LEAST_KEYPOINTS = 16
-_FIRST_PATCHES, _LIKELY_SHIFTS, _AT_ONCE = 32, 64, 16
+_FIRST_PATCHES, _LIKELY_SHIFTS, _AT_ONCE = 24, 64, 16
 _MOST_RATIO = 0.6
 """Of one step to the one before, for what follows to be believed a geometric series."""
 _PLAIN_GAIN = 3.0
