@@ -1,12 +1,15 @@
 """Where a pair's alignment starts: candidates scored on the images, the best kept; and the method's subject of it."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair, Candidates
+from agalign.capture.evidence import Look
 from agalign.config import SeedSettings
 from agalign.flight.model import FlightModel
+from agalign.judge.verdict import seed_fits
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import match_seed, starter_for_matching
 from agalign.method.state import Subject
@@ -14,7 +17,7 @@ from agalign.pixels.landmarks import VIEWS, agreed_homography, landmarks
 from agalign.pixels.resample import single, textured, warped
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.values.alignment import Seed
+from agalign.values.alignment import Residual, Seed
 from agalign.values.choices import SeedKind
 from agalign.values.doubts import Doubt
 from agalign.values.geometry import Matrix
@@ -43,15 +46,12 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
     best = best_seed(pair, candidates)
     if best.score >= _PLAIN_SIGMA or _is_known(pair):
         return best
-    for found in _by_landmarks(pair):
-        best = max(best, best_seed(pair, {"match": found}), key=lambda seed: seed.score)
-        if best.score >= _PLAIN_SIGMA:
-            return best
-    if best.trusted:
-        return best
-    learnt = match_seed(_network(pair, model), pair.fixed, pair.moving, _MOST_KEYPOINTS)
-    if learnt is not None:
-        best = max(best, best_seed(pair, {"match": learnt}), key=lambda seed: seed.score)
+    shown = _windows_under(pair, best)
+    for found in _matched(pair, model, by_learnt_descriptors=not best.trusted):
+        matched = _at_its_place(pair, "match", found)
+        there = _windows_under(pair, matched)
+        if seed_fits(there, pair.reference.settings.check) and there.is_better_than(shown):
+            return replace(matched, trusted=True)
     return best
 
 
@@ -61,14 +61,22 @@ def _is_known(pair: BandPair) -> bool:
     return forced or pair.is_known_to_a_rig or "user" in pair.candidates
 
 
-def _by_landmarks(pair: BandPair) -> Iterator[Matrix]:
-    """Mappings, however turned, scaled or far apart, that landmarks of both images agree on."""
+def _matched(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors: bool) -> Iterator[Matrix]:
+    """Mappings, however turned, scaled or far apart, that landmarks or learnt descriptors of both images agree on."""
     for view in VIEWS:
         here = pair.reference.landmarks(view).undistorted(pair.fixed.lens)
         there = landmarks(pair.moving, view).undistorted(pair.moving.lens)
         found = agreed_homography(here, there, pair.fixed.size_px)
         if found is not None:
             yield found
+    if by_learnt_descriptors:
+        found = match_seed(_network(pair, model), pair.fixed, pair.moving, _MOST_KEYPOINTS)
+        if found is not None:
+            yield found
+
+
+def _windows_under(pair: BandPair, seed: Seed) -> Residual:
+    return Look.at(pair, pair.mapping(seed.fixed_to_moving)).residual
 
 
 def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
@@ -102,8 +110,13 @@ def best_seed(pair: BandPair, candidates: Candidates) -> Seed:
     return max(forced or scored, key=lambda seed: seed.score)
 
 
+def _at_its_place(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> Seed:
+    """A candidate as it is, with what the structures say of it."""
+    return _scored(pair, kind, fixed_to_moving)[0]
+
+
 def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[Seed]:
-    """The candidate itself and, where the structures agree better a shift away, its `structure` variant.
+    """The candidate itself first and, where the structures agree better a shift away, its `structure` variant.
 
     On a sliver of common area the peak of the correlation means nothing: such a candidate scores 0.
     """

@@ -98,6 +98,10 @@ class Residual:
         coverage = float(measured.mean()) if len(measured) else 0.0
         return cls(centres_px, shifts_px, float(median), float(p95), coverage, peaks_sigma)
 
+    def is_better_than(self, other: "Residual") -> bool:
+        """True where more windows lie close: half of all, weighed with how many could be measured, within less."""
+        return self.median_px / max(self.coverage, 1e-6) < other.median_px / max(other.coverage, 1e-6)
+
     def enlarged(self, up: tuple[float, float]) -> "Residual":
         """The same on an image that is larger by these factors (x, y)."""
         return replace(
