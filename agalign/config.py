@@ -222,6 +222,9 @@ class LocalSettings(Stage):
     """A window that the field misses by so many times what it misses most by has half a vote."""
     reweightings: Positive = 4
     rounds: Positive = 2
+    most_rounds: Positive = 4
+    settled_px: float = 0.2
+    """Median of what the windows still show, from which there are as many rounds."""
     least_windows: Positive = 24
     least_gain_sigma: float = 4.0
     """A field is kept where the squared shifts of windows left out of its fit fall by so many standard errors, and
@@ -234,7 +237,7 @@ class LocalSettings(Stage):
 
     def is_wanted_for(self, doubts: tuple[Doubt, ...], *, rig_known: bool) -> bool:
         """True where a field is to be tried for a result that has these doubts."""
-        mendable = all(d.kind in ("close_windows", "cluster") for d in doubts)
+        mendable = all(d.kind in ("close_windows", "cluster", "residual_px") for d in doubts)
         return mendable and (self.use == "always" or (self.use == "auto" and (bool(doubts) or not rig_known)))
 
 

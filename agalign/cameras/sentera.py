@@ -13,16 +13,19 @@ import numpy as np
 
 from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import BAND_NAME, CAPTURE_UUID, FLIGHT_UUID, perspective_lens, spectral
+from agalign.cameras.pix4d import BAND_NAME, CAMERA, CAPTURE_UUID, FLIGHT_UUID, perspective_lens, spectral
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
-_ANY_BAND_FOLDER = re.compile(r"^(?:\d+-)?[A-Za-z ]+-\d{3,4}(?:-\d+)?$|^(?:\d+-)?(?:RGB|NDRE|NDVI|NIR|RE|LWIR)$", re.I)
+_ANY_BAND_FOLDER = re.compile(
+    r"^(?:\d+-)?[A-Za-z ]+-\d{3,4}(?:-\d+)?$|^(?:\d+-)?(?:n?RGB|NDRE|NDVI|NIR|RE|LWIR)$", re.I
+)
 _CHANNELS = {"NDRE": {1: ("Red edge", 720.0), 3: ("NIR", 840.0)}, "NDVI": {1: ("Red", 625.0), 3: ("NIR", 850.0)}}
 """Of the one-lens cameras: the channels that hold a band, with their centre wavelengths in nm."""
 
 
+_SPELT = {"RedEdge": "Red edge"}
 _SENTERA = "sentera.com"
 
 
@@ -40,6 +43,9 @@ class Sentera(Camera):
         matrix = tags.numbers(_SENTERA, "AlignMatrix")
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
         if len(info.dtypes) > 1:
+            listed = _listed_bands(path, tags, info)
+            if listed:
+                return listed
             kind = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), "")
             if not kind:
                 # The Double 4K's colour camera is one of its two: no mere companion.
@@ -62,3 +68,20 @@ class Sentera(Camera):
 
     def capture_name(self, path: Path) -> str:
         return re.sub(r"_\d{3}_\d{2,3}$", "", path.stem)
+
+
+def _listed_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+    """The bands of a photograph whose tags list them, channel by channel: one without a wavelength holds none."""
+    names = tags.xmp.get(BAND_NAME, ())
+    wavelengths, widths = (tags.numbers(CAMERA, name) for name in ("CentralWavelength", "WavelengthFWHM"))
+    if not len(names) == len(wavelengths) == len(info.dtypes):
+        return ()
+    lens = perspective_lens(tags)
+    return tuple(
+        replace(
+            band_of(path, info, _SPELT.get(name, name), index), wavelength_nm=wavelength, one_lens=True, lens=lens,
+            bandwidth_nm=widths[index - 1] if len(widths) == len(names) else None,
+        )
+        for index, (name, wavelength) in enumerate(zip(names, wavelengths, strict=True), start=1)
+        if wavelength > 0
+    )  # fmt: skip

@@ -37,7 +37,8 @@ class LocalRefiner:
         """The field over a mapping, with the displacements that it has already, and what it gains on windows that it
         was not fitted to.
 
-        The shifts are measured again after each round, under the field so far: windows over steps sharpen so.
+        The shifts are measured again after each round, under the field so far: windows over steps sharpen so, and long
+        shifts are found in steps.
         """
         before = None if mapping.local is None else mapping.local.on_lattice(self.settings.lattice_px, self.size_px)
         first = self._measure(moving, mapping)
@@ -51,8 +52,10 @@ class LocalRefiner:
         else:
             return LocalResult(None, gain.before_p95_px, gain.after_p95_px)
         field = before
-        for number in range(self.settings.rounds):
+        for number in range(self.settings.most_rounds):
             found = first if number == 0 else self._measure(moving, replace(mapping, local=field))
+            if number >= self.settings.rounds and found.median_px <= self.settings.settled_px:
+                break
             more = fitted_field(Shifts.of(found), gain.smoothness, self.settings, self.size_px)
             total = more if field is None else field.plus(more)
             if not _is_one_to_one(total, self.size_px):

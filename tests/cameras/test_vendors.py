@@ -15,9 +15,10 @@ from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.parrot import Sequoia
-from agalign.cameras.pix4d import CAMERA
+from agalign.cameras.pix4d import BAND_NAME, CAMERA
+from agalign.cameras.sentera import Sentera
 from agalign.cameras.tiff_directory import Entry, add_directories, byte_string, rational, short, text
-from agalign.pixels.raster import probe
+from agalign.pixels.raster import RasterInfo, probe
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Capture
 
@@ -280,6 +281,25 @@ def test_double_4k_is_a_capture_of_two_photographs(tmp_path: Path) -> None:
     capture = only_capture(tmp_path)
     assert [b.name for b in capture.bands] == ["Red edge", "NIR", "RGB Red", "RGB Green", "RGB Blue"]
     assert [b.band_index for b in capture.bands] == [1, 3, 1, 2, 3]
+
+
+def test_a_double_4k_lists_its_bands_and_calls_one_garbage(tmp_path: Path) -> None:
+    lens = {
+        (CAMERA, "PrincipalPoint"): ("3.1,2.325",), (CAMERA, "PerspectiveFocalLength"): ("3484",),
+        (CAMERA, "PerspectiveDistortion"): ("-0.093", "0.122", "0", "0", "0"),
+    }  # fmt: skip
+    for folder, names, wavelengths in (
+        ("nRGB", ("Red", "Green", "Blue"), ("650", "548", "446")),
+        ("NDRE", ("RedEdge", "Garbage", "NIR"), ("720", "0", "840")),
+    ):
+        path = tmp_path / folder / "IMG_00042.jpg"
+        info = RasterInfo(160, 120, ("uint8",) * 3, (None,) * 3, (None,) * 3, (None,) * 3, None, None)
+        tags = Tags(make="Sentera", xmp=lens | {BAND_NAME: names, (CAMERA, "CentralWavelength"): wavelengths})
+        bands = Sentera().bands(path, tags, info)
+        assert [b.band_index for b in bands] == ([1, 2, 3] if folder == "nRGB" else [1, 3])
+        assert [b.name for b in bands] == (["Red", "Green", "Blue"] if folder == "nRGB" else ["Red edge", "NIR"])
+        assert bands[0].wavelength_nm == float(wavelengths[0])
+        assert Sentera().capture_folder(path) == tmp_path
 
 
 def test_three_bands_of_one_lens_are_no_capture(tmp_path: Path) -> None:
