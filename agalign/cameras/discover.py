@@ -116,6 +116,33 @@ def discover(
     return Flight(folder, tuple(captures), tuple(problems))
 
 
+def captures_onto(reference: Path, moving: Sequence[Path], band: str | None = None) -> list[Capture]:
+    """Georeferenced images that are to be laid on the grid of another one: of each, a capture of the reference's `band`
+    (by default the green one) and of all its own bands, which share one mapping.
+
+    Raises UnreadableFileError, InputError where one is not georeferenced, NoSuchBandError.
+    """
+    here = _georeferenced_bands(reference)
+    fixed = here[_reference_index(here, band, reference)]
+    fixed = replace(fixed, name=f"{reference.stem} {fixed.name}")
+    captures = []
+    for path in moving:
+        if path.resolve() == reference.resolve():
+            raise InputError(f"{path}: is the reference itself; name the mosaics that are to be laid on it")
+        bands = [fixed, *(replace(b, one_lens=True, companion=False) for b in _georeferenced_bands(path))]
+        taken_at = read_tags(path).captured_at
+        captures.append(Capture(path.stem, Path(), tuple(_with_unique_band_names(bands)), 0, captured_at=taken_at))
+    return _with_unique_names(captures)
+
+
+def _georeferenced_bands(path: Path) -> tuple[Band, ...]:
+    info = probe(path)
+    if info.georeference is None:
+        raise InputError(f"{path}: has no coordinates; align images without by 'agalign FOLDER'")
+    *_, generic = known_cameras(None)
+    return generic.bands(path, read_tags(path), info)
+
+
 def _images(folder: Path, skip: Sequence[Path]) -> list[Path]:
     skipped = {p.resolve() for p in skip}
     found: list[Path] = []

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.evidence import Look, judged, with_metrics, without_result
+from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.prediction import with_predictions, worth_learning
 from agalign.capture.seeding import find_seed, subject_of, unscored
 from agalign.capture.whole import most_probable
@@ -45,6 +46,8 @@ def align_capture_bands(
         found[band.name] = Alignment(unmoved.fixed_to_moving, "pixel", "aligned", (), unmoved, None, None, 0.0)
     for pair in pairs:
         alignment = aligned[pair.name].between_files(*pair.scales)
+        if pair.is_reduced and alignment.status == "aligned":
+            alignment = at_full_resolution(reference, pair.bands[0], alignment, settings.check)
         shared = replace(alignment, seconds=alignment.seconds / len(pair.bands))
         found |= dict.fromkeys((b.name for b in pair.bands), shared)
     for band in capture.moving:

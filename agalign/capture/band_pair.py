@@ -64,6 +64,11 @@ class BandPair:
         return "undistorted" if both else "pixel"
 
     @property
+    def is_reduced(self) -> bool:
+        """True where the images are smaller than their files."""
+        return min(*self.scales[0], *self.scales[1]) < 1.0
+
+    @property
     def reach_px(self) -> float:
         """How far from its seed it may lie, px of the fixed image: what a user knows is not left."""
         return _STANDARD_DEVIATIONS * self.known_to_px.get("user", np.inf)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.corner_fit import fit_corners
 from agalign.flight.rig import FACTOR_STD_PX, Expectation, Rig
 from agalign.values import geometry, lens
 from agalign.values.alignment import JointResult, Residual
@@ -31,12 +32,7 @@ _WINDOWS_STD_PX = 0.01
 _LEAST_WINDOWS = 16
 _FARTHEST_PX = 1.0
 """Windows that would move a corner farther do not correct a mapping: they contradict it."""
-_SPREADS = 2.0
-"""A window that lies so many times farther out than most has half a vote."""
-_LEAST_SPREAD_PX = 0.05
 _REWEIGHTINGS = 6
-_NOTHING = 1e-9
-"""Of all that is known: what directions get of which nothing is."""
 _FREEDOM = 4.0
 """Of the t distribution by which a band may lie beside where the rig has it."""
 
@@ -126,24 +122,10 @@ def _of_windows(pair: BandPair, residual: Residual) -> Witness | None:
     if some.sum() < _LEAST_WINDOWS:
         return None
     at, there = (_undistorted(pair, p) for p in (residual.centres_px, residual.centres_px + residual.shifts_px))
-    shift, design = (there - at)[some], geometry.over_corners(at[some], *pair.fixed.size_px)
-    sigma = residual.peaks_sigma[some]
-    trust, vote = (sigma / np.median(sigma)) ** 4, np.ones(len(shift))
-    for _ in range(_REWEIGHTINGS):
-        weight = trust * vote
-        normal = np.einsum("n,nki,nkj->ij", weight, design, design)
-        mean = np.linalg.lstsq(normal, np.einsum("n,nki,nk->i", weight, design, shift), rcond=None)[0]
-        left = shift - design @ mean
-        off = np.linalg.norm(left, axis=1)
-        vote = 1 / (1 + (off / (_SPREADS * max(1.4826 * float(np.median(off)), _LEAST_SPREAD_PX))) ** 2)
-    if not np.abs(mean).max() <= _FARTHEST_PX:
+    fit = fit_corners(at[some], (there - at)[some], residual.peaks_sigma[some], pair.fixed.size_px)
+    if not np.abs(fit.mean_px).max() <= _FARTHEST_PX:
         return None
-    score = np.einsum("n,nki,nk->ni", weight, design, left)
-    # Windows in a line agree, and say nothing of what lies beside it.
-    inverse = np.linalg.inv(normal + _NOTHING * np.trace(normal) * np.eye(8))
-    disagreement = inverse @ (score.T @ score) @ inverse
-    covariance = disagreement + (_LEAST_SPREAD_PX**2 / np.median(weight)) * inverse
-    return Witness.of(mean, np.asarray(covariance + _WINDOWS_STD_PX**2 * np.eye(8)))
+    return Witness.of(fit.mean_px, fit.covariance_px2 + _WINDOWS_STD_PX**2 * np.eye(8))
 
 
 def _undistorted(pair: BandPair, raw_px: Array) -> Array:

@@ -51,7 +51,7 @@ Jobs = Annotated[
         "-j",
         min=0,
         show_default=False,
-        help="Captures at a time; by default one a core, and one for short flights.",
+        help="Captures at a time; by default one a core.",
     ),
 ]
 Dask = Annotated[

@@ -15,6 +15,7 @@ from agalign.cli import align as cli_align
 from agalign.cli import evaluate as cli_evaluate
 from agalign.cli import info as cli_info
 from agalign.cli.align import Jobs, find_captures
+from agalign.cli.onto import onto
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
 from agalign.values.choices import LocalUse
 
@@ -147,6 +148,7 @@ def ndvi(
 
 
 cli_evaluate.register(app)
+app.command()(onto)
 _COMMANDS = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
 
 

@@ -1,0 +1,56 @@
+"""`agalign onto`: georeferenced mosaics of other dates or sensors, laid on the grid of one of them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from agalign.cli.align import Jobs, Reference, conclude, run
+from agalign.cli.terminal import LogJson, Quiet, Verbose, Voice, exits
+from agalign.values.choices import Compression, Interpolation, LocalUse, RasterFormat
+
+
+def onto(
+    reference: Annotated[
+        Path, typer.Argument(help="The mosaic on whose grid the others are laid.", show_default=False)
+    ],
+    moving: Annotated[list[Path], typer.Argument(help="Mosaics of other dates or sensors.", show_default=False)],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Output folder; by default REFERENCE-aligned.", show_default=False),
+    ] = None,
+    band: Reference = None,
+    local: Annotated[
+        LocalUse, typer.Option(help="Follow what one homography leaves by a smooth field: where it helps, or never.")
+    ] = "auto",
+    interpolation: Annotated[Interpolation, typer.Option(help="Resampling of the moving mosaics.")] = "lanczos",
+    format: Annotated[RasterFormat, typer.Option(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
+    compression: Annotated[Compression, typer.Option(help="Lossless.")] = "auto",
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
+    rng_seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
+    jobs: Jobs = 1,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Do again what an earlier run finished.")] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    log_json: LogJson = False,
+) -> None:
+    """Lay georeferenced mosaics of other dates or sensors on the grid of REFERENCE.
+
+    Grids, resolutions and coordinate reference systems may differ. Written are, for each MOVING, a raster on the
+    reference's pixels that holds the band it was compared with and the moving mosaic's bands, and a sidecar.
+    """
+    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(voice):
+        from agalign.cameras.discover import Flight, captures_onto
+        from agalign.config import FlightSettings, JointSettings, LocalSettings, Settings, WriteSettings
+
+        target = out or reference.absolute().parent / f"{reference.stem}-aligned"
+        settings = Settings(
+            joint=JointSettings(device=device, rng_seed=rng_seed),
+            flight=FlightSettings(together=False),
+            local=LocalSettings(use=local),
+            write=WriteSettings(interpolation=interpolation, crop="none", format=format, compression=compression),
+        )
+        flight = Flight(reference.parent, tuple(captures_onto(reference, moving, band)), ())
+        reports = run(flight, target, settings, voice, overwrite=overwrite, jobs=jobs)
+        raise typer.Exit(conclude(flight, reports, target, voice))
