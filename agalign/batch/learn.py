@@ -26,7 +26,7 @@ from agalign.method.joint import Results, refine_with
 from agalign.method.starter import start_from
 from agalign.method.state import JointState, Progress, Subject
 from agalign.pixels.raster import without_warnings
-from agalign.values.alignment import Alignment, JointResult, Residual, Seed
+from agalign.values.alignment import JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 
@@ -84,30 +84,31 @@ def learn_flight(
 
 
 def _still_holds(model: FlightModel, captures: Sequence[Capture], settings: Settings, at_once: int) -> bool:
-    """True where captures spread over a flight, of which some can be aligned, lie where a model's rig has them."""
+    """True where captures of a flight can be aligned, and a model's rig foretells each of their bands from the others
+    well enough for a lost one to count as delivered.
+    """
     rig = model.rig
     if rig is None or model.bands != _sides(captures[0]):
         return False
     plain = _without_local(settings)
 
     def fits(capture: Capture) -> tuple[int, int]:
-        """(bands that are aligned, those of which lie where the rig expects them)."""
+        """(bands that are aligned, those of which that the rig foretells)."""
         try:
             pairs, _ = read_pairs(capture, plain, model)
             found = align_pairs(pairs, plain, lambda *_: None, model, scratch=False)
-            expected = with_predictions(pairs, found, rig, capture, settings.check)
+            told = with_predictions(pairs, found, rig, capture, settings.check)
         except (AgalignError, cv2.error):
             return 0, 0
-        return _aligned(found), _aligned(expected)
+        aligned = [told[name] for name, a in found.items() if a.status == "aligned"]
+        limit_px = settings.check.accept_predicted_px
+        foretold = [a for a in aligned if a.prediction is not None and a.prediction.std_px <= limit_px]
+        return len(aligned), len(foretold)
 
     with ThreadPoolExecutor(at_once) as pool:
         some = [captures[len(captures) * k // 3] for k in (1, 2)]
         counts = list(pool.map(fits, some))
-    return sum(aligned for aligned, _ in counts) >= len(model.bands) and all(a == e for a, e in counts)
-
-
-def _aligned(found: Mapping[str, Alignment]) -> int:
-    return sum(a.status == "aligned" for a in found.values())
+    return sum(aligned for aligned, _ in counts) >= len(model.bands) and all(a == f for a, f in counts)
 
 
 def _without_local(settings: Settings) -> Settings:

@@ -11,7 +11,7 @@ from rasterio.errors import RasterioError
 
 from agalign.errors import OutputError
 from agalign.judge.expected_error import expected_error_px
-from agalign.pixels.raster import without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, without_warnings
 from agalign.products.write import georeferenced
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
@@ -35,7 +35,7 @@ def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid:
     profile |= {} if georeference is None else georeferenced(georeference, grid)
     try:
         with (
-            complete_file(path) as partial, without_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO"),
+            complete_file(path) as partial, without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT),
             rasterio.open(partial, "w", **profile) as dataset,
         ):  # fmt: skip
             for index, (name, alignment) in enumerate(alignments.items(), start=1):

@@ -16,7 +16,7 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from agalign.errors import AgalignError, InputError, OutputError
-from agalign.pixels.raster import open_raster, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, without_warnings
 from agalign.products.fill_sidecar import is_delivered
 from agalign.products.indices import Index, bands_for, compute
 from agalign.products.picture import write_png
@@ -173,7 +173,7 @@ def _create(stack: ExitStack, path: Path, like: rasterio.DatasetReader, index: I
     }  # fmt: skip
     if like.crs is not None and not like.transform.is_identity:
         profile |= {"crs": like.crs, "transform": like.transform}
-    stack.enter_context(rasterio.Env(GDAL_PAM_ENABLED="NO"))
+    stack.enter_context(rasterio.Env(**GDAL_ENVIRONMENT))
     stack.enter_context(without_warnings())
     dataset = stack.enter_context(rasterio.open(path, "w", **profile))
     dataset.set_band_description(1, index.name)

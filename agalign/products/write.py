@@ -26,7 +26,7 @@ from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import TIFF_SUFFIXES, open_raster, read_window, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, TIFF_SUFFIXES, open_raster, read_window, without_warnings
 from agalign.pixels.resample import resample_tile, tiles
 from agalign.products.layout import Layer
 from agalign.values import geometry
@@ -148,7 +148,7 @@ def write_raster(
     profile = _profile(capture.reference, len(layers), grid, dtype, nodata, compression, settings.tile_px)
     try:
         with complete_file(path) as partial:
-            with without_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO", GDAL_NUM_THREADS="ALL_CPUS"):
+            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT):
                 with rasterio.open(partial, "w", **profile) as dataset:
                     _describe(dataset, capture, layers, settings)
                     for index, layer in enumerate(layers, start=1):

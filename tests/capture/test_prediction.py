@@ -51,6 +51,21 @@ def test_the_rig_of_the_flight_is_learnt(model: FlightModel) -> None:
     assert set(model.rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
 
 
+def test_a_model_that_still_holds_is_kept_and_one_that_does_not_is_learnt_anew(five: Path, model: FlightModel) -> None:
+    captures = discover(five).captures
+    again = learn_flight(captures, Settings(), lambda *_: None, start=model)
+    assert again is not None
+    assert again.net is model.net
+    assert again.rig is model.rig
+    assert model.rig is not None
+    apart_px = dict(zip(model.bands, (12.0, -12.0, 9.0, -9.0), strict=True))
+    elsewhere = {b: geometry.translation(apart_px[b], apart_px[b] / 3) @ m for b, m in model.rig.mean.items()}
+    moved = replace(model, rig=replace(model.rig, mean=elsewhere), mappings=elsewhere)
+    anew = learn_flight(captures, Settings(), lambda *_: None, start=moved)
+    assert anew is not None
+    assert anew.rig is not moved.rig
+
+
 def test_a_lost_band_is_predicted_with_an_error_bar_and_never_called_aligned(five: Path, model: FlightModel) -> None:
     capture = discover(five).captures[2]
     found = align_capture_bands(capture, Settings(), model, lambda *_: None)

@@ -1,11 +1,13 @@
+import cv2
 import numpy as np
 import pytest
 
 from agalign.capture.band_pair import BandPair, Candidates
-from agalign.capture.seeding import best_seed
+from agalign.capture.seeding import best_seed, find_seed
 from agalign.capture.tag_seeds import geo_seed
 from agalign.config import SeedSettings, Settings
 from agalign.errors import GeometryError
+from agalign.pixels.landmarks import VIEWS, agreed_homography, landmarks
 from agalign.values import geometry
 from agalign.values.alignment import Seed
 from agalign.values.capture import Band, Georeference
@@ -92,3 +94,45 @@ def test_the_flights_mapping_is_enough_where_it_leaves_no_doubt() -> None:
     assert mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 1
     lost = best(rasters(SHIFTED), {"model": geometry.translation(300, 0), "rig": SHIFTED})
     assert mean_error_px(lost.fixed_to_moving, SHIFTED, 400, 320) < 1
+
+
+def turned(image: np.ndarray, degrees: float, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(an image turned and scaled about its centre, on a canvas that holds all of it; its mask; old px to new ones)."""
+    height, width = image.shape
+    cos, sin = np.cos(np.radians(degrees)) * scale, np.sin(np.radians(degrees)) * scale
+    size = round(width * abs(cos) + height * abs(sin)), round(width * abs(sin) + height * abs(cos))
+    matrix = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+    matrix[:2, 2] = (np.array(size) - 1) / 2 - matrix[:2, :2] @ ((np.array([width, height]) - 1) / 2)
+    valid = cv2.warpAffine(np.full(image.shape, 255, np.uint8), matrix[:2], size) == 255
+    return cv2.warpAffine(image, matrix[:2], size, flags=cv2.INTER_CUBIC), valid, matrix
+
+
+@pytest.mark.parametrize(("degrees", "scale"), [(3, 1.0), (45, 1.0), (180, 1.0), (10, 0.6), (-90, 1.5)])
+def test_landmarks_find_what_is_turned_or_scaled(degrees: float, scale: float) -> None:
+    fixed, moving = textured_pair(SHIFTED)
+    image, valid, to_turned = turned(moving, degrees, scale)
+    images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
+    overlay = geometry.overlay(images[0].size_px, images[1].size_px)
+    seed = find_seed(BandPair.of_images("moving", *images, {"identity": overlay}, Settings()))
+    assert isinstance(seed, Seed)
+    assert (seed.kind, seed.trusted) == ("match", True)
+    assert mean_error_px(seed.fixed_to_moving, geometry.compose(to_turned, SHIFTED), 400, 320) < 2 * scale
+
+
+def test_what_a_user_knows_is_not_left_for_landmarks() -> None:
+    fixed, moving = textured_pair(np.eye(3))
+    image, valid, to_turned = turned(moving, 10, 1.0)
+    images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
+    elsewhere = geometry.translation(5, 5)
+    pair = BandPair.of_images("moving", *images, {"user": elsewhere}, Settings(), {"user": 3.0})
+    seed = find_seed(pair)
+    assert isinstance(seed, Seed)
+    assert seed.kind in ("user", "structure")
+    assert mean_error_px(seed.fixed_to_moving, to_turned, 400, 320) > 5
+
+
+def test_unrelated_images_have_no_landmarks_in_common() -> None:
+    valid = np.ones((320, 400), bool)
+    one, other = (Raster(textured_image(400, 320, s), valid) for s in (5, 6))
+    for view in VIEWS:
+        assert agreed_homography(landmarks(one, view), landmarks(other, view), (400, 320)) is None
