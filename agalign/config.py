@@ -224,7 +224,7 @@ class LocalSettings(Stage):
     rounds: Positive = 2
     most_rounds: Positive = 4
     settled_px: float = 0.2
-    """Median of what the windows still show, from which there are as many rounds."""
+    """Median of what the windows still show, above which there are as many rounds."""
     least_windows: Positive = 24
     least_gain_sigma: float = 4.0
     """A field is kept where the squared shifts of windows left out of its fit fall by so many standard errors, and

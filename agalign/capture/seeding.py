@@ -44,7 +44,7 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
             return Doubt("no_such_seed", detail="match")
         candidates = {"match": found}
     best = best_seed(pair, candidates)
-    if best.score >= _PLAIN_SIGMA or _is_known(pair):
+    if best.score >= _PLAIN_SIGMA or _is_known(pair) or (best.trusted and pair.is_expected(best.fixed_to_moving)):
         return best
     shown = _windows_under(pair, best)
     for found in _matched(pair, model, by_learnt_descriptors=not best.trusted):

@@ -54,13 +54,13 @@ class LocalRefiner:
         field = before
         for number in range(self.settings.most_rounds):
             found = first if number == 0 else self._measure(moving, replace(mapping, local=field))
-            if number >= self.settings.rounds and found.median_px <= self.settings.settled_px:
-                break
             more = fitted_field(Shifts.of(found), gain.smoothness, self.settings, self.size_px)
             total = more if field is None else field.plus(more)
             if not _is_one_to_one(total, self.size_px):
                 break
             field = total
+            if number + 1 >= self.settings.rounds and found.median_px <= self.settings.settled_px:
+                break
         return LocalResult(None if field is before else field, gain.before_p95_px, gain.after_p95_px)
 
     def _held_out_gain(self, residual: Residual, smoothness: float, folds: Iterable[int], apart_px: float) -> "_Gain":

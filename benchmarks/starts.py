@@ -1,0 +1,155 @@
+"""From which starts a pair is found, and by whom: shifts, turns and scales of the moving band, no tags used.
+
+    pip install -e '.[bench]' && python benchmarks/starts.py DATA... [--pairs 3] [--plot FILE]
+
+DATA holds folders of bands with `ties.json` or `truth.json` (benchmarks/accuracy.py says how); of each so many pairs
+are taken, and a synthetic flight's. The moving band is shifted within its frame by a share of its width, then turned
+and scaled about its centre on a canvas that holds all of it. A pair is found where the median error is at most 0.3 px
+of the moving file. Prints a table, and draws a heat map.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from peers import Case, cases, sift
+
+import agalign
+from agalign.evaluation.methods import elastix_affinity
+from agalign.synthetic import flight as synthetic
+from agalign.values import geometry
+from agalign.values.image import Raster
+
+FOUND_PX, WRONG_PX = 0.3, 1.0
+SHIFTS, TURNS, SCALES = (0.0, 0.1, 0.2, 0.25), (0.0, 3.0, 10.0, 45.0, 90.0, 180.0), (0.5, 0.8, 1.25, 2.0)
+STARTS = (
+    [(shift, turn, 1.0) for turn in TURNS for shift in SHIFTS] + [(0.0, turn, s) for s in SCALES for turn in TURNS]
+)  # fmt: skip
+
+Matrix = np.ndarray
+Aligner = Callable[[Raster, Raster], tuple[Matrix | None, bool]]
+"""A pair to (fixed_to_moving, whether it says that it is sure)."""
+
+
+def moved(raster: Raster, shift: float, degrees: float, scale: float) -> tuple[Raster, Matrix]:
+    """(the image shifted within its frame, turned and scaled; its old pixels to the new ones)."""
+    width, height = raster.size_px
+    within = geometry.translation(shift * width, -shift * height / 2)
+    turn = np.radians(degrees)
+    linear = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    size = tuple(np.ceil(np.abs(linear) @ (width, height)).astype(int).tolist())
+    about = np.eye(3)
+    about[:2, :2] = linear
+    about[:2, 2] = (np.array(size) - 1) / 2 - linear @ ((np.array([width, height]) - 1) / 2)
+    frame = cv2.warpAffine(raster.valid.astype(np.uint8) * 255, within[:2], (width, height))
+    whole = cv2.warpAffine(frame, about[:2], size) == 255
+    source = cv2.GaussianBlur(raster.pixels, (0, 0), 0.5 * np.sqrt(1 / scale**2 - 1)) if scale < 1 else raster.pixels
+    matrix = about @ within
+    return Raster(cv2.warpAffine(source, matrix[:2], size, flags=cv2.INTER_CUBIC), whole), matrix
+
+
+def ours(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
+    found = agalign.align(fixed.pixels, moving.pixels, fixed_valid=fixed.valid, moving_valid=moving.valid)
+    return found.fixed_to_moving, found.status == "aligned"
+
+
+def by_sift(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
+    return sift(fixed, moving, np.eye(3)), True
+
+
+def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
+    """On the moving image laid over the fixed one: images of other sizes are beyond it."""
+    overlay = geometry.overlay(fixed.size_px, moving.size_px)
+    laid = cv2.warpPerspective(moving.pixels, overlay, fixed.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    found = elastix_affinity(fixed, Raster(laid, fixed.valid))
+    return None if found is None else geometry.compose(overlay, found), True
+
+
+METHODS: dict[str, Aligner] = {"agalign": ours, "SIFT + RANSAC": by_sift, "elastix affine": by_elastix}
+
+
+def error_px(case: Case, to_moved: Matrix, found: Matrix | None) -> float:
+    """Median over the ties that lie in the moved image too, px of the moving file."""
+    if found is None:
+        return float("inf")
+    there = geometry.apply(to_moved, case.ties[:, 2:])
+    off = np.linalg.norm(geometry.apply(found, case.ties[:, :2]) - there, axis=1)
+    return float(np.median(off) / np.sqrt(abs(np.linalg.det(to_moved[:2, :2]))))
+
+
+def chosen(folders: Sequence[Path], pairs: int) -> Iterator[Case]:
+    """So many pairs of each set, spread over it."""
+    for folder in folders:
+        some = list(cases([folder]))
+        yield from (some[i] for i in np.unique(np.linspace(0, len(some) - 1, pairs).round().astype(int)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, nargs="+")
+    parser.add_argument("--pairs", type=int, default=3)
+    parser.add_argument("--methods", default=";".join(METHODS))
+    parser.add_argument("--plot", type=Path)
+    options = parser.parse_args()
+    shares: dict[str, dict[tuple[float, float, float], float]] = {name: {} for name in options.methods.split(";")}
+    print("| method | shift | turn | scale | found | median, px | worst sure, px | wrong though sure | s |")
+    print("|---|---|---|---|---|---|---|---|---|", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "synthetic"
+        synthetic.make_flight(made, captures=2, rng_seed=11)
+        tried = list(chosen([*options.data, made], options.pairs))
+        for start in STARTS:
+            for name in shares:
+                errors, sure, seconds = [], [], []
+                for case in tried:
+                    fixed, moving = case.straight()
+                    image, to_moved = moved(moving, *start)
+                    began = time.perf_counter()
+                    found, is_sure = METHODS[name](fixed, image)
+                    seconds.append(time.perf_counter() - began)
+                    errors.append(error_px(case, to_moved, found))
+                    sure.append(is_sure)
+                off, says = np.array(errors), np.array(sure)
+                hit = off <= FOUND_PX
+                shares[name][start] = float(hit.mean())
+                worst = f"{off[says].max():.2f}" if says.any() else "-"
+                print(
+                    f"| {name} | {start[0]:.0%} | {start[1]:g}° | {start[2]:g} | {hit.sum()} of {len(hit)} | "
+                    f"{np.median(off):.3f} | {worst} | {(says & (off > WRONG_PX)).sum()} | {np.median(seconds):.1f} |",
+                    flush=True,
+                )
+    if options.plot is not None:
+        draw(shares, options.plot)
+
+
+def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path) -> None:
+    """A heat map a method: turns against shifts and scales, coloured by the share that is found."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    across = [(s, 1.0) for s in SHIFTS] + [(0.0, s) for s in SCALES]
+    labels = [f"{shift:.0%}" for shift in SHIFTS] + [f"×{scale:g}" for scale in SCALES]
+    figure, axes = plt.subplots(1, len(shares), figsize=(4.6 * len(shares), 3.6), sharey=True, squeeze=False)
+    for axis, (name, found) in zip(axes[0], shares.items(), strict=True):
+        table = np.array([[found[shift, turn, scale] for shift, scale in across] for turn in TURNS])
+        image = axis.imshow(table, cmap="RdYlGn", vmin=0, vmax=1, aspect="auto")
+        for (row, column), share in np.ndenumerate(table):
+            axis.text(column, row, f"{share:.0%}", ha="center", va="center", fontsize=8)
+        axis.set_xticks(range(len(labels)), labels)
+        axis.set_yticks(range(len(TURNS)), [f"{turn:g}°" for turn in TURNS])
+        axis.axvline(len(SHIFTS) - 0.5, color="white", linewidth=3)
+        axis.set_title(name)
+        axis.set_xlabel("shift of the width        scale")
+    axes[0, 0].set_ylabel("turn")
+    figure.colorbar(image, ax=axes[0].tolist(), label="found within 0.3 px")
+    figure.savefig(path, dpi=110, bbox_inches="tight")
+
+
+if __name__ == "__main__":
+    main()
