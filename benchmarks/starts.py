@@ -134,7 +134,7 @@ def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path)
     from matplotlib import pyplot as plt
 
     across = [(s, 1.0) for s in SHIFTS] + [(0.0, s) for s in SCALES]
-    labels = [f"{shift:.0%}" for shift in SHIFTS] + [f"×{scale:g}" for scale in SCALES]
+    labels = [f"{shift:.0%}" for shift in SHIFTS] + [f"x{scale:g}" for scale in SCALES]
     figure, axes = plt.subplots(1, len(shares), figsize=(4.6 * len(shares), 3.6), sharey=True, squeeze=False)
     for axis, (name, found) in zip(axes[0], shares.items(), strict=True):
         table = np.array([[found[shift, turn, scale] for shift, scale in across] for turn in TURNS])
