@@ -38,6 +38,8 @@ from agalign.values.choices import Layout
 
 _CAPTURES_WORTH_A_PROCESS = 4
 """To start one takes as long as these."""
+MOST_THREADS = 4
+"""Of one process: more wait for the interpreter."""
 
 
 def prepare_output(out: Path) -> None:
@@ -107,7 +109,8 @@ def run_flight(
     with _executor(sum(len(mine) for _, _, mine in left), options, settings) as (executor, most):
         waiting: list[Task] = []
         for whole, name, mine in left:
-            path = _learn(whole, out / "models" / name, settings, listener, known, _cores(options, settings))
+            at_once = min(MOST_THREADS, _cores(options, settings))
+            path = _learn(whole, out / "models" / name, settings, listener, known, at_once)
             waiting += [Task(c, out, settings, path) for c in mine]
         if executor is None:
             yield from _one_by_one(waiting, listener)
@@ -134,13 +137,15 @@ def _executor(captures: int, options: RunOptions, settings: Settings) -> Iterato
     if options.executor is not None:
         yield options.executor, MOST_HANDED_OVER
         return
-    jobs = min(_cores(options, settings), captures)
+    cores = _cores(options, settings)
+    jobs = min(cores, captures // _CAPTURES_WORTH_A_PROCESS)
     if jobs <= 1:
-        yield None, 0
-        return
-    if captures < jobs * _CAPTURES_WORTH_A_PROCESS:
-        with without_warnings(), ThreadPoolExecutor(jobs) as pool:
-            yield pool, jobs
+        threads = min(cores, captures, MOST_THREADS)
+        if threads <= 1:
+            yield None, 0
+            return
+        with without_warnings(), ThreadPoolExecutor(threads) as few:
+            yield few, threads
         return
     threads = max(1, (os.cpu_count() or 1) // jobs)
     with (

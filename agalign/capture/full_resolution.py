@@ -28,6 +28,7 @@ _COLUMNS, _ROWS = 8, 6
 """A tile in each cell of the image."""
 _ROUNDS = 3
 _LEAST_WINDOWS = 24
+_REST_PX = 0.02
 _MOST_STEP_PX = 40.0
 """Of a corner: beyond, the windows contradict what the reduced images say."""
 
@@ -37,8 +38,8 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment, chec
 
     Where the tiles show too little it stays as it is. Raises UnreadableFileError.
     """
-    best = alignment
-    shown = _shifts(reference, moving, mapping_of(reference, moving, best), _tiles(reference, alignment), check)
+    best, tiles = alignment, _tiles(reference, alignment)
+    shown = _shifts(reference, moving, mapping_of(reference, moving, best), tiles, check)
     for _ in range(_ROUNDS):
         known = np.isfinite(shown.shifts_px[:, 0])
         if known.sum() < _LEAST_WINDOWS:
@@ -50,12 +51,11 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment, chec
             return best
         change = geometry.moving_corners(fit.mean_px, *reference.size_px)
         step = replace(best, fixed_to_moving=geometry.compose(best.fixed_to_moving, change))
-        mapping = mapping_of(reference, moving, step)
-        again = _shifts(reference, moving, mapping, _tiles(reference, alignment), check)
+        again = _shifts(reference, moving, mapping_of(reference, moving, step), tiles, check)
         if not again.median_px < shown.median_px:
             break
         best, shown = _known_to(step, fit.covariance_px2, again), again
-        if np.abs(fit.mean_px).max() <= check.most_corner_std_px / 100:
+        if np.abs(fit.mean_px).max() <= _REST_PX:
             break
     return best
 
