@@ -2,10 +2,12 @@
 
     python benchmarks/flight.py [lengths, by default 10,30,100] [jobs, by default 1,2]
 
-Prints a table, the line total = learning + captures x steady through its rows, and the largest memory of any process.
+Prints a table, the line total = learning + captures x steady through its rows, and the largest memory of any process;
+also what all processes of a run hold in its second and its last quarter, memory and open files (where there is /proc).
 """
 
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -15,12 +17,44 @@ from pathlib import Path
 import numpy as np
 
 
+def watched(command: list[str]) -> tuple[resource.struct_rusage, list[tuple[float, int]]]:
+    """(what a run used, [(GB, open files) of it and all its children, every half second])."""
+    process, held = subprocess.Popen(command), []
+    while True:
+        pid, _, usage = os.wait4(process.pid, os.WNOHANG)
+        if pid:
+            return usage, held or [(0.0, 0)]
+        found = [holds(p) for p in descendants(process.pid)]
+        held.append((sum(memory for memory, _ in found), sum(files for _, files in found)))
+        time.sleep(0.5)
+
+
+def descendants(pid: int) -> list[int]:
+    """A process and all that it has started, as long as they run."""
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:
+        return [pid]
+    return [pid, *(d for child in children for d in descendants(int(child)))]
+
+
+def holds(pid: int) -> tuple[float, int]:
+    """(GB, open files) of a process."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+        return pages * resource.getpagesize() / 1e9, len(os.listdir(f"/proc/{pid}/fd"))
+    except (OSError, IndexError):
+        return 0.0, 0
+
+
 def main() -> None:
     lengths = [int(n) for n in (sys.argv[1] if len(sys.argv) > 1 else "10,30,100").split(",")]
     jobs = [int(n) for n in (sys.argv[2] if len(sys.argv) > 2 else "1,2").split(",")]
     seconds: dict[tuple[int, int], float] = {}
-    print("| captures | jobs | seconds | largest process, GB |")
-    print("|---|---|---|---|")
+    print(
+        "| captures | jobs | seconds | largest process, GB | all, 2nd and last quarter, GB | open files, likewise |"
+    )
+    print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "flight"
         # In a process of its own: a child's memory is counted from its parent's at its start.
@@ -37,10 +71,15 @@ def main() -> None:
                 out = Path(folder) / f"out{length}-{count}"
                 command = [sys.executable, "-m", "agalign", str(part), "-o", str(out), "-q", "--jobs", str(count)]
                 began = time.perf_counter()
-                _, _, usage = os.wait4(subprocess.Popen(command).pid, 0)
+                usage, held = watched(command)
                 seconds[length, count] = time.perf_counter() - began
                 gigabytes = usage.ru_maxrss / 1e6
-                print(f"| {length} | {count} | {seconds[length, count]:.1f} | {gigabytes:.2f} |", flush=True)
+                quarters = [np.median(held[len(held) * k // 4 : len(held) * (k + 1) // 4], axis=0) for k in (1, 3)]
+                memory, files = (" / ".join(f"{q[k]:.{2 - 2 * k}f}" for q in quarters) for k in (0, 1))
+                print(
+                    f"| {length} | {count} | {seconds[length, count]:.1f} | {gigabytes:.2f} | {memory} | {files} |",
+                    flush=True,
+                )
     for count in jobs:
         slope, offset = np.polyfit(lengths, [seconds[n, count] for n in lengths], 1)
         print(f"jobs {count}: {offset:.1f} s + {slope:.2f} s a capture")
