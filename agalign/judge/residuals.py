@@ -88,7 +88,7 @@ def _starts(length: int, side: int, step: int | None) -> list[int]:
 def _peaks(cross: Field, least_sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """((n, 2) shifts, nan where no peak stands out; (n,) heights in standard deviations) of cross spectra."""
     count, height, width = cross.shape
-    surfaces = fft.ifft2(cross).real.reshape(count, -1)
+    surfaces = fft.ifft2(cross).real.reshape(count, height * width)
     highest = surfaces.argmax(axis=1)
     # Their means are 0: the windows have none.
     spread = np.sqrt(np.einsum("ni,ni->n", surfaces, surfaces) / (height * width))

@@ -159,3 +159,11 @@ def test_tiles_without_structure_are_not_tried() -> None:
     residual = tile_residuals(Raster(fixed, valid), Raster(moving, valid), CheckSettings())
     assert len(residual.centres_px) > 0
     assert residual.centres_px[:, 0].max() < 200
+
+
+def test_windows_that_are_nowhere_valid_say_nothing() -> None:
+    one, other = textured_pair(np.eye(3))
+    nowhere = Raster(other, np.zeros(other.shape, bool))
+    found = tile_residuals(Raster(one, np.ones(one.shape, bool)), nowhere, CheckSettings())
+    assert len(found.centres_px) == 0
+    assert (found.median_px, found.coverage) == (np.inf, 0.0)
