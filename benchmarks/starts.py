@@ -135,13 +135,13 @@ def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path)
 
     across = [(s, 1.0) for s in SHIFTS] + [(0.0, s) for s in SCALES]
     labels = [f"{shift:.0%}" for shift in SHIFTS] + [f"x{scale:g}" for scale in SCALES]
-    figure, axes = plt.subplots(1, len(shares), figsize=(4.6 * len(shares), 3.6), sharey=True, squeeze=False)
+    figure, axes = plt.subplots(1, len(shares), figsize=(5.4 * len(shares), 3.6), sharey=True, squeeze=False)
     for axis, (name, found) in zip(axes[0], shares.items(), strict=True):
         table = np.array([[found[shift, turn, scale] for shift, scale in across] for turn in TURNS])
         image = axis.imshow(table, cmap="RdYlGn", vmin=0, vmax=1, aspect="auto")
         for (row, column), share in np.ndenumerate(table):
-            axis.text(column, row, f"{share:.0%}", ha="center", va="center", fontsize=8)
-        axis.set_xticks(range(len(labels)), labels)
+            axis.text(column, row, f"{share:.0%}", ha="center", va="center", fontsize=7)
+        axis.set_xticks(range(len(labels)), labels, fontsize=8)
         axis.set_yticks(range(len(TURNS)), [f"{turn:g}°" for turn in TURNS])
         axis.axvline(len(SHIFTS) - 0.5, color="white", linewidth=3)
         axis.set_title(name)
