@@ -51,9 +51,7 @@ def main() -> None:
     lengths = [int(n) for n in (sys.argv[1] if len(sys.argv) > 1 else "10,30,100").split(",")]
     jobs = [int(n) for n in (sys.argv[2] if len(sys.argv) > 2 else "1,2").split(",")]
     seconds: dict[tuple[int, int], float] = {}
-    print(
-        "| captures | jobs | seconds | largest process, GB | all, 2nd and last quarter, GB | open files, likewise |"
-    )
+    print("| captures | jobs | seconds | largest process, GB | all, 2nd and last quarter, GB | open files, likewise |")
     print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "flight"

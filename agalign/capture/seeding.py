@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair, Candidates
+from agalign.capture.corner_fit import fit_corners
 from agalign.capture.evidence import Look
 from agalign.config import SeedSettings
+from agalign.errors import GeometryError
 from agalign.flight.model import FlightModel
 from agalign.judge.verdict import seed_fits
 from agalign.method.descriptor import Descriptor
@@ -16,7 +18,7 @@ from agalign.method.state import Subject
 from agalign.pixels.landmarks import VIEWS, agreed_homography, landmarks
 from agalign.pixels.resample import single, textured, warped
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
-from agalign.values import geometry
+from agalign.values import geometry, lens
 from agalign.values.alignment import Residual, Seed
 from agalign.values.choices import SeedKind
 from agalign.values.doubts import Doubt
@@ -25,6 +27,9 @@ from agalign.values.geometry import Matrix
 _PLAIN_SIGMA = 120.0
 """A peak that only images reach which lie on each other everywhere: turned by one degree they have one of 60 to 120, by
 three degrees of 17."""
+_CLOSE_PX = 3.0
+"""Where nearly all windows lie this close under a match, no better one is looked for."""
+_LEAST_WINDOWS = 12
 _MOST_KEYPOINTS = 1000
 """Where learnt descriptors are the last resort."""
 _SAME_PEAK_PX = 2.0
@@ -48,11 +53,32 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
         return best
     shown = _windows_under(pair, best)
     for found in _matched(pair, model, by_learnt_descriptors=not best.trusted):
-        matched = _at_its_place(pair, "match", found)
-        there = _windows_under(pair, matched)
+        there = _windows_under(pair, matched := _at_its_place(pair, found))
+        sharpened = _sharpened(pair, found, there)
+        if sharpened is not None:
+            again = _windows_under(pair, other := _at_its_place(pair, sharpened))
+            if again.is_better_than(there):
+                matched, there = other, again
         if seed_fits(there, pair.reference.settings.check) and there.is_better_than(shown):
-            return replace(matched, trusted=True)
+            best, shown = replace(matched, trusted=True), there
+        if best.kind == "match" and shown.p95_px <= _CLOSE_PX:
+            break
     return best
+
+
+def _sharpened(pair: BandPair, fixed_to_moving: Matrix, shown: Residual) -> Matrix | None:
+    """A mapping moved to where most of the windows have it; None where they are few."""
+    known = np.isfinite(shown.shifts_px[:, 0])
+    if known.sum() < _LEAST_WINDOWS:
+        return None
+    at, there = (
+        lens.undistort(pair.fixed.lens, p[known]) for p in (shown.centres_px, shown.centres_px + shown.shifts_px)
+    )
+    fit = fit_corners(at, there - at, shown.peaks_sigma[known], pair.fixed.size_px)
+    try:
+        return geometry.compose(fixed_to_moving, geometry.moving_corners(fit.mean_px, *pair.fixed.size_px))
+    except GeometryError:
+        return None
 
 
 def _is_known(pair: BandPair) -> bool:
@@ -110,9 +136,9 @@ def best_seed(pair: BandPair, candidates: Candidates) -> Seed:
     return max(forced or scored, key=lambda seed: seed.score)
 
 
-def _at_its_place(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> Seed:
-    """A candidate as it is, with what the structures say of it."""
-    return _scored(pair, kind, fixed_to_moving)[0]
+def _at_its_place(pair: BandPair, fixed_to_moving: Matrix) -> Seed:
+    """A match as it is, with what the structures say of it."""
+    return _scored(pair, "match", fixed_to_moving)[0]
 
 
 def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[Seed]:
