@@ -8,7 +8,7 @@ brighter in the near infra-red.
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ from agalign.values.mapping import splined
 
 ALTITUDE_M = 22.0, 34.0
 _TIES, _TIES_OVER_RELIEF = (25, 19), (65, 49)
+_CAPTURES_A_FIELD = 4
+"""Taken beside each other over one painted ground: memory is one ground's, however long the flight."""
 _VIGNETTING = 0.35
 """What the corners lack of the middle's light."""
 
@@ -67,31 +69,47 @@ def make_flight(
     high: the homography then is the plane's below them, and the ties are true. `altitude_m` is between what heights
     above the plane the captures are taken. Returns the path of truth.json.
     """
-    poses, ground, rng = lay_out_flight(captures, size_px, rng_seed, relief_m, altitude_m)
-    return write_shots(folder, [Shot(pose, ground) for pose in poses], size_px, camera, rng)
+    rng, truth = np.random.default_rng(rng_seed), dict[str, Any]()
+    for first in range(0, captures, _CAPTURES_A_FIELD):
+        poses = [_pose(rng, number, altitude_m) for number in range(min(_CAPTURES_A_FIELD, captures - first))]
+        ground = paint_ground(rng, poses, size_px, relief_m)
+        truth |= _write(folder, [Shot(pose, ground) for pose in poses], size_px, camera, rng, first)
+    return _write_truth(folder, truth)
 
 
 def write_shots(
     folder: Path, shots: Sequence[Shot], size_px: tuple[int, int], camera: CameraSpec, rng: np.random.Generator
 ) -> Path:
     """Write captures and their truth as `make_flight` does, with each one's "trouble" beside it."""
+    return _write_truth(folder, _write(folder, shots, size_px, camera, rng))
+
+
+def _write(
+    folder: Path, shots: Sequence[Shot], size_px: tuple[int, int], camera: CameraSpec, rng: np.random.Generator,
+    before: int = 0,
+) -> dict[str, Any]:  # fmt: skip
+    """Write captures, of which so many were taken before on other fields, farther south; returns their truth."""
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
     grounds = {id(shot.ground): shot.ground for shot in shots}
     for band in camera.bands:
         painted: tuple[int, Field] | None = None
-        for number, shot in enumerate(shots, start=1):
+        for number, shot in enumerate(shots, start=before + 1):
             if painted is None or painted[0] != id(shot.ground):
                 painted = id(shot.ground), reflectance(grounds[id(shot.ground)], band)
             spoil = shot.spoil if shot.spoilt is None or band.name in shot.spoilt else None
             pixels = render(painted[1], shot.ground, band, shot.pose, size_px, rng, spoil)
             if band.name not in shot.without:
                 path = images / tags.file_name(camera, band, number)
-                tags.write_band(path, pixels, camera, band, shot.pose, number, _VIGNETTING)
-    truth = {
+                there = replace(shot.pose, north_m=shot.pose.north_m + before)
+                tags.write_band(path, pixels, camera, band, there, number, _VIGNETTING)
+    return {
         tags.capture_name(camera, number): _truth(shot, number, camera, size_px)
-        for number, shot in enumerate(shots, start=1)
+        for number, shot in enumerate(shots, start=before + 1)
     }
+
+
+def _write_truth(folder: Path, truth: dict[str, Any]) -> Path:
     path = folder / "truth.json"
     path.write_text(json.dumps(truth))
     return path
