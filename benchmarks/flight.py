@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +32,10 @@ def watched(command: list[str]) -> tuple[resource.struct_rusage, list[tuple[floa
 
 def descendants(pid: int) -> list[int]:
     """A process and all that it has started, as long as they run."""
-    try:
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    except OSError:
-        return [pid]
+    children: list[str] = []
+    for thread in Path(f"/proc/{pid}/task").glob("*/children"):
+        with suppress(OSError):
+            children += thread.read_text().split()
     return [pid, *(d for child in children for d in descendants(int(child)))]
 
 
