@@ -136,3 +136,16 @@ def test_unrelated_images_have_no_landmarks_in_common() -> None:
     one, other = (Raster(textured_image(400, 320, s), valid) for s in (5, 6))
     for view in VIEWS:
         assert agreed_homography(landmarks(one, view), landmarks(other, view), (400, 320)) is None
+
+
+def test_a_match_that_is_some_px_off_is_sharpened_by_the_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    fixed, moving = textured_pair(SHIFTED)
+    image, valid, to_turned = turned(moving, 45, 1.0)
+    truth = geometry.compose(to_turned, SHIFTED)
+    off = geometry.compose(truth, geometry.moving_corners([3.0, -2.0, -2.0, 2.0, 3.0, 2.0, -2.0, -3.0], 400, 320))
+    monkeypatch.setattr("agalign.capture.seeding._matched", lambda *_, **__: iter([off]))
+    images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
+    seed = find_seed(BandPair.of_images("moving", *images, {"identity": np.eye(3)}, Settings()))
+    assert isinstance(seed, Seed)
+    assert mean_error_px(off, truth, 400, 320) > 1.0
+    assert mean_error_px(seed.fixed_to_moving, truth, 400, 320) < 0.5
