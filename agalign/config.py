@@ -201,17 +201,25 @@ class CheckSettings(Stage):
     and within this."""
 
 
+class LocalScale(Stage):
+    """How fine a field of displacements is, px."""
+
+    window_px: Positive
+    """Side of the windows in which shifts are measured, half of which they overlap."""
+    lattice_px: Positive
+
+
 class LocalSettings(Stage):
     """A smooth field of displacements over the homography, for parallax over trees, terraces and buildings."""
 
     use: LocalUse = "auto"
     """auto fits a field where nothing but some windows that lie apart stands against an alignment, and where no rig of
     a flight knows what the lenses leave."""
-    window_px: Positive = 64
-    """Side of the windows in which shifts are measured, half of which they overlap."""
+    scale: LocalScale = LocalScale(window_px=64, lattice_px=48)
+    finer_scale: LocalScale = LocalScale(window_px=32, lattice_px=24)
+    """For what stands so high above the ground that the first cannot follow it."""
     most_windows: Positive = 4000
     """In larger images they lie farther apart."""
-    lattice_px: Positive = 48
     smoothness: tuple[float, ...] = (0.3, 1.0, 4.0, 16.0, 64.0)
     """Weights of the field's second differences beside one window's shift, of which the windows left out of a fit
     choose."""

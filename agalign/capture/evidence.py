@@ -75,14 +75,12 @@ def judged(
         look = Look.at(pair, found) if look is None else look.under(found)
         doubts = doubts_of(joint, look.residual, size_px, check) or _repeats(joint, look, check)
         if settings.local.is_wanted_for(doubts, rig_known=pair.is_known_to_a_rig):
-            local = pair.reference.local.refine(single(pair.moving_image), found)
-            if local.field is not None:
-                bent = Look.at(pair, replace(found, local=local.field))
-                # The verdict is asked again: what a field makes worse, or no better, is not aligned by it.
-                if doubts_of(joint, bent.residual, size_px, check) or _repeats(joint, bent, check):
-                    local = LocalResult(None, local.before_p95_px, local.after_p95_px)
-                else:
-                    look, doubts = bent, ()
+            local, bent = _bent(pair, joint, found, check)
+            if bent is None and doubts:
+                # What stands close together, such as the leaves of large plants, needs a finer field.
+                local, bent = _bent(pair, joint, found, check, finer=True)
+            if bent is not None:
+                look, doubts = bent, ()
     if look is None or doubts:
         look = Look.at(pair, pair.mapping(seed.fixed_to_moving))
     usable = seed.trusted or settings.seed.only
@@ -93,6 +91,21 @@ def judged(
         look.mapping.fixed_to_moving, pair.space, status, doubts, seed, joint, look.residual, 0.0, local=local,
         field=look.mapping.local,
     )  # fmt: skip
+
+
+def _bent(
+    pair: BandPair, joint: JointResult, found: PixelMapping, check: CheckSettings, *, finer: bool = False
+) -> tuple[LocalResult, Look | None]:
+    """A field of displacements over a mapping, and the pair under it where nothing speaks against that."""
+    refiner = pair.reference.finer_local if finer else pair.reference.local
+    local = refiner.refine(single(pair.moving_image), found)
+    if local.field is None:
+        return local, None
+    bent = Look.at(pair, replace(found, local=local.field))
+    # The verdict is asked again: what a field makes worse, or no better, is not aligned by it.
+    if doubts_of(joint, bent.residual, pair.fixed.size_px, check) or _repeats(joint, bent, check):
+        return replace(local, field=None), None
+    return local, bent
 
 
 def as_predicted(alignment: Alignment, pair: BandPair, prediction: Prediction) -> Alignment:

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import cached_property
 
-from agalign.config import Settings
+from agalign.config import LocalScale, Settings
 from agalign.judge.local import LocalRefiner
 from agalign.judge.metrics import FixedSimilarity
 from agalign.judge.residuals import FixedWindows
@@ -77,7 +77,15 @@ class Reference:
     @cached_property
     def local(self) -> LocalRefiner:
         """Smaller ones, which local displacements are fitted to."""
-        return LocalRefiner(self.grey.valid, self.structure, self.settings.local, self.settings.check)
+        return self._local_at(self.settings.local.scale)
+
+    @cached_property
+    def finer_local(self) -> LocalRefiner:
+        """The smallest."""
+        return self._local_at(self.settings.local.finer_scale)
+
+    def _local_at(self, scale: LocalScale) -> LocalRefiner:
+        return LocalRefiner(self.grey.valid, self.structure, self.settings.local, self.settings.check, scale)
 
     @cached_property
     def similarity(self) -> FixedSimilarity:

@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix, csr_matrix, dia_matrix, diags, identity, kr
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from agalign.config import CheckSettings, LocalSettings
+from agalign.config import CheckSettings, LocalScale, LocalSettings
 from agalign.judge.residuals import FixedWindows
 from agalign.pixels.resample import warped
 from agalign.pixels.structure import Field
@@ -26,11 +26,13 @@ from agalign.values.mapping import PixelMapping
 class LocalRefiner:
     """The reference cut into small, overlapping windows, ready for any number of moving bands."""
 
-    def __init__(self, valid: Mask, structure: Field, settings: LocalSettings, check: CheckSettings) -> None:
+    def __init__(
+        self, valid: Mask, structure: Field, settings: LocalSettings, check: CheckSettings, scale: LocalScale
+    ) -> None:
         """`valid` and `structure` (height, width) are the reference's."""
-        self.settings, self.size_px = settings, (valid.shape[1], valid.shape[0])
-        step = max(settings.window_px // 2, round((valid.size / settings.most_windows) ** 0.5))
-        small = check.model_copy(update={"tile_px": settings.window_px})
+        self.settings, self.size_px, self.lattice_px = settings, (valid.shape[1], valid.shape[0]), scale.lattice_px
+        step = max(scale.window_px // 2, round((valid.size / settings.most_windows) ** 0.5))
+        small = check.model_copy(update={"tile_px": scale.window_px})
         self.windows = FixedWindows(valid, structure, small, step)
 
     def refine(self, moving: Raster, mapping: PixelMapping) -> LocalResult:
@@ -40,7 +42,7 @@ class LocalRefiner:
         The shifts are measured again after each round, under the field so far: windows over steps sharpen so, and long
         shifts are found in steps.
         """
-        before = None if mapping.local is None else mapping.local.on_lattice(self.settings.lattice_px, self.size_px)
+        before = None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px)
         first = self._measure(moving, mapping)
         some = [self._held_out_gain(first, s, _SOME_FOLDS, apart_px=0) for s in self.settings.smoothness]
         finest = min(some, key=lambda g: g.left).smoothness
@@ -54,7 +56,7 @@ class LocalRefiner:
         field = before
         for number in range(self.settings.most_rounds):
             found = first if number == 0 else self._measure(moving, replace(mapping, local=field))
-            more = fitted_field(Shifts.of(found), gain.smoothness, self.settings, self.size_px)
+            more = self._field(Shifts.of(found), gain.smoothness)
             total = more if field is None else field.plus(more)
             if not _is_one_to_one(total, self.size_px):
                 break
@@ -74,9 +76,12 @@ class LocalRefiner:
             out = fold == k
             kept = ~out & ~_near(found.centres_px, found.centres_px[out], apart_px)
             if kept.sum() >= self.settings.least_windows // 2:
-                field = fitted_field(found.some(kept), smoothness, self.settings, self.size_px)
+                field = self._field(found.some(kept), smoothness)
                 left[out] = np.linalg.norm(found.shifts_px[out] - field(found.centres_px[out]), axis=1)
         return _gain_of(found, left, smoothness)
+
+    def _field(self, found: "Shifts", smoothness: float) -> LocalField:
+        return fitted_field(found, smoothness, self.settings, self.lattice_px, self.size_px)
 
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Residual:
         return self.windows.residuals(warped(moving, mapping, self.size_px), least_valid=1.0)
@@ -188,6 +193,7 @@ def common_field(residuals: Sequence[Residual], settings: LocalSettings, size_px
     captures = [s for s in map(Shifts.of, residuals) if len(s)]
     if len(captures) < _LEAST_CAPTURES:
         return None
+    lattice_px = settings.scale.lattice_px
     folds = [captures[k :: min(len(captures), _COMMON_FOLDS)] for k in range(min(len(captures), _COMMON_FOLDS))]
     out = Shifts.together([c for fold in folds for c in fold])
 
@@ -195,18 +201,20 @@ def common_field(residuals: Sequence[Residual], settings: LocalSettings, size_px
         left = []
         for fold in folds:
             rest = Shifts.together([c for other in folds if other is not fold for c in other])
-            field = fitted_field(rest, smoothness * len(captures), settings, size_px)
+            field = fitted_field(rest, smoothness * len(captures), settings, lattice_px, size_px)
             left += [np.linalg.norm(c.shifts_px - field(c.centres_px), axis=1) for c in fold]
         return _gain_of(out, np.concatenate(left), smoothness)
 
     best = min(map(gain, _COMMON_SMOOTHNESS), key=lambda g: g.left)
     if best.sigma < _LEAST_COMMON_GAIN_SIGMA or best.after_p95_px > _NO_WORSE * best.before_p95_px:
         return None
-    field = fitted_field(out, best.smoothness * len(captures), settings, size_px)
+    field = fitted_field(out, best.smoothness * len(captures), settings, lattice_px, size_px)
     return field if _is_one_to_one(field, size_px) else None
 
 
-def fitted_field(found: Shifts, smoothness: float, settings: LocalSettings, size_px: tuple[int, int]) -> LocalField:
+def fitted_field(
+    found: Shifts, smoothness: float, settings: LocalSettings, lattice_px: int, size_px: tuple[int, int]
+) -> LocalField:
     """The smooth field d through shifts s at centres x: on a lattice,
 
         min sum_i t_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + pull |d|^2
@@ -214,7 +222,7 @@ def fitted_field(found: Shifts, smoothness: float, settings: LocalSettings, size
     with trust t, second differences D2, and Cauchy weights w against windows that found a wrong peak. The pull to
     nothing is small: it decides where nothing was measured.
     """
-    step = settings.lattice_px
+    step = lattice_px
     columns, rows = (int(np.ceil(n / step)) + 1 for n in size_px)
     design = _interpolation(found.centres_px / step, columns, rows)
     penalty = smoothness * _bending(columns, rows) + settings.pull * identity(rows * columns)

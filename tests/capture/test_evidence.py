@@ -95,13 +95,16 @@ def test_residuals_of_a_reduced_image_are_given_in_px_of_the_file() -> None:
     assert (residual.median_px, residual.shifts_px[0, 0]) == (2.0, 2.0)
 
 
-def bent_pair(height_px: float) -> BandPair:
-    """A pair of which the middle is displaced by a smooth bump: no homography explains it."""
+def bent_pair(height_px: float, apart_px: float | None = None) -> BandPair:
+    """A pair of which the middle is displaced by a smooth bump, or all of it by waves: no homography explains it."""
     fixed, moving = textured_pair(np.eye(3), 640, 480, seed=4)
     grid = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
 
     def bump(points: np.ndarray) -> np.ndarray:
-        fall = np.exp(-(((points - (320, 240)) / 110) ** 2).sum(-1))
+        if apart_px is None:
+            fall = np.exp(-(((points - (320, 240)) / 110) ** 2).sum(-1))
+        else:
+            fall = np.prod(np.sin(2 * np.pi * points / apart_px), axis=-1)
         return height_px * fall[..., None] * np.array([1.0, -0.6])
 
     back = grid - bump(grid - bump(grid))
@@ -117,6 +120,17 @@ def test_a_field_starts_by_itself_where_a_part_of_the_image_lies_apart(use: str,
     found = judged(bent_pair(4.0), seed, result(np.eye(3)), settings)
     assert found.status == status
     assert (found.field is not None) == (status == "aligned")
+
+
+def test_what_changes_from_plant_to_plant_is_followed_by_a_finer_field() -> None:
+    """Waves of 170 px: the first field's windows show half of them each."""
+    pair, seed = bent_pair(2.5, apart_px=170.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
+    found = judged(pair, seed, result(np.eye(3)), Settings())
+    assert found.status == "aligned"
+    assert found.field is not None
+    assert found.field.step_px == Settings().local.finer_scale.lattice_px
+    assert found.residual.median_px < 0.1
+    assert pair.reference.local.refine(pair.moving_image, pair.mapping(np.eye(3))).field is None
 
 
 @pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])

@@ -31,7 +31,7 @@ def test_a_smooth_field_is_found_through_noise_and_wrong_peaks() -> None:
     shifts = bump(at) + 0.08 * rng.normal(size=at.shape)
     wrong = rng.random(len(at)) < 0.05
     shifts[wrong] += rng.uniform(-20, 20, (wrong.sum(), 2))
-    field = fitted_field(Shifts(at, shifts, np.ones(len(at))), 1.0, SETTINGS, SIZE)
+    field = fitted_field(Shifts(at, shifts, np.ones(len(at))), 1.0, SETTINGS, 48, SIZE)
     error = np.linalg.norm(field(at) - bump(at), axis=1)
     assert np.sqrt((error**2).mean()) < 0.09
     assert np.linalg.norm(bump(at), axis=1).max() > 1.2
@@ -41,7 +41,7 @@ def test_far_from_all_measurements_the_field_goes_to_nothing() -> None:
     at = centres()
     near = at[at[:, 0] < 200]
     field = fitted_field(
-        Shifts(near, np.tile([2.0, 0.0], (len(near), 1)), np.ones(len(near))), 1.0, SETTINGS, (6400, 480)
+        Shifts(near, np.tile([2.0, 0.0], (len(near), 1)), np.ones(len(near))), 1.0, SETTINGS, 48, (6400, 480)
     )
     assert field(np.array([[100.0, 240.0]]))[0, 0] == pytest.approx(2.0, abs=0.05)
     assert abs(field(np.array([[6000.0, 240.0]]))[0]).max() < 0.2
@@ -86,7 +86,7 @@ def test_where_a_homography_is_enough_nothing_is_added() -> None:
 
 def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:
     at = centres()
-    field = fitted_field(Shifts(at, bump(at), np.ones(len(at))), 1.0, SETTINGS, SIZE)
+    field = fitted_field(Shifts(at, bump(at), np.ones(len(at))), 1.0, SETTINGS, 48, SIZE)
     mapping = PixelMapping(geometry.translation(5, 3), local=field)
     points = geometry.lattice(*SIZE, 9, 7)
     np.testing.assert_allclose(mapping(points), points + field(points) + (5, 3))
