@@ -14,6 +14,7 @@ from agalign.capture.evidence import with_metrics
 from agalign.config import Settings
 from agalign.errors import InputError
 from agalign.pixels.masks import raster_of
+from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.resample import resample
 from agalign.products.summary import write_summary
 from agalign.values import geometry
@@ -87,7 +88,8 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
 
     Raises UnreadableFileError where its reference band cannot be read, and OutputError.
     """
-    return process_capture(capture, Path(out), settings or Settings())
+    settings = settings or Settings()
+    return process_capture(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings)
 
 
 def align_folder(

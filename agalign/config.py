@@ -11,6 +11,7 @@ from agalign.values.choices import (
     Interpolation,
     Layout,
     LocalUse,
+    RadiometryChoice,
     RasterFormat,
     Recipe,
     Resolution,
@@ -275,8 +276,13 @@ class WriteSettings(Stage):
     """A STAC item beside each capture's files."""
     error_map: bool = False
     """A raster of the error to be expected at every pixel, beside them."""
-    radiometry: bool = False
-    """Write reflectance or radiance (float32) instead of raw numbers, where the camera's tags tell how."""
+    radiometry: RadiometryChoice = "off"
+    """Write float32 instead of raw numbers: radiance as the camera's own calibration has it, reflectance by the light
+    sensor, or by a panel; auto is the last of these that every band can be given. Thermal bands are in degrees C then.
+    """
+    panel_albedo: tuple[tuple[str, float], ...] = ()
+    """Reflectance of the calibration panel, 0 to 1, by band in lower case, or for all others by the empty name; before
+    what tags or its code say. Where it is given, a panel is also known by its looks."""
 
 
 class Settings(Stage):

@@ -61,7 +61,7 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
         strip = np.full((34, 2 * SIZE_PX[0], 3), 255, np.uint8)
         rows += [strip, draw_matches(fixed, moving, here, there, right[drawn])]
         text = f"{title}: {right.mean():.0%} of {len(right)} keypoints find their own patch"
-        cv2.putText(strip, text, (6, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (40, 40, 40), 1, cv2.LINE_AA)
+        strip[:] = with_text(strip, text, (6, 24), 20)
     return np.vstack(rows)
 
 

@@ -33,7 +33,7 @@ def main(captures: int) -> None:
         folder, out = Path(temporary) / "flight", Path(temporary) / "aligned"
         synthetic.make_flight(folder, captures, SIZE_PX)
         poses, ground, _ = synthetic.lay_out_flight(captures, SIZE_PX)
-        settings = Settings(write=WriteSettings(radiometry=True))
+        settings = Settings(write=WriteSettings(radiometry="auto"))
         agalign.align_folder(folder, out, settings=settings)
         bands = {b.name: b for b in rig.BANDS}
         reference = rig.BANDS[rig.REFERENCE]

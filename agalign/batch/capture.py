@@ -1,5 +1,6 @@
 """One capture, start to end: its pairs aligned, its stack and sidecar written."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from agalign.products.sidecar import Sidecar, read_sidecar, write_sidecar
 from agalign.products.stac import write_item
 from agalign.products.write import write_capture
 from agalign.values.capture import Capture
+from agalign.values.choices import RadiometryChoice
 
 
 def quiet(*_: object) -> None:
@@ -47,12 +49,13 @@ def process_capture(
 ) -> CaptureOutcome:  # fmt: skip
     """Align a capture and write its stack and sidecar; a band that cannot be aligned does not stop the others.
 
-    With the flight's `model` only what it cannot align is learnt anew.
+    Its bands' radiometry is what was chosen for them (`with_radiometry`). With the flight's `model` only what it cannot
+    align is learnt anew.
     Raises UnreadableFileError where the reference itself cannot be read, and OutputError.
     """
     reference, rig = capture.reference, None if model is None else model.rig
-    if settings.write.radiometry:
-        _need_radiometry(capture)
+    if settings.write.radiometry != "off":
+        _need_radiometry(capture, settings.write.radiometry)
     alignments = align_capture_bands(capture, settings, model, progress)
     progress(reference.name, "writing", 0.0)
     stack_path, sidecar_path = output_paths(capture, out)
@@ -93,10 +96,16 @@ def discard_outputs(stack: Path, sidecar: Path) -> None:
                 path.unlink(missing_ok=True)
 
 
-def _need_radiometry(capture: Capture) -> None:
+_WHY_NOT: Mapping[RadiometryChoice, str] = {
+    "auto": "no tags that agalign can turn into radiance or reflectance in {bands}; leave --radiometry out",
+    "camera": "no tags that agalign can turn into radiance in {bands}; leave --radiometry out",
+    "sun": "no tags of a light sensor in {bands}; choose --radiometry camera or panel",
+    "panel": "no calibration panel of the same hours says how bright {bands} is, or its reflectance is not known "
+    "(--panel-albedo); choose --radiometry camera or sun",
+}
+
+
+def _need_radiometry(capture: Capture, choice: RadiometryChoice) -> None:
     without = [b.name for b in capture.bands if b.radiometry is None]
     if without:
-        raise InputError(
-            f"{capture.reference.path}: no tags that agalign can turn into reflectance in {', '.join(without)}; leave "
-            "--radiometry out"
-        )
+        raise InputError(f"{capture.reference.path}: {_WHY_NOT[choice].format(bands=', '.join(without))}")

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from agalign.batch.capture import output_paths, quiet
+from agalign.batch.capture import discard_outputs, output_paths, quiet
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.batch.workers import (
     MOST_HANDED_OVER,
@@ -24,13 +24,16 @@ from agalign.batch.workers import (
 )
 from agalign.cameras.discover import Flight
 from agalign.capture.align import PairProgress
-from agalign.config import Settings
+from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
 from agalign.flight.fingerprint import fingerprint
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.flight.panels import PanelReading, factors_for, read_panel, with_panels
 from agalign.method.device import choose_device
+from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
+from agalign.products.panels import write_panels
 from agalign.products.sidecar import Sidecar, read_sidecar
 from agalign.products.write import band_file_names
 from agalign.values.capture import Capture
@@ -56,12 +59,14 @@ def prepare_output(out: Path) -> None:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run goes about it: nothing here changes a result."""
+    """How a run goes about it: nothing here changes a capture's result."""
 
     overwrite: bool = False
     """Do captures again that an earlier run finished."""
     jobs: int = 1
     """Captures at a time, each in a process of its own, or a thread where they are few; 0 is one a core."""
+    align_panels: bool = False
+    """Captures of calibration panels are aligned like any other."""
     executor: Executor | None = None
     """Where the captures are done instead: any executor whose workers see the same folders (`dask_executor` is one)."""
 
@@ -94,11 +99,16 @@ def run_flight(
     if known is not None:
         used = settings.flight.model_copy(update={"start": known.fingerprint})
         settings = settings.model_copy(update={"flight": used})
+    panels, captures = _panels(flight.captures, settings.write, options)
+    for reading, part in zip(panels, write_panels(panels, out), strict=True):
+        discard_outputs(*output_paths(reading.capture, out))
+        yield CaptureReport(reading.capture.label, "panel", None, panel=part.sentence)
     left: list[tuple[Sequence[Capture], str, list[Capture]]] = []
-    groups = flights_of(flight.captures)
+    groups = flights_of(captures)
     for group, name in zip(groups, model_names(groups), strict=True):
         mine = []
-        for capture in group:
+        for raw in group:
+            capture = with_radiometry(raw, settings.write.radiometry, factors_for(raw, panels))
             earlier = None if options.overwrite else finished_before(capture, out, settings)
             if earlier is None:
                 mine.append(capture)
@@ -116,6 +126,18 @@ def run_flight(
             yield from _one_by_one(waiting, listener)
         else:
             yield from on_executor([t.absolute() for t in waiting], executor, most)
+
+
+def _panels(
+    captures: Sequence[Capture], settings: WriteSettings, options: RunOptions
+) -> tuple[list[PanelReading], list[Capture]]:
+    """(what the captures of calibration panels say, the other captures)."""
+    if options.align_panels:
+        return [], list(captures)
+    albedos = dict(settings.panel_albedo)
+    seen = with_panels(captures, by_look=bool(albedos))
+    panels = [read_panel(c, albedos) for c in seen if c.panel is not None]
+    return panels, [c for c in seen if c.panel is None]
 
 
 def _one_by_one(tasks: Sequence[Task], listener: Listener) -> Iterator[CaptureReport]:

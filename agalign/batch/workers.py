@@ -38,10 +38,14 @@ class CaptureReport:
     """What became of one capture."""
 
     label: str
-    state: Literal["done", "kept", "error"]
-    """`kept` means that an earlier run's result with the same settings was there."""
+    state: Literal["done", "kept", "error", "panel"]
+    """`kept` means that an earlier run's result with the same settings was there, and `panel` that it shows a
+    calibration panel and takes no part.
+    """
     sidecar: Sidecar | None
     error: str | None = None
+    panel: str | None = None
+    """What the calibration panel is, in words."""
 
     def without_tables(self) -> "CaptureReport":
         """The same without the sidecar's long tables: a thousand of these are kept until a run ends."""
@@ -55,8 +59,10 @@ class CaptureReport:
 
     @property
     def good(self) -> bool:
-        """True where every band pair of the capture is aligned, or predicted well enough, and none is missing."""
-        return self.sidecar is not None and self.sidecar.status == "ok"
+        """True where nothing is left to be wished for: every band pair of the capture is aligned, or predicted well
+        enough, and none is missing.
+        """
+        return self.state == "panel" or (self.sidecar is not None and self.sidecar.status == "ok")
 
     @property
     def useful(self) -> bool:

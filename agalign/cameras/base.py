@@ -67,7 +67,7 @@ class Camera(ABC):
 
 def default_reference(bands: Sequence[Band]) -> int:
     """Index of the green band; else of the one nearest to 550 nm; else the first. Never a thermal one."""
-    seeing = [i for i, b in enumerate(bands) if not _is_thermal(b)]
+    seeing = [i for i, b in enumerate(bands) if not is_thermal(b)]
     for index in seeing:
         if re.split(r"[-_ ]", bands[index].name.lower())[0] in _PREFERRED_REFERENCES:
             return index
@@ -75,7 +75,8 @@ def default_reference(bands: Sequence[Band]) -> int:
     return min(known)[1] if known else next(iter(seeing), 0)
 
 
-def _is_thermal(band: Band) -> bool:
+def is_thermal(band: Band) -> bool:
+    """True for a band that sees how warm things are."""
     long = band.wavelength_nm is not None and band.wavelength_nm >= _SHORTEST_THERMAL_NM
     return long or band.name.lower().startswith(_THERMAL)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from agalign.cameras.base import Camera, default_reference
 from agalign.cameras.known import camera_of, known_cameras
 from agalign.cameras.metadata import Tags, read_tags
+from agalign.cameras.pix4d import panel_in
 from agalign.errors import AgalignError, ConfigurationError, InputError, NoSuchBandError, UnreadableFileError
 from agalign.pixels.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, RasterInfo, probe
 from agalign.values.capture import Band, CameraIdentity, Capture
@@ -175,8 +176,9 @@ def _examine(path: Path, cameras: Iterable[Camera], *, with_rgb: bool) -> _File:
     # Cameras write one band a file, or photographs: a stack is someone's product, whatever make it carries on.
     *_, generic = cameras
     camera = generic if _is_stack(path, info) else next(c for c in cameras if c.recognises(tags))
-    bands = camera.bands(path, tags, info)
-    return _File(path, camera, tags, tuple(b for b in bands if with_rgb or not b.companion))
+    panel = panel_in(tags, (info.width_px, info.height_px))
+    bands = (replace(b, panel=panel) for b in camera.bands(path, tags, info) if with_rgb or not b.companion)
+    return _File(path, camera, tags, tuple(bands))
 
 
 def _is_stack(path: Path, info: RasterInfo) -> bool:

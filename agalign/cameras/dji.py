@@ -115,13 +115,12 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     black = tags.number(_DJI, "BlackLevel") or tags.number(CAMERA, "BlackCurrent") or tags.black_level
     if not gain or not exposure_us or black is None:
         return None
-    irradiance = tags.number(_DJI, "Irradiance")
+    irradiance = tags.number(_DJI, "Irradiance") or 0.0
     adjusted = tags.number(_DJI, "SensorGainAdjustment") or 1.0
     centre, k = _pair(tags, _CENTRE), tags.numbers(*_VIGNETTING)
     return Radiometry(
-        "relative reflectance" if irradiance else "radiance", black, 65536.0,
-        adjusted / (gain * exposure_us / 1e6) / (irradiance or 1.0),
-        centre or (0.0, 0.0), k if centre else (), False,
+        "relative radiance", black, 65536.0, adjusted / (gain * exposure_us / 1e6), centre or (0.0, 0.0), k if centre else (),
+        vignetting_divides=False, by_sun=(1 / irradiance, "relative reflectance") if irradiance > 0 else None,
     )  # fmt: skip
 
 

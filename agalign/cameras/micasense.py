@@ -10,7 +10,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import Camera, band_of, largest_value, rays_to_rig, rotation
+from agalign.cameras.base import Camera, band_of, is_thermal, largest_value, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, rational
 from agalign.cameras.pix4d import (
     BAND_NAME,
@@ -36,6 +36,8 @@ _CAPTURE_ID: Name = (_MICASENSE, "CaptureId")
 _CALIBRATION: Name = (_MICASENSE, "RadiometricCalibration")
 
 
+_CENTIKELVIN = Radiometry("temperature", 27315.0, 1.0, 0.01)
+"""What thermal bands count in: the Altum's tag SceneTemperature agrees with it."""
 _LAYOUT = {
     "Blue": (0.9, 0.0), "Green": (0.0, 0.0), "Red": (0.0, 0.65), "NIR": (0.9, 0.7), "Red edge": (0.4, 0.35),
 }  # fmt: skip
@@ -64,9 +66,10 @@ class MicaSense(Camera):
         top = _TWELVE_BIT_TOP if band.dtype == "uint16" else largest_value(band.dtype)
         to_rig = rays_to_rig(lens, rotation(*rig_degrees(tags)))
         parallax = parallax_of(tags) or (_LAYOUT.get(band.name) if tags.model == "RedEdge-M" else None)
+        radiometry = _CENTIKELVIN if is_thermal(band) else _radiometry(tags)
         return (
             replace(
-                band, saturation_value=top, lens=lens, to_rig=to_rig, parallax=parallax, radiometry=_radiometry(tags),
+                band, saturation_value=top, lens=lens, to_rig=to_rig, parallax=parallax, radiometry=radiometry,
             ),
         )  # fmt: skip
 
@@ -85,14 +88,13 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     )
     if len(a) != 3 or not exposure_s or tags.black_level is None or not isinstance(sensitivity, int) or not sensitivity:
         return None
-    gain = a[0] / (sensitivity / 100) / exposure_s
     irradiance = _irradiance(tags)
     centre, k = tags.numbers(*VIGNETTING_CENTRE), tags.numbers(*VIGNETTING_POLYNOMIAL)
     known = len(centre) == 2
     return Radiometry(
-        "reflectance" if irradiance else "radiance", tags.black_level, 65536.0,
-        gain * math.pi / irradiance if irradiance else gain,
+        "radiance", tags.black_level, 65536.0, a[0] / (sensitivity / 100) / exposure_s,
         (centre[0], centre[1]) if known else (0.0, 0.0), k if known else (), True, a[1] / exposure_s - a[2],
+        (math.pi / irradiance, "reflectance") if irradiance else None,
     )  # fmt: skip
 
 
@@ -101,11 +103,12 @@ def _irradiance(tags: Tags) -> float | None:
     light sensor measured in its own plane.
     """
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
-    horizontal = tags.number(_DLS, "HorizontalIrradiance")
-    if horizontal:
-        return horizontal * (scale or 0.01)
-    measured = tags.number(_DLS, "SpectralIrradiance") or tags.number(CAMERA, "Irradiance")
-    return measured * (scale or 1.0) if measured else None
+    found = [
+        (tags.number(_DLS, "HorizontalIrradiance"), scale or 0.01),
+        (tags.number(_DLS, "SpectralIrradiance"), scale or 1.0),
+        (tags.number(CAMERA, "Irradiance"), scale or 1.0),
+    ]
+    return next((value * unit for value, unit in found if value is not None and value * unit > 0), None)
 
 
 def _index_in_name(path: Path) -> str:

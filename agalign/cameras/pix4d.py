@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from agalign.cameras.metadata import Tags
 from agalign.cameras.xmp import Name, Packet
-from agalign.values.capture import Band
+from agalign.values.capture import Band, Panel
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 
@@ -28,6 +28,8 @@ RIG_RELATIVES: Name = (CAMERA, "RigRelatives")
 VIGNETTING_CENTRE: Name = (CAMERA, "VignettingCenter")
 VIGNETTING_POLYNOMIAL: Name = (CAMERA, "VignettingPolynomial")
 
+_PANEL_SERIALS: tuple[Name, ...] = (("micasense.com/MicaSense", "PanelSerial"), (CAMERA, "PanelSerial"))
+_AREA_NUMBERS = 8
 _LONGEST_FOCAL_LENGTH_MM = 100.0
 _MOST_MAGNIFICATION = 1.02
 """Beyond this a polynomial of vignetting in the band's own pixels is dropped."""
@@ -97,6 +99,20 @@ def spectral(band: Band, tags: Tags) -> Band:
         wavelength_nm=tags.number(CAMERA, "CentralWavelength"),
         bandwidth_nm=tags.number(CAMERA, "WavelengthFWHM"),
     )
+
+
+def panel_in(tags: Tags, size_px: tuple[int, int]) -> Panel | None:
+    """The calibration panel that the firmware saw in an image (width, height): CalibrationPicture, Albedo, ReflectArea
+    (x, y of four corners, px) and PanelSerial; None where it saw none.
+    """
+    area = tags.numbers(CAMERA, "ReflectArea")
+    if not tags.number(CAMERA, "CalibrationPicture") and len(area) != _AREA_NUMBERS:
+        return None
+    corners = tuple(zip(area[::2], area[1::2], strict=True)) if len(area) == _AREA_NUMBERS else ()
+    inside = all(0 <= x < size_px[0] and 0 <= y < size_px[1] for x, y in corners)
+    albedo = tags.number(CAMERA, "Albedo")
+    known = albedo if albedo is not None and 0 < albedo <= 1 else None
+    return Panel("tags", tags.first_text(_PANEL_SERIALS), known, corners if inside else ())
 
 
 # ---- what becomes of them

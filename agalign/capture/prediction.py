@@ -1,9 +1,7 @@
 """What the flight's rig says of each band of a capture: where it lies, and whether its images are to be believed."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.evidence import as_predicted
@@ -22,7 +20,7 @@ def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], capture:
     """The mappings of a capture that are aligned, as the rig takes them."""
     good = {p.name: (p, a) for p in pairs if (a := found[p.name]).status == "aligned" and a.joint is not None}
     return Observation(
-        _seconds_of(capture.captured_at),
+        capture.seconds,
         {name: pair.in_file_px(a.fixed_to_moving) for name, (pair, a) in good.items()},
         {name: a.joint.corner_std_px / min(pair.scales[0]) for name, (pair, a) in good.items() if a.joint is not None},
         None if capture.position is None else capture.position.altitude_m,
@@ -81,14 +79,6 @@ def worth_learning(
 def _shows_something(alignment: Alignment) -> bool:
     joint = alignment.joint
     return alignment.seed.trusted or (joint is not None and joint.retrieval >= _PLAINLY_MORE * joint.chance)
-
-
-def _seconds_of(captured_at: str) -> float:
-    """Seconds since 1970 of an ISO 8601 time, UTC where it names no zone; 0 where there is none."""
-    with suppress(ValueError):
-        moment = datetime.fromisoformat(captured_at)
-        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-    return 0.0
 
 
 def _in_image_px(prediction: Prediction, pair: BandPair) -> Prediction:

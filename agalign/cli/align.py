@@ -4,6 +4,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
-from agalign.errors import NoSuchBandError
+from agalign.errors import ConfigurationError, NoSuchBandError
 from agalign.values.choices import (
     BandOrder,
     Compression,
@@ -22,6 +23,7 @@ from agalign.values.choices import (
     Interpolation,
     Layout,
     LocalUse,
+    RadiometryChoice,
     RasterFormat,
     Recipe,
     Resolution,
@@ -30,7 +32,7 @@ from agalign.values.choices import (
 )
 
 if TYPE_CHECKING:
-    from agalign.batch import CaptureReport
+    from agalign.batch import CaptureReport, RunOptions
     from agalign.cameras.discover import DiscoverOptions, Flight
     from agalign.config import Settings
     from agalign.values.capture import Capture
@@ -126,10 +128,21 @@ def align(
         ),
     ] = 1.0,
     radiometry: Annotated[
-        bool,
+        RadiometryChoice,
         typer.Option(
-            "--radiometry", help="Write reflectance or radiance as the camera's tags give it, not raw numbers."
+            help="Write float32: radiance by the camera's calibration, reflectance by its light sensor or by a panel; "
+            "thermal bands in degrees C. --radiometry alone is auto: the last of these that all bands can be given."
         ),
+    ] = "off",
+    panel_albedo: Annotated[
+        str | None,
+        typer.Option(
+            help="Reflectance of the calibration panel, as 0.51 or as Blue=0.51,NIR=0.49; by default what tags or its "
+            "QR code say. With it a panel is also known by its looks."
+        ),
+    ] = None,
+    align_panels: Annotated[
+        bool, typer.Option("--align-panels", help="Align captures of calibration panels too, as any other.")
     ] = False,
     stac: Annotated[bool, typer.Option("--stac", help="A STAC item beside each capture's files.")] = False,
     error_map: Annotated[
@@ -161,6 +174,7 @@ def align(
     """Align every capture below FOLDER."""
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(voice, GOES_ON):
+        from agalign.batch import RunOptions
         from agalign.cameras.discover import DiscoverOptions
         from agalign.config import (
             CheckSettings,
@@ -184,7 +198,7 @@ def align(
             local=LocalSettings(use=local),
             write=WriteSettings(
                 interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
-                radiometry=radiometry, stac=stac, error_map=error_map,
+                radiometry=radiometry, panel_albedo=albedos(panel_albedo), stac=stac, error_map=error_map,
                 format=format, compression=compression,
             ),
         )  # fmt: skip
@@ -194,8 +208,27 @@ def align(
         if stac:
             need_stac()
         flight = find_captures(folder, options, voice)
-        reports = run(flight, target, settings, voice, overwrite=overwrite, jobs=jobs, dask=dask, model=model)
+        how = RunOptions(overwrite, jobs, align_panels)
+        reports = run(flight, target, settings, voice, how, dask=dask, model=model)
         raise typer.Exit(conclude(flight, reports, target, voice))
+
+
+def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
+    """(band in lower case, reflectance) of a list 'Blue=0.51,NIR=0.49', or of one number for all, whose name is empty.
+
+    Raises ConfigurationError.
+    """
+    found = []
+    for part in band_names(text):
+        name, _, number = part.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = 0.0
+        if not 0 < value <= 1:
+            raise ConfigurationError(f"--panel-albedo {text}: '{part}' is no reflectance between 0 and 1")
+        found.append((name.strip().lower(), value))
+    return tuple(found)
 
 
 def band_names(text: str | None) -> tuple[str, ...]:
@@ -230,11 +263,11 @@ def find_captures(folder: Path, options: "DiscoverOptions", voice: Voice, *, sil
 
 
 def run(
-    flight: "Flight", out: Path, settings: "Settings", voice: Voice, *,
-    overwrite: bool, jobs: int, dask: str | None = None, model: Path | None = None, keep_tables: bool = False,
+    flight: "Flight", out: Path, settings: "Settings", voice: Voice, how: "RunOptions", *,
+    dask: str | None = None, model: Path | None = None, keep_tables: bool = False,
 ) -> "list[CaptureReport]":  # fmt: skip
     """Align the captures, saying how far it has come; their reports in the flight's order."""
-    from agalign.batch import Listener, RunOptions, run_flight
+    from agalign.batch import Listener, run_flight
     from agalign.batch.workers import dask_executor
 
     reports: list[CaptureReport] = []
@@ -243,7 +276,7 @@ def run(
     started = time.monotonic()
     cluster = nullcontext() if dask is None else dask_executor(dask)
     with cluster as executor, _progress(voice, all_pairs) as show, _interruptible() as check_interrupt:
-        options = RunOptions(overwrite, jobs, executor)
+        options = replace(how, executor=executor)
         current: Capture | None = None
 
         def on_start(capture: "Capture") -> None:
@@ -330,6 +363,10 @@ def _progress(voice: Voice, pairs: int) -> Iterator[Callable[[float, str], None]
 
 
 def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> None:
+    if report.panel is not None:
+        text = f"[{number}/{count}] {report.label}: {report.panel}"
+        voice.event("panel", text, capture=report.label, panel=report.panel)
+        return
     if report.sidecar is None:
         voice.problem(f"{report.label}: {report.error}", capture=report.label)
         return
@@ -380,8 +417,12 @@ def conclude(flight: "Flight", reports: "list[CaptureReport]", out: Path, voice:
         counts = [str(sum(b.status == s for b in mine)) for s in ("aligned", "predicted", "seed_only", "failed")]
         worst = (f"{median(known):.3f}", f"{max(known):.3f}") if known else ("-", "-")
         table.add_row(escape(name), *counts, *worst, f"{median(b.seconds for b in mine):.1f}")
-    voice.result(table)
+    if pairs:
+        voice.result(table)
     voice.result(escape(f"Report: {out / 'index.html'}"))
+    if reports and all(r.state == "panel" for r in reports):
+        voice.problem("nothing but calibration panels there; --align-panels aligns them all the same")
+        return EXIT_NOTHING
     if not any(r.useful for r in reports):
         voice.problem("no band pair could be aligned")
         alone = all(r.sidecar is None for r in reports)

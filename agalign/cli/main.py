@@ -3,6 +3,7 @@
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -17,7 +18,7 @@ from agalign.cli import info as cli_info
 from agalign.cli.align import Jobs, find_captures
 from agalign.cli.onto import onto
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
-from agalign.values.choices import LocalUse
+from agalign.values.choices import LocalUse, RadiometryChoice
 
 app = typer.Typer(
     name="agalign",
@@ -53,7 +54,7 @@ def demo(
     """Make a synthetic flight, align it, and compare the result with the known truth."""
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(voice, cli_align.GOES_ON):
-        from agalign.batch import prepare_output
+        from agalign.batch import RunOptions, prepare_output
         from agalign.cameras.discover import DiscoverOptions
         from agalign.config import JointSettings, Settings
         from agalign.synthetic.score import make_flight, score_against_truth
@@ -66,7 +67,7 @@ def demo(
         truth = make_flight(source, captures, rng_seed=rng_seed)
         flight = find_captures(source, DiscoverOptions(), voice)
         settings = Settings(joint=JointSettings(device=device, rng_seed=rng_seed))
-        reports = cli_align.run(flight, target, settings, voice, overwrite=True, jobs=jobs, keep_tables=True)
+        reports = cli_align.run(flight, target, settings, voice, RunOptions(True, jobs), keep_tables=True)
         table = Table("Capture", "Band", "Status", title="Error against the truth, px")
         for name in ("before", "median", "95 %"):
             table.add_column(name, justify="right")
@@ -157,11 +158,8 @@ def main() -> None:
     arguments = sys.argv[1:]
     if arguments and arguments[0] not in _COMMANDS and not _is_root_option(arguments[0]):
         arguments = ["align", *arguments]
-    if "--local" in arguments:
-        # It was a flag before it had values.
-        after = arguments.index("--local") + 1
-        if arguments[after : after + 1] not in [[use] for use in get_args(LocalUse)]:
-            arguments.insert(after, "always")
+    _give_value(arguments, "--local", get_args(LocalUse), "always")
+    _give_value(arguments, "--radiometry", get_args(RadiometryChoice), "auto")
     # Threads that spin while they wait cost a multiple of the time where another program wants the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # The matrices here are small: a second BLAS thread does nothing but spin.
@@ -169,6 +167,14 @@ def main() -> None:
     logging.getLogger("rasterio").setLevel(logging.CRITICAL)
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     app(args=arguments, prog_name="agalign")
+
+
+def _give_value(arguments: list[str], option: str, values: Sequence[str], alone: str) -> None:
+    """Options that were flags before they had values may still stand alone."""
+    if option in arguments:
+        after = arguments.index(option) + 1
+        if arguments[after : after + 1] not in [[value] for value in values]:
+            arguments.insert(after, alone)
 
 
 def _is_root_option(argument: str) -> bool:

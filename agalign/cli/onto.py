@@ -41,6 +41,7 @@ def onto(
     """
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(voice):
+        from agalign.batch import RunOptions
         from agalign.cameras.discover import Flight, captures_onto
         from agalign.config import FlightSettings, JointSettings, LocalSettings, Settings, WriteSettings
 
@@ -52,5 +53,5 @@ def onto(
             write=WriteSettings(interpolation=interpolation, crop="none", format=format, compression=compression),
         )
         flight = Flight(reference.parent, tuple(captures_onto(reference, moving, band)), ())
-        reports = run(flight, target, settings, voice, overwrite=overwrite, jobs=jobs)
+        reports = run(flight, target, settings, voice, RunOptions(overwrite, jobs, align_panels=True))
         raise typer.Exit(conclude(flight, reports, target, voice))

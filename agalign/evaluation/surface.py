@@ -13,7 +13,7 @@ from agalign.errors import NoContrastError, NotEnoughTextureError
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.paper import descend
 from agalign.method.state import JointState, Subject
-from agalign.products.picture import write_png
+from agalign.products.drawing import with_text, write_png
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
@@ -51,11 +51,10 @@ def draw_surface(surface: NDArray[np.float64], offsets_px: NDArray[np.float64], 
     field = cv2.resize(shade.astype(np.uint8), (side, side), interpolation=cv2.INTER_CUBIC)
     sheet = np.full((side + 2 * margin, side + 2 * margin, 3), 255, np.uint8)
     sheet[margin : margin + side, margin : margin + side] = cv2.applyColorMap(field, cv2.COLORMAP_VIRIDIS)
-    ink, font = (40, 40, 40), cv2.FONT_HERSHEY_SIMPLEX
+    sheet = np.ascontiguousarray(sheet[..., ::-1])
 
     def write(text: str, x: int, y: int) -> None:
-        width = cv2.getTextSize(text, font, 0.42, 1)[0][0]
-        cv2.putText(sheet, text, (x - width // 2, y), font, 0.42, ink, 1, cv2.LINE_AA)
+        sheet[:] = with_text(sheet, text, (x, y), anchor="ms")
 
     half = side / (2 * len(offsets_px))
     for k in np.linspace(0, len(offsets_px) - 1, 5).round().astype(int):
@@ -64,4 +63,4 @@ def draw_surface(surface: NDArray[np.float64], offsets_px: NDArray[np.float64], 
         write(f"{offsets_px[k]:g}", margin // 2, at + 4)
     write("offset along x, px", margin + side // 2, margin + side + 42)
     write(f"loss a keypoint, {low:.3f} (dark) to {high:.3f}; offset along y at the left", margin + side // 2, 32)
-    write_png(sheet[..., ::-1], path)
+    write_png(sheet, path)

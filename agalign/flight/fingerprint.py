@@ -20,7 +20,13 @@ def fingerprint(capture: Capture, *stages: Stage) -> str:
 
     What the other captures of the flight are does not count: a result stays good when the card holds more.
     """
-    bands = [(b.name, b.address, b.lens, b.to_rig, b.georeference is not None, _state(b.path)) for b in capture.bands]
+    bands = [
+        (
+            b.name, b.address, b.lens, b.to_rig, b.georeference is not None, _state(b.path),
+            None if b.radiometry is None else (b.radiometry.quantity, b.radiometry.gain),
+        )
+        for b in capture.bands
+    ]  # fmt: skip
     return hashed(__version__, *(s.model_dump_json() for s in stages), capture.reference_index, bands)
 
 

@@ -4,14 +4,47 @@
     value = gain * signal
 
 y is the row and r the distance from the vignetting's centre, px of the band's own file. Vignetting multiplies by
-1 / (1 + k1 r + ... + k6 r^6) with MicaSense and by 1 + k1 r + ... + k6 r^6 with DJI.
+1 / (1 + k1 r + ... + k6 r^6) with MicaSense and by 1 + k1 r + ... + k6 r^6 with DJI. Reflectance is radiance times
+what the light sensor says of the sun, or times what a panel of known reflectance says. Temperatures are temperatures
+whatever is chosen.
 """
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.values.capture import Radiometry
+from agalign.values.capture import Capture, Quantity, Radiometry
+from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage
+
+
+def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, float]) -> Capture:
+    """The capture with, of every band, what turns its numbers into what was chosen; None where it cannot be had.
+
+    `by_panel` is, of bands that a panel was seen in, what radiance is to be multiplied by for reflectance. `auto` is by
+    panel where all bands can be, else by the sun where all can be, else by the camera alone.
+    """
+    if choice == "off":
+        return capture
+    in_turn: Sequence[RadiometryChoice] = ("panel", "sun", "camera") if choice == "auto" else (choice,)
+    for one in in_turn:
+        found = {b.name: _chosen(b.radiometry, one, by_panel.get(b.name)) for b in capture.bands}
+        if all(r is not None for r in found.values()):
+            break
+    return replace(capture, bands=tuple(replace(b, radiometry=found[b.name]) for b in capture.bands))
+
+
+def _chosen(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: float | None) -> Radiometry | None:
+    if of_camera is None or not of_camera.is_of_light or choice == "camera":
+        return of_camera
+    reflectance: Quantity = "reflectance"
+    factor = (by_panel, reflectance) if choice == "panel" and by_panel is not None else None
+    factor = of_camera.by_sun if choice == "sun" else factor
+    if factor is None:
+        return None
+    return replace(of_camera, gain=of_camera.gain * factor[0], quantity=factor[1], by_sun=None)
 
 
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:

@@ -17,9 +17,9 @@ from rasterio.windows import Window
 
 from agalign.errors import AgalignError, InputError, OutputError
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, without_warnings
+from agalign.products.drawing import with_text, write_png
 from agalign.products.fill_sidecar import is_delivered
 from agalign.products.indices import Index, bands_for, compute
-from agalign.products.picture import write_png
 from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
 from agalign.products.write import verify
 from agalign.values.files import complete_file
@@ -117,9 +117,9 @@ def _unit(index: Index, sources: Sequence[Source]) -> str:
 
 def _units_of(source: rasterio.DatasetReader, index: int) -> list[str]:
     """Without a word of radiometry numbers are reflectance where most of them, scaled as the file says, can be."""
-    said = str(source.tags().get("RADIOMETRY", ""))
+    said = source.tags(index).get("QUANTITY") or source.tags().get("RADIOMETRY")
     if said:
-        return said.split(" and ")
+        return str(said).split(" and ")
     whole = np.dtype(source.dtypes[index - 1]).kind in "ui"
     if whole and source.scales[index - 1] == 1.0:
         return [_RAW]
@@ -192,7 +192,7 @@ def _write_picture(raster: Path, index: Index, counts: NDArray[np.int64]) -> Non
         scale = min(1.0, _PICTURE_PX / max(source.width, source.height))
         shape = max(1, round(source.height * scale)), max(1, round(source.width * scale))
         values = source.read(1, out_shape=shape)
-    width, margin, bars, font = max(shape[1], 360), 24, 90, cv2.FONT_HERSHEY_SIMPLEX
+    width, margin, bars = max(shape[1], 360), 24, 90
     sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
     sheet[: shape[0], : shape[1]] = _coloured(values, index)
     base = shape[0] + margin + bars
@@ -205,10 +205,8 @@ def _write_picture(raster: Path, index: Index, counts: NDArray[np.int64]) -> Non
         cv2.rectangle(sheet, (int(left), base - height), (int(right) - 1, base), colour, -1)
     for value in np.linspace(*index.span, 5):
         at = round(margin + (value - index.span[0]) / (index.span[1] - index.span[0]) * (width - 2 * margin))
-        text = f"{value:.2f}"
-        offset = cv2.getTextSize(text, font, 0.42, 1)[0][0] // 2
-        cv2.putText(sheet, text, (at - offset, base + 18), font, 0.42, (60, 60, 60), 1, cv2.LINE_AA)
-    cv2.putText(sheet, index.name.upper(), (margin, shape[0] + 18), font, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
+        sheet = with_text(sheet, f"{value:.2f}", (at, base + 18), anchor="ms")
+    sheet = with_text(sheet, index.name.upper(), (margin, shape[0] + 18), 16)
     write_png(sheet, raster.with_suffix(".png"))
 
 

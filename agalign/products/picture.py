@@ -7,13 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.errors import OutputError
 from agalign.pixels.raster import read_preview
+from agalign.products.drawing import Picture, with_text, write_png
 from agalign.values.capture import Band, Capture
-from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid
-
-Picture = NDArray[np.uint8]
 
 _OVERVIEW_PX = 480
 _ZOOM_SOURCE_PX = 160
@@ -47,13 +44,6 @@ def write_picture(
     names = ", ".join(b.name for b in chosen)
     sheet = _sheet(before, after, f"before: {names} as red, green, blue", "after")
     write_png(sheet, path)
-
-
-def write_png(image: Picture, path: Path) -> None:
-    """Write (H, W, 3) red, green, blue, complete or not at all. Raises OutputError."""
-    with complete_file(path) as partial:
-        if not cv2.imwrite(str(partial), image[..., ::-1]):
-            raise OutputError(f"{path}: cannot be written")
 
 
 def _before(band: Band, reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
@@ -98,9 +88,8 @@ def _sheet(before: Picture, after: Picture, title_before: str, title_after: str)
         detail = image[zoom_y : zoom_y + side_y, zoom_x : zoom_x + side_x]
         detail = cv2.resize(detail, overview, interpolation=cv2.INTER_NEAREST)
         strip = np.full((_TITLE_PX, overview[0], 3), 255, np.uint8)
-        cv2.putText(strip, title, (2, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
         gap = np.full((_GAP_PX, overview[0], 3), 255, np.uint8)
-        columns.append(np.vstack([strip, whole, gap, detail]))
+        columns.append(np.vstack([with_text(strip, title, (2, 18)), whole, gap, detail]))
     between = np.full((columns[0].shape[0], _GAP_PX, 3), 255, np.uint8)
     return np.hstack([columns[0], between, columns[1]])
 

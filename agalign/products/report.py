@@ -11,7 +11,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, select_autoescape
 
 from agalign.products.sidecar import BandPart, ResidualTile, Sidecar
-from agalign.products.summary import sidecars_below
+from agalign.products.summary import panels_of, sidecars_below
 from agalign.values.files import write_text
 
 _FULL_SCALE_PX = 1.0
@@ -71,6 +71,7 @@ def write_report(out: Path) -> Path:
         median_residual_px=median(residuals) if residuals else None,
         worst_residual_px=max(residuals, default=None),
         bands=_by_band(pairs),
+        panels=panels_of(out),
         has_local=any(p.local is not None for p in pairs),
         version=captures[0].sidecar.agalign if captures else "",
     )

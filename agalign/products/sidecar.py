@@ -227,10 +227,10 @@ class Sidecar(_Part):
 
 def write_sidecar(path: Path, sidecar: Sidecar) -> None:
     """Write at once or not at all. Raises OutputError."""
-    write_text(path, _compact_lists(sidecar.model_dump_json(by_alias=True, indent=1)))
+    write_text(path, compact_lists(sidecar.model_dump_json(by_alias=True, indent=1)))
 
 
-def _compact_lists(text: str) -> str:
+def compact_lists(text: str) -> str:
     """Lists of numbers on one line: a matrix reads as a matrix, and the file is a third of the size."""
     innermost = re.compile(r"\[[^\[\]{}\"]*\]")
     return innermost.sub(lambda match: " ".join(match.group().split()).replace("[ ", "[").replace(" ]", "]"), text)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from agalign.errors import SidecarError
+from agalign.products.panels import PanelPart, read_panels
 from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
 from agalign.values.files import write_text
 
@@ -24,7 +25,8 @@ def _ignore(_problem: str) -> None:
 
 
 def write_summary(out: Path, on_problem: Callable[[str], None] = _ignore) -> Path:
-    """OUT/summary.csv from all sidecars below OUT, a row per band pair; unreadable ones are told to `on_problem`.
+    """OUT/summary.csv from all sidecars below OUT, a row per band pair, and then one for each band of a capture that
+    shows a calibration panel; what is unreadable is told to `on_problem`.
 
     Raises OutputError.
     """
@@ -33,6 +35,9 @@ def write_summary(out: Path, on_problem: Callable[[str], None] = _ignore) -> Pat
     writer.writeheader()
     for folder, sidecar in sidecars_below(out, on_problem):
         writer.writerows(_row(folder, sidecar, band) for band in sidecar.bands if band.status != "reference")
+    for panel in panels_of(out, on_problem):
+        facts = {"folder": panel.folder, "capture": panel.capture, "status": "panel", "reason": panel.sentence}
+        writer.writerows({**facts, "band": band.band} for band in panel.bands)
     path = out / "summary.csv"
     write_text(path, table.getvalue())
     return path
@@ -45,6 +50,15 @@ def sidecars_below(out: Path, on_problem: Callable[[str], None] = _ignore) -> It
             yield path.parent.relative_to(out).as_posix(), read_sidecar(path)
         except SidecarError as error:
             on_problem(str(error))
+
+
+def panels_of(out: Path, on_problem: Callable[[str], None] = _ignore) -> list[PanelPart]:
+    """The calibration panels of the run below OUT; `on_problem` is told of a file that cannot be read."""
+    try:
+        return read_panels(out)
+    except SidecarError as error:
+        on_problem(str(error))
+        return []
 
 
 def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:

@@ -30,12 +30,17 @@ from agalign.pixels.raster import GDAL_ENVIRONMENT, TIFF_SUFFIXES, open_raster, 
 from agalign.pixels.resample import resample_tile, tiles
 from agalign.products.layout import Layer
 from agalign.values import geometry
-from agalign.values.capture import Band, Capture, Georeference
+from agalign.values.capture import Band, Capture, Georeference, Quantity
 from agalign.values.files import complete_file
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
 
 Pixels = NDArray[np.generic]
+UNITS: Mapping[Quantity, str] = {
+    "radiance": "W m-2 sr-1 nm-1", "relative radiance": "", "reflectance": "1", "relative reflectance": "1",
+    "temperature": "degC",
+}  # fmt: skip
+"""In the words of UDUNITS."""
 _FOUND_PX = 0.1
 _TILE_PX = 2048
 _MOST_VALUES_TRIED = 1 << 16
@@ -94,7 +99,7 @@ def write_capture(
                 source, back = some[0].band.path, _from_source(some[0], grid)
                 write(
                     stack.parent / name, some,
-                    band_tags(source, reference, grid, back, radiometry=settings.radiometry),
+                    band_tags(source, reference, grid, back, radiometry=settings.radiometry != "off"),
                 )  # fmt: skip
     if settings.layout != "bands":
         write(stack, layers, capture_tags(reference, grid))
@@ -141,7 +146,8 @@ def write_raster(
     the smallest step. Tags that TIFF libraries do not write are left out of a COG, whose layout they would break.
     Raises OutputError, or UnreadableFileError for an input.
     """
-    dtype = np.dtype(np.float32) if settings.radiometry else np.result_type(*(layer.band.dtype for layer in layers))
+    raw = settings.radiometry == "off"
+    dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
     nodata = _nodata(capture, layers, grid, dtype, settings)
     whole = len(layers) == len(capture.bands) and settings.layout != "bands"
     compression = _compression(settings, whole=whole)
@@ -208,7 +214,7 @@ def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels 
     """A layer's pixels on a tile and their mask; no pixels for a gap."""
     if layer.is_gap:
         return None, np.zeros((tile.height, tile.width), dtype=bool)
-    radiometry = layer.band.radiometry if settings.radiometry else None
+    radiometry = None if settings.radiometry == "off" else layer.band.radiometry
     if layer.mapping is not None:
         return resample_tile(layer.band, layer.mapping, tile, settings.interpolation, radiometry)
     with open_raster(layer.band.path) as source:
@@ -230,7 +236,7 @@ def _nodata(
     capture: Capture, layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any], settings: WriteSettings
 ) -> float | None:
     """The value to declare; None where every pixel has a value."""
-    if settings.radiometry:
+    if settings.radiometry != "off":
         return math.nan
     declared = capture.reference.nodata
     if declared is not None and _fits(declared, dtype):
@@ -327,11 +333,15 @@ def _describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings:
         "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
         "REFERENCE_BAND": capture.reference.name,
     }
-    quantities = [layer.band.radiometry.quantity for layer in layers if layer.band.radiometry is not None]
-    if settings.radiometry and quantities:
-        facts["RADIOMETRY"] = " and ".join(dict.fromkeys(quantities))
+    raw = settings.radiometry == "off"
+    quantities = [None if raw or layer.band.radiometry is None else layer.band.radiometry.quantity for layer in layers]
+    facts["RADIOMETRY"] = " and ".join(dict.fromkeys(q for q in quantities if q is not None))
     dataset.update_tags(**{k: v for k, v in facts.items() if v})
-    if not settings.radiometry and any(layer.band.scale_offset != (1.0, 0.0) for layer in layers):
+    if any(quantities):
+        dataset.units = [UNITS[q] if q is not None else "" for q in quantities]
+        for index, quantity in enumerate(quantities, start=1):
+            dataset.update_tags(index, **({} if quantity is None else {"QUANTITY": quantity}))
+    if raw and any(layer.band.scale_offset != (1.0, 0.0) for layer in layers):
         dataset.scales, dataset.offsets = zip(*(layer.band.scale_offset for layer in layers), strict=True)
     for index, layer in enumerate(layers, start=1):
         dataset.set_band_description(index, layer.band.name)

@@ -1,6 +1,8 @@
 """What a camera's files hold, as their tags say: the bands of a moment, their lenses and places."""
 
+from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
@@ -18,14 +20,17 @@ class Georeference:
     crs_wkt: str
 
 
+Quantity = Literal["radiance", "relative radiance", "reflectance", "relative reflectance", "temperature"]
+"""Radiance in W / m^2 / sr / nm, reflectance 0 to 1, each of the two up to a factor that all bands share, and
+temperature in degrees Celsius.
+"""
+
+
 @dataclass(frozen=True)
 class Radiometry:
-    """What turns a band's raw numbers into a physical quantity; `radiometry` has the equation."""
+    """What turns a band's raw numbers into a physical quantity; `pixels.radiometry` has the equation."""
 
-    quantity: Literal["reflectance", "relative reflectance", "radiance"]
-    """Reflectance by the light sensor, 0 to 1, or up to a factor that all bands share; without a light sensor
-    radiance, W / m^2 / sr / nm or the maker's own unit.
-    """
+    quantity: Quantity
     black_level: float
     full_scale: float
     gain: float
@@ -35,6 +40,28 @@ class Radiometry:
     vignetting_divides: bool = True
     row_gradient: float = 0.0
     """Share of the signal that each row has more than the one above it."""
+    by_sun: tuple[float, Quantity] | None = None
+    """What radiance is to be multiplied by for reflectance, by the light sensor, and which kind of it that gives."""
+
+    @property
+    def is_of_light(self) -> bool:
+        """True for what reflectance can be made of."""
+        return self.quantity in ("radiance", "relative radiance")
+
+
+PanelSource = Literal["tags", "QR code", "look"]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A calibration panel in a band's image."""
+
+    seen_by: PanelSource
+    serial: str = ""
+    albedo: float | None = None
+    """Its reflectance in the band, 0 to 1, where that is known."""
+    corners_px: tuple[tuple[float, float], ...] = ()
+    """Of an area within it, raw pixels of the file; none where it was not found."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +99,7 @@ class Band:
     overviews: tuple[int, ...] = ()
     """Reductions at which the file holds the band too."""
     radiometry: Radiometry | None = None
+    panel: Panel | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -146,6 +174,19 @@ class Capture:
 
     def _is_of_the_references_lens(self, band: Band) -> bool:
         return band.one_lens and band.path == self.reference.path
+
+    @property
+    def panel(self) -> Panel | None:
+        """The calibration panel that it was taken of, as the first band that shows it has it."""
+        return next((b.panel for b in self.bands if b.panel is not None), None)
+
+    @property
+    def seconds(self) -> float:
+        """When it was taken, seconds since 1970, UTC where no zone is named; 0 where that is not known."""
+        with suppress(ValueError):
+            moment = datetime.fromisoformat(self.captured_at)
+            return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+        return 0.0
 
     @property
     def label(self) -> str:

@@ -322,7 +322,8 @@ def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
     path = tmp_path / "DJI_0012.TIF"
     (band,) = Dji().bands(path, tags, probe(path))
     assert band.radiometry is not None
-    assert band.radiometry.gain == pytest.approx(0.9 / (2 * 1e-3) / 5000)
+    assert band.radiometry.gain == pytest.approx(0.9 / (2 * 1e-3))
+    assert band.radiometry.by_sun == (pytest.approx(1 / 5000), "relative reflectance")
     assert not band.radiometry.vignetting_divides
 
 

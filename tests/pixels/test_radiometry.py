@@ -6,12 +6,13 @@ import pytest
 
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
-from agalign.pixels.radiometry import calibrated
+from agalign.pixels.radiometry import calibrated, with_radiometry
 from agalign.pixels.raster import probe
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic import rig
 from agalign.synthetic.ground import paint_ground
-from agalign.values.capture import Radiometry
+from agalign.values.capture import Band, Capture, Radiometry
+from agalign.values.choices import RadiometryChoice
 
 
 def test_every_term_has_its_place() -> None:
@@ -40,7 +41,7 @@ def test_reflectance_of_the_synthetic_flight_is_the_truth(tmp_path: Path) -> Non
     ground = paint_ground(rng, [pose], (320, 240))
     for spec in rig.BANDS:
         path = tmp_path / "0000SET" / "000" / f"IMG_0001_{spec.rig_index + 1}.tif"
-        (band,) = MicaSense().bands(path, read_tags(path), probe(path))
+        band = by(path, "sun")
         assert band.radiometry is not None
         assert band.radiometry.quantity == "reflectance"
         bright = np.full_like(ground.crop, 0.3 * max(spec.soil, spec.crop))
@@ -65,6 +66,48 @@ def test_without_its_tags_there_is_no_radiometry(tmp_path: Path, missing: str) -
     assert band.radiometry is None
 
 
+def by(path: Path, choice: RadiometryChoice, factors: dict[str, float] | None = None) -> Band:
+    """A file's band with the radiometry that was chosen."""
+    bands = MicaSense().bands(path, read_tags(path), probe(path))
+    return with_radiometry(Capture("IMG_0001", Path(), bands, 0), choice, factors or {}).bands[0]
+
+
+def test_radiometry_is_what_was_chosen(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
+    path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
+    raw, camera, sun = (by(path, choice).radiometry for choice in ("off", "camera", "sun"))
+    assert raw is not None and camera is not None and sun is not None
+    assert raw == camera
+    assert (camera.quantity, sun.quantity) == ("radiance", "reflectance")
+    assert sun.gain == pytest.approx(camera.gain * np.pi / 0.8)
+    panel = by(path, "panel", {"Blue": 2.5}).radiometry
+    assert panel is not None
+    assert (panel.quantity, panel.gain) == ("reflectance", pytest.approx(2.5 * camera.gain))
+    assert by(path, "panel", {"Green": 2.5}).radiometry is None
+    assert by(path, "auto", {"Blue": 2.5}).radiometry == panel
+    assert by(path, "auto").radiometry == sun
+
+
+def test_temperatures_stay_temperatures_whatever_is_chosen() -> None:
+    kelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)
+    band = Band("LWIR", Path("IMG_0001_6.tif"), 1, 160, 120, "uint16", radiometry=kelvin)
+    for choice in ("auto", "camera", "sun", "panel"):
+        (found,) = with_radiometry(Capture("IMG_0001", Path(), (band,), 0), choice, {}).bands
+        assert found.radiometry == kelvin
+    assert calibrated(np.full((2, 2), 30115, np.uint16), kelvin, 0, 0) == pytest.approx(28.0)
+
+
+@pytest.mark.parametrize("value", ["-5", "0", "nan"])
+def test_a_light_that_cannot_be_is_none(tmp_path: Path, value: str) -> None:
+    synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
+    path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
+    tags = read_tags(path)
+    xmp = {**tags.xmp, ("micasense.com/DLS", "HorizontalIrradiance"): (value,)}
+    (band,) = MicaSense().bands(path, Tags(**{**vars(tags), "xmp": xmp}), probe(path))
+    assert band.radiometry is not None
+    assert band.radiometry.by_sun is None
+
+
 def test_without_a_light_sensor_it_is_radiance(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
     path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
@@ -72,4 +115,4 @@ def test_without_a_light_sensor_it_is_radiance(tmp_path: Path) -> None:
     xmp = {k: v for k, v in tags.xmp.items() if k[0] != "micasense.com/DLS"}
     (band,) = MicaSense().bands(path, Tags(**{**vars(tags), "xmp": xmp}), probe(path))
     assert band.radiometry is not None
-    assert band.radiometry.quantity == "radiance"
+    assert (band.radiometry.quantity, band.radiometry.by_sun) == ("radiance", None)

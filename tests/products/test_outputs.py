@@ -128,7 +128,7 @@ def test_layout_bands_of_a_multiband_file(tmp_path: Path) -> None:
 
 
 def test_radiometry_without_tags_is_refused(aligned_capture: Path, tmp_path: Path) -> None:
-    settings = ONLY_SEED.model_copy(update={"write": WriteSettings(radiometry=True)})
+    settings = ONLY_SEED.model_copy(update={"write": WriteSettings(radiometry="auto")})
     (report,) = agalign.align_folder(aligned_capture, tmp_path / "out", settings=settings)
     assert report.state == "error"
     assert report.error is not None
@@ -139,7 +139,7 @@ def test_radiometry_without_tags_is_refused(aligned_capture: Path, tmp_path: Pat
 def test_ndvi_of_the_synthetic_flight_is_its_truth(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path / "in", 1, (480, 360), rng_seed=3)
     out = tmp_path / "out"
-    agalign.align_folder(tmp_path / "in", out, settings=Settings(write=WriteSettings(radiometry=True)))
+    agalign.align_folder(tmp_path / "in", out, settings=Settings(write=WriteSettings(radiometry="auto")))
     (found,) = write_indices(out, [INDICES["ndvi"]])
     assert not found.problem
     assert not found.raw_numbers
@@ -270,7 +270,7 @@ def test_the_stack_and_a_photograph_of_its_name_live_beside_each_other(aligned_c
 def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path / "in", 1, (480, 360), rng_seed=3)
     out = tmp_path / "out"
-    agalign.align_folder(tmp_path / "in", out, settings=Settings(write=WriteSettings(radiometry=True)))
+    agalign.align_folder(tmp_path / "in", out, settings=Settings(write=WriteSettings(radiometry="auto")))
     (stack,) = out.rglob("IMG_0001.tif")
     with rasterio.open(stack, "r+") as dataset:
         dataset.update_tags(RADIOMETRY="reflectance and radiance")
@@ -325,8 +325,8 @@ def test_bands_of_other_sizes_are_aligned(tmp_path: Path) -> None:
     "options",
     [
         {"layout": "both", "undistort": True, "resolution": "finest"},
-        {"layout": "bands", "format": "cog", "crop": "none", "radiometry": True},
-        {"layout": "both", "radiometry": True, "stac": True, "interpolation": "nearest"},
+        {"layout": "bands", "format": "cog", "crop": "none", "radiometry": "auto"},
+        {"layout": "both", "radiometry": "auto", "stac": True, "interpolation": "nearest"},
         {"layout": "stack", "format": "cog", "undistort": True, "compression": "none"},
     ],
     ids=str,

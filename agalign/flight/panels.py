@@ -1,0 +1,157 @@
+"""What calibration panels say: which captures show one, and by what radiance is to be multiplied for reflectance."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from agalign.errors import AgalignError
+from agalign.flight.groups import camera_key, flights_of
+from agalign.pixels.panel import albedo_of, find_panel, inside
+from agalign.pixels.radiometry import calibrated
+from agalign.pixels.raster import open_raster, read_for_alignment, read_window
+from agalign.values.capture import Band, Capture, Panel
+
+Albedos = Mapping[str, float]
+"""Reflectance of the panel by band in lower case, or by the empty name for all others: what a user says."""
+_AT_EITHER_END = 3
+"""Captures of a flight that are looked at where their tags do not tell: panels are held before and after."""
+_LOOK_PX = 1600
+_SAME_OUTING_S = 6 * 3600.0
+"""A panel tells nothing of another day's light."""
+_MOST_SATURATED = 0.01
+
+
+@dataclass(frozen=True)
+class BandReading:
+    """A panel as one band has it."""
+
+    band: Band
+    """With its panel."""
+    albedo: float | None
+    radiance: float | None
+    """Mean over its area, in the unit of the camera's own calibration."""
+    problem: str = ""
+    """Why it tells nothing."""
+
+    @property
+    def factor(self) -> float | None:
+        """What radiance is to be multiplied by for reflectance."""
+        if self.problem or self.albedo is None or self.radiance is None:
+            return None
+        return self.albedo / self.radiance
+
+
+@dataclass(frozen=True)
+class PanelReading:
+    """A capture of a panel."""
+
+    capture: Capture
+    bands: tuple[BandReading, ...]
+
+    @property
+    def panel(self) -> Panel:
+        """As the first band shows it."""
+        assert self.capture.panel is not None
+        return self.capture.panel
+
+
+def with_panels(captures: Sequence[Capture], *, by_look: bool = False) -> list[Capture]:
+    """The captures, of which those show a panel that the tags say, and among the first and last of each flight those
+    whose images show one with its QR code, or `by_look` without one.
+    """
+    asked = [c for flight in flights_of(captures) for c in _at_the_ends(flight) if c.panel is None]
+    with ThreadPoolExecutor(4) as pool:
+        seen = dict(zip((c.label for c in asked), pool.map(lambda c: _looked_at(c, by_look), asked), strict=True))
+    return [seen.get(c.label, c) for c in captures]
+
+
+def read_panel(capture: Capture, albedos: Albedos) -> PanelReading:
+    """What a capture of a panel shows, band by band."""
+    return PanelReading(capture, tuple(_read(b, albedos) for b in capture.bands))
+
+
+def factors_for(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, float]:
+    """By band, what a capture's radiance is to be multiplied by for reflectance: linear in time between the panels of
+    its camera, and as the nearest one has it before the first and after the last.
+    """
+    mine = [
+        r for r in readings
+        if camera_key(r.capture) == camera_key(capture)
+        and abs(r.capture.seconds - capture.seconds) <= _SAME_OUTING_S
+    ]  # fmt: skip
+    found: dict[str, list[tuple[float, float]]] = {}
+    for reading in mine:
+        for band in reading.bands:
+            if band.factor is not None:
+                found.setdefault(band.band.name, []).append((reading.capture.seconds, band.factor))
+    return {name: _at(capture.seconds, known) for name, known in found.items()}
+
+
+def _at(seconds: float, known: list[tuple[float, float]]) -> float:
+    times = sorted({t for t, _ in known})
+    return float(np.interp(seconds, times, [np.mean([f for t, f in known if t == time]) for time in times]))
+
+
+def _at_the_ends(flight: Sequence[Capture]) -> list[Capture]:
+    in_time = sorted(flight, key=lambda c: c.seconds)
+    return in_time if len(flight) <= 2 * _AT_EITHER_END else in_time[:_AT_EITHER_END] + in_time[-_AT_EITHER_END:]
+
+
+def _looked_at(capture: Capture, by_look: bool) -> Capture:
+    if _seen(capture.reference, without_code=by_look) is None:
+        return capture
+    return replace(capture, bands=tuple(replace(b, panel=_seen(b, without_code=True)) for b in capture.bands))
+
+
+def _seen(band: Band, *, without_code: bool) -> Panel | None:
+    try:
+        image = read_for_alignment(band, _LOOK_PX)
+    except AgalignError:
+        return None
+    found = find_panel(replace(image, lens=None), without_code=without_code)
+    if found is None:
+        return None
+    scale = image.size_px[0] / band.width_px
+    corners = tuple(((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5) for x, y in found.area_px)
+    serial, _, _ = found.code.partition("_")
+    albedo = albedo_of(found.code, band.wavelength_nm)
+    return Panel("QR code" if found.code else "look", serial, albedo, corners)
+
+
+def _read(band: Band, albedos: Albedos) -> BandReading:
+    panel = band.panel if band.panel is not None and band.panel.corners_px else _seen(band, without_code=True)
+    panel = panel or band.panel
+    if band.panel is not None and panel is not None:
+        panel = replace(panel, seen_by=band.panel.seen_by, albedo=band.panel.albedo or panel.albedo)
+    band = replace(band, panel=panel)
+    albedo = albedos.get(band.name.lower(), albedos.get("", None if panel is None else panel.albedo))
+    if panel is None or not panel.corners_px:
+        return BandReading(band, albedo, None, "it was not found in this band")
+    try:
+        radiance, saturated = _radiance(band, panel)
+    except AgalignError as error:
+        return BandReading(band, albedo, None, str(error))
+    if saturated > _MOST_SATURATED:
+        return BandReading(band, albedo, radiance, f"{saturated:.0%} of it is saturated")
+    if radiance is not None and not radiance > 0:
+        return BandReading(band, albedo, radiance, "it is black")
+    return BandReading(band, albedo, radiance)
+
+
+def _radiance(band: Band, panel: Panel) -> tuple[float | None, float]:
+    """(mean over the panel's area, None where the tags give no calibration; share of it that is saturated)."""
+    corners = np.asarray(panel.corners_px)
+    x0, y0 = np.floor(corners.min(axis=0)).astype(int).clip(0, np.subtract(band.size_px, 1))
+    x1, y1 = np.ceil(corners.max(axis=0)).astype(int).clip((x0, y0), np.subtract(band.size_px, 1))
+    with open_raster(band.path) as source:
+        pixels, valid = read_window(source, band, int(x0), int(y0), int(x1 - x0 + 1), int(y1 - y0 + 1))
+    within = inside(corners - (x0, y0), pixels.shape) & valid
+    if not within.any():
+        return None, 0.0
+    values = pixels[within].astype(np.float64)
+    saturated = 0.0 if band.saturation_value is None else float((values >= band.saturation_value).mean())
+    if band.radiometry is None or not band.radiometry.is_of_light:
+        return None, saturated
+    return float(calibrated(pixels, band.radiometry, int(x0), int(y0))[within].mean(dtype=np.float64)), saturated

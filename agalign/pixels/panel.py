@@ -1,0 +1,143 @@
+"""A calibration panel by its look: a homogeneous bright square, and the QR code that makers print beside it."""
+
+import re
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agalign.values.image import FloatImage, Mask, Raster
+
+_LONGEST_PX = 1600
+_SHOWN_PERCENTILES = 1.0, 99.5
+_LEVELS = 12
+"""Brightnesses at which outlines are looked for."""
+_INNER = 0.5
+"""Side of the area that is measured beside the panel's,"""
+_RING = 1.15, 1.4
+"""and of the ring around it that it is compared with."""
+_CODE_AREAS = 0.3, 6.0
+"""Of the panel, beside its code's."""
+_CODE_REACH = 3.0
+"""How far their middles lie apart at most, in sides of the code."""
+_SHARE_OF_IMAGE = 0.004, 0.3
+"""Of a panel without a code."""
+_MOST_SPREAD = 0.06
+"""Standard deviation within the area, beside its mean."""
+_LEAST_CONTRAST = 1.5
+"""How much brighter it is than what lies around it."""
+_MOST_SLANT = 1.4
+"""Longest side over shortest."""
+_ALBEDO_IN_CODE = re.compile(r"_(\d{4})(\d{3})(\d{4})(\d{3})$")
+
+Corners = NDArray[np.float64]
+"""(4, 2) px, one after another around."""
+
+
+@dataclass(frozen=True)
+class PanelSight:
+    """What was seen of a panel."""
+
+    code: str
+    """What its QR code says; empty where there is none."""
+    area_px: tuple[tuple[float, float], ...]
+    """(x, y) of the corners of an area well within it; none where only the code was found."""
+
+
+def find_panel(image: Raster, *, without_code: bool = False) -> PanelSight | None:
+    """The panel in a band; None where there is none.
+
+    Roofs and sheets are homogeneous squares too: one without a code counts only `without_code`.
+    """
+    shown, scale = _shown(image)
+    code, at = _code(shown)
+    if not code and not without_code:
+        return None
+    limits = _SHARE_OF_IMAGE if at is None else tuple(share * _area(at) / shown.size for share in _CODE_AREAS)
+    squares = _outlines(shown, limits[0] * shown.size, limits[1] * shown.size)
+    squares = [s for s in squares if (at is None or _is_beside(s, at)) and _is_panel(shown, s)]
+    if not squares:
+        return PanelSight(code, ()) if code else None
+    largest = max(squares, key=_area)
+    area = (_shrunk(largest) + 0.5) / scale - 0.5
+    return PanelSight(code, tuple((float(x), float(y)) for x, y in area))
+
+
+def albedo_of(code: str, wavelength_nm: float | None) -> float | None:
+    """What a panel's code says of its reflectance, 0 to 1: RP04-…_04005111000507 is 51.1 % at 400 nm and 50.7 % at
+    1000 nm, with a straight line between them, as the cameras' firmware takes it too.
+    """
+    found = _ALBEDO_IN_CODE.search(code)
+    if found is None or wavelength_nm is None:
+        return None
+    first_nm, first, last_nm, last = (float(n) for n in found.groups())
+    if not first_nm <= wavelength_nm <= last_nm or last_nm == first_nm:
+        return None
+    return (first + (last - first) * (wavelength_nm - first_nm) / (last_nm - first_nm)) / 1000
+
+
+def inside(corners_px: ArrayLike, shape: tuple[int, int]) -> Mask:
+    """(height, width): the pixels of an area, whose corners are (n, 2)."""
+    mask = np.zeros(shape, np.uint8)
+    cv2.fillPoly(mask, [np.round(np.asarray(corners_px)).astype(np.int32)], 1)
+    return mask.astype(bool)
+
+
+def _shown(image: Raster) -> tuple[NDArray[np.uint8], float]:
+    """(8 bits, how much smaller)."""
+    pixels: FloatImage = image.pixels if image.pixels.ndim == 2 else image.pixels.mean(axis=0)
+    scale = min(1.0, _LONGEST_PX / max(pixels.shape))
+    if scale < 1:
+        pixels = np.asarray(cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.float32)
+    low, high = np.percentile(pixels, _SHOWN_PERCENTILES)
+    stretched = (pixels - low) * (255.0 / max(float(high - low), 1e-9))
+    return np.clip(np.rint(stretched), 0, 255).astype(np.uint8), scale
+
+
+def _code(shown: NDArray[np.uint8]) -> tuple[str, Corners | None]:
+    """(text, corners) of a QR code; a text that was decoded is no mistake, a mere outline often is."""
+    try:
+        text, at, _ = cv2.QRCodeDetector().detectAndDecode(shown)
+    except cv2.error:  # some outlines that are no codes make it divide by nothing
+        return "", None
+    return (text, np.asarray(at, np.float64).reshape(4, 2)) if text else ("", None)
+
+
+def _outlines(shown: NDArray[np.uint8], least: float, most: float) -> list[Corners]:
+    """Convex quadrilaterals that some brightness outlines, of areas between two."""
+    found = []
+    low, high = (float(v) for v in np.percentile(shown, (5, 99.5)))
+    for level in np.linspace(low, high, _LEVELS + 2)[1:-1]:
+        contours, _ = cv2.findContours((shown > level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
+        for contour in (c for c in contours if least <= cv2.contourArea(c) <= most):
+            four = cv2.approxPolyDP(contour, 0.04 * cv2.arcLength(contour, closed=True), closed=True).reshape(-1, 2)
+            if len(four) == 4 and cv2.isContourConvex(four):
+                sides = np.linalg.norm(four - np.roll(four, 1, axis=0), axis=1)
+                if sides.max() <= _MOST_SLANT * sides.min():
+                    found.append(four.astype(np.float64))
+    return found
+
+
+def _is_panel(shown: NDArray[np.uint8], square: Corners) -> bool:
+    """True where it is homogeneous, and brighter than a ring around it."""
+    inner, edge, outer = (inside(_shrunk(square, share), shown.shape) for share in (_INNER, *_RING))
+    within, around = shown[inner].astype(np.float64), shown[outer & ~edge]
+    if not len(within) or not len(around):
+        return False
+    bright = within.mean() >= _LEAST_CONTRAST * np.median(around)
+    return bool(bright and within.std() <= _MOST_SPREAD * within.mean())
+
+
+def _is_beside(square: Corners, code: Corners) -> bool:
+    side, apart = _area(code) ** 0.5, float(np.linalg.norm(square.mean(axis=0) - code.mean(axis=0)))
+    return bool(side <= apart <= _CODE_REACH * side)
+
+
+def _area(corners: Corners) -> float:
+    return float(cv2.contourArea(corners.astype(np.float32)))
+
+
+def _shrunk(square: Corners, share: float = _INNER) -> Corners:
+    middle = square.mean(axis=0)
+    return np.asarray(middle + share * (square - middle))

@@ -1,0 +1,32 @@
+"""Pictures with words on them, and how they are written."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from agalign.errors import OutputError
+from agalign.values.files import complete_file
+
+Picture = NDArray[np.uint8]
+"""(height, width, 3) red, green, blue."""
+_INK = 40, 40, 40
+
+
+def write_png(image: Picture, path: Path) -> None:
+    """Complete or not at all. Raises OutputError."""
+    with complete_file(path) as partial:
+        if not cv2.imwrite(str(partial), image[..., ::-1]):
+            raise OutputError(f"{path}: cannot be written")
+
+
+def with_text(
+    image: Picture, text: str, at_px: tuple[float, float], size_px: float = 14, anchor: str = "ls",
+    ink: tuple[int, int, int] = _INK,
+) -> Picture:  # fmt: skip
+    """The picture with a line of text; `anchor` is Pillow's, the left end of the baseline unless told."""
+    drawn = Image.fromarray(image)
+    ImageDraw.Draw(drawn).text(at_px, text, ink, ImageFont.load_default(size_px), anchor)
+    return np.asarray(drawn)

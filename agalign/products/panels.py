@@ -1,0 +1,144 @@
+"""What was read off calibration panels, OUT/panels.json, and a picture of each with the area that was read."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from agalign.errors import SidecarError
+from agalign.flight.panels import BandReading, PanelReading
+from agalign.pixels.raster import read_preview
+from agalign.products.drawing import Picture, with_text, write_png
+from agalign.products.sidecar import compact_lists
+from agalign.values.capture import PanelSource
+from agalign.values.files import write_text
+
+PANELS_FILE = "panels.json"
+_TILE_PX = 320
+_TITLE_PX = 24
+_GAP_PX = 6
+_AREA_COLOUR = 255, 64, 32
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class PanelBandPart(_Part):
+    """The panel in one band."""
+
+    band: str
+    file: str
+    area_px: list[tuple[float, float]]
+    """Corners (x, y) of what was read, raw pixels of the file."""
+    albedo: float | None
+    """Its reflectance, 0 to 1."""
+    radiance: float | None
+    """Mean over the area, in the unit of the camera's own calibration."""
+    reflectance_per_radiance: float | None
+    problem: str | None
+    """Why the band tells nothing."""
+
+
+class PanelPart(_Part):
+    """One capture of a panel."""
+
+    folder: str
+    capture: str
+    captured_at: str
+    seen_by: PanelSource
+    serial: str
+    picture: str
+    bands: list[PanelBandPart]
+
+    @property
+    def sentence(self) -> str:
+        """What it is, in words."""
+        albedos = [b.albedo for b in self.bands if b.albedo is not None]
+        known = f"reflectance {min(albedos):.2f} to {max(albedos):.2f}" if albedos else "reflectance not known"
+        name = f"calibration panel {self.serial}".strip()
+        return f"{name} ({known}; seen by its {self.seen_by}): kept out of the alignment"
+
+
+class Panels(_Part):
+    """All of a run."""
+
+    schema_: Annotated[Literal["agalign-panels/1"], Field(alias="schema")] = "agalign-panels/1"
+    panels: list[PanelPart]
+
+
+def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]:
+    """OUT/panels.json and <capture>.panel.png beside where the capture's files would be; where there is none, neither
+    of an earlier run is left.
+
+    Raises OutputError.
+    """
+    path = out / PANELS_FILE
+    parts: list[PanelPart] = []
+    if not readings:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        return parts
+    for reading in readings:
+        capture = reading.capture
+        picture = out / capture.folder / f"{capture.name}.panel.png"
+        write_png(_sheet(reading), picture)
+        parts.append(
+            PanelPart(
+                folder=capture.folder.as_posix(), capture=capture.name, captured_at=capture.captured_at,
+                seen_by=reading.panel.seen_by, serial=reading.panel.serial, picture=picture.relative_to(out).as_posix(),
+                bands=[_band_part(b) for b in reading.bands],
+            )
+        )  # fmt: skip
+    write_text(path, compact_lists(Panels(panels=parts).model_dump_json(by_alias=True, indent=1)) + "\n")
+    return parts
+
+
+def read_panels(out: Path) -> list[PanelPart]:
+    """Of an earlier run; none where there are none. Raises SidecarError for a file that is none of ours."""
+    path = out / PANELS_FILE
+    try:
+        return Panels.model_validate_json(path.read_bytes()).panels
+    except FileNotFoundError:
+        return []
+    except (OSError, ValidationError):
+        raise SidecarError(f"{path}: cannot be read; run again") from None
+
+
+def _band_part(reading: BandReading) -> PanelBandPart:
+    panel, factor = reading.band.panel, reading.factor
+    return PanelBandPart(
+        band=reading.band.name, file=reading.band.path.name,
+        area_px=[] if panel is None else [(round(x, 2), round(y, 2)) for x, y in panel.corners_px],
+        albedo=reading.albedo, radiance=reading.radiance, reflectance_per_radiance=factor,
+        problem=reading.problem or (None if factor is not None else "its reflectance or the band's is not known"),
+    )  # fmt: skip
+
+
+def _sheet(reading: PanelReading) -> Picture:
+    """Every band beside the next, with the area that was read."""
+    tiles = [_tile(b) for b in reading.bands]
+    height = max(t.shape[0] for t in tiles)
+    gap = np.full((height, _GAP_PX, 3), 255, np.uint8)
+    columns = [np.pad(t, ((0, height - t.shape[0]), (0, 0), (0, 0)), constant_values=255) for t in tiles]
+    return np.hstack([part for column in columns for part in (column, gap)][:-1])
+
+
+def _tile(reading: BandReading) -> Picture:
+    band = reading.band
+    scale = _TILE_PX / band.width_px
+    size = _TILE_PX, max(1, round(band.height_px * scale))
+    pixels = read_preview(band.path, band.band_index, (0, 0, *band.size_px), size)
+    low, high = np.nanpercentile(pixels, (1, 99.5)) if np.isfinite(pixels).any() else (0.0, 1.0)
+    grey = np.clip(np.nan_to_num((pixels - low) / max(high - low, 1e-9)), 0, 1) * 255
+    image = np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+    if band.panel is not None and band.panel.corners_px:
+        corners = ((np.asarray(band.panel.corners_px) + 0.5) * scale - 0.5).round().astype(np.int32)
+        cv2.polylines(image, [corners], isClosed=True, color=_AREA_COLOUR, thickness=2, lineType=cv2.LINE_AA)
+    said = f"{band.name}: " + ("?" if reading.albedo is None else f"{reading.albedo:.3f}")
+    strip = np.full((_TITLE_PX, _TILE_PX, 3), 255, np.uint8)
+    return np.vstack([with_text(strip, said, (2, 17)), image])
