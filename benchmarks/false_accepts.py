@@ -17,9 +17,10 @@ import numpy as np
 from lattices import pair as lattice
 
 import agalign
+from agalign.synthetic.cameras import BANDS, REFERENCE
 from agalign.synthetic.flight import render
 from agalign.synthetic.ground import Ground, paint_ground, reflectance
-from agalign.synthetic.rig import BANDS, REFERENCE, Pose, true_homography
+from agalign.synthetic.rig import Pose, true_homography
 from agalign.values import geometry
 
 SIZE = (640, 480)

@@ -21,8 +21,9 @@ from agalign.evaluation.image_pairs import read_image
 from agalign.evaluation.methods import Task, method_named
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.method.detect import sift_keypoints, to_8_bit, visible_in_both
+from agalign.products.drawing import with_text
+from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
-from agalign.synthetic import rig
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
@@ -34,7 +35,7 @@ GREEN, RED = (80, 200, 60), (60, 60, 230)
 
 def straight_pair(folder: Path) -> tuple[Raster, Raster, Matrix]:
     """Green and near infra-red of one synthetic capture without lens distortion, and the truth between them."""
-    straight = replace(rig.REDEDGE, bands=tuple(replace(b, distortion=(0.0,) * 5) for b in rig.BANDS))
+    straight = replace(cameras.REDEDGE, bands=tuple(replace(b, distortion=(0.0,) * 5) for b in cameras.BANDS))
     capture = json.loads(synthetic.make_flight(folder, 1, SIZE_PX, rng_seed=11, camera=straight).read_text())[
         "IMG_0001"
     ]

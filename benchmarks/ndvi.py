@@ -19,8 +19,8 @@ from agalign.pixels.raster import probe
 from agalign.products.index_rasters import write_indices
 from agalign.products.indices import INDICES, compute
 from agalign.products.sidecar import read_sidecar
+from agalign.synthetic import cameras, rig
 from agalign.synthetic import flight as synthetic
-from agalign.synthetic import rig
 from agalign.synthetic.ground import reflectance
 
 SIZE_PX = (1280, 960)
@@ -35,8 +35,8 @@ def main(captures: int) -> None:
         poses, ground, _ = synthetic.lay_out_flight(captures, SIZE_PX)
         settings = Settings(write=WriteSettings(radiometry="auto"))
         agalign.align_folder(folder, out, settings=settings)
-        bands = {b.name: b for b in rig.BANDS}
-        reference = rig.BANDS[rig.REFERENCE]
+        bands = {b.name: b for b in cameras.BANDS}
+        reference = cameras.BANDS[cameras.REFERENCE]
         for number, (pose, report) in enumerate(zip(poses, write_indices(out, [NDVI]), strict=True), start=1):
             painted = [reflectance(ground, bands[name]) for name in ("NIR", "Red")]
             truth = compute(NDVI, [synthetic.view(p, ground, reference, pose, SIZE_PX) for p in painted])

@@ -54,6 +54,10 @@ class Camera(ABC):
         """Files with the same key (and the same camera and folder) are one capture."""
         return tags.first_text(self.capture_ids) or self.capture_name(path)
 
+    def placed(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
+        """The bands of a capture, those among them that only the tags of its other files place, too."""
+        return list(bands)
+
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """How fast the ground passes through the image, right and down, in focal lengths a second; None where the tags
         do not tell.
@@ -83,9 +87,20 @@ def is_thermal(band: Band) -> bool:
 
 def rig_seed(reference: Band, moving: Band) -> Matrix | None:
     """fixed_to_moving between undistorted pixels from metadata alone; None where it does not tell."""
-    if reference.to_rig is None or moving.to_rig is None:
+    return _through_rig(reference.to_rig, moving.to_rig)
+
+
+def other_rig_seed(reference: Band, moving: Band) -> Matrix | None:
+    """The same by the other tags that some makers write."""
+    if reference.other_to_rig is None and moving.other_to_rig is None:
         return None
-    return geometry.normalised(geometry.compose(geometry.invert(moving.to_rig), reference.to_rig))
+    return _through_rig(*(b.to_rig if b.other_to_rig is None else b.other_to_rig for b in (reference, moving)))
+
+
+def _through_rig(reference: Matrix | None, moving: Matrix | None) -> Matrix | None:
+    if reference is None or moving is None:
+        return None
+    return geometry.normalised(geometry.compose(geometry.invert(moving), reference))
 
 
 # ---- for the cameras

@@ -246,9 +246,9 @@ def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capt
     if len(bands) < 2:
         text = f"{first.path}: a band with no companion; name files '<capture>_<band>.tif' or give --pattern"
         return Problem(first.path, InputError(text))
-    bands = _with_unique_band_names(bands)
+    bands = first.camera.placed(_with_unique_band_names(bands), [f.tags for f in files])
     if options.ignore_metadata:
-        bands = [replace(b, lens=None, to_rig=None) for b in bands]
+        bands = [replace(b, lens=None, to_rig=None, other_to_rig=None) for b in bands]
     try:
         reference = bands[_reference_index(bands, options.reference, first.path)]
     except NoSuchBandError as error:

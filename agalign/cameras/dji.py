@@ -4,13 +4,15 @@ Phantom 4: x_band = x_reference + (RelativeOpticalCenter_band - RelativeOpticalC
 DewarpData makes the bands fit worse than none (0.13 to 0.19 px against 0.08 to 0.11 px on the best homography), and
 DewarpHMatrix is worse than no seed at all: neither is used.
 
-Mavic 3: after undistortion by DewarpData, CalibratedHMatrix maps a band to a plane that all bands share:
-H(reference -> band) = C_band^-1 C_reference. Firmware without it: the rule of the Phantom 4. Its bands are exposed one
-after another, so that in motion a seed is off by tens of pixels.
+Mavic 3: after undistortion by DewarpData, CalibratedHMatrix maps a band to a plane that all bands share, the designed
+bands' frame: H(reference -> band) = C_band^-1 C_reference. The rule of the Phantom 4 is tried beside it, and takes its
+place where firmware does not write it. DewarpHMatrix, in the bands' files, maps that frame to the colour photograph's.
+Its bands are exposed one after another, so that in motion a seed is off by tens of pixels.
 """
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,12 +44,13 @@ _FOCAL_LENGTH_PX: Name = (_DJI, "CalibratedFocalLength")
 _H_MATRIX: Name = (_DJI, "CalibratedHMatrix")
 _SPEED = "FlightXSpeed", "FlightYSpeed", "GimbalYawDegree", "RelativeAltitude"
 _VIGNETTING: Name = (_DJI, "VignettingData")
+_TO_COLOUR: Name = (_DJI, "DewarpHMatrix")
+_PHANTOM_4 = "FC6360"
 
 
 class _Carrying(Carrying):
     geometry = Carrying.geometry | {
-        *_CENTRE, *_RELATIVE_CENTRE, _DEWARP_DATA, _FOCAL_LENGTH_PX, _H_MATRIX, (_DJI, "DewarpFlag"),
-        (_DJI, "DewarpHMatrix"),
+        *_CENTRE, *_RELATIVE_CENTRE, _DEWARP_DATA, _FOCAL_LENGTH_PX, _H_MATRIX, (_DJI, "DewarpFlag"), _TO_COLOUR,
     }  # fmt: skip
     of_the_sensor = Carrying.of_the_sensor | {_VIGNETTING}
     radiometry = Carrying.radiometry | {(_DJI, "BlackLevel")}
@@ -81,23 +84,34 @@ class Dji(Camera):
         return tags.make.upper() == "DJI" or _CAPTURE_UUID in tags.xmp
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        calibrated = _calibrated_h_matrix(tags)
-        lens = _lens(tags) if calibrated is not None else None
-        to_rig = _shift_to_rig(tags) if lens is None else calibrated
+        phantom, by_centres = tags.model == _PHANTOM_4, _shift_to_rig(tags)
+        calibrated = None if phantom else _matrix(tags, _H_MATRIX)
+        lens = None if phantom else _lens(tags)
         if len(info.dtypes) > 1:
-            return colour_bands(path, info, lens, to_rig)
+            return colour_bands(path, info, lens, by_centres if phantom else None)
         name = tags.text(*BAND_NAME) or tags.text(_DJI, "BandName") or _band_in_name(path)
         band = spectral(band_of(path, info, name), tags)
-        return (replace(band, lens=lens, to_rig=to_rig, radiometry=_radiometry(tags)),)
+        if calibrated is None or lens is None:
+            return (replace(band, lens=lens, to_rig=by_centres, radiometry=_radiometry(tags)),)
+        return (
+            replace(band, lens=lens, to_rig=calibrated, other_to_rig=by_centres, radiometry=_radiometry(tags)),
+        )  # fmt: skip
+
+    def placed(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
+        to_colour = next((m for t in tags if t.model != _PHANTOM_4 and (m := _matrix(t, _TO_COLOUR)) is not None), None)
+        if to_colour is None:
+            return list(bands)
+        to_rig = geometry.invert(to_colour)
+        return [replace(b, to_rig=to_rig) if b.companion and b.to_rig is None else b for b in bands]
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """From the speed over ground (north, east, m/s), the gimbal's yaw, which is the image's upward direction, and
-        the height above the take-off point.
+        the height above the take-off point. A gimbal that looks down and is said to be rolled by 180 degrees is turned.
         """
         north, east, yaw_deg, height_m = (tags.number(_DJI, name) for name in _SPEED)
         if north is None or east is None or yaw_deg is None or height_m is None or height_m <= 0:
             return None
-        yaw = math.radians(yaw_deg)
+        yaw = math.radians(yaw_deg + (180 if abs(tags.number(_DJI, "GimbalRollDegree") or 0.0) > 90 else 0))
         forward = north * math.cos(yaw) + east * math.sin(yaw)
         right = east * math.cos(yaw) - north * math.sin(yaw)
         return -right / height_m, forward / height_m
@@ -119,8 +133,9 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     adjusted = tags.number(_DJI, "SensorGainAdjustment") or 1.0
     centre, k = _pair(tags, _CENTRE), tags.numbers(*_VIGNETTING)
     return Radiometry(
-        "relative radiance", black, 65536.0, adjusted / (gain * exposure_us / 1e6), centre or (0.0, 0.0), k if centre else (),
-        vignetting_divides=False, by_sun=(1 / irradiance, "relative reflectance") if irradiance > 0 else None,
+        "relative radiance", black, 65536.0, adjusted / (gain * exposure_us / 1e6), centre or (0.0, 0.0),
+        k if centre else (), vignetting_divides=False,
+        by_sun=(1 / irradiance, "relative reflectance") if irradiance > 0 else None,
     )  # fmt: skip
 
 
@@ -141,8 +156,9 @@ def _pair(tags: Tags, names: tuple[Name, Name]) -> tuple[float, float] | None:
     return None if x is None or y is None else (x, y)
 
 
-def _calibrated_h_matrix(tags: Tags) -> Matrix | None:
-    values = tags.numbers(*_H_MATRIX)
+def _matrix(tags: Tags, name: Name) -> Matrix | None:
+    """3 x 3; None where there is none that can be inverted."""
+    values = tags.numbers(*name)
     if len(values) != 9:
         return None
     matrix = np.array(values).reshape(3, 3)

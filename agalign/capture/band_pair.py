@@ -156,7 +156,7 @@ def read_pairs(
 
 def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float]) -> dict[SeedKind, float]:
     """Tags are as good as their makers' parallax; the flight's mean as captures left out of it showed."""
-    known: dict[SeedKind, float] = {"rig": _TAGS_STD_PX * scale[0]}
+    known: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), _TAGS_STD_PX * scale[0])
     if model is not None and model.rig is not None and band in model.rig.mean:
         known["model"] = max(model.rig.missed_px(band, by_neighbours=False), _LEAST_MODEL_STD_PX) * scale[0]
     return known

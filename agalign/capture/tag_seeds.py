@@ -5,7 +5,7 @@ from contextlib import suppress
 import cv2
 import numpy as np
 
-from agalign.cameras import rig_seed
+from agalign.cameras import other_rig_seed, rig_seed
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
 from agalign.pixels.raster import transformed
@@ -27,6 +27,10 @@ def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> di
         rig = rig_seed(reference, moving)
         if rig is not None:
             candidates["rig"] = rig
+    with suppress(GeometryError):
+        by_centres = other_rig_seed(reference, moving)
+        if by_centres is not None:
+            candidates["centre"] = by_centres
     with suppress(GeometryError):
         geo = geo_seed(reference, moving)
         if geo is not None:

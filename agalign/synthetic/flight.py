@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.synthetic import tags
+from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.ground import Field, Ground, map_px, on_ground, paint_ground, reflectance
 from agalign.synthetic.rig import (
-    REDEDGE,
     BandSpec,
     CameraSpec,
     Pose,
@@ -34,6 +34,7 @@ ALTITUDE_M = 22.0, 34.0
 _TIES, _TIES_OVER_RELIEF = (25, 19), (65, 49)
 _CAPTURES_A_FIELD = 4
 """Taken beside each other over one painted ground: memory is one ground's, however long the flight."""
+_WARMEST_C, _HEAT_NOISE_C = 50.0, 0.05
 _VIGNETTING = 0.35
 """What the corners lack of the middle's light."""
 
@@ -72,7 +73,7 @@ def make_flight(
     rng, truth = np.random.default_rng(rng_seed), dict[str, Any]()
     for first in range(0, captures, _CAPTURES_A_FIELD):
         poses = [_pose(rng, number, altitude_m) for number in range(min(_CAPTURES_A_FIELD, captures - first))]
-        ground = paint_ground(rng, poses, size_px, relief_m)
+        ground = paint_ground(rng, poses, size_px, relief_m, camera)
         truth |= _write(folder, [Shot(pose, ground) for pose in poses], size_px, camera, rng, first)
     return _write_truth(folder, truth)
 
@@ -101,8 +102,9 @@ def _write(
             pixels = render(painted[1], shot.ground, band, shot.pose, size_px, rng, spoil)
             if band.name not in shot.without:
                 path = images / tags.file_name(camera, band, number)
+                path.parent.mkdir(parents=True, exist_ok=True)
                 there = replace(shot.pose, north_m=shot.pose.north_m + before)
-                tags.write_band(path, pixels, camera, band, there, number, _VIGNETTING)
+                tags.write_band(path, pixels, camera, band, there, number, _VIGNETTING, size_px)
     return {
         tags.capture_name(camera, number): _truth(shot, number, camera, size_px)
         for number, shot in enumerate(shots, start=before + 1)
@@ -118,10 +120,10 @@ def _write_truth(folder: Path, truth: dict[str, Any]) -> Path:
 def _truth(shot: Shot, number: int, camera: CameraSpec, size_px: tuple[int, int]) -> dict[str, Any]:
     reference = camera.bands[camera.reference]
     return {
-        "reference": tags.file_name(camera, reference, number),
+        "reference": Path(tags.file_name(camera, reference, number)).name,
         "trouble": shot.trouble,
         "bands": {
-            tags.file_name(camera, b, number): {
+            Path(tags.file_name(camera, b, number)).name: {
                 "fixed_to_moving": true_homography(reference, b, shot.pose, size_px).tolist(),
                 "ties": true_ties(shot.ground, reference, b, shot.pose, size_px),
             }
@@ -148,31 +150,36 @@ def true_ties(
     ground: Ground, reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]
 ) -> list[list[float]]:
     """[x_ref, y_ref, x_mov, y_mov] in raw pixels on a lattice, where both lie in their images."""
-    width, height = size_px
-    here = geometry.lattice(width, height, *(_TIES if ground.height_m is None else _TIES_OVER_RELIEF))
+    here = geometry.lattice(*reference.size_px(size_px), *(_TIES if ground.height_m is None else _TIES_OVER_RELIEF))
     place, rays = place_and_rays(band, pose, size_px)
     seen = on_ground(ground, reference, pose, size_px, here)
     # The way back: a point of the ground from the band's place, as a ray of its camera.
     straight = geometry.apply(geometry.invert(rays), (seen[:, :2] - place[:2]) / (seen[:, 2:] - place[2]))
     there = lens.distort(band.lens(*size_px), straight)
-    inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
+    inside = ((there >= 0) & (there <= np.subtract(band.size_px(size_px), 1))).all(axis=1)
     rows: list[list[float]] = np.hstack([here, there])[inside].round(4).tolist()
     return rows
 
 
 def view(painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Field:
-    """(height, width) of a painted ground as a band's camera sees it, through its lens, without vignetting or noise."""
-    width, height = size_px
+    """(height, width) of a painted ground as a band's camera sees it, through its lens, without vignetting or noise.
+
+    Where its pixels are much larger than the ground's, each is the mean of many.
+    """
+    width, height = band.size_px(size_px)
+    many = max(1, round(band.view / band.size_ratio[0]))
 
     def on_map(raw_px: Points) -> Points:
         return map_px(ground, on_ground(ground, band, pose, size_px, raw_px)[..., :2])
 
-    x, y = np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)
+    x, y = ((np.arange(n * many, dtype=np.float64) + 0.5) / many - 0.5 for n in (width, height))
     if ground.height_m is None:
         positions = splined(on_map, x, y, dtype=np.float32)
     else:
         positions = on_map(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
     seen = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    if many > 1:
+        seen = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
     return np.asarray(seen, np.float32)
 
 
@@ -180,9 +187,15 @@ def render(
     painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], rng: np.random.Generator,
     spoil: Spoil | None = None,
 ) -> NDArray[np.uint16]:  # fmt: skip
-    """What one camera records of the ground painted in its band: (height, width) uint16 with vignetting and noise."""
-    width, height = size_px
+    """What one camera records of the ground painted in its band: (height, width) uint16 with vignetting and noise, and
+    of heat hundredths of a kelvin.
+    """
+    width, height = band.size_px(size_px)
     scene = view(painted, ground, band, pose, size_px)
+    if band.sees == "heat":
+        celsius = _WARMEST_C * (scene if spoil is None else spoil(scene, rng))
+        celsius = celsius + rng.normal(0, _HEAT_NOISE_C, scene.shape)
+        return np.asarray(np.rint(100 * (celsius + 273.15)).astype(np.uint16))
     y, x = np.arange(height), np.arange(width)
     radius2 = ((x - width / 2) ** 2)[None, :] + ((y - height / 2) ** 2)[:, None]
     vignetting = 1 - _VIGNETTING * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from agalign.synthetic.rig import FOCAL_LENGTH_MM, PIXELS_PER_MM, BandSpec, Pose, place_and_rays
+from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic.rig import FOCAL_LENGTH_MM, PIXELS_PER_MM, BandSpec, CameraSpec, Pose, place_and_rays
 from agalign.values import lens
 from agalign.values.geometry import Points
 
@@ -37,13 +38,15 @@ class Ground:
 
 
 def paint_ground(
-    rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int], relief_m: float = 0.0
-) -> Ground:
-    """Parcels, rows, tracks and trees, large enough for all poses."""
+    rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int], relief_m: float = 0.0,
+    camera: CameraSpec = REDEDGE,
+) -> Ground:  # fmt: skip
+    """Parcels, rows, tracks and trees, large and fine enough for all bands at all poses."""
     focal = FOCAL_LENGTH_MM * PIXELS_PER_MM * size_px[0] / 1280
     lowest, highest = min(p.altitude_m for p in poses), max(p.altitude_m for p in poses)
-    metres_per_px = lowest / focal / _MAP_PX_PER_IMAGE_PX
-    reach_m = max(np.hypot(p.east_m, p.north_m) for p in poses) + 0.62 * highest * np.hypot(*size_px) / focal
+    metres_per_px = lowest / focal / camera.sharpest / _MAP_PX_PER_IMAGE_PX
+    seen_m = 0.62 * highest * np.hypot(*size_px) / focal * camera.widest
+    reach_m = max(np.hypot(p.east_m, p.north_m) for p in poses) + seen_m
     side = 2 * int(np.ceil(reach_m / metres_per_px))
     metre = 1 / metres_per_px
     count = max(6, round((side / metre / 9) ** 2))

@@ -1,4 +1,6 @@
-"""The synthetic camera: the lenses of its bands, their places and angles in the rig, and what they are sensitive to."""
+"""What a synthetic camera is: the lenses of its bands, their places and angles in the rig, what they are sensitive to,
+and how they see the ground from a pose. `synthetic.cameras` has the cameras.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -36,60 +38,60 @@ class BandSpec:
     """Of the principal point from the middle of a 1280 x 960 sensor."""
     delay_s: float = 0.0
     """How much later than the first band it is exposed."""
+    sees: Literal["light", "colour", "heat"] = "light"
+    """In colour it is one of three that share a file; what a thermal band sees is given as shares of 50 degrees."""
+    size_ratio: tuple[float, float] = (1.0, 1.0)
+    """Pixels of its sensor beside the camera's, along x and y."""
+    view: float = 1.0
+    """Its field of view beside that of the first camera below."""
 
     @property
     def exposure(self) -> float:
         """Share of the full signal that a reflectance of 1 would give."""
         return 0.55 / max(self.soil, self.crop)
 
+    @property
+    def focal_length_mm(self) -> float:
+        """All sensors are 4.8 mm wide."""
+        return FOCAL_LENGTH_MM / self.view
+
+    def size_px(self, camera_px: tuple[int, int]) -> tuple[int, int]:
+        """(width, height) of its images by a camera of the given size."""
+        return round(camera_px[0] * self.size_ratio[0]), round(camera_px[1] * self.size_ratio[1])
+
     def lens(self, width_px: int, height_px: int) -> Lens:
-        """The lens on a sensor of the given size; smaller sensors have larger pixels."""
-        scale = width_px / 1280
-        focal = FOCAL_LENGTH_MM * PIXELS_PER_MM * scale
-        cx = (width_px - 1) / 2 + self.centre_offset_px[0] * scale
-        cy = (height_px - 1) / 2 + self.centre_offset_px[1] * scale
+        """The lens, by a camera of the given size; smaller sensors have larger pixels."""
+        width, height = self.size_px((width_px, height_px))
+        scale = width / 1280
+        focal = self.focal_length_mm * PIXELS_PER_MM * scale
+        cx = (width - 1) / 2 + self.centre_offset_px[0] * scale
+        cy = (height - 1) / 2 + self.centre_offset_px[1] * scale
         return Lens(focal, focal, cx, cy, self.distortion)
-
-
-BANDS = (
-    BandSpec("Blue", 475, 20, 0.085, 0.042, 0.030, 0, (0.31, -0.22, 0.12), (-0.03, -0.021),
-             (-0.104, 0.150, -0.0003, 0.0006, -0.03), (11.2, -7.5)),
-    BandSpec("Green", 560, 20, 0.125, 0.105, 0.070, 1, (0.0, 0.0, 0.0), (0.0, -0.021),
-             (-0.101, 0.145, 0.0002, -0.0004, -0.02), (-6.3, 4.9)),
-    BandSpec("Red", 668, 10, 0.185, 0.055, 0.040, 2, (-0.42, 0.35, -0.18), (0.03, -0.021),
-             (-0.108, 0.158, -0.0001, 0.0003, -0.04), (3.7, 12.6)),
-    BandSpec("NIR", 840, 40, 0.265, 0.520, 0.430, 3, (0.55, -0.16, 0.21), (-0.03, 0.021),
-             (-0.110, 0.152, -0.0003, 0.0005, -0.05), (13.5, 9.1)),
-    BandSpec("Red edge", 717, 10, 0.225, 0.285, 0.220, 4, (-0.27, -0.31, -0.09), (0.03, 0.021),
-             (-0.106, 0.160, 0.0004, -0.0002, -0.06), (-9.4, -5.8)),
-)  # fmt: skip
-REFERENCE = 1
 
 
 @dataclass(frozen=True)
 class CameraSpec:
     """A camera, and whose tags it writes."""
 
-    maker: Literal["MicaSense", "DJI"]
+    maker: Literal["MicaSense", "DJI", "Sentera"]
+    model: str
     bands: tuple[BandSpec, ...]
     reference: int
     """Index of the band that the others are aligned to."""
+    size_px: tuple[int, int] = (1280, 960)
+    """(width, height) of the reference's images."""
+    calibrated: bool = True
+    """DJI's: its bands' mappings to a plane that all share are in its tags, not only their optical centres."""
 
+    @property
+    def sharpest(self) -> float:
+        """Most pixels an angle that a band has, beside the first camera's."""
+        return max(b.size_ratio[0] / b.view for b in self.bands)
 
-REDEDGE = CameraSpec("MicaSense", BANDS, REFERENCE)
-MAVIC = CameraSpec("DJI", (
-    BandSpec("Green", 560, 32, 0.125, 0.105, 0.070, 1, (0.0, 0.0, 0.0), (-0.012, -0.009),
-             (-0.081, 0.095, 0.0002, -0.0003, -0.02), (-5.1, 3.4), 0.0),
-    BandSpec("Red", 650, 32, 0.175, 0.060, 0.045, 2, (-0.21, 0.17, -0.11), (0.012, -0.009),
-             (-0.084, 0.098, -0.0001, 0.0002, -0.02), (4.6, 8.2), 0.025),
-    BandSpec("RedEdge", 730, 32, 0.230, 0.310, 0.240, 3, (-0.12, -0.24, 0.08), (-0.012, 0.009),
-             (-0.079, 0.091, 0.0003, -0.0001, -0.03), (-7.7, -2.9), 0.050),
-    BandSpec("NIR", 860, 52, 0.270, 0.510, 0.420, 4, (0.26, -0.09, 0.14), (0.012, 0.009),
-             (-0.086, 0.101, -0.0002, 0.0003, -0.03), (9.3, 5.5), 0.075),
-), 0)  # fmt: skip
-"""Its bands are exposed one after another: at 8 m/s and 28 m up near infra-red moves by 62 px against green between
-opposite headings.
-"""
+    @property
+    def widest(self) -> float:
+        """Widest field of view, likewise."""
+        return max(b.view for b in self.bands)
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
+from agalign.synthetic.cameras import MAVIC, REDEDGE
 from agalign.synthetic.flight import Shot, Spoil, write_shots
 from agalign.synthetic.ground import Field, Ground, paint_ground
-from agalign.synthetic.rig import MAVIC, REDEDGE, Pose
+from agalign.synthetic.rig import CameraSpec, Pose
 
 _HEIGHT_M = 28.0
 _SPEED_M_S = 8.0
@@ -32,21 +33,22 @@ def make_troubled_flight(
 
 
 def make_two_headings(
-    folder: Path, captures: int = 24, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0
-) -> Path:
-    """Write a flight of lines to and fro with the camera facing one way, by a camera that exposes its bands one after
-    another; the captures before and after each turn lie over water.
+    folder: Path, captures: int = 24, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0,
+    camera: CameraSpec = MAVIC, line: int = _LINE, *, lakes: bool = True,
+) -> Path:  # fmt: skip
+    """Write a flight of lines to and fro with the camera facing one way, by default one that exposes its bands one
+    after another; with `lakes` the captures before and after each turn lie over water.
     """
     rng = np.random.default_rng(rng_seed)
     shots = []
     for number in range(captures):
-        speed = float(rng.normal(_SPEED_M_S, 0.5)) * (-1) ** (number // _LINE)
+        speed = float(rng.normal(_SPEED_M_S, 0.5)) * (-1) ** (number // line)
         drift = float(rng.normal(0.0, 0.3))
         pose = replace(_pose(rng, number), yaw_deg=float(rng.normal(12.0, 1.5)), velocity_m_s=(drift, -speed))
-        turns = number % _LINE in (0, _LINE - 1) and 0 < number < captures - 1
-        make = _spoilt("a lake", _water) if turns else _plain
-        shots.append(make(rng, pose, size_px))
-    return write_shots(folder, shots, size_px, MAVIC, rng)
+        turns = lakes and number % line in (0, line - 1) and 0 < number < captures - 1
+        ground = paint_ground(rng, [_above_the_origin(pose)], size_px, camera=camera)
+        shots.append(_shot(pose, ground, *(("a lake",) if turns else ()), spoil=_water if turns else None))
+    return write_shots(folder, shots, size_px, camera, rng)
 
 
 def _plan(captures: int) -> list[Make]:

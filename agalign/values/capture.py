@@ -86,6 +86,8 @@ class Band:
     to_rig: Matrix | None = None
     """Homography from this file's undistorted pixels (raw ones without a lens model) to a plane that all bands of the
     rig share, as far as the tags tell."""
+    other_to_rig: Matrix | None = None
+    """The same as other tags of the file have it, where makers give two."""
     parallax: tuple[float, float] | None = None
     """Direction in which its pixels move as the ground comes nearer, right and down, relative to the rig's other bands;
     in any unit."""

@@ -2,7 +2,8 @@
 
 from typing import Literal
 
-SeedKind = Literal["user", "match", "model", "rig", "geo", "structure", "identity"]
+SeedKind = Literal["user", "match", "model", "rig", "centre", "geo", "structure", "identity"]
+"""`centre` is by the optical centres that DJI writes, where `rig` is by its calibrated homographies."""
 SeedChoice = Literal["auto", "rig", "geo", "structure", "match", "identity"]
 Recipe = Literal["fast", "paper"]
 Sharing = Literal["siamese", "pseudo-siamese", "unshared"]

@@ -11,7 +11,7 @@ from agalign.cameras.micasense import MicaSense
 from agalign.cameras.pix4d import CAMERA
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import RasterInfo, probe
-from agalign.synthetic import rig
+from agalign.synthetic import cameras, rig
 from agalign.values import geometry
 from agalign.values.capture import Band
 
@@ -26,7 +26,7 @@ def micasense_bands(flight: Path) -> dict[str, Band]:
 
 def test_micasense_lens_is_the_generators(flight: Path) -> None:
     bands = micasense_bands(flight)
-    for spec in rig.BANDS:
+    for spec in cameras.BANDS:
         expected, found = spec.lens(480, 360), bands[spec.name].lens
         assert found is not None
         np.testing.assert_allclose(
@@ -38,8 +38,8 @@ def test_micasense_lens_is_the_generators(flight: Path) -> None:
 def test_rig_seed_is_the_truth_at_infinity(flight: Path) -> None:
     bands = micasense_bands(flight)
     far = rig.Pose(1e4, 0.0, 0.0, 0.0, 0.0, 0.0)
-    reference = rig.BANDS[rig.REFERENCE]
-    for spec in rig.BANDS:
+    reference = cameras.BANDS[cameras.REFERENCE]
+    for spec in cameras.BANDS:
         seed = rig_seed(bands["Green"], bands[spec.name])
         assert seed is not None
         truth = rig.true_homography(reference, spec, far, (480, 360))

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from agalign.pixels.resample import resample, resample_tile, tiles, warped
 from agalign.products.layout import _largest_rectangle, common_area
-from agalign.synthetic import rig
+from agalign.synthetic import cameras
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.choices import Interpolation
@@ -33,7 +33,7 @@ def write_band(path: Path, pixels: np.ndarray, nodata: float | None = None) -> B
 
 
 def test_source_positions_are_the_mapping(flight: Path) -> None:
-    lenses = [rig.BANDS[k].lens(480, 360) for k in (1, 3)]
+    lenses = [cameras.BANDS[k].lens(480, 360) for k in (1, 3)]
     for mapping in (PixelMapping(H), PixelMapping(H, *lenses), PixelMapping(H, None, lenses[1])):
         tile = Tile(100, 40, 211, 97)
         positions = mapping.positions(tile)
@@ -42,7 +42,7 @@ def test_source_positions_are_the_mapping(flight: Path) -> None:
 
 
 def test_undistorted_pixels_of_the_reference_reach_the_same_place() -> None:
-    own, other = (rig.BANDS[k].lens(480, 360) for k in (1, 3))
+    own, other = (cameras.BANDS[k].lens(480, 360) for k in (1, 3))
     straight = np.array([[50.0, 60.0], [400.0, 300.0]])
     raw = lens.distort(own, straight)
     for mapping in (PixelMapping(H, own, other), PixelMapping(H)):
@@ -90,7 +90,7 @@ def test_the_type_is_kept_rounded_and_clipped(tmp_path: Path, dtype: str) -> Non
 
 def test_tiles_join_without_a_seam(tmp_path: Path) -> None:
     band = write_band(tmp_path / "b.tif", (textured_image(300, 220) * 100).astype(np.float32))
-    mapping = PixelMapping(H, rig.BANDS[1].lens(300, 220), rig.BANDS[3].lens(300, 220))
+    mapping = PixelMapping(H, cameras.BANDS[1].lens(300, 220), cameras.BANDS[3].lens(300, 220))
     # Not lanczos: there OpenCV rounds positions to 1/32 px, and a thousandth more or less tips it over.
     whole, whole_valid = resample_tile(band, mapping, Tile(0, 0, 300, 220), "cubic")
     for tile in tiles(Tile(0, 0, 300, 220), 64):

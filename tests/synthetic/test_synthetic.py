@@ -7,8 +7,8 @@ import pytest
 
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import read_for_alignment
+from agalign.synthetic import cameras, rig
 from agalign.synthetic import flight as synthetic
-from agalign.synthetic import rig
 from agalign.synthetic.ground import paint_ground, reflectance
 from agalign.values import geometry, lens
 
@@ -17,7 +17,7 @@ def test_the_truth_follows_from_rays_and_the_plane() -> None:
     # Independent of the generator's homographies: shoot a ray from the reference, hit the ground, look from the band.
     pose = rig.Pose(30.0, 40.0, 1.5, -2.0, 3.0, -4.0)
     size = (1280, 960)
-    reference, band = rig.BANDS[rig.REFERENCE], rig.BANDS[3]
+    reference, band = cameras.BANDS[cameras.REFERENCE], cameras.BANDS[3]
     attitude = rig._rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
     ground = paint_ground(np.random.default_rng(0), [pose], (320, 240))
     ties = np.array(synthetic.true_ties(ground, reference, band, pose, size))
@@ -40,7 +40,7 @@ def test_the_truth_follows_from_rays_and_the_plane() -> None:
 
 def test_parallax_depends_on_the_altitude() -> None:
     poses = [rig.Pose(h, 0.0, 0.0, 0.0, 0.0, 0.0) for h in (20.0, 40.0)]
-    low, high = (rig.true_homography(rig.BANDS[1], rig.BANDS[3], p, (1280, 960)) for p in poses)
+    low, high = (rig.true_homography(cameras.BANDS[1], cameras.BANDS[3], p, (1280, 960)) for p in poses)
     assert geometry.corner_error_px(low, high, 1280, 960) > 0.5
 
 
@@ -74,7 +74,7 @@ def test_the_images_show_what_the_truth_says(flight: Path) -> None:
 
 def test_contrast_reverses_between_green_and_near_infra_red(flight: Path) -> None:
     ground = paint_ground(np.random.default_rng(0), [rig.Pose(30, 0, 0, 0, 0, 0)], (320, 240))
-    by_name = {b.name: reflectance(ground, b).ravel() for b in rig.BANDS}
+    by_name = {b.name: reflectance(ground, b).ravel() for b in cameras.BANDS}
     assert np.corrcoef(by_name["Red"], by_name["NIR"])[0, 1] < -0.25
     assert np.corrcoef(by_name["Green"], by_name["Red"])[0, 1] > 0.5
 
@@ -88,7 +88,7 @@ def test_the_same_seed_gives_the_same_flight(tmp_path: Path) -> None:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-@pytest.mark.parametrize("band", rig.BANDS, ids=lambda b: b.name)
+@pytest.mark.parametrize("band", cameras.BANDS, ids=lambda b: b.name)
 def test_bands_are_well_exposed(flight: Path, band: rig.BandSpec) -> None:
     (found,) = [b for b in discover(flight).captures[0].bands if b.name == band.name]
     raster = read_for_alignment(found, 4096)
@@ -109,7 +109,7 @@ def test_relief_moves_what_stands_up(tmp_path: Path) -> None:
     flat = np.array([[*k, *v] for k, v in truths[0.0].items()])
     left = {}
     for name, ties in (("relief", points), ("plane", flat)):
-        spec = [rig.BANDS[i].lens(320, 240) for i in (rig.REFERENCE, 3)]
+        spec = [cameras.BANDS[i].lens(320, 240) for i in (cameras.REFERENCE, 3)]
         here, there = lens.undistort(spec[0], ties[:, :2]), lens.undistort(spec[1], ties[:, 2:])
         fitted, _ = cv2.findHomography(here, there, 0)
         left[name] = np.linalg.norm(geometry.apply(fitted, here) - there, axis=1)
