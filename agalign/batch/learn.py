@@ -1,7 +1,7 @@
 """Learning a flight: one network on a few of its captures, to be frozen for all of them."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ import numpy as np
 from agalign.capture.align import align_pairs, judge_together
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.prediction import observed, with_predictions
-from agalign.capture.seeding import find_seed, subject_of
+from agalign.capture.seeding import find_seed, subjects_of
 from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.fingerprint import fingerprint, hashed
@@ -53,7 +53,7 @@ def learn_flight(
     if not loaded:
         return None
     state = JointState(settings.joint, progress)
-    subjects = [one.subject for one in loaded]
+    subjects = [subject for one in loaded for _, subject in one.subjects]
     bands = _sides(captures[0])
     net = state.fast_descriptor([1] * (1 + len(bands)))
     if start is not None:
@@ -61,14 +61,15 @@ def learn_flight(
     try:
         learn(state, subjects, net, at_once)
         with ThreadPoolExecutor(at_once) as pool:
-            results = list(pool.map(lambda s: refine_with(net, s, settings.joint, progress), subjects))
+            refined = iter(list(pool.map(lambda s: refine_with(net, s, settings.joint, progress), subjects)))
     except (AgalignError, cv2.error) as why_not:
         # What one capture does to the others' learning must not cost the flight: each is learnt alone then.
         _LOG.debug("the flight could not be learnt from: %s", why_not)
         return None
+    results = [one.in_order(refined) for one in loaded]
     found: dict[str, list[Matrix]] = {}
-    for one, of_subject in zip(loaded, results, strict=True):
-        for pair, result in zip(one.pairs, of_subject, strict=True):
+    for one, of_capture in zip(loaded, results, strict=True):
+        for pair, result in zip(one.pairs, of_capture, strict=True):
             if isinstance(result, JointResult) and result.retrieval >= settings.joint.fast.step_gate:
                 found.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
     if not found:
@@ -181,9 +182,15 @@ class _Loaded:
     """A capture to learn from."""
 
     capture: Capture
-    subject: Subject
+    subjects: list[tuple[list[int], Subject]]
+    """Each with the places of its pairs."""
     pairs: list[BandPair]
     seeds: list[Seed]
+
+    def in_order(self, refined: Iterator[Results]) -> Results:
+        """The results of its pairs, from those of its subjects."""
+        found = {i: r for places, _ in self.subjects for i, r in zip(places, next(refined), strict=True)}
+        return [found[i] for i in range(len(self.pairs))]
 
     @property
     def shows(self) -> float:
@@ -254,7 +261,7 @@ def _read(capture: Capture, settings: Settings, start: FlightModel | None) -> _L
     if not found:
         return None
     usable, seeds = [p for p, _ in found], [seed for _, seed in found]
-    return _Loaded(capture, subject_of(usable, seeds, [sides.index(p.name) + 1 for p in usable]), usable, seeds)
+    return _Loaded(capture, subjects_of(usable, seeds, [sides.index(p.name) + 1 for p in usable]), usable, seeds)
 
 
 def _sides(capture: Capture) -> tuple[str, ...]:

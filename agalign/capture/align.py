@@ -8,7 +8,7 @@ from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.evidence import Look, judged, with_metrics, without_result
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.prediction import with_predictions, worth_learning
-from agalign.capture.seeding import find_seed, subject_of, unscored
+from agalign.capture.seeding import find_seed, subjects_of, unscored
 from agalign.capture.whole import most_probable
 from agalign.config import Settings
 from agalign.flight.model import FlightModel
@@ -134,24 +134,16 @@ def align_pairs(
 def _results(
     starts: Sequence[Start], sides: Sequence[int], align: _Align, progress: PairProgress
 ) -> list[JointResult | Doubt]:
-    """Pairs that share the reference's undistorted pixels are aligned together, and those that share its raw ones.
-
-    `sides` are the network's for the moving images; where none are given, they are counted within each group.
-    """
+    """In the order of the pairs; those that share a subject are aligned together, with the network's `sides`."""
     found: dict[int, JointResult | Doubt] = {}
-    for space in ("undistorted", "pixel"):
-        group = [i for i, (pair, _) in enumerate(starts) if pair.space == space]
-        if not group:
-            continue
-        pairs, seeds = zip(*(starts[i] for i in group), strict=True)
-        own_sides = [sides[i] for i in group] if sides else list(range(1, len(group) + 1))
-        first = pairs[0].name
+    for places, subject in subjects_of([p for p, _ in starts], [s for _, s in starts], sides):
+        first = starts[places[0]][0].name
 
         def report(stage: str, share: float, first: str = first) -> None:
             """Pairs that advance together are told as the first one."""
             progress(first, stage, share)
 
-        found |= dict(zip(group, align(subject_of(pairs, seeds, own_sides), report), strict=True))
+        found |= dict(zip(places, align(subject, report), strict=True))
     return [found[i] for i in range(len(starts))]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import seed_candidates
-from agalign.config import Settings
+from agalign.config import JointSettings, Settings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.pixels.raster import read_for_alignment
@@ -46,6 +46,8 @@ class BandPair:
     """(x, y) of the fixed and of the moving image relative to their files."""
     known_to_px: Mapping[SeedKind, float] = dataclasses.field(default_factory=dict)
     """Standard deviation of candidates of which one is known: px of the fixed image."""
+    is_coarse: bool = False
+    """The moving image shows so much less that the reference's is reduced for it."""
     field: LocalField | None = None
     """Displacements before any homography, px of the fixed image: what the flight's rig knows of the lenses."""
 
@@ -65,8 +67,8 @@ class BandPair:
 
     @property
     def is_reduced(self) -> bool:
-        """True where the images are smaller than their files."""
-        return min(*self.scales[0], *self.scales[1]) < 1.0
+        """True where the files show more than the images."""
+        return min(*self.scales[1], *(() if self.is_coarse else self.scales[0])) < 1.0
 
     @property
     def reach_px(self) -> float:
@@ -114,6 +116,12 @@ class BandPair:
             if kind in self.candidates
         )
 
+    @property
+    def reference_file_px(self) -> tuple[int, int]:
+        """(width, height) of the reference's file."""
+        width, height = (round(n / s) for n, s in zip(self.fixed.size_px, self.scales[0], strict=True))
+        return width, height
+
     def in_file_px(self, fixed_to_moving: Matrix) -> Matrix:
         """A homography between the images as one between their files."""
         return geometry.rescale(fixed_to_moving, *((1 / x, 1 / y) for x, y in self.scales))
@@ -128,7 +136,7 @@ def read_pairs(
     Raises UnreadableFileError where the reference cannot be read.
     """
     longest = settings.joint.longest_side_px
-    reference = Reference(read_for_alignment(capture.reference, longest), settings)
+    references: dict[int, Reference] = {}
     pairs: list[BandPair] = []
     left_out: dict[str, Doubt] = {}
     for bands in capture.moving_lenses:
@@ -145,13 +153,28 @@ def read_pairs(
         except AgalignError as error:
             left_out |= dict.fromkeys((b.name for b in bands), Doubt("unreadable", detail=str(error)))
             continue
+        most = longest_for(capture.reference, next(iter(candidates.values())), settings.joint)
+        if most not in references:
+            references[most] = Reference(read_for_alignment(capture.reference, most), settings)
+        reference, is_coarse = references[most], most < min(longest, max(capture.reference.size_px))
         scales = _scale(reference.image, capture.reference), _scale(moving, bands[0])
         down: Candidates = {kind: geometry.rescale(m, *scales) for kind, m in candidates.items()}
         field = None if model is None or model.rig is None else model.rig.fields.get(name)
         field = None if field is None else field.rescaled(scales[0])
         known = _known_to_px(name, model, scales[0])
-        pairs.append(BandPair(name, reference, moving, down, bands, scales, known, field))
+        pairs.append(BandPair(name, reference, moving, down, bands, scales, known, is_coarse, field))
     return pairs, left_out
+
+
+def longest_for(reference: Band, fixed_to_moving: Matrix, settings: JointSettings) -> int:
+    """Longer side that the reference's image is to have beside a moving band: its own, but where the band's pixels are
+    much larger, a thermal camera's, so many that a few of them make one of the band's.
+    """
+    ratio = abs(float(geometry.local_scale(fixed_to_moving, *reference.size_px)[-1]))
+    if not 0 < ratio < settings.coarse_ratio:
+        return settings.longest_side_px
+    side = round(settings.coarse_oversampling * ratio * max(reference.size_px))
+    return min(settings.longest_side_px, max(side, settings.coarse_least_px))
 
 
 def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float]) -> dict[SeedKind, float]:

@@ -22,10 +22,17 @@ def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], capture:
     return Observation(
         capture.seconds,
         {name: pair.in_file_px(a.fixed_to_moving) for name, (pair, a) in good.items()},
-        {name: a.joint.corner_std_px / min(pair.scales[0]) for name, (pair, a) in good.items() if a.joint is not None},
+        {name: _std_there_px(pair, a) for name, (pair, a) in good.items()},
         None if capture.position is None else capture.position.altitude_m,
         capture.motion,
     )
+
+
+def _std_there_px(pair: BandPair, alignment: Alignment) -> float:
+    """How well a mapping is known, px of the moving file, which the rig's errors are in."""
+    assert alignment.joint is not None
+    scale = geometry.local_scale(pair.in_file_px(alignment.fixed_to_moving), *pair.reference_file_px)[-1]
+    return alignment.joint.corner_std_px / min(pair.scales[0]) * abs(float(scale))
 
 
 def with_predictions(

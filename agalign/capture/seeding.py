@@ -20,7 +20,7 @@ from agalign.pixels.resample import single, textured, warped
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry, lens
 from agalign.values.alignment import Residual, Seed
-from agalign.values.choices import SeedKind
+from agalign.values.choices import SeedKind, Space
 from agalign.values.doubts import Doubt
 from agalign.values.geometry import Matrix
 
@@ -110,8 +110,26 @@ def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
     return starter_for_matching(channels) if model is None else model.matching_network(pair.name, channels)
 
 
-def subject_of(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> Subject:
-    """What the method works on: pairs of one capture and one space, their seeds, and the network's side for each."""
+def subjects_of(
+    pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int] = ()
+) -> list[tuple[list[int], Subject]]:
+    """What the method works on: the pairs of a capture that see one image of the reference in one space, with their
+    seeds and the network's side for each, by default counted; and which of the pairs those are.
+    """
+    groups: dict[tuple[int, Space], list[int]] = {}
+    for place, pair in enumerate(pairs):
+        groups.setdefault((id(pair.reference), pair.space), []).append(place)
+    return [
+        (
+            places,
+            _subject([pairs[i] for i in places], [seeds[i] for i in places],
+                     [sides[i] for i in places] if sides else range(1, len(places) + 1)),
+        )
+        for places in groups.values()
+    ]  # fmt: skip
+
+
+def _subject(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> Subject:
     mappings = [s.fixed_to_moving for s in seeds]
     fields = [p.field for p in pairs]
     return Subject(

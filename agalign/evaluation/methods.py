@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.seeding import best_seed, subject_of
+from agalign.capture.seeding import best_seed, subjects_of
 from agalign.config import JointSettings, Settings
 from agalign.errors import ConfigurationError, GeometryError, InputError, NoContrastError, NotEnoughTextureError
 from agalign.evaluation.protocol import grey_patches
@@ -121,7 +121,7 @@ def _learnt_on_the_pair(task: Task, settings: JointSettings, *, colour: bool) ->
     pair = BandPair.of_images("moving", fixed, moving, {"user": task.start}, Settings())
     if task.seeding:
         seed = best_seed(pair, pair.candidates)
-    state, subject = JointState(settings, lambda *_: None), subject_of([pair], [seed], [1])
+    state, [(_, subject)] = JointState(settings, lambda *_: None), subjects_of([pair], [seed])
     try:
         if settings.recipe == "paper":
             net, found = align_by_paper(state, subject)

@@ -10,13 +10,14 @@ from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
 from agalign.pixels.panel import albedo_of, find_panel, inside
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import open_raster, read_for_alignment, read_window
+from agalign.pixels.raster import open_raster, read_for_alignment, read_window, without_warnings
 from agalign.values.capture import Band, Capture, Panel
 
 Albedos = Mapping[str, float]
 """Reflectance of the panel by band in lower case, or by the empty name for all others: what a user says."""
 _AT_EITHER_END = 3
 """Captures of a flight that are looked at where their tags do not tell: panels are held before and after."""
+_READERS = 4
 _LOOK_PX = 1600
 _SAME_OUTING_S = 6 * 3600.0
 """A panel tells nothing of another day's light."""
@@ -62,7 +63,7 @@ def with_panels(captures: Sequence[Capture], *, by_look: bool = False) -> list[C
     whose images show one with its QR code, or `by_look` without one.
     """
     asked = [c for flight in flights_of(captures) for c in _at_the_ends(flight) if c.panel is None]
-    with ThreadPoolExecutor(4) as pool:
+    with without_warnings(), ThreadPoolExecutor(_READERS) as pool:
         seen = dict(zip((c.label for c in asked), pool.map(lambda c: _looked_at(c, by_look), asked), strict=True))
     return [seen.get(c.label, c) for c in captures]
 

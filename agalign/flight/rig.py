@@ -117,7 +117,9 @@ class Rig:
     seen: tuple[Seen, ...]
     """The captures that it was learnt on, in their order."""
     from_bands_px: Mapping[str, float]
-    """Root mean square error of each band as the other bands of captures left out predict it."""
+    """Root mean square error of each band as the other bands of captures left out predict it. Of a band all is in px
+    of its own file.
+    """
     fields: Mapping[str, LocalField] = field(default_factory=dict)
     """What no homography explains and all captures have in common, raw px of the reference's file, by band."""
 
@@ -217,7 +219,7 @@ class Rig:
         by_factor = np.einsum("xa,akf,nk->nxf", turn, self._design(band), coordinates(self.size_px, corners))
         over = geometry.over_corners(points, *self.size_px).reshape(-1, 8)
         square = over.T @ over / len(points)
-        std_px = max(self.from_bands_px[band], LEAST_STD_PX)
+        std_px = max(self.from_bands_px[band], LEAST_STD_PX) * float(np.sqrt(abs(np.linalg.det(turn))))
         corners_px = (geometry.apply(back, geometry.apply(self.mean[band], corners)) - corners).reshape(8)
         covariance = np.asarray(std_px**2 / 8 * np.linalg.inv(square))
         return Expectation(corners_px, np.asarray(by_factor.reshape(8, FACTORS)), covariance)

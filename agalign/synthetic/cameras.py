@@ -80,6 +80,7 @@ _LWIR = replace(
     BANDS[0], name="LWIR", wavelength_nm=11000, bandwidth_nm=6000, soil=0.46, crop=0.20, tree=0.14, rig_index=5,
     rig_degrees=(0.330743, -0.522099, 0.197540), baseline_m=(0.0, 0.03),
     distortion=(-0.38696, 0.47842, 0.00367, 0.00041, -0.48929), centre_offset_px=(-9.7, -20.5), sees="heat", view=1.117,
+    tags_off_deg=(0.2, -0.15, 0.1),
 )  # fmt: skip
 ALTUM = CameraSpec(
     "MicaSense", "Altum", (*_ALTUM_BANDS, replace(_LWIR, size_ratio=(160 / 2064, 120 / 1544))), REFERENCE, (2064, 1544)

@@ -42,6 +42,8 @@ class BandSpec:
     """In colour it is one of three that share a file; what a thermal band sees is given as shares of 50 degrees."""
     size_ratio: tuple[float, float] = (1.0, 1.0)
     """Pixels of its sensor beside the camera's, along x and y."""
+    tags_off_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """By how much its tags miss its angles."""
     view: float = 1.0
     """Its field of view beside that of the first camera below."""
 

@@ -97,7 +97,7 @@ def _micasense(
         cx=model.cx_px / density, cy=model.cy_px / density, focal=band.focal_length_mm,
         k1=band.distortion[0], k2=band.distortion[1], k3=band.distortion[4],
         p1=band.distortion[2], p2=band.distortion[3],
-        rig=", ".join(f"{v:.6f}" for v in band.rig_degrees),
+        rig=", ".join(f"{v + off:.6f}" for v, off in zip(band.rig_degrees, band.tags_off_deg, strict=True)),
         place=f"{band.baseline_m[0]:.4f}, {band.baseline_m[1]:.4f}, 0", index=band.rig_index,
         reference=camera.bands[camera.reference].rig_index, capture=f"synthetic{number:011d}",
         altitude=pose.altitude_m, of_light="" if band.sees == "heat" else of_light,
