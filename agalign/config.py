@@ -281,6 +281,8 @@ class WriteSettings(Stage):
     """The reference's own pixels, or as many more as the finest band has."""
     stac: bool = False
     """A STAC item beside each capture's files."""
+    pan_sharpen: bool = False
+    """The narrow bands at the panchromatic band's resolution, beside the others."""
     error_map: bool = False
     """A raster of the error to be expected at every pixel, beside them."""
     radiometry: RadiometryChoice = "off"

@@ -12,6 +12,7 @@ from agalign.flight.model import FlightModel
 from agalign.products.error_map import write_error_map
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.layout import lay_out
+from agalign.products.pan_sharpen import need_panchromatic, write_pan_sharpened
 from agalign.products.picture import write_picture
 from agalign.products.sidecar import Sidecar, read_sidecar, write_sidecar
 from agalign.products.stac import write_item
@@ -43,6 +44,11 @@ def error_map_path(stack: Path) -> Path:
     return stack.with_suffix(".error.tif")
 
 
+def pan_sharpened_path(stack: Path) -> Path:
+    """The sharpened bands beside a stack."""
+    return stack.with_suffix(".pan.tif")
+
+
 def process_capture(
     capture: Capture, out: Path, settings: Settings, progress: PairProgress = quiet,
     model: FlightModel | None = None,
@@ -56,6 +62,8 @@ def process_capture(
     reference, rig = capture.reference, None if model is None else model.rig
     if settings.write.radiometry != "off":
         _need_radiometry(capture, settings.write.radiometry)
+    if settings.write.pan_sharpen:
+        need_panchromatic(capture)
     alignments = align_capture_bands(capture, settings, model, progress)
     progress(reference.name, "writing", 0.0)
     stack_path, sidecar_path = output_paths(capture, out)
@@ -66,13 +74,18 @@ def process_capture(
     if usable:
         layers, grid = lay_out(capture, {b.name: alignments[b.name] for b in usable}, settings.write, rig)
         written = write_capture(capture, layers, grid, stack_path, settings.write)
+        if settings.write.pan_sharpen:
+            of_bands = {b.name: alignments[b.name] for b in usable}
+            write_pan_sharpened(capture, of_bands, pan_sharpened_path(stack_path), settings.write, rig)
         # The picture is a convenience: a full disk must not cost the sidecar.
         with suppress(AgalignError):
             write_picture(capture, written.places, grid, usable, picture)
         if settings.write.error_map:
             write_error_map(capture, {b.name: alignments[b.name] for b in usable}, grid, error_map_path(stack_path))
         if settings.write.stac:
-            write_item(capture, written, sidecar_path, picture)
+            more = (picture, "thumbnail"), (error_map_path(stack_path), "metadata")
+            beside = [*more, (pan_sharpened_path(stack_path), "data")]
+            write_item(capture, written, sidecar_path, settings.write, beside)
     sidecar = sidecar_of(capture, alignments, written, settings)
     write_sidecar(sidecar_path, sidecar)
     return CaptureOutcome(sidecar, sidecar_path)
@@ -85,6 +98,7 @@ def discard_outputs(stack: Path, sidecar: Path) -> None:
     What cannot be removed is written over, or told by the writing that fails.
     """
     old = [sidecar, stack, stack.with_suffix(".png"), stack.with_suffix(".stac.json"), error_map_path(stack)]
+    old.append(pan_sharpened_path(stack))
     with suppress(SidecarError):
         output = read_sidecar(sidecar).output
         old += [sidecar.parent / part.file for part in output.band_files] if output else []

@@ -29,12 +29,13 @@ from agalign.errors import AgalignError, ConfigurationError, OutputError, Sideca
 from agalign.flight.fingerprint import fingerprint
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
-from agalign.flight.panels import PanelReading, factors_for, read_panel, with_panels
+from agalign.flight.panels import PanelReading, factors_for, read_panel, with_height, with_panels
 from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.panels import write_panels
 from agalign.products.sidecar import Sidecar, read_sidecar
+from agalign.products.stac import write_collections
 from agalign.products.write import band_file_names
 from agalign.values.capture import Capture
 from agalign.values.choices import Layout
@@ -109,6 +110,7 @@ def run_flight(
         mine = []
         for raw in group:
             capture = with_radiometry(raw, settings.write.radiometry, factors_for(raw, panels))
+            capture = with_height(capture, panels)
             earlier = None if options.overwrite else finished_before(capture, out, settings)
             if earlier is None:
                 mine.append(capture)
@@ -126,6 +128,8 @@ def run_flight(
             yield from _one_by_one(waiting, listener)
         else:
             yield from on_executor([t.absolute() for t in waiting], executor, most)
+    if settings.write.stac:
+        write_collections(captures, out)
 
 
 def _panels(

@@ -17,7 +17,7 @@ from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError
 from agalign.pixels.raster import RasterInfo
 from agalign.values import geometry
-from agalign.values.capture import Band
+from agalign.values.capture import Band, Pose
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 
@@ -57,6 +57,10 @@ class Camera(ABC):
     def placed(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
         """The bands of a capture, those among them that only the tags of its other files place, too."""
         return list(bands)
+
+    def pose(self, tags: Tags) -> Pose | None:
+        """How it hung; None where the tags do not tell."""
+        return None
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """How fast the ground passes through the image, right and down, in focal lengths a second; None where the tags

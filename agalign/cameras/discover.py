@@ -268,6 +268,7 @@ def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capt
         flight_id=tags.first_text(camera.flight_ids),
         captured_at=tags.captured_at,
         position=tags.position,
+        pose=camera.pose(tags),
         motion=camera.motion(tags),
     )
 

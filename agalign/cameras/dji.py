@@ -25,7 +25,7 @@ from agalign.cameras.xmp import Name, Packet
 from agalign.errors import GeometryError
 from agalign.pixels.raster import RasterInfo
 from agalign.values import geometry
-from agalign.values.capture import Band, Radiometry
+from agalign.values.capture import Band, Pose, Radiometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
@@ -66,6 +66,8 @@ class _Carrying(Carrying):
         if terms:
             scaled = [v * grid.scale for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]
             packet.put(_DEWARP_DATA, [f"{date};" + ",".join(map(number_text, scaled))])
+        if grid.undistorted:
+            packet.put((_DJI, "DewarpFlag"), ["1"])
 
     def pixels_per_mm(self, tags: Tags) -> float | None:
         focal_px = tags.number(*_FOCAL_LENGTH_PX)
@@ -104,14 +106,24 @@ class Dji(Camera):
         to_rig = geometry.invert(to_colour)
         return [replace(b, to_rig=to_rig) if b.companion and b.to_rig is None else b for b in bands]
 
+    def pose(self, tags: Tags) -> Pose | None:
+        yaw_deg, pitch_deg = tags.number(_DJI, "GimbalYawDegree"), tags.number(_DJI, "GimbalPitchDegree")
+        if yaw_deg is None or pitch_deg is None:
+            return None
+        height_m = tags.number(_DJI, "RelativeAltitude")
+        return Pose(
+            _heading_deg(tags, yaw_deg), pitch_deg + 90, 0.0, height_m if height_m and height_m > 0 else None,
+            tags.number(*_FOCAL_LENGTH_PX),
+        )  # fmt: skip
+
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """From the speed over ground (north, east, m/s), the gimbal's yaw, which is the image's upward direction, and
-        the height above the take-off point. A gimbal that looks down and is said to be rolled by 180 degrees is turned.
+        the height above the take-off point.
         """
         north, east, yaw_deg, height_m = (tags.number(_DJI, name) for name in _SPEED)
         if north is None or east is None or yaw_deg is None or height_m is None or height_m <= 0:
             return None
-        yaw = math.radians(yaw_deg + (180 if abs(tags.number(_DJI, "GimbalRollDegree") or 0.0) > 90 else 0))
+        yaw = math.radians(_heading_deg(tags, yaw_deg))
         forward = north * math.cos(yaw) + east * math.sin(yaw)
         right = east * math.cos(yaw) - north * math.sin(yaw)
         return -right / height_m, forward / height_m
@@ -119,6 +131,11 @@ class Dji(Camera):
     def capture_name(self, path: Path) -> str:
         mavic = _MAVIC_3_NAME.match(path.stem)
         return mavic["capture"] if mavic else re.sub(r"(?<=\d)\d$", "", path.stem)
+
+
+def _heading_deg(tags: Tags, yaw_deg: float) -> float:
+    """A gimbal that looks down and is said to be rolled by 180 degrees is turned: units write either."""
+    return yaw_deg + (180 if abs(tags.number(_DJI, "GimbalRollDegree") or 0.0) > 90 else 0)
 
 
 def _radiometry(tags: Tags) -> Radiometry | None:

@@ -18,14 +18,16 @@ from agalign.cameras.pix4d import (
     VIGNETTING_CENTRE,
     VIGNETTING_POLYNOMIAL,
     Carrying,
+    focal_length_px,
     parallax_of,
     perspective_lens,
+    pose_of,
     rig_degrees,
     spectral,
 )
 from agalign.cameras.xmp import Name
 from agalign.pixels.raster import RasterInfo
-from agalign.values.capture import Band, Radiometry
+from agalign.values.capture import Band, Pose, Radiometry
 
 _TWELVE_BIT_TOP = 65520.0
 """RedEdge cameras store 12 bits in the upper bits of uint16."""
@@ -72,6 +74,11 @@ class MicaSense(Camera):
                 band, saturation_value=top, lens=lens, to_rig=to_rig, parallax=parallax, radiometry=radiometry,
             ),
         )  # fmt: skip
+
+    def pose(self, tags: Tags) -> Pose | None:
+        """As its tags say, else turned as its light sensor is, which stands on the same aircraft."""
+        yaw, focal_px = tags.number(_DLS, "Yaw"), focal_length_px(tags)
+        return pose_of(tags) or (None if yaw is None else Pose(math.degrees(yaw), focal_length_px=focal_px))
 
     def capture_name(self, path: Path) -> str:
         return re.sub(r"_\d+$", "", path.stem)

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from agalign.cameras.metadata import Tags
 from agalign.cameras.xmp import Name, Packet
-from agalign.values.capture import Band, Panel
+from agalign.values.capture import Band, Panel, Pose
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 
@@ -25,6 +25,7 @@ FOCAL_LENGTH_UNITS: Name = (CAMERA, "PerspectiveFocalLengthUnits")
 DISTORTION: Name = (CAMERA, "PerspectiveDistortion")
 MODEL_TYPE: Name = (CAMERA, "ModelType")
 RIG_RELATIVES: Name = (CAMERA, "RigRelatives")
+RIG_TRANSLATIONS: Name = (CAMERA, "RigTranslations")
 VIGNETTING_CENTRE: Name = (CAMERA, "VignettingCenter")
 VIGNETTING_POLYNOMIAL: Name = (CAMERA, "VignettingPolynomial")
 
@@ -43,8 +44,8 @@ FromSource = Callable[[float, float], tuple[float, float]]
 
 def perspective_lens(tags: Tags) -> Lens | None:
     """K = [f r, f r, ppx r, ppy r] with r in px/mm; Camera:PerspectiveDistortion is k1, k2, k3, p1, p2."""
-    focal_px, centre_px = _focal_length_px(tags), principal_point_px(tags)
-    if focal_px is None or focal_px <= 0 or centre_px is None:
+    focal_px, centre_px = focal_length_px(tags), principal_point_px(tags)
+    if focal_px is None or centre_px is None:
         return None
     k = tags.numbers(*DISTORTION)
     distortion = (k[0], k[1], k[3], k[4], k[2]) if len(k) == 5 else ()
@@ -71,9 +72,10 @@ def focal_length_is_in_px(tags: Tags) -> bool:
     return "px" in units or "pixel" in units or (length is not None and length > _LONGEST_FOCAL_LENGTH_MM)
 
 
-def _focal_length_px(tags: Tags) -> float | None:
+def focal_length_px(tags: Tags) -> float | None:
+    """Camera:PerspectiveFocalLength; None where it is missing or none that can be."""
     focal, density = tags.number(*FOCAL_LENGTH), pixels_per_mm(tags)
-    if focal is None or density is None:
+    if focal is None or density is None or focal <= 0:
         return None
     return focal if focal_length_is_in_px(tags) else focal * density
 
@@ -88,7 +90,7 @@ def parallax_of(tags: Tags) -> tuple[float, float] | None:
     """Direction in which a band's pixels move as the ground comes nearer, from Camera:RigTranslations, where the lens
     stands right of and below the rig's origin, metres or millimetres: the other way.
     """
-    place = tags.numbers(CAMERA, "RigTranslations")
+    place = tags.numbers(*RIG_TRANSLATIONS)
     return (-place[0], -place[1]) if len(place) == 3 else None
 
 
@@ -99,6 +101,14 @@ def spectral(band: Band, tags: Tags) -> Band:
         wavelength_nm=tags.number(CAMERA, "CentralWavelength"),
         bandwidth_nm=tags.number(CAMERA, "WavelengthFWHM"),
     )
+
+
+def pose_of(tags: Tags, height_m: float | None = None) -> Pose | None:
+    """From Camera:Yaw, Pitch and Roll, degrees, of a camera that looks down; None where they are missing."""
+    yaw, pitch, roll = (tags.number(CAMERA, name) for name in ("Yaw", "Pitch", "Roll"))
+    if yaw is None:
+        return None
+    return Pose(yaw, pitch or 0.0, roll or 0.0, height_m, focal_length_px(tags))
 
 
 def panel_in(tags: Tags, size_px: tuple[int, int]) -> Panel | None:
@@ -123,7 +133,7 @@ class Carrying:
 
     geometry: frozenset[Name] = frozenset({
         PRINCIPAL_POINT, FOCAL_LENGTH, FOCAL_LENGTH_UNITS, DISTORTION, MODEL_TYPE, RIG_RELATIVES,
-        (CAMERA, "RigTranslations"), (CAMERA, "RigRelativesReferenceRigCameraIndex"),
+        RIG_TRANSLATIONS, (CAMERA, "RigRelativesReferenceRigCameraIndex"),
     })  # fmt: skip
     """Of the lens and the rig: the reference's take their place."""
     of_the_sensor: frozenset[Name] = frozenset({
@@ -138,9 +148,14 @@ class Carrying:
     """The principal point is of the image as EXIF's Orientation makes it, not as it is stored."""
 
     def put_geometry(self, packet: Packet, theirs: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
-        """Replace a band's geometry by the reference's on a grid; `theirs` and `tags` are the reference's file's."""
+        """Replace a band's geometry by the reference's on a grid; `theirs` and `tags` are the reference's file's.
+
+        Of the rig nothing is left: what takes the bands for a rig's would lay them on each other once more.
+        """
         packet.take(theirs, self.geometry)
         packet.remove(self.of_the_sensor)
+        for name in (RIG_RELATIVES, RIG_TRANSLATIONS):
+            packet.put(name, ["0", "0", "0"])
         point_px, density = principal_point_px(tags), self.pixels_per_mm(tags)
         if point_px is not None and density is not None:
             if self.is_turned(tags):

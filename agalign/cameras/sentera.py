@@ -13,9 +13,9 @@ import numpy as np
 
 from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import BAND_NAME, CAMERA, CAPTURE_UUID, FLIGHT_UUID, perspective_lens, spectral
+from agalign.cameras.pix4d import BAND_NAME, CAMERA, CAPTURE_UUID, FLIGHT_UUID, perspective_lens, pose_of, spectral
 from agalign.pixels.raster import RasterInfo
-from agalign.values.capture import Band
+from agalign.values.capture import Band, Pose
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
 _ANY_BAND_FOLDER = re.compile(
@@ -62,6 +62,9 @@ class Sentera(Camera):
             width = float(folder["width"]) if folder["width"] else None
             band = replace(band, wavelength_nm=float(folder["wavelength"]), bandwidth_nm=width)
         return (replace(band, lens=perspective_lens(tags) if to_rig is None else None, to_rig=to_rig),)
+
+    def pose(self, tags: Tags) -> Pose | None:
+        return pose_of(tags, tags.number(_SENTERA, "AboveGroundAltitude") or tags.number(CAMERA, "AboveGroundAltitude"))
 
     def capture_folder(self, path: Path) -> Path:
         return path.parent.parent if _ANY_BAND_FOLDER.match(path.parent.name) else path.parent

@@ -144,6 +144,14 @@ def align(
     align_panels: Annotated[
         bool, typer.Option("--align-panels", help="Align captures of calibration panels too, as any other.")
     ] = False,
+    pan_sharpen: Annotated[
+        bool,
+        typer.Option(
+            "--pan-sharpen",
+            help="The bands at the panchromatic's resolution too, or at the colour photograph's with --with-rgb: "
+            "<capture>.pan.tif.",
+        ),
+    ] = False,
     stac: Annotated[bool, typer.Option("--stac", help="A STAC item beside each capture's files.")] = False,
     error_map: Annotated[
         bool, typer.Option("--error-map", help="A raster of the error to expect at every pixel, <capture>.error.tif.")
@@ -199,6 +207,7 @@ def align(
             write=WriteSettings(
                 interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
                 radiometry=radiometry, panel_albedo=albedos(panel_albedo), stac=stac, error_map=error_map,
+                pan_sharpen=pan_sharpen,
                 format=format, compression=compression,
             ),
         )  # fmt: skip

@@ -105,7 +105,7 @@ def method_named(name: str) -> Method:
     )
 
 
-_MODULES = {"daisy": "skimage", "elastix": "itk"}
+_MODULES = {"elastix": "itk"}
 
 
 # ---- this program's

@@ -22,6 +22,8 @@ _LOOK_PX = 1600
 _SAME_OUTING_S = 6 * 3600.0
 """A panel tells nothing of another day's light."""
 _MOST_SATURATED = 0.01
+_PANEL_HEIGHT_M, _LEAST_HEIGHT_M = 1.0, 3.0
+"""At which the camera is held over a panel; and what errors of altitudes come to."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,8 @@ def read_panel(capture: Capture, albedos: Albedos) -> PanelReading:
 
 
 def factors_for(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, float]:
-    """By band, what a capture's radiance is to be multiplied by for reflectance: linear in time between the panels of
-    its camera, and as the nearest one has it before the first and after the last.
+    """By band, what a capture's radiance is to be multiplied by for reflectance: the light is linear in time between
+    the panels of its camera, and as the nearest one has it before the first and after the last.
     """
     mine = [
         r for r in readings
@@ -86,13 +88,29 @@ def factors_for(capture: Capture, readings: Iterable[PanelReading]) -> dict[str,
     for reading in mine:
         for band in reading.bands:
             if band.factor is not None:
-                found.setdefault(band.band.name, []).append((reading.capture.seconds, band.factor))
-    return {name: _at(capture.seconds, known) for name, known in found.items()}
+                found.setdefault(band.band.name, []).append((reading.capture.seconds, 1 / band.factor))
+    return {name: 1 / _at(capture.seconds, known) for name, known in found.items()}
+
+
+def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
+    """The capture with its height above the ground, where its tags have only an altitude and a panel of the same hours
+    was held on the ground.
+    """
+    pose, position = capture.pose, capture.position
+    if pose is None or pose.height_m is not None or position is None or position.altitude_m is None:
+        return capture
+    panels = [
+        r.capture.position.altitude_m for r in readings
+        if abs(r.capture.seconds - capture.seconds) <= _SAME_OUTING_S
+        and r.capture.position is not None and r.capture.position.altitude_m is not None
+    ]  # fmt: skip
+    height_m = position.altitude_m - min(panels) + _PANEL_HEIGHT_M if panels else 0.0
+    return replace(capture, pose=replace(pose, height_m=height_m)) if height_m > _LEAST_HEIGHT_M else capture
 
 
 def _at(seconds: float, known: list[tuple[float, float]]) -> float:
     times = sorted({t for t, _ in known})
-    return float(np.interp(seconds, times, [np.mean([f for t, f in known if t == time]) for time in times]))
+    return float(np.interp(seconds, times, [np.mean([v for t, v in known if t == time]) for time in times]))
 
 
 def _at_the_ends(flight: Sequence[Capture]) -> list[Capture]:

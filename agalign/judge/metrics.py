@@ -10,6 +10,7 @@ from functools import cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import entr
 
 from agalign.values.image import FloatImage, Mask, Raster
 
@@ -121,9 +122,7 @@ def cubic_spline(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def mutual_information(joint: NDArray[np.float64]) -> float:
     """Sum of p log(p / (p_fixed p_moving)), in nats."""
-    product = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
-    some = joint > 1e-16
-    return float((joint[some] * np.log(joint[some] / product[some])).sum())
+    return _entropy(joint.sum(axis=1)) + _entropy(joint.sum(axis=0)) - _entropy(joint)
 
 
 def normalised_mutual_information(joint: NDArray[np.float64]) -> float:
@@ -133,8 +132,7 @@ def normalised_mutual_information(joint: NDArray[np.float64]) -> float:
 
 
 def _entropy(p: NDArray[np.float64]) -> float:
-    some = p[p > 1e-16]
-    return float(-(some * np.log(some)).sum())
+    return float(entr(p).sum())
 
 
 def correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:

@@ -11,6 +11,7 @@ from agalign.values.image import FloatImage, Mask, Raster
 
 _LONGEST_PX = 1600
 _SHOWN_PERCENTILES = 1.0, 99.5
+_SMOOTHING_PX = 2.0
 _LEVELS = 12
 """Brightnesses at which outlines are looked for."""
 _INNER = 0.5
@@ -27,8 +28,8 @@ _MOST_SPREAD = 0.06
 """Standard deviation within the area, beside its mean."""
 _LEAST_CONTRAST = 1.5
 """How much brighter it is than what lies around it."""
-_MOST_SLANT = 1.4
-"""Longest side over shortest."""
+_MOST_SLANT, _MOST_TAPER = 1.4, 1.15
+"""Longest side over shortest, and either side over the one across."""
 _ALBEDO_IN_CODE = re.compile(r"_(\d{4})(\d{3})(\d{4})(\d{3})$")
 
 Corners = NDArray[np.float64]
@@ -55,6 +56,7 @@ def find_panel(image: Raster, *, without_code: bool = False) -> PanelSight | Non
     if not code and not without_code:
         return None
     limits = _SHARE_OF_IMAGE if at is None else tuple(share * _area(at) / shown.size for share in _CODE_AREAS)
+    shown = np.asarray(cv2.GaussianBlur(shown, (0, 0), _SMOOTHING_PX), np.uint8)  # a dark panel's noise is no structure
     squares = _outlines(shown, limits[0] * shown.size, limits[1] * shown.size)
     squares = [s for s in squares if (at is None or _is_beside(s, at)) and _is_panel(shown, s)]
     if not squares:
@@ -114,7 +116,8 @@ def _outlines(shown: NDArray[np.uint8], least: float, most: float) -> list[Corne
             four = cv2.approxPolyDP(contour, 0.04 * cv2.arcLength(contour, closed=True), closed=True).reshape(-1, 2)
             if len(four) == 4 and cv2.isContourConvex(four):
                 sides = np.linalg.norm(four - np.roll(four, 1, axis=0), axis=1)
-                if sides.max() <= _MOST_SLANT * sides.min():
+                longer, shorter = np.maximum(sides[:2], sides[2:]), np.minimum(sides[:2], sides[2:])
+                if sides.max() <= _MOST_SLANT * sides.min() and (longer <= _MOST_TAPER * shorter).all():
                     found.append(four.astype(np.float64))
     return found
 

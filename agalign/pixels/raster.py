@@ -135,6 +135,12 @@ def read_preview(
     return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))
 
 
+def crs_code(crs_wkt: str) -> str | None:
+    """Authority and number of a coordinate reference system, such as EPSG:32613; None where it has none."""
+    authority = rasterio.CRS.from_wkt(crs_wkt).to_authority()
+    return None if authority is None else ":".join(authority)
+
+
 def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDArray[np.float64]:
     """(n, 2) map positions, x or longitude first, in another coordinate reference system (WKT or EPSG:number).
 

@@ -94,6 +94,16 @@ def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float
     return found
 
 
+def role_of(name: str, wavelength_nm: float | None) -> Role | None:
+    """What a narrow band is for vegetation, by its wavelength where that is known, else by name."""
+    if name.lower().startswith(_NOT_NARROW):
+        return None
+    for role, (shortest, _, longest) in _NOMINAL_NM.items():
+        if name.lower() in _NAMES[role] if wavelength_nm is None else shortest <= wavelength_nm <= longest:
+            return role
+    return None
+
+
 def compute(index: Index, bands: Sequence[FloatImage]) -> FloatImage:
     """The index of reflectances (H, W), nan where a band is nan or the formula divides by zero."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

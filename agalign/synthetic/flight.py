@@ -56,6 +56,10 @@ class Shot:
     """Bands whose files are missing."""
     trouble: str = ""
     """What is wrong with it."""
+    sun: float = 1.0
+    """How bright it is, beside what the light sensor says."""
+    shutter: float = 1.0
+    """How long it is exposed, beside the others."""
 
 
 def make_flight(
@@ -99,12 +103,13 @@ def _write(
             if painted is None or painted[0] != id(shot.ground):
                 painted = id(shot.ground), reflectance(grounds[id(shot.ground)], band)
             spoil = shot.spoil if shot.spoilt is None or band.name in shot.spoilt else None
-            pixels = render(painted[1], shot.ground, band, shot.pose, size_px, rng, spoil)
+            light = painted[1] if band.sees == "heat" else painted[1] * np.float32(shot.sun * shot.shutter)
+            pixels = render(light, shot.ground, band, shot.pose, size_px, rng, spoil)
             if band.name not in shot.without:
                 path = images / tags.file_name(camera, band, number)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 there = replace(shot.pose, north_m=shot.pose.north_m + before)
-                tags.write_band(path, pixels, camera, band, there, number, _VIGNETTING, size_px)
+                tags.write_band(path, pixels, camera, band, there, number, _VIGNETTING, size_px, shot.shutter)
     return {
         tags.capture_name(camera, number): _truth(shot, number, camera, size_px)
         for number, shot in enumerate(shots, start=before + 1)

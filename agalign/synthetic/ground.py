@@ -35,6 +35,8 @@ class Ground:
     metres_per_px: float
     height_m: Field | None = None
     """Above the plane; None where everything lies on it."""
+    laid_out: Field | None = None
+    """Reflectance of what was laid on it, alike in all bands; nan where the ground is bare."""
 
 
 def paint_ground(
@@ -89,9 +91,10 @@ def reflectance(ground: Ground, band: BandSpec) -> Field:
     crop = band.crop * (1 + 0.35 * bright * ground.vigour)
     soil = band.soil * ground.brightness
     bare = 1 - ground.crop - ground.tree
-    return np.asarray(
-        soil * bare + crop * ground.crop + band.tree * (1 + 0.5 * ground.vigour) * ground.tree, np.float32
-    )
+    found = soil * bare + crop * ground.crop + band.tree * (1 + 0.5 * ground.vigour) * ground.tree
+    if ground.laid_out is not None:
+        found = np.where(np.isnan(ground.laid_out), found, ground.laid_out)
+    return np.asarray(found, np.float32)
 
 
 def on_ground(ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], raw_px: Points) -> Points:

@@ -40,16 +40,17 @@ def file_name(camera: CameraSpec, band: BandSpec, number: int) -> str:
 
 def write_band(
     path: Path, pixels: NDArray[np.uint16], camera: CameraSpec, band: BandSpec, pose: Pose, number: int,
-    vignetting: float, size_px: tuple[int, int],
+    vignetting: float, size_px: tuple[int, int], shutter: float = 1.0,
 ) -> None:  # fmt: skip
     """Write (height, width) pixels with the tags of a camera, whose reference is of `size_px`.
 
-    `vignetting` is the share of light that corners lack. A colour photograph is written band after band.
+    `vignetting` is the share of light that corners lack, `shutter` how long it was exposed beside the usual. A colour
+    photograph is written band after band.
     """
     if band.sees == "colour":
         _colour(path, pixels, camera, band, pose, number)
     elif camera.maker == "MicaSense":
-        _micasense(path, pixels, camera, band, pose, number, vignetting, size_px)
+        _micasense(path, pixels, camera, band, pose, number, vignetting, size_px, shutter)
     elif camera.maker == "DJI":
         _dji(path, pixels, camera, band, pose, number, size_px)
     else:
@@ -83,7 +84,7 @@ def _pixels_per_mm(pixels: NDArray[np.uint16]) -> float:
 
 def _micasense(
     path: Path, pixels: NDArray[np.uint16], camera: CameraSpec, band: BandSpec, pose: Pose, number: int,
-    vignetting: float, size_px: tuple[int, int],
+    vignetting: float, size_px: tuple[int, int], shutter: float,
 ) -> None:  # fmt: skip
     width, height = band.size_px(size_px)
     density, model = _pixels_per_mm(pixels), band.lens(*size_px)
@@ -100,12 +101,13 @@ def _micasense(
         rig=", ".join(f"{v + off:.6f}" for v, off in zip(band.rig_degrees, band.tags_off_deg, strict=True)),
         place=f"{band.baseline_m[0]:.4f}, {band.baseline_m[1]:.4f}, 0", index=band.rig_index,
         reference=camera.bands[camera.reference].rig_index, capture=f"synthetic{number:011d}",
-        altitude=pose.altitude_m, of_light="" if band.sees == "heat" else of_light,
+        altitude=pose.altitude_m, yaw=pose.yaw_deg, pitch=pose.pitch_deg, roll=pose.roll_deg,
+        of_light="" if band.sees == "heat" else of_light,
     )  # fmt: skip
     black = {} if band.sees == "heat" else {50714: short(round(BLACK_LEVEL))}
     _write(
         path, pixels, camera, band, pose, number, xmp, "SY01-0000001-AG", {305: text("agalign demo"), **black},
-        {0x829A: rational(_EXPOSURE_S), 0x8827: short(100), 0x9290: text("000000")},
+        {0x829A: rational(_EXPOSURE_S * shutter), 0x8827: short(100), 0x9290: text("000000")},
     )  # fmt: skip
 
 
@@ -228,6 +230,9 @@ _MICASENSE = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
    </Camera:PerspectiveDistortion>
    <Camera:RigRelatives>{rig}</Camera:RigRelatives>
    <Camera:RigTranslations>{place}</Camera:RigTranslations>
+   <Camera:Yaw>{yaw:.4f}</Camera:Yaw>
+   <Camera:Pitch>{pitch:.4f}</Camera:Pitch>
+   <Camera:Roll>{roll:.4f}</Camera:Roll>
    <Camera:RigCameraIndex>{index}</Camera:RigCameraIndex>
    <Camera:RigRelativesReferenceRigCameraIndex>{reference}</Camera:RigRelativesReferenceRigCameraIndex>
   </rdf:Description>

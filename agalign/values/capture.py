@@ -124,6 +124,22 @@ class Position:
 
 
 @dataclass(frozen=True)
+class Pose:
+    """How the camera hung when a capture was taken."""
+
+    heading_deg: float
+    """Of the image's upward direction, clockwise from north."""
+    pitch_deg: float = 0.0
+    """By how much it looked ahead of straight down."""
+    roll_deg: float = 0.0
+    """By how much it looked to the left of that, as an aircraft does whose right side is down."""
+    height_m: float | None = None
+    """Above the ground."""
+    focal_length_px: float | None = None
+    """Of the reference."""
+
+
+@dataclass(frozen=True)
 class CameraIdentity:
     """What made the images, as far as their tags say."""
 
@@ -146,6 +162,7 @@ class Capture:
     flight_id: str = ""
     captured_at: str = ""
     position: Position | None = None
+    pose: Pose | None = None
     motion: tuple[float, float] | None = None
     """How fast the ground passes through the image, right and down, focal lengths a second, as far as the tags tell."""
     missing_bands: tuple[str, ...] = ()

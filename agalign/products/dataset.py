@@ -1,0 +1,137 @@
+"""Aligned captures as xarray has them: a variable a band, with its wavelength and unit, read when it is asked for."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agalign.errors import ConfigurationError, InputError, UnreadableFileError
+from agalign.pixels.raster import without_warnings
+from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
+
+if TYPE_CHECKING:
+    import xarray
+
+_RAW_UNIT = "count"
+_CHUNKS = {"x": 1024, "y": 1024}
+
+
+def open_capture(path: str | Path, *, masked: bool = False) -> "xarray.Dataset":
+    """The aligned bands of a capture by its sidecar or its stack, lazily (dask).
+
+    Dimensions are y and x, at the centres of pixels: on the map where the capture lies on one (`.rio.crs`), else in px
+    of what was written. A variable is named after its band and has the attributes `wavelength_nm`, `bandwidth_nm`,
+    `units`, `status` and, where nodata is declared, `_FillValue`; with `masked` such pixels are nan instead.
+    Bands of which nothing was written are left out. Raises SidecarError, UnreadableFileError, and ConfigurationError
+    where xarray is not installed.
+    """
+    import_xarray()
+    sidecar_path = Path(path)
+    if sidecar_path.suffix.lower() != ".json":
+        sidecar_path = sidecar_path.with_suffix(".json")
+    return _dataset(read_sidecar(sidecar_path), sidecar_path.parent, masked=masked)
+
+
+def open_flight(out: str | Path, *, masked: bool = False) -> "xarray.Dataset":
+    """All captures below the output folder of a run, stacked along `capture`, lazily (dask).
+
+    Coordinates of `capture` are its label, and `time`, `latitude`, `longitude` and `altitude_m` as far as the camera
+    wrote them. Bands are those that all captures have. Raises InputError where there is no run or its captures differ
+    in size (write with crop 'flight'), and what `open_capture` raises.
+    """
+    xr = import_xarray()
+    folder = Path(out)
+    sidecars = [(p, read_sidecar(p)) for p in find_sidecars(folder)] if folder.is_dir() else []
+    sidecars = [(p, s) for p, s in sidecars if s.output is not None]
+    if not sidecars:
+        raise InputError(f"{folder}: no aligned captures there; give the output folder of a run")
+    sizes = {s.output.crop[2:]: p for p, s in sidecars if s.output is not None}
+    if len(sizes) > 1:
+        raise InputError(
+            f"{folder}: its captures differ in size ({', '.join(p.stem for p in sizes.values())}); open them one by one"
+        )
+    opened = [_dataset(s, p.parent, masked=masked) for p, s in sidecars]
+    common = [name for name in opened[0].data_vars if all(name in one for one in opened)]
+    # Each capture has a place of its own on the map: in a stack only the pixels are alike.
+    plain = [_without_place(one[common]) for one in opened]
+    stacked = xr.concat(plain, dim="capture", join="override", combine_attrs="override", coords="minimal")
+    places = [s.position for _, s in sidecars]
+    stacked.attrs = {k: opened[0].attrs[k] for k in ("camera", "reference_band")}
+    flight: xarray.Dataset = stacked.assign_coords(
+        capture=[(p.parent / p.stem).relative_to(folder).as_posix() for p, _ in sidecars],
+        time=("capture", [_moment(s) for _, s in sidecars]),
+        latitude=("capture", [float("nan") if q is None else q.latitude for q in places]),
+        longitude=("capture", [float("nan") if q is None else q.longitude for q in places]),
+        altitude_m=("capture", [float("nan") if q is None or q.altitude_m is None else q.altitude_m for q in places]),
+    )
+    return flight
+
+
+def import_xarray() -> Any:
+    """Raises ConfigurationError where it is not installed."""
+    try:
+        import dask.array  # noqa: F401
+        import rioxarray  # noqa: F401
+        import xarray as xr
+    except ImportError:
+        raise ConfigurationError(
+            "xarray, rioxarray and dask are not installed; pip install 'agalign[xarray]'"
+        ) from None
+    return xr
+
+
+def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset":
+    xr = import_xarray()
+    files: dict[str, xarray.DataArray] = {}
+    found = {}
+    for band in sidecar.bands:
+        if band.place is None:
+            continue
+        name = band.place.file
+        if name not in files:
+            files[name] = _opened(folder, name, masked=masked)
+        found[band.band] = _variable(files[name], band, band.place.band_index)
+    dataset: xarray.Dataset = xr.Dataset(found)
+    dataset.attrs = {
+        "capture": sidecar.capture, "capture_id": sidecar.capture_id, "flight_id": sidecar.flight_id,
+        "captured_at": sidecar.captured_at, "camera": f"{sidecar.camera.make} {sidecar.camera.model}".strip(),
+        "reference_band": sidecar.reference.band,
+    }  # fmt: skip
+    return dataset
+
+
+def _opened(folder: Path, name: str, *, masked: bool) -> "xarray.DataArray":
+    import rioxarray
+
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise InputError(f"{folder / name}: lies outside the folder of its sidecar")
+    try:
+        with without_warnings():
+            opened: xarray.DataArray = rioxarray.open_rasterio(path, chunks=_CHUNKS, masked=masked)
+    except OSError as error:
+        raise UnreadableFileError(f"{path}: cannot be read ({error}); run again") from None
+    return opened
+
+
+def _variable(file: "xarray.DataArray", band: BandPart, index: int) -> "xarray.DataArray":
+    one = file.isel(band=index - 1, drop=True)
+    units = file.attrs.get("units")
+    unit = units[index - 1] if isinstance(units, tuple) else units
+    kept = {k: v for k, v in file.attrs.items() if k in ("_FillValue", "scale_factor", "add_offset")}
+    one.attrs = kept | {"long_name": band.band, "units": unit or _RAW_UNIT, "status": band.status}
+    if band.wavelength_nm is not None:
+        one.attrs["wavelength_nm"] = band.wavelength_nm
+    return one
+
+
+def _without_place(dataset: "xarray.Dataset") -> "xarray.Dataset":
+    counted = {axis: range(dataset.sizes[axis]) for axis in ("y", "x")}
+    return dataset.drop_vars("spatial_ref", errors="ignore").assign_coords(counted)
+
+
+def _moment(sidecar: Sidecar) -> Any:
+    import numpy as np
+
+    try:
+        return np.datetime64(sidecar.captured_at.partition("+")[0].rstrip("Z"), "ns")
+    except ValueError:
+        return np.datetime64("NaT", "ns")

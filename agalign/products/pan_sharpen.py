@@ -1,0 +1,200 @@
+"""Bands at the resolution of the panchromatic one, or of the colour photograph, by the weighted Brovey transform:
+
+    sharpened_b = B_b P / sum_i w_i B_i
+
+with the bands B resampled to the pixels of the panchromatic P. That is what GDAL's pansharpening computes. The weights
+are those by which the bands, of those whose light the panchromatic sees, make up P where P is as blurred as they are
+(least squares, none negative). It keeps the bands' ratios and changes each one's own radiometry by P / sum w B, which
+is 1 only on the mean. Other bands are resampled and not sharpened: visible light says little of near infra-red.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import RasterioError
+from scipy.optimize import nnls
+
+from agalign.cameras.base import is_thermal
+from agalign.config import WriteSettings
+from agalign.errors import InputError, OutputError
+from agalign.flight.rig import Rig
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, without_warnings
+from agalign.pixels.resample import tiles
+from agalign.products.layout import lay_out
+from agalign.products.write import verify, write_raster
+from agalign.values.alignment import Alignment
+from agalign.values.capture import Band, Capture
+from agalign.values.files import complete_file
+from agalign.values.image import FloatImage, Tile
+
+_BROAD_NM = 200.0
+"""Bands at least so wide are panchromatic."""
+_COLOUR_NM = 400.0, 700.0
+"""What a colour photograph sees."""
+_SAMPLE_PX = 1024
+_MOST_RATIO = 5.0
+"""Between noise and noise any ratio may come out."""
+_WORK_PX = 1024
+
+
+def panchromatic(capture: Capture) -> list[Band]:
+    """The band that sees the others' light together, else the three of the colour photograph; none where there is
+    neither.
+    """
+    broad = [b for b in capture.bands if b.name.lower().startswith("pan") or (b.bandwidth_nm or 0.0) >= _BROAD_NM]
+    return [b for b in broad if not is_thermal(b)][:1] or [b for b in capture.bands if b.companion]
+
+
+def need_panchromatic(capture: Capture) -> None:
+    """Raises InputError where a capture has nothing that its bands can be sharpened with."""
+    if not panchromatic(capture):
+        raise InputError(
+            f"{capture.reference.path}: no panchromatic band to sharpen with; add --with-rgb where the camera takes a "
+            "colour photograph, or leave --pan-sharpen out"
+        )
+
+
+def write_pan_sharpened(
+    capture: Capture, alignments: Mapping[str, Alignment], path: Path, settings: WriteSettings, rig: Rig | None = None
+) -> Path | None:
+    """Write the capture's narrow bands, as far as they have these alignments, at the panchromatic's resolution.
+
+    Returns None, and writes nothing, where the panchromatic band is not aligned. Raises OutputError, or
+    UnreadableFileError for an input.
+    """
+    pan = panchromatic(capture)
+    there = {name for name, a in alignments.items() if a.status in ("aligned", "predicted")} | {capture.reference.name}
+    if not pan or not all(b.name in there for b in pan):
+        return None
+    fine = settings.model_copy(update={"resolution": "finest", "format": "gtiff", "compression": "none"})
+    layers, grid = lay_out(capture, {n: a for n, a in alignments.items() if n in there}, fine, rig)
+    narrow = [
+        layer for layer in layers
+        if layer.band not in pan and not layer.band.companion and not is_thermal(layer.band) and not layer.is_gap
+    ]  # fmt: skip
+    sources = [*narrow, *(layer for layer in layers if layer.band in pan)]
+    unsharpened = path.with_name(f".{path.stem}.layers.part.tif")
+    try:
+        nodata = write_raster(capture, sources, grid, unsharpened, fine)
+        bands = [layer.band for layer in narrow]
+        seen = [_is_seen(b, pan) for b in bands]
+        # Ratios are of light: what a sensor counts in the dark is none.
+        dark = [_dark(layer.band, settings) for layer in sources]
+        with complete_file(path) as partial:
+            _sharpen(unsharpened, partial, bands, pan, seen, dark, max(grid.scale_xy), nodata)
+            verify(partial)
+    except RasterioError as error:
+        raise OutputError(f"{path}: cannot be written ({error})") from None
+    finally:
+        unsharpened.unlink(missing_ok=True)
+    return path
+
+
+def weights_of(bands: Sequence[FloatImage], pan: FloatImage, scale: float) -> NDArray[np.float64]:
+    """How much of each band (height, width) makes up a panchromatic one of so many times their resolution; nan is
+    left aside.
+    """
+    blurred = cv2.GaussianBlur(np.nan_to_num(pan), (0, 0), max(0.5 * scale, 0.3))
+    known = np.isfinite(pan) & np.logical_and.reduce([np.isfinite(b) for b in bands])
+    if not known.any():
+        return np.full(len(bands), 1 / len(bands))
+    found, _ = nnls(np.stack([b[known] for b in bands], axis=-1).astype(np.float64), blurred[known].astype(np.float64))
+    return np.asarray(found) if found.any() else np.full(len(bands), 1 / len(bands))
+
+
+def brovey_ratio(bands: Sequence[FloatImage], pan: FloatImage, weights: NDArray[np.float64]) -> FloatImage:
+    """P / sum w B, (height, width), 1 where that says nothing."""
+    made = np.tensordot(weights, np.stack(bands), axes=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(made > 0, pan / made, 1.0)
+    return np.asarray(np.clip(np.nan_to_num(ratio, nan=1.0), 1 / _MOST_RATIO, _MOST_RATIO), np.float32)
+
+
+def _sharpen(
+    source: Path, target: Path, bands: Sequence[Band], pan: Sequence[Band], seen: Sequence[bool], dark: Sequence[float],
+    scale: float, nodata: float | None,
+) -> None:  # fmt: skip
+    """From a file of the bands and, after them, the panchromatic's planes."""
+    with open_raster(source) as file, without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT):
+        of_light = [k for k, is_seen in enumerate(seen) if is_seen]
+        side = Tile(
+            max(0, (file.width - _SAMPLE_PX) // 2), max(0, (file.height - _SAMPLE_PX) // 2),
+            min(file.width, _SAMPLE_PX), min(file.height, _SAMPLE_PX),
+        )  # fmt: skip
+        planes, _ = _read(file, side, dark, nodata)
+        weights = weights_of([planes[k] for k in of_light], planes[len(bands) :].mean(axis=0), scale)
+        profile = file.profile | {
+            "count": len(bands), "compress": "deflate", "predictor": 3 if file.dtypes[0].startswith("f") else 2,
+        }  # fmt: skip
+        with rasterio.open(target, "w", **profile) as written:
+            _describe(written, file, bands, pan, seen, weights)
+            for tile in tiles(Tile(0, 0, file.width, file.height), _WORK_PX):
+                planes, valid = _read(file, tile, dark, nodata)
+                ratio = brovey_ratio([planes[k] for k in of_light], planes[len(bands) :].mean(axis=0), weights)
+                for k, is_sharpened in enumerate(seen):
+                    values = (planes[k] * ratio if is_sharpened else planes[k]) + np.float32(dark[k])
+                    written.write(_as(values, valid[k], file.dtypes[0], nodata), k + 1, window=_window(tile))
+
+
+def _is_seen(band: Band, pan: Sequence[Band]) -> bool:
+    """True where the panchromatic sees a band's light; of a panchromatic of which that is not known, all of it."""
+    if band.wavelength_nm is None:
+        return True
+    if pan[0].companion:
+        low, high = _COLOUR_NM
+    else:
+        middle, width = pan[0].wavelength_nm, pan[0].bandwidth_nm
+        low, high = (-math.inf, math.inf) if not middle or not width else (middle - width / 2, middle + width / 2)
+    return low <= band.wavelength_nm <= high
+
+
+def _dark(band: Band, settings: WriteSettings) -> float:
+    if settings.radiometry != "off" or band.radiometry is None:
+        return 0.0
+    return band.radiometry.black_level
+
+
+def _read(
+    file: Any, tile: Tile, dark: Sequence[float], nodata: float | None
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """((planes, height, width) of light, nan where there is none; where there is some)."""
+    pixels = file.read(window=_window(tile)).astype(np.float32)
+    valid = np.isfinite(pixels) if nodata is None or math.isnan(nodata) else pixels != nodata
+    return np.where(valid, pixels - np.array(dark, np.float32)[:, None, None], np.float32(np.nan)), valid
+
+
+def _as(values: FloatImage, valid: NDArray[np.bool_], dtype: str, nodata: float | None) -> NDArray[Any]:
+    kind = np.dtype(dtype)
+    if kind.kind == "f":
+        return np.where(valid, values, np.nan).astype(kind)
+    limits = np.iinfo(str(kind))
+    whole = np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max).astype(kind)
+    if nodata is None:
+        return whole
+    beside = nodata + 1 if nodata < limits.max else nodata - 1
+    return np.where(valid, np.where(whole == nodata, kind.type(beside), whole), kind.type(nodata))
+
+
+def _describe(
+    written: Any, source: Any, bands: Sequence[Band], pan: Sequence[Band], seen: Sequence[bool],
+    weights: NDArray[np.float64],
+) -> None:  # fmt: skip
+    name = "the colour photograph" if pan[0].companion else pan[0].name
+    used = iter(weights.tolist())
+    said = [f"weighted Brovey by {name}, weight {next(used):.4g}" if is_seen else "no" for is_seen in seen]
+    written.update_tags(**{k: v for k, v in source.tags().items() if k != "AREA_OR_POINT"})
+    written.units = source.units[: len(bands)]
+    for index, (band, text) in enumerate(zip(bands, said, strict=True), start=1):
+        written.set_band_description(index, band.name)
+        written.update_tags(index, **source.tags(index), PANSHARPENED=text)
+        written.update_tags(index, ns="IMAGERY", **source.tags(index, ns="IMAGERY"))
+
+
+def _window(tile: Tile) -> rasterio.windows.Window:
+    return rasterio.windows.Window(tile.x0, tile.y0, tile.width, tile.height)
