@@ -1,6 +1,7 @@
 """The real captures, where they are present: accuracy against reference ties."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,12 @@ import agalign
 from agalign.batch.capture import process_capture
 from agalign.cameras import rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.cameras.metadata import read_tags
+from agalign.cameras.micasense import MicaSense
 from agalign.config import LocalSettings, SeedSettings, Settings
+from agalign.flight.panels import read_panel, with_panels
+from agalign.pixels.radiometry import calibrated
+from agalign.pixels.raster import open_raster, probe
 from agalign.values import geometry
 
 pytestmark = pytest.mark.real
@@ -114,3 +120,48 @@ def test_sequoia_is_read_oriented_and_seeded(real_data: Path) -> None:
         assert seed is not None
         # Lenses 15 mm apart, aimed alike: what their tags leave is the tilt between them, tens of px of 1280.
         assert 3 < geometry.corner_error_px(seed, geometry.identity(), *capture.reference.size_px) < 120
+
+
+def test_the_panel_of_the_row_crop_is_recognised_with_and_without_its_tags(real_data: Path, tmp_path: Path) -> None:
+    (capture,) = discover(real_data / "captures/rededge_panel").captures
+    told = read_panel(capture, {})
+    assert {(b.band.panel.seen_by, b.band.panel.serial) for b in told.bands} == {("tags", "RP04-1826246-SC")}
+    bare = replace(capture, bands=tuple(replace(b, panel=None) for b in capture.bands))
+    (seen,) = with_panels([bare])
+    for tags, look in zip(told.bands, read_panel(seen, {}).bands, strict=True):
+        assert look.band.panel.seen_by == "QR code"
+        assert look.albedo == pytest.approx(tags.albedo, abs=1e-6)
+        assert look.radiance == pytest.approx(tags.radiance, rel=0.01)
+    assert not any(c.panel for c in with_panels(discover(real_data / "flights/rededge_m_rowcrop").captures))
+
+
+def test_temperature_is_what_the_altum_says_itself(real_data: Path) -> None:
+    """SceneTemperature, degrees C, is in its tags."""
+    for path in sorted((real_data / "captures/altum_lwir").glob("*.tif")):
+        tags = read_tags(path)
+        (band,) = MicaSense().bands(path, tags, probe(path))
+        with open_raster(path) as file:
+            found = calibrated(file.read(1), band.radiometry, 0, 0)
+        said = tags.number("micasense.com/MicaSense", "SceneTemperature")
+        assert found.min() - 1 < said < found.max() + 1
+
+
+def test_bananas_from_close_by_with_the_photograph(real_data: Path, tmp_path: Path) -> None:
+    options = DiscoverOptions(with_rgb=True)
+    (report,) = agalign.align_folder(real_data / "captures/p4m_bananas", tmp_path, options=options)
+    assert report.good
+    residuals = [b.metrics.after.residual_px for b in report.sidecar.bands if b.metrics]
+    assert len(residuals) == 7
+    assert max(residuals) < 0.5
+
+
+def test_a_sentera_s_cameras_are_laid_on_each_other(real_data: Path, tmp_path: Path) -> None:
+    captures = discover(real_data / "captures/sentera_d4k").captures
+    assert [len(c.bands) for c in captures] == [5, 5]
+    sidecar = process_capture(captures[1], tmp_path, Settings()).sidecar
+    for band in sidecar.bands:
+        if band.band in ("Red edge", "NIR"):
+            here, there = np.array(band.grid.reference_px), np.array(band.grid.moving_px)
+            middle = np.argmin(np.linalg.norm(here - here.mean(axis=0), axis=1))
+            assert band.status == "aligned"
+            assert np.linalg.norm(there[middle] - here[middle] - (-533, -85)) < 3

@@ -8,7 +8,7 @@ import numpy as np
 
 from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
-from agalign.pixels.panel import albedo_of, find_panel, inside
+from agalign.pixels.panel import PanelSight, albedo_of, find_panel, inside
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, read_for_alignment, read_window, without_warnings
 from agalign.values.capture import Band, Capture, Panel
@@ -121,10 +121,22 @@ def _at_the_ends(flight: Sequence[Capture]) -> list[Capture]:
 def _looked_at(capture: Capture, by_look: bool) -> Capture:
     if _seen(capture.reference, without_code=by_look) is None:
         return capture
-    return replace(capture, bands=tuple(replace(b, panel=_seen(b, without_code=True)) for b in capture.bands))
+    sights = [_seen(b, without_code=True) for b in capture.bands]
+    # A code that one band shows plainly is the others' too.
+    code = next((s.code for s in sights if s is not None and s.code), "")
+    bands = (
+        replace(b, panel=None if s is None else _panel(s, b, code)) for b, s in zip(capture.bands, sights, strict=True)
+    )
+    return replace(capture, bands=tuple(bands))
 
 
-def _seen(band: Band, *, without_code: bool) -> Panel | None:
+def _panel(sight: PanelSight, band: Band, code: str) -> Panel:
+    serial, _, _ = code.partition("_")
+    return Panel("QR code" if code else "look", serial, albedo_of(code, band.wavelength_nm), sight.area_px)
+
+
+def _seen(band: Band, *, without_code: bool) -> PanelSight | None:
+    """What a band shows of a panel, px of its file."""
     try:
         image = read_for_alignment(band, _LOOK_PX)
     except AgalignError:
@@ -133,18 +145,16 @@ def _seen(band: Band, *, without_code: bool) -> Panel | None:
     if found is None:
         return None
     scale = image.size_px[0] / band.width_px
-    corners = tuple(((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5) for x, y in found.area_px)
-    serial, _, _ = found.code.partition("_")
-    albedo = albedo_of(found.code, band.wavelength_nm)
-    return Panel("QR code" if found.code else "look", serial, albedo, corners)
+    return replace(found, area_px=tuple(((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5) for x, y in found.area_px))
 
 
 def _read(band: Band, albedos: Albedos) -> BandReading:
-    panel = band.panel if band.panel is not None and band.panel.corners_px else _seen(band, without_code=True)
-    panel = panel or band.panel
-    if band.panel is not None and panel is not None:
-        panel = replace(panel, seen_by=band.panel.seen_by, albedo=band.panel.albedo or panel.albedo)
-    band = replace(band, panel=panel)
+    panel = band.panel
+    if panel is not None and not panel.corners_px:
+        # Firmware that knows its panel does not always say where it is.
+        sight = _seen(band, without_code=True)
+        panel = panel if sight is None else replace(panel, corners_px=sight.area_px)
+        band = replace(band, panel=panel)
     albedo = albedos.get(band.name.lower(), albedos.get("", None if panel is None else panel.albedo))
     if panel is None or not panel.corners_px:
         return BandReading(band, albedo, None, "it was not found in this band")

@@ -1,11 +1,18 @@
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.align import align_capture_bands
-from agalign.capture.band_pair import read_pairs
-from agalign.config import SeedSettings, Settings
+from agalign.capture.band_pair import longest_for, read_pairs
+from agalign.config import JointSettings, SeedSettings, Settings
+from agalign.synthetic.cameras import ALTUM
+from agalign.synthetic.score import score_against_truth
+from agalign.synthetic.troubles import make_two_headings
+from agalign.values.capture import Band
 
 
 @pytest.mark.parametrize("kind", ["rig", "geo"])
@@ -38,3 +45,29 @@ def test_without_one_lens_neither_is_corrected(flight: Path) -> None:
     assert by_name["NIR"].space == "pixel"
     assert by_name["NIR"].fixed.lens is None
     assert by_name["Red"].fixed.lens is not None
+
+
+@pytest.mark.parametrize(
+    ("ratio", "longest"),
+    [(1.0, 4096), (2.0, 4096), (0.5, 4096), (0.25, 640), (0.0775, 198), (0.01, 128), (0.0, 4096)],
+)
+def test_for_a_band_of_few_pixels_the_reference_is_reduced(ratio: float, longest: int) -> None:
+    band = Band("Green", Path("x.tif"), 1, 1280, 960, "uint16")
+    mapping = np.diag([abs(ratio), ratio, 1.0])
+    assert longest_for(band, mapping, JointSettings()) == longest
+
+
+def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path) -> None:
+    """Of 160 x 120 beside 800 x 600, whose tags are off by 0.3 degrees: four px of the reference."""
+    thermal = replace(ALTUM.bands[-1], size_ratio=(0.2, 0.2), centre_offset_px=(-9.7, -20.5))
+    camera = replace(ALTUM, bands=(ALTUM.bands[1], ALTUM.bands[3], thermal), reference=0)
+    truth = make_two_headings(tmp_path, 4, (800, 600), camera=camera, line=2, lakes=False)
+    reports = agalign.align_folder(tmp_path, tmp_path / "out")
+    for score in score_against_truth(reports, truth):
+        assert score.status == "aligned"
+        assert score.median_px < (0.3 if score.band == "LWIR" else 0.1)
+    capture = discover(tmp_path).captures[0]
+    pairs, _ = read_pairs(capture, Settings())
+    assert [(p.name, p.is_coarse, p.is_reduced) for p in pairs] == [("NIR", False, False), ("LWIR", True, False)]
+    assert 270 < pairs[1].fixed.size_px[0] < 310  # about two of its pixels to one of the thermal band's
+    assert pairs[1].reference_file_px == (800, 600)

@@ -1,0 +1,36 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from agalign.cameras.metadata import Tags
+from agalign.cameras.micasense import MicaSense
+from agalign.cameras.pix4d import BAND_NAME, CAMERA, panel_in
+from agalign.pixels.raster import probe
+
+
+def test_thermal_bands_count_in_hundredths_of_a_kelvin(tmp_path: Path) -> None:
+    path = tmp_path / "IMG_0001_6.tif"
+    tifffile.imwrite(path, np.zeros((48, 64), np.uint16), photometric="minisblack", metadata=None)
+    tags = Tags(make="MicaSense", model="Altum", xmp={BAND_NAME: ("LWIR",), (CAMERA, "CentralWavelength"): ("11000",)})
+    (band,) = MicaSense().bands(path, tags, probe(path))
+    assert band.radiometry is not None
+    assert (band.radiometry.quantity, band.radiometry.gain) == ("temperature", 0.01)
+
+
+@pytest.mark.parametrize(
+    ("values", "albedo", "corners"),
+    [
+        ({"CalibrationPicture": "2", "Albedo": "0.51", "ReflectArea": "40,10,20,10,20,30,40,30"}, 0.51, 4),
+        ({"CalibrationPicture": "1"}, None, 0),
+        ({"ReflectArea": "40,10,20,10,20,30,4000,30"}, None, 0),
+        ({"CalibrationPicture": "2", "Albedo": "51", "ReflectArea": "1,2,3"}, None, 0),
+    ],
+)
+def test_panels_as_firmware_writes_them(values: dict[str, str], albedo: float | None, corners: int) -> None:
+    found = panel_in(Tags(xmp={(CAMERA, k): (v,) for k, v in values.items()}), (64, 48))
+    assert found is not None
+    assert (found.albedo, len(found.corners_px)) == (albedo, corners)
+    assert panel_in(Tags(xmp={(CAMERA, "CalibrationPicture"): ("0",)}), (64, 48)) is None
+    assert panel_in(Tags(), (64, 48)) is None

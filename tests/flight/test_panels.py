@@ -1,0 +1,88 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from agalign.cameras.discover import discover
+from agalign.flight.panels import BandReading, PanelReading, factors_for, read_panel, with_height, with_panels
+from agalign.synthetic.panel import make_flight_between_panels
+from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Radiometry
+
+AREA = ((20.0, 10.0), (39.0, 10.0), (39.0, 29.0), (20.0, 29.0))
+PLAIN = Radiometry("radiance", 1000.0, 65536.0, 2.0)
+
+
+def panel_file(path: Path, level: int = 33768) -> Band:
+    """A square of one level, (33768 - 1000) / 65536 = 0.5 by default, in the dark."""
+    pixels = np.full((48, 64), 2000, np.uint16)
+    pixels[5:35, 15:45] = level
+    tifffile.imwrite(path, pixels)
+    panel = Panel("tags", "RP04", 0.4, AREA)
+    return Band("Green", path, 1, 64, 48, "uint16", saturation_value=65520.0, radiometry=PLAIN, panel=panel)
+
+
+def capture(band: Band, moment: str = "2026-06-21T10:00:00", **more: object) -> Capture:
+    return Capture("IMG_0001", Path(), (band,), 0, CameraIdentity("a", "b", "1"), captured_at=moment, **more)  # type: ignore[arg-type]
+
+
+def reading(moment: str, factor: float, band: Band | None = None) -> PanelReading:
+    band = band or Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
+    return PanelReading(capture(band, moment), (BandReading(band, 0.5, 0.5 / factor),))
+
+
+def test_what_a_panel_reflects_is_what_its_radiance_is_worth(tmp_path: Path) -> None:
+    (found,) = read_panel(capture(panel_file(tmp_path / "a.tif")), {}).bands
+    assert found.radiance == pytest.approx(1.0)
+    assert (found.albedo, found.factor) == (0.4, pytest.approx(0.4))
+
+
+def test_a_user_s_reflectance_goes_before_the_tags(tmp_path: Path) -> None:
+    shown = capture(panel_file(tmp_path / "a.tif"))
+    assert read_panel(shown, {"": 0.6}).bands[0].factor == pytest.approx(0.6)
+    assert read_panel(shown, {"": 0.6, "green": 0.7}).bands[0].factor == pytest.approx(0.7)
+    assert read_panel(shown, {"red": 0.6}).bands[0].factor == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(("level", "problem"), [(65535, "saturated"), (900, "black")])
+def test_a_panel_that_cannot_be_measured_tells_nothing(tmp_path: Path, level: int, problem: str) -> None:
+    (found,) = read_panel(capture(panel_file(tmp_path / "a.tif", level)), {}).bands
+    assert problem in found.problem
+    assert found.factor is None
+
+
+def test_between_panels_the_light_is_linear_in_time_and_beyond_them_as_the_nearest_has_it() -> None:
+    panels = [reading("2026-06-21T10:00:00", 2.0), reading("2026-06-21T11:00:00", 4.0)]
+    of = panels[0].capture.bands[0]
+
+    def at(moment: str) -> dict[str, float]:
+        return factors_for(capture(of, f"2026-06-21T{moment}"), panels)
+
+    assert at("09:00:00") == {"Green": pytest.approx(2.0)}
+    assert at("10:30:00") == {"Green": pytest.approx(1 / 0.375)}
+    assert at("12:00:00") == {"Green": pytest.approx(4.0)}
+    assert factors_for(capture(of, "2026-06-23T10:30:00"), panels) == {}
+    assert factors_for(replace(capture(of), camera=CameraIdentity("a", "b", "2")), panels) == {}
+
+
+def test_a_panel_on_the_ground_tells_how_high_the_others_are() -> None:
+    band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
+    ground = PanelReading(capture(band, position=Position(52.0, 5.0, 93.0)), ())
+    high = capture(band, position=Position(52.0, 5.0, 112.0), pose=Pose(30.0))
+    found = with_height(high, [ground])
+    assert found.pose is not None
+    assert found.pose.height_m == pytest.approx(20.0)
+    assert with_height(high, []) == high
+    told = replace(high, pose=Pose(30.0, height_m=25.0))
+    assert with_height(told, [ground]) == told
+    assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
+
+
+def test_the_first_and_last_captures_are_looked_at(tmp_path: Path) -> None:
+    make_flight_between_panels(tmp_path, 7, (640, 480))
+    found = with_panels(discover(tmp_path).captures)
+    assert [c.panel is not None for c in found] == [True, *[False] * 7, True]
+    assert all(b.panel is not None and b.panel.corners_px and b.panel.albedo for b in found[0].bands)
+    (shown,) = {b.panel.serial for b in found[-1].bands if b.panel is not None}
+    assert shown == "RP04-0000001-SY"

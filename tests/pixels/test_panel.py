@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from agalign.pixels.panel import albedo_of, find_panel, inside
+from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic.flight import view
+from agalign.synthetic.ground import paint_ground, reflectance
+from agalign.synthetic.panel import PANEL_CODE, with_panel
+from agalign.synthetic.rig import Pose
+from agalign.values.image import Raster
+
+from ..conftest import textured_image
+
+SIZE = 960, 720
+HELD = Pose(1.0, 25.0, 2.0, -3.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def panel() -> np.ndarray:
+    """Green, from a metre up, turned by 25 degrees: reflectances (720, 960)."""
+    ground = with_panel(paint_ground(np.random.default_rng(0), [HELD], SIZE))
+    green = REDEDGE.bands[REDEDGE.reference]
+    return view(reflectance(ground, green), ground, green, HELD, SIZE)
+
+
+def raster(pixels: np.ndarray) -> Raster:
+    noise = np.random.default_rng(1).normal(0, 0.02, pixels.shape)
+    return Raster((5000 + 40000 * (pixels + noise)).astype(np.float32), np.ones(pixels.shape, bool))
+
+
+def test_a_panel_is_found_by_its_code_and_its_grey_is_inside_the_area(panel: np.ndarray) -> None:
+    found = find_panel(raster(panel))
+    assert found is not None
+    assert found.code == PANEL_CODE
+    within = panel[inside(found.area_px, panel.shape)]
+    assert len(within) > 1000
+    assert within.mean() == pytest.approx(0.51, abs=0.005)
+    assert within.std() < 0.01
+
+
+def test_a_square_without_a_code_counts_only_where_asked_for(panel: np.ndarray) -> None:
+    bare = np.where(panel > 0.6, 0.05, panel)  # no label
+    assert find_panel(raster(bare)) is None
+    found = find_panel(raster(bare), without_code=True)
+    assert found is not None
+    assert found.code == ""
+    assert panel[inside(found.area_px, panel.shape)].mean() == pytest.approx(0.51, abs=0.005)
+
+
+@pytest.mark.parametrize("without_code", [False, True])
+def test_a_field_shows_no_panel(without_code: bool) -> None:
+    pose = Pose(28.0, 25.0, 0.0, 0.0, 0.0, 0.0)
+    ground = paint_ground(np.random.default_rng(3), [pose], SIZE)
+    for band in REDEDGE.bands:
+        seen = view(reflectance(ground, band), ground, band, pose, SIZE)
+        assert find_panel(raster(seen), without_code=without_code) is None
+    assert find_panel(raster(0.2 + 0.05 * textured_image(*SIZE)), without_code=without_code) is None
+    assert find_panel(raster(np.full(SIZE[::-1], 0.3)), without_code=without_code) is None
+
+
+def test_codes_tell_reflectance_along_a_line() -> None:
+    """The real panel's code; its camera's tags say 0.5105 at 475 nm and 0.508067 at 840 nm."""
+    code = "RP04-1826246-SC_04005111000507"
+    assert albedo_of(code, 475.0) == pytest.approx(0.5105)
+    assert albedo_of(code, 840.0) == pytest.approx(0.5080667, abs=1e-6)
+    assert albedo_of(code, 1100.0) is None
+    assert albedo_of(code, None) is None
+    assert albedo_of("https://example.org", 560.0) is None
+    assert albedo_of("RP04-1_04005110400507", 400.0) is None

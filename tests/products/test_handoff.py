@@ -1,0 +1,152 @@
+"""Aligned bands as the programs that come next read them, with the libraries that they read them with."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import exifread
+import pytest
+import xmltodict
+from PIL import Image
+
+import agalign
+from agalign.cameras.discover import DiscoverOptions
+from agalign.config import SeedSettings, Settings, WriteSettings
+from agalign.synthetic.cameras import MAVIC, MAVIC_3M, REDEDGE, SENTERA_6X
+from agalign.synthetic.rig import CameraSpec
+from agalign.synthetic.troubles import make_two_headings
+
+CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
+CAPTURE_TAGS = ("@drone-dji:CaptureUUID", "MicaSense:CaptureId", "@Camera:CaptureUUID", "Camera:CaptureUUID")
+SIZE = 480, 360
+
+
+@pytest.fixture(scope="module", params=list(CAMERAS))
+def aligned(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[CameraSpec, Path, Path]:
+    """(camera, its files, the aligned ones)."""
+    camera, folder, out = CAMERAS[request.param], tmp_path_factory.mktemp("in"), tmp_path_factory.mktemp("out")
+    make_two_headings(folder, 1, SIZE, camera=camera, line=1, lakes=False)
+    settings = Settings(seed=SeedSettings(only=True), write=WriteSettings(layout="bands"))
+    options = DiscoverOptions(with_rgb=True)
+    (report,) = agalign.align_folder(folder, out, settings=settings, options=options)
+    assert report.error is None
+    return camera, folder, out
+
+
+def bands_of(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".tif" and not p.name.endswith("_D.tif"))
+
+
+def exif_of(path: Path) -> dict[str, Any]:
+    with path.open("rb") as file:
+        found: dict[str, Any] = exifread.process_file(file, details=True, extract_thumbnail=False)
+    return found
+
+
+def xmp_of(path: Path) -> dict[str, Any]:
+    """Keys with the prefixes that cameras write, attributes with an @, as OpenDroneMap looks them up."""
+    data = path.read_bytes()
+    packet = data[data.index(b"<x:xmpmeta") : data.index(b"</x:xmpmeta>") + len(b"</x:xmpmeta>")]
+    found = xmltodict.parse(packet)["x:xmpmeta"]["rdf:RDF"]["rdf:Description"]
+    merged: dict[str, Any] = {}
+    for description in found if isinstance(found, list) else [found]:
+        merged |= description
+    return merged
+
+
+def numbers(value: Any) -> list[float]:
+    if isinstance(value, dict):
+        items = value["rdf:Seq"]["rdf:li"]
+        return [float(v) for v in (items if isinstance(items, list) else [items])]
+    return [float(v) for v in str(value).split(",")]
+
+
+def test_bands_are_grouped_and_named_as_before(aligned: tuple[CameraSpec, Path, Path]) -> None:
+    camera, folder, out = aligned
+    before, after = ({p.name: xmp_of(p) for p in bands_of(f)} for f in (folder, out))
+    assert set(before) == set(after)
+    assert len(after) == sum(b.sees == "light" for b in camera.bands)
+    captures = {xmp.get(tag) for xmp in after.values() for tag in CAPTURE_TAGS} - {None}
+    assert len(captures) == 1
+    for name, xmp in after.items():
+        for tag in ("Camera:BandName", "Camera:CentralWavelength", *CAPTURE_TAGS):
+            assert xmp.get(tag) == before[name].get(tag)
+        assert xmp["Camera:BandName"]
+    assert len({xmp["Camera:BandName"] for xmp in after.values()}) == len(after)
+
+
+def test_place_time_and_camera_are_as_before(aligned: tuple[CameraSpec, Path, Path]) -> None:
+    _, folder, out = aligned
+    sources = {p.name: p for p in bands_of(folder)}
+    for path in bands_of(out):
+        before, after = exif_of(sources[path.name]), exif_of(path)
+        for tag in (
+            "Image Make", "Image Model", "GPS GPSLatitude", "GPS GPSLatitudeRef", "GPS GPSLongitude", "GPS GPSAltitude",
+            "EXIF DateTimeOriginal", "EXIF FocalLength", "EXIF ExposureTime", "EXIF ISOSpeedRatings",
+        ):  # fmt: skip
+            assert str(after.get(tag)) == str(before.get(tag)), tag
+        with Image.open(path) as image:
+            assert image.getexif()[271] == str(before["Image Make"])
+            assert image.getexif().get_ifd(0x8825)[1] == "N"
+
+
+def test_nobody_aligns_them_once_more(aligned: tuple[CameraSpec, Path, Path]) -> None:
+    """All bands are one camera's now: no angles between them, one principal point, one lens, one homography."""
+    camera, _, out = aligned
+    packets = [xmp_of(p) for p in bands_of(out)]
+    if camera.maker == "MicaSense":
+        for xmp in packets:
+            assert numbers(xmp["Camera:RigRelatives"]) == [0, 0, 0]
+            assert numbers(xmp["Camera:RigTranslations"]) == [0, 0, 0]
+    shared = (
+        "Camera:PrincipalPoint", "Camera:PerspectiveDistortion", "Camera:PerspectiveFocalLength",
+        "@drone-dji:CalibratedHMatrix", "@drone-dji:DewarpData", "@drone-dji:RelativeOpticalCenterX",
+        "@drone-dji:RelativeOpticalCenterY", "@drone-dji:CalibratedOpticalCenterX", "@drone-dji:DewarpFlag",
+    )  # fmt: skip
+    for tag in shared:
+        assert len({str(xmp.get(tag)) for xmp in packets}) == 1, tag
+
+
+def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: tuple[CameraSpec, Path, Path]) -> None:
+    camera, folder, out = aligned
+    (sidecar,) = out.rglob("*.json")
+    data = json.loads(sidecar.read_text())
+    x0, y0, *_ = data["output"]["crop"]
+    reference = data["reference"]["file"]
+    before, after = (next(xmp_of(p) for p in bands_of(f) if p.name == reference) for f in (folder, out))
+    if camera.maker == "MicaSense":
+        (path,) = (p for p in bands_of(out) if p.name == reference)
+        density = float(exif_of(path)["EXIF FocalPlaneXResolution"].values[0])
+        here, there = (numbers(x["Camera:PrincipalPoint"]) for x in (before, after))
+        moved = [density * (a - b) for a, b in zip(here, there, strict=True)]
+    elif camera.maker == "DJI":
+        names = "@drone-dji:CalibratedOpticalCenterX", "@drone-dji:CalibratedOpticalCenterY"
+        moved = [float(before[n]) - float(after[n]) for n in names]
+    else:
+        pytest.skip("its tags have no principal point")
+    assert moved == pytest.approx([x0, y0], abs=0.01)
+
+
+def test_undistorted_pixels_say_so(tmp_path: Path) -> None:
+    make_two_headings(tmp_path / "in", 1, SIZE, camera=MAVIC, line=1, lakes=False)
+    settings = Settings(seed=SeedSettings(only=True), write=WriteSettings(layout="bands", undistort=True))
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
+    for path in bands_of(tmp_path / "out"):
+        xmp = xmp_of(path)
+        assert xmp["@drone-dji:DewarpFlag"] == "1"
+        assert numbers(xmp["@drone-dji:DewarpData"].partition(";")[2])[4:] == [0] * 5
+
+
+def test_gdalinfo_opens_them(aligned: tuple[CameraSpec, Path, Path]) -> None:
+    gdalinfo = shutil.which("gdalinfo")
+    if gdalinfo is None:
+        pytest.skip("gdalinfo is not installed")
+    _, _, out = aligned
+    for path in bands_of(out):
+        done = subprocess.run([gdalinfo, "-json", str(path)], capture_output=True, text=True, check=True)
+        assert not done.stderr
+        (band,) = json.loads(done.stdout)["bands"]
+        assert band["description"]
+        assert float(band["metadata"][""]["wavelength"]) > 400

@@ -1,0 +1,99 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+import agalign
+from agalign.config import Settings, WriteSettings
+from agalign.products.pan_sharpen import brovey_ratio, panchromatic, weights_of
+from agalign.synthetic.cameras import ALTUM_PT
+from agalign.synthetic.troubles import make_two_headings
+from agalign.values.capture import Band, Capture
+
+from ..conftest import textured_image
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def scene() -> tuple[list[np.ndarray], np.ndarray]:
+    """Two bands of half the resolution, brought to that of the panchromatic that is made of them."""
+    fine = [2000 + 300 * textured_image(320, 240, seed) for seed in (1, 2)]
+    coarse = [cv2.resize(cv2.resize(f, (160, 120), interpolation=cv2.INTER_AREA), (320, 240)) for f in fine]
+    return coarse, (0.7 * fine[0] + 0.2 * fine[1]).astype(np.float32)
+
+
+def test_weights_are_those_that_the_panchromatic_is_made_with() -> None:
+    bands, pan = scene()
+    np.testing.assert_allclose(weights_of(bands, pan, 2.0), [0.7, 0.2], atol=0.03)
+    missing = [np.where(np.arange(320) < 50, np.float32(np.nan), b) for b in bands]
+    np.testing.assert_allclose(weights_of(missing, pan, 2.0), [0.7, 0.2], atol=0.04)
+    nothing = [np.full_like(b, np.nan) for b in bands]
+    np.testing.assert_allclose(weights_of(nothing, pan, 2.0), [0.5, 0.5])
+
+
+def test_it_is_what_gdal_computes(tmp_path: Path) -> None:
+    bands, pan = scene()
+    profile = {"driver": "GTiff", "width": 320, "height": 240, "dtype": "float32"}
+    profile |= {"crs": "EPSG:32631", "transform": rasterio.Affine(0.1, 0, 5e5, 0, -0.1, 5.8e6)}
+    with rasterio.open(tmp_path / "bands.tif", "w", count=2, **profile) as file:
+        file.write(np.stack(bands))
+    with rasterio.open(tmp_path / "pan.tif", "w", count=1, **profile) as file:
+        file.write(pan, 1)
+    spectral = "".join(
+        f'<SpectralBand dstBand="{k}"><SourceFilename>{tmp_path / "bands.tif"}</SourceFilename>'
+        f"<SourceBand>{k}</SourceBand></SpectralBand>"
+        for k in (1, 2)
+    )
+    vrt = (
+        '<VRTDataset subClass="VRTPansharpenedDataset"><PansharpeningOptions>'
+        "<Algorithm>WeightedBrovey</Algorithm>"
+        "<AlgorithmOptions><Weights>0.7,0.2</Weights></AlgorithmOptions>"
+        f"<PanchroBand><SourceFilename>{tmp_path / 'pan.tif'}</SourceFilename><SourceBand>1</SourceBand></PanchroBand>"
+        f"{spectral}</PansharpeningOptions></VRTDataset>"
+    )
+    with rasterio.open(vrt) as file:
+        expected = file.read()
+    ratio = brovey_ratio(bands, pan, np.array([0.7, 0.2]))
+    np.testing.assert_allclose(np.stack(bands) * ratio, expected, rtol=1e-4)
+
+
+def test_what_is_sharpened_keeps_its_brightness_and_gains_detail(tmp_path: Path) -> None:
+    make_two_headings(tmp_path / "in", 1, (640, 480), camera=ALTUM_PT, line=1, lakes=False)
+    settings = Settings(write=WriteSettings(pan_sharpen=True, crop="none"))
+    (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
+    assert report.error is None
+    folder = tmp_path / "out" / "0000SET" / "000"
+    with rasterio.open(folder / "IMG_0001.tif") as stack, rasterio.open(folder / "IMG_0001.pan.tif") as sharp:
+        assert sharp.descriptions == ("Blue", "Green", "Red", "NIR", "Red edge")
+        assert sharp.width == pytest.approx(2 * stack.width, rel=0.04)
+        assert sharp.dtypes[0] == "uint16"
+        assert sharp.tags(2)["PANSHARPENED"].startswith("weighted Brovey by Panchro")
+        assert sharp.tags(4)["wavelength"] == "840"
+        before, after = stack.read(2).astype(float), sharp.read(2).astype(float)
+    # Of a dark level and light: the light is as much as it was.
+    dark = 4800
+    assert np.median(after) - dark == pytest.approx(np.median(before) - dark, rel=0.02)
+    plain = cv2.resize(before, after.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    assert np.std(cv2.Laplacian(after, -1)) > 1.3 * np.std(cv2.Laplacian(plain, -1))
+
+
+def test_without_a_panchromatic_band_it_is_refused(flight: Path, tmp_path: Path) -> None:
+    settings = Settings(write=WriteSettings(pan_sharpen=True))
+    reports = agalign.align_folder(flight, tmp_path, settings=settings)
+    assert all(r.error is not None and "--with-rgb" in r.error for r in reports)
+
+
+def test_what_sees_the_others_light_together() -> None:
+    def band(name: str, width_nm: float | None = None, **more: object) -> Band:
+        return Band(name, Path("x.tif"), 1, 64, 48, "uint16", bandwidth_nm=width_nm, **more)  # type: ignore[arg-type]
+
+    def pan(*bands: Band) -> list[str]:
+        return [b.name for b in panchromatic(Capture("a", Path(), bands, 0))]
+
+    colours = [band(f"RGB {c}", companion=True) for c in ("Red", "Green", "Blue")]
+    assert pan(band("Green", 20), band("Panchro", 463)) == ["Panchro"]
+    assert pan(band("Green", 20), band("LWIR", 6000, wavelength_nm=11000.0)) == []
+    assert pan(band("Green", 20), *colours) == ["RGB Red", "RGB Green", "RGB Blue"]
+    assert pan(band("Green", 20), band("pan"), *colours) == ["pan"]

@@ -1,0 +1,58 @@
+"""What the synthetic cameras write is read as what they are."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from agalign.cameras import rig_seed
+from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.synthetic.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, REDEDGE, SENTERA_6X
+from agalign.synthetic.flight import Shot, write_shots
+from agalign.synthetic.ground import paint_ground
+from agalign.synthetic.rig import CameraSpec, Pose, true_homography
+from agalign.values import geometry
+
+CAMERAS = {
+    "RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "Altum": ALTUM, "Altum-PT": ALTUM_PT,
+    "6X": SENTERA_6X,
+}  # fmt: skip
+SIZE = 324, 243
+
+
+@pytest.mark.parametrize("name", list(CAMERAS))
+def test_rig_tags_are_the_truth_from_far_above(tmp_path: Path, name: str) -> None:
+    camera: CameraSpec = CAMERAS[name]
+    ground = paint_ground(np.random.default_rng(0), [Pose(28.0, 20.0, 0, 0, 0, 0)], SIZE, camera=camera)
+    pose = Pose(40_000.0, 20.0, 0, 0, 0, 0)  # so high that the lenses stand in one place
+    path = write_shots(tmp_path, [Shot(pose, ground)], SIZE, camera, np.random.default_rng(0))
+    (capture,) = discover(tmp_path, DiscoverOptions(with_rgb=True)).captures
+    assert {b.name for b in capture.bands} == {b.name for b in camera.bands}
+    assert capture.reference.name == camera.bands[camera.reference].name
+    for band in capture.bands:
+        spec = next(b for b in camera.bands if b.name == band.name)
+        assert band.size_px == spec.size_px(SIZE)
+    for band in capture.moving:
+        spec = next(b for b in camera.bands if b.name == band.name)
+        truth = true_homography(camera.bands[camera.reference], spec, pose, SIZE)
+        seed = rig_seed(capture.reference, band)
+        assert seed is not None
+        # Tags of optical centres know of no angles, and those of the thermal lens are not its true ones.
+        tolerance = 0.5 if not camera.calibrated else 3.0 if spec.sees == "heat" else 0.05
+        assert geometry.corner_error_px(seed, truth, *SIZE) < tolerance
+    assert set(json.loads(path.read_text())[capture.name]["bands"]) == {b.path.name for b in capture.moving}
+
+
+def test_the_photograph_is_a_whole_one(tmp_path: Path) -> None:
+    pose = Pose(28.0, 0, 0, 0, 0, 0)
+    ground = paint_ground(np.random.default_rng(0), [pose], SIZE, camera=MAVIC_3M)
+    write_shots(tmp_path, [Shot(pose, ground)], SIZE, MAVIC_3M, np.random.default_rng(0))
+    (path,) = tmp_path.rglob("*_D.JPG")
+    with Image.open(path) as photo:
+        assert photo.size == (660, 494)
+        means = np.asarray(photo).mean(axis=(0, 1))
+    assert (means > 30).all()
+    assert not list(tmp_path.rglob("*.npy"))
+    assert {b.name for b in discover(tmp_path).captures[0].bands} == {"Green", "Red", "RedEdge", "NIR"}
