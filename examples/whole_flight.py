@@ -5,9 +5,8 @@ python examples/whole_flight.py FLIGHT OUT
 
 import sys
 
-from agalign.batch.flight import RunOptions
-
 import agalign
+from agalign.batch import RunOptions
 from agalign.config import Settings, WriteSettings
 
 

@@ -38,6 +38,7 @@ _MAVIC_3_NAME = re.compile(r"^(?P<capture>.*?)_(?:MS_(?P<band>G|RE?|NIR)|D)$", r
 _DJI = "dji.com/drone-dji"
 _CAPTURE_UUID: Name = (_DJI, "CaptureUUID")
 _DEWARP_DATA: Name = (_DJI, "DewarpData")
+_DEWARP_FLAG: Name = (_DJI, "DewarpFlag")
 _CENTRE: tuple[Name, Name] = ((_DJI, "CalibratedOpticalCenterX"), (_DJI, "CalibratedOpticalCenterY"))
 _RELATIVE_CENTRE: tuple[Name, Name] = ((_DJI, "RelativeOpticalCenterX"), (_DJI, "RelativeOpticalCenterY"))
 _FOCAL_LENGTH_PX: Name = (_DJI, "CalibratedFocalLength")
@@ -45,12 +46,11 @@ _H_MATRIX: Name = (_DJI, "CalibratedHMatrix")
 _SPEED = "FlightXSpeed", "FlightYSpeed", "GimbalYawDegree", "RelativeAltitude"
 _VIGNETTING: Name = (_DJI, "VignettingData")
 _TO_COLOUR: Name = (_DJI, "DewarpHMatrix")
-_PHANTOM_4 = "FC6360"
 
 
 class _Carrying(Carrying):
     geometry = Carrying.geometry | {
-        *_CENTRE, *_RELATIVE_CENTRE, _DEWARP_DATA, _FOCAL_LENGTH_PX, _H_MATRIX, (_DJI, "DewarpFlag"), _TO_COLOUR,
+        *_CENTRE, *_RELATIVE_CENTRE, _DEWARP_DATA, _FOCAL_LENGTH_PX, _H_MATRIX, _DEWARP_FLAG, _TO_COLOUR,
     }  # fmt: skip
     of_the_sensor = Carrying.of_the_sensor | {_VIGNETTING}
     radiometry = Carrying.radiometry | {(_DJI, "BlackLevel")}
@@ -67,7 +67,7 @@ class _Carrying(Carrying):
             scaled = [v * grid.scale for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]
             packet.put(_DEWARP_DATA, [f"{date};" + ",".join(map(number_text, scaled))])
         if grid.undistorted:
-            packet.put((_DJI, "DewarpFlag"), ["1"])
+            packet.put(_DEWARP_FLAG, ["1"])
 
     def pixels_per_mm(self, tags: Tags) -> float | None:
         focal_px = tags.number(*_FOCAL_LENGTH_PX)
@@ -86,11 +86,11 @@ class Dji(Camera):
         return tags.make.upper() == "DJI" or _CAPTURE_UUID in tags.xmp
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        phantom, by_centres = tags.model == _PHANTOM_4, _shift_to_rig(tags)
-        calibrated = None if phantom else _matrix(tags, _H_MATRIX)
-        lens = None if phantom else _lens(tags)
+        is_mavic, by_centres = _is_mavic_3(tags) or bool(_MAVIC_3_NAME.match(path.stem)), _shift_to_rig(tags)
+        calibrated = _matrix(tags, _H_MATRIX)
+        lens = _lens(tags) if is_mavic or calibrated is not None else None
         if len(info.dtypes) > 1:
-            return colour_bands(path, info, lens, by_centres if phantom else None)
+            return colour_bands(path, info, lens, None if is_mavic else by_centres)
         name = tags.text(*BAND_NAME) or tags.text(_DJI, "BandName") or _band_in_name(path)
         band = spectral(band_of(path, info, name), tags)
         if calibrated is None or lens is None:
@@ -100,7 +100,7 @@ class Dji(Camera):
         )  # fmt: skip
 
     def placed(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
-        to_colour = next((m for t in tags if t.model != _PHANTOM_4 and (m := _matrix(t, _TO_COLOUR)) is not None), None)
+        to_colour = next((m for t in tags if _is_mavic_3(t) and (m := _matrix(t, _TO_COLOUR)) is not None), None)
         if to_colour is None:
             return list(bands)
         to_rig = geometry.invert(to_colour)
@@ -156,6 +156,10 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     )  # fmt: skip
 
 
+def _is_mavic_3(tags: Tags) -> bool:
+    return tags.model.upper().startswith("M3M")
+
+
 def _band_in_name(path: Path) -> str:
     mavic = _MAVIC_3_NAME.match(path.stem)
     if mavic and mavic["band"]:
@@ -187,12 +191,13 @@ def _matrix(tags: Tags, name: Name) -> Matrix | None:
 
 
 def _lens(tags: Tags) -> Lens | None:
-    """K = [fx, fy, COCx + cx, COCy + cy] from DewarpData."""
+    """K = [fx, fy, COCx + cx, COCy + cy] from DewarpData, without distortion where DewarpFlag says that is done."""
     (_, terms), centre = _dewarp_data(tags), _pair(tags, _CENTRE)
     if centre is None or not terms or not (terms[0] > 0 and terms[1] > 0):
         return None
     fx, fy, cx, cy, *k = terms
-    return Lens(fx, fy, centre[0] + cx, centre[1] + cy, tuple(k))
+    dewarped = tags.number(*_DEWARP_FLAG) == 1
+    return Lens(fx, fy, centre[0] + cx, centre[1] + cy, () if dewarped else tuple(k))
 
 
 def _dewarp_data(tags: Tags) -> tuple[str, list[float]]:

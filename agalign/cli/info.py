@@ -55,10 +55,11 @@ def info(
             _show_model(folder, voice, as_json=as_json)
             raise typer.Exit(EXIT_OK)
         from agalign.cameras.discover import DiscoverOptions
+        from agalign.flight.panels import with_panels
 
         options = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
         flight = find_captures(folder, options, voice, silent=as_json)
-        rows = [_facts(c) for c in flight.captures]
+        rows = [_facts(c) for c in with_panels(flight.captures)]
         if as_json:
             problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
             typer.echo(json.dumps({"folder": str(folder), "captures": rows, "problems": problems}, indent=1))
@@ -70,6 +71,9 @@ def info(
                 cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
                 table.add_row(*(escape(c) for c in cells), escape(", ".join(row["missing_bands"])))
             voice.result(table)
+            panels = [row for row in rows if row["panel"] is not None]
+            for row in panels:
+                voice.result(escape(f"{row['label']}: calibration panel {row['panel']}".rstrip()))
             found = f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {len(flight.problems)} problems"
             voice.result(found)
         raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
@@ -147,4 +151,5 @@ def _facts(capture: "Capture") -> dict[str, Any]:
         "bands": bands,
         "seeds": [kind for kind in ("rig", "geo") if kind in offered] + ["structure", "identity"],
         "missing_bands": list(capture.missing_bands),
+        "panel": None if capture.panel is None else capture.panel.serial,
     }

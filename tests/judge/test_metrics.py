@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from skimage.metrics import structural_similarity
+from skimage.metrics import normalized_mutual_information, structural_similarity
 
 from agalign.capture.reference import Reference
 from agalign.config import CheckSettings, Settings
@@ -167,3 +167,10 @@ def test_windows_that_are_nowhere_valid_say_nothing() -> None:
     found = tile_residuals(Raster(one, np.ones(one.shape, bool)), nowhere, CheckSettings())
     assert len(found.centres_px) == 0
     assert (found.median_px, found.coverage) == (np.inf, 0.0)
+
+
+def test_normalised_mutual_information_is_scikit_image_s() -> None:
+    one, other = textured_pair(np.eye(3), 320, 240)
+    joint, _, _ = np.histogram2d(one.ravel(), other.ravel(), 32)
+    found = normalised_mutual_information(joint / joint.sum())
+    assert found == pytest.approx(normalized_mutual_information(one, other, bins=32), abs=1e-6)

@@ -273,10 +273,10 @@ def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
     agalign.align_folder(tmp_path / "in", out, settings=Settings(write=WriteSettings(radiometry="auto")))
     (stack,) = out.rglob("IMG_0001.tif")
     with rasterio.open(stack, "r+") as dataset:
-        dataset.update_tags(RADIOMETRY="reflectance and radiance")
+        dataset.update_tags(dataset.descriptions.index("NIR") + 1, QUANTITY="radiance")
     assert "different units" in next(write_indices(out, [INDICES["ndvi"]])).problem
     with rasterio.open(stack, "r+") as dataset:
-        dataset.update_tags(RADIOMETRY="radiance")
+        dataset.update_tags(dataset.descriptions.index("Red") + 1, QUANTITY="radiance")
     assert "needs reflectance, and the bands are radiance" in next(write_indices(out, [INDICES["savi"]])).problem
 
 

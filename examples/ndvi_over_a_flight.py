@@ -1,0 +1,23 @@
+"""A flight as one lazily read xarray Dataset: NDVI of every capture, and where it was taken.
+
+pip install 'agalign[xarray]'
+python examples/ndvi_over_a_flight.py ALIGNED
+"""
+
+import sys
+
+import agalign
+
+flight = agalign.open_flight(sys.argv[1])
+print(flight)
+
+red, nir = flight["Red"].astype("float32"), flight["NIR"].astype("float32")
+ndvi = ((nir - red) / (nir + red)).where(nir + red > 0)
+median = ndvi.median(("y", "x"), skipna=True).compute()
+for capture in median.capture:
+    here = median.sel(capture=capture)
+    print(f"{capture.item()}: {float(here):.3f} at {float(here.latitude):.6f}, {float(here.longitude):.6f}")
+
+# One capture by itself lies on the map where it has a map: .rio is rioxarray's.
+one = agalign.open_capture(f"{sys.argv[1]}/{flight.capture.values[0]}.json")
+print(one["NIR"].attrs, one.rio.crs)
