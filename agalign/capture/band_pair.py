@@ -181,7 +181,10 @@ def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float
     """Tags are as good as their makers' parallax; the flight's mean as captures left out of it showed."""
     known: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), _TAGS_STD_PX * scale[0])
     if model is not None and model.rig is not None and band in model.rig.mean:
-        known["model"] = max(model.rig.missed_px(band, by_neighbours=False), _LEAST_MODEL_STD_PX) * scale[0]
+        mean, rig = model.rig.mean[band], model.rig
+        # What a rig misses is in px of the band's own file.
+        ratio = abs(float(geometry.local_scale(mean, *rig.size_px)[-1]))
+        known["model"] = max(rig.missed_px(band, by_neighbours=False) / ratio, _LEAST_MODEL_STD_PX) * scale[0]
     return known
 
 

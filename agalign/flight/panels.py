@@ -16,7 +16,7 @@ from agalign.values.capture import Band, Capture, Panel
 Albedos = Mapping[str, float]
 """Reflectance of the panel by band in lower case, or by the empty name for all others: what a user says."""
 _AT_EITHER_END = 3
-"""Captures of a flight that are looked at where their tags do not tell: panels are held before and after."""
+"""Captures at either end of a flight that are looked at in vain: panels are held before and after."""
 _READERS = 4
 _LOOK_PX = 1600
 _SAME_OUTING_S = 6 * 3600.0
@@ -64,9 +64,9 @@ def with_panels(captures: Sequence[Capture], *, by_look: bool = False) -> list[C
     """The captures, of which those show a panel that the tags say, and among the first and last of each flight those
     whose images show one with its QR code, or `by_look` without one.
     """
-    asked = [c for flight in flights_of(captures) for c in _at_the_ends(flight) if c.panel is None]
+    ends = [end for flight in flights_of(captures) for end in _from_either_end(flight)]
     with without_warnings(), ThreadPoolExecutor(_READERS) as pool:
-        seen = dict(zip((c.label for c in asked), pool.map(lambda c: _looked_at(c, by_look), asked), strict=True))
+        seen = {c.label: c for found in pool.map(lambda end: _panels_at(end, by_look), ends) for c in found}
     return [seen.get(c.label, c) for c in captures]
 
 
@@ -113,9 +113,26 @@ def _at(seconds: float, known: list[tuple[float, float]]) -> float:
     return float(np.interp(seconds, times, [np.mean([v for t, v in known if t == time]) for time in times]))
 
 
-def _at_the_ends(flight: Sequence[Capture]) -> list[Capture]:
+def _from_either_end(flight: Sequence[Capture]) -> tuple[list[Capture], list[Capture]]:
+    """The first half of a flight, and the second from its end."""
     in_time = sorted(flight, key=lambda c: c.seconds)
-    return in_time if len(flight) <= 2 * _AT_EITHER_END else in_time[:_AT_EITHER_END] + in_time[-_AT_EITHER_END:]
+    middle = (len(in_time) + 1) // 2
+    return in_time[:middle], in_time[middle:][::-1]
+
+
+def _panels_at(end: Sequence[Capture], by_look: bool) -> list[Capture]:
+    """Those that show a panel, looked for until a few in a row show none."""
+    found: list[Capture] = []
+    without = 0
+    for capture in end:
+        # Mosaics show none, and are long to read.
+        told = capture.panel is not None or capture.reference.georeference is not None
+        seen = capture if told else _looked_at(capture, by_look)
+        found += [] if seen.panel is None else [seen]
+        without = 0 if seen.panel is not None else without + 1
+        if without == _AT_EITHER_END:
+            break
+    return found
 
 
 def _looked_at(capture: Capture, by_look: bool) -> Capture:

@@ -34,7 +34,9 @@ def expected_error_px(alignment: Alignment, size_px: tuple[int, int], points_px:
 
 def _of_the_mapping(alignment: Alignment, size_px: tuple[int, int], points_px: Points) -> NDArray[np.float64]:
     if alignment.status == "predicted" and alignment.prediction is not None:
-        return np.full(len(points_px), alignment.prediction.std_px**2)
+        # An error bar is in px of the moving file.
+        ratio = abs(float(geometry.local_scale(alignment.fixed_to_moving, *size_px)[-1]))
+        return np.full(len(points_px), (alignment.prediction.std_px / ratio) ** 2)
     joint = alignment.joint
     if alignment.status != "aligned" or joint is None or joint.corner_covariance_px2 is None:
         return np.full(len(points_px), 0.0 if joint is None and alignment.status == "aligned" else np.inf)

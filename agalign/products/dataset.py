@@ -1,5 +1,6 @@
 """Aligned captures as xarray has them: a variable a band, with its wavelength and unit, read when it is asked for."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,22 +12,22 @@ if TYPE_CHECKING:
     import xarray
 
 _RAW_UNIT = "count"
+_MORE = re.compile(r"(?:\.stac)?\.json$|\.tiff?$", re.IGNORECASE)
 _CHUNKS = {"x": 1024, "y": 1024}
 
 
 def open_capture(path: str | Path, *, masked: bool = False) -> "xarray.Dataset":
-    """The aligned bands of a capture by its sidecar or its stack, lazily (dask).
+    """The aligned bands of a capture by its sidecar, its stack or its STAC item, lazily (dask).
 
     Dimensions are y and x, at the centres of pixels: on the map where the capture lies on one (`.rio.crs`), else in px
-    of what was written. A variable is named after its band and has the attributes `wavelength_nm`, `bandwidth_nm`,
-    `units`, `status` and, where nodata is declared, `_FillValue`; with `masked` such pixels are nan instead.
+    of what was written. A variable is named after its band and has the attributes `wavelength_nm`, `units`, `status`
+    and, where nodata is declared, `_FillValue`; with `masked` such pixels are nan instead.
     Bands of which nothing was written are left out. Raises SidecarError, UnreadableFileError, and ConfigurationError
     where xarray is not installed.
     """
     import_xarray()
-    sidecar_path = Path(path)
-    if sidecar_path.suffix.lower() != ".json":
-        sidecar_path = sidecar_path.with_suffix(".json")
+    given = Path(path)
+    sidecar_path = given.with_name(_MORE.sub("", given.name) + ".json")
     return _dataset(read_sidecar(sidecar_path), sidecar_path.parent, masked=masked)
 
 

@@ -144,7 +144,7 @@ class LocalPart(_Part):
 class PredictionPart(_Part):
     """Where the flight's rig says that the band lies: from the capture's other bands, from the captures before and
     after, or from the flight's mean. `std_px` is the root mean square error to be expected; `off_px` how far from there
-    the band's own image has it, null where it does not say.
+    the band's own image has it, null where it does not say. Both are in px of the band's own file.
     """
 
     source: Annotated[PredictionSource, Field(alias="from")]

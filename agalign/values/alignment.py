@@ -172,7 +172,7 @@ class Prediction:
     source: PredictionSource
     """From the capture's other bands, from the captures around it, or from the flight's mean."""
     std_px: float
-    """Root mean square error that is to be expected over the image."""
+    """Root mean square error that is to be expected over the image, px of the moving file."""
     off_px: float | None = None
     """Root mean square distance of what the band's own image says; None where it says nothing."""
 

@@ -79,6 +79,28 @@ def test_a_panel_on_the_ground_tells_how_high_the_others_are() -> None:
     assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
 
 
+def test_the_ends_of_a_flight_are_looked_at_until_three_in_a_row_show_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
+    flight = [replace(capture(band, f"2026-06-21T10:00:{k:02d}"), name=f"{k}") for k in range(20)]
+    looked: list[str] = []
+
+    def look(one: Capture, _by_look: bool) -> Capture:
+        looked.append(one.name)
+        shown = one.name in ("0", "1", "2", "3", "5", "18")
+        return replace(one, bands=(replace(band, panel=Panel("look") if shown else None),))
+
+    monkeypatch.setattr("agalign.flight.panels._looked_at", look)
+    found = with_panels(flight)
+    assert [c.name for c in found if c.panel] == ["0", "1", "2", "3", "5", "18"]
+    assert sorted(map(int, looked)) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 15, 16, 17, 18, 19]
+    looked.clear()
+    with_panels(flight[7:8])
+    assert looked == ["7"]
+    with_panels(flight[7:9])
+    assert sorted(looked) == ["7", "7", "8"]
+    assert with_panels([]) == []
+
+
 def test_the_first_and_last_captures_are_looked_at(tmp_path: Path) -> None:
     make_flight_between_panels(tmp_path, 7, (640, 480))
     found = with_panels(discover(tmp_path).captures)

@@ -43,4 +43,7 @@ def test_a_prediction_is_as_good_as_it_says_and_a_seed_says_nothing() -> None:
     known = alignment([0.01] * 4, None)
     predicted = replace(known, status="predicted", prediction=Prediction(np.eye(3), "bands", 0.4))
     np.testing.assert_allclose(expected_error_px(predicted, SIZE, LEFT), 0.4)
+    # Of a thermal band it is in pixels that are ten times as large.
+    thermal = replace(predicted, fixed_to_moving=np.diag([0.1, 0.1, 1.0]))
+    np.testing.assert_allclose(expected_error_px(thermal, SIZE, LEFT), 4.0)
     assert np.isinf(expected_error_px(replace(known, status="seed_only"), SIZE, LEFT)).all()

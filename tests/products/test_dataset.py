@@ -28,6 +28,7 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 def test_a_capture_is_its_files(run: Path) -> None:
     dataset = agalign.open_capture(run / "0000SET" / "000" / "IMG_0001.tif")
+    assert dataset.equals(agalign.open_capture(str(run / "0000SET" / "000" / "IMG_0001.stac.json")))
     assert set(dataset.data_vars) == {"Blue", "Green", "Red", "NIR", "Red edge"}
     assert (dataset.NIR.attrs["wavelength_nm"], dataset.NIR.attrs["units"]) == (840, "1")
     assert dataset.NIR.dims == ("y", "x")
