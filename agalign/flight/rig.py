@@ -184,7 +184,7 @@ class Rig:
 
     def _told(self, guess: "_Guess | None", like: Seen, band: str) -> tuple[Array | None, float]:
         """(factors of a capture from what is known of those around it, its error bar for a band, px): what the same
-        guess misses of captures that lie as far from the others as this one does.
+        guess misses of captures that lie as far from the others as this one does, or what those around it differ by.
         """
         here = self._design(band)
         found = _TYPICAL if guess is None else guess(like, self.seen)
@@ -201,7 +201,8 @@ class Rig:
         climb_px = self._unknown_climb_px(like.altitude_m) * float(np.linalg.norm(self.baselines[band]))
         # Of few captures the mean square may be small by chance.
         few = (len(enough) + 1) / max(len(enough) - 1, 1)
-        square = few * np.mean(enough or [0.0]) + self.from_bands_px[band] ** 2 + climb_px**2
+        between = float(((here @ found.std) ** 2).sum())
+        square = max(few * np.mean(enough or [0.0]), between) + self.from_bands_px[band] ** 2 + climb_px**2
         return None if guess is None else found.factors, float(np.sqrt(square))
 
     def expectation(self, band: str, fixed_to_moving: Matrix) -> Expectation:
@@ -332,6 +333,8 @@ class Guessed:
     """(5,)"""
     gap: float
     """How far it lies from the captures that they are taken from, in what they are taken by."""
+    std: Array = field(default_factory=lambda: np.zeros(FACTORS))
+    """(5,) how far off they may be between captures that differ: as a walk that is known at both ends only."""
 
 
 _Guess = Callable[[Seen, Sequence[Seen]], Guessed | None]
@@ -349,9 +352,10 @@ def around_in_height(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
     if like.altitude_m is None or len(known) < LEAST_CAPTURES:
         return None
     by_height = _between([s.altitude_m or 0.0 for s in known], like.altitude_m, known)
-    factors = around_in_time(like, seen).factors
-    factors[0] = by_height.factors[0]
-    return Guessed(factors, by_height.gap)
+    in_time = around_in_time(like, seen)
+    factors, std = in_time.factors, in_time.std
+    factors[0], std[0] = by_height.factors[0], by_height.std[0]
+    return Guessed(factors, by_height.gap, std)
 
 
 def by_motion(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
@@ -363,9 +367,10 @@ def by_motion(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
     # Where all flew alike nothing is said of other motions: the least slope that fits.
     scale = np.maximum(np.abs(x).max(axis=0), 1e-12)
     slope = np.linalg.lstsq(x / scale, np.array([s.factors[3:] for s in known]), rcond=1e-3)[0]
-    factors = around_in_time(like, seen).factors
-    factors[3:] = (np.array([1.0, *like.motion]) / scale) @ slope
-    return Guessed(factors, float(np.linalg.norm(x[:, 1:] - like.motion, axis=1).min()))
+    in_time = around_in_time(like, seen)
+    factors, std = in_time.factors, in_time.std
+    factors[3:], std[3:] = (np.array([1.0, *like.motion]) / scale) @ slope, 0.0
+    return Guessed(factors, float(np.linalg.norm(x[:, 1:] - like.motion, axis=1).min()), std)
 
 
 _GUESSES: tuple[_Guess | None, ...] = (None, around_in_time, around_in_height, by_motion)
@@ -378,7 +383,12 @@ def _between(places: Sequence[float], place: float, seen: Sequence[Seen]) -> Gue
     order = np.argsort(places, kind="stable")
     at, factors = np.array(places)[order], np.array([s.factors for s in seen])[order]
     found = np.array([np.interp(place, at, column) for column in factors.T])
-    return Guessed(found, float(np.abs(at - place).min()))
+    after = int(np.searchsorted(at, place))
+    std = np.zeros(FACTORS)
+    if 0 < after < len(at) and at[after] > at[after - 1]:
+        share = (place - at[after - 1]) / (at[after] - at[after - 1])
+        std = np.abs(factors[after] - factors[after - 1]) * np.sqrt(share * (1 - share))
+    return Guessed(found, float(np.abs(at - place).min()), std)
 
 
 # ---- mappings as numbers
