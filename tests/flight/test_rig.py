@@ -213,3 +213,19 @@ def test_a_capture_without_evidence_on_the_other_heading_lies_where_its_speed_sa
         error = distance_px(prediction.fixed_to_moving, truth.mappings["NIR"], SIZE)
         assert error < 1.0
         assert error < 2.5 * prediction.std_px
+
+
+def test_between_captures_that_differ_nothing_is_known_for_sure() -> None:
+    """A panel a metre below the camera was taken just before: in time it is near, in height it is not."""
+    panel = replace(observation(0.0, 100.0), altitude_m=1.0)
+    others = [replace(observation(10.0 * k, 0.1 * (k % 3)), altitude_m=28.0 + 0.1 * (k % 3)) for k in range(1, 9)]
+    rig = learn_rig([panel, *others], SIZE, BASELINES)
+    assert rig is not None
+    lost = Observation(6.0, {}, {}, 28.1)
+    error, std = error_px(rig, "NIR", lost, mappings(0.1)["NIR"])
+    assert error < 1.0
+    assert error < 3 * std
+    # Where no height is known, the error bar says how little the two tell.
+    error, std = error_px(rig, "NIR", replace(lost, altitude_m=None), mappings(0.1)["NIR"])
+    assert std > 10
+    assert error < 3 * std
