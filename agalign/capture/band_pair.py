@@ -28,6 +28,7 @@ _STANDARD_DEVIATIONS = 3.0
 _TAGS_STD_PX = 5.0
 """Rig tags are off by 2 px in the median and 12 at most on five cameras (docs/cameras.md)."""
 _LEAST_MODEL_STD_PX = 1.0
+_PLAINLY_REDUCED = 0.7
 _NOT_REDUCED = (1.0, 1.0), (1.0, 1.0)
 
 
@@ -67,8 +68,8 @@ class BandPair:
 
     @property
     def is_reduced(self) -> bool:
-        """True where the files show more than the images."""
-        return min(*self.scales[1], *(() if self.is_coarse else self.scales[0])) < 1.0
+        """True where the files show so much more than the images that it is worth looking at them again."""
+        return min(*self.scales[1], *(() if self.is_coarse else self.scales[0])) < _PLAINLY_REDUCED
 
     @property
     def reach_px(self) -> float:

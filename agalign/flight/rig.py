@@ -202,7 +202,7 @@ class Rig:
         # Of few captures the mean square may be small by chance.
         few = (len(enough) + 1) / max(len(enough) - 1, 1)
         between = float(((here @ found.std) ** 2).sum())
-        square = max(few * np.mean(enough or [0.0]), between) + self.from_bands_px[band] ** 2 + climb_px**2
+        square = max(few * float(np.mean(enough or [0.0])), between) + self.from_bands_px[band] ** 2 + climb_px**2
         return None if guess is None else found.factors, float(np.sqrt(square))
 
     def expectation(self, band: str, fixed_to_moving: Matrix) -> Expectation:

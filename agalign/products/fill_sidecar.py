@@ -37,11 +37,12 @@ from agalign.values.alignment import Alignment, JointResult, LocalResult, Predic
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Matrix
-from agalign.values.mapping import mapping_of
+from agalign.values.mapping import PixelMapping, mapping_of
 
 _GRID = 17, 13
-_LOCAL_GRID = 65, 49
-"""Local displacements need more points than a lens."""
+_FINE_GRID = 65, 49
+"""Local displacements need more points, and so does a lens that the reference's own does not nearly undo."""
+_MOST_BENT_PX = 0.2
 
 
 def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:
@@ -141,9 +142,10 @@ def _place(written: Written, band: str) -> PlacePart | None:
 def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
     joint, residual = alignment.joint, alignment.residual
     local = alignment.local
-    bent = alignment.field is not None
-    grid_px = geometry.lattice(reference.width_px, reference.height_px, *(_LOCAL_GRID if bent else _GRID))
-    there_px = mapping_of(reference, band, alignment)(grid_px)
+    mapping = mapping_of(reference, band, alignment)
+    bent = alignment.field is not None or _bends(mapping, reference.size_px)
+    grid_px = geometry.lattice(*reference.size_px, *(_FINE_GRID if bent else _GRID))
+    there_px = mapping(grid_px)
     after = dict(alignment.after)
     if residual is not None and math.isfinite(residual.median_px):
         after |= {"residual_px": residual.median_px, "residual_p95_px": residual.p95_px}
@@ -173,6 +175,14 @@ def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
         prediction=None if alignment.prediction is None else _prediction_part(alignment.prediction),
         seconds=round(alignment.seconds, 3),
     )
+
+
+def _bends(mapping: PixelMapping, size_px: tuple[int, int]) -> bool:
+    """True where the middles between the points of a coarse grid lie aside from the straight lines between them."""
+    points = geometry.lattice(*size_px, *_GRID).reshape(_GRID[1], _GRID[0], 2)
+    there = mapping(points)
+    straight = mapping(0.5 * (points[:, 1:] + points[:, :-1])) - 0.5 * (there[:, 1:] + there[:, :-1])
+    return bool(np.abs(straight).max() > _MOST_BENT_PX)
 
 
 def _prediction_part(prediction: Prediction) -> PredictionPart:

@@ -5,6 +5,7 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
 from agalign.config import Settings
@@ -24,6 +25,8 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.capture import Band, Capture
 from agalign.values.doubts import Doubt
+from agalign.values.lens import Lens
+from agalign.values.mapping import PixelMapping
 
 SHIPPED = Path(agalign.__file__).with_name("sidecar.schema.json")
 
@@ -110,3 +113,27 @@ def test_a_rejected_solution_says_so() -> None:
 def test_a_doubt_that_could_not_be_measured_is_null_in_json() -> None:
     part = DoubtPart(kind="retrieval", value=None, limit=0.2)
     assert json.loads(part.model_dump_json()) == {"kind": "retrieval", "value": None, "limit": 0.2}
+
+
+def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
+    """Interpolated as anyone would, it is the mapping to a hundredth of a px."""
+    wide = Lens(1490.0, 1490.0, 1056.0, 790.0, (-0.11, 0.012, 0.0, 0.0, -0.02))
+    plain = Lens(870.0, 870.0, 518.0, 388.0)
+    bands = (
+        Band("green", Path("g.tif"), 1, 1037, 777, "uint16", lens=plain),
+        Band("rgb", Path("c.jpg"), 1, 2112, 1582, "uint8", lens=wide),
+        Band("red", Path("r.tif"), 1, 1037, 777, "uint16", lens=plain),
+    )
+    found = {
+        "rgb": geometry.compose(wide.matrix, geometry.invert(plain.matrix)), "red": geometry.translation(5.0, 2.0),
+    }  # fmt: skip
+    seed = Seed("rig", np.eye(3), 30.0)
+    alignments = {b: Alignment(m, "undistorted", "aligned", (), seed, None, None, 0.0) for b, m in found.items()}
+    _, colour, red = sidecar_of(Capture("c", Path(), bands, 0), alignments, None, Settings()).bands
+    assert colour.grid is not None
+    assert red.grid is not None
+    assert (len(colour.grid.reference_px), len(red.grid.reference_px)) == (65 * 49, 17 * 13)
+    at = np.random.default_rng(0).uniform((0, 0), (1036, 776), (500, 2))
+    there = CloughTocher2DInterpolator(colour.grid.reference_px, colour.grid.moving_px)(at)
+    exact = PixelMapping(found["rgb"], plain, wide)(at)
+    assert np.abs(there - exact).max() < 0.02

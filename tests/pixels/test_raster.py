@@ -1,0 +1,51 @@
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from agalign.errors import GeometryError
+from agalign.pixels.raster import crs_code, probe, read_for_alignment, transformed
+from agalign.values.capture import Band
+
+from ..conftest import textured_image
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def test_a_photograph_is_averaged_down(tmp_path: Path) -> None:
+    scene = (128 + 30 * textured_image(640, 480)).clip(1, 254).astype(np.uint8)
+    path = tmp_path / "a.jpg"
+    cv2.imwrite(str(path), np.stack([scene, scene // 2, scene // 3], axis=-1), [cv2.IMWRITE_JPEG_QUALITY, 98])
+    band = Band("red", path, 3, 640, 480, "uint8")
+    with rasterio.open(path) as file:
+        whole = file.read(3).astype(np.float64)
+    half = read_for_alignment(band, 320)
+    assert half.size_px == (320, 240)
+    np.testing.assert_allclose(half.pixels, whole.reshape(240, 2, 320, 2).mean((1, 3)), atol=0.51)
+    # One with a mask is GDAL's to average; it takes the photograph's own reductions, which differ by little.
+    masked = read_for_alignment(replace(band, has_mask=True), 320)
+    assert np.abs(half.pixels - masked.pixels).mean() < 1.5
+
+
+def test_codes_of_coordinate_systems() -> None:
+    assert crs_code(rasterio.CRS.from_epsg(32631).to_wkt()) == "EPSG:32631"
+    assert crs_code(rasterio.CRS.from_string("+proj=aeqd +lat_0=52 +lon_0=5 +datum=WGS84").to_wkt()) is None
+    found = transformed(np.array([[0.0, 1000.0]]), "+proj=aeqd +lat_0=52 +lon_0=5 +datum=WGS84", "EPSG:4326")
+    np.testing.assert_allclose(found, [[5.0, 52.00899]], atol=1e-4)
+    with pytest.raises(GeometryError, match="cannot be transformed"):
+        transformed(np.zeros((1, 2)), "EPSG:0", "EPSG:4326")
+
+
+def test_a_file_says_what_it_holds(tmp_path: Path) -> None:
+    profile = {"driver": "GTiff", "width": 8, "height": 6, "count": 2, "dtype": "uint16"}
+    with rasterio.open(tmp_path / "a.tif", "w", **profile) as file:
+        file.update_tags(2, wavelength="0.84", wavelength_units="micrometers")
+        file.set_band_description(1, "red")
+    info = probe(tmp_path / "a.tif")
+    assert (info.width_px, info.height_px, info.dtypes) == (8, 6, ("uint16", "uint16"))
+    assert info.descriptions == ("red", None)
+    assert info.wavelengths_nm == (None, 840.0)
+    assert info.georeference is None
