@@ -293,6 +293,11 @@ class WriteSettings(Stage):
     """Reflectance of the calibration panel, 0 to 1, by band in lower case, or for all others by the empty name; before
     what tags or its code say. Where it is given, a panel is also known by its looks."""
 
+    @field_validator("radiometry", mode="before")
+    @classmethod
+    def _yes_or_no(cls, value: object) -> object:
+        return {True: "auto", False: "off"}.get(value, value) if isinstance(value, bool) else value
+
 
 class Settings(Stage):
     """Everything that a run depends on."""

@@ -120,6 +120,6 @@ _WHY_NOT: Mapping[RadiometryChoice, str] = {
 
 
 def _need_radiometry(capture: Capture, choice: RadiometryChoice) -> None:
-    without = [b.name for b in capture.bands if b.radiometry is None]
+    without = [b.name for b in capture.bands if b.radiometry is None and not b.companion]
     if without:
         raise InputError(f"{capture.reference.path}: {_WHY_NOT[choice].format(bands=', '.join(without))}")

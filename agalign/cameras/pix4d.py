@@ -115,14 +115,15 @@ def panel_in(tags: Tags, size_px: tuple[int, int]) -> Panel | None:
     """The calibration panel that the firmware saw in an image (width, height): CalibrationPicture, Albedo, ReflectArea
     (x, y of four corners, px) and PanelSerial; None where it saw none.
     """
-    area = tags.numbers(CAMERA, "ReflectArea")
-    if not tags.number(CAMERA, "CalibrationPicture") and len(area) != _AREA_NUMBERS:
-        return None
+    area, is_picture = tags.numbers(CAMERA, "ReflectArea"), tags.number(CAMERA, "CalibrationPicture")
     corners = tuple(zip(area[::2], area[1::2], strict=True)) if len(area) == _AREA_NUMBERS else ()
     inside = all(0 <= x < size_px[0] and 0 <= y < size_px[1] for x, y in corners)
+    corners = corners if inside and len(set(corners)) == _AREA_NUMBERS // 2 else ()
+    if is_picture == 0 or (is_picture is None and not corners):
+        return None
     albedo = tags.number(CAMERA, "Albedo")
     known = albedo if albedo is not None and 0 < albedo <= 1 else None
-    return Panel("tags", tags.first_text(_PANEL_SERIALS), known, corners if inside else ())
+    return Panel("tags", tags.first_text(_PANEL_SERIALS), known, corners)
 
 
 # ---- what becomes of them

@@ -137,7 +137,7 @@ def read_pairs(
     Raises UnreadableFileError where the reference cannot be read.
     """
     longest = settings.joint.longest_side_px
-    references: dict[int, Reference] = {}
+    references = {longest: Reference(read_for_alignment(capture.reference, longest), settings)}
     pairs: list[BandPair] = []
     left_out: dict[str, Doubt] = {}
     for bands in capture.moving_lenses:

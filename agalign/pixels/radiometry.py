@@ -24,14 +24,15 @@ def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mappin
     """The capture with, of every band, what turns its numbers into what was chosen; None where it cannot be had.
 
     `by_panel` is, of bands that a panel was seen in, what radiance is to be multiplied by for reflectance. `auto` is by
-    panel where all bands can be, else by the sun where all can be, else by the camera alone.
+    panel where all bands can be, else by the sun where all can be, else by the camera alone; a colour photograph, of
+    which nothing is known, stands in nobody's way.
     """
     if choice == "off":
         return capture
     in_turn: Sequence[RadiometryChoice] = ("panel", "sun", "camera") if choice == "auto" else (choice,)
     for one in in_turn:
         found = {b.name: _chosen(b.radiometry, one, by_panel.get(b.name)) for b in capture.bands}
-        if all(r is not None for r in found.values()):
+        if all(found[b.name] is not None for b in capture.bands if not b.companion):
             break
     return replace(capture, bands=tuple(replace(b, radiometry=found[b.name]) for b in capture.bands))
 
@@ -39,12 +40,13 @@ def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mappin
 def _chosen(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: float | None) -> Radiometry | None:
     if of_camera is None or not of_camera.is_of_light or choice == "camera":
         return of_camera
-    reflectance: Quantity = "reflectance"
-    factor = (by_panel, reflectance) if choice == "panel" and by_panel is not None else None
-    factor = of_camera.by_sun if choice == "sun" else factor
-    if factor is None:
+    told: tuple[float, Quantity] | None = of_camera.by_sun
+    if choice == "panel":
+        told = None if by_panel is None else (by_panel, "reflectance")
+    if told is None:
         return None
-    return replace(of_camera, gain=of_camera.gain * factor[0], quantity=factor[1], by_sun=None)
+    factor, quantity = told
+    return replace(of_camera, gain=of_camera.gain * factor, quantity=quantity, by_sun=None)
 
 
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:

@@ -24,7 +24,8 @@ def test_thermal_bands_count_in_hundredths_of_a_kelvin(tmp_path: Path) -> None:
     [
         ({"CalibrationPicture": "2", "Albedo": "0.51", "ReflectArea": "40,10,20,10,20,30,40,30"}, 0.51, 4),
         ({"CalibrationPicture": "1"}, None, 0),
-        ({"ReflectArea": "40,10,20,10,20,30,4000,30"}, None, 0),
+        ({"CalibrationPicture": "1", "ReflectArea": "40,10,20,10,20,30,4000,30"}, None, 0),
+        ({"ReflectArea": "40,10,20,10,20,30,40,30"}, None, 4),
         ({"CalibrationPicture": "2", "Albedo": "51", "ReflectArea": "1,2,3"}, None, 0),
     ],
 )
@@ -32,5 +33,14 @@ def test_panels_as_firmware_writes_them(values: dict[str, str], albedo: float | 
     found = panel_in(Tags(xmp={(CAMERA, k): (v,) for k, v in values.items()}), (64, 48))
     assert found is not None
     assert (found.albedo, len(found.corners_px)) == (albedo, corners)
-    assert panel_in(Tags(xmp={(CAMERA, "CalibrationPicture"): ("0",)}), (64, 48)) is None
-    assert panel_in(Tags(), (64, 48)) is None
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {}, {"CalibrationPicture": "0"}, {"CalibrationPicture": "0", "ReflectArea": "40,10,20,10,20,30,40,30"},
+        {"ReflectArea": "0,0,0,0,0,0,0,0"}, {"ReflectArea": "40,10,20,10,20,30,4000,30"}, {"Albedo": "0.5"},
+    ],
+)  # fmt: skip
+def test_other_captures_are_no_panels(values: dict[str, str]) -> None:
+    assert panel_in(Tags(xmp={(CAMERA, k): (v,) for k, v in values.items()}), (64, 48)) is None

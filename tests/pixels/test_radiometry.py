@@ -6,6 +6,7 @@ import pytest
 
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
+from agalign.config import WriteSettings
 from agalign.pixels.radiometry import calibrated, with_radiometry
 from agalign.pixels.raster import probe
 from agalign.synthetic import cameras, rig
@@ -87,6 +88,14 @@ def test_radiometry_is_what_was_chosen(tmp_path: Path) -> None:
     assert by(path, "panel", {"Green": 2.5}).radiometry is None
     assert by(path, "auto", {"Blue": 2.5}).radiometry == panel
     assert by(path, "auto").radiometry == sun
+
+
+def test_a_colour_photograph_stands_in_nobody_s_way() -> None:
+    green = Band("Green", Path("g.tif"), 1, 64, 48, "uint16", radiometry=Radiometry("radiance", 0.0, 1.0, 2.0))
+    colour = Band("RGB Red", Path("c.jpg"), 1, 64, 48, "uint8", companion=True)
+    capture = with_radiometry(Capture("a", Path(), (green, colour), 0), "auto", {"Green": 3.0})
+    assert [b.radiometry and b.radiometry.gain for b in capture.bands] == [6.0, None]
+    assert (WriteSettings(radiometry=True).radiometry, WriteSettings(radiometry=False).radiometry) == ("auto", "off")
 
 
 def test_temperatures_stay_temperatures_whatever_is_chosen() -> None:
