@@ -8,11 +8,15 @@ import rasterio
 import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.align import align_capture_bands
-from agalign.capture.band_pair import longest_for, read_pairs
+from agalign.capture.band_pair import _known_to_px, longest_for, read_pairs
+from agalign.capture.prediction import observed
 from agalign.config import JointSettings, SeedSettings, Settings
+from agalign.flight.model import FlightModel
+from agalign.flight.rig import Rig
 from agalign.synthetic.cameras import ALTUM
 from agalign.synthetic.score import score_against_truth
 from agalign.synthetic.troubles import make_two_headings
+from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Band
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -81,3 +85,27 @@ def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path
     assert [(p.name, p.is_coarse, p.is_reduced) for p in pairs] == [("NIR", False, False), ("LWIR", True, False)]
     assert 270 < pairs[1].fixed.size_px[0] < 310  # about two of its pixels to one of the thermal band's
     assert pairs[1].reference_file_px == (800, 600)
+
+
+def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
+    """Of a band whose pixels are ten times as large a mapping known to 0.2 px of the reference is known to 0.02."""
+    pairs, _ = read_pairs(discover(flight).captures[0], Settings())
+    pair = pairs[0]
+    joint = JointResult(
+        np.eye(3), 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, ((0.2 / 2**0.5, 0.2 / 2**0.5),) * 4
+    )
+    seed = Seed("rig", np.eye(3), 30.0)
+    alignment = Alignment(np.eye(3), "undistorted", "aligned", (), seed, joint, None, 0.0)
+    known = observed([pair], {pair.name: alignment}, discover(flight).captures[0])
+    assert known.std_px[pair.name] == pytest.approx(0.2)
+    coarse = replace(alignment, fixed_to_moving=np.diag([0.1, 0.1, 1.0]))
+    known = observed([pair], {pair.name: coarse}, discover(flight).captures[0])
+    assert known.std_px[pair.name] == pytest.approx(0.02)
+
+
+def test_what_a_rig_misses_is_brought_to_px_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    band, size = "LWIR", (800, 600)
+    rig = Rig(size, {band: np.diag([0.1, 0.1, 1.0])}, {band: (1.0, 0.0)}, {}, {}, {}, (), (), {band: 0.5})
+    monkeypatch.setattr(Rig, "missed_px", lambda *_, **__: 0.5)
+    model = FlightModel(None, "", (band,), {}, "", rig)  # type: ignore[arg-type]
+    assert _known_to_px(band, model, (0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)

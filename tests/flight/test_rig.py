@@ -229,3 +229,13 @@ def test_between_captures_that_differ_nothing_is_known_for_sure() -> None:
     error, std = error_px(rig, "NIR", replace(lost, altitude_m=None), mappings(0.1)["NIR"])
     assert std > 10
     assert error < 3 * std
+
+
+def test_what_is_expected_of_a_band_of_large_pixels_is_told_in_px_of_the_reference() -> None:
+    rig = learn_rig(flight(), SIZE, {})
+    assert rig is not None
+    mean = rig.mean["NIR"]
+    coarse = replace(rig, mean={**rig.mean, "NIR": geometry.compose(np.diag([0.1, 0.1, 1.0]), mean)})
+    one, other = (r.expectation("NIR", r.mean["NIR"]) for r in (rig, coarse))
+    np.testing.assert_allclose(other.covariance, 100 * one.covariance, rtol=1e-6)
+    np.testing.assert_allclose(other.by_factor, 10 * one.by_factor, rtol=1e-6, atol=1e-9)
