@@ -58,8 +58,10 @@ class PanelPart(_Part):
     @property
     def sentence(self) -> str:
         """What it is, in words."""
-        albedos = [b.albedo for b in self.bands if b.albedo is not None]
-        known = f"reflectance {min(albedos):.2f} to {max(albedos):.2f}" if albedos else "reflectance not known"
+        albedos = sorted({f"{b.albedo:.2f}" for b in self.bands if b.albedo is not None})
+        known = (
+            f"reflectance {' to '.join(albedos[:: max(len(albedos) - 1, 1)])}" if albedos else "reflectance not known"
+        )
         name = f"calibration panel {self.serial}".strip()
         return f"{name} ({known}; seen by its {self.seen_by}): kept out of the alignment"
 

@@ -36,10 +36,9 @@ def write_picture(
     chosen = choose_bands(usable, capture.reference)
     after_planes = [read_preview(*places[b.name], (0, 0, grid.width, grid.height)) for b in chosen]
     before_planes = [_before(b, capture.reference, grid) for b in chosen]
-    stretches = [_limits(plane) for plane in after_planes]
+    # Each by its own limits: what is written may be reflectance of what the files have as numbers.
     before, after = (
-        np.stack([_stretched(p, s) for p, s in zip(planes, stretches, strict=True)], axis=-1)
-        for planes in (before_planes, after_planes)
+        np.stack([_stretched(p, _limits(p)) for p in planes], axis=-1) for planes in (before_planes, after_planes)
     )
     names = ", ".join(b.name for b in chosen)
     sheet = _sheet(before, after, f"before: {names} as red, green, blue", "after")

@@ -61,7 +61,7 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: tuple[Path, list[Capt
     out, reports = by_panel
     folder = out / "0000SET" / "000"
     assert reports[0].panel is not None
-    assert "RP04-0000001-SY" in reports[0].panel
+    assert reports[0].panel.startswith("calibration panel RP04-0000001-SY (reflectance 0.51; seen by its QR code)")
     assert reports[0].good
     assert not (folder / "IMG_0001.tif").exists()
     with Image.open(folder / "IMG_0001.panel.png") as picture:
@@ -76,6 +76,13 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: tuple[Path, list[Capt
     page = write_report(out).read_text()
     assert "Calibration panels" in page
     assert "IMG_0001.panel.png" in page
+
+
+def test_the_picture_shows_both_sides_of_what_changed_its_unit(by_panel: tuple[Path, list[CaptureReport]]) -> None:
+    with Image.open(by_panel[0] / "0000SET" / "000" / "IMG_0002.png") as picture:
+        drawn = np.asarray(picture).astype(float)
+    before, after = drawn[40:400, 20:460], drawn[40:400, 510:950]
+    assert before.std() > 0.5 * after.std() > 10
 
 
 def test_another_run_keeps_what_is_done_and_drops_the_panels_where_they_are_aligned(
