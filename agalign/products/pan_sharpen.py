@@ -24,14 +24,15 @@ from agalign.cameras.base import is_thermal
 from agalign.config import WriteSettings
 from agalign.errors import InputError, OutputError
 from agalign.flight.rig import Rig
+from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, without_warnings
 from agalign.pixels.resample import tiles
 from agalign.products.layout import lay_out
-from agalign.products.write import verify, write_raster
+from agalign.products.write import marked, verify, write_raster
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.files import complete_file
-from agalign.values.image import FloatImage, Tile
+from agalign.values.image import FloatImage, Mask, Tile
 
 _BROAD_NM = 200.0
 """Bands at least so wide are panchromatic."""
@@ -65,8 +66,8 @@ def write_pan_sharpened(
 ) -> Path | None:
     """Write the capture's narrow bands, as far as they have these alignments, at the panchromatic's resolution.
 
-    Returns None, and writes nothing, where the panchromatic band is not aligned. Raises OutputError, or
-    UnreadableFileError for an input.
+    Returns None, and writes nothing, where the panchromatic band is not aligned or sees the light of none of them.
+    Raises OutputError, or UnreadableFileError for an input.
     """
     pan = panchromatic(capture)
     there = {name for name, a in alignments.items() if a.status in ("aligned", "predicted")} | {capture.reference.name}
@@ -78,12 +79,14 @@ def write_pan_sharpened(
         layer for layer in layers
         if layer.band not in pan and not layer.band.companion and not is_thermal(layer.band) and not layer.is_gap
     ]  # fmt: skip
+    bands = [layer.band for layer in narrow]
+    seen = [_is_seen(b, pan) for b in bands]
+    if not any(seen):
+        return None
     sources = [*narrow, *(layer for layer in layers if layer.band in pan)]
     unsharpened = path.with_name(f".{path.stem}.layers.part.tif")
     try:
         nodata = write_raster(capture, sources, grid, unsharpened, fine)
-        bands = [layer.band for layer in narrow]
-        seen = [_is_seen(b, pan) for b in bands]
         # Ratios are of light: what a sensor counts in the dark is none.
         dark = [_dark(layer.band, settings) for layer in sources]
         with complete_file(path) as partial:
@@ -160,25 +163,20 @@ def _dark(band: Band, settings: WriteSettings) -> float:
     return band.radiometry.black_level
 
 
-def _read(
-    file: Any, tile: Tile, dark: Sequence[float], nodata: float | None
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _read(file: Any, tile: Tile, dark: Sequence[float], nodata: float | None) -> tuple[FloatImage, Mask]:
     """((planes, height, width) of light, nan where there is none; where there is some)."""
     pixels = file.read(window=_window(tile)).astype(np.float32)
-    valid = np.isfinite(pixels) if nodata is None or math.isnan(nodata) else pixels != nodata
+    valid = data_mask(pixels, nodata)
     return np.where(valid, pixels - np.array(dark, np.float32)[:, None, None], np.float32(np.nan)), valid
 
 
-def _as(values: FloatImage, valid: NDArray[np.bool_], dtype: str, nodata: float | None) -> NDArray[Any]:
+def _as(values: FloatImage, valid: Mask, dtype: str, nodata: float | None) -> NDArray[Any]:
     kind = np.dtype(dtype)
-    if kind.kind == "f":
-        return np.where(valid, values, np.nan).astype(kind)
-    limits = np.iinfo(str(kind))
-    whole = np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max).astype(kind)
-    if nodata is None:
-        return whole
-    beside = nodata + 1 if nodata < limits.max else nodata - 1
-    return np.where(valid, np.where(whole == nodata, kind.type(beside), whole), kind.type(nodata))
+    if kind.kind != "f":
+        limits = np.iinfo(str(kind))
+        values = np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max)
+    found = values.astype(kind)
+    return found if nodata is None else marked(found, valid, nodata)
 
 
 def _describe(

@@ -205,7 +205,7 @@ def _write_layer(
         if pixels is None:
             pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
         elif nodata is not None and not (valid.all() and layer.is_copied):
-            pixels = _marked(pixels.astype(dtype, copy=False), valid, nodata)
+            pixels = marked(pixels.astype(dtype, copy=False), valid, nodata)
         window = Window(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
         dataset.write(pixels.astype(dtype, copy=False), index, window=window)
 
@@ -222,7 +222,8 @@ def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels 
     return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
 
 
-def _marked(pixels: Pixels, valid: Mask, nodata: float) -> Pixels:
+def marked(pixels: Pixels, valid: Mask, nodata: float) -> Pixels:
+    """Nodata where pixels are not valid; valid ones that happen to equal it are moved by the smallest step."""
     if not math.isnan(nodata):
         step = 1 if pixels.dtype.kind != "f" else np.spacing(np.abs(pixels.dtype.type(nodata)) + 1)
         beside = (

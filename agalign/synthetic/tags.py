@@ -267,7 +267,7 @@ _MICASENSE_LIGHT = """  <rdf:Description rdf:about="Pix4D Camera Information" xm
   </rdf:Description>
 """
 
-_DJI = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
+_DJI_OPEN = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/">
  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
   <rdf:Description rdf:about="DJI Meta Data" xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"
@@ -275,32 +275,21 @@ _DJI = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
    drone-dji:CaptureUUID="{uuid}" drone-dji:RelativeAltitude="{altitude:+.2f}" drone-dji:GimbalYawDegree="{yaw:+.2f}"
    drone-dji:GimbalPitchDegree="{pitch:+.2f}" drone-dji:GimbalRollDegree="{roll:+.2f}"
    drone-dji:FlightXSpeed="{north_m_s:+.1f}" drone-dji:FlightYSpeed="{east_m_s:+.1f}" drone-dji:FlightZSpeed="+0.0"
-   drone-dji:SensorIndex="{index}" drone-dji:CalibratedFocalLength="{focal:.6f}"
-   drone-dji:CalibratedOpticalCenterX="{x:.6f}" drone-dji:CalibratedOpticalCenterY="{y:.6f}"
-   {of_bands} drone-dji:DewarpData="{dewarp}" drone-dji:DewarpFlag="0">
-   <Camera:BandName>{name}</Camera:BandName>
-   <Camera:CentralWavelength>{wavelength:g}</Camera:CentralWavelength>
-   <Camera:WavelengthFWHM>{fwhm:g}</Camera:WavelengthFWHM>
-  </rdf:Description>
- </rdf:RDF>
-</x:xmpmeta>
-<?xpacket end="w"?>
-"""
-
-_DJI_COLOUR = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
-<x:xmpmeta xmlns:x="adobe:ns:meta/">
- <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-  <rdf:Description rdf:about="DJI Meta Data" xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"
-   drone-dji:CaptureUUID="{uuid}" drone-dji:RelativeAltitude="{altitude:+.2f}" drone-dji:GimbalYawDegree="{yaw:+.2f}"
-   drone-dji:GimbalPitchDegree="{pitch:+.2f}" drone-dji:GimbalRollDegree="{roll:+.2f}"
-   drone-dji:FlightXSpeed="{north_m_s:+.1f}" drone-dji:FlightYSpeed="{east_m_s:+.1f}" drone-dji:FlightZSpeed="+0.0"
    drone-dji:CalibratedFocalLength="{focal:.6f}"
    drone-dji:CalibratedOpticalCenterX="{x:.6f}" drone-dji:CalibratedOpticalCenterY="{y:.6f}"
-   drone-dji:DewarpData="{dewarp}" drone-dji:DewarpFlag="0"/>
+   drone-dji:DewarpData="{dewarp}" drone-dji:DewarpFlag="0"
+"""
+_DJI_CLOSE = """  </rdf:Description>
  </rdf:RDF>
 </x:xmpmeta>
 <?xpacket end="w"?>
 """
+_DJI = f"""{_DJI_OPEN}   drone-dji:SensorIndex="{{index}}" {{of_bands}}>
+   <Camera:BandName>{{name}}</Camera:BandName>
+   <Camera:CentralWavelength>{{wavelength:g}}</Camera:CentralWavelength>
+   <Camera:WavelengthFWHM>{{fwhm:g}}</Camera:WavelengthFWHM>
+{_DJI_CLOSE}"""
+_DJI_COLOUR = f"{_DJI_OPEN}>{_DJI_CLOSE}"
 
 _SENTERA = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/">

@@ -6,9 +6,10 @@ import pytest
 import rasterio
 
 import agalign
-from agalign.config import Settings, WriteSettings
-from agalign.products.pan_sharpen import brovey_ratio, panchromatic, weights_of
-from agalign.synthetic.cameras import ALTUM_PT
+from agalign.cameras.discover import DiscoverOptions
+from agalign.config import SeedSettings, Settings, WriteSettings
+from agalign.products.pan_sharpen import _is_seen, _sharpen, brovey_ratio, panchromatic, weights_of
+from agalign.synthetic.cameras import ALTUM_PT, MAVIC_3M
 from agalign.synthetic.troubles import make_two_headings
 from agalign.values.capture import Band, Capture
 
@@ -97,3 +98,39 @@ def test_what_sees_the_others_light_together() -> None:
     assert pan(band("Green", 20), band("LWIR", 6000, wavelength_nm=11000.0)) == []
     assert pan(band("Green", 20), *colours) == ["RGB Red", "RGB Green", "RGB Blue"]
     assert pan(band("Green", 20), band("pan"), *colours) == ["pan"]
+
+
+@pytest.mark.parametrize(("nodata", "dtype"), [(0, np.uint16), (-9999.0, np.float32)])
+def test_gaps_keep_the_nodata_value_and_what_is_not_seen_is_not_sharpened(
+    tmp_path: Path, nodata: float, dtype: type
+) -> None:
+    _, pan = scene()
+    planes = np.stack([np.full_like(pan, 3000), np.full_like(pan, 2000), pan]).astype(dtype)
+    planes[:, :20] = nodata
+    profile = {"driver": "GTiff", "width": 320, "height": 240, "dtype": planes.dtype, "count": 3, "nodata": nodata}
+    with rasterio.open(tmp_path / "layers.tif", "w", **profile) as file:
+        file.write(planes)
+    bands = [Band(n, tmp_path, 1, 320, 240, "uint16") for n in ("Green", "NIR")]
+    panchro = Band("Panchro", tmp_path, 1, 320, 240, "uint16")
+    _sharpen(
+        tmp_path / "layers.tif", tmp_path / "out.tif", bands, [panchro], [True, False], [0.0] * 3, 2.0, nodata
+    )  # fmt: skip
+    with rasterio.open(tmp_path / "out.tif") as file:
+        found = file.read()
+    assert (found[:, :20] == nodata).all()
+    assert found[0, 30:].std() > 100
+    assert (found[1, 20:] == 2000).all()
+
+
+def test_a_photograph_sharpens_no_infra_red_alone(tmp_path: Path) -> None:
+    make_two_headings(tmp_path / "in", 1, (480, 360), camera=MAVIC_3M, line=1, lakes=False)
+    colours = ("RGB Red", "RGB Green", "RGB Blue")
+    options = DiscoverOptions(with_rgb=True, reference="NIR", bands=("NIR", "RedEdge", *colours))
+    settings = Settings(seed=SeedSettings(only=True), write=WriteSettings(pan_sharpen=True))
+    (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings, options=options)
+    assert report.error is None
+    assert not list((tmp_path / "out").rglob("*.pan.tif"))
+    colour = Band("RGB Red", tmp_path, 1, 64, 48, "uint8", companion=True)
+    assert [_is_seen(Band("b", tmp_path, 1, 64, 48, "uint16", wavelength_nm=nm), [colour]) for nm in (650, 730)] == [
+        True, False,
+    ]  # fmt: skip
