@@ -10,13 +10,20 @@ from typing import Any
 import tifffile
 from PIL import ExifTags, Image
 
+from agalign.cameras.tiff_directory import check_directories
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
 from agalign.values.capture import Position
+from agalign.values.text import without_controls
 
 _RATIONAL_TYPES = (5, 10)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
+_READ = {271, 272, 274, 306, 700, 34665, 34853, 50714}
+"""What is read of a TIFF: what else there is may be as long as it likes."""
+_LATITUDE_DEG, _LONGITUDE_DEG, _ALTITUDE_M = 90.0, 180.0, 20_000.0
+"""Positions beyond these are none."""
+_LONGEST_TEXT = 200
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -104,8 +111,9 @@ def read_tags(path: Path) -> Tags:
 
 
 def _tiff_values(path: Path) -> dict[int, Any]:
+    check_directories(path)
     with tifffile.TiffFile(path) as tiff:
-        tags = tiff.pages[0].tags.values()  # type: ignore[union-attr]
+        tags = [tag for tag in tiff.pages[0].tags.values() if tag.code in _READ]  # type: ignore[union-attr]
         return {tag.code: _fractions(tag.value) if tag.dtype in _RATIONAL_TYPES else tag.value for tag in tags}
 
 
@@ -115,7 +123,7 @@ def _fractions(value: tuple[int, ...]) -> tuple[float, ...]:
 
 
 def _jpeg_values(path: Path) -> dict[int, Any]:
-    with Image.open(path) as image:
+    with Image.open(path, formats=("JPEG", "MPO")) as image:
         exif = image.getexif()
         named = {ExifTags.TAGS.get(code, str(code)): value for code, value in exif.get_ifd(34665).items()}
         place = {ExifTags.GPSTAGS.get(code, str(code)): value for code, value in exif.get_ifd(34853).items()}
@@ -130,7 +138,11 @@ def _position(gps: Any) -> Position | None:
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         return None
     south, west = (_text(gps.get(f"GPS{axis}Ref")) for axis in ("Latitude", "Longitude"))
+    if abs(latitude) > _LATITUDE_DEG or abs(longitude) > _LONGITUDE_DEG:
+        return None
     altitude = rational(gps.get("GPSAltitude"))
+    if altitude is not None and abs(altitude) > _ALTITUDE_M:
+        altitude = None
     below = gps.get("GPSAltitudeRef") in (1, b"\x01")
     return Position(
         -latitude if south.upper() == "S" else latitude, -longitude if west.upper() == "W" else longitude,
@@ -160,7 +172,7 @@ def _mean(value: Any) -> float | None:
 def _text(value: Any) -> str:
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
-    return str(value).strip("\0 ") if isinstance(value, (str, int)) else ""
+    return without_controls(str(value)).strip()[:_LONGEST_TEXT] if isinstance(value, (str, int)) else ""
 
 
 def _iso_time(exif: Mapping[str, Any], fallback: Any) -> str:

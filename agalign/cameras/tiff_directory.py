@@ -18,7 +18,10 @@ _SIZE = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12:
 """Bytes of a value of each type."""
 _SWAPPED = {**_SIZE, 5: 4, 10: 4}
 """Bytes that a byte order turns round together: a rational is two numbers."""
-_LONGEST_VALUE = 1 << 28
+_LONGEST_VALUE = 1 << 25
+_MOST_BYTES = 1 << 25
+"""Of the tags of one file, which are a few thousand; its pixels are elsewhere."""
+_MOST_ENTRIES = 4096
 _TOP = (1 << 32) - 1
 
 
@@ -83,12 +86,26 @@ def read_directories(path: Path) -> dict[int, Directory]:
     with path.open("rb") as file:
         if file.read(2) != b"\xff\xd8":
             return _read_all(file)
-    with Image.open(path) as image:
+    with Image.open(path, formats=("JPEG", "MPO")) as image:
         block, packet = image.info.get("exif", b""), image.info.get("xmp", b"")
     found = _read_all(BytesIO(block[6:])) if block.startswith(b"Exif\0\0") else {0: {}, EXIF: {}, GPS: {}}
     if packet:
         found[0][XMP] = byte_string(packet)
     return found
+
+
+def check_directories(path: Path) -> None:
+    """Raises ValueError where a TIFF is malformed or its tags declare more than a reader should be asked to hold."""
+    with path.open("rb") as file:
+        layout, at, _ = _header(file)
+        first = _entries(file, layout, at)[0]
+        declared = sum(length for _, _, _, length, _ in first)
+        for tag, kind, _, _, value in first:
+            if tag in (EXIF, GPS) and kind in _SIZE:
+                place = _turned(value[: _SIZE[kind]], kind, layout.order)
+                declared += sum(e[3] for e in _entries(file, layout, int.from_bytes(place, "little"))[0])
+    if declared > _MOST_BYTES:
+        raise ValueError(f"its tags declare {declared >> 20} MB")
 
 
 def add_directories(path: Path, first: Mapping[int, Entry], exif: Directory, gps: Directory) -> None:
@@ -159,23 +176,35 @@ def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
 
 def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory, int]:
     """(entries, where the next directory is)."""
-    entry_format = f"{layout.order}HH{layout.offset}"
-    fixed = struct.calcsize(entry_format)
-    file.seek(at)
-    (count,) = struct.unpack(layout.order + layout.entries, _exactly(file, struct.calcsize(layout.entries)))
-    raw = _exactly(file, count * (fixed + layout.inline_bytes))
-    (following,) = struct.unpack(layout.order + layout.offset, _exactly(file, layout.inline_bytes))
+    entries, following = _entries(file, layout, at)
     found: Directory = {}
-    for start in range(0, len(raw), fixed + layout.inline_bytes):
-        tag, kind, number = struct.unpack_from(entry_format, raw, start)
-        length = _SIZE.get(kind, 0) * number
-        if length == 0 or length > _LONGEST_VALUE:
+    left = _MOST_BYTES
+    for tag, kind, number, length, value in entries:
+        if length == 0 or length > min(left, _LONGEST_VALUE):
             continue
-        value = raw[start + fixed : start + fixed + layout.inline_bytes]
+        left -= length
         if length > layout.inline_bytes:
             file.seek(struct.unpack(layout.order + layout.offset, value)[0])
             value = _exactly(file, length)
         found[tag] = Entry(kind, number, _turned(value[:length], kind, layout.order))
+    return found, following
+
+
+def _entries(file: BinaryIO, layout: _Layout, at: int) -> tuple[list[tuple[int, int, int, int, bytes]], int]:
+    """((tag, type, count, length in bytes, the value or its place) of each entry, where the next directory is)."""
+    entry_format = f"{layout.order}HH{layout.offset}"
+    fixed = struct.calcsize(entry_format)
+    file.seek(at)
+    (count,) = struct.unpack(layout.order + layout.entries, _exactly(file, struct.calcsize(layout.entries)))
+    if count > _MOST_ENTRIES:
+        raise ValueError(f"a directory of {count} tags")
+    size = fixed + layout.inline_bytes
+    raw = _exactly(file, count * size)
+    (following,) = struct.unpack(layout.order + layout.offset, _exactly(file, layout.inline_bytes))
+    found = []
+    for start in range(0, len(raw), size):
+        tag, kind, number = struct.unpack_from(entry_format, raw, start)
+        found.append((tag, kind, number, _SIZE.get(kind, 0) * number, raw[start + fixed : start + size]))
     return found, following
 
 

@@ -1,7 +1,9 @@
 """XMP packets: values by namespace, in whatever form a camera wrote them, and changes to them."""
 
 import re
+import threading
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -11,12 +13,18 @@ from xml.etree.ElementTree import Element, ParseError
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 
+from agalign.values.text import without_controls
+
 Name = tuple[str, str]
 """(namespace, name). A namespace is a domain, such as `micasense.com`, or a place in it, such as `micasense.com/DLS`:
 its URI without scheme, `www.`, version and closing slash, which firmware changes.
 """
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
-_DEEPEST = 4
+_DEEPEST_NAMESPACE = 4
+_DEEPEST = 50
+"""Elements within each other; cameras write six."""
+_LONGEST = 1 << 22
+_NAMESPACES = threading.Lock()
 _AROUND = re.compile(r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$", re.IGNORECASE)
 _PREFIX = re.compile(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""")
 
@@ -26,12 +34,14 @@ class Packet:
     """One XMP packet; an empty one has no root."""
 
     root: Element | None = None
+    prefixes: tuple[tuple[str, str], ...] = ()
+    """(prefix, namespace) as it came with them."""
 
     @classmethod
     def parse(cls, packet: Any) -> "Packet":
         """From bytes or text. A malformed packet is an empty one: cameras do write them, and the images are good."""
         text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
-        if not isinstance(text, str):
+        if not isinstance(text, str) or len(text) > _LONGEST:
             return cls()
         start, end = text.find("<x:xmpmeta"), text.rfind("</x:xmpmeta>")
         if start < 0 or end < 0:
@@ -41,10 +51,9 @@ class Packet:
             root = fromstring(text)
         except (ParseError, DefusedXmlException, ValueError):
             return cls()
-        for prefix, uri in _PREFIX.findall(text):
-            if not re.fullmatch(r"ns\d+", prefix):
-                ElementTree.register_namespace(prefix, uri)  # so that it is written under the name it came with
-        return cls(root)
+        if _is_deeper(root, _DEEPEST):
+            return cls()
+        return cls(root, tuple(p for p in _PREFIX.findall(text) if not re.fullmatch(r"ns\d+", p[0])))
 
     def values(self) -> dict[Name, tuple[str, ...]]:
         """{(namespace, name): values} from all rdf:Description blocks; the first of two counts. A value is found by
@@ -54,7 +63,7 @@ class Packet:
         for description in self._descriptions():
             attributes = [(tag, (value,)) for tag, value in description.attrib.items()]
             for tag, raw in [*attributes, *((child.tag, _texts(child)) for child in description)]:
-                cleaned = tuple(v.strip() for v in raw)
+                cleaned = tuple(without_controls(v).strip() for v in raw)
                 for name in _names(tag) if any(cleaned) else ():
                     found.setdefault(name, cleaned)
         return found
@@ -106,12 +115,37 @@ class Packet:
         """As it stands in a file; nothing for an empty packet."""
         if self.root is None:
             return b""
-        body = ElementTree.tostring(self.root, encoding="unicode")
+        with _registered(self.prefixes):
+            body = ElementTree.tostring(self.root, encoding="unicode")
         head, tail = '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>', '<?xpacket end="w"?>'
         return f"{head}\n{body}\n{tail}".encode()
 
     def _descriptions(self) -> Iterator[Element]:
         return iter(()) if self.root is None else self.root.iter(f"{_RDF}Description")
+
+
+@contextmanager
+def _registered(prefixes: Sequence[tuple[str, str]]) -> Iterator[None]:
+    """Namespaces are written under the prefixes they came with: the library keeps one list for the whole process, in
+    which what one file says must not reach another.
+    """
+    everybodys: dict[str, str] = vars(ElementTree)["_namespace_map"]
+    with _NAMESPACES:
+        before = dict(everybodys)
+        try:
+            for prefix, uri in prefixes:
+                ElementTree.register_namespace(prefix, uri)
+            yield
+        finally:
+            everybodys.clear()
+            everybodys.update(before)
+
+
+def _is_deeper(root: Element, deepest: int) -> bool:
+    level = [root]
+    for _ in range(deepest):
+        level = [child for element in level for child in element]
+    return bool(level)
 
 
 def _texts(element: Element) -> tuple[str, ...]:
@@ -133,5 +167,5 @@ def _namespaces(uri: str) -> list[str]:
     if uri.startswith("http://www.w3.org/"):
         return []
     place = _AROUND.sub("", uri)
-    parts = place.split("/")[:_DEEPEST]
+    parts = place.split("/")[:_DEEPEST_NAMESPACE]
     return ["/".join(parts[:count]) for count in range(len(parts), 0, -1)] if place else []

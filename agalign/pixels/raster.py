@@ -1,5 +1,7 @@
 """Reading rasters: what a file holds, its pixels at any resolution, and its validity."""
 
+import math
+import stat
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,9 +27,21 @@ TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 _READ_WHOLE_PX = 1 << 26
 """Images up to this are decoded at once where they are to be averaged."""
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
-GDAL_ENVIRONMENT = {"GDAL_PAM_ENABLED": "NO", "GDAL_NUM_THREADS": "ALL_CPUS", "GDAL_CACHEMAX": 256}
-"""No files beside the user's; and megabytes of blocks that are kept, of which GDAL takes a twentieth of the machine's.
+GDAL_ENVIRONMENT = {
+    "GDAL_PAM_ENABLED": "NO", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_NUM_THREADS": "ALL_CPUS",
+    "GDAL_CACHEMAX": 256,
+}  # fmt: skip
+"""No files beside the user's, and none of his taken for a part of an image: x.tif.ovr may hold anything, such as a
+description of other files or of a server. And megabytes of blocks that are kept, of which GDAL takes a twentieth of the
+machine's.
 """
+_DRIVERS = {
+    b"II*\0": "GTiff", b"MM\0*": "GTiff", b"II+\0": "GTiff", b"MM\0+": "GTiff", b"\xff\xd8\xff": "JPEG",
+}  # fmt: skip
+"""By how a file begins. GDAL has drivers that execute, or ask other computers, for whatever name a file has."""
+MOST_PIXELS = 250_000_000
+"""Of one image, unless told otherwise: more than any camera has."""
+_MOST_BANDS = 512
 
 
 @dataclass(frozen=True)
@@ -63,27 +77,65 @@ def without_warnings() -> Iterator[None]:
 
 @contextmanager
 def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """A rasterio dataset for reading. Raises UnreadableFileError, naming the file, where GDAL cannot."""
+    """A rasterio dataset of a TIFF or JPEG for reading. Raises UnreadableFileError, naming the file, where it is
+    neither or GDAL cannot read it.
+    """
+    driver = _driver_of(path)
     try:
-        with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(path) as dataset:
+        with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(path, driver=driver) as dataset:
             yield dataset
     except (RasterioIOError, RasterioError, UnicodeEncodeError) as error:
-        text = str(error).replace(str(path), "").strip(" :'").splitlines()[0]
+        text = why(error).replace(str(path), "").strip(" :'")
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
 
 
-def probe(path: Path) -> RasterInfo:
-    """What a raster file holds, without reading its pixels. Raises UnreadableFileError."""
+def why(error: BaseException) -> str:
+    """What GDAL says of an error, in a line; rasterio's own word for it is that there was one."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def _driver_of(path: Path) -> str:
+    """Raises UnreadableFileError for what is no file, cannot be read, or is neither TIFF nor JPEG."""
+    try:
+        # What is no file, such as a pipe, would keep whoever opens it waiting.
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise UnreadableFileError(f"{path}: is no file; take it out of the folder")
+        with path.open("rb") as file:
+            head = file.read(4)
+    except (OSError, ValueError) as error:
+        text = getattr(error, "strerror", None) or error
+        raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
+    for magic, driver in _DRIVERS.items():
+        if head.startswith(magic):
+            return driver
+    what = "is empty" if not head else "is neither a TIFF nor a JPEG"
+    raise UnreadableFileError(f"{path}: {what}; copy it from the card again")
+
+
+def probe(path: Path, most_pixels: int = MOST_PIXELS) -> RasterInfo:
+    """What a raster file holds, without reading its pixels. Raises UnreadableFileError, also where it declares more
+    than so many pixels a band.
+    """
     with open_raster(path) as dataset:
+        width, height, count = dataset.width, dataset.height, dataset.count
+        if width * height > most_pixels:
+            raise UnreadableFileError(
+                f"{path}: declares {width} x {height} pixels, more than the {most_pixels:,} that --max-pixels allows"
+            )
+        if count > _MOST_BANDS:
+            raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MOST_BANDS} can take part")
         wavelengths = tuple(_wavelength_nm(dataset.tags(index)) for index in dataset.indexes)
         alpha = [i for i, c in enumerate(dataset.colorinterp, start=1) if c == ColorInterp.alpha]
         georeference = None
-        if dataset.crs is not None and not dataset.transform.is_identity:
-            georeference = Georeference(np.array(dataset.transform, float).reshape(3, 3), dataset.crs.to_wkt())
+        transform = np.array(dataset.transform, float).reshape(3, 3)
+        if dataset.crs is not None and not dataset.transform.is_identity and _places_pixels(transform):
+            georeference = Georeference(transform, dataset.crs.to_wkt())
         if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
             raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
         return RasterInfo(
-            dataset.width, dataset.height, tuple(dataset.dtypes), tuple(dataset.nodatavals),
+            width, height, tuple(dataset.dtypes), tuple(dataset.nodatavals),
             tuple(dataset.descriptions), wavelengths, alpha[0] if alpha else None, georeference,
             MaskFlags.per_dataset in dataset.mask_flag_enums[0],
             tuple(zip(dataset.scales, dataset.offsets, strict=True)), tuple(dataset.overviews(1)),
@@ -173,12 +225,18 @@ def _dataset_mask(dataset: rasterio.DatasetReader, index: int, shape: tuple[int,
     return np.asarray(mask > 0)
 
 
+def _places_pixels(transform: NDArray[np.float64]) -> bool:
+    return bool(np.isfinite(transform).all() and np.linalg.det(transform[:2, :2]) != 0)
+
+
 def _wavelength_nm(tags: dict[str, str]) -> float | None:
     """A band's wavelength from the tag names in use: ENVI's, GDAL's imagery domain, and ours."""
     for name in ("wavelength", "WAVELENGTH", "CENTRAL_WAVELENGTH_NM", "central_wavelength_nm"):
         try:
             value = float(tags[name])
         except (KeyError, ValueError):
+            continue
+        if not 0 < value < math.inf:
             continue
         micrometres = value < 20 or "micro" in tags.get("wavelength_units", "").lower()
         return value * 1000 if micrometres else value

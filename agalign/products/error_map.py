@@ -6,13 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rasterio
+import tifffile
 from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
 from agalign.errors import OutputError
 from agalign.judge.expected_error import expected_error_px
-from agalign.pixels.raster import GDAL_ENVIRONMENT, without_warnings
-from agalign.products.write import georeferenced
+from agalign.pixels.raster import GDAL_ENVIRONMENT, why, without_warnings
+from agalign.products.write import georeferenced, verify
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import complete_file
@@ -34,16 +35,17 @@ def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid:
     }  # fmt: skip
     profile |= {} if georeference is None else georeferenced(georeference, grid)
     try:
-        with (
-            complete_file(path) as partial, without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT),
-            rasterio.open(partial, "w", **profile) as dataset,
-        ):  # fmt: skip
-            for index, (name, alignment) in enumerate(alignments.items(), start=1):
-                dataset.write(_map_of(alignment, size_px, grid), index)
-                dataset.set_band_description(index, name)
-                dataset.update_tags(index, units="px of the reference", STATUS=alignment.status)
-    except RasterioError as error:
-        raise OutputError(f"{path}: cannot be written ({error})") from None
+        with complete_file(path) as partial:
+            with (
+                without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
+            ):  # fmt: skip
+                for index, (name, alignment) in enumerate(alignments.items(), start=1):
+                    dataset.write(_map_of(alignment, size_px, grid), index)
+                    dataset.set_band_description(index, name)
+                    dataset.update_tags(index, units="px of the reference", STATUS=alignment.status)
+            verify(partial)
+    except (RasterioError, tifffile.TiffFileError) as error:
+        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
 
 
 def _map_of(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:

@@ -16,7 +16,7 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from agalign.errors import AgalignError, InputError, OutputError
-from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, why, without_warnings
 from agalign.products.drawing import with_text, write_png
 from agalign.products.fill_sidecar import is_delivered
 from agalign.products.indices import Index, bands_for, compute
@@ -146,7 +146,7 @@ def _write_values(
                 dataset.write(value, 1, window=window)
         verify(partial)
     except (OSError, RasterioError, tifffile.TiffFileError) as error:
-        raise OutputError(f"{target}: cannot be written ({error})") from None
+        raise OutputError(f"{target}: cannot be written ({why(error)})") from None
 
 
 def _physical(

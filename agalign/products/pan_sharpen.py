@@ -25,13 +25,13 @@ from agalign.config import WriteSettings
 from agalign.errors import InputError, OutputError
 from agalign.flight.rig import Rig
 from agalign.pixels.masks import data_mask
-from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, why, without_warnings
 from agalign.pixels.resample import tiles
 from agalign.products.layout import lay_out
 from agalign.products.write import marked, verify, write_raster
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
-from agalign.values.files import complete_file
+from agalign.values.files import complete_file, scratch_file
 from agalign.values.image import FloatImage, Mask, Tile
 
 _BROAD_NM = 200.0
@@ -84,18 +84,16 @@ def write_pan_sharpened(
     if not any(seen):
         return None
     sources = [*narrow, *(layer for layer in layers if layer.band in pan)]
-    unsharpened = path.with_name(f".{path.stem}.layers.part.tif")
     try:
-        nodata = write_raster(capture, sources, grid, unsharpened, fine)
-        # Ratios are of light: what a sensor counts in the dark is none.
-        dark = [_dark(layer.band, settings) for layer in sources]
-        with complete_file(path) as partial:
-            _sharpen(unsharpened, partial, bands, pan, seen, dark, max(grid.scale_xy), nodata)
-            verify(partial)
+        with scratch_file(path) as unsharpened:
+            nodata = write_raster(capture, sources, grid, unsharpened, fine)
+            # Ratios are of light: what a sensor counts in the dark is none.
+            dark = [_dark(layer.band, settings) for layer in sources]
+            with complete_file(path) as partial:
+                _sharpen(unsharpened, partial, bands, pan, seen, dark, max(grid.scale_xy), nodata)
+                verify(partial)
     except RasterioError as error:
-        raise OutputError(f"{path}: cannot be written ({error})") from None
-    finally:
-        unsharpened.unlink(missing_ok=True)
+        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
     return path
 
 

@@ -26,7 +26,7 @@ from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import GDAL_ENVIRONMENT, TIFF_SUFFIXES, open_raster, read_window, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, TIFF_SUFFIXES, open_raster, read_window, why, without_warnings
 from agalign.pixels.resample import resample_tile, tiles
 from agalign.products.layout import Layer
 from agalign.values import geometry
@@ -168,7 +168,7 @@ def write_raster(
                     _to_cog(partial, compression)
             verify(partial)
     except (RasterioError, tifffile.TiffFileError) as error:
-        raise OutputError(f"{path}: cannot be written ({error})") from None
+        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
     return nodata
 
 

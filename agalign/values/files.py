@@ -1,34 +1,77 @@
-"""Files that are complete or not there."""
+"""Files that are complete or not there, and the names that they may have."""
 
 import os
-import threading
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from agalign.errors import OutputError
+
+_PARTIAL = ".agalign-part-"
 
 
 @contextmanager
 def complete_file(path: Path) -> Iterator[Path]:
     """A path to write to beside `path`, which takes that name where the block ends well and goes where it does not.
 
-    It has the same suffix, by which some libraries choose a format, and a name that no other process or thread takes;
-    as a hidden file it is no image to be aligned. The folder is made. Raises OutputError for an OSError.
+    What was written has reached the disk before it takes the name: where the power fails, either the old file is there
+    or the whole new one. Raises OutputError for an OSError.
     """
-    partial = path.with_name(f".{path.stem}.{os.getpid()}-{threading.get_native_id()}.part{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with scratch_file(path) as partial:
         yield partial
+        _to_disk(partial)
         partial.replace(path)
+        _to_disk(path.parent)
+
+
+@contextmanager
+def scratch_file(beside: Path) -> Iterator[Path]:
+    """A path to write to beside another, which is gone when the block ends.
+
+    It has the same suffix, by which some libraries choose a format, and a name that no other process, here or on
+    another machine that sees the folder, takes; as a hidden file it is no image to be aligned. The folder is made.
+    Raises OutputError for an OSError.
+    """
+    scratch = beside.with_name(f"{_PARTIAL}{secrets.token_hex(8)}{beside.suffix}")
+    try:
+        beside.parent.mkdir(parents=True, exist_ok=True)
+        yield scratch
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
+        raise OutputError(f"{beside}: cannot be written ({error.strerror or error})") from None
     finally:
         with suppress(OSError):
-            partial.unlink(missing_ok=True)
+            scratch.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file, complete or not at all. Raises OutputError."""
     with complete_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def remove_partial_files(folder: Path) -> None:
+    """What a killed process left of `scratch_file` below a folder. Nobody else may be writing there."""
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            if name.startswith(_PARTIAL):
+                with suppress(OSError):
+                    Path(parent, name).unlink()
+
+
+def lies_within(name: str) -> bool:
+    """True for the relative path of a file that no reading of it puts outside the folder it is relative to."""
+    posix, windows = PurePosixPath(name), PureWindowsPath(name)
+    anchored = posix.is_absolute() or bool(windows.drive or windows.root)
+    return bool(name) and not anchored and ".." not in windows.parts and name.isprintable()
+
+
+def _to_disk(path: Path) -> None:
+    """A folder's entries are written to disk like a file's contents, where the system has that."""
+    if path.is_dir() and os.name == "nt":
+        return
+    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
