@@ -4,18 +4,21 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 from agalign.cameras.base import Camera, default_reference
 from agalign.cameras.known import camera_of, known_cameras
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
 from agalign.errors import AgalignError, ConfigurationError, InputError, NoSuchBandError, UnreadableFileError
-from agalign.pixels.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, RasterInfo, probe
+from agalign.pixels.radiometry import is_physical
+from agalign.pixels.raster import JPEG_SUFFIXES, MOST_PIXELS, TIFF_SUFFIXES, RasterInfo, probe
 from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.choices import BandOrder
+from agalign.values.files import RUN_FILE
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,10 @@ class Flight:
 
 
 _SUFFIXES = TIFF_SUFFIXES | JPEG_SUFFIXES
+_SYSTEMS = {"lost+found", "System Volume Information", "$RECYCLE.BIN"}
+"""What operating systems keep on a card."""
+_NAMELESS = "capture"
+_NAMES_OF_THE_RUN = {"panels", Path(RUN_FILE).stem, "summary", "index"}
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,8 @@ class DiscoverOptions:
     """Of the bands in the stacks: as the camera counts them, by wavelength, or by name."""
     skip: tuple[Path, ...] = field(default=())
     """Folders not to look into, such as the output's."""
+    most_pixels: int = MOST_PIXELS
+    """Images that declare more are refused before anything is made of them."""
 
 
 def discover(
@@ -80,18 +89,17 @@ def discover(
     has.
     """
     options = options or DiscoverOptions()
-    if not folder.is_dir():
-        what = "is a file; give the folder it is in" if folder.exists() else "does not exist"
-        raise InputError(f"{folder}: {what}")
+    _check_folder(folder)
     cameras = known_cameras(options.pattern)
-    problems: list[Problem] = []
     files: list[_File] = []
-    paths = _images(folder, options.skip)
+    paths, problems = _images(folder, options.skip)
+    if not paths and problems:
+        raise problems[0].error
     if not paths:
         raise InputError(f"{folder}: no .tif, .tiff, .jpg or .jpeg file in it or below it")
     for number, path in enumerate(paths, start=1):
         try:
-            file = _examine(path, cameras, with_rgb=options.with_rgb)
+            file = _examine(path, cameras, options)
             if file.bands:
                 files.append(file)
         except UnreadableFileError as error:
@@ -113,50 +121,73 @@ def discover(
     if unknown and files:
         raise ConfigurationError(f"{folder}: no capture has a band {' or '.join(map(repr, unknown))}, as --bands asks")
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
-    captures = _with_missing_bands(_with_unique_names(captures))
+    captures = _with_missing_bands(_with_unique_names(captures, _names_of_files(captures)))
     return Flight(folder, tuple(captures), tuple(problems))
 
 
-def captures_onto(reference: Path, moving: Sequence[Path], band: str | None = None) -> list[Capture]:
+def _check_folder(folder: Path) -> None:
+    """Raises InputError for what is no folder."""
+    if folder.as_posix().startswith("/vsi"):
+        raise InputError(f"{folder}: is one of GDAL's virtual paths; mount or unpack it, and give the folder")
+    try:
+        if folder.is_dir():
+            return
+        what = "is a file; give the folder it is in" if folder.exists() else "does not exist"
+    except OSError as error:
+        what = f"cannot be looked into ({error.strerror or error})"
+    raise InputError(f"{folder}: {what}")
+
+
+def captures_onto(
+    reference: Path, moving: Sequence[Path], band: str | None = None, most_pixels: int = MOST_PIXELS
+) -> list[Capture]:
     """Georeferenced images that are to be laid on the grid of another one: of each, a capture of the reference's `band`
     (by default the green one) and of all its own bands, which share one mapping.
 
     Raises UnreadableFileError, InputError where one is not georeferenced, NoSuchBandError.
     """
-    here = _georeferenced_bands(reference)
+    here = _georeferenced_bands(reference, most_pixels)
     fixed = here[_reference_index(here, band, reference)]
     fixed = replace(fixed, name=f"{reference.stem} {fixed.name}")
     captures = []
     for path in moving:
         if path.resolve() == reference.resolve():
             raise InputError(f"{path}: is the reference itself; name the mosaics that are to be laid on it")
-        bands = [fixed, *(replace(b, one_lens=True, companion=False) for b in _georeferenced_bands(path))]
+        bands = [fixed, *(replace(b, one_lens=True, companion=False) for b in _georeferenced_bands(path, most_pixels))]
         taken_at = read_tags(path).captured_at
         captures.append(Capture(path.stem, Path(), tuple(_with_unique_band_names(bands)), 0, captured_at=taken_at))
     return _with_unique_names(captures)
 
 
-def _georeferenced_bands(path: Path) -> tuple[Band, ...]:
-    info = probe(path)
+def _georeferenced_bands(path: Path, most_pixels: int) -> tuple[Band, ...]:
+    info = probe(path, most_pixels)
     if info.georeference is None:
         raise InputError(f"{path}: has no coordinates; align images without by 'agalign FOLDER'")
     *_, generic = known_cameras(None)
     return generic.bands(path, read_tags(path), info)
 
 
-def _images(folder: Path, skip: Sequence[Path]) -> list[Path]:
+def _images(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Problem]]:
+    """(the image files below a folder, the folders that cannot be looked into)."""
     skipped = {p.resolve() for p in skip}
     found: list[Path] = []
-    for parent, folders, names in os.walk(folder):
+    problems: list[Problem] = []
+
+    def refused(error: OSError) -> None:
+        path = Path(error.filename)
+        problems.append(Problem(path, InputError(f"{path}: cannot be looked into ({error.strerror}); left out")))
+
+    for parent, folders, names in os.walk(folder, onerror=refused):
         here = Path(parent)
         folders[:] = sorted(
             d for d in folders
-            if not d.startswith(".") and (here / d).resolve() not in skipped and not _is_output(here / d)
+            if not d.startswith(".") and d not in _SYSTEMS and (here / d).resolve() not in skipped
+            and not is_output(here / d)
         )  # fmt: skip
         images = [n for n in names if Path(n).suffix.lower() in _SUFFIXES and not n.startswith(".")]
         images.sort(key=_natural)
         found.extend(here / n for n in images)
-    return found
+    return found, problems
 
 
 def _natural(name: str) -> list[tuple[bool, int, str]]:
@@ -165,20 +196,33 @@ def _natural(name: str) -> list[tuple[bool, int, str]]:
     return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part.lower()) for part in parts]
 
 
-def _is_output(folder: Path) -> bool:
-    """An earlier run's output folder lies below its input: its stacks are not captures."""
-    return (folder / "summary.csv").is_file() and (folder / "index.html").is_file()
+def is_output(folder: Path) -> bool:
+    """An earlier run's output folder lies below its input: its stacks are not captures.
+
+    A run names itself there before it writes anything else, so that one that was killed is known too.
+    """
+    try:
+        entries = {entry.name for entry in os.scandir(folder)}
+    except OSError:
+        return False
+    return RUN_FILE in entries or {"summary.csv", "index.html"} <= entries
 
 
-def _examine(path: Path, cameras: Iterable[Camera], *, with_rgb: bool) -> _File:
-    info = probe(path)
+def _examine(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> _File:
+    info = probe(path, options.most_pixels)
     tags = read_tags(path)
     # Cameras write one band a file, or photographs: a stack is someone's product, whatever make it carries on.
     *_, generic = cameras
     camera = generic if _is_stack(path, info) else next(c for c in cameras if c.recognises(tags))
     panel = panel_in(tags, (info.width_px, info.height_px))
-    bands = (replace(b, panel=panel) for b in camera.bands(path, tags, info) if with_rgb or not b.companion)
-    return _File(path, camera, tags, tuple(bands))
+    bands = (replace(b, panel=panel) for b in camera.bands(path, tags, info) if options.with_rgb or not b.companion)
+    return _File(path, camera, tags, tuple(_with_possible_values(b) for b in bands))
+
+
+def _with_possible_values(band: Band) -> Band:
+    """What damaged tags say of a band, and cannot be, is not said."""
+    possible = band.radiometry is None or is_physical(band.radiometry, band.size_px)
+    return band if possible else replace(band, radiometry=None)
 
 
 def _is_stack(path: Path, info: RasterInfo) -> bool:
@@ -198,17 +242,16 @@ def _groups(files: Iterable[_File]) -> list[list[_File]]:
         key = file.path.name if _is_whole(file) else file.camera.capture_key(file.path, file.tags)
         groups[(file.camera.name, str(file.camera.capture_folder(file.path)), key)].append(file)
     # A file whose tags are damaged lost its capture id, but not its name.
+    with_id: dict[tuple[str, ...], tuple[str, ...]] = {}
+    for group_key, group in groups.items():
+        names = {f.camera.capture_name(f.path) for f in group}
+        if len(names) == 1 and not _is_whole(group[0]) and names != {group_key[-1]}:
+            with_id.setdefault((*group_key[:-1], *names), group_key)
     for group_key in list(groups):
-        camera, folder, key = group_key
-        stray = groups[group_key]
-        if _is_whole(stray[0]) or stray[0].camera.capture_name(stray[0].path) != key:
-            continue
-        for other_key, other in groups.items():
-            same_place = other_key[:2] == (camera, folder) and other_key != group_key and not _is_whole(other[0])
-            if same_place and all(f.camera.capture_name(f.path) == key for f in other):
-                other.extend(groups.pop(group_key))
-                other.sort(key=lambda f: _natural(f.path.name))
-                break
+        home = with_id.get(group_key)
+        if home is not None and not _is_whole(groups[group_key][0]):
+            groups[home].extend(groups.pop(group_key))
+            groups[home].sort(key=lambda f: _natural(f.path.name))
     return list(groups.values())
 
 
@@ -259,7 +302,7 @@ def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capt
     camera = camera_of(tags)
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
     return Capture(
-        name=first.path.stem if len(files) == 1 else first.camera.capture_name(first.path),
+        name=(first.path.stem if len(files) == 1 else first.camera.capture_name(first.path)) or _NAMELESS,
         folder=_below(folder, first.camera.capture_folder(first.path)),
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),
@@ -306,15 +349,26 @@ def _with_unique_band_names(bands: Sequence[Band]) -> list[Band]:
     return unique
 
 
-def _with_unique_names(captures: Sequence[Capture]) -> list[Capture]:
-    """Two captures of one folder must not write the same file: the later one gets a number."""
-    taken: set[str] = set()
+def _names_of_files(captures: Sequence[Capture]) -> dict[str, str]:
+    """{file below the output folder that a layout of single bands may write, without suffix: its capture's label}."""
+    return {
+        (c.folder / b.path.stem).as_posix().lower(): c.label
+        for c in captures if len({b.path for b in c.bands}) > 1 for b in c.bands
+    }  # fmt: skip
+
+
+def _with_unique_names(captures: Sequence[Capture], files: Mapping[str, str] = MappingProxyType({})) -> list[Capture]:
+    """Two captures of one folder must not write the same file, neither their own nor a band's of the other, nor one of
+    the run's: the later one gets a number.
+    """
+    taken = set(_NAMES_OF_THE_RUN)
+    counts: Counter[str] = Counter()
     unique = []
     for capture in captures:
-        count, given = 1, capture
-        while given.label.lower() in taken:
-            count += 1
-            given = replace(capture, name=f"{capture.name}-{count}")
+        given = capture
+        while given.label.lower() in taken or files.get(given.label.lower(), capture.label) != capture.label:
+            counts[capture.label.lower()] += 1
+            given = replace(capture, name=f"{capture.name}-{counts[capture.label.lower()] + 1}")
         taken.add(given.label.lower())
         unique.append(given)
     return unique

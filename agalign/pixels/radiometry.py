@@ -19,6 +19,36 @@ from agalign.values.capture import Capture, Quantity, Radiometry
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage
 
+_MOST_FALLOFF = 1000.0
+_MOST_LOG_FALLOFF = np.log(_MOST_FALLOFF)
+_MOST_RAW = 65535.0
+_MOST_VALUE = 1e12
+"""Float32 holds more; no light does."""
+
+
+def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
+    """True where a calibration is one that an image of (width, height) can have: finite, of a gain above nothing, and
+    darkening neither its corners nor its last row beyond a thousandfold. Damaged tags give others.
+    """
+    factor, _ = radiometry.by_sun or (1.0, None)
+    numbers = (
+        radiometry.black_level, radiometry.full_scale, radiometry.gain, factor, radiometry.row_gradient,
+        *radiometry.vignetting, *radiometry.vignetting_centre_px,
+    )  # fmt: skip
+    if not np.isfinite(numbers).all() or min(radiometry.gain, radiometry.full_scale, factor) <= 0:
+        return False
+    width, height = size_px
+    cx, cy = radiometry.vignetting_centre_px
+    r = np.linspace(0.0, max(np.hypot(x - cx, y - cy) for x in (0, width) for y in (0, height)), 32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        falloff = np.polynomial.polynomial.polyval(r, (1.0, *radiometry.vignetting))
+        along = 1.0 + radiometry.row_gradient * np.array([0.0, height])
+        largest = radiometry.gain / radiometry.full_scale * factor * _MOST_RAW
+    return bool(
+        (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < _MOST_LOG_FALLOFF).all()
+        and (along > 1 / _MOST_FALLOFF).all() and largest < _MOST_VALUE
+    )  # fmt: skip
+
 
 def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, float]) -> Capture:
     """The capture with, of every band, what turns its numbers into what was chosen; None where it cannot be had.

@@ -8,6 +8,8 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from agalign.errors import OutputError
 
+RUN_FILE = "agalign-run.json"
+"""What a run is, in its output folder: there before anything else is, so that the folder is known by it."""
 _PARTIAL = ".agalign-part-"
 
 
