@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from agalign.values.choices import (
+    MOST_RNG_SEED,
     Compression,
     Crop,
     FamilyChoice,
@@ -116,7 +117,7 @@ class JointSettings(Stage):
     sharing: Sharing = "pseudo-siamese"
     model_family: FamilyChoice = "auto"
     device: str = "auto"
-    rng_seed: Annotated[int, Field(ge=0)] = 0
+    rng_seed: Annotated[int, Field(ge=0, le=MOST_RNG_SEED)] = 0
     fast: FastRecipe = FastRecipe()
     paper: PaperRecipe = PaperRecipe()
     longest_side_px: Positive = 4096

@@ -49,7 +49,3 @@ class SidecarError(InputError):
 
 class OutputError(AgalignError):
     """A result cannot be written (no permission, disk full, a folder where a file should be)."""
-
-
-class WorkerError(AgalignError):
-    """A worker process ended without saying why."""

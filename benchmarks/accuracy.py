@@ -15,11 +15,13 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 
+from agalign.products.sidecar import find_sidecars
+
 
 def medians_and_seconds(out: Path, truth: dict[str, list[list[float]]]) -> list[tuple[str, float, float, float]]:
     """(status, median error px, 95 % error px, seconds) of each pair that has ties."""
     rows = []
-    for path in sorted(out.rglob("*.json")):
+    for path in find_sidecars(out):
         for band in json.loads(path.read_text())["bands"]:
             if band["file"] not in truth or band["status"] == "reference":
                 continue

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 
+from agalign.products.sidecar import find_sidecars
 from agalign.synthetic import make_flight
 from agalign.synthetic.troubles import make_troubled_flight, make_two_headings
 
@@ -33,7 +34,7 @@ def align(flight: Path, out: Path) -> float:
 def rows(out: Path, truth: dict) -> list[tuple[str, str, str, float, float]]:
     """(trouble, capture and band, status, median error, error bar) of every moving band that was written."""
     found = []
-    for path in sorted(out.rglob("*.json")):
+    for path in find_sidecars(out):
         sidecar = json.loads(path.read_text())
         known = truth.get(sidecar.get("capture"))
         for band in sidecar["bands"] if known else ():

@@ -19,6 +19,8 @@ import numpy as np
 import rasterio
 from scipy.interpolate import CloughTocher2DInterpolator
 
+from agalign.products.sidecar import find_sidecars
+
 Row = tuple[str, str, str, float, float]
 
 
@@ -42,7 +44,7 @@ def align(flight: Path, out: Path) -> None:
 def rows(out: Path, truth: dict, kind: str, lost: set[str]) -> list[Row]:
     """(kind, band, status, error, error bar) of each lost file."""
     found = []
-    for path in sorted(out.rglob("*.json")):
+    for path in find_sidecars(out):
         for band in json.loads(path.read_text())["bands"]:
             if band["file"] not in lost or band["file"] not in truth:
                 continue

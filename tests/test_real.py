@@ -19,6 +19,7 @@ from agalign.config import LocalSettings, SeedSettings, Settings
 from agalign.flight.panels import read_panel, with_panels
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, probe
+from agalign.products.sidecar import find_sidecars
 from agalign.values import geometry
 
 pytestmark = pytest.mark.real
@@ -28,7 +29,7 @@ def pair_medians(out: Path, ties_path: Path) -> dict[str, float]:
     """Median tie error of each pair that was delivered as aligned, by moving file."""
     truth = {f: e for c in json.loads(ties_path.read_text()).values() for f, e in c["bands"].items()}
     medians = {}
-    for path in out.rglob("*.json"):
+    for path in find_sidecars(out):
         for band in json.loads(path.read_text())["bands"]:
             if band["status"] != "aligned" or band["file"] not in truth:
                 continue

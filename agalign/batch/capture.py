@@ -16,9 +16,9 @@ from agalign.products.pan_sharpen import need_panchromatic, write_pan_sharpened
 from agalign.products.picture import write_picture
 from agalign.products.sidecar import Sidecar, read_sidecar, write_sidecar
 from agalign.products.stac import write_item
-from agalign.products.write import write_capture
+from agalign.products.write import band_file_names, write_capture
 from agalign.values.capture import Capture
-from agalign.values.choices import RadiometryChoice
+from agalign.values.choices import Layout, RadiometryChoice
 
 
 def quiet(*_: object) -> None:
@@ -31,6 +31,8 @@ class CaptureOutcome:
 
     sidecar: Sidecar
     path: Path
+    shortcomings: tuple[str, ...] = ()
+    """What was not written though the capture is done, and why."""
 
 
 def output_paths(capture: Capture, out: Path) -> tuple[Path, Path]:
@@ -71,15 +73,18 @@ def process_capture(
     picture = stack_path.with_suffix(".png")
     discard_outputs(stack_path, sidecar_path)
     written = None
+    shortcomings: tuple[str, ...] = ()
     if usable:
         layers, grid = lay_out(capture, {b.name: alignments[b.name] for b in usable}, settings.write, rig)
         written = write_capture(capture, layers, grid, stack_path, settings.write)
         if settings.write.pan_sharpen:
             of_bands = {b.name: alignments[b.name] for b in usable}
             write_pan_sharpened(capture, of_bands, pan_sharpened_path(stack_path), settings.write, rig)
-        # The picture is a convenience: a full disk must not cost the sidecar.
-        with suppress(AgalignError):
+        try:
             write_picture(capture, written.places, grid, usable, picture)
+        except AgalignError as error:
+            # The picture is a convenience: it must not cost the sidecar.
+            shortcomings = (str(error),)
         if settings.write.error_map:
             write_error_map(capture, {b.name: alignments[b.name] for b in usable}, grid, error_map_path(stack_path))
         if settings.write.stac:
@@ -88,7 +93,20 @@ def process_capture(
             write_item(capture, written, sidecar_path, settings.write, beside)
     sidecar = sidecar_of(capture, alignments, written, settings)
     write_sidecar(sidecar_path, sidecar)
-    return CaptureOutcome(sidecar, sidecar_path)
+    return CaptureOutcome(sidecar, sidecar_path, shortcomings)
+
+
+def paths_written(capture: Capture, out: Path, layout: Layout) -> list[Path]:
+    """Everything that may be written of a capture."""
+    stack, sidecar = output_paths(capture, out)
+    bands = () if layout == "stack" else dict.fromkeys(band_file_names(capture).values())
+    return [*_beside(stack, sidecar), *(stack.parent / name for name in bands)]
+
+
+def _beside(stack: Path, sidecar: Path) -> list[Path]:
+    """Every file of a capture but those of single bands."""
+    picture, item = stack.with_suffix(".png"), stack.with_suffix(".stac.json")
+    return [sidecar, stack, picture, item, error_map_path(stack), pan_sharpened_path(stack)]
 
 
 def discard_outputs(stack: Path, sidecar: Path) -> None:
@@ -97,17 +115,13 @@ def discard_outputs(stack: Path, sidecar: Path) -> None:
 
     What cannot be removed is written over, or told by the writing that fails.
     """
-    old = [sidecar, stack, stack.with_suffix(".png"), stack.with_suffix(".stac.json"), error_map_path(stack)]
-    old.append(pan_sharpened_path(stack))
+    old = _beside(stack, sidecar)
     with suppress(SidecarError):
         output = read_sidecar(sidecar).output
         old += [sidecar.parent / part.file for part in output.band_files] if output else []
-    folder = sidecar.parent.resolve()
     for path in old:
         with suppress(OSError):
-            # A sidecar is a file like any other: what it names beyond its folder is not ours to remove.
-            if path.parent.resolve().is_relative_to(folder):
-                path.unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
 
 
 _WHY_NOT: Mapping[RadiometryChoice, str] = {

@@ -1,26 +1,29 @@
 """Many captures: which are still to be done, what their flight learns first, and each one done."""
 
 import os
+import stat
+import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
-from agalign.batch.capture import discard_outputs, output_paths, quiet
+from agalign.batch.capture import discard_outputs, output_paths, paths_written, quiet
 from agalign.batch.learn import learn_flight, learning_fingerprint
+from agalign.batch.output_folder import held, is_full
 from agalign.batch.workers import (
     MOST_HANDED_OVER,
     CaptureReport,
+    Submit,
     Task,
     do_capture,
+    done_by,
     loaded_model,
-    on_executor,
+    own_processes,
     read_ahead,
     stamp,
-    start_worker,
-    threads_of_children,
-    worker_context,
 )
 from agalign.cameras.discover import Flight
 from agalign.capture.align import PairProgress
@@ -34,9 +37,9 @@ from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.panels import write_panels
+from agalign.products.run_record import ProblemPart, RunState, Tally, write_run_record
 from agalign.products.sidecar import Sidecar, read_sidecar
 from agalign.products.stac import write_collections
-from agalign.products.write import band_file_names
 from agalign.values.capture import Capture
 from agalign.values.choices import Layout
 
@@ -46,26 +49,19 @@ MOST_THREADS = 4
 """Of one process: more wait for the interpreter."""
 
 
-def prepare_output(out: Path) -> None:
-    """Make the output folder. Raises OutputError where it cannot be made or written to."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        if not os.access(out, os.W_OK):
-            raise OutputError(f"{out}: no permission to write there; choose another folder with -o")
-    except FileExistsError:
-        raise OutputError(f"{out}: is a file; choose another folder with -o") from None
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be made ({error.strerror or error})") from None
-
-
 @dataclass(frozen=True)
 class RunOptions:
     """How a run goes about it: nothing here changes a capture's result."""
 
     overwrite: bool = False
     """Do captures again that an earlier run finished."""
+    retry_failed: bool = False
+    """Do those of them again in which a band is not aligned, or missing."""
     jobs: int = 1
     """Captures at a time, each in a process of its own, or a thread where they are few; 0 is one a core."""
+    timeout_s: float | None = None
+    """After which a capture is given up; it has a process then, whose end ends whatever it hangs in. Not for an
+    `executor`, which has its own (`dask_executor`)."""
     align_panels: bool = False
     """Captures of calibration panels are aligned like any other."""
     executor: Executor | None = None
@@ -81,6 +77,8 @@ class Listener:
     """Of captures in this process only."""
     on_learning: Callable[[str, float], None] = quiet
     """The camera whose network is learnt, and the share that is behind."""
+    on_learnt: Callable[[str, float], None] = quiet
+    """The camera whose network was learnt, and the seconds that it took."""
 
 
 def run_flight(
@@ -90,16 +88,61 @@ def run_flight(
     """Align the captures, yielding each as it is done; those done before are kept.
 
     A network is learnt for every camera and flight first and saved below OUT/models; `model` is one to start from.
-    One capture's failure never stops the others, and no result depends on the order in which they are done.
-    Raises OutputError where the output folder cannot be used, InputError or ConfigurationError for `model`.
+    One capture's failure never stops the others, and no result depends on the order in which they are done. What the
+    run was is told by OUT/agalign-run.json.
+    Raises OutputError where the output folder cannot be used, another run writes there or the disk is full, InputError
+    or ConfigurationError for `model`.
     """
     options, listener = options or RunOptions(), listener or Listener()
-    prepare_output(out)
-    _refuse_to_overwrite_inputs(flight, out, settings.write.layout)
+    _refuse_to_overwrite(flight, out, settings.write.layout)
     known = None if model is None else _given_model(model, flight, settings)
     if known is not None:
         used = settings.flight.model_copy(update={"start": known.fingerprint})
         settings = settings.model_copy(update={"flight": used})
+    with held(out), _recorded(flight, out, settings) as tally:
+        for report in _reports(flight, out, settings, options, _with_seconds(listener, tally), known):
+            tally.add(report.label, report.state, report.sidecar, report.problems)
+            if report.state == "done":
+                tally.capture_seconds[report.label] = report.seconds
+            for (_, stage), seconds in report.stages.items():
+                tally.stage_seconds[stage] += seconds
+            yield report
+            if report.problems and is_full(out):
+                raise OutputError(f"{out}: the disk is full; make room, and the same command goes on from here")
+
+
+@contextmanager
+def _recorded(flight: Flight, out: Path, settings: Settings) -> Iterator[Tally]:
+    """A tally that is written at the beginning and at the end of a run, however it ends."""
+    tally, began = Tally(), time.monotonic()
+    tally.captures["found"] = len(flight.captures)
+    tally.problems += [ProblemPart(of=str(p.path), problem=p.text) for p in flight.problems]
+    started_at = datetime.now(UTC).isoformat(timespec="seconds")
+
+    def write(state: RunState) -> None:
+        write_run_record(out, flight.folder, settings, tally, state, started_at, time.monotonic() - began)
+
+    write("running")
+    try:
+        yield tally
+    except BaseException:
+        with suppress(OutputError):
+            write("interrupted")
+        raise
+    write("finished")
+
+
+def _with_seconds(listener: Listener, tally: Tally) -> Listener:
+    def on_learnt(camera: str, seconds: float) -> None:
+        tally.stage_seconds["learning a flight"] += seconds
+        listener.on_learnt(camera, seconds)
+
+    return replace(listener, on_learnt=on_learnt)
+
+
+def _reports(
+    flight: Flight, out: Path, settings: Settings, options: RunOptions, listener: Listener, known: FlightModel | None
+) -> Iterator[CaptureReport]:
     panels, captures = _panels(flight.captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
         discard_outputs(*output_paths(reading.capture, out))
@@ -112,22 +155,22 @@ def run_flight(
             capture = with_radiometry(raw, settings.write.radiometry, factors_for(raw, panels))
             capture = with_height(capture, panels)
             earlier = None if options.overwrite else finished_before(capture, out, settings)
-            if earlier is None:
+            if earlier is None or (options.retry_failed and earlier.status != "ok"):
                 mine.append(capture)
             else:
                 yield CaptureReport(capture.label, "kept", earlier)
         if mine:
             left.append((group, name, mine))
-    with _executor(sum(len(mine) for _, _, mine in left), options, settings) as (executor, most):
+    with _workers(sum(len(mine) for _, _, mine in left), options, settings) as (submit, most):
         waiting: list[Task] = []
         for whole, name, mine in left:
             at_once = min(MOST_THREADS, _cores(options, settings))
             path = _learn(whole, out / "models" / name, settings, listener, known, at_once)
             waiting += [Task(c, out, settings, path) for c in mine]
-        if executor is None:
+        if submit is None:
             yield from _one_by_one(waiting, listener)
         else:
-            yield from on_executor([t.absolute() for t in waiting], executor, most)
+            yield from done_by(submit, [t.absolute() for t in waiting], most, options.timeout_s)
     if settings.write.stac:
         write_collections(captures, out)
 
@@ -155,33 +198,27 @@ def _one_by_one(tasks: Sequence[Task], listener: Listener) -> Iterator[CaptureRe
 
 
 @contextmanager
-def _executor(captures: int, options: RunOptions, settings: Settings) -> Iterator[tuple[Executor | None, int]]:
+def _workers(captures: int, options: RunOptions, settings: Settings) -> Iterator[tuple[Submit | None, int]]:
     """(what does so many captures at a time, how many it is handed); None where they are done one by one.
 
     Processes of our own load what they need while the flight is learnt; few captures are done by threads instead.
     """
     if options.executor is not None:
-        yield options.executor, MOST_HANDED_OVER
+        executor = options.executor
+        yield lambda task: executor.submit(do_capture, task), MOST_HANDED_OVER
         return
-    cores = _cores(options, settings)
-    jobs = min(cores, captures // _CAPTURES_WORTH_A_PROCESS)
-    if jobs <= 1:
-        threads = min(cores, captures, MOST_THREADS)
-        if threads <= 1:
-            yield None, 0
-            return
-        with without_warnings(), ThreadPoolExecutor(threads) as few:
-            yield few, threads
+    cores, must_end = _cores(options, settings), options.timeout_s is not None
+    processes = min(cores, captures if must_end else captures // _CAPTURES_WORTH_A_PROCESS)
+    if processes > 1 or (processes and must_end):
+        with own_processes(processes, options.timeout_s) as submit:
+            yield submit, 2 * processes
         return
-    threads = max(1, (os.cpu_count() or 1) // jobs)
-    with (
-        threads_of_children(threads),
-        ProcessPoolExecutor(jobs, worker_context(), start_worker, (threads,)) as pool,
-        ThreadPoolExecutor(1) as meanwhile,
-    ):
-        for _ in range(jobs):
-            meanwhile.submit(pool.submit, quiet)
-        yield pool, 2 * jobs
+    threads = min(cores, captures, MOST_THREADS)
+    if threads <= 1:
+        yield None, 0
+        return
+    with without_warnings(), ThreadPoolExecutor(threads) as few:
+        yield lambda task: few.submit(do_capture, task), threads
 
 
 def _cores(options: RunOptions, settings: Settings) -> int:
@@ -220,32 +257,38 @@ def _learn(
     def progress(_stage: str, share: float) -> None:
         listener.on_learning(path.stem, share)
 
+    began = time.monotonic()
     model = learn_flight(captures, settings, progress, start, at_once)
+    listener.on_learnt(path.stem, time.monotonic() - began)
     if model is None:
         return None
     save_model(model, path)
     return path
 
 
-def _refuse_to_overwrite_inputs(flight: Flight, out: Path, layout: Layout) -> None:
+def _refuse_to_overwrite(flight: Flight, out: Path, layout: Layout) -> None:
+    """Neither an input nor what another capture writes. Raises ConfigurationError."""
     if out.resolve() == flight.folder.resolve():
         raise ConfigurationError(f"{out}: is the folder of the images; choose another output folder with -o")
     sources = {band.path.resolve() for capture in flight.captures for band in capture.bands}
+    there: dict[Path, Path] = {}
+    written: dict[str, Capture] = {}
     for capture in flight.captures:
-        stack, _ = output_paths(capture, out)
-        written = (
-            [stack] if layout == "stack" else [stack, *(stack.parent / n for n in band_file_names(capture).values())]
-        )
-        for path in written:
-            if path.resolve() in sources:
+        for path in paths_written(capture, out, layout):
+            if path.parent not in there:
+                there[path.parent] = path.parent.resolve()
+            if there[path.parent] / path.name in sources:
                 raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder with -o")
+            other = written.setdefault(str(path).lower(), capture)
+            if other is not capture:
+                raise ConfigurationError(
+                    f"{path}: would be written of {other.label} and of {capture.label}; rename one's files"
+                )
 
 
 def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar | None:
     """The sidecar of an earlier run with the same settings and bands whose outputs are still there."""
     stack, path = output_paths(capture, out)
-    if not path.is_file():
-        return None
     try:
         sidecar = read_sidecar(path)
     except SidecarError:
@@ -261,4 +304,8 @@ def _outputs_are_there(sidecar: Sidecar, folder: Path, stack: Path) -> bool:
         return not stack.is_file()
     files = [(f.file, f.bytes) for f in output.band_files]
     files += [] if output.file is None or output.bytes is None else [(output.file, output.bytes)]
-    return all((folder / name).is_file() and (folder / name).stat().st_size == size for name, size in files)
+    try:
+        states = [((folder / name).stat(), size) for name, size in files]
+    except OSError:
+        return False
+    return all(stat.S_ISREG(state.st_mode) and state.st_size == size for state, size in states)

@@ -3,23 +3,26 @@
 import logging
 import os
 import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
-from multiprocessing import get_all_start_methods, get_context
+from multiprocessing import get_all_start_methods, get_context, parent_process
 from multiprocessing.context import BaseContext
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
+from pebble import ProcessExpired, ProcessPool
 
 from agalign.batch.capture import process_capture, quiet
+from agalign.batch.stages import StageClock
 from agalign.capture.align import PairProgress
 from agalign.config import Settings
-from agalign.errors import AgalignError, ConfigurationError, WorkerError
+from agalign.errors import AgalignError, ConfigurationError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
 from agalign.products.sidecar import Sidecar
@@ -29,6 +32,8 @@ _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, 
 _LOG = logging.getLogger(__name__)
 _MOST_READ_AHEAD_BYTES = 64 << 20
 _DASK_ANSWERS_WITHIN_S = 10
+_GIVEN_UP_EXIT_CODE = 75
+_OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
 MOST_HANDED_OVER = 1000
 """Captures that wait in an executor at a time: enough for any cluster, and little memory."""
 
@@ -46,6 +51,12 @@ class CaptureReport:
     error: str | None = None
     panel: str | None = None
     """What the calibration panel is, in words."""
+    shortcomings: tuple[str, ...] = ()
+    """What was not written though the capture is done, and why."""
+    seconds: float = 0.0
+    """What it took in this run."""
+    stages: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    """The same by (band, stage)."""
 
     def without_tables(self) -> "CaptureReport":
         """The same without the sidecar's long tables: a thousand of these are kept until a run ends."""
@@ -60,9 +71,15 @@ class CaptureReport:
     @property
     def good(self) -> bool:
         """True where nothing is left to be wished for: every band pair of the capture is aligned, or predicted well
-        enough, and none is missing.
+        enough, none is missing, and all is written.
         """
-        return self.state == "panel" or (self.sidecar is not None and self.sidecar.status == "ok")
+        done = self.sidecar is not None and self.sidecar.status == "ok" and not self.shortcomings
+        return self.state == "panel" or done
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What went wrong, but for bands that are not aligned, which the sidecar has."""
+        return self.shortcomings if self.error is None else (self.error, *self.shortcomings)
 
     @property
     def useful(self) -> bool:
@@ -86,84 +103,186 @@ class Task:
         return replace(self, capture=replace(self.capture, bands=bands), out=self.out.absolute(), model=model)
 
 
+Submit = Callable[[Task], "Future[CaptureReport]"]
+
+
 def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     """Do one capture; what can go wrong with it is in the report."""
-    label = task.capture.label
+    label, clock = task.capture.label, StageClock(on_pair)
     keep_freed_memory()
     try:
         device = task.settings.joint.device
         model = None if task.model is None else loaded_model(task.model, device, stamp(task.model))
-        # Where memory is short, the captures that follow would fare no better.
         with one_thread(), one_memory_error():
-            outcome = process_capture(task.capture, task.out, task.settings, on_pair, model)
+            outcome = process_capture(task.capture, task.out, task.settings, clock, model)
     except AgalignError as error:
-        return CaptureReport(label, "error", None, str(error))
+        problem = str(error)
+    except MemoryError:
+        problem = _OUT_OF_MEMORY
     except _FAULTS as error:
         # A fault of this program: it must not cost the captures that follow.
-        problem = f"{label}: agalign failed on it ({type(error).__name__}: {error}); please report this"
-        _LOG.debug(problem, exc_info=True)
-        return CaptureReport(label, "error", None, problem)
-    return CaptureReport(label, "done", outcome.sidecar)
+        problem = f"agalign failed on it ({type(error).__name__}: {error}); please report this"
+        _LOG.debug("%s: %s", label, problem, exc_info=True)
+    else:
+        return CaptureReport(
+            label, "done", outcome.sidecar, shortcomings=outcome.shortcomings, seconds=clock.seconds,
+            stages=clock.stages(),
+        )  # fmt: skip
+    return CaptureReport(label, "error", None, problem, seconds=clock.seconds, stages=clock.stages())
 
 
-def on_executor(tasks: Sequence[Task], executor: Executor, most: int) -> Iterator[CaptureReport]:
+def done_by(
+    submit: Submit, tasks: Sequence[Task], most: int, timeout_s: float | None = None
+) -> Iterator[CaptureReport]:
     """Never more than `most` handed over at a time, so that a season's captures do not wait in memory."""
     futures: dict[Future[CaptureReport], Task] = {}
     remaining = iter(tasks)
     try:
         for task in islice(remaining, most):
-            futures[executor.submit(do_capture, task)] = task
+            futures[submit(task)] = task
         while futures:
             done, _ = wait(futures, return_when=FIRST_COMPLETED)
             for future in done:
                 task = futures.pop(future)
-                yield _report_of(future, task)
+                yield _report_of(future, task, timeout_s)
                 for following in islice(remaining, 1):
-                    futures[executor.submit(do_capture, following)] = following
-    except BrokenExecutor:
-        raise WorkerError("a worker process ended without a word (out of memory?); try again with --jobs 1") from None
+                    futures[submit(following)] = following
     finally:
         for future in futures:
             future.cancel()
 
 
-def _report_of(future: "Future[CaptureReport]", task: Task) -> CaptureReport:
+def _report_of(future: "Future[CaptureReport]", task: Task, timeout_s: float | None) -> CaptureReport:
+    label = task.capture.label
     try:
         return future.result()
-    except BrokenExecutor:
-        raise
+    except TimeoutError:
+        problem = f"given up after {timeout_s:g} s, as --timeout asks"
+    except ProcessExpired as error:
+        how = f"signal {-error.exitcode}" if error.exitcode < 0 else f"exit code {error.exitcode}"
+        problem = f"its worker process was killed ({how}; out of memory?); run again to do what is left"
     except MemoryError:
-        return CaptureReport(task.capture.label, "error", None, f"{task.capture.label}: out of memory")
+        problem = _OUT_OF_MEMORY
     except Exception as error:
         lost = isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed"
         if not lost:
             raise
-        problem = f"{task.capture.label}: the cluster lost it ({error}); run again to do what is left"
-        return CaptureReport(task.capture.label, "error", None, problem)
+        said = next(iter(str(error).splitlines()), type(error).__name__)
+        problem = f"the cluster lost it ({said}); run again to do what is left"
+    return CaptureReport(label, "error", None, problem)
 
 
 @contextmanager
-def dask_executor(address: str) -> Iterator[Executor]:
+def own_processes(jobs: int, timeout_s: float | None) -> Iterator[Submit]:
+    """So many processes of our own. One that is killed costs the capture that it was doing, and so does one that takes
+    longer than the timeout; another takes its place.
+
+    They load what they need while the caller does something else.
+    """
+    threads = max(1, (os.cpu_count() or 1) // jobs)
+    with threads_of_children(threads), ThreadPoolExecutor(1) as meanwhile:
+        pool = ProcessPool(jobs, context=worker_context(), initializer=start_worker, initargs=(threads,))
+
+        def start() -> None:
+            with _without_interrupt_key():
+                for _ in range(jobs):
+                    pool.schedule(quiet)
+
+        started = meanwhile.submit(start)
+
+        def submit(task: Task) -> "Future[CaptureReport]":
+            started.result()
+            found: Future[CaptureReport] = pool.schedule(do_capture, args=(task,), timeout=timeout_s)
+            return found
+
+        try:
+            yield submit
+            pool.close()
+        except BaseException:
+            pool.stop()
+            raise
+        finally:
+            with suppress(Exception):
+                started.result()
+            pool.join()
+
+
+@contextmanager
+def _without_interrupt_key() -> Iterator[None]:
+    """The interrupt key is for the main process; processes started here, and theirs, inherit not to hear it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+LOCAL = "local"
+"""In place of a scheduler's address: a cluster of worker processes on this machine."""
+
+
+@contextmanager
+def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -> Iterator[Executor]:
     """The workers of a Dask cluster as an executor. Each needs this package and sees the same folders.
 
-    `address` is a scheduler's, such as tcp://host:8786. Raises ConfigurationError where Dask is not installed or the
-    scheduler does not answer.
+    `address` is a scheduler's, such as tcp://host:8786, or `local` for so many worker processes here, 0 being one a
+    core. What a lost worker was doing is done by another. A capture that takes longer than the timeout ends its worker,
+    which its nanny replaces; the scheduler tries it on other workers, as often as its setting `allowed-failures` has
+    it, before it is given up. Raises ConfigurationError where Dask is not installed or the scheduler does not answer.
     """
     try:
-        from distributed import Client
+        from distributed import Client, LocalCluster
     except ImportError:
         raise ConfigurationError("Dask is not installed; pip install 'agalign[dask]'") from None
+    with ExitStack() as stack:
+        try:
+            if address == LOCAL:
+                cluster = LocalCluster(
+                    n_workers=jobs or os.cpu_count() or 1, threads_per_worker=1, processes=True, dashboard_address=None
+                )
+                address = stack.enter_context(cluster).scheduler_address
+            client = Client(address, set_as_default=False, timeout=_DASK_ANSWERS_WITHIN_S)
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(f"no Dask scheduler answers at {address} ({error})") from None
+        yield _OnDask(stack.enter_context(client).get_executor(pure=False), timeout_s)
+
+
+class _OnDask(Executor):
+    """Dask's executor, whose tasks end their worker where they take too long."""
+
+    def __init__(self, executor: Executor, timeout_s: float | None) -> None:
+        self._executor, self._timeout_s = executor, timeout_s
+
+    def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
+        return self._executor.submit(_within, self._timeout_s, function, *arguments, **named)
+
+
+def _within(timeout_s: float | None, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """What hangs in a library hears nothing: only the end of its process ends it."""
+    if timeout_s is None:
+        return function(*arguments, **named)
+    alarm = threading.Timer(timeout_s, os._exit, (_GIVEN_UP_EXIT_CODE,))
+    alarm.start()
     try:
-        client = Client(address, set_as_default=False, timeout=_DASK_ANSWERS_WITHIN_S)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"no Dask scheduler answers at {address} ({error})") from None
-    with client:
-        yield client.get_executor(pure=False)
+        return function(*arguments, **named)
+    finally:
+        alarm.cancel()
 
 
 def start_worker(threads: int) -> None:
-    """The interrupt key is for the main process, which lets the workers finish what they have begun."""
+    """A worker process does not outlive the one that started it, however that ended: nobody would tell it to stop."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    if parent is not None:
+
+        def follow() -> None:
+            parent.join()
+            os._exit(1)
+
+        threading.Thread(target=follow, daemon=True).start()
     limit_threads(threads)
 
 

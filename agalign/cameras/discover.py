@@ -15,9 +15,9 @@ from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
 from agalign.errors import AgalignError, ConfigurationError, InputError, NoSuchBandError, UnreadableFileError
 from agalign.pixels.radiometry import is_physical
-from agalign.pixels.raster import JPEG_SUFFIXES, MOST_PIXELS, TIFF_SUFFIXES, RasterInfo, probe
+from agalign.pixels.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, RasterInfo, probe
 from agalign.values.capture import Band, CameraIdentity, Capture
-from agalign.values.choices import BandOrder
+from agalign.values.choices import MOST_MOSAIC_PIXELS, MOST_PIXELS, BandOrder
 from agalign.values.files import RUN_FILE
 
 
@@ -139,7 +139,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def captures_onto(
-    reference: Path, moving: Sequence[Path], band: str | None = None, most_pixels: int = MOST_PIXELS
+    reference: Path, moving: Sequence[Path], band: str | None = None, most_pixels: int = MOST_MOSAIC_PIXELS
 ) -> list[Capture]:
     """Georeferenced images that are to be laid on the grid of another one: of each, a capture of the reference's `band`
     (by default the green one) and of all its own bands, which share one mapping.

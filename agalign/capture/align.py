@@ -39,7 +39,7 @@ def align_capture_bands(
     aligned = align_pairs(pairs, settings, progress, model, capture)
     if model is not None and model.rig is not None and not settings.seed.only:
         aligned = with_predictions(pairs, aligned, model.rig, capture, settings.check)
-    aligned = _measured(pairs, aligned)
+    aligned = _measured(pairs, aligned, progress)
     found: dict[str, Alignment] = {}
     for band in capture.bands_of_the_references_lens:
         unmoved = Seed("identity", geometry.identity(), 0.0)
@@ -72,10 +72,11 @@ def judge_together(
         yield pair.name, judged(pair, seed, result, settings, look)
 
 
-def _measured(pairs: Sequence[BandPair], found: dict[str, Alignment]) -> dict[str, Alignment]:
+def _measured(pairs: Sequence[BandPair], found: dict[str, Alignment], progress: PairProgress) -> dict[str, Alignment]:
     """With metrics, whose time is the pair's too."""
     watch, measured = _Watch(), {}
     for pair in pairs:
+        progress(pair.name, "measuring", 0.0)
         measured[pair.name] = with_metrics(found[pair.name], pair)
         watch.lap([pair.name])
     return watch.added_to(measured)
@@ -111,9 +112,10 @@ def align_pairs(
     def attempt(some: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
         results = _results(some, sides, align, progress)
         watch.lap([pair.name for pair, _ in some])
-        for name, alignment in judge_together(some, results, model, settings):
-            found[name] = alignment
-            progress(name, "checking", 0.0)
+        judged_ones = judge_together(some, results, model, settings)
+        for pair, _ in some:
+            progress(pair.name, "checking", 0.0)
+            name, found[name] = next(judged_ones)
             watch.lap([name])
 
     if model is not None and settings.joint.recipe == "fast":

@@ -1,21 +1,31 @@
 """The command that aligns a folder, and what `demo` shares with it."""
 
-import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
-from agalign.errors import ConfigurationError, NoSuchBandError
+from agalign.cli.terminal import (
+    EXIT_NOTHING,
+    EXIT_OK,
+    EXIT_PARTIAL,
+    LogJson,
+    Quiet,
+    RngSeed,
+    Verbose,
+    Voice,
+    exits,
+    shown,
+)
+from agalign.errors import ConfigurationError, NoSuchBandError, OutputError
 from agalign.values.choices import (
+    MOST_PIXELS,
     BandOrder,
     Compression,
     Crop,
@@ -58,7 +68,10 @@ Jobs = Annotated[
 ]
 Dask = Annotated[
     str | None,
-    typer.Option(help="Scheduler of a Dask cluster that does the captures, tcp://host:8786; it sees the same folders."),
+    typer.Option(
+        help="Scheduler of a Dask cluster that does the captures, tcp://host:8786; it sees the same folders. "
+        "'local' starts worker processes here."
+    ),
 ]
 IgnoreMetadata = Annotated[bool, typer.Option("--ignore-metadata", help="Use no lens or rig tags.")]
 BandNames = Annotated[
@@ -161,9 +174,7 @@ def align(
         Compression, typer.Option(help="Lossless; auto is zstd for stacks and deflate for single bands.")
     ] = "auto",
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
-    rng_seed: Annotated[
-        int, typer.Option(min=0, help="Seed of all random numbers; the same seed gives the same result.")
-    ] = 0,
+    rng_seed: RngSeed = 0,
     jobs: Jobs = 0,
     dask: Dask = None,
     model: Annotated[
@@ -175,6 +186,15 @@ def align(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Do captures again that an earlier run finished.")
     ] = False,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Do those of them again in which a band is not aligned, or missing.")
+    ] = False,
+    timeout: Annotated[
+        float | None, typer.Option(min=1, help="Seconds after which a capture is given up; by default never.")
+    ] = None,
+    max_pixels: Annotated[
+        int, typer.Option(min=1, help="Images that declare more are refused before anything is read.")
+    ] = MOST_PIXELS,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
@@ -195,7 +215,8 @@ def align(
         )
         from agalign.products.stac import need_stac
 
-        target = out or folder.absolute().parent / f"{folder.absolute().name}-aligned"
+        whole = folder.resolve()
+        target = out or whole.parent / f"{whole.name}-aligned"
         settings = Settings(
             seed=SeedSettings(force=None if seed == "auto" else seed, only=only_seed),
             joint=JointSettings(
@@ -212,14 +233,14 @@ def align(
             ),
         )  # fmt: skip
         options = DiscoverOptions(
-            pattern, reference, ignore_metadata, with_rgb, band_names(bands), order, skip=(target,)
+            pattern, reference, ignore_metadata, with_rgb, band_names(bands), order, (target,), max_pixels
         )  # fmt: skip
         if stac:
             need_stac()
         flight = find_captures(folder, options, voice)
-        how = RunOptions(overwrite, jobs, align_panels)
-        reports = run(flight, target, settings, voice, how, dask=dask, model=model)
-        raise typer.Exit(conclude(flight, reports, target, voice))
+        how = RunOptions(overwrite, retry_failed, jobs, timeout, align_panels)
+        outcome = run(flight, target, settings, voice, how, dask=dask, model=model)
+        raise typer.Exit(conclude(flight, outcome, target, voice))
 
 
 def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
@@ -271,11 +292,21 @@ def find_captures(folder: Path, options: "DiscoverOptions", voice: Voice, *, sil
     return flight
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What a run came to."""
+
+    reports: "list[CaptureReport]"
+    """In the flight's order."""
+    complete: bool
+    """False where captures were not begun, or the report could not be written."""
+
+
 def run(
     flight: "Flight", out: Path, settings: "Settings", voice: Voice, how: "RunOptions", *,
     dask: str | None = None, model: Path | None = None, keep_tables: bool = False,
-) -> "list[CaptureReport]":  # fmt: skip
-    """Align the captures, saying how far it has come; their reports in the flight's order."""
+) -> Outcome:  # fmt: skip
+    """Align the captures, saying how far it has come. Raises OutputError where nothing could be written."""
     from agalign.batch import Listener, run_flight
     from agalign.batch.workers import dask_executor
 
@@ -283,22 +314,26 @@ def run(
     done_pairs, all_pairs = 0, sum(len(c.moving) for c in flight.captures)
     pairs = {c.label: len(c.moving) for c in flight.captures}
     started = time.monotonic()
-    cluster = nullcontext() if dask is None else dask_executor(dask)
-    with cluster as executor, _progress(voice, all_pairs) as show, _interruptible() as check_interrupt:
+    cluster = nullcontext() if dask is None else dask_executor(dask, how.jobs, how.timeout_s)
+    complete = True
+    with cluster as executor, _progress(voice, all_pairs) as show:
         options = replace(how, executor=executor)
         current: Capture | None = None
 
         def on_start(capture: "Capture") -> None:
             nonlocal current
-            check_interrupt()
+            voice.check()
             current = capture
 
         def on_learning(camera: str, share: float) -> None:
-            check_interrupt()
+            voice.check()
             show(done_pairs, f"learning from {camera}: {share:.0%} at most")
 
+        def on_learnt(camera: str, seconds: float) -> None:
+            voice.event("learnt", camera=camera, seconds=round(seconds, 2))
+
         def on_pair(band: str, stage: str, share: float) -> None:
-            check_interrupt()
+            voice.check()
             assert current is not None
             names = [b.name for b in current.moving]
             place = names.index(band) if band in names else len(names)
@@ -308,52 +343,39 @@ def run(
             )
 
         try:
-            listener = Listener(on_start, on_pair, on_learning)
+            listener = Listener(on_start, on_pair, on_learning, on_learnt)
             for capture_report in run_flight(flight, out, settings, options, listener, model):
-                check_interrupt()
+                voice.check()
                 reports.append(capture_report if keep_tables else capture_report.without_tables())
                 done_pairs += pairs[capture_report.label]
                 show(done_pairs, capture_report.label)
                 _tell(capture_report, voice, len(reports), len(flight.captures))
+        except OutputError as error:
+            if not reports:
+                raise
+            voice.problem(str(error))
+            complete = False
         finally:
-            _write_pages(out, reports)
-    reports.sort(key=lambda r: list(pairs).index(r.label))
+            complete = _write_pages(out, reports, voice) and complete
+    places = {label: number for number, label in enumerate(pairs)}
+    reports.sort(key=lambda r: places[r.label])
     voice.event("finished", seconds=round(time.monotonic() - started, 1), captures=len(reports))
-    return reports
+    return Outcome(reports, complete)
 
 
-def _write_pages(out: Path, reports: "list[CaptureReport]") -> None:
-    """Also after an interruption: what is finished is reported."""
+def _write_pages(out: Path, reports: "list[CaptureReport]", voice: Voice) -> bool:
+    """Also after an interruption: what is finished is reported. False where that could not be written."""
     from agalign.products.report import write_report
     from agalign.products.summary import write_summary
 
-    if reports:
-        write_summary(out)
-        write_report(out)
-
-
-@contextmanager
-def _interruptible() -> Iterator[Callable[[], None]]:
-    """Yields a check that raises KeyboardInterrupt once SIGINT has come.
-
-    The exception that Python itself raises is lost where it falls into a callback from a C library.
-    """
-    came = False
-
-    def on_interrupt(_number: int, _frame: object) -> None:
-        nonlocal came
-        came = True
-        raise KeyboardInterrupt
-
-    def check() -> None:
-        if came:
-            raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, on_interrupt)
     try:
-        yield check
-    finally:
-        signal.signal(signal.SIGINT, before)
+        if reports:
+            write_summary(out)
+            write_report(out)
+    except OutputError as error:
+        voice.problem(str(error))
+        return False
+    return True
 
 
 @contextmanager
@@ -368,7 +390,7 @@ def _progress(voice: Voice, pairs: int) -> Iterator[Callable[[float, str], None]
     )  # fmt: skip
     with Progress(*columns, console=voice.err, transient=True) as progress:
         task = progress.add_task("starting", total=pairs)
-        yield lambda done, text: progress.update(task, completed=done, description=escape(text))
+        yield lambda done, text: progress.update(task, completed=done, description=shown(text))
 
 
 def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> None:
@@ -376,8 +398,11 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
         text = f"[{number}/{count}] {report.label}: {report.panel}"
         voice.event("panel", text, capture=report.label, panel=report.panel)
         return
+    for text in report.problems:
+        voice.problem(f"{report.label}: {text}", capture=report.label)
+    for (name, stage), seconds in report.stages.items() if voice.log_json else ():
+        voice.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(seconds, 4))
     if report.sidecar is None:
-        voice.problem(f"{report.label}: {report.error}", capture=report.label)
         return
     pairs = [b for b in report.sidecar.bands if b.status != "reference"]
     aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
@@ -395,6 +420,7 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
             aligned=aligned,
             predicted=predicted,
             pairs=len(pairs),
+            seconds=round(report.seconds, 3),
         )
     for band in pairs:
         residual = band.metrics.after.residual_px if band.metrics else None
@@ -411,10 +437,11 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
             )
 
 
-def conclude(flight: "Flight", reports: "list[CaptureReport]", out: Path, voice: Voice) -> int:
+def conclude(flight: "Flight", outcome: Outcome, out: Path, voice: Voice) -> int:
     """The closing table, and the exit code."""
     from statistics import median
 
+    reports = outcome.reports
     pairs = [b for r in reports if r.sidecar for b in r.sidecar.bands if b.status != "reference"]
     table = Table("Band", title=f"{sum(b.status == 'aligned' for b in pairs)} of {len(pairs)} band pairs aligned")
     for name in ("Aligned", "Predicted", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair"):
@@ -425,10 +452,10 @@ def conclude(flight: "Flight", reports: "list[CaptureReport]", out: Path, voice:
         known = [r for r in residuals if r is not None]
         counts = [str(sum(b.status == s for b in mine)) for s in ("aligned", "predicted", "seed_only", "failed")]
         worst = (f"{median(known):.3f}", f"{max(known):.3f}") if known else ("-", "-")
-        table.add_row(escape(name), *counts, *worst, f"{median(b.seconds for b in mine):.1f}")
+        table.add_row(shown(name), *counts, *worst, f"{median(b.seconds for b in mine):.1f}")
     if pairs:
         voice.result(table)
-    voice.result(escape(f"Report: {out / 'index.html'}"))
+    voice.result(shown(f"Report: {out / 'index.html'}"))
     if reports and all(r.state == "panel" for r in reports):
         voice.problem("nothing but calibration panels there; --align-panels aligns them all the same")
         return EXIT_NOTHING
@@ -436,4 +463,5 @@ def conclude(flight: "Flight", reports: "list[CaptureReport]", out: Path, voice:
         voice.problem("no band pair could be aligned")
         alone = all(r.sidecar is None for r in reports)
         return EXIT_NOTHING if alone else EXIT_PARTIAL
-    return EXIT_OK if all(r.good for r in reports) and not flight.problems else EXIT_PARTIAL
+    whole = outcome.complete and not flight.problems and all(r.good for r in reports)
+    return EXIT_OK if whole else EXIT_PARTIAL

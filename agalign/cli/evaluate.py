@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from agalign.cli.terminal import LogJson, Quiet, Verbose, Voice, exits
+from agalign.cli.terminal import LogJson, Quiet, RngSeed, Verbose, Voice, exits
 from agalign.errors import ConfigurationError
 
 Pairs = Annotated[
@@ -16,7 +16,6 @@ Pairs = Annotated[
     ),
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")]
-RngSeed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
 def register(app: typer.Typer) -> None:

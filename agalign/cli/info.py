@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from agalign.cli.align import (
@@ -19,7 +18,7 @@ from agalign.cli.align import (
     band_names,
     find_captures,
 )
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Voice, exits, in_json
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Voice, exits, in_json, shown
 
 if TYPE_CHECKING:
     from agalign.flight.rig import Rig
@@ -69,11 +68,11 @@ def info(
                 bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
                 size = "{width} x {height}".format(**row["bands"][0])
                 cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
-                table.add_row(*(escape(c) for c in cells), escape(", ".join(row["missing_bands"])))
+                table.add_row(*(shown(c) for c in cells), shown(", ".join(row["missing_bands"])))
             voice.result(table)
             panels = [row for row in rows if row["panel"] is not None]
             for row in panels:
-                voice.result(escape(f"{row['label']}: calibration panel {row['panel']}".rstrip()))
+                voice.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip()))
             found = f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {len(flight.problems)} problems"
             voice.result(found)
         raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
@@ -92,7 +91,7 @@ def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
         facts = {"model": str(path), "camera": model.camera, "bands": list(model.bands), "rig": rig}
         typer.echo(json.dumps(facts, indent=1))
         return
-    voice.result(escape(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}"))
+    voice.result(shown(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}"))
     if not rows:
         voice.result("no rig: too few captures said something of it")
         return
@@ -103,7 +102,7 @@ def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
         (dx, dy), (bx, by) = row["offset_px"], row["baseline"]
         errors = (f"{row[k]:.2f}" for k in ("from_bands_px", "from_neighbours_px", "from_flight_px"))
         field = "none" if row["field_px"] is None else f"{row['field_px']:.2f}"
-        table.add_row(escape(row["band"]), f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field)
+        table.add_row(shown(row["band"]), f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field)
     voice.result(table)
     shared = ", ".join(factors) or "nothing"
     voice.result(f"rig learnt on {captures} captures; what the bands of a capture share: {shared}")

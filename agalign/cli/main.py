@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, get_args
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from agalign._version import __version__
@@ -17,7 +16,19 @@ from agalign.cli import evaluate as cli_evaluate
 from agalign.cli import info as cli_info
 from agalign.cli.align import Jobs, find_captures
 from agalign.cli.onto import onto
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, LogJson, Quiet, Verbose, Voice, exits
+from agalign.cli.terminal import (
+    EXIT_NOTHING,
+    EXIT_OK,
+    EXIT_PARTIAL,
+    LogJson,
+    Quiet,
+    RngSeed,
+    Verbose,
+    Voice,
+    exits,
+    printed,
+    shown,
+)
 from agalign.values.choices import LocalUse, RadiometryChoice
 
 app = typer.Typer(
@@ -46,7 +57,7 @@ def demo(
     captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
     jobs: Jobs = 0,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
-    rng_seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
+    rng_seed: RngSeed = 0,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
@@ -67,14 +78,16 @@ def demo(
         truth = make_flight(source, captures, rng_seed=rng_seed)
         flight = find_captures(source, DiscoverOptions(), voice)
         settings = Settings(joint=JointSettings(device=device, rng_seed=rng_seed))
-        reports = cli_align.run(flight, target, settings, voice, RunOptions(True, jobs), keep_tables=True)
+        outcome = cli_align.run(
+            flight, target, settings, voice, RunOptions(overwrite=True, jobs=jobs), keep_tables=True
+        )
         table = Table("Capture", "Band", "Status", title="Error against the truth, px")
         for name in ("before", "median", "95 %"):
             table.add_column(name, justify="right")
-        for s in score_against_truth(reports, truth):
+        for s in score_against_truth(outcome.reports, truth):
             table.add_row(s.capture, s.band, s.status, f"{s.before_px:.1f}", f"{s.median_px:.3f}", f"{s.p95_px:.3f}")
         voice.result(table)
-        raise typer.Exit(cli_align.conclude(flight, reports, target, voice))
+        raise typer.Exit(cli_align.conclude(flight, outcome, target, voice))
 
 
 cli_info.register(app)
@@ -98,7 +111,8 @@ def report(
         summary = write_summary(out, unreadable.append)
         for text in unreadable:
             voice.problem(text)
-        voice.result(escape(f"{write_report(out)}\n{summary}"))
+        voice.result(shown(str(write_report(out))))
+        voice.result(shown(str(summary)))
         raise typer.Exit(EXIT_PARTIAL if unreadable else EXIT_OK)
 
 
@@ -166,7 +180,8 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.getLogger("rasterio").setLevel(logging.CRITICAL)
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
-    app(args=arguments, prog_name="agalign")
+    with printed():
+        app(args=arguments, prog_name="agalign")
 
 
 def _give_value(arguments: list[str], option: str, values: Sequence[str], alone: str) -> None:

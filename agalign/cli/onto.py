@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from agalign.cli.align import Jobs, Reference, conclude, run
-from agalign.cli.terminal import LogJson, Quiet, Verbose, Voice, exits
-from agalign.values.choices import Compression, Interpolation, LocalUse, RasterFormat
+from agalign.cli.terminal import LogJson, Quiet, RngSeed, Verbose, Voice, exits
+from agalign.values.choices import MOST_MOSAIC_PIXELS, Compression, Interpolation, LocalUse, RasterFormat
 
 
 def onto(
@@ -27,9 +27,12 @@ def onto(
     format: Annotated[RasterFormat, typer.Option(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
     compression: Annotated[Compression, typer.Option(help="Lossless.")] = "auto",
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
-    rng_seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
+    rng_seed: RngSeed = 0,
     jobs: Jobs = 1,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Do again what an earlier run finished.")] = False,
+    max_pixels: Annotated[
+        int, typer.Option(min=1, help="Mosaics that declare more are refused before anything is read.")
+    ] = MOST_MOSAIC_PIXELS,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
@@ -52,6 +55,6 @@ def onto(
             local=LocalSettings(use=local),
             write=WriteSettings(interpolation=interpolation, crop="none", format=format, compression=compression),
         )
-        flight = Flight(reference.parent, tuple(captures_onto(reference, moving, band)), ())
-        reports = run(flight, target, settings, voice, RunOptions(overwrite, jobs, align_panels=True))
-        raise typer.Exit(conclude(flight, reports, target, voice))
+        flight = Flight(reference.parent, tuple(captures_onto(reference, moving, band, max_pixels)), ())
+        outcome = run(flight, target, settings, voice, RunOptions(overwrite, jobs=jobs, align_panels=True))
+        raise typer.Exit(conclude(flight, outcome, target, voice))

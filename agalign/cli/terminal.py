@@ -1,10 +1,15 @@
 """How the commands speak: results, progress, complaints and exit codes."""
 
+import io
 import json
 import math
+import os
+import signal
 import sys
+import threading
+import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Annotated, Any
 
 import typer
@@ -12,10 +17,28 @@ from rich.console import Console
 from rich.markup import escape
 
 from agalign.errors import AgalignError, ConfigurationError
+from agalign.values.choices import MOST_RNG_SEED
+from agalign.values.text import harmless
 
-EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
+EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL = 0, 1, 2, 3
+_SIGNALLED = 128
+"""What shells add to the number of the signal that ended a program: 130 for the interrupt key, 143 for a request."""
 _PLAIN_WIDTH = 160
 _OUT_OF_MEMORY = "out of memory; close other programs or try a smaller image"
+_ENDING = ("SIGINT", "SIGTERM", "SIGHUP")
+
+
+class Stopped(KeyboardInterrupt):
+    """Somebody wants the program to end."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+def shown(text: str) -> str:
+    """A text from outside as rich prints it: no markup, nothing that a terminal acts on."""
+    return escape(harmless(text))
 
 
 def in_json(value: Any) -> Any:
@@ -28,6 +51,7 @@ class Voice:
 
     def __init__(self, *, quiet: bool, verbose: bool, log_json: bool) -> None:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
+        self._stopped_by: int | None = None
         # Lines in a file or a pipe are not wrapped to a terminal's width.
         self.out = Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
         self.err = Console(stderr=True, highlight=False, emoji=False, soft_wrap=not sys.stderr.isatty())
@@ -41,21 +65,54 @@ class Voice:
                 flush=True,
             )
         elif text and not self.quiet:
-            self.err.print(escape(text))
+            self.err.print(shown(text))
 
     def problem(self, text: str, **fields: Any) -> None:
         """A complaint: shown even with --quiet."""
         if self.log_json:
             self.event("problem", message=text, **fields)
         else:
-            self.err.print(f"[yellow]agalign: {escape(text)}[/]")
+            self.err.print(f"[yellow]agalign: {shown(text)}[/]")
 
     def result(self, thing: Any) -> None:
         """A result on standard output, unless --quiet."""
         if not self.quiet and not self.log_json:
             self.out.print(thing)
 
+    def check(self) -> None:
+        """Raises Stopped once somebody wanted the program to end: what a signal raises is lost where it falls into a
+        callback from a C library.
+        """
+        if self._stopped_by is not None:
+            raise Stopped(self._stopped_by)
 
+    @contextmanager
+    def stoppable(self) -> Iterator[None]:
+        """Signals that end a program raise Stopped inside; the second one ends it at once."""
+
+        def stop(number: int, _frame: object) -> None:
+            if self._stopped_by is not None:
+                os._exit(_SIGNALLED + number)
+            self._stopped_by = number
+            raise Stopped(number)
+
+        before = {}
+        if threading.current_thread() is threading.main_thread():
+            for name in _ENDING:
+                number = getattr(signal, name, None)
+                # Who started the program may want it to bear some: nohup, or a shell with its jobs in the background.
+                if number is not None and signal.getsignal(number) != signal.SIG_IGN:
+                    before[number] = signal.signal(number, stop)
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+RngSeed = Annotated[
+    int, typer.Option(min=0, max=MOST_RNG_SEED, help="Seed of all random numbers; the same seed gives the same result.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print problems only.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print a line per band pair.")]
 LogJson = Annotated[bool, typer.Option("--log-json", help="Print one JSON object a line to standard error.")]
@@ -65,16 +122,57 @@ LogJson = Annotated[bool, typer.Option("--log-json", help="Print one JSON object
 def exits(voice: Voice, on_interrupt: str = "interrupted") -> Iterator[None]:
     """Turns what can go wrong into one line and an exit code."""
     try:
+        with voice.stoppable():
+            yield
+    except typer.Exit:
+        raise
+    except BaseException as error:
+        code, text = _ending(error, on_interrupt)
+        if code is None:
+            raise
+        with suppress(OSError):  # of a full disk, the terminal's too
+            if voice.verbose and code == EXIT_NOTHING and not isinstance(error, AgalignError):
+                voice.err.print(escape(traceback.format_exc()))
+            voice.problem(text)
+        raise typer.Exit(code) from None
+
+
+def _ending(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:
+    """(exit code, the line that says why); no code for what is not ours to catch."""
+    match error:
+        case Stopped():
+            return _SIGNALLED + error.number, on_interrupt
+        case KeyboardInterrupt():
+            return _SIGNALLED + signal.SIGINT, on_interrupt
+        case ConfigurationError():
+            return EXIT_USAGE, str(error)
+        case AgalignError():
+            return EXIT_NOTHING, str(error)
+        case MemoryError():
+            return EXIT_NOTHING, _OUT_OF_MEMORY
+        case ImportError():
+            return EXIT_NOTHING, f"a library cannot be loaded ({error}); is memory short, or the installation damaged?"
+        case OSError():
+            return EXIT_NOTHING, f"{error.filename or 'output'}: {error.strerror or error}"
+        case Exception():
+            return EXIT_NOTHING, f"agalign failed ({type(error).__name__}: {error}); please report this"
+    return None, ""
+
+
+@contextmanager
+def printed() -> Iterator[None]:
+    """What is printed inside is out before the program ends, whatever the terminal's letters. Raises SystemExit where
+    it cannot be.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    try:
         yield
-    except KeyboardInterrupt:
-        voice.problem(on_interrupt)
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    except ConfigurationError as error:
-        voice.problem(str(error))
-        raise typer.Exit(EXIT_USAGE) from None
-    except AgalignError as error:
-        voice.problem(str(error))
-        raise typer.Exit(EXIT_NOTHING) from None
-    except MemoryError:
-        voice.problem(_OUT_OF_MEMORY)
-        raise typer.Exit(EXIT_NOTHING) from None
+    finally:
+        try:
+            sys.stdout.flush()
+        except OSError as error:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            print(f"agalign: standard output: {error.strerror}", file=sys.stderr)
+            raise SystemExit(EXIT_NOTHING) from None

@@ -5,6 +5,9 @@ from collections.abc import Iterable, Sequence
 
 from agalign.values.capture import Capture
 
+_LONGEST_STEM = 60
+"""Systems bear 255 bytes in a name, of which a letter may take four."""
+
 
 def camera_key(capture: Capture) -> str:
     """Captures with the same key were taken by the same camera, with the same bands and reference."""
@@ -28,6 +31,7 @@ def model_names(groups: Sequence[Sequence[Capture]]) -> list[str]:
     for group in groups:
         camera = group[0].camera
         stem = re.sub(r"[^\w.+-]+", "_", f"{camera.model} {camera.serial}".strip()) or "camera"
+        stem = stem.lstrip(".")[:_LONGEST_STEM] or "camera"
         given, count = stem, 1
         while given.lower() in taken:
             count += 1

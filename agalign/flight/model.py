@@ -4,24 +4,28 @@ The captures of a flight share their cameras, so what tells the bands' patches a
 the paper leaves as future work).
 """
 
+import hashlib
 import json
+import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors import safe_open
+from safetensors.torch import save
 
 from agalign._version import __version__
-from agalign.errors import InputError, OutputError
+from agalign.errors import InputError
 from agalign.flight.rig import Rig
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import matching_network
 from agalign.values.files import complete_file
-from agalign.values.geometry import Matrix
+from agalign.values.geometry import Matrix, normalised
 
 _FORMAT = "agalign-model/1"
+_LONGEST_BYTES = 1 << 28
+_MOST_SIDES = 512
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class FlightModel:
 
 
 def save_model(model: FlightModel, path: Path) -> None:
-    """Write a model, complete or not at all. Raises OutputError."""
+    """Write a model, complete or not at all; the same model is the same bytes. Raises OutputError."""
     tensors = {f"theta.{k}": v.detach().cpu().contiguous() for k, v in model.net.state_dict().items()}
     tensors |= {f"mapping.{k}": torch.tensor(m) for k, m in model.mappings.items()}
     if model.rig is not None:
@@ -60,29 +64,63 @@ def save_model(model: FlightModel, path: Path) -> None:
         "sharing": model.net.sharing, "channels": json.dumps(model.net.channels), "fingerprint": model.fingerprint,
         "rig": "" if model.rig is None else model.rig.as_json(),
     }  # fmt: skip
-    try:
-        with complete_file(path) as partial:
-            save_file(tensors, partial, facts)
-    except SafetensorError as error:
-        raise OutputError(f"{path}: cannot be written ({error})") from None
+    contents = _with_sorted_header(save(tensors, facts | {"digest": _digest(tensors, facts)}))
+    with complete_file(path) as partial:
+        partial.write_bytes(contents)
 
 
 def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
-    """Raises InputError, naming the file, where it is not a model of this program."""
+    """Raises InputError, naming the file, where it is not a model of this program, or a damaged one."""
     try:
-        with safe_open(path, framework="pt") as file:
-            facts = file.metadata() or {}
-            if facts.get("format") != _FORMAT:
-                raise InputError(f"{path}: is no model of agalign; give a file of an earlier run's models folder")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        bands = tuple(json.loads(facts["bands"]))
-        channels = json.loads(facts["channels"])
-        net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
-        net.load_state_dict({k.removeprefix("theta."): v for k, v in tensors.items() if k.startswith("theta.")})
-        net.learnt = True
-        fields = {k.removeprefix("field."): v.numpy() for k, v in tensors.items() if k.startswith("field.")}
-        rig = Rig.from_json(facts["rig"], fields) if facts.get("rig") else None
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{path}: cannot be read as a model ({str(error).splitlines()[0]})") from None
-    mappings = {k.removeprefix("mapping."): v.numpy() for k, v in tensors.items() if k.startswith("mapping.")}
-    return FlightModel(net.to(device()), facts["camera"], bands, mappings, facts["fingerprint"], rig)
+        model = _read_model(path)
+    except InputError:
+        raise
+    except Exception as error:  # of a damaged file anything may be wrong
+        said = next(iter(str(error).splitlines()), type(error).__name__)
+        raise InputError(f"{path}: cannot be read as a model ({said})") from None
+    return replace(model, net=model.net.to(device()))
+
+
+def _read_model(path: Path) -> FlightModel:
+    if path.stat().st_size > _LONGEST_BYTES:
+        raise ValueError("it is too large for one")
+    with safe_open(path, framework="pt") as file:
+        facts = dict(file.metadata() or {})
+        if facts.get("format") != _FORMAT:
+            raise InputError(f"{path}: is no model of agalign; give a file of an earlier run's models folder")
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    digest = facts.pop("digest", None)
+    if digest is not None and digest != _digest(tensors, facts):
+        raise ValueError("it is damaged")
+    if not all(torch.isfinite(t).all() for t in tensors.values()):
+        raise ValueError("its numbers are none")
+    channels = [int(c) for c in json.loads(facts["channels"])]
+    if not 1 < len(channels) <= _MOST_SIDES or not all(0 < c <= _MOST_SIDES for c in channels):
+        raise ValueError(f"a network for images of {channels[:8]} channels")
+    net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
+    net.load_state_dict({k.removeprefix("theta."): v for k, v in tensors.items() if k.startswith("theta.")})
+    net.learnt = True
+    fields = {k.removeprefix("field."): v.numpy() for k, v in tensors.items() if k.startswith("field.")}
+    mappings = {
+        k.removeprefix("mapping."): normalised(v.numpy()) for k, v in tensors.items() if k.startswith("mapping.")
+    }
+    bands = tuple(map(str, json.loads(facts["bands"])))
+    rig = Rig.from_json(facts["rig"], fields) if facts.get("rig") else None
+    return FlightModel(net, facts["camera"], bands, mappings, facts["fingerprint"], rig)
+
+
+def _digest(tensors: Mapping[str, torch.Tensor], facts: Mapping[str, str]) -> str:
+    """Of the contents: a flipped bit in a weight is no fault that anything else would see."""
+    found = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        found.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
+        found.update(tensor.contiguous().numpy().tobytes())
+    return found.hexdigest()
+
+
+def _with_sorted_header(contents: bytes) -> bytes:
+    """Safetensors' header with its names in their order, in which the library itself has the facts at random."""
+    (length,) = struct.unpack_from("<Q", contents)
+    header = json.dumps(json.loads(contents[8 : 8 + length]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return struct.pack("<Q", len(header)) + header + contents[8 + length :]

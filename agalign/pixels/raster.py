@@ -21,6 +21,7 @@ from agalign.errors import GeometryError, UnreadableFileError
 from agalign.pixels.masks import data_mask, learnable, undeclared_fill
 from agalign.values import lens
 from agalign.values.capture import Band, Georeference
+from agalign.values.choices import MOST_PIXELS
 from agalign.values.image import Mask, Raster
 
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
@@ -39,8 +40,6 @@ _DRIVERS = {
     b"II*\0": "GTiff", b"MM\0*": "GTiff", b"II+\0": "GTiff", b"MM\0+": "GTiff", b"\xff\xd8\xff": "JPEG",
 }  # fmt: skip
 """By how a file begins. GDAL has drivers that execute, or ask other computers, for whatever name a file has."""
-MOST_PIXELS = 250_000_000
-"""Of one image, unless told otherwise: more than any camera has."""
 _MOST_BANDS = 512
 
 

@@ -89,7 +89,7 @@ def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset
         name = band.place.file
         if name not in files:
             files[name] = _opened(folder, name, masked=masked)
-        found[band.band] = _variable(files[name], band, band.place.band_index)
+        found[band.band] = _variable(files[name], band, band.place.band_index, name)
     dataset: xarray.Dataset = xr.Dataset(found)
     dataset.attrs = {
         "capture": sidecar.capture, "capture_id": sidecar.capture_id, "flight_id": sidecar.flight_id,
@@ -102,18 +102,19 @@ def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset
 def _opened(folder: Path, name: str, *, masked: bool) -> "xarray.DataArray":
     import rioxarray
 
-    path = (folder / name).resolve()
-    if not path.is_relative_to(folder.resolve()):
-        raise InputError(f"{folder / name}: lies outside the folder of its sidecar")
+    path = folder / name
     try:
         with without_warnings():
-            opened: xarray.DataArray = rioxarray.open_rasterio(path, chunks=_CHUNKS, masked=masked)
+            # Whatever the file says of itself: other drivers may open other files.
+            opened: xarray.DataArray = rioxarray.open_rasterio(path, chunks=_CHUNKS, masked=masked, driver="GTiff")
     except OSError as error:
         raise UnreadableFileError(f"{path}: cannot be read ({error}); run again") from None
     return opened
 
 
-def _variable(file: "xarray.DataArray", band: BandPart, index: int) -> "xarray.DataArray":
+def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str) -> "xarray.DataArray":
+    if index > file.sizes["band"]:
+        raise UnreadableFileError(f"{name}: has no band {index}, as its sidecar says; run again")
     one = file.isel(band=index - 1, drop=True)
     units = file.attrs.get("units")
     unit = units[index - 1] if isinstance(units, tuple) else units

@@ -101,7 +101,11 @@ def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> 
 
 def _open(stack: ExitStack, sidecar: Path, part: BandPart) -> Source:
     assert part.place is not None
-    return stack.enter_context(open_raster(sidecar.parent / part.place.file)), part.place.band_index
+    path, index = sidecar.parent / part.place.file, part.place.band_index
+    source = stack.enter_context(open_raster(path))
+    if index > source.count:
+        raise InputError(f"{path}: has no band {index}, as its sidecar says; run again")
+    return source, index
 
 
 def _unit(index: Index, sources: Sequence[Source]) -> str:

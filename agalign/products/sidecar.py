@@ -4,23 +4,36 @@ All pixel coordinates are x right, y down, (0, 0) the centre of the top-left pix
 the reference to a pixel of the moving band; `grid` samples the complete mapping between the raw pixels of the files.
 """
 
-import json
 import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from agalign.errors import SidecarError
 from agalign.values.choices import CaptureStatus, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.doubts import DoubtKind
-from agalign.values.files import write_text
+from agalign.values.files import lies_within, write_text
 
 SCHEMA = "agalign/1"
 
 Row = tuple[float, float, float]
 Matrix3x3 = tuple[Row, Row, Row]
 PointPx = tuple[float, float]
+_LONGEST_BYTES = 1 << 26
+_LONGEST_QUOTED = 60
+
+
+def _beside(name: str) -> str:
+    if not lies_within(name):
+        raise ValueError("names a file outside its folder")
+    return name
+
+
+BesideIt = Annotated[str, AfterValidator(_beside)]
+"""A file in the sidecar's folder or below: a sidecar is a file like any other, and what it names is read and removed.
+"""
+Count = Annotated[int, Field(gt=0)]
 
 
 class _Part(BaseModel):
@@ -48,9 +61,9 @@ class ReferencePart(_Part):
 
     band: str
     file: str
-    band_index: int
-    width: int
-    height: int
+    band_index: Count
+    width: Count
+    height: Count
 
 
 class HomographyPart(_Part):
@@ -155,8 +168,8 @@ class PredictionPart(_Part):
 class PlacePart(_Part):
     """A file beside the sidecar that holds a band's aligned pixels, and the band's index there, from 1."""
 
-    file: str
-    band_index: int
+    file: BesideIt
+    band_index: Count
 
 
 class BandPart(_Part):
@@ -184,7 +197,7 @@ class BandPart(_Part):
 class FilePart(_Part):
     """A file beside the sidecar."""
 
-    file: str
+    file: BesideIt
     bytes: int
     nodata: float | str | None = None
 
@@ -197,7 +210,7 @@ class OutputPart(_Part):
     its sides as the reference's file.
     """
 
-    file: str | None
+    file: BesideIt | None
     bytes: int | None
     band_files: list[FilePart] = []
     crop: tuple[int, int, int, int]
@@ -210,7 +223,7 @@ class Sidecar(_Part):
 
     schema_: Annotated[Literal["agalign/1"], Field(alias="schema")] = "agalign/1"
     agalign: str
-    capture: str
+    capture: BesideIt
     capture_id: str
     flight_id: str
     captured_at: str
@@ -239,31 +252,42 @@ def compact_lists(text: str) -> str:
 def read_sidecar(path: Path) -> Sidecar:
     """Raises SidecarError, naming the file and the field, where it is missing, malformed or of another version."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        size = path.stat().st_size
+        if size > _LONGEST_BYTES:
+            raise SidecarError(f"{path}: {size >> 20} MB are no sidecar; delete it and run again")
+        return Sidecar.model_validate_json(path.read_bytes())
     except OSError as error:
         raise SidecarError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except ValueError as error:
-        raise SidecarError(f"{path}: not valid JSON ({error}); delete it and run again") from None
-    schema = data.get("schema") if isinstance(data, dict) else None
-    if schema != SCHEMA:
-        raise SidecarError(f"{path}: schema is {schema!r}, not {SCHEMA!r}; run again with --overwrite")
-    try:
-        return Sidecar.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
+        problems = {".".join(map(str, e["loc"])): e for e in error.errors(include_url=False)}
+        (where, first), *_ = problems.items()
+        if first["type"] == "json_invalid":
+            raise SidecarError(f"{path}: not valid JSON ({first['msg']}); delete it and run again") from None
+        if not where:
+            raise SidecarError(f"{path}: is no sidecar of schema {SCHEMA!r}; delete it and run again") from None
+        if "schema" in problems:
+            found = _shortened(problems["schema"]["input"] if problems["schema"]["type"] != "missing" else None)
+            raise SidecarError(f"{path}: schema is {found}, not {SCHEMA!r}; run again with --overwrite") from None
         raise SidecarError(f"{path}: {where}: {first['msg']}; run again with --overwrite") from None
 
 
+def _shortened(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}…"
+
+
 def find_sidecars(folder: Path) -> list[Path]:
-    """The sidecars below an output folder, sorted; other JSON files are passed over."""
+    """The sidecars below an output folder, sorted; other JSON files are passed over, but not what cannot be read."""
     found = []
     for path in sorted(folder.rglob("*.json")):
         try:
-            with path.open(encoding="utf-8") as file:
+            if not path.is_file():
+                continue
+            with path.open("rb") as file:
                 head = file.read(200)
-        except (OSError, UnicodeDecodeError):
+        except OSError:
+            found.append(path)
             continue
-        if '"agalign/' in head:
+        if b'"agalign/' in head:
             found.append(path)
     return found

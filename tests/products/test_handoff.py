@@ -14,6 +14,7 @@ from PIL import Image
 import agalign
 from agalign.cameras.discover import DiscoverOptions
 from agalign.config import SeedSettings, Settings, WriteSettings
+from agalign.products.sidecar import find_sidecars
 from agalign.synthetic.cameras import MAVIC, MAVIC_3M, REDEDGE, SENTERA_6X
 from agalign.synthetic.rig import CameraSpec
 from agalign.synthetic.troubles import make_two_headings
@@ -111,7 +112,7 @@ def test_nobody_aligns_them_once_more(aligned: tuple[CameraSpec, Path, Path]) ->
 
 def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: tuple[CameraSpec, Path, Path]) -> None:
     camera, folder, out = aligned
-    (sidecar,) = out.rglob("*.json")
+    (sidecar,) = find_sidecars(out)
     data = json.loads(sidecar.read_text())
     x0, y0, *_ = data["output"]["crop"]
     reference = data["reference"]["file"]

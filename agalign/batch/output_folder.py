@@ -1,0 +1,69 @@
+"""The output folder of a run: made, held by one run at a time, and rid of what a killed one left."""
+
+import os
+import platform
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from agalign.errors import OutputError
+from agalign.values.files import remove_partial_files
+
+_LOCK_FILE = ".agalign.lock"
+_LEAST_FREE_BYTES = 1 << 20
+
+
+def prepare_output(out: Path) -> None:
+    """Make the output folder. Raises OutputError where it cannot be made or written to."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if not os.access(out, os.W_OK):
+            raise OutputError(f"{out}: no permission to write there; choose another folder with -o")
+    except FileExistsError:
+        raise OutputError(f"{out}: is a file; choose another folder with -o") from None
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be made ({error.strerror or error})") from None
+
+
+@contextmanager
+def held(out: Path) -> Iterator[None]:
+    """The output folder, made and for this run alone. Raises OutputError, also where another run holds it.
+
+    The system lets go of the lock of a process that ends, however it does: one that was killed keeps nobody out.
+    """
+    prepare_output(out)
+    path = out / _LOCK_FILE
+    lock = FileLock(path, thread_local=False)
+    try:
+        lock.acquire(blocking=False)
+    except (Timeout, RuntimeError):
+        raise OutputError(f"{out}: another run writes there{_holder(path)}; wait for it, or choose -o") from None
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
+    try:
+        with suppress(OSError):  # a full disk is told by what needs it
+            path.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
+        remove_partial_files(out)
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        lock.release()
+
+
+def is_full(out: Path) -> bool:
+    """True where nothing more can be written: what follows would fare no better."""
+    try:
+        return shutil.disk_usage(out).free < _LEAST_FREE_BYTES
+    except OSError:
+        return False
+
+
+def _holder(lock_file: Path) -> str:
+    with suppress(OSError, UnicodeDecodeError):
+        text = lock_file.read_text(encoding="utf-8")
+        return f" ({text})" if text else ""
+    return ""

@@ -1,0 +1,136 @@
+"""OUT/agalign-run.json: what a run was, with what, on what, and what came of it; written before anything else is."""
+
+import os
+import platform
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from agalign._version import __version__
+from agalign.config import Settings
+from agalign.errors import SidecarError
+from agalign.products.sidecar import Sidecar, compact_lists
+from agalign.values.files import RUN_FILE, write_text
+
+_LIBRARIES = ("torch", "numpy", "rasterio", "opencv-python-headless", "tifffile", "pydantic")
+_LONGEST_BYTES = 1 << 28
+
+RunState = Literal["running", "interrupted", "finished"]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", ser_json_inf_nan="null")
+
+
+class RefusalPart(_Part):
+    """A band that is not aligned, and why."""
+
+    capture: str
+    band: str
+    status: str
+    reason: str | None
+
+
+class ProblemPart(_Part):
+    """A file that took no part, or a capture that came to nothing, and why."""
+
+    of: str
+    problem: str
+
+
+class RunPart(_Part):
+    """One run. `running` is also what a run that was killed has left."""
+
+    schema_: Annotated[Literal["agalign-run/1"], Field(alias="schema")] = "agalign-run/1"
+    agalign: str = __version__
+    state: RunState
+    started_at: str
+    """ISO 8601, UTC."""
+    seconds: float
+    input: str
+    versions: dict[str, str]
+    machine: dict[str, str | int]
+    settings: dict[str, Any]
+    captures: dict[str, int]
+    """How many were found, and how many are done, kept, panel, error."""
+    pairs: dict[str, int]
+    """How many band pairs have which status."""
+    stage_seconds: dict[str, float]
+    """What the captures that were done cost, added over workers, and the learning before them."""
+    capture_seconds: dict[str, float]
+    """The same by capture."""
+    refused: list[RefusalPart]
+    problems: list[ProblemPart]
+
+
+@dataclass
+class Tally:
+    """What a run has come to so far."""
+
+    captures: Counter[str] = field(default_factory=Counter)
+    pairs: Counter[str] = field(default_factory=Counter)
+    stage_seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    capture_seconds: dict[str, float] = field(default_factory=dict)
+    refused: list[RefusalPart] = field(default_factory=list)
+    problems: list[ProblemPart] = field(default_factory=list)
+
+    def add(self, label: str, state: str, sidecar: Sidecar | None, problems: Iterable[str]) -> None:
+        """One capture more."""
+        self.captures[state] += 1
+        self.problems += [ProblemPart(of=label, problem=text) for text in problems]
+        for band in [] if sidecar is None else sidecar.bands:
+            if band.status == "reference":
+                continue
+            self.pairs[band.status] += 1
+            if band.status != "aligned":
+                refusal = RefusalPart(capture=label, band=band.band, status=band.status, reason=band.reason)
+                self.refused.append(refusal)
+
+
+def write_run_record(
+    out: Path, folder: Path, settings: Settings, tally: Tally, state: RunState, started_at: str, seconds: float
+) -> None:
+    """OUT/agalign-run.json. Raises OutputError."""
+    part = RunPart(
+        state=state, started_at=started_at, seconds=round(seconds, 2), input=str(folder), versions=_versions(),
+        machine=_machine(settings), settings=settings.model_dump(mode="json"), captures=dict(tally.captures),
+        pairs=dict(tally.pairs), refused=tally.refused, problems=tally.problems,
+        stage_seconds={k: round(v, 3) for k, v in sorted(tally.stage_seconds.items())},
+        capture_seconds={k: round(v, 3) for k, v in sorted(tally.capture_seconds.items())},
+    )  # fmt: skip
+    write_text(out / RUN_FILE, compact_lists(part.model_dump_json(by_alias=True, indent=1)) + "\n")
+
+
+def read_run_record(out: Path) -> RunPart | None:
+    """Of the last run into a folder; None where there is none. Raises SidecarError for a file that is none of ours."""
+    path = out / RUN_FILE
+    try:
+        if path.stat().st_size > _LONGEST_BYTES:
+            raise SidecarError(f"{path}: is too large for what it should be; run again")
+        return RunPart.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValidationError):
+        raise SidecarError(f"{path}: cannot be read; run again") from None
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "unknown"
+    return found
+
+
+def _machine(settings: Settings) -> dict[str, str | int]:
+    return {
+        "system": platform.system(), "release": platform.release(), "processor": platform.machine(),
+        "cores": os.cpu_count() or 1, "device": settings.joint.device,
+    }  # fmt: skip

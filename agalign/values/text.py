@@ -1,0 +1,21 @@
+"""Texts from files, shown where some characters would do something."""
+
+import unicodedata
+
+
+def harmless(text: str) -> str:
+    r"""The text on one line, with what a terminal would act on (escape sequences, turns of the writing's direction)
+    written out: `\x1b`.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else _written_out(c) for c in text)
+
+
+def without_controls(text: str) -> str:
+    """The text without control characters, as a tag is meant that has some."""
+    return text if text.isprintable() else "".join(c for c in text if unicodedata.category(c) not in ("Cc", "Cs"))
+
+
+def _written_out(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
