@@ -1,5 +1,6 @@
 """The Python API: arrays, one capture, a folder."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,14 @@ from agalign.errors import InputError
 from agalign.pixels.masks import raster_of
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.resample import resample
-from agalign.products.summary import write_summary
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.choices import Interpolation, SeedKind
 from agalign.values.image import Mask, Tile
 from agalign.values.mapping import PixelMapping
+
+_LOG = logging.getLogger(__name__)
 
 
 def align(
@@ -108,12 +110,11 @@ def align_folder(
     Raises InputError where there is no such folder, OutputError where `out` cannot be written, ConfigurationError
     for a model of another camera.
     """
-    from agalign.products.report import write_report
+    from agalign.products.report import write_pages
 
     source, target = Path(folder), Path(out)
     found = discover(source, options or DiscoverOptions(skip=(target,)))
     start = None if model is None else Path(model)
     reports = list(run_flight(found, target, settings or Settings(), run, model=start))
-    write_summary(target)
-    write_report(target)
+    write_pages(target, _LOG.warning)
     return reports

@@ -38,7 +38,7 @@ from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.panels import write_panels
 from agalign.products.run_record import ProblemPart, RunState, Tally, write_run_record
-from agalign.products.sidecar import Sidecar, read_sidecar
+from agalign.products.sidecar import CaptureResult, read_result
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
 from agalign.values.choices import Layout
@@ -101,7 +101,7 @@ def run_flight(
         settings = settings.model_copy(update={"flight": used})
     with held(out), _recorded(flight, out, settings) as tally:
         for report in _reports(flight, out, settings, options, _with_seconds(listener, tally), known):
-            tally.add(report.label, report.state, report.sidecar, report.problems)
+            tally.add(report.label, report.state, report.result, report.problems)
             if report.state == "done":
                 tally.capture_seconds[report.label] = report.seconds
             for (_, stage), seconds in report.stages.items():
@@ -146,7 +146,7 @@ def _reports(
     panels, captures = _panels(flight.captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
         discard_outputs(*output_paths(reading.capture, out))
-        yield CaptureReport(reading.capture.label, "panel", None, panel=part.sentence)
+        yield CaptureReport(reading.capture.label, "panel", panel=part.sentence)
     left: list[tuple[Sequence[Capture], str, list[Capture]]] = []
     groups = flights_of(captures)
     for group, name in zip(groups, model_names(groups), strict=True):
@@ -158,7 +158,7 @@ def _reports(
             if earlier is None or (options.retry_failed and earlier.status != "ok"):
                 mine.append(capture)
             else:
-                yield CaptureReport(capture.label, "kept", earlier)
+                yield CaptureReport(capture.label, "kept", earlier, output_paths(capture, out)[1])
         if mine:
             left.append((group, name, mine))
     with _workers(sum(len(mine) for _, _, mine in left), options, settings) as (submit, most):
@@ -286,11 +286,11 @@ def _refuse_to_overwrite(flight: Flight, out: Path, layout: Layout) -> None:
                 )
 
 
-def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar | None:
-    """The sidecar of an earlier run with the same settings and bands whose outputs are still there."""
+def finished_before(capture: Capture, out: Path, settings: Settings) -> CaptureResult | None:
+    """What the sidecar says of an earlier run with the same settings and bands whose outputs are still there."""
     stack, path = output_paths(capture, out)
     try:
-        sidecar = read_sidecar(path)
+        sidecar = read_result(path)
     except SidecarError:
         return None
     if sidecar.settings != fingerprint(capture, settings):
@@ -298,7 +298,7 @@ def finished_before(capture: Capture, out: Path, settings: Settings) -> Sidecar 
     return sidecar if _outputs_are_there(sidecar, path.parent, stack) else None
 
 
-def _outputs_are_there(sidecar: Sidecar, folder: Path, stack: Path) -> bool:
+def _outputs_are_there(sidecar: CaptureResult, folder: Path, stack: Path) -> bool:
     output = sidecar.output
     if output is None:
         return not stack.is_file()

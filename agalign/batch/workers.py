@@ -2,7 +2,6 @@
 
 import logging
 import os
-import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
@@ -10,7 +9,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
-from multiprocessing import get_all_start_methods, get_context, parent_process
+from multiprocessing import get_all_start_methods, get_context
 from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any, Literal
@@ -25,8 +24,9 @@ from agalign.config import Settings
 from agalign.errors import AgalignError, ConfigurationError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
-from agalign.products.sidecar import Sidecar
+from agalign.products.sidecar import CaptureResult, Sidecar, read_sidecar
 from agalign.values.capture import Capture
+from agalign.values.processes import follow_parent, without_interrupt_key
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 _LOG = logging.getLogger(__name__)
@@ -47,7 +47,10 @@ class CaptureReport:
     """`kept` means that an earlier run's result with the same settings was there, and `panel` that it shows a
     calibration panel and takes no part.
     """
-    sidecar: Sidecar | None
+    result: CaptureResult | None = None
+    """What its sidecar says, without the long tables."""
+    path: Path | None = None
+    """Of the sidecar."""
     error: str | None = None
     panel: str | None = None
     """What the calibration panel is, in words."""
@@ -58,22 +61,17 @@ class CaptureReport:
     stages: Mapping[tuple[str, str], float] = field(default_factory=dict)
     """The same by (band, stage)."""
 
-    def without_tables(self) -> "CaptureReport":
-        """The same without the sidecar's long tables: a thousand of these are kept until a run ends."""
-        if self.sidecar is None:
-            return self
-        bands = [
-            b.model_copy(update={"grid": None, "metrics": b.metrics and b.metrics.model_copy(update={"tiles": []})})
-            for b in self.sidecar.bands
-        ]
-        return replace(self, sidecar=self.sidecar.model_copy(update={"bands": bands}))
+    @property
+    def sidecar(self) -> Sidecar | None:
+        """The whole of it, read from its file; None where there is none. Raises SidecarError."""
+        return None if self.path is None else read_sidecar(self.path)
 
     @property
     def good(self) -> bool:
         """True where nothing is left to be wished for: every band pair of the capture is aligned, or predicted well
         enough, none is missing, and all is written.
         """
-        done = self.sidecar is not None and self.sidecar.status == "ok" and not self.shortcomings
+        done = self.result is not None and self.result.status == "ok" and not self.shortcomings
         return self.state == "panel" or done
 
     @property
@@ -84,7 +82,7 @@ class CaptureReport:
     @property
     def useful(self) -> bool:
         """True where at least one band pair is aligned or predicted."""
-        return self.sidecar is not None and any(b.status in ("aligned", "predicted") for b in self.sidecar.bands)
+        return self.result is not None and any(b.status in ("aligned", "predicted") for b in self.result.bands)
 
 
 @dataclass(frozen=True)
@@ -125,10 +123,10 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
         _LOG.debug("%s: %s", label, problem, exc_info=True)
     else:
         return CaptureReport(
-            label, "done", outcome.sidecar, shortcomings=outcome.shortcomings, seconds=clock.seconds,
-            stages=clock.stages(),
+            label, "done", outcome.sidecar.result(), outcome.path, shortcomings=outcome.shortcomings,
+            seconds=clock.seconds, stages=clock.stages(),
         )  # fmt: skip
-    return CaptureReport(label, "error", None, problem, seconds=clock.seconds, stages=clock.stages())
+    return CaptureReport(label, "error", error=problem, seconds=clock.seconds, stages=clock.stages())
 
 
 def done_by(
@@ -169,7 +167,7 @@ def _report_of(future: "Future[CaptureReport]", task: Task, timeout_s: float | N
             raise
         said = next(iter(str(error).splitlines()), type(error).__name__)
         problem = f"the cluster lost it ({said}); run again to do what is left"
-    return CaptureReport(label, "error", None, problem)
+    return CaptureReport(label, "error", error=problem)
 
 
 @contextmanager
@@ -184,7 +182,7 @@ def own_processes(jobs: int, timeout_s: float | None) -> Iterator[Submit]:
         pool = ProcessPool(jobs, context=worker_context(), initializer=start_worker, initargs=(threads,))
 
         def start() -> None:
-            with _without_interrupt_key():
+            with without_interrupt_key():
                 for _ in range(jobs):
                     pool.schedule(quiet)
 
@@ -205,19 +203,6 @@ def own_processes(jobs: int, timeout_s: float | None) -> Iterator[Submit]:
             with suppress(Exception):
                 started.result()
             pool.join()
-
-
-@contextmanager
-def _without_interrupt_key() -> Iterator[None]:
-    """The interrupt key is for the main process; processes started here, and theirs, inherit not to hear it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 LOCAL = "local"
@@ -273,16 +258,8 @@ def _within(timeout_s: float | None, function: Callable[..., Any], *arguments: A
 
 
 def start_worker(threads: int) -> None:
-    """A worker process does not outlive the one that started it, however that ended: nobody would tell it to stop."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = parent_process()
-    if parent is not None:
-
-        def follow() -> None:
-            parent.join()
-            os._exit(1)
-
-        threading.Thread(target=follow, daemon=True).start()
+    """What a worker process does first."""
+    follow_parent()
     limit_threads(threads)
 
 

@@ -4,10 +4,13 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
 from types import MappingProxyType
+
+from pebble import ProcessExpired, ProcessPool
 
 from agalign.cameras.base import Camera, default_reference
 from agalign.cameras.known import camera_of, known_cameras
@@ -19,6 +22,7 @@ from agalign.pixels.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, RasterInfo, prob
 from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.choices import MOST_MOSAIC_PIXELS, MOST_PIXELS, BandOrder
 from agalign.values.files import RUN_FILE
+from agalign.values.processes import follow_parent, without_interrupt_key
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,9 @@ _SUFFIXES = TIFF_SUFFIXES | JPEG_SUFFIXES
 _SYSTEMS = {"lost+found", "System Volume Information", "$RECYCLE.BIN"}
 """What operating systems keep on a card."""
 _NAMELESS = "capture"
+_FILES_AT_ONCE = 100
+_KILLED = "reading it, or a file beside it, killed the process; take it out of the folder"
+_FILES_WORTH_PROCESSES = 1000
 _NAMES_OF_THE_RUN = {"panels", Path(RUN_FILE).stem, "summary", "index"}
 
 
@@ -78,6 +85,8 @@ class DiscoverOptions:
     """Folders not to look into, such as the output's."""
     most_pixels: int = MOST_PIXELS
     """Images that declare more are refused before anything is made of them."""
+    jobs: int = 1
+    """Processes that look at files, where these are many; the calling script must be importable then."""
 
 
 def discover(
@@ -90,32 +99,29 @@ def discover(
     """
     options = options or DiscoverOptions()
     _check_folder(folder)
-    cameras = known_cameras(options.pattern)
     files: list[_File] = []
     paths, problems = _images(folder, options.skip)
     if not paths and problems:
         raise problems[0].error
     if not paths:
         raise InputError(f"{folder}: no .tif, .tiff, .jpg or .jpeg file in it or below it")
-    for number, path in enumerate(paths, start=1):
-        try:
-            file = _examine(path, cameras, options)
-            if file.bands:
-                files.append(file)
-        except UnreadableFileError as error:
-            # A colour photograph that does not take part does no harm either.
-            if options.with_rgb or path.suffix.lower() in TIFF_SUFFIXES:
-                problems.append(Problem(path, error))
+    for number, found in enumerate(_examined(paths, options), start=1):
+        if isinstance(found, _File):
+            if found.bands:
+                files.append(found)
+        # A colour photograph that does not take part does no harm either.
+        elif options.with_rgb or found.path.suffix.lower() in TIFF_SUFFIXES:
+            problems.append(found)
         if progress is not None:
             progress(number, len(paths))
     captures: list[Capture] = []
     for group in _groups(files):
         problems += _alike(group, options)
-        found = _capture(folder, group, options)
-        if isinstance(found, Problem):
-            problems.append(found)
+        made = _capture(folder, group, options)
+        if isinstance(made, Problem):
+            problems.append(made)
         else:
-            captures.append(found)
+            captures.append(made)
     known = {b.name.lower() for file in files for b in file.bands}
     unknown = [name for name in options.bands if name.lower() not in known]
     if unknown and files:
@@ -206,6 +212,42 @@ def is_output(folder: Path) -> bool:
     except OSError:
         return False
     return RUN_FILE in entries or {"summary.csv", "index.html"} <= entries
+
+
+def _examined(paths: Sequence[Path], options: DiscoverOptions) -> Iterator["_File | Problem"]:
+    """What each file holds, or why it cannot take part; many files are looked at by several processes."""
+    parts = [paths[i : i + _FILES_AT_ONCE] for i in range(0, len(paths), _FILES_AT_ONCE)]
+    if min(options.jobs, len(parts)) <= 1 or len(paths) < _FILES_WORTH_PROCESSES:
+        for part in parts:
+            yield from _look_at(part, options)
+        return
+    # Processes that start from nothing: what a fork would take along of this one is not known here.
+    pool = ProcessPool(min(options.jobs, len(parts)), context=get_context("spawn"), initializer=follow_parent)
+    try:
+        with without_interrupt_key():
+            futures = [pool.schedule(_look_at, args=(part, options)) for part in parts]
+        for part, future in zip(parts, futures, strict=True):
+            try:
+                yield from future.result()
+            except ProcessExpired:
+                yield from (Problem(path, UnreadableFileError(f"{path}: {_KILLED}")) for path in part)
+        pool.close()
+    except BaseException:
+        pool.stop()
+        raise
+    finally:
+        pool.join()
+
+
+def _look_at(paths: Sequence[Path], options: DiscoverOptions) -> list["_File | Problem"]:
+    cameras = known_cameras(options.pattern)
+    found: list[_File | Problem] = []
+    for path in paths:
+        try:
+            found.append(_examine(path, cameras, options))
+        except UnreadableFileError as error:
+            found.append(Problem(path, error))
+    return found
 
 
 def _examine(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> _File:

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, ParseError
@@ -153,10 +154,11 @@ def _texts(element: Element) -> tuple[str, ...]:
     return tuple(items) if items else (element.text or "",)
 
 
-def _names(tag: str) -> list[Name]:
+@lru_cache(maxsize=4096)  # a thousand captures of one camera have the same few tags
+def _names(tag: str) -> tuple[Name, ...]:
     """A tag's name in its namespace and in those that it lies in; none for RDF's own and for one without a place."""
     uri, _, name = tag.removeprefix("{").rpartition("}")
-    return [(namespace, name) for namespace in _namespaces(uri)]
+    return tuple((namespace, name) for namespace in _namespaces(uri))
 
 
 def _is_one_of(tag: str, names: Collection[Name]) -> bool:

@@ -16,8 +16,8 @@ from agalign.cli.align import (
     Reference,
     WithRgb,
     band_names,
-    find_captures,
 )
+from agalign.cli.run import find_captures
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Voice, exits, in_json, shown
 
 if TYPE_CHECKING:

@@ -14,8 +14,9 @@ from agalign._version import __version__
 from agalign.cli import align as cli_align
 from agalign.cli import evaluate as cli_evaluate
 from agalign.cli import info as cli_info
-from agalign.cli.align import Jobs, find_captures
+from agalign.cli.align import Jobs
 from agalign.cli.onto import onto
+from agalign.cli.run import GOES_ON, conclude, find_captures, run
 from agalign.cli.terminal import (
     EXIT_NOTHING,
     EXIT_OK,
@@ -40,6 +41,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 cli_align.register(app)
+_MOST_SHOWN = 20
 
 
 @app.callback(invoke_without_command=True)
@@ -64,8 +66,8 @@ def demo(
 ) -> None:
     """Make a synthetic flight, align it, and compare the result with the known truth."""
     voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice, cli_align.GOES_ON):
-        from agalign.batch import RunOptions, prepare_output
+    with exits(voice, GOES_ON):
+        from agalign.batch import CaptureReport, RunOptions, prepare_output
         from agalign.cameras.discover import DiscoverOptions
         from agalign.config import JointSettings, Settings
         from agalign.synthetic.score import make_flight, score_against_truth
@@ -78,16 +80,17 @@ def demo(
         truth = make_flight(source, captures, rng_seed=rng_seed)
         flight = find_captures(source, DiscoverOptions(), voice)
         settings = Settings(joint=JointSettings(device=device, rng_seed=rng_seed))
-        outcome = cli_align.run(
-            flight, target, settings, voice, RunOptions(overwrite=True, jobs=jobs), keep_tables=True
-        )
+        reports: list[CaptureReport] = []
+        how = RunOptions(overwrite=True, jobs=jobs)
+        outcome = run(flight, target, settings, voice, how, each=reports.append)
+        reports.sort(key=lambda r: r.label)
         table = Table("Capture", "Band", "Status", title="Error against the truth, px")
         for name in ("before", "median", "95 %"):
             table.add_column(name, justify="right")
-        for s in score_against_truth(outcome.reports, truth):
+        for s in score_against_truth(reports, truth):
             table.add_row(s.capture, s.band, s.status, f"{s.before_px:.1f}", f"{s.median_px:.3f}", f"{s.p95_px:.3f}")
         voice.result(table)
-        raise typer.Exit(cli_align.conclude(flight, outcome, target, voice))
+        raise typer.Exit(conclude(outcome, target, voice))
 
 
 cli_info.register(app)
@@ -101,18 +104,26 @@ def report(
     voice = Voice(quiet=False, verbose=False, log_json=False)
     with exits(voice):
         from agalign.errors import InputError
-        from agalign.products.report import write_report
+        from agalign.products.report import write_pages
         from agalign.products.sidecar import find_sidecars
-        from agalign.products.summary import write_summary
 
         if not out.is_dir() or not find_sidecars(out):
             raise InputError(f"{out}: no sidecars there; give the output folder of a run")
         unreadable: list[str] = []
-        summary = write_summary(out, unreadable.append)
+        pages = write_pages(out, unreadable.append)
         for text in unreadable:
             voice.problem(text)
-        voice.result(shown(str(write_report(out))))
-        voice.result(shown(str(summary)))
+        if pages.troubled:
+            table = Table("What fell short", title=f"{len(pages.troubled)} captures")
+            for label in pages.troubled[:_MOST_SHOWN]:
+                table.add_row(shown(label))
+            voice.result(table)
+        table = Table("Slowest", "Seconds")
+        for label, seconds in pages.slowest:
+            table.add_row(shown(label), f"{seconds:.1f}")
+        voice.result(table)
+        for path in (pages.report, pages.summary):
+            voice.result(shown(str(path)))
         raise typer.Exit(EXIT_PARTIAL if unreadable else EXIT_OK)
 
 

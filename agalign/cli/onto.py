@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from agalign.cli.align import Jobs, Reference, conclude, run
+from agalign.cli.align import Jobs, Reference
+from agalign.cli.run import conclude, run
 from agalign.cli.terminal import LogJson, Quiet, RngSeed, Verbose, Voice, exits
 from agalign.values.choices import MOST_MOSAIC_PIXELS, Compression, Interpolation, LocalUse, RasterFormat
 
@@ -57,4 +58,4 @@ def onto(
         )
         flight = Flight(reference.parent, tuple(captures_onto(reference, moving, band, max_pixels)), ())
         outcome = run(flight, target, settings, voice, RunOptions(overwrite, jobs=jobs, align_panels=True))
-        raise typer.Exit(conclude(flight, outcome, target, voice))
+        raise typer.Exit(conclude(outcome, target, voice))

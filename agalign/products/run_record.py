@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
-from agalign.products.sidecar import Sidecar, compact_lists
+from agalign.products.sidecar import CaptureResult, compact_lists
 from agalign.values.files import RUN_FILE, write_text
 
 _LIBRARIES = ("torch", "numpy", "rasterio", "opencv-python-headless", "tifffile", "pydantic")
@@ -79,11 +79,11 @@ class Tally:
     refused: list[RefusalPart] = field(default_factory=list)
     problems: list[ProblemPart] = field(default_factory=list)
 
-    def add(self, label: str, state: str, sidecar: Sidecar | None, problems: Iterable[str]) -> None:
+    def add(self, label: str, state: str, result: CaptureResult | None, problems: Iterable[str]) -> None:
         """One capture more."""
         self.captures[state] += 1
         self.problems += [ProblemPart(of=label, problem=text) for text in problems]
-        for band in [] if sidecar is None else sidecar.bands:
+        for band in [] if result is None else result.bands:
             if band.status == "reference":
                 continue
             self.pairs[band.status] += 1

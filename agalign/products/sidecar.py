@@ -5,8 +5,9 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -38,6 +39,12 @@ Count = Annotated[int, Field(gt=0)]
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", ser_json_inf_nan="null", populate_by_name=True)
+
+
+class _Result(_Part):
+    """Read from what holds more."""
+
+    model_config = ConfigDict(extra="ignore")
 
 
 class CameraPart(_Part):
@@ -138,11 +145,18 @@ class ResidualTile(_Part):
     shift_px: tuple[float | None, float | None]
 
 
-class MetricsPart(_Part):
+class MetricsResult(_Result):
     """Before: the files as they are. After: as written."""
 
     before: SimilarityPart
     after: SimilarityPart
+
+
+class MetricsPart(MetricsResult):
+    """The same with the shifts that windows show."""
+
+    model_config = ConfigDict(extra="forbid")
+
     tiles: list[ResidualTile]
 
 
@@ -172,8 +186,8 @@ class PlacePart(_Part):
     band_index: Count
 
 
-class BandPart(_Part):
-    """One band of the capture."""
+class BandResult(_Result):
+    """What became of one band of the capture."""
 
     band: str
     wavelength_nm: float | None
@@ -185,13 +199,21 @@ class BandPart(_Part):
     """Everything that speaks against it; the first is the one that `reason` tells."""
     homography: HomographyPart | None = None
     seed: SeedPart | None = None
-    grid: GridPart | None = None
     joint: JointPart | None = None
-    metrics: MetricsPart | None = None
+    metrics: MetricsResult | None = None
     local: LocalPart | None = None
     prediction: PredictionPart | None = None
     place: PlacePart | None = None
     seconds: float
+
+
+class BandPart(BandResult):
+    """The same with the mapping and the shifts of windows, which are long."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    metrics: MetricsPart | None = None
+    grid: GridPart | None = None
 
 
 class FilePart(_Part):
@@ -218,8 +240,10 @@ class OutputPart(_Part):
     nodata: float | str | None
 
 
-class Sidecar(_Part):
-    """One capture. `status` is ok where every moving band is aligned, or predicted as well as was asked for."""
+class CaptureResult(_Result):
+    """What became of one capture. `status` is ok where every moving band is aligned, or predicted as well as was asked
+    for.
+    """
 
     schema_: Annotated[Literal["agalign/1"], Field(alias="schema")] = "agalign/1"
     agalign: str
@@ -232,10 +256,23 @@ class Sidecar(_Part):
     status: CaptureStatus
     missing_bands: list[str]
     reference: ReferencePart
-    bands: list[BandPart]
+    bands: Sequence[BandResult]
     output: OutputPart | None
     settings: str
     """Fingerprint of the settings that made this; another run with the same need not do it again."""
+
+
+class Sidecar(CaptureResult):
+    """One capture, as its sidecar has it."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    bands: list[BandPart]
+
+    def result(self) -> CaptureResult:
+        """The same without its bands' long tables, of which a season has no need at once."""
+        short: dict[str, Any] = {"bands": {"__all__": {"grid": True, "metrics": {"tiles"}}}}
+        return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude=short))
 
 
 def write_sidecar(path: Path, sidecar: Sidecar) -> None:
@@ -251,11 +288,23 @@ def compact_lists(text: str) -> str:
 
 def read_sidecar(path: Path) -> Sidecar:
     """Raises SidecarError, naming the file and the field, where it is missing, malformed or of another version."""
+    return _read(path, Sidecar)
+
+
+def read_result(path: Path) -> CaptureResult:
+    """A sidecar without its long tables, which take most of the time to read. Raises as `read_sidecar` does."""
+    return _read(path, CaptureResult)
+
+
+Model = TypeVar("Model", bound=CaptureResult)
+
+
+def _read(path: Path, model: type[Model]) -> Model:
     try:
         size = path.stat().st_size
         if size > _LONGEST_BYTES:
             raise SidecarError(f"{path}: {size >> 20} MB are no sidecar; delete it and run again")
-        return Sidecar.model_validate_json(path.read_bytes())
+        return model.model_validate_json(path.read_bytes())
     except OSError as error:
         raise SidecarError(f"{path}: cannot be read ({error.strerror or error})") from None
     except ValidationError as error:

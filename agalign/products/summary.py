@@ -1,14 +1,14 @@
-"""One row per band pair, from the sidecars of a run."""
+"""OUT/summary.csv: one row per band pair of a run, and one for each band of a calibration panel."""
 
 import csv
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from agalign.errors import SidecarError
-from agalign.products.panels import PanelPart, read_panels
-from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
+from agalign.products.panels import PanelPart
+from agalign.products.sidecar import BandPart, Sidecar
 from agalign.values.files import write_text
+from agalign.values.text import harmless
 
 SUMMARY_COLUMNS = (
     "folder", "capture", "band", "wavelength_nm", "status", "reason", "seed", "retrieval", "corner_std_px",
@@ -18,47 +18,27 @@ SUMMARY_COLUMNS = (
     "nmi_after", "ncc_before", "ncc_after", "gradient_correlation_before", "gradient_correlation_after",
     "structure_ssim_before", "structure_ssim_after", "seconds",
 )  # fmt: skip
+_FORMULA = ("=", "+", "-", "@")
 
 
-def _ignore(_problem: str) -> None:
-    """Unreadable sidecars are told to nobody."""
+def summary_rows(folder: str, sidecar: Sidecar) -> list[dict[str, object]]:
+    """A row for each band pair of a capture."""
+    return [_row(folder, sidecar, band) for band in sidecar.bands if band.status != "reference"]
 
 
-def write_summary(out: Path, on_problem: Callable[[str], None] = _ignore) -> Path:
-    """OUT/summary.csv from all sidecars below OUT, a row per band pair, and then one for each band of a capture that
-    shows a calibration panel; what is unreadable is told to `on_problem`.
+def panel_rows(panel: PanelPart) -> list[dict[str, object]]:
+    """A row for each band of a capture that shows a calibration panel."""
+    facts = {"folder": panel.folder, "capture": panel.capture, "status": "panel", "reason": panel.sentence}
+    return [{**facts, "band": band.band} for band in panel.bands]
 
-    Raises OutputError.
-    """
+
+def write_summary(rows: Iterable[Mapping[str, object]], path: Path) -> None:
+    """Raises OutputError."""
     table = io.StringIO()
     writer = csv.DictWriter(table, SUMMARY_COLUMNS, lineterminator="\n")
     writer.writeheader()
-    for folder, sidecar in sidecars_below(out, on_problem):
-        writer.writerows(_row(folder, sidecar, band) for band in sidecar.bands if band.status != "reference")
-    for panel in panels_of(out, on_problem):
-        facts = {"folder": panel.folder, "capture": panel.capture, "status": "panel", "reason": panel.sentence}
-        writer.writerows({**facts, "band": band.band} for band in panel.bands)
-    path = out / "summary.csv"
+    writer.writerows({k: _no_formula(v) for k, v in row.items()} for row in rows)
     write_text(path, table.getvalue())
-    return path
-
-
-def sidecars_below(out: Path, on_problem: Callable[[str], None] = _ignore) -> Iterable[tuple[str, Sidecar]]:
-    """(folder relative to OUT, sidecar) of every readable sidecar; `on_problem` is told of the others."""
-    for path in find_sidecars(out):
-        try:
-            yield path.parent.relative_to(out).as_posix(), read_sidecar(path)
-        except SidecarError as error:
-            on_problem(str(error))
-
-
-def panels_of(out: Path, on_problem: Callable[[str], None] = _ignore) -> list[PanelPart]:
-    """The calibration panels of the run below OUT; `on_problem` is told of a file that cannot be read."""
-    try:
-        return read_panels(out)
-    except SidecarError as error:
-        on_problem(str(error))
-        return []
 
 
 def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:
@@ -88,6 +68,14 @@ def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:
         for name in ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim"):
             row |= {f"{name}_before": _short(before[name]), f"{name}_after": _short(after[name])}
     return row
+
+
+def _no_formula(value: object) -> object:
+    """A text that a spreadsheet would calculate, as a text: the names in it are a camera's or a card's."""
+    if not isinstance(value, str):
+        return value
+    text = harmless(value)
+    return f"'{text}" if text.startswith(_FORMULA) else text
 
 
 def _short(value: float | None) -> float | None:

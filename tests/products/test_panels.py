@@ -14,7 +14,7 @@ from agalign.batch import CaptureReport, RunOptions
 from agalign.config import Settings, WriteSettings
 from agalign.errors import SidecarError
 from agalign.products.panels import PANELS_FILE, read_panels
-from agalign.products.report import write_report
+from agalign.products.report import write_pages
 from agalign.synthetic.panel import make_flight_between_panels
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -73,7 +73,7 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: tuple[Path, list[Capt
     table = csv.DictReader((out / "summary.csv").read_text().splitlines())
     rows = [r for r in table if r["status"] == "panel"]
     assert {(r["capture"], r["band"]) for r in rows} >= {("IMG_0001", "NIR"), ("IMG_0004", "Green")}
-    page = write_report(out).read_text()
+    page = write_pages(out, print).report.read_text()
     assert "Calibration panels" in page
     assert "IMG_0001.panel.png" in page
 

@@ -1,0 +1,257 @@
+"""A flight aligned from the command line: found, done with a progress line, told capture by capture, and summed up."""
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Voice, shown
+from agalign.errors import NoSuchBandError, OutputError
+
+if TYPE_CHECKING:
+    from agalign.batch import CaptureReport, RunOptions
+    from agalign.cameras.discover import DiscoverOptions, Flight
+    from agalign.config import Settings
+    from agalign.values.capture import Capture
+
+GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
+
+
+def find_captures(folder: Path, options: "DiscoverOptions", voice: Voice, *, silent: bool = False) -> "Flight":
+    """The captures below a folder; what is wrong with its files is said. Raises where there is none."""
+    from agalign.cameras.discover import discover
+    from agalign.errors import InputError
+
+    flight = discover(folder, options)
+    if not silent:
+        for problem in flight.problems:
+            voice.problem(problem.text, file=problem.path)
+    if not flight.captures:
+        if any(isinstance(p.error, NoSuchBandError) for p in flight.problems):
+            raise NoSuchBandError(f"{folder}: no capture has a band '{options.reference}'")
+        raise InputError(
+            f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' shows what was found"
+        )
+    bands = sum(len(c.bands) for c in flight.captures)
+    if not silent:
+        voice.event(
+            "found",
+            f"{len(flight.captures)} captures, {bands} bands in {folder}",
+            captures=len(flight.captures),
+            bands=bands,
+        )
+    return flight
+
+
+def load_ahead() -> None:
+    """Begin to load what takes two seconds to load, torch among it, while the files are looked at."""
+
+    def load() -> None:
+        with suppress(Exception):  # told by whoever needs it
+            import_module("agalign.batch")
+
+    threading.Thread(target=load, daemon=True).start()
+
+
+@dataclass
+class BandTotals:
+    """One band in all captures of a run."""
+
+    statuses: Counter[str] = field(default_factory=Counter)
+    residuals_px: list[float] = field(default_factory=list)
+    """Of those that are aligned."""
+    seconds: list[float] = field(default_factory=list)
+
+
+@dataclass
+class Outcome:
+    """What a run has come to so far: sums, so that a season needs no more memory than a capture."""
+
+    states: Counter[str] = field(default_factory=Counter)
+    bands: dict[str, BandTotals] = field(default_factory=dict)
+    useful: bool = False
+    """Some band pair is aligned or predicted."""
+    good: bool = True
+    """Nothing is left to be wished for, of captures, of files that were found and of the report."""
+
+    def add(self, report: "CaptureReport") -> None:
+        """One capture more."""
+        self.states[report.state] += 1
+        self.useful |= report.useful
+        self.good &= report.good
+        for band in [] if report.result is None else report.result.bands:
+            if band.status == "reference":
+                continue
+            totals = self.bands.setdefault(band.band, BandTotals())
+            totals.statuses[band.status] += 1
+            totals.seconds.append(band.seconds)
+            residual = band.metrics.after.residual_px if band.metrics else None
+            if band.status == "aligned" and residual is not None:
+                totals.residuals_px.append(residual)
+
+
+def run(
+    flight: "Flight", out: Path, settings: "Settings", voice: Voice, how: "RunOptions", *,
+    dask: str | None = None, model: Path | None = None, each: "Callable[[CaptureReport], None]" = lambda _: None,
+) -> Outcome:  # fmt: skip
+    """Align the captures, saying how far it has come. Raises OutputError where nothing could be written."""
+    from agalign.batch import Listener, run_flight
+    from agalign.batch.workers import dask_executor
+
+    outcome = Outcome(good=not flight.problems)
+    done_pairs, all_pairs = 0, sum(len(c.moving) for c in flight.captures)
+    pairs = {c.label: len(c.moving) for c in flight.captures}
+    started = time.monotonic()
+    cluster = nullcontext() if dask is None else dask_executor(dask, how.jobs, how.timeout_s)
+    with cluster as executor, _progress(voice, all_pairs) as show:
+        options = replace(how, executor=executor)
+        current: Capture | None = None
+
+        def on_start(capture: "Capture") -> None:
+            nonlocal current
+            voice.check()
+            current = capture
+
+        def on_learning(camera: str, share: float) -> None:
+            voice.check()
+            show(done_pairs, f"learning from {camera}: {share:.0%} at most")
+
+        def on_learnt(camera: str, seconds: float) -> None:
+            voice.event("learnt", camera=camera, seconds=round(seconds, 2))
+
+        def on_pair(band: str, stage: str, share: float) -> None:
+            voice.check()
+            assert current is not None
+            names = [b.name for b in current.moving]
+            place = names.index(band) if band in names else len(names)
+            show(
+                done_pairs + place + (0.85 * share if stage in ("learning", "refining") else 0.0),
+                f"{current.label} {band}: {stage}",
+            )
+
+        try:
+            listener = Listener(on_start, on_pair, on_learning, on_learnt)
+            for report in run_flight(flight, out, settings, options, listener, model):
+                voice.check()
+                outcome.add(report)
+                each(report)
+                done_pairs += pairs[report.label]
+                show(done_pairs, report.label)
+                _tell(report, voice, outcome.states.total(), len(flight.captures))
+        except OutputError as error:
+            if not outcome.states:
+                raise
+            voice.problem(str(error))
+            outcome.good = False
+        finally:
+            # Also after an interruption: what is finished is reported.
+            if outcome.states:
+                outcome.good &= _write_pages(out, voice, changed=set(outcome.states) != {"kept"})
+    seconds = time.monotonic() - started
+    voice.event("finished", seconds=round(seconds, 1), captures=outcome.states.total(), **outcome.states)
+    return outcome
+
+
+def _write_pages(out: Path, voice: Voice, *, changed: bool) -> bool:
+    """False where they could not be written."""
+    from agalign.products.report import pages_stand, write_pages
+
+    try:
+        if changed or not pages_stand(out):
+            write_pages(out, voice.problem)
+    except OutputError as error:
+        voice.problem(str(error))
+        return False
+    return True
+
+
+@contextmanager
+def _progress(voice: Voice, pairs: int) -> Iterator[Callable[[float, str], None]]:
+    """A bar on a terminal, nothing elsewhere: there each capture prints a plain line."""
+    if voice.quiet or voice.log_json or not voice.err.is_terminal:
+        yield lambda _done, _text: None
+        return
+    columns = (
+        BarColumn(bar_width=28), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )  # fmt: skip
+    with Progress(*columns, console=voice.err, transient=True) as progress:
+        task = progress.add_task("starting", total=pairs)
+        yield lambda done, text: progress.update(task, completed=done, description=shown(text))
+
+
+def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> None:
+    if report.panel is not None:
+        text = f"[{number}/{count}] {report.label}: {report.panel}"
+        voice.event("panel", text, capture=report.label, panel=report.panel)
+        return
+    for text in report.problems:
+        voice.problem(f"{report.label}: {text}", capture=report.label)
+    for (name, stage), seconds in report.stages.items() if voice.log_json else ():
+        voice.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(seconds, 4))
+    if report.result is None:
+        return
+    pairs = [b for b in report.result.bands if b.status != "reference"]
+    aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
+    also = f", {predicted} predicted" if predicted else ""
+    kept = ", kept from an earlier run" if report.state == "kept" else ""
+    seconds = sum(b.seconds for b in pairs)
+    text = f"[{number}/{count}] {report.label}: {aligned} of {len(pairs)} aligned{also}, {seconds:.1f} s{kept}"
+    if voice.verbose or not voice.err.is_terminal or voice.log_json:
+        voice.event(
+            "capture",
+            text,
+            capture=report.label,
+            state=report.state,
+            status=report.result.status,
+            aligned=aligned,
+            predicted=predicted,
+            pairs=len(pairs),
+            seconds=round(report.seconds, 3),
+        )
+    for band in pairs:
+        residual = band.metrics.after.residual_px if band.metrics else None
+        shown = "" if residual is None else f", residual {residual:.3f} px"
+        if voice.verbose or voice.log_json:
+            voice.event(
+                "pair", f"    {band.band}: {band.status}{shown}, {band.seconds:.1f} s",
+                capture=report.label, band=band.band, status=band.status, reason=band.reason,
+                residual_px=residual, seconds=band.seconds,
+            )  # fmt: skip
+        if band.status in ("predicted", "seed_only", "failed"):
+            voice.problem(
+                f"{report.label} {band.band}: {band.status}: {band.reason}", capture=report.label, band=band.band
+            )
+
+
+def conclude(outcome: Outcome, out: Path, voice: Voice) -> int:
+    """The closing table, and the exit code."""
+    from statistics import median
+
+    statuses = sum((band.statuses for band in outcome.bands.values()), Counter[str]())
+    table = Table("Band", title=f"{statuses['aligned']} of {statuses.total()} band pairs aligned")
+    for name in ("Aligned", "Predicted", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair"):
+        table.add_column(name, justify="right")
+    for name, band in outcome.bands.items():
+        counts = [str(band.statuses[s]) for s in ("aligned", "predicted", "seed_only", "failed")]
+        known = band.residuals_px
+        worst = (f"{median(known):.3f}", f"{max(known):.3f}") if known else ("-", "-")
+        table.add_row(shown(name), *counts, *worst, f"{median(band.seconds):.1f}")
+    if outcome.bands:
+        voice.result(table)
+    voice.result(shown(f"Report: {out / 'index.html'}"))
+    if outcome.states and set(outcome.states) == {"panel"}:
+        voice.problem("nothing but calibration panels there; --align-panels aligns them all the same")
+        return EXIT_NOTHING
+    if not outcome.useful:
+        voice.problem("no band pair could be aligned")
+        return EXIT_PARTIAL if outcome.bands else EXIT_NOTHING
+    return EXIT_OK if outcome.good else EXIT_PARTIAL
