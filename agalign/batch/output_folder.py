@@ -49,6 +49,7 @@ def held(out: Path) -> Iterator[None]:
         remove_partial_files(out)
         yield
     finally:
+        remove_partial_files(out)  # of workers that were lost
         with suppress(OSError):
             path.unlink(missing_ok=True)
         lock.release()

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 from agalign.batch.capture import discard_outputs, output_paths, paths_written, quiet
@@ -37,7 +36,7 @@ from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.panels import write_panels
-from agalign.products.run_record import ProblemPart, RunState, Tally, write_run_record
+from agalign.products.run_record import ProblemPart, RunState, Tally, begun, write_run_record
 from agalign.products.sidecar import CaptureResult, read_result
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
@@ -117,10 +116,10 @@ def _recorded(flight: Flight, out: Path, settings: Settings) -> Iterator[Tally]:
     tally, began = Tally(), time.monotonic()
     tally.captures["found"] = len(flight.captures)
     tally.problems += [ProblemPart(of=str(p.path), problem=p.text) for p in flight.problems]
-    started_at = datetime.now(UTC).isoformat(timespec="seconds")
+    run = begun(flight.folder, settings)
 
     def write(state: RunState) -> None:
-        write_run_record(out, flight.folder, settings, tally, state, started_at, time.monotonic() - began)
+        write_run_record(out, run, tally, state, time.monotonic() - began)
 
     write("running")
     try:

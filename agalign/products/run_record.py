@@ -5,6 +5,7 @@ import platform
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -92,17 +93,24 @@ class Tally:
                 self.refused.append(refusal)
 
 
-def write_run_record(
-    out: Path, folder: Path, settings: Settings, tally: Tally, state: RunState, started_at: str, seconds: float
-) -> None:
-    """OUT/agalign-run.json. Raises OutputError."""
-    part = RunPart(
-        state=state, started_at=started_at, seconds=round(seconds, 2), input=str(folder), versions=_versions(),
-        machine=_machine(settings), settings=settings.model_dump(mode="json"), captures=dict(tally.captures),
-        pairs=dict(tally.pairs), refused=tally.refused, problems=tally.problems,
-        stage_seconds={k: round(v, 3) for k, v in sorted(tally.stage_seconds.items())},
-        capture_seconds={k: round(v, 3) for k, v in sorted(tally.capture_seconds.items())},
+def begun(folder: Path, settings: Settings) -> RunPart:
+    """A run that has just begun."""
+    return RunPart(
+        state="running", started_at=datetime.now(UTC).isoformat(timespec="seconds"), seconds=0.0, input=str(folder),
+        versions=_versions(), machine=_machine(settings), settings=settings.model_dump(mode="json"), captures={},
+        pairs={}, stage_seconds={}, capture_seconds={}, refused=[], problems=[],
     )  # fmt: skip
+
+
+def write_run_record(out: Path, run: RunPart, tally: Tally, state: RunState, seconds: float) -> None:
+    """OUT/agalign-run.json of a run that has come so far. Raises OutputError."""
+    facts = {
+        "state": state, "seconds": round(seconds, 2), "captures": dict(tally.captures), "pairs": dict(tally.pairs),
+        "refused": tally.refused, "problems": tally.problems,
+        "stage_seconds": {k: round(v, 3) for k, v in sorted(tally.stage_seconds.items())},
+        "capture_seconds": {k: round(v, 3) for k, v in sorted(tally.capture_seconds.items())},
+    }  # fmt: skip
+    part = run.model_copy(update=facts)
     write_text(out / RUN_FILE, compact_lists(part.model_dump_json(by_alias=True, indent=1)) + "\n")
 
 

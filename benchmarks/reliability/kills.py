@@ -67,7 +67,9 @@ def differences(out: Path, expected: dict[str, object]) -> Counter[str]:
     found["left over"] = len(here.keys() - expected.keys())
     for name in expected.keys() & here.keys():
         try:
-            found["different"] += contents(here[name]) != expected[name]
+            if contents(here[name]) != expected[name]:
+                found["different"] += 1
+                print("different:", name)
         except Exception as error:
             print(name, error)
             found["corrupt"] += 1
