@@ -49,3 +49,13 @@ class SidecarError(InputError):
 
 class OutputError(AgalignError):
     """A result cannot be written (no permission, disk full, a folder where a file should be)."""
+
+
+_SAID_OF_MEMORY = (
+    "not enough memory", "can't allocate memory", "Cannot allocate memory", "bad_alloc", "Insufficient memory",
+)  # fmt: skip
+
+
+def is_want_of_memory(error: BaseException) -> bool:
+    """True where a library says in words that memory is short, having no class for it."""
+    return isinstance(error, MemoryError) or any(said in str(error) for said in _SAID_OF_MEMORY)

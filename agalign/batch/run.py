@@ -36,7 +36,7 @@ from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.panels import write_panels
-from agalign.products.run_record import ProblemPart, RunState, Tally, begun, write_run_record
+from agalign.products.run_record import RunState, Tally, begun, problem_of, write_run_record
 from agalign.products.sidecar import CaptureResult, read_result
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
@@ -115,7 +115,7 @@ def _recorded(flight: Flight, out: Path, settings: Settings) -> Iterator[Tally]:
     """A tally that is written at the beginning and at the end of a run, however it ends."""
     tally, began = Tally(), time.monotonic()
     tally.captures["found"] = len(flight.captures)
-    tally.problems += [ProblemPart(of=str(p.path), problem=p.text) for p in flight.problems]
+    tally.problems += [problem_of(str(p.path), p.text) for p in flight.problems]
     run = begun(flight.folder, settings)
 
     def write(state: RunState) -> None:

@@ -18,7 +18,7 @@ _BAND_WORDS = (
 _SUFFIX = re.compile(
     rf"^(?P<capture>.*?)(?:(?:^|(?<=.)[_\-. ]+)(?P<band>(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|b?\d{{1,2}}|re|[bgrn])"
     rf"|(?<=[0-9a-z])(?P<glued>(?-i:Blue|Green|RedEdge|Red|NIR|GRE|REG|RED|BLUE|GREEN)|\d{{3,4}}nm))$",
-    re.IGNORECASE,
+    re.IGNORECASE | re.DOTALL,
 )
 
 
@@ -83,7 +83,7 @@ def compile_pattern(pattern: str) -> tuple[re.Pattern[str], ...]:
         )
     escaped = re.escape(pattern).replace(r"\{capture\}", "(?P<capture>.+)").replace(r"\*", ".*")
     bands = rf"(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm", "[^/]+?"
-    return tuple(re.compile(escaped.replace(r"\{band\}", f"(?P<band>{band})"), re.IGNORECASE) for band in bands)
+    return tuple(re.compile(escaped.replace(r"\{band\}", f"(?P<band>{band})"), re.IGNORECASE | re.DOTALL) for band in bands)
 
 
 def _wavelength_in(name: str) -> float | None:

@@ -16,7 +16,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from agalign.errors import AgalignError, ConfigurationError
+from agalign.errors import AgalignError, ConfigurationError, is_want_of_memory
 from agalign.values.choices import MOST_RNG_SEED
 from agalign.values.text import harmless
 
@@ -148,7 +148,7 @@ def _ending(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:
             return EXIT_USAGE, str(error)
         case AgalignError():
             return EXIT_NOTHING, str(error)
-        case MemoryError():
+        case _ if is_want_of_memory(error):
             return EXIT_NOTHING, _OUT_OF_MEMORY
         case ImportError():
             return EXIT_NOTHING, f"a library cannot be loaded ({error}); is memory short, or the installation damaged?"

@@ -16,7 +16,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 
 from agalign._version import __version__
-from agalign.errors import InputError
+from agalign.errors import InputError, is_want_of_memory
 from agalign.flight.rig import Rig
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import matching_network
@@ -76,6 +76,8 @@ def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
     except InputError:
         raise
     except Exception as error:  # of a damaged file anything may be wrong
+        if is_want_of_memory(error):
+            raise MemoryError(str(error)) from None
         said = next(iter(str(error).splitlines()), type(error).__name__)
         raise InputError(f"{path}: cannot be read as a model ({said})") from None
     return replace(model, net=model.net.to(device()))

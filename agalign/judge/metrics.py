@@ -20,6 +20,7 @@ _FINE = 64
 """Moving values are counted in 64ths of a bin before the spline is applied: exact to 1/128 bin."""
 _LEAST_PIXELS = 256
 _ENOUGH_PIXELS = 250_000
+_LEAST_DEVIATION = 1e-9
 _SSIM_WINDOW_PX = 11
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
 """Of SSIM, for a range of 1."""
@@ -168,6 +169,8 @@ def _ssim(one: _Gradient, other: _Gradient, valid: Mask, inside: Mask) -> float:
     if not inside.any():
         return 0.0
     (mean_a, by_a), (mean_b, by_b) = (_standard(g.here[valid]) for g in (one, other))
+    if not by_a * by_b:  # an image without edges resembles nothing
+        return 0.0
     a, b = (g.local_mean[inside] for g in (one, other))
     product = _blur(one.magnitude * other.magnitude)[one.lattice][inside]
     covariance = (by_a * by_b) * (product - a * b)
@@ -178,9 +181,9 @@ def _ssim(one: _Gradient, other: _Gradient, valid: Mask, inside: Mask) -> float:
 
 
 def _standard(values: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
-    """(mean, 1 / standard deviation)."""
+    """(mean, 1 / standard deviation); 0 for one that is none."""
     mean, deviation = values.mean(dtype=np.float64), values.std(dtype=np.float64)
-    return np.float32(mean), np.float32(1 / max(deviation, 1e-12))
+    return np.float32(mean), np.float32(1 / deviation if deviation > _LEAST_DEVIATION else 0.0)
 
 
 def _blur(image: FloatImage) -> FloatImage:

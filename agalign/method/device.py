@@ -11,7 +11,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from agalign.errors import ConfigurationError
+from agalign.errors import ConfigurationError, is_want_of_memory
 
 
 def choose_device(name: str) -> torch.device:
@@ -104,4 +104,4 @@ def _is_want_of_memory(error: cv2.error | RuntimeError) -> bool:
     if isinstance(error, cv2.error):
         return error.code == cv2.Error.STS_NO_MEM
     # torch's allocator on the CPU has no class of its own for it.
-    return isinstance(error, torch.cuda.OutOfMemoryError) or "not enough memory" in str(error)
+    return isinstance(error, torch.cuda.OutOfMemoryError) or is_want_of_memory(error)

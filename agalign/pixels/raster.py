@@ -83,7 +83,9 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
     try:
         with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(path, driver=driver) as dataset:
             yield dataset
-    except (RasterioIOError, RasterioError, UnicodeEncodeError) as error:
+    except UnicodeEncodeError:
+        raise UnreadableFileError(f"{path}: its name is not in this system's letters; set LC_ALL=C.UTF-8") from None
+    except (RasterioIOError, RasterioError) as error:
         text = why(error).replace(str(path), "").strip(" :'")
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
 

@@ -18,8 +18,10 @@ _INK = 40, 40, 40
 def write_png(image: Picture, path: Path) -> None:
     """Complete or not at all. Raises OutputError."""
     with complete_file(path) as partial:
-        if not cv2.imwrite(str(partial), image[..., ::-1]):
-            raise OutputError(f"{path}: cannot be written")
+        encoded, data = cv2.imencode(".png", image[..., ::-1])
+        if not encoded:
+            raise OutputError(f"{path}: cannot be made")
+        partial.write_bytes(data.tobytes())
 
 
 def with_text(

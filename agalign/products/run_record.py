@@ -17,6 +17,7 @@ from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.sidecar import CaptureResult, compact_lists
 from agalign.values.files import RUN_FILE, write_text
+from agalign.values.text import harmless
 
 _LIBRARIES = ("torch", "numpy", "rasterio", "opencv-python-headless", "tifffile", "pydantic")
 _LONGEST_BYTES = 1 << 28
@@ -69,6 +70,11 @@ class RunPart(_Part):
     problems: list[ProblemPart]
 
 
+def problem_of(what: str, text: str) -> ProblemPart:
+    """Names of files may hold what is no letter; those are written out."""
+    return ProblemPart(of=harmless(what), problem=harmless(text))
+
+
 @dataclass
 class Tally:
     """What a run has come to so far."""
@@ -83,7 +89,7 @@ class Tally:
     def add(self, label: str, state: str, result: CaptureResult | None, problems: Iterable[str]) -> None:
         """One capture more."""
         self.captures[state] += 1
-        self.problems += [ProblemPart(of=label, problem=text) for text in problems]
+        self.problems += [problem_of(label, text) for text in problems]
         for band in [] if result is None else result.bands:
             if band.status == "reference":
                 continue
@@ -96,7 +102,7 @@ class Tally:
 def begun(folder: Path, settings: Settings) -> RunPart:
     """A run that has just begun."""
     return RunPart(
-        state="running", started_at=datetime.now(UTC).isoformat(timespec="seconds"), seconds=0.0, input=str(folder),
+        state="running", started_at=datetime.now(UTC).isoformat(timespec="seconds"), seconds=0.0, input=harmless(str(folder)),
         versions=_versions(), machine=_machine(settings), settings=settings.model_dump(mode="json"), captures={},
         pairs={}, stage_seconds={}, capture_seconds={}, refused=[], problems=[],
     )  # fmt: skip

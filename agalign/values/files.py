@@ -65,7 +65,7 @@ def lies_within(name: str) -> bool:
     """True for the relative path of a file that no reading of it puts outside the folder it is relative to."""
     posix, windows = PurePosixPath(name), PureWindowsPath(name)
     anchored = posix.is_absolute() or bool(windows.drive or windows.root)
-    return bool(name) and not anchored and ".." not in windows.parts and name.isprintable()
+    return bool(name) and not anchored and ".." not in windows.parts and "\0" not in name
 
 
 def _to_disk(path: Path) -> None:
