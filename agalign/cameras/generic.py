@@ -83,7 +83,8 @@ def compile_pattern(pattern: str) -> tuple[re.Pattern[str], ...]:
         )
     escaped = re.escape(pattern).replace(r"\{capture\}", "(?P<capture>.+)").replace(r"\*", ".*")
     bands = rf"(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm", "[^/]+?"
-    return tuple(re.compile(escaped.replace(r"\{band\}", f"(?P<band>{band})"), re.IGNORECASE | re.DOTALL) for band in bands)
+    whole = (escaped.replace(r"\{band\}", f"(?P<band>{band})") for band in bands)
+    return tuple(re.compile(one, re.IGNORECASE | re.DOTALL) for one in whole)
 
 
 def _wavelength_in(name: str) -> float | None:
