@@ -15,8 +15,6 @@ from agalign.values.doubts import Doubt
 _PLAINLY_MORE = 5.0
 """Times what guessing tells of held-out patches: there is something in common."""
 
-_STEP_PX = 1e-4
-
 
 def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], capture: Capture) -> Observation:
     """The mappings of a capture that are aligned, as the rig takes them."""
@@ -31,13 +29,10 @@ def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], capture:
 
 
 def _std_there_px(pair: BandPair, alignment: Alignment) -> float:
-    """How well a mapping is known, px of the moving file, which the rig's errors are in.
-
-    In steps: beyond these it depends on where in memory its sums were added up, and the rig would with it.
-    """
+    """How well a mapping is known, px of the moving file, which the rig's errors are in."""
     assert alignment.joint is not None
     scale = geometry.local_scale(pair.in_file_px(alignment.fixed_to_moving), *pair.reference_file_px)[-1]
-    return round(alignment.joint.corner_std_px / min(pair.scales[0]) * abs(float(scale)) / _STEP_PX) * _STEP_PX
+    return alignment.joint.corner_std_px / min(pair.scales[0]) * abs(float(scale))
 
 
 def with_predictions(

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import entr
 
+from agalign.pixels.structure import gradient_magnitude
 from agalign.values.image import FloatImage, Mask, Raster
 
 _BINS = 32
@@ -157,7 +158,7 @@ class _Gradient:
     @classmethod
     def of(cls, image: FloatImage, lattice: tuple[slice, slice]) -> "_Gradient":
         gx, gy = (cv2.Sobel(image, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
-        magnitude = np.asarray(cv2.magnitude(gx, gy), np.float32)
+        magnitude = gradient_magnitude(gx, gy)
         mean, square = (_blur(x)[lattice] for x in (magnitude, magnitude * magnitude))
         return cls(lattice, magnitude, magnitude[lattice], mean, square - mean * mean)
 

@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from agalign.method.patches import FOOTPRINT_PX, Keypoints, bilinear, footprint_radius, transform
 from agalign.pixels.resample import shrink
+from agalign.pixels.structure import gradient_magnitude
 from agalign.values import geometry, lens
 from agalign.values.alignment import LocalField
 from agalign.values.geometry import Matrix
@@ -225,7 +226,7 @@ def _room_px(valid: Mask) -> NDArray[np.float32]:
 def _gradient_magnitude(planes: FloatImage) -> FloatImage:
     """Largest gradient over the channels, per pixel of distance."""
     gradients = [
-        cv2.magnitude(cv2.Sobel(p, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(p, cv2.CV_32F, 0, 1, scale=1 / 8))
+        gradient_magnitude(cv2.Sobel(p, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(p, cv2.CV_32F, 0, 1, scale=1 / 8))
         for p in planes
     ]
     return np.asarray(np.max(gradients, axis=0))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from agalign.errors import GeometryError
 from agalign.pixels.resample import shrink, single
+from agalign.pixels.structure import gradient_magnitude
 from agalign.values import geometry, lens
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import FloatImage, Mask, Raster
@@ -53,7 +54,7 @@ def landmarks(raster: Raster, view: View) -> Landmarks:
     looked_at, valid = small.pixels, small.valid
     if view == "edges":
         smooth = cv2.GaussianBlur(np.where(valid, looked_at, 0).astype(np.float32), (0, 0), _EDGES_SMOOTHED_PX)
-        looked_at = np.sqrt(cv2.magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))))
+        looked_at = np.sqrt(gradient_magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))))
         beside = np.ones((_BESIDE_INVALID_PX, _BESIDE_INVALID_PX), np.uint8)
         valid = cv2.erode(valid.astype(np.uint8), beside, borderValue=1) > 0
     found, described = cv2.SIFT.create(nfeatures=_MOST).detectAndCompute(eight_bit(looked_at, valid), valid.view("u1"))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from agalign.values.image import Raster
+from agalign.values.image import FloatImage, Raster
 
 Field = NDArray[np.complex64]
 
@@ -27,7 +27,7 @@ def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
     if not complete:
         smooth /= np.maximum(cv2.GaussianBlur(raster.valid.astype(np.float32), (0, 0), smoothing_px), 1e-3)
     gx, gy = (cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1)))
-    magnitude = cv2.magnitude(gx, gy)
+    magnitude = gradient_magnitude(gx, gy)
     inside = cv2.erode(raster.valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
     some = magnitude[::3, ::3][inside[::3, ::3]]
     ceiling = float(np.quantile(some, _AMPLITUDE_QUANTILE)) if some.size else 0.0
@@ -38,6 +38,15 @@ def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
         field[..., 0] = (gx - gy) * (gx + gy) * weight
         field[..., 1] = 2 * gx * gy * weight
     return np.asarray(field.view(np.complex64)[..., 0])
+
+
+def gradient_magnitude(gx: FloatImage, gy: FloatImage) -> FloatImage:
+    """(height, width). OpenCV's depends in its last digit on where in memory its arrays lie, and with it all results
+    would.
+    """
+    square = gx * gx
+    square += gy * gy
+    return np.asarray(np.sqrt(square, out=square))
 
 
 @dataclass(frozen=True)

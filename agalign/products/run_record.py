@@ -103,8 +103,9 @@ def begun(folder: Path, settings: Settings) -> RunPart:
     """A run that has just begun."""
     return RunPart(
         state="running", started_at=datetime.now(UTC).isoformat(timespec="seconds"), seconds=0.0,
-        input=harmless(str(folder)), versions=_versions(), machine=_machine(settings), settings=settings.model_dump(mode="json"), captures={},
-        pairs={}, stage_seconds={}, capture_seconds={}, refused=[], problems=[],
+        input=harmless(str(folder)), versions=_versions(), machine=_machine(settings),
+        settings=settings.model_dump(mode="json"), captures={}, pairs={}, stage_seconds={}, capture_seconds={},
+        refused=[], problems=[],
     )  # fmt: skip
 
 

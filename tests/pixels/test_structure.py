@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from agalign.pixels.resample import shrink, textured
-from agalign.pixels.structure import correlation_surface, find_peak, structure_field
+from agalign.pixels.structure import correlation_surface, find_peak, gradient_magnitude, structure_field
 from agalign.values.image import Raster
 
 from ..conftest import textured_image
@@ -63,3 +63,19 @@ def test_textured() -> None:
     assert textured(Raster(textured_image(320, 240), EVERYWHERE))
     assert not textured(Raster(np.full((240, 320), 7, np.float32), EVERYWHERE))
     assert not textured(Raster(textured_image(320, 240), ~EVERYWHERE))
+
+
+def at_offset(image: np.ndarray, offset: int) -> np.ndarray:
+    """The same image so many bytes behind a multiple of 128 in memory."""
+    room = np.empty(image.nbytes + 256, np.uint8)
+    start = -room.ctypes.data % 128 + offset
+    placed = room[start : start + image.nbytes].view(image.dtype).reshape(image.shape)
+    placed[...] = image
+    return placed
+
+
+def test_the_magnitude_does_not_depend_on_where_the_image_lies_in_memory() -> None:
+    gx, gy = textured_image(471, 353, 1), textured_image(471, 353, 2)
+    found = {gradient_magnitude(at_offset(gx, k), at_offset(gy, (5 * k) % 128)).tobytes() for k in range(0, 128, 4)}
+    assert len(found) == 1
+    np.testing.assert_allclose(gradient_magnitude(gx, gy), cv2.magnitude(gx, gy), atol=1e-5)
