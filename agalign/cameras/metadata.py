@@ -123,7 +123,7 @@ def _fractions(value: tuple[int, ...]) -> tuple[float, ...]:
 
 
 def _jpeg_values(path: Path) -> dict[int, Any]:
-    with Image.open(path, formats=("JPEG", "MPO")) as image:
+    with Image.open(path, formats=("JPEG",)) as image:
         exif = image.getexif()
         named = {ExifTags.TAGS.get(code, str(code)): value for code, value in exif.get_ifd(34665).items()}
         place = {ExifTags.GPSTAGS.get(code, str(code)): value for code, value in exif.get_ifd(34853).items()}

@@ -86,7 +86,7 @@ def read_directories(path: Path) -> dict[int, Directory]:
     with path.open("rb") as file:
         if file.read(2) != b"\xff\xd8":
             return _read_all(file)
-    with Image.open(path, formats=("JPEG", "MPO")) as image:
+    with Image.open(path, formats=("JPEG",)) as image:
         block, packet = image.info.get("exif", b""), image.info.get("xmp", b"")
     found = _read_all(BytesIO(block[6:])) if block.startswith(b"Exif\0\0") else {0: {}, EXIF: {}, GPS: {}}
     if packet:

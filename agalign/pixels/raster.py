@@ -14,7 +14,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio import warp
 from rasterio.enums import ColorInterp, MaskFlags, Resampling
-from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
+from rasterio.errors import NotGeoreferencedWarning
 from rasterio.windows import Window
 
 from agalign.errors import GeometryError, UnreadableFileError
@@ -85,7 +85,10 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
             yield dataset
     except UnicodeEncodeError:
         raise UnreadableFileError(f"{path}: its name is not in this system's letters; set LC_ALL=C.UTF-8") from None
-    except (RasterioIOError, RasterioError) as error:
+    except Exception as error:
+        # Some of what GDAL says rasterio raises by classes that it does not give out.
+        if not type(error).__module__.startswith("rasterio."):
+            raise
         text = why(error).replace(str(path), "").strip(" :'")
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
 

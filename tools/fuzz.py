@@ -1,0 +1,160 @@
+"""Coverage-guided fuzzing of what is read from a card: tags, XMP packets, and the names of files.
+
+    pip install atheris
+    python tools/fuzz.py [--inputs 200000] [--markdown docs/reliability.md]
+    python tools/fuzz.py --target xmp --inputs 10000       one target, with libFuzzer's own output
+
+An input fails where anything but an AgalignError is raised, where it takes longer than a second, or where the process
+comes to hold more than 500 MB. Inputs begin from the files of a synthetic flight of each camera. What failed is left in
+the working folder, as `crash-…`, `timeout-…` or `oom-…`, to be given to `--target` as an argument of its own.
+"""
+
+import argparse
+import contextlib
+import logging
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import tifffile
+
+SHARES = {"xmp": 0.5, "tags": 0.35, "names": 0.15}
+MOST_SECONDS, MOST_MEGABYTES = 1, 500
+LONGEST_BYTES = {"xmp": 20_000, "tags": 30_000, "names": 300}
+SIZE_PX = 32, 24
+
+
+def seeds(folder: Path) -> None:
+    """Files for each target to begin from."""
+    from agalign.cameras.tiff_directory import XMP, read_directories
+    from agalign.synthetic import cameras, flight
+
+    for target in SHARES:
+        (folder / target).mkdir(parents=True)
+    known = (cameras.REDEDGE, cameras.MAVIC, cameras.MAVIC_3M, cameras.ALTUM, cameras.SENTERA_6X)
+    for camera in known:
+        made = folder / "made" / camera.model.replace(" ", "_")
+        flight.make_flight(made, 1, SIZE_PX, camera=camera)
+        names = []
+        for path in sorted(p for p in made.rglob("*") if p.suffix.lower() in (".tif", ".jpg")):
+            names.append(path.name)
+            packet = read_directories(path)[0].get(XMP)
+            if packet is not None:
+                (folder / "xmp" / path.name).write_bytes(packet.data)
+            if path.stat().st_size < LONGEST_BYTES["tags"]:
+                (folder / "tags" / path.name).write_bytes(path.read_bytes())
+        (folder / "names" / made.name).write_text("\n".join(names))
+    (folder / "names" / "generic").write_text("a_red.tif\na_nir.tif\nb-840nm.tiff\nDJI_0011.TIF\n.hidden.tif\n_1.tif")
+
+
+def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
+    """Run libFuzzer in this process, which it ends."""
+    import atheris
+
+    with atheris.instrument_imports(include=["agalign.cameras", "agalign.values", "tifffile", "defusedxml", "xml"]):
+        from agalign.cameras import carried_tags, discover, known, metadata, pix4d, tiff_directory, xmp
+    from agalign.errors import AgalignError
+    from agalign.pixels.raster import RasterInfo
+
+    for library in ("tifffile", "rasterio", "PIL"):
+        logging.getLogger(library).setLevel(logging.CRITICAL + 1)
+    cameras = known.known_cameras(None)
+    info = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
+    scratch = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+    file = scratch / "IMG_0001_1.tif"
+    plain = scratch.parent / f"{scratch.name}.tif"
+    tifffile.imwrite(plain, np.zeros((8, 8), np.uint16))
+
+    def on_xmp(data: bytes) -> None:
+        packet = xmp.Packet.parse(data)
+        for make in ("MicaSense", "DJI", "Parrot", "Sentera", "MAPIR", ""):
+            tags = metadata.Tags(make=make, model="x", xmp=packet.values())
+            camera = next(c for c in cameras if c.recognises(tags))
+            bands = camera.bands(file, tags, info)
+            camera.placed(bands, [tags] * len(bands))
+            camera.pose(tags)
+            camera.motion(tags)
+            pix4d.panel_in(tags, (1280, 960))
+        other = xmp.Packet.parse(packet.serialised())
+        packet.take(other, [("pix4d.com/camera", "BandName")])
+
+    def on_tags(data: bytes) -> None:
+        file.write_bytes(data)
+        with contextlib.suppress(AgalignError):
+            discover._examine(file, cameras, discover.DiscoverOptions())
+        with contextlib.suppress(AgalignError):
+            metadata.read_tags(file)
+        carried_tags._directories(file)
+        with contextlib.suppress(ValueError):
+            tiff_directory.check_directories(file)
+
+    def on_names(data: bytes) -> None:
+        folder = Path(tempfile.mkdtemp(dir=scratch))
+        made = []
+        for name in data.decode("utf-8", "surrogateescape").split("\n")[:8]:
+            with contextlib.suppress(OSError, ValueError):
+                os.link(plain, folder / name)
+                made.append(folder / name)
+        with contextlib.suppress(AgalignError):
+            discover.discover(folder)
+        for path in made:
+            path.unlink()
+        folder.rmdir()
+
+    options = [
+        f"-timeout={MOST_SECONDS}", f"-rss_limit_mb={MOST_MEGABYTES}", f"-max_len={LONGEST_BYTES[target]}",
+        "-print_final_stats=1", "-verbosity=1",
+    ]  # fmt: skip
+    test_one = {"xmp": on_xmp, "tags": on_tags, "names": on_names}[target]
+    atheris.Setup([sys.argv[0], *options, *arguments, str(corpus)], test_one)
+    atheris.Fuzz()
+
+
+def run(target: str, inputs: int, corpus: Path) -> tuple[int, int, int, str]:
+    """(inputs, slowest in seconds, peak MB, how it ended) of a target in a process of its own."""
+    command = [sys.executable, __file__, "--target", target, "--inputs", str(inputs), "--corpus", str(corpus)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    stats = {name: int(value) for name, value in re.findall(r"stat::(\w+):\s+(\d+)", done.stdout)}
+    said = done.stdout[done.stdout.find("=== Uncaught") :] if "=== Uncaught" in done.stdout else done.stdout
+    ended = "no failure" if done.returncode == 0 else said[-3000:]
+    return (
+        stats.get("number_of_executed_units", 0), stats.get("slowest_unit_time_sec", 0),
+        stats.get("peak_rss_mb", 0), ended,
+    )  # fmt: skip
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--inputs", type=int, default=200_000)
+    options.add_argument("--target", choices=SHARES)
+    options.add_argument("--corpus", type=Path)
+    options.add_argument("--markdown", type=Path)
+    asked, more = options.parse_known_args()
+    if asked.target and asked.corpus:
+        fuzz(asked.target, asked.corpus, [f"-runs={asked.inputs}", *more])
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks" / "reliability"))
+    from report import Section
+
+    with tempfile.TemporaryDirectory() as folder:
+        seeds(Path(folder))
+        rows = [("what is fuzzed", "inputs", "failures", "slowest, whole seconds", "most memory, MB", "seconds")]
+        failed = []
+        for target, share in SHARES.items() if asked.target is None else {asked.target: 1.0}.items():
+            began = time.monotonic()
+            count, slowest, memory, ended = run(target, round(asked.inputs * share), Path(folder, target))
+            bad = ended != "no failure"
+            failed += [ended] if bad else []
+            took = time.monotonic() - began
+            rows.append((target, str(count), str(int(bad)), str(slowest), str(memory), f"{took:.0f}"))
+        Section("fuzz", asked.markdown).table(rows)
+        if failed:
+            raise SystemExit("\n".join(failed))
+
+
+if __name__ == "__main__":
+    main()
