@@ -4,7 +4,15 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -34,6 +42,8 @@ _MOST_READ_AHEAD_BYTES = 64 << 20
 _DASK_ANSWERS_WITHIN_S = 10
 _GIVEN_UP_EXIT_CODE = 75
 _OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
+_MOST_BREAKS = 100
+"""Captures that are handed over again in a run because all processes were lost."""
 MOST_HANDED_OVER = 1000
 """Captures that wait in an executor at a time: enough for any cluster, and little memory."""
 
@@ -134,7 +144,7 @@ def done_by(
 ) -> Iterator[CaptureReport]:
     """Never more than `most` handed over at a time, so that a season's captures do not wait in memory."""
     futures: dict[Future[CaptureReport], Task] = {}
-    remaining = iter(tasks)
+    remaining, breaks = iter(tasks), 0
     try:
         for task in islice(remaining, most):
             futures[submit(task)] = task
@@ -142,6 +152,11 @@ def done_by(
             done, _ = wait(futures, return_when=FIRST_COMPLETED)
             for future in done:
                 task = futures.pop(future)
+                broken = not future.cancelled() and isinstance(future.exception(), BrokenExecutor)
+                if broken and breaks < _MOST_BREAKS:
+                    breaks += 1
+                    futures[submit(task)] = task
+                    continue
                 yield _report_of(future, task, timeout_s)
                 for following in islice(remaining, 1):
                     futures[submit(following)] = following
@@ -159,6 +174,8 @@ def _report_of(future: "Future[CaptureReport]", task: Task, timeout_s: float | N
     except ProcessExpired as error:
         how = f"signal {-error.exitcode}" if error.exitcode < 0 else f"exit code {error.exitcode}"
         problem = f"its worker process was killed ({how}; out of memory?); run again to do what is left"
+    except BrokenExecutor:
+        problem = "the processes end as soon as they begin (out of memory?); try again with --jobs 1"
     except MemoryError:
         problem = _OUT_OF_MEMORY
     except Exception as error:
@@ -179,30 +196,32 @@ def own_processes(jobs: int, timeout_s: float | None) -> Iterator[Submit]:
     """
     threads = max(1, (os.cpu_count() or 1) // jobs)
     with threads_of_children(threads), ThreadPoolExecutor(1) as meanwhile:
-        pool = ProcessPool(jobs, context=worker_context(), initializer=start_worker, initargs=(threads,))
 
-        def start() -> None:
+        def new_pool() -> ProcessPool:
+            pool = ProcessPool(jobs, context=worker_context(), initializer=start_worker, initargs=(threads,))
             with without_interrupt_key():
                 for _ in range(jobs):
                     pool.schedule(quiet)
+            return pool
 
-        started = meanwhile.submit(start)
+        started = meanwhile.submit(new_pool)
 
         def submit(task: Task) -> "Future[CaptureReport]":
-            started.result()
-            found: Future[CaptureReport] = pool.schedule(do_capture, args=(task,), timeout=timeout_s)
+            nonlocal started
+            if not started.result().active:  # a process that was killed while it waited breaks a pool
+                started.result().stop()
+                started = meanwhile.submit(new_pool)
+            found: Future[CaptureReport] = started.result().schedule(do_capture, args=(task,), timeout=timeout_s)
             return found
 
         try:
             yield submit
-            pool.close()
+            started.result().close()
         except BaseException:
-            pool.stop()
+            started.result().stop()
             raise
         finally:
-            with suppress(Exception):
-                started.result()
-            pool.join()
+            started.result().join()
 
 
 LOCAL = "local"

@@ -3,7 +3,6 @@ packet, with the reference's geometry in place of the band's own, so that photog
 what they are.
 """
 
-import struct
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -84,9 +83,10 @@ def band_tags(
 
 def _directories(path: Path) -> dict[int, Directory]:
     """A file whose directories cannot be followed gives none: its pixels are good all the same."""
-    with suppress(ValueError, OSError, struct.error):
+    try:
         return read_directories(path)
-    return {0: {}, EXIF: {}, GPS: {}}
+    except Exception:  # a damaged file makes a reader fail in any way
+        return {0: {}, EXIF: {}, GPS: {}}
 
 
 def _some(directory: Directory, tags: Iterable[int]) -> Directory:

@@ -145,6 +145,7 @@ def _results(
             """Pairs that advance together are told as the first one."""
             progress(first, stage, share)
 
+        report("refining", 0.0)
         found |= dict(zip(places, align(subject, report), strict=True))
     return [found[i] for i in range(len(starts))]
 

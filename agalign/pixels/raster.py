@@ -87,7 +87,7 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
         raise UnreadableFileError(f"{path}: its name is not in this system's letters; set LC_ALL=C.UTF-8") from None
     except Exception as error:
         # Some of what GDAL says rasterio raises by classes that it does not give out.
-        if not type(error).__module__.startswith("rasterio."):
+        if not isinstance(error, UnicodeDecodeError) and not type(error).__module__.startswith("rasterio."):
             raise
         text = why(error).replace(str(path), "").strip(" :'")
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
@@ -122,6 +122,16 @@ def probe(path: Path, most_pixels: int = MOST_PIXELS) -> RasterInfo:
     """What a raster file holds, without reading its pixels. Raises UnreadableFileError, also where it declares more
     than so many pixels a band.
     """
+    try:
+        return _probe(path, most_pixels)
+    except UnreadableFileError:
+        raise
+    except Exception as error:  # a damaged file makes a reader fail in any way
+        said = next(iter(str(error).splitlines()), type(error).__name__)
+        raise UnreadableFileError(f"{path}: cannot be read ({said}); copy it from the card again") from None
+
+
+def _probe(path: Path, most_pixels: int) -> RasterInfo:
     with open_raster(path) as dataset:
         width, height, count = dataset.width, dataset.height, dataset.count
         if width * height > most_pixels:

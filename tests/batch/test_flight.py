@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -8,17 +9,18 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from distributed import LocalCluster
 
 import agalign
-from agalign.batch import RunOptions, dask_executor, run_flight, workers
+from agalign.batch import RunOptions, run_flight, workers
+from agalign.batch import capture as batch_capture
 from agalign.batch import learn as batch_learn
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.cameras.discover import discover
 from agalign.config import FastRecipe, FlightSettings, JointSettings, Settings
-from agalign.errors import ConfigurationError, GeometryError, InputError
+from agalign.errors import ConfigurationError, GeometryError, InputError, OutputError
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.products.run_record import read_run_record
 from agalign.products.sidecar import find_sidecars, read_sidecar
 from agalign.synthetic.score import score_against_truth
 from agalign.values.capture import Capture
@@ -157,26 +159,6 @@ def test_any_executor_will_do(flight: Path, tmp_path: Path) -> None:
     assert all(r.good for r in reports)
 
 
-def test_a_dask_cluster_does_the_captures(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(flight.parent)
-    with (
-        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
-        dask_executor(cluster.scheduler_address) as executor,
-    ):
-        reports = agalign.align_folder(flight.name, tmp_path, settings=SETTINGS, run=RunOptions(executor=executor))
-    assert all(r.good for r in reports)
-    assert len(reports) == 2
-
-
-def test_a_scheduler_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_DASK_ANSWERS_WITHIN_S", 0.5)
-    with (
-        pytest.raises(ConfigurationError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "),
-        dask_executor("tcp://127.0.0.1:1"),
-    ):
-        pass
-
-
 def test_one_broken_reference_stops_neither_learning_nor_the_others(flight: Path, tmp_path: Path) -> None:
     copy = tmp_path / "in"
     shutil.copytree(flight, copy)
@@ -259,3 +241,75 @@ def test_an_output_that_cannot_be_replaced_costs_its_capture_only(flight: Path, 
     lost = reports["0000SET/000/IMG_0001"]
     assert lost.state == "error"
     assert "IMG_0001.tif: cannot be written" in (lost.error or "")
+
+
+def test_the_same_model_is_the_same_bytes_and_is_for_everybody(model: FlightModel, tmp_path: Path) -> None:
+    paths = [tmp_path / f"{k}.safetensors" for k in range(2)]
+    for path in paths:
+        save_model(model, path)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    plain = tmp_path / "plain"
+    plain.write_bytes(b"")
+    assert paths[0].stat().st_mode == plain.stat().st_mode
+
+
+def test_a_run_tells_what_it_was(flight: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "in"
+    shutil.copytree(flight, copy)
+    next(copy.rglob("IMG_0001_5.tif")).write_bytes(b"no image")
+    reports = run_flight(discover(copy), tmp_path / "out", SETTINGS)
+    record = read_run_record(tmp_path / "out")
+    assert record is None
+    first = next(reports)
+    record = read_run_record(tmp_path / "out")
+    assert record is not None
+    assert record.state == "running"
+    rest = list(reports)
+    record = read_run_record(tmp_path / "out")
+    assert record is not None
+    assert (record.state, record.captures) == ("finished", {"found": 2, "done": 2})
+    assert record.pairs["aligned"] == 7
+    assert set(record.capture_seconds) == {first.label, rest[0].label}
+    assert {"reading", "refining", "checking", "writing", "learning a flight"} <= set(record.stage_seconds)
+    assert [p.problem for p in record.problems if "IMG_0001_5.tif" in p.of]
+    assert record.versions["torch"]
+    assert record.settings["joint"]["recipe"] == "fast"
+
+
+def test_what_fell_short_is_done_again_where_asked(flight: Path, tmp_path: Path) -> None:
+    captures = discover(flight)
+    labels = [r.label for r in run_flight(captures, tmp_path, SETTINGS)]
+    path = tmp_path / "0000SET" / "000" / "IMG_0001.json"
+    path.write_text(path.read_text().replace('"status": "ok"', '"status": "degraded"', 1))
+    assert {r.state for r in run_flight(captures, tmp_path, SETTINGS)} == {"kept"}
+    again = {r.label: r for r in run_flight(captures, tmp_path, SETTINGS, RunOptions(retry_failed=True))}
+    assert {again[label].state for label in labels if label.endswith("IMG_0001")} == {"done"}
+    assert {again[label].state for label in labels if label.endswith("IMG_0002")} == {"kept"}
+    assert all(r.good for r in again.values())
+
+
+def test_one_run_at_a_time(flight: Path, tmp_path: Path) -> None:
+    captures = discover(flight)
+    first = run_flight(captures, tmp_path, SETTINGS)
+    next(first)
+    with pytest.raises(OutputError, match=rf"another run writes there \(process {os.getpid()} on "):
+        next(run_flight(captures, tmp_path, SETTINGS))
+    first.close()
+    record = read_run_record(tmp_path)
+    assert record is not None
+    assert record.state == "interrupted"
+    assert [r.state for r in run_flight(captures, tmp_path, SETTINGS)].count("kept") >= 1
+    assert not list(tmp_path.rglob(".agalign*"))
+
+
+def test_a_picture_that_fails_is_told_and_costs_no_more(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise OutputError("a.png: cannot be written")
+
+    monkeypatch.setattr(batch_capture, "write_picture", fails)
+    reports = list(run_flight(discover(flight), tmp_path, SETTINGS))
+    assert [r.shortcomings for r in reports] == [("a.png: cannot be written",)] * 2
+    assert not any(r.good for r in reports)
+    assert all(r.result is not None and r.result.status == "ok" for r in reports)

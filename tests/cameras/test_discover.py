@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 import tifffile
 
+from agalign.cameras import metadata
 from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.tiff_directory import EXIF, add_directories, rational, read_directories, text
 from agalign.errors import InputError, NoSuchBandError
@@ -203,3 +205,47 @@ def test_a_reference_that_no_capture_has_is_an_error_of_its_own_class(flight: Pa
     found = discover(flight, DiscoverOptions(reference="SWIR"))
     assert not found.captures
     assert {type(p.error) for p in found.problems} == {NoSuchBandError}
+
+
+def test_positions_that_cannot_be_are_none(tmp_path: Path) -> None:
+    def gps(latitude: float, longitude: float) -> dict[str, object]:
+        return {"GPSLatitude": (latitude, 0.0, 0.0), "GPSLongitude": (longitude, 0.0, 0.0), "GPSAltitude": 1e9}
+
+    found = metadata._position(gps(47.0, 9.0))
+    assert found is not None
+    assert found.altitude_m is None
+    assert metadata._position(gps(4e9, 9.0)) is None
+    assert metadata._position(gps(47.0, 181.0)) is None
+
+
+def test_a_file_that_is_only_a_number_is_not_hidden(tmp_path: Path) -> None:
+    image = np.arange(64, dtype=np.uint16).reshape(8, 8)
+    for name in ("_1.tif", "_2.tif"):
+        tifffile.imwrite(tmp_path / name, image, extratags=[(271, 2, 0, "MicaSense", True)])
+    (capture,) = discover(tmp_path).captures
+    assert capture.name == "capture"
+
+
+def test_names_are_looked_at_a_few_times_each_however_many_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = np.arange(64, dtype=np.uint16).reshape(8, 8)
+    count, asked = 150, []
+    for number in range(count):
+        for band in ("red", "nir"):
+            tifffile.imwrite(tmp_path / f"f{number}_{band}.tif", image)
+    real = Generic.capture_name
+    monkeypatch.setattr(Generic, "capture_name", lambda self, path: asked.append(path) or real(self, path))
+    assert len(discover(tmp_path).captures) == count
+    assert len(asked) <= 3 * 2 * count
+
+
+def test_several_processes_find_what_one_finds(tmp_path: Path) -> None:
+    image = np.arange(64, dtype=np.uint16).reshape(8, 8)
+    for number in range(510):
+        for band in ("red", "nir"):
+            tifffile.imwrite(tmp_path / f"f{number}_{band}.tif", image)
+    (tmp_path / "f3_nir.tif").write_bytes(b"no image")
+    one, several = (discover(tmp_path, DiscoverOptions(jobs=jobs)) for jobs in (1, 2))
+    assert one.captures == several.captures
+    assert [p.text for p in one.problems] == [p.text for p in several.problems]

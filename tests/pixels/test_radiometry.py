@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import pytest
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.config import WriteSettings
-from agalign.pixels.radiometry import calibrated, with_radiometry
+from agalign.pixels.radiometry import calibrated, is_physical, with_radiometry
 from agalign.pixels.raster import probe
 from agalign.synthetic import cameras, rig
 from agalign.synthetic import flight as synthetic
@@ -126,3 +127,17 @@ def test_without_a_light_sensor_it_is_radiance(tmp_path: Path) -> None:
     (band,) = MicaSense().bands(path, Tags(**{**vars(tags), "xmp": xmp}), probe(path))
     assert band.radiometry is not None
     assert (band.radiometry.quantity, band.radiometry.by_sun) == ("radiance", None)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"gain": 1e300}, {"gain": -1.0}, {"gain": math.nan}, {"full_scale": 0.0}, {"black_level": math.inf},
+        {"by_sun": (-5.0, "reflectance")}, {"vignetting": (10.0,)}, {"vignetting": (1e300,)},
+        {"vignetting_centre_px": (math.nan, 0.0)}, {"row_gradient": -0.01},
+    ],
+)  # fmt: skip
+def test_calibrations_that_cannot_be(change: dict[str, object]) -> None:
+    good = Radiometry("radiance", 4800.0, 65536.0, 0.02, (640.0, 480.0), (1e-5, -2e-7))
+    assert is_physical(good, (1280, 960))
+    assert not is_physical(replace(good, **change), (1280, 960))  # type: ignore[arg-type]

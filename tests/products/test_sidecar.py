@@ -12,12 +12,15 @@ from agalign.config import Settings
 from agalign.errors import OutputError, SidecarError
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.sidecar import (
+    BandPart,
     CameraPart,
     DoubtPart,
+    GridPart,
     OutputPart,
     ReferencePart,
     Sidecar,
     find_sidecars,
+    read_result,
     read_sidecar,
     write_sidecar,
 )
@@ -137,3 +140,37 @@ def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
     there = CloughTocher2DInterpolator(colour.grid.reference_px, colour.grid.moving_px)(at)
     exact = PixelMapping(found["rgb"], plain, wide)(at)
     assert np.abs(there - exact).max() < 0.02
+
+
+@pytest.mark.parametrize("name", ["../a.tif", "/vsicurl/http://example.org/a.tif", "C:/a.tif"])
+def test_a_sidecar_names_no_file_elsewhere(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "a.json"
+    data = json.loads(example().model_dump_json(by_alias=True))
+    band = {"band": "NIR", "file": "n.tif", "band_index": 1, "status": "failed", "seconds": 0, "wavelength_nm": None}
+    data["bands"] = [band | {"reason": None}]
+    data["output"] = {"file": "a.tif", "bytes": 1, "band_files": [], "crop": [0, 0, 1, 1], "nodata": None}
+    path.write_text(json.dumps(data))
+    read_sidecar(path)
+    for change in (
+        lambda d: d["output"].update(file=name), lambda d: d.update(capture=name),
+        lambda d: d["output"]["band_files"].append({"file": name, "bytes": 1, "nodata": None}),
+        lambda d: d["bands"][0].update(place={"file": name, "band_index": 1}),
+    ):  # fmt: skip
+        changed = json.loads(json.dumps(data))
+        change(changed)
+        path.write_text(json.dumps(changed))
+        with pytest.raises(SidecarError, match="names a file outside its folder"):
+            read_sidecar(path)
+
+
+def test_a_result_is_the_sidecar_without_its_tables(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    band = BandPart(
+        band="NIR", wavelength_nm=None, file="n.tif", band_index=1, status="aligned", reason=None, seconds=1.5,
+        grid=GridPart(reference_px=[(0, 0)], moving_px=[(1, 1)]),
+    )  # fmt: skip
+    whole = example().model_copy(update={"bands": [band]})
+    write_sidecar(path, whole)
+    result = read_result(path)
+    assert result == whole.result()
+    assert (result.bands[0].seconds, hasattr(result.bands[0], "grid")) == (1.5, False)

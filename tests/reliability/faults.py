@@ -16,7 +16,6 @@ import struct
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -66,6 +65,8 @@ class Scene:
     process: dict[str, Any] = field(default_factory=dict)
     """How that process is started, where it must have one."""
     undo: Callable[[], None] = lambda: None
+    children: list[psutil.Process] = field(default_factory=list)
+    """Processes that must not outlive the program."""
 
     def file(self, name: str = "b_nir.tif") -> Path:
         return self.folder / name
@@ -172,12 +173,14 @@ def run_inside(arguments: list[str], scene: Scene) -> tuple[int, str]:
 
 def run_outside(arguments: list[str], scene: Scene) -> tuple[int, str]:
     """In a process of its own: (exit code, standard error)."""
-    given = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True} | scene.process
+    given = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    given |= scene.process
     with subprocess.Popen([sys.executable, "-m", "agalign", *arguments], **given) as process:
         if scene.watch is not None:
             scene.watch(process)
         _, errors = process.communicate(timeout=200)
-    return process.returncode, errors
+    _, left = psutil.wait_procs(scene.children, timeout=20)
+    return process.returncode, errors + "".join(f"agalign: left behind: {p}\n" for p in left)
 
 
 # ---- what is done to files
@@ -472,17 +475,26 @@ def larger(scene: Scene) -> None:
 
 
 def signalled(number_: int) -> Callable[["subprocess.Popen[str]", Scene], None]:
-    def act(process: "subprocess.Popen[str]", _scene: Scene) -> None:
-        children = psutil.Process(process.pid).children(recursive=True)
-        process.send_signal(number_)
-        threading.Thread(target=_see_them_end, args=(children,)).start()
+    """Sent to all processes of the run, as a terminal does; none of them may be left."""
+
+    def act(process: "subprocess.Popen[str]", scene: Scene) -> None:
+        scene.children = psutil.Process(process.pid).children(recursive=True)
+        os.killpg(process.pid, number_)
 
     return act
 
 
-def _see_them_end(children: list[psutil.Process]) -> None:
-    _, alive = psutil.wait_procs(children, timeout=20)
-    assert not alive
+def interrupted_while_workers_start(scene: Scene) -> None:
+    when_begun(signalled(signal.SIGINT), "-j", "2")(scene)
+    act = signalled(signal.SIGINT)
+
+    def watch(process: "subprocess.Popen[str]") -> None:
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and not psutil.Process(process.pid).children():
+            time.sleep(0.005)
+        act(process, scene)
+
+    scene.watch = watch
 
 
 def in_ascii(scene: Scene) -> None:
@@ -583,6 +595,7 @@ FAULTS = (
     Fault("a capture that takes for ever", when_begun(stop_worker, "-j", "2", "--timeout", "4"), 3,
           "given up after 4 s", (), 1),
     Fault("the interrupt key", when_begun(signalled(signal.SIGINT), "-j", "2"), 130, "interrupted; what is", ()),
+    Fault("the interrupt key while workers start", interrupted_while_workers_start, 130, "interrupted; what is", ()),
     Fault("SIGTERM", when_begun(signalled(signal.SIGTERM), "-j", "2"), 143, "interrupted; what is", ()),
     Fault("XML entities that multiply", tagged(_BOMB), 0, "", ("a", "b")),
     Fault("an XML entity that names a file", tagged(_OUTSIDE), 0, "", ("a", "b")),
@@ -618,6 +631,9 @@ FAULTS = (
     Fault("a sidecar of width 0, for the report", both(
         with_sidecar(lambda _, t: re.sub(r'"width": \d+', '"width": 0', t)), commanding("report", "{out}")), 3,
         "b.json: reference.width"),
+    Fault("a sidecar without permission, for the report", both(
+        first_run, forbidden(lambda s: s.out / "b.json"), commanding("report", "{out}")), 3,
+        r"b.json: cannot be read \(Permission"),
     Fault("a band index of 99 in a sidecar, for indices", both(
         with_sidecar(lambda _, t: t.replace(_SECOND, _SECOND.replace("2", "99"))),
         commanding("ndvi", "{out}", "--index", "gndvi")), 3, "b.tif: has no band 99", ("a", "b")),
@@ -687,6 +703,8 @@ def what_is_wrong(fault: Fault, seen: Seen) -> str:
         wrong.append(f"complaints {seen.complaints}")
     if fault.all_but is not None and len(seen.finished) != MANY - fault.all_but:
         wrong.append(f"{len(seen.finished)} captures finished")
+    if "left behind" in seen.output:
+        wrong.append("processes are left")
     if missing := set(fault.finished) - set(seen.finished):
         wrong.append(f"not finished: {sorted(missing)}")
     return "; ".join(wrong)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from agalign.errors import OutputError
-from agalign.values.files import complete_file, write_text
+from agalign.values.files import complete_file, lies_within, remove_partial_files, scratch_file, write_text
 
 
 def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
@@ -51,3 +51,26 @@ def test_what_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(OutputError, match="folder: cannot be written"):
         write_text(tmp_path / "folder", "x")
+
+
+@pytest.mark.parametrize("name", ["a.tif", "red/a.tif", "..a.tif", "with space é.tif"])
+def test_names_that_lie_within(name: str) -> None:
+    assert lies_within(name)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["", "../a", "a/../../b", "/etc/passwd", "/vsicurl/http://x/y", "C:\\a", "\\\\host\\a", "a\\..\\..\\b", "a\0b"],
+)
+def test_names_that_do_not(name: str) -> None:
+    assert not lies_within(name)
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    with scratch_file(tmp_path / "sub" / "a.tif") as partial:
+        pass
+    partial.write_text("half")
+    (tmp_path / "sub" / "b.tif").write_text("whole")
+    remove_partial_files(tmp_path)
+    assert [p.name for p in (tmp_path / "sub").iterdir()] == ["b.tif"]

@@ -1,0 +1,183 @@
+"""What is read from a card or from an output folder may hold anything: it is refused by name, or it is something."""
+
+import io
+import json
+import re
+import string
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from agalign.cameras.carried_tags import capture_tags
+from agalign.cameras.discover import discover
+from agalign.cameras.known import known_cameras
+from agalign.cameras.metadata import Tags, read_tags
+from agalign.cameras.xmp import Packet
+from agalign.cli.align import albedos
+from agalign.errors import AgalignError, InputError, SidecarError
+from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.method.descriptor import Descriptor
+from agalign.pixels.raster import RasterInfo, probe
+from agalign.products.panels import read_panels
+from agalign.products.run_record import read_run_record
+from agalign.products.sidecar import read_result, read_sidecar
+from agalign.values.capture import Band
+from agalign.values.files import RUN_FILE
+from agalign.values.image import OutputGrid
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning", "ignore::UserWarning")
+
+ANY_FILE = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=12)
+INFO = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=20,
+)  # fmt: skip
+
+
+def edited(data: bytes, edits: list[tuple[float, int]]) -> bytes:
+    changed = bytearray(data)
+    for place, value in edits:
+        changed[int(place * (len(data) - 1))] = value
+    return bytes(changed)
+
+
+def refusal(read: Callable[[Any], object], given: object) -> str | None:
+    """How it is refused; anything but an AgalignError is a fault."""
+    try:
+        read(given)
+    except AgalignError as error:
+        return str(error)
+    return None
+
+
+@pytest.fixture(scope="module")
+def images(flight: Path) -> list[bytes]:
+    """A band's file of a camera, without most of its pixels, and a plain one."""
+    camera = next(flight.rglob("IMG_0001_1.tif"))
+    tags = {t.code: t for t in tifffile.TiffFile(camera).pages[0].tags.values()}  # type: ignore[union-attr]
+    plain, tagged = io.BytesIO(), io.BytesIO()
+    tifffile.imwrite(plain, np.arange(48, dtype=np.uint16).reshape(6, 8))
+    extra = [(700, 1, len(tags[700].value), tags[700].value, True), (271, 2, 0, "MicaSense", True)]
+    tifffile.imwrite(tagged, np.arange(48, dtype=np.uint16).reshape(6, 8), extratags=extra)
+    return [plain.getvalue(), tagged.getvalue()]
+
+
+@ANY_FILE
+@given(edits=EDITS, which=st.integers(0, 1), cut=st.floats(0.2, 1.0))
+def test_any_tiff(images: list[bytes], tmp_path: Path, edits: list[tuple[float, int]], which: int, cut: float) -> None:
+    path = tmp_path / "a_red.tif"
+    data = edited(images[which], edits)
+    path.write_bytes(data[: int(cut * len(data))])
+    for read in (probe, read_tags):
+        said = refusal(read, path)
+        assert said is None or ("a_red.tif" in said and "\n" not in said)
+    band = Band("red", path, 1, 8, 6, "uint16")
+    capture_tags(band, OutputGrid(0, 0, 8, 6))
+
+
+NAMED = (
+    "Camera:BandName", "Camera:RigRelatives", "Camera:PerspectiveFocalLength", "Camera:PrincipalPoint",
+    "Camera:CentralWavelength", "Camera:VignettingPolynomial", "Camera:FlyingHeight", "DLS:Yaw",
+    "DLS:HorizontalIrradiance", "MicaSense:RadiometricCalibration", "drone-dji:DewarpData",
+    "drone-dji:CalibratedHMatrix", "drone-dji:VignettingData", "drone-dji:SensorGain", "drone-dji:Irradiance",
+    "drone-dji:GimbalYawDegree",
+)  # fmt: skip
+LISTS = st.lists(st.floats(), max_size=12).map(lambda numbers: ",".join(map(str, numbers)))
+
+
+@ANY_FILE
+@given(
+    values=st.dictionaries(st.sampled_from(NAMED), st.text() | st.floats().map(str) | LISTS),
+    make=st.sampled_from(["MicaSense", "DJI", "Parrot", "Sentera", "MAPIR", ""]),
+)
+def test_any_packet(values: dict[str, str], make: str) -> None:
+    text = "".join(f"<{k}>{re.sub('[<&>]', '', v)}</{k}>" for k, v in values.items())
+    packet = Packet.parse(
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        '<rdf:Description xmlns:Camera="http://pix4d.com/camera/1.0/" xmlns:DLS="http://micasense.com/DLS/1.0/"'
+        ' xmlns:MicaSense="http://micasense.com/MicaSense/1.0/" xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/">'
+        f"{text}</rdf:Description></rdf:RDF></x:xmpmeta>"
+    )
+    tags = Tags(make=make, model="x", xmp=packet.values())
+    camera = next(c for c in known_cameras(None) if c.recognises(tags))
+    bands = camera.bands(Path("IMG_0001_1.tif"), tags, INFO)
+    camera.placed(bands, [tags])
+    camera.pose(tags)
+    camera.motion(tags)
+    assert Packet.parse(packet.serialised()).values() == packet.values()
+
+
+NAMES = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1, max_size=40)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(names=st.lists(NAMES.map(lambda n: n + ".tif"), max_size=6, unique_by=str.lower))
+def test_any_names(tmp_path_factory: pytest.TempPathFactory, images: list[bytes], names: list[str]) -> None:
+    folder = tmp_path_factory.mktemp("names")
+    for name in names:
+        try:
+            (folder / name).write_bytes(images[0])
+        except OSError:
+            continue
+    said = refusal(discover, folder)
+    if said is not None:
+        assert str(folder) in said
+        return
+    found = discover(folder)
+    labels = [c.label.lower() for c in found.captures]
+    assert len(labels) == len(set(labels))
+    assert all(c.name and not c.name.startswith("/") for c in found.captures)
+
+
+@ANY_FILE
+@given(data=JSON, raw=st.binary(max_size=60) | st.none())
+def test_any_json(tmp_path: Path, data: object, raw: bytes | None) -> None:
+    contents = json.dumps(data).encode() if raw is None else raw
+    for name, read in (("a.json", read_sidecar), ("a.json", read_result)):
+        (tmp_path / name).write_bytes(contents)
+        with pytest.raises(SidecarError, match=r"a\.json"):
+            read(tmp_path / name)
+    for name, read_folder in (("panels.json", read_panels), (RUN_FILE, read_run_record)):
+        (tmp_path / name).write_bytes(contents)
+        with pytest.raises(SidecarError, match=re.escape(name)):
+            read_folder(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def model_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    net = Descriptor("pseudo-siamese", [1, 1], half_rectified=True, unit_length=True)
+    path = tmp_path_factory.mktemp("model") / "m.safetensors"
+    save_model(FlightModel(net, "camera", ("nir",), {"nir": np.eye(3)}, "f"), path)
+    return path.read_bytes()
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(edits=EDITS, cut=st.floats(0.0, 1.0))
+def test_any_damage_to_a_model_is_seen(
+    model_bytes: bytes, tmp_path: Path, edits: list[tuple[float, int]], cut: float
+) -> None:
+    path = tmp_path / "m.safetensors"
+    for data in (edited(model_bytes, edits), model_bytes[: int(cut * (len(model_bytes) - 1))]):
+        path.write_bytes(data)
+        if data == model_bytes:
+            continue
+        with pytest.raises(InputError, match=r"m\.safetensors"):
+            load_model(path, lambda: torch.device("cpu"))
+
+
+@given(text=st.text(string.printable))
+def test_any_albedo(text: str) -> None:
+    said = refusal(albedos, text)
+    if said is None:
+        assert all(0 < value <= 1 for _, value in albedos(text))
+    else:
+        assert "--panel-albedo" in said
