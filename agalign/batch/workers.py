@@ -170,7 +170,7 @@ def _report_of(future: "Future[CaptureReport]", task: Task, timeout_s: float | N
     try:
         return future.result()
     except TimeoutError:
-        problem = f"given up after {timeout_s:g} s, as --timeout asks"
+        problem = f"given up after {timeout_s or 0:g} s, as --timeout asks"
     except ProcessExpired as error:
         how = f"signal {-error.exitcode}" if error.exitcode < 0 else f"exit code {error.exitcode}"
         problem = f"its worker process was killed ({how}; out of memory?); run again to do what is left"

@@ -198,6 +198,7 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
     for (name, stage), seconds in report.stages.items() if voice.log_json else ():
         voice.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(seconds, 4))
     if report.result is None:
+        voice.event("capture", capture=report.label, state=report.state, seconds=round(report.seconds, 3))
         return
     pairs = [b for b in report.result.bands if b.status != "reference"]
     aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))

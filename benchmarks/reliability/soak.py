@@ -24,14 +24,15 @@ SIZE_PX = 240, 180
 QUANTITIES = ("memory of all processes, MB", "open files of all processes", "processes")
 
 
-def watched(command: list[str]) -> tuple[int, float, np.ndarray]:
-    """(exit code, seconds, (n, 4): seconds, memory in MB, open files, processes)."""
+def watched(command: list[str]) -> tuple[int, float, np.ndarray, set[psutil.Process]]:
+    """(exit code, seconds, (n, 4): seconds, memory in MB, open files, processes; every process that was seen)."""
     began = time.monotonic()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    rows = []
+    rows, seen = [], set[psutil.Process]()
     while process.poll() is None:
         here = psutil.Process(process.pid)
         memory = files = count = 0.0
+        seen.update(here.children(recursive=True))
         for one in [here, *here.children(recursive=True)]:
             try:
                 memory += one.memory_full_info().uss / 1e6
@@ -41,7 +42,7 @@ def watched(command: list[str]) -> tuple[int, float, np.ndarray]:
                 continue
         rows.append((time.monotonic() - began, memory, files, count))
         time.sleep(0.5)
-    return process.returncode, time.monotonic() - began, np.array(rows)
+    return process.returncode, time.monotonic() - began, np.array(rows), seen
 
 
 def slope(t_s: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
@@ -60,22 +61,21 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         flight, out = Path(folder, "flight"), Path(folder, "out")
         synthetic.make_flight(flight, asked.captures, SIZE_PX, rng_seed=1)
-        before = {p.pid for p in psutil.process_iter()}
         command = [sys.executable, "-m", "agalign", str(flight), "-o", str(out), "-q", "-j", str(asked.jobs)]
-        code, seconds, rows = watched(command)
-        time.sleep(1)
-        left = [p for p in psutil.process_iter() if p.pid not in before and "python" in p.name()]
+        code, seconds, rows, seen = watched(command)
+        _, left = psutil.wait_procs(seen, timeout=2)
         section.say(
             f"{asked.captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} and five bands, {asked.jobs} worker processes: "
             f"exit code {code}, {seconds:.0f} s, {len(left)} processes left behind."
         )
-        half = rows[rows[:, 0] > rows[-1, 0] / 2][:-4]
-        table = [("over the second half of the run", "mean", "growth", "scatter")]
+        working = rows[rows[:, 3] == np.median(rows[:, 3])]  # neither while processes start nor while they end
+        half = working[working[:, 0] > working[-1, 0] / 2]
+        table = [("while all processes work, second half of the run", "mean", "growth", "scatter")]
         for name, y in zip(QUANTITIES, half[:, 1:].T, strict=True):
             mean, growth, scatter = slope(half[:, 0], y)
             table.append((name, f"{mean:.0f}", f"{growth:+.1f}", f"{scatter:.1f}"))
         section.table(table)
-        code, seconds, rows = watched(command)
+        code, seconds, rows, _ = watched(command)
         section.say(f"The same command again, all kept: exit code {code}, {seconds:.1f} s, {rows[:, 1].max():.0f} MB.")
 
 
