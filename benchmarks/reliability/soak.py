@@ -63,7 +63,7 @@ def main() -> None:
         synthetic.make_flight(flight, asked.captures, SIZE_PX, rng_seed=1)
         command = [sys.executable, "-m", "agalign", str(flight), "-o", str(out), "-q", "-j", str(asked.jobs)]
         code, seconds, rows, seen = watched(command)
-        _, left = psutil.wait_procs(seen, timeout=2)
+        _, left = psutil.wait_procs(seen, timeout=10)
         section.say(
             f"{asked.captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} and five bands, {asked.jobs} worker processes: "
             f"exit code {code}, {seconds:.0f} s, {len(left)} processes left behind."
