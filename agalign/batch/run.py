@@ -54,17 +54,17 @@ class RunOptions:
 
     overwrite: bool = False
     """Do captures again that an earlier run finished."""
-    retry_failed: bool = False
-    """Do those of them again in which a band is not aligned, or missing."""
     jobs: int = 1
     """Captures at a time, each in a process of its own, or a thread where they are few; 0 is one a core."""
-    timeout_s: float | None = None
-    """After which a capture is given up; it has a process then, whose end ends whatever it hangs in. Not for an
-    `executor`, which has its own (`dask_executor`)."""
     align_panels: bool = False
     """Captures of calibration panels are aligned like any other."""
     executor: Executor | None = None
     """Where the captures are done instead: any executor whose workers see the same folders (`dask_executor` is one)."""
+    retry_failed: bool = False
+    """Do those captures again that an earlier run finished in which a band is not aligned, or missing."""
+    timeout_s: float | None = None
+    """After which a capture is given up; it has a process then, whose end ends whatever it hangs in. Not for an
+    `executor`, which has its own (`dask_executor`)."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -229,6 +230,8 @@ def _examined(paths: Sequence[Path], options: DiscoverOptions) -> Iterator["_Fil
         for part, future in zip(parts, futures, strict=True):
             try:
                 yield from future.result()
+            except BrokenExecutor:  # all of them were killed, and not over a file
+                yield from _look_at(part, options)
             except ProcessExpired:
                 yield from (Problem(path, UnreadableFileError(f"{path}: {_KILLED}")) for path in part)
         pool.close()

@@ -227,7 +227,7 @@ def align(
             need_stac()
         load_ahead()
         flight = find_captures(folder, options, voice)
-        how = RunOptions(overwrite, retry_failed, jobs, timeout, align_panels)
+        how = RunOptions(overwrite, jobs, align_panels, retry_failed=retry_failed, timeout_s=timeout)
         outcome = run(flight, target, settings, voice, how, dask=dask, model=model)
         raise typer.Exit(conclude(outcome, target, voice))
 
