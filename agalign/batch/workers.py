@@ -44,6 +44,8 @@ _GIVEN_UP_EXIT_CODE = 75
 _OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
 _MOST_BREAKS = 100
 """Captures that are handed over again in a run because all processes were lost."""
+_CAPTURES_A_PROCESS = 500
+"""Libraries keep some kilobytes of each; then a process makes room for a new one."""
 MOST_HANDED_OVER = 1000
 """Captures that wait in an executor at a time: enough for any cluster, and little memory."""
 
@@ -198,7 +200,7 @@ def own_processes(jobs: int, timeout_s: float | None) -> Iterator[Submit]:
     with threads_of_children(threads), ThreadPoolExecutor(1) as meanwhile:
 
         def new_pool() -> ProcessPool:
-            pool = ProcessPool(jobs, context=worker_context(), initializer=start_worker, initargs=(threads,))
+            pool = ProcessPool(jobs, _CAPTURES_A_PROCESS, start_worker, (threads,), worker_context())
             with without_interrupt_key():
                 for _ in range(jobs):
                     pool.schedule(quiet)
