@@ -100,8 +100,8 @@ class Voice:
         if threading.current_thread() is threading.main_thread():
             for name in _ENDING:
                 number = getattr(signal, name, None)
-                # Who started the program may want it to bear some: nohup, or a shell with its jobs in the background.
-                if number is not None and signal.getsignal(number) != signal.SIG_IGN:
+                # Who started the program may want it to outlive his terminal: nohup.
+                if number is not None and (name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN):
                     before[number] = signal.signal(number, stop)
         try:
             yield
