@@ -39,8 +39,6 @@ SIZE_PX = 320, 240
 MANY = 12
 """Captures of a run that something happens to."""
 XMP = 700
-LITTLE_BYTES = 1_330_000_000
-"""Enough to load what is needed, and little more."""
 STRANGE_NAMES = "with space é 雨", "-rf", "quote'\"`$(x)", "new\nline", "\x1b[31mred\a", "_", "x" * 200
 _PACKET = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -511,10 +509,6 @@ def standard_output_full(scene: Scene) -> None:
         scene.process = {"stdout": os.dup(full.fileno())}
 
 
-def little_memory(scene: Scene) -> None:
-    scene.process = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_AS, (LITTLE_BYTES,) * 2)}
-
-
 def asking(*arguments: str) -> Callable[[Scene], None]:
     def spoil(scene: Scene) -> None:
         scene.arguments = list(arguments)
@@ -648,7 +642,6 @@ FAULTS = (
     Fault("a system without letters beyond ASCII", both(strange_names, in_c), 3,
           "its name is not in this system's letters", ("a", "b")),
     Fault("standard output full", standard_output_full, 1, "standard output|output: No space left", ("a", "b")),
-    Fault("little memory for everything", little_memory, 1, "out of memory", ()),
     Fault("a random seed beyond 64 bits", asking("--rng-seed", "9" * 30), 2, "", ()),
     Fault("a device that computes nothing", asking("--device", "meta"), 2, "device 'meta' cannot be used", ()),
     Fault("one of GDAL's virtual paths", commanding("/vsizip/flight.zip", "-o", "{out}"), 1, "virtual paths", ()),
