@@ -6,19 +6,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agalign.capture.align import PairProgress, align_capture_bands
-from agalign.config import Settings
+from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, InputError, SidecarError
 from agalign.flight.model import FlightModel
-from agalign.products.error_map import write_error_map
+from agalign.flight.rig import Rig
+from agalign.products.error_map import error_lattice_px, write_error_map
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.layout import lay_out
 from agalign.products.pan_sharpen import need_panchromatic, write_pan_sharpened
-from agalign.products.picture import write_picture
-from agalign.products.sidecar import Sidecar, read_sidecar, write_sidecar
+from agalign.products.picture import choose_bands, write_picture
+from agalign.products.preview import preview_bytes, write_preview
+from agalign.products.sidecar import PreviewPart, Sidecar, read_sidecar, write_sidecar
 from agalign.products.stac import write_item
-from agalign.products.write import band_file_names, write_capture
+from agalign.products.views import read_views
+from agalign.products.write import Written, band_file_names, write_capture
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.choices import Layout, RadiometryChoice
+from agalign.values.image import OutputGrid
 
 
 def quiet(*_: object) -> None:
@@ -41,6 +46,16 @@ def output_paths(capture: Capture, out: Path) -> tuple[Path, Path]:
     return folder / f"{capture.name}.tif", folder / f"{capture.name}.json"
 
 
+def picture_path(stack: Path) -> Path:
+    """The before/after picture beside a stack."""
+    return stack.with_suffix(".png")
+
+
+def preview_path(stack: Path) -> Path:
+    """The sheet of small pictures beside a stack."""
+    return stack.with_suffix(".preview.jpg")
+
+
 def error_map_path(stack: Path) -> Path:
     """The raster of expected errors beside a stack."""
     return stack.with_suffix(".error.tif")
@@ -53,12 +68,12 @@ def pan_sharpened_path(stack: Path) -> Path:
 
 def process_capture(
     capture: Capture, out: Path, settings: Settings, progress: PairProgress = quiet,
-    model: FlightModel | None = None,
+    model: FlightModel | None = None, most_preview_bytes: int = preview_bytes(1),
 ) -> CaptureOutcome:  # fmt: skip
     """Align a capture and write its stack and sidecar; a band that cannot be aligned does not stop the others.
 
     Its bands' radiometry is what was chosen for them (`with_radiometry`). With the flight's `model` only what it cannot
-    align is learnt anew.
+    align is learnt anew. Its preview has about as many bytes as it may have.
     Raises UnreadableFileError where the reference itself cannot be read, and OutputError.
     """
     reference, rig = capture.reference, None if model is None else model.rig
@@ -69,31 +84,52 @@ def process_capture(
     alignments = align_capture_bands(capture, settings, model, progress)
     progress(reference.name, "writing", 0.0)
     stack_path, sidecar_path = output_paths(capture, out)
-    usable = [b for b in capture.moving if alignments[b.name].status != "failed"]
-    picture = stack_path.with_suffix(".png")
+    usable = {b.name: alignments[b.name] for b in capture.moving if alignments[b.name].status != "failed"}
     discard_outputs(stack_path, sidecar_path)
-    written = None
+    written = _write_rasters(capture, usable, stack_path, settings.write, rig) if usable else None
+    preview: PreviewPart | None = None
     shortcomings: tuple[str, ...] = ()
-    if usable:
-        layers, grid = lay_out(capture, {b.name: alignments[b.name] for b in usable}, settings.write, rig)
-        written = write_capture(capture, layers, grid, stack_path, settings.write)
-        if settings.write.pan_sharpen:
-            of_bands = {b.name: alignments[b.name] for b in usable}
-            write_pan_sharpened(capture, of_bands, pan_sharpened_path(stack_path), settings.write, rig)
-        try:
-            write_picture(capture, written.places, grid, usable, picture)
-        except AgalignError as error:
-            # The picture is a convenience: it must not cost the sidecar.
-            shortcomings = (str(error),)
-        if settings.write.error_map:
-            write_error_map(capture, {b.name: alignments[b.name] for b in usable}, grid, error_map_path(stack_path))
-        if settings.write.stac:
-            more = (picture, "thumbnail"), (error_map_path(stack_path), "metadata")
-            beside = [*more, (pan_sharpened_path(stack_path), "data")]
-            write_item(capture, written, sidecar_path, settings.write, beside)
-    sidecar = sidecar_of(capture, alignments, written, settings)
+    try:
+        preview = _write_pictures(capture, usable, written, stack_path, settings.write, most_preview_bytes)
+    except AgalignError as error:
+        # Pictures are a convenience: they must not cost the sidecar.
+        shortcomings = (str(error),)
+    if written is not None and settings.write.stac:
+        more = (picture_path(stack_path), "thumbnail"), (error_map_path(stack_path), "metadata")
+        beside = [*more, (pan_sharpened_path(stack_path), "data")]
+        write_item(capture, written, sidecar_path, settings.write, beside)
+    sidecar = sidecar_of(capture, alignments, written, settings, preview)
     write_sidecar(sidecar_path, sidecar)
     return CaptureOutcome(sidecar, sidecar_path, shortcomings)
+
+
+def _write_rasters(
+    capture: Capture, usable: Mapping[str, Alignment], stack: Path, settings: WriteSettings, rig: Rig | None
+) -> Written:
+    layers, grid = lay_out(capture, usable, settings, rig)
+    written = write_capture(capture, layers, grid, stack, settings)
+    if settings.pan_sharpen:
+        write_pan_sharpened(capture, usable, pan_sharpened_path(stack), settings, rig)
+    if settings.error_map:
+        write_error_map(capture, usable, grid, error_map_path(stack))
+    return written
+
+
+def _write_pictures(
+    capture: Capture, usable: Mapping[str, Alignment], written: Written | None, stack: Path, settings: WriteSettings,
+    most_bytes: int,
+) -> PreviewPart:  # fmt: skip
+    """The picture, where something was written, and the preview: that of a capture which came to nothing shows why."""
+    reference = capture.reference
+    grid = OutputGrid(0, 0, *reference.size_px) if written is None else written.grid
+    views = read_views(capture, {} if written is None else written.places, grid)
+    if written is not None:
+        chosen = choose_bands([b for b in capture.moving if b.name in usable], reference)
+        write_picture(views, [b.name for b in chosen], picture_path(stack))
+    errors_px = {n: error_lattice_px(a, reference.size_px, grid) for n, a in usable.items()}
+    return write_preview(
+        views, [b.name for b in capture.bands], errors_px if settings.error_map else {}, preview_path(stack), most_bytes
+    )
 
 
 def paths_written(capture: Capture, out: Path, layout: Layout) -> list[Path]:
@@ -105,8 +141,8 @@ def paths_written(capture: Capture, out: Path, layout: Layout) -> list[Path]:
 
 def _beside(stack: Path, sidecar: Path) -> list[Path]:
     """Every file of a capture but those of single bands."""
-    picture, item = stack.with_suffix(".png"), stack.with_suffix(".stac.json")
-    return [sidecar, stack, picture, item, error_map_path(stack), pan_sharpened_path(stack)]
+    of_stack = (picture_path, preview_path, error_map_path, pan_sharpened_path)
+    return [sidecar, stack, stack.with_suffix(".stac.json"), *(path(stack) for path in of_stack)]
 
 
 def discard_outputs(stack: Path, sidecar: Path) -> None:

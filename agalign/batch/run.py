@@ -36,6 +36,7 @@ from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.panels import write_panels
+from agalign.products.preview import preview_bytes
 from agalign.products.run_record import RunState, Tally, begun, problem_of, write_run_record
 from agalign.products.sidecar import CaptureResult, read_result
 from agalign.products.stac import write_collections
@@ -165,7 +166,7 @@ def _reports(
         for whole, name, mine in left:
             at_once = min(MOST_THREADS, _cores(options, settings))
             path = _learn(whole, out / "models" / name, settings, listener, known, at_once)
-            waiting += [Task(c, out, settings, path) for c in mine]
+            waiting += [Task(c, out, settings, path, preview_bytes(len(flight.captures))) for c in mine]
         if submit is None:
             yield from _one_by_one(waiting, listener)
         else:

@@ -32,6 +32,7 @@ from agalign.config import Settings
 from agalign.errors import AgalignError, ConfigurationError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
+from agalign.products.preview import preview_bytes
 from agalign.products.sidecar import CaptureResult, Sidecar, read_sidecar
 from agalign.values.capture import Capture
 from agalign.values.processes import follow_parent, without_interrupt_key
@@ -105,6 +106,7 @@ class Task:
     out: Path
     settings: Settings
     model: Path | None
+    most_preview_bytes: int = preview_bytes(1)
 
     def absolute(self) -> "Task":
         """With absolute paths: workers elsewhere have another working folder."""
@@ -124,7 +126,7 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
         device = task.settings.joint.device
         model = None if task.model is None else loaded_model(task.model, device, stamp(task.model))
         with one_thread(), one_memory_error():
-            outcome = process_capture(task.capture, task.out, task.settings, clock, model)
+            outcome = process_capture(task.capture, task.out, task.settings, clock, model, task.most_preview_bytes)
     except AgalignError as error:
         problem = str(error)
     except MemoryError:

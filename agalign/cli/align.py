@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -13,7 +13,12 @@ from agalign.cli.terminal import (
     RngSeed,
     Verbose,
     Voice,
+    examples,
     exits,
+    of_alignment,
+    of_input,
+    of_output,
+    of_running,
 )
 from agalign.errors import ConfigurationError
 from agalign.values.choices import (
@@ -33,155 +38,177 @@ from agalign.values.choices import (
     Sharing,
 )
 
-if TYPE_CHECKING:
-    pass
-
 FolderArgument = Annotated[
     Path, typer.Argument(help="Folder with the images, sub-folders included.", show_default=False)
 ]
 Pattern = Annotated[
-    str | None, typer.Option(help="File names as '{capture}_{band}.tif', where agalign does not know them.")
+    str | None,
+    of_input(help="File names as '{capture}_{band}.tif', where agalign does not know them."),
 ]
-Reference = Annotated[str | None, typer.Option(help="Name of the reference band; by default green.")]
+Reference = Annotated[str | None, of_input(help="Name of the reference band; by default green.")]
 Jobs = Annotated[
     int,
-    typer.Option(
-        "--jobs",
-        "-j",
-        min=0,
-        show_default=False,
-        help="Captures at a time; by default one a core.",
-    ),
+    of_running("--jobs", "-j", min=0, show_default=False, help="Captures at a time; by default one a core."),
 ]
 Dask = Annotated[
     str | None,
-    typer.Option(
+    of_running(
         help="Scheduler of a Dask cluster that does the captures, tcp://host:8786; it sees the same folders. "
         "'local' starts worker processes here."
     ),
 ]
-IgnoreMetadata = Annotated[bool, typer.Option("--ignore-metadata", help="Use no lens or rig tags.")]
+IgnoreMetadata = Annotated[bool, of_input("--ignore-metadata", help="Use no lens or rig tags.")]
 BandNames = Annotated[
-    str | None, typer.Option("--bands", help="Names of the bands that take part, separated by commas; by default all.")
+    str | None,
+    of_input("--bands", help="Names of the bands that take part, separated by commas; by default all."),
 ]
-Order = Annotated[BandOrder, typer.Option(help="Of the bands: as the camera counts them, by wavelength, or by name.")]
+Order = Annotated[
+    BandOrder,
+    of_input(help="Of the bands: as the camera counts them, by wavelength, or by name."),
+]
 WithRgb = Annotated[
-    bool, typer.Option("--with-rgb", help="The camera's colour photograph (JPEG) takes part too, as three bands.")
+    bool,
+    of_input("--with-rgb", help="The camera's colour photograph (JPEG) takes part too, as three bands."),
 ]
+
+
+_EXAMPLES = examples(
+    ("agalign flight/", "into flight-aligned/, with what the images and their tags say"),
+    ("agalign flight/ -o aligned/ --radiometry", "reflectance where the camera's tags allow it"),
+    ("agalign flight/ -o aligned/ --layout bands", "single files with their tags, for photogrammetry"),
+    ("agalign orchard/ --local --error-map", "follow trees and terraces, and map what error is left"),
+    ("agalign flight/ --model earlier/models/CAMERA.safetensors", "begin with what an earlier flight learnt"),
+    ("agalign flight/ --retry-failed", "once more what fell short"),
+)
 
 
 def register(app: typer.Typer) -> None:
     """Add the command to the program."""
-    app.command()(align)
+    app.command(epilog=_EXAMPLES)(align)
 
 
 def align(
     folder: FolderArgument,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Output folder; by default FOLDER with '-aligned' added.")
-    ] = None,
     reference: Reference = None,
     bands: BandNames = None,
     order: Order = "index",
     with_rgb: WithRgb = False,
     pattern: Pattern = None,
-    seed: Annotated[SeedChoice, typer.Option(help="Start from this kind of coarse alignment only.")] = "auto",
-    only_seed: Annotated[
-        bool, typer.Option("--only-seed", help="Stop at the coarse alignment; learn nothing.")
-    ] = False,
     ignore_metadata: IgnoreMetadata = False,
-    recipe: Annotated[Recipe, typer.Option(help="How to optimise: fast, or step by step as published.")] = "fast",
-    sharing: Annotated[Sharing, typer.Option(help="What the descriptor's two sides share.")] = "pseudo-siamese",
-    model_family: Annotated[
-        FamilyChoice, typer.Option(help="Mapping to fit; auto is as rich as the images allow.")
-    ] = "auto",
-    interpolation: Annotated[Interpolation, typer.Option(help="Resampling of the moving bands.")] = "lanczos",
-    crop: Annotated[
-        Crop,
-        typer.Option(
-            help="Cut to the area all bands share, alike for all captures of a flight or for each by itself, or keep "
-            "the reference's frame."
-        ),
-    ] = "flight",
-    undistort: Annotated[
-        bool, typer.Option("--undistort", help="Write the lens-corrected grid of the reference.")
+    align_panels: Annotated[
+        bool,
+        of_input("--align-panels", help="Align captures of calibration panels too, as any other."),
     ] = False,
-    resolution: Annotated[
-        Resolution, typer.Option(help="Of the output: the reference's, or the finest band's on the reference's frame.")
-    ] = "reference",
-    layout: Annotated[
-        Layout, typer.Option(help="A stack of all bands, a file for each input file with its tags, or both.")
-    ] = "stack",
+    max_pixels: Annotated[
+        int,
+        of_input(min=1, help="Images that declare more are refused before anything is read."),
+    ] = MOST_PIXELS,
+    seed: Annotated[SeedChoice, of_alignment(help="Start from this kind of coarse alignment only.")] = "auto",
+    only_seed: Annotated[
+        bool,
+        of_alignment("--only-seed", help="Stop at the coarse alignment; learn nothing."),
+    ] = False,
+    recipe: Annotated[Recipe, of_alignment(help="How to optimise: fast, or step by step as published.")] = "fast",
+    sharing: Annotated[Sharing, of_alignment(help="What the descriptor's two sides share.")] = "pseudo-siamese",
+    model_family: Annotated[
+        FamilyChoice,
+        of_alignment(help="Mapping to fit; auto is as rich as the images allow."),
+    ] = "auto",
     local: Annotated[
         LocalUse,
-        typer.Option(
+        of_alignment(
             help="Follow parallax over trees and buildings by a smooth field over the homography: where it is needed, "
             "wherever it helps, or not at all. --local alone is always."
         ),
     ] = "auto",
     accept_predicted: Annotated[
         float,
-        typer.Option(
+        of_alignment(
             min=0,
             help="A band whose own image cannot say where it lies counts as delivered where the flight's rig "
             "predicts it this well, px.",
         ),
     ] = 1.0,
+    model: Annotated[
+        Path | None,
+        of_alignment(help="Start from what an earlier flight of the same camera learnt: OUT/models/…."),
+    ] = None,
+    each_alone: Annotated[
+        bool,
+        of_alignment("--each-alone", help="Learn every capture by itself instead of once a flight."),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        of_output("-o", "--out", help="Output folder; by default FOLDER with '-aligned' added."),
+    ] = None,
+    interpolation: Annotated[Interpolation, of_output(help="Resampling of the moving bands.")] = "lanczos",
+    crop: Annotated[
+        Crop,
+        of_output(
+            help="Cut to the area all bands share, alike for all captures of a flight or for each by itself, or keep "
+            "the reference's frame."
+        ),
+    ] = "flight",
+    undistort: Annotated[
+        bool,
+        of_output("--undistort", help="Write the lens-corrected grid of the reference."),
+    ] = False,
+    resolution: Annotated[
+        Resolution,
+        of_output(help="Of the output: the reference's, or the finest band's on the reference's frame."),
+    ] = "reference",
+    layout: Annotated[
+        Layout,
+        of_output(help="A stack of all bands, a file for each input file with its tags, or both."),
+    ] = "stack",
     radiometry: Annotated[
         RadiometryChoice,
-        typer.Option(
+        of_output(
             help="Write float32: radiance by the camera's calibration, reflectance by its light sensor or by a panel; "
             "thermal bands in degrees C. --radiometry alone is auto: the last of these that all bands can be given."
         ),
     ] = "off",
     panel_albedo: Annotated[
         str | None,
-        typer.Option(
+        of_output(
             help="Reflectance of the calibration panel, as 0.51 or as Blue=0.51,NIR=0.49; by default what tags or its "
             "QR code say. With it a panel is also known by its looks."
         ),
     ] = None,
-    align_panels: Annotated[
-        bool, typer.Option("--align-panels", help="Align captures of calibration panels too, as any other.")
-    ] = False,
     pan_sharpen: Annotated[
         bool,
-        typer.Option(
+        of_output(
             "--pan-sharpen",
             help="The bands at the panchromatic's resolution too, or at the colour photograph's with --with-rgb: "
             "<capture>.pan.tif.",
         ),
     ] = False,
-    stac: Annotated[bool, typer.Option("--stac", help="A STAC item beside each capture's files.")] = False,
+    stac: Annotated[bool, of_output("--stac", help="A STAC item beside each capture's files.")] = False,
     error_map: Annotated[
-        bool, typer.Option("--error-map", help="A raster of the error to expect at every pixel, <capture>.error.tif.")
+        bool,
+        of_output("--error-map", help="A raster of the error to expect at every pixel, <capture>.error.tif."),
     ] = False,
-    format: Annotated[RasterFormat, typer.Option(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
+    format: Annotated[RasterFormat, of_output(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
     compression: Annotated[
-        Compression, typer.Option(help="Lossless; auto is zstd for stacks and deflate for single bands.")
+        Compression,
+        of_output(help="Lossless; auto is zstd for stacks and deflate for single bands."),
     ] = "auto",
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
+    device: Annotated[str, of_running(help="auto, cpu, cuda, cuda:1 …")] = "auto",
     rng_seed: RngSeed = 0,
     jobs: Jobs = 0,
     dask: Dask = None,
-    model: Annotated[
-        Path | None, typer.Option(help="Start from what an earlier flight of the same camera learnt: OUT/models/….")
-    ] = None,
-    each_alone: Annotated[
-        bool, typer.Option("--each-alone", help="Learn every capture by itself instead of once a flight.")
-    ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Do captures again that an earlier run finished.")
+        bool,
+        of_running("--overwrite", help="Do captures again that an earlier run finished."),
     ] = False,
     retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Do those of them again in which a band is not aligned, or missing.")
+        bool,
+        of_running("--retry-failed", help="Do those of them again in which a band is not aligned, or missing."),
     ] = False,
     timeout: Annotated[
-        float | None, typer.Option(min=1, help="Seconds after which a capture is given up; by default never.")
+        float | None,
+        of_running(min=1, help="Seconds after which a capture is given up; by default never."),
     ] = None,
-    max_pixels: Annotated[
-        int, typer.Option(min=1, help="Images that declare more are refused before anything is read.")
-    ] = MOST_PIXELS,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,

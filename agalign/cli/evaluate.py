@@ -21,7 +21,7 @@ Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")]
 def register(app: typer.Typer) -> None:
     """Add these commands to the program."""
     for command in (evaluate, surface, learn):
-        app.command()(command)
+        app.command(rich_help_panel="Descriptors")(command)
 
 
 def evaluate(

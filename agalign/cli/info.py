@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich.table import Table
 
@@ -21,7 +20,6 @@ from agalign.cli.run import find_captures
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Voice, exits, in_json, shown
 
 if TYPE_CHECKING:
-    from agalign.flight.rig import Rig
     from agalign.values.capture import Capture
 
 _MODEL_SUFFIX = ".safetensors"
@@ -81,10 +79,11 @@ def info(
 def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
     """What a model knows of its camera. Raises InputError where it is none."""
     from agalign.flight.model import load_model
+    from agalign.flight.rig_file import rig_rows
     from agalign.method.device import choose_device
 
     model = load_model(path, lambda: choose_device("cpu"))
-    rows = [] if model.rig is None else _rig_rows(model.rig)
+    rows = [] if model.rig is None else rig_rows(model.rig)
     captures, factors = (0, ()) if model.rig is None else (len(model.rig.seen), model.rig.factors)
     if as_json:
         rig = {"captures": captures, "factors": factors, "bands": rows} if rows else None
@@ -106,24 +105,6 @@ def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
     voice.result(table)
     shared = ", ".join(factors) or "nothing"
     voice.result(f"rig learnt on {captures} captures; what the bands of a capture share: {shared}")
-
-
-def _rig_rows(rig: "Rig") -> list[dict[str, Any]]:
-    """A band each: where its middle lies in the moving image, how it moves, and how well it is predicted."""
-    from agalign.values.geometry import apply
-
-    middle = (np.array(rig.size_px, float) - 1) / 2
-    return [
-        {
-            "band": band, "offset_px": (apply(mean, middle[None])[0] - middle).tolist(),
-            "baseline": rig.baselines[band], "from_bands_px": rig.from_bands_px[band],
-            "from_neighbours_px": rig.missed_px(band, by_neighbours=True),
-            "from_flight_px": rig.missed_px(band, by_neighbours=False),
-            "field_px": float(np.hypot(*np.moveaxis(rig.fields[band].displacements_px, -1, 0)).max())
-            if band in rig.fields else None,
-        }
-        for band, mean in rig.mean.items()
-    ]  # fmt: skip
 
 
 def _facts(capture: "Capture") -> dict[str, Any]:

@@ -12,11 +12,13 @@ from rich.table import Table
 
 from agalign._version import __version__
 from agalign.cli import align as cli_align
+from agalign.cli import doctor as cli_doctor
 from agalign.cli import evaluate as cli_evaluate
 from agalign.cli import info as cli_info
 from agalign.cli.align import Jobs
 from agalign.cli.onto import onto
 from agalign.cli.run import GOES_ON, conclude, find_captures, run
+from agalign.cli.shortfalls import explain
 from agalign.cli.terminal import (
     EXIT_NOTHING,
     EXIT_OK,
@@ -26,22 +28,30 @@ from agalign.cli.terminal import (
     RngSeed,
     Verbose,
     Voice,
+    examples,
     exits,
+    of_running,
     printed,
     shown,
 )
 from agalign.values.choices import LocalUse, RadiometryChoice
 
+_EXAMPLES = examples(
+    ("agalign demo", "a synthetic flight, aligned and compared with its truth"),
+    ("agalign info flight/", "what would be aligned, and what is missing"),
+    ("agalign flight/ -o aligned/", "align it; 'agalign align --help' has the options"),
+    ("agalign ndvi aligned/", "indices of what was aligned"),
+    ("agalign doctor", "what this machine has"),
+)
 app = typer.Typer(
     name="agalign",
     help="Co-register the bands of multispectral drone cameras. 'agalign FOLDER' aligns everything below FOLDER.",
+    epilog=_EXAMPLES,
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
+    rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
 cli_align.register(app)
-_MOST_SHOWN = 20
 
 
 @app.callback(invoke_without_command=True)
@@ -58,7 +68,7 @@ def demo(
     out: Annotated[Path, typer.Argument(help="Folder to make.")] = Path("agalign-demo"),
     captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
     jobs: Jobs = 0,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
+    device: Annotated[str, of_running(help="auto, cpu, cuda, cuda:1 …")] = "auto",
     rng_seed: RngSeed = 0,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -113,11 +123,7 @@ def report(
         pages = write_pages(out, unreadable.append)
         for text in unreadable:
             voice.problem(text)
-        if pages.troubled:
-            table = Table("What fell short", title=f"{len(pages.troubled)} captures")
-            for label in pages.troubled[:_MOST_SHOWN]:
-                table.add_row(shown(label))
-            voice.result(table)
+        explain(pages.shortfalls, voice)
         table = Table("Slowest", "Seconds")
         for label, seconds in pages.slowest:
             table.add_row(shown(label), f"{seconds:.1f}")
@@ -173,8 +179,9 @@ def ndvi(
         raise typer.Exit(EXIT_NOTHING if not written else EXIT_OK if len(written) == len(reports) else EXIT_PARTIAL)
 
 
-cli_evaluate.register(app)
 app.command()(onto)
+cli_doctor.register(app)
+cli_evaluate.register(app)
 _COMMANDS = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
 
 
@@ -204,7 +211,7 @@ def _give_value(arguments: list[str], option: str, values: Sequence[str], alone:
 
 
 def _is_root_option(argument: str) -> bool:
-    return argument in ("--help", "-h", "--version")
+    return argument in ("--help", "-h", "--version", "--install-completion", "--show-completion")
 
 
 if __name__ == "__main__":

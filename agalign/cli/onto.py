@@ -7,7 +7,18 @@ import typer
 
 from agalign.cli.align import Jobs, Reference
 from agalign.cli.run import conclude, run
-from agalign.cli.terminal import LogJson, Quiet, RngSeed, Verbose, Voice, exits
+from agalign.cli.terminal import (
+    LogJson,
+    Quiet,
+    RngSeed,
+    Verbose,
+    Voice,
+    exits,
+    of_alignment,
+    of_input,
+    of_output,
+    of_running,
+)
 from agalign.values.choices import MOST_MOSAIC_PIXELS, Compression, Interpolation, LocalUse, RasterFormat
 
 
@@ -18,21 +29,21 @@ def onto(
     moving: Annotated[list[Path], typer.Argument(help="Mosaics of other dates or sensors.", show_default=False)],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Output folder; by default REFERENCE-aligned.", show_default=False),
+        of_output("--out", "-o", help="Output folder; by default REFERENCE-aligned.", show_default=False),
     ] = None,
     band: Reference = None,
     local: Annotated[
-        LocalUse, typer.Option(help="Follow what one homography leaves by a smooth field: where it helps, or never.")
+        LocalUse, of_alignment(help="Follow what one homography leaves by a smooth field: where it helps, or never.")
     ] = "auto",
-    interpolation: Annotated[Interpolation, typer.Option(help="Resampling of the moving mosaics.")] = "lanczos",
-    format: Annotated[RasterFormat, typer.Option(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
-    compression: Annotated[Compression, typer.Option(help="Lossless.")] = "auto",
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")] = "auto",
+    interpolation: Annotated[Interpolation, of_output(help="Resampling of the moving mosaics.")] = "lanczos",
+    format: Annotated[RasterFormat, of_output(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
+    compression: Annotated[Compression, of_output(help="Lossless.")] = "auto",
+    device: Annotated[str, of_running(help="auto, cpu, cuda, cuda:1 …")] = "auto",
     rng_seed: RngSeed = 0,
     jobs: Jobs = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Do again what an earlier run finished.")] = False,
+    overwrite: Annotated[bool, of_running("--overwrite", help="Do again what an earlier run finished.")] = False,
     max_pixels: Annotated[
-        int, typer.Option(min=1, help="Mosaics that declare more are refused before anything is read.")
+        int, of_input(min=1, help="Mosaics that declare more are refused before anything is read.")
     ] = MOST_MOSAIC_PIXELS,
     quiet: Quiet = False,
     verbose: Verbose = False,

@@ -10,9 +10,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Column, Table
 
+from agalign.cli.shortfalls import explain
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Voice, shown
 from agalign.errors import NoSuchBandError, OutputError
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from agalign.batch import CaptureReport, RunOptions
     from agalign.cameras.discover import DiscoverOptions, Flight
     from agalign.config import Settings
+    from agalign.products.shortfalls import Shortfalls
     from agalign.values.capture import Capture
 
 GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
@@ -61,6 +63,12 @@ def load_ahead() -> None:
     threading.Thread(target=load, daemon=True).start()
 
 
+def _no_shortfalls() -> "Shortfalls":
+    from agalign.products.shortfalls import Shortfalls
+
+    return Shortfalls()
+
+
 @dataclass
 class BandTotals:
     """One band in all captures of a run."""
@@ -81,13 +89,17 @@ class Outcome:
     """Some band pair is aligned or predicted."""
     good: bool = True
     """Nothing is left to be wished for, of captures, of files that were found and of the report."""
+    shortfalls: "Shortfalls" = field(default_factory=_no_shortfalls)
 
     def add(self, report: "CaptureReport") -> None:
         """One capture more."""
         self.states[report.state] += 1
         self.useful |= report.useful
         self.good &= report.good
-        for band in [] if report.result is None else report.result.bands:
+        if report.result is None:
+            return
+        self.shortfalls.add(report.label, report.result)
+        for band in report.result.bands:
             if band.status == "reference":
                 continue
             totals = self.bands.setdefault(band.band, BandTotals())
@@ -107,11 +119,9 @@ def run(
     from agalign.batch.workers import dask_executor
 
     outcome = Outcome(good=not flight.problems)
-    done_pairs, all_pairs = 0, sum(len(c.moving) for c in flight.captures)
-    pairs = {c.label: len(c.moving) for c in flight.captures}
     started = time.monotonic()
     cluster = nullcontext() if dask is None else dask_executor(dask, how.jobs, how.timeout_s)
-    with cluster as executor, _progress(voice, all_pairs) as show:
+    with cluster as executor, _progress(voice, len(flight.captures)) as show:
         options = replace(how, executor=executor)
         current: Capture | None = None
 
@@ -122,7 +132,7 @@ def run(
 
         def on_learning(camera: str, share: float) -> None:
             voice.check()
-            show(done_pairs, f"learning from {camera}: {share:.0%} at most")
+            show(outcome, 0.0, f"learning from {camera}: {share:.0%} at most")
 
         def on_learnt(camera: str, seconds: float) -> None:
             voice.event("learnt", camera=camera, seconds=round(seconds, 2))
@@ -132,10 +142,8 @@ def run(
             assert current is not None
             names = [b.name for b in current.moving]
             place = names.index(band) if band in names else len(names)
-            show(
-                done_pairs + place + (0.85 * share if stage in ("learning", "refining") else 0.0),
-                f"{current.label} {band}: {stage}",
-            )
+            behind = place + (0.85 * share if stage in ("learning", "refining") else 0.0)
+            show(outcome, behind / max(len(names), 1), f"{current.label} {band}: {stage}")
 
         try:
             listener = Listener(on_start, on_pair, on_learning, on_learnt)
@@ -143,8 +151,7 @@ def run(
                 voice.check()
                 outcome.add(report)
                 each(report)
-                done_pairs += pairs[report.label]
-                show(done_pairs, report.label)
+                show(outcome, 0.0, report.label)
                 _tell(report, voice, outcome.states.total(), len(flight.captures))
         except OutputError as error:
             if not outcome.states:
@@ -174,18 +181,49 @@ def _write_pages(out: Path, voice: Voice, *, changed: bool) -> bool:
 
 
 @contextmanager
-def _progress(voice: Voice, pairs: int) -> Iterator[Callable[[float, str], None]]:
-    """A bar on a terminal, nothing elsewhere: there each capture prints a plain line."""
+def _progress(voice: Voice, captures: int) -> Iterator[Callable[[Outcome, float, str], None]]:
+    """One line for the whole flight on a terminal, nothing elsewhere: there each capture prints a plain line. It is
+    told what is done, the share of the capture that is worked on, and what is done to which.
+    """
     if voice.quiet or voice.log_json or not voice.err.is_terminal:
-        yield lambda _done, _text: None
+        yield lambda _outcome, _share, _text: None
         return
     columns = (
-        BarColumn(bar_width=28), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-        TextColumn("{task.description}"),
+        BarColumn(bar_width=20), TextColumn("{task.fields[done]} of {task.total} captures"),
+        TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis")),
     )  # fmt: skip
     with Progress(*columns, console=voice.err, transient=True) as progress:
-        task = progress.add_task("starting", total=pairs)
-        yield lambda done, text: progress.update(task, completed=done, description=shown(text))
+        task = progress.add_task("starting", total=captures, done=0, rate="")
+        pace = _Pace()
+
+        def show(outcome: Outcome, share: float, text: str) -> None:
+            done = outcome.states.total()
+            progress.update(
+                task, completed=done + share, done=done, rate=pace.of(outcome.states), description=shown(text)
+            )
+
+        yield show
+
+
+@dataclass
+class _Pace:
+    """How many captures are done in a minute; kept ones do not count, nor does the learning before."""
+
+    since: float = field(default_factory=time.monotonic)
+    before: int = 0
+
+    def of(self, states: Counter[str]) -> str:
+        """As text, empty while nothing is known."""
+        done = states.total() - states["kept"] - states["panel"]
+        if done == 0:
+            self.since = time.monotonic()
+            return ""
+        # What was finished first was begun before anybody counted.
+        if self.before == 0:
+            self.before, self.since = done, time.monotonic()
+        seconds = time.monotonic() - self.since
+        return f"{60 * (done - self.before) / seconds:.0f} a minute" if done > self.before else ""
 
 
 def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> None:
@@ -227,7 +265,7 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
                 capture=report.label, band=band.band, status=band.status, reason=band.reason,
                 residual_px=residual, seconds=band.seconds,
             )  # fmt: skip
-        if band.status in ("predicted", "seed_only", "failed"):
+        if band.status != "aligned" and (voice.verbose or voice.log_json):
             voice.problem(
                 f"{report.label} {band.band}: {band.status}: {band.reason}", capture=report.label, band=band.band
             )
@@ -248,6 +286,7 @@ def conclude(outcome: Outcome, out: Path, voice: Voice) -> int:
         table.add_row(shown(name), *counts, *worst, f"{median(band.seconds):.1f}")
     if outcome.bands:
         voice.result(table)
+    explain(outcome.shortfalls.groups(), voice)
     voice.result(shown(f"Report: {out / 'index.html'}"))
     if outcome.states and set(outcome.states) == {"panel"}:
         voice.problem("nothing but calibration panels there; --align-panels aligns them all the same")

@@ -8,8 +8,9 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -67,12 +68,14 @@ class Voice:
         elif text and not self.quiet:
             self.err.print(shown(text))
 
-    def problem(self, text: str, **fields: Any) -> None:
-        """A complaint: shown even with --quiet."""
+    def problem(self, text: str, more: Sequence[str] = (), /, **fields: Any) -> None:
+        """A complaint: shown even with --quiet, with further lines for who reads it."""
         if self.log_json:
             self.event("problem", message=text, **fields)
-        else:
-            self.err.print(f"[yellow]agalign: {shown(text)}[/]")
+            return
+        self.err.print(f"[yellow]agalign: {shown(text)}[/]")
+        for line in more:
+            self.err.print(f"    {shown(line)}")
 
     def result(self, thing: Any) -> None:
         """A result on standard output, unless --quiet."""
@@ -110,12 +113,24 @@ class Voice:
                 signal.signal(number, handler)
 
 
+of_input = partial(typer.Option, rich_help_panel="Input")
+of_alignment = partial(typer.Option, rich_help_panel="Alignment")
+of_output = partial(typer.Option, rich_help_panel="Output")
+of_running = partial(typer.Option, rich_help_panel="Running")
+"""An option in the panel of the help that it belongs to."""
+
+
+def examples(*lines: tuple[str, str]) -> str:
+    """Commands and what they do, as the end of a help text."""
+    return "\n\n".join(["Examples:", *(f"[bold]{escape(command)}[/]  {escape(what)}" for command, what in lines)])
+
+
 RngSeed = Annotated[
-    int, typer.Option(min=0, max=MOST_RNG_SEED, help="Seed of all random numbers; the same seed gives the same result.")
+    int, of_running(min=0, max=MOST_RNG_SEED, help="Seed of all random numbers; the same seed gives the same result.")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print problems only.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print a line per band pair.")]
-LogJson = Annotated[bool, typer.Option("--log-json", help="Print one JSON object a line to standard error.")]
+Quiet = Annotated[bool, of_running("--quiet", "-q", help="Print problems only.")]
+Verbose = Annotated[bool, of_running("--verbose", "-v", help="Print a line per band pair.")]
+LogJson = Annotated[bool, of_running("--log-json", help="Print one JSON object a line to standard error.")]
 
 
 @contextmanager

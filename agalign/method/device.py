@@ -1,9 +1,11 @@
 """Where the tensors live, with how many threads, and what to make of it when they do not fit."""
 
 import ctypes
+import platform
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache
 
 import cv2
@@ -26,6 +28,38 @@ def choose_device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         raise ConfigurationError(f"device '{name}' cannot be used here: {str(error).splitlines()[0]}") from None
     return device
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where tensors may live."""
+
+    name: str
+    what: str
+    threads: int
+    """That torch would use; 0 where that means nothing."""
+    problem: str
+    """Why it cannot be used, or empty."""
+
+
+def devices() -> list[Device]:
+    """The CPU and every GPU, each tried."""
+    found = [Device("cpu", platform.machine(), torch.get_num_threads(), _trial("cpu"))]
+    for i in range(torch.cuda.device_count()):
+        facts = torch.cuda.get_device_properties(i)
+        what = f"{facts.name}, {facts.total_memory / 1e9:.0f} GB"
+        found.append(Device(f"cuda:{i}", what, 0, _trial(f"cuda:{i}")))
+    if torch.backends.mps.is_available():
+        found.append(Device("mps", "Apple GPU", 0, _trial("mps")))
+    return found
+
+
+def _trial(name: str) -> str:
+    try:
+        ones = torch.ones(64, 64, device=name)
+        return "" if float((ones @ ones).sum()) == 64**3 else "it multiplies wrongly"
+    except RuntimeError as error:
+        return str(error).splitlines()[0]
 
 
 def exact(tensor: Tensor) -> Tensor:

@@ -212,6 +212,11 @@ def read_preview(
     return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))
 
 
+def gdal_version() -> str:
+    """Of the GDAL that rasterio brings."""
+    return str(rasterio.__gdal_version__)
+
+
 def crs_code(crs_wkt: str) -> str | None:
     """Authority and number of a coordinate reference system, such as EPSG:32613; None where it has none."""
     authority = rasterio.CRS.from_wkt(crs_wkt).to_authority()

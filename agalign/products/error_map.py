@@ -48,14 +48,22 @@ def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
 
 
-def _map_of(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
-    """(height, width): the error on a lattice over the grid, between whose nodes it is linear; nan where unknown."""
+def error_lattice_px(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
+    """(rows, columns): the error to be expected on a lattice over a grid, px of the reference (width, height); nan
+    where nothing is known.
+    """
     columns, rows = (max(2, -(-n // _LATTICE_PX)) for n in (grid.width, grid.height))
     x = (grid.x0 + np.linspace(0, grid.width - 1, columns) + 0.5) / grid.scale_xy[0] - 0.5
     y = (grid.y0 + np.linspace(0, grid.height - 1, rows) + 0.5) / grid.scale_xy[1] - 0.5
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     nodes = expected_error_px(alignment, size_px, points).reshape(rows, columns)
-    nodes = np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
+    return np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
+
+
+def _map_of(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
+    """(height, width): linear between the nodes of a lattice."""
+    nodes = error_lattice_px(alignment, size_px, grid)
+    rows, columns = nodes.shape
     at_x, at_y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in ((columns, grid.width), (rows, grid.height)))
     found = cv2.remap(nodes, *np.meshgrid(at_x, at_y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(np.round(found / _STEP_PX) * _STEP_PX, np.float32)

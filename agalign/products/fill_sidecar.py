@@ -25,6 +25,7 @@ from agalign.products.sidecar import (
     PlacePart,
     PositionPart,
     PredictionPart,
+    PreviewPart,
     ReferencePart,
     ResidualTile,
     SeedPart,
@@ -61,8 +62,9 @@ def is_delivered(band: BandPart, accept_predicted_px: float) -> bool:
 
 
 def sidecar_of(
-    capture: Capture, alignments: dict[str, Alignment], written: Written | None, settings: Settings
-) -> Sidecar:
+    capture: Capture, alignments: dict[str, Alignment], written: Written | None, settings: Settings,
+    preview: PreviewPart | None = None,
+) -> Sidecar:  # fmt: skip
     """The sidecar of a capture whose moving bands have the given alignments, by band name."""
     reference = capture.reference
     parts = []
@@ -103,6 +105,7 @@ def sidecar_of(
         ),
         bands=parts,
         output=None if written is None else _output_part(written),
+        preview=preview,
         settings=fingerprint(capture, settings),
     )
 

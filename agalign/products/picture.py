@@ -1,16 +1,14 @@
 """The small before/after picture beside each stack: three bands as red, green and blue; misalignment is colour."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from agalign.pixels.raster import read_preview
 from agalign.products.drawing import Picture, with_text, write_png
-from agalign.values.capture import Band, Capture
-from agalign.values.image import OutputGrid
+from agalign.products.views import Grey, Views
+from agalign.values.capture import Band
 
 _OVERVIEW_PX = 480
 _ZOOM_SOURCE_PX = 160
@@ -29,54 +27,19 @@ def choose_bands(bands: list[Band], reference: Band) -> list[Band]:
     return [red, between, reference]
 
 
-def write_picture(
-    capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid, usable: list[Band], path: Path
-) -> None:
-    """Write the picture of a capture, whose bands were written to `places` on a grid. Raises OutputError."""
-    chosen = choose_bands(usable, capture.reference)
-    after_planes = [read_preview(*places[b.name], (0, 0, grid.width, grid.height)) for b in chosen]
-    before_planes = [_before(b, capture.reference, grid) for b in chosen]
-    # Each by its own limits: what is written may be reflectance of what the files have as numbers.
-    before, after = (
-        np.stack([_stretched(p, _limits(p)) for p in planes], axis=-1) for planes in (before_planes, after_planes)
-    )
-    names = ", ".join(b.name for b in chosen)
-    sheet = _sheet(before, after, f"before: {names} as red, green, blue", "after")
+def write_picture(views: Views, names: Sequence[str], path: Path) -> None:
+    """Write the picture of three bands as red, green and blue. Raises OutputError."""
+    before, after = (np.stack([of[name] for name in names], axis=-1) for of in (views.before, views.after))
+    sheet = _sheet(before, after, f"before: {', '.join(names)} as red, green, blue", "after")
     write_png(sheet, path)
-
-
-def _before(band: Band, reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
-    """The raw file laid on the reference as it is, cut to the grid."""
-    sx, sy = (n / (s * m) for n, s, m in zip(band.size_px, grid.scale_xy, reference.size_px, strict=True))
-    window = (
-        round(grid.x0 * sx), round(grid.y0 * sy), max(1, round(grid.width * sx)), max(1, round(grid.height * sy)),
-    )  # fmt: skip
-    return read_preview(band.path, band.band_index, window, size_px=_preview_size(grid.width, grid.height))
-
-
-def _preview_size(width: int, height: int) -> tuple[int, int]:
-    """Large images are read reduced: the picture does not need more."""
-    reduction = max(1.0, max(width, height) / 2048)
-    return round(width / reduction), round(height / reduction)
-
-
-def _limits(plane: NDArray[np.float32]) -> tuple[float, float]:
-    finite = plane[np.isfinite(plane) & (plane != 0)]
-    if finite.size == 0:
-        return 0.0, 1.0
-    low, high = np.percentile(finite[:: max(1, finite.size // 200_000)], (1.5, 98.5))
-    return float(low), max(float(high), float(low) + 1e-9)
-
-
-def _stretched(plane: NDArray[np.float32], limits: tuple[float, float]) -> Picture:
-    low, high = limits
-    return np.asarray((np.clip(np.nan_to_num((plane - low) / (high - low)), 0, 1) * 255).astype(np.uint8))
 
 
 def _sheet(before: Picture, after: Picture, title_before: str, title_after: str) -> Picture:
     height, width = before.shape[:2]
     overview = _OVERVIEW_PX, max(1, round(_OVERVIEW_PX * height / width))
-    zoom_x, zoom_y, side_x, side_y = _busiest_window(after)
+    side_x = min(width, _ZOOM_SOURCE_PX)
+    side_y = max(1, min(height, round(side_x * height / width)))
+    zoom_x, zoom_y = busiest_window(after[..., 2], (side_x, side_y))
     columns = []
     for image, title in ((before, title_before), (after, title_after)):
         whole = cv2.resize(image, overview, interpolation=cv2.INTER_AREA)
@@ -93,14 +56,11 @@ def _sheet(before: Picture, after: Picture, title_before: str, title_after: str)
     return np.hstack([columns[0], between, columns[1]])
 
 
-def _busiest_window(image: Picture) -> tuple[int, int, int, int]:
-    """(x, y, width, height) of the window with the most edges: there a misalignment shows."""
-    height, width = image.shape[:2]
-    side_x = min(width, _ZOOM_SOURCE_PX)
-    side_y = max(1, min(height, round(side_x * height / width)))
-    edges = np.abs(cv2.Laplacian(image[..., 2].astype(np.float32), cv2.CV_32F)).clip(0, 60)
-    activity = cv2.boxFilter(edges, -1, (side_x, side_y), anchor=(0, 0), normalize=True)
-    y, x = np.unravel_index(
-        int(activity[: height - side_y + 1, : width - side_x + 1].argmax()), (height - side_y + 1, width - side_x + 1)
-    )
-    return int(x), int(y), side_x, side_y
+def busiest_window(image: Grey, size_px: tuple[int, int]) -> tuple[int, int]:
+    """(x, y) of the window (width, height) with the most edges: there a misalignment shows."""
+    (height, width), (side_x, side_y) = image.shape, size_px
+    edges = np.abs(cv2.Laplacian(image.astype(np.float32), cv2.CV_32F)).clip(0, 60)
+    activity = cv2.boxFilter(edges, -1, size_px, anchor=(0, 0), normalize=True)
+    inside = activity[: height - side_y + 1, : width - side_x + 1]
+    y, x = np.unravel_index(int(inside.argmax()), inside.shape)
+    return int(x), int(y)

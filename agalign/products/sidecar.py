@@ -240,6 +240,21 @@ class OutputPart(_Part):
     nodata: float | str | None
 
 
+class PreviewPart(_Part):
+    """A sheet of small grey pictures of all bands beside the sidecar, which the report composes: a column for each band
+    of `bands`, in their order, and rows of the raw files as they lie, of what was written, of a detail of either, and
+    of the error to be expected where that was written, white for `error_full_px`.
+    """
+
+    file: BesideIt
+    tile_px: tuple[Count, Count]
+    """(width, height) of a picture in rows 0, 1 and 4, and of a detail in rows 2 and 3,"""
+    detail_px: tuple[Count, Count]
+    detail: tuple[float, float, float, float]
+    """x0, y0, width, height of the detail as shares of the picture's sides."""
+    error_full_px: float | None = None
+
+
 class CaptureResult(_Result):
     """What became of one capture. `status` is ok where every moving band is aligned, or predicted as well as was asked
     for.
@@ -258,6 +273,7 @@ class CaptureResult(_Result):
     reference: ReferencePart
     bands: Sequence[BandResult]
     output: OutputPart | None
+    preview: PreviewPart | None = None
     settings: str
     """Fingerprint of the settings that made this; another run with the same need not do it again."""
 

@@ -1,4 +1,4 @@
-"""Why an alignment is not believed: what was measured beside what it should have been, and that in words."""
+"""Why an alignment is not believed: what was measured and what it should have been, in words, and what to try."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -57,3 +57,57 @@ def sentence(doubt: Doubt) -> str:
 def explanation(doubts: Sequence[Doubt]) -> str | None:
     """The first of some doubts, which is what to look at, in words; None where there is none."""
     return sentence(doubts[0]) if doubts else None
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """Doubts that come of one cause, as somebody reads of them who has a flight to deliver."""
+
+    cause: str
+    advice: str
+
+
+_UNREADABLE = Remedy("a file cannot be read", "copy it from the card again; the other bands do not need it")
+_BLANK = Remedy(
+    "a band shows nothing: all its pixels are one value, or invalid",
+    "look at the file: a covered lens, a dead sensor or wrong exposure; --bands leaves a band out",
+)
+_ASKED = Remedy("only the first guess was asked for", "leave --seed and --only-seed out")
+_TEXTURELESS = Remedy(
+    "too little in common to hold on to: water, fog, blur or noise in one of the bands",
+    "where the flight has three captures with texture its rig places such bands; --model OUT/models/… of an earlier "
+    "flight of the camera does so from the first capture on",
+)
+_UNLIKE = Remedy(
+    "the bands do not show the same thing",
+    "look at the picture: did the scene move between the exposures, is one band blurred or of another place? --seed "
+    "match finds images that lie far apart; --model OUT/models/… brings what an earlier flight knows of the camera",
+)
+_RELIEF = Remedy(
+    "a part of the image lies apart: trees, buildings or terraces near the camera", "--local follows the relief"
+)
+_REPEATING = Remedy(
+    "the scene repeats, and nothing says which place is the right one",
+    "keep the camera's metadata in the files (no --ignore-metadata), or give --model OUT/models/… of an earlier flight",
+)
+_ELSEWHERE = Remedy(
+    "it lies elsewhere than the rig of the flight has it",
+    "if a lens was knocked or changed, align without --model; else look at the picture",
+)
+MISSING_BAND = Remedy("a band is missing that other captures of this camera have", "copy the files from the card again")
+_REMEDIES: dict[DoubtKind, Remedy] = {
+    "unreadable": _UNREADABLE,
+    "blank_reference": _BLANK, "blank_moving": _BLANK,
+    "no_such_seed": _ASKED, "seed_asked_for": _ASKED,
+    "no_contrast": _TEXTURELESS, "few_keypoints": _TEXTURELESS, "few_windows": _TEXTURELESS,
+    "corners_unknown": _TEXTURELESS, "corner_std_px": _TEXTURELESS, "retrieval": _TEXTURELESS,
+    "not_invertible": _UNLIKE, "folds": _UNLIKE, "coverage": _UNLIKE, "residual_px": _UNLIKE,
+    "seed_does_not_fit": _UNLIKE,
+    "close_windows": _RELIEF, "cluster": _RELIEF,
+    "repeats": _REPEATING, "unexpected_px": _ELSEWHERE,
+}  # fmt: skip
+
+
+def remedy(kind: DoubtKind) -> Remedy:
+    """What a doubt of this kind mostly comes of, and what to try."""
+    return _REMEDIES[kind]

@@ -94,7 +94,7 @@ def test_summary_and_report(aligned: tuple[Path, subprocess.CompletedProcess[str
     assert all(float(r["mattes_mi_after"]) < float(r["mattes_mi_before"]) for r in rows)
     page = (out / "index.html").read_text()
     assert "8 of 8" in page
-    assert 'src="0000SET/000/IMG_0001.png"' in page
+    assert '"picture":"0000SET/000/IMG_0001.png"' in page
     before = page
     (out / "index.html").unlink()
     done = agalign("report", out)

@@ -1,0 +1,140 @@
+"""The command that says what this machine has for the program, and what it lacks."""
+
+import json
+import os
+import platform
+import shutil
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from agalign._version import __version__
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, Voice, exits, shown
+
+_LIBRARIES = ("torch", "numpy", "opencv-python-headless", "rasterio", "tifffile", "scikit-image", "pydantic")
+EXTRAS = {
+    "dask": "captures on the workers of a Dask cluster (--dask)",
+    "evaluate": "elastix beside the learnt descriptors (agalign evaluate)",
+    "stac": "STAC items and collections (--stac)",
+    "xarray": "a flight as one lazily read Dataset (agalign.open_flight)",
+}
+_LITTLE_DISK_GB = 5.0
+_GB = 1e9
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the program."""
+    app.command()(doctor)
+
+
+def doctor(
+    folder: Annotated[Path, typer.Argument(help="Where aligned files would be written.")] = Path(),
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """Say what this machine has: versions, devices, threads, memory, disk, and what extras would add."""
+    voice = Voice(quiet=False, verbose=False, log_json=False)
+    with exits(voice):
+        facts = {"machine": _machine(), "disk": _disk(folder), "devices": _devices(), "extras": _extras()}
+        problems = _problems(facts)
+        if as_json:
+            typer.echo(json.dumps(facts | {"problems": problems}, indent=1))
+        else:
+            _show(facts, voice)
+            for text in problems:
+                voice.problem(text)
+            if not problems:
+                voice.result("nothing is in the way")
+        raise typer.Exit(EXIT_NOTHING if problems else EXIT_OK)
+
+
+def _machine() -> dict[str, Any]:
+    from agalign.pixels.raster import gdal_version
+
+    return {
+        "agalign": __version__, "python": platform.python_version(), "system": platform.platform(),
+        **{name: _version(name) for name in _LIBRARIES}, "gdal": gdal_version(),
+        "cores": _cores(), "memory_gb": _memory_gb(),
+    }  # fmt: skip
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _cores() -> int:
+    """Those that this process may use, which in a container or a cluster's job may be fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def _memory_gb() -> float | None:
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / _GB, 1)
+    except (AttributeError, ValueError, OSError):  # not on Windows
+        return None
+
+
+def _disk(folder: Path) -> dict[str, Any]:
+    here = next((p for p in (folder.absolute(), *folder.absolute().parents) if p.is_dir()), Path.cwd())
+    return {
+        "folder": str(here), "free_gb": round(shutil.disk_usage(here).free / _GB, 1),
+        "writable": os.access(here, os.W_OK),
+    }  # fmt: skip
+
+
+def _devices() -> list[dict[str, Any]]:
+    from agalign.method.device import devices
+
+    return [{"device": d.name, "what": d.what, "threads": d.threads, "problem": d.problem} for d in devices()]
+
+
+def _extras() -> list[dict[str, Any]]:
+    """Of each extra what it adds, and which of its libraries are missing."""
+    found = []
+    for name, adds in EXTRAS.items():
+        missing = [d for d in _needs(name) if _version(d) is None]
+        found.append({"extra": name, "adds": adds, "missing": missing})
+    return found
+
+
+def _needs(extra: str) -> list[str]:
+    """Distributions that an extra asks for, by the package's own metadata."""
+    asked = [r for r in metadata.requires("agalign") or [] if f"extra == '{extra}'" in r.replace('"', "'")]
+    return ["".join(c if c.isalnum() or c in "-_." else " " for c in r).split()[0] for r in asked]
+
+
+def _problems(facts: dict[str, Any]) -> list[str]:
+    machine, disk = facts["machine"], facts["disk"]
+    problems = [f"{name} is not installed; install agalign again" for name in _LIBRARIES if machine[name] is None]
+    problems += [
+        f"{d['device']}: {d['problem']}; choose another with --device" for d in facts["devices"] if d["problem"]
+    ]
+    if not disk["writable"]:
+        problems.append(f"{disk['folder']}: may not be written to; choose another folder with -o")
+    if disk["free_gb"] < _LITTLE_DISK_GB:
+        problems.append(f"{disk['folder']}: {disk['free_gb']:.1f} GB are free; a thousand captures take 10 GB or more")
+    return problems
+
+
+def _show(facts: dict[str, Any], voice: Voice) -> None:
+    machine, disk = facts["machine"], facts["disk"]
+    table = Table("This machine", "", show_lines=False)
+    for name, value in machine.items():
+        table.add_row(name.replace("_gb", ", GB"), shown("unknown" if value is None else str(value)))
+    writable = "" if disk["writable"] else ", not writable"
+    table.add_row("disk", shown(f"{disk['free_gb']:.1f} GB free at {disk['folder']}{writable}"))
+    for device in facts["devices"]:
+        threads = f", {device['threads']} threads" if device["threads"] else ""
+        table.add_row(f"device {device['device']}", shown(device["problem"] or device["what"] + threads))
+    voice.result(table)
+    table = Table("Extra", "What it adds", "")
+    for row in facts["extras"]:
+        how = f"pip install 'agalign[{row['extra']}]'" if row["missing"] else "there"
+        table.add_row(row["extra"], row["adds"], shown(how))
+    voice.result(table)

@@ -1,0 +1,109 @@
+"""The preview of a capture: every band small and grey, before and after, on one JPEG from which the report composes
+any three of them.
+
+The sheet has a column for each band of the sidecar, in its order, and these rows:
+
+    0  the raw files laid on the reference's as they are
+    1  what was written; black where nothing was
+    2  a detail of row 0 at the views' own resolution, where there is most to see
+    3  the same detail of row 1
+    4  where error maps are written: the error to be expected, white for `ERROR_FULL_PX` and more
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.errors import OutputError
+from agalign.products.picture import busiest_window
+from agalign.products.sidecar import PreviewPart
+from agalign.products.views import Grey, Views
+from agalign.values.files import complete_file
+from agalign.values.image import Tile
+
+ERROR_FULL_PX = 0.5
+_WIDEST_PX, _NARROWEST_PX, _DETAIL_SHARE = 480, 96, 0.45
+"""Of a tile, and how wide a detail is beside it."""
+_QUALITY, _BLOCK_PX = 35, 8
+"""Of the JPEG: pictures that share no block do not show in each other."""
+_MOST_BYTES_EACH, _MOST_BYTES_IN_ALL = 400_000, 44_000_000
+"""A season's report can still be sent to somebody."""
+
+
+def preview_bytes(captures: int) -> int:
+    """How large the preview of one capture of so many may be."""
+    return min(_MOST_BYTES_EACH, _MOST_BYTES_IN_ALL // max(captures, 1))
+
+
+def write_preview(
+    views: Views, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], path: Path, most_bytes: int
+) -> PreviewPart:
+    """Write the sheet, about as large as `most_bytes` allows, with a detail where the first of the bands has most to
+    show; `errors_px` has a coarse map (rows, columns) by band, or none. Raises OutputError.
+    """
+    longest = max(views.size_px)
+    widest = min(_WIDEST_PX, longest)
+    for _ in range(6):
+        part, sheet = _sheet(views, bands, errors_px, widest / longest, path.name)
+        encoded, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        if not encoded:
+            raise OutputError(f"{path}: cannot be made")
+        if len(data) <= most_bytes or widest <= _NARROWEST_PX:
+            break
+        widest = max(_NARROWEST_PX, int(widest * 0.97 * (most_bytes / len(data)) ** 0.5))
+    with complete_file(path) as partial:
+        partial.write_bytes(data.tobytes())
+    return part
+
+
+def _sheet(
+    views: Views, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], scale: float, name: str
+) -> tuple[PreviewPart, Grey]:
+    width, height = views.size_px
+    tile_px = _blocks(width * scale, width), _blocks(height * scale, height)
+    detail_px = _blocks(tile_px[0] * _DETAIL_SHARE, width), _blocks(tile_px[1] * _DETAIL_SHARE, height)
+    x, y = busiest_window(next(of[n] for n in bands for of in (views.after, views.before) if n in of), detail_px)
+    detail = Tile(x, y, *detail_px)
+    rows = [
+        [_small(views.before.get(n), tile_px) for n in bands],
+        [_small(views.after.get(n), tile_px) for n in bands],
+        [_cut(views.before.get(n), detail) for n in bands],
+        [_cut(views.after.get(n), detail) for n in bands],
+    ]
+    if errors_px:
+        rows.append([_small(_as_grey(errors_px.get(n)), tile_px) for n in bands])
+    strips = [np.hstack(row) for row in rows]
+    whole = max(s.shape[1] for s in strips)
+    sheet = np.vstack([np.pad(s, ((0, 0), (0, whole - s.shape[1]))) for s in strips])
+    part = PreviewPart(
+        file=name, tile_px=tile_px, detail_px=detail_px,
+        detail=(x / width, y / height, detail_px[0] / width, detail_px[1] / height),
+        error_full_px=ERROR_FULL_PX if errors_px else None,
+    )  # fmt: skip
+    return part, np.asarray(sheet, np.uint8)
+
+
+def _blocks(length_px: float, most_px: int) -> int:
+    return min(most_px, max(_BLOCK_PX, int(length_px / _BLOCK_PX) * _BLOCK_PX))
+
+
+def _small(image: Grey | None, size_px: tuple[int, int]) -> Grey:
+    if image is None:
+        return np.zeros(size_px[::-1], np.uint8)
+    larger = size_px[0] > image.shape[1]
+    return np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_LINEAR if larger else cv2.INTER_AREA))
+
+
+def _cut(image: Grey | None, tile: Tile) -> Grey:
+    if image is None:
+        return np.zeros((tile.height, tile.width), np.uint8)
+    return image[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
+
+
+def _as_grey(error_px: NDArray[np.float32] | None) -> Grey | None:
+    if error_px is None:
+        return None
+    return np.asarray(np.nan_to_num(error_px / ERROR_FULL_PX, nan=1.0).clip(0, 1) * 255, np.uint8)

@@ -1,0 +1,187 @@
+"""What the page knows of each capture, short enough for a thousand of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from agalign.products.shortfalls import Shortfalls
+from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, Sidecar, SimilarityPart
+
+SCHEMA = "agalign-report/1"
+_SHIFT_STEP_PX = 0.01
+"""Shifts of windows are told in whole numbers of this."""
+_LIKE_SCALES = 0.1
+"""Of two bands whose scales differ by more than this share a displacement says nothing."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """A capture, without what only its picture needs."""
+
+    label: str
+    captured_at: str
+    status: str
+    camera: str
+    position: tuple[float, float] | None
+    """Latitude and longitude, degrees."""
+    seconds: float
+    """What its alignment took."""
+    offsets_px: dict[str, tuple[float, float]]
+    """Where the middle of the reference lies in each band beside its own middle; of bands that were delivered."""
+
+
+@dataclass(frozen=True)
+class BandRow:
+    """One band in all captures."""
+
+    name: str
+    aligned: int
+    pairs: int
+    apart_px: float | None
+    """Medians over captures: how far the raw files lie apart,"""
+    residual_px: float | None
+    """and what is left of that, with the worst capture's."""
+    worst_px: float | None
+    seconds: float
+
+
+@dataclass
+class Facts:
+    """What is told of the captures below an output folder, as they are added."""
+
+    out: Path
+    told: list[Told] = field(default_factory=list)
+    bands: list[BandResult] = field(default_factory=list)
+    """All moving bands of all captures."""
+    shortfalls: Shortfalls = field(default_factory=Shortfalls)
+    _captures: list[dict[str, Any]] = field(default_factory=list)
+    _apart_px: dict[str, list[float]] = field(default_factory=dict)
+    _lattices: dict[tuple[float, ...], int] = field(default_factory=dict)
+    """Places of windows, which many pairs have in common, and their number."""
+
+    def add(self, folder: str, sidecar: Sidecar) -> None:
+        """One capture more, of a folder relative to the output folder."""
+        base = "" if folder == "." else f"{folder}/"
+        label, result = f"{base}{sidecar.capture}", sidecar.result()
+        pairs = [self._pair(b, sidecar) for b in sidecar.bands]
+        moving = [b for b in result.bands if b.status != "reference"]
+        self.bands += moving
+        self.shortfalls.add(label, result)
+        delivered = {"aligned", "predicted"}
+        position = sidecar.position
+        told = Told(
+            label, sidecar.captured_at, sidecar.status, _camera(result),
+            None if position is None else (position.latitude, position.longitude), sum(b.seconds for b in moving),
+            {p["band"]: p["offset_px"] for p in pairs if p["status"] in delivered and p["offset_px"] is not None},
+        )  # fmt: skip
+        for pair in pairs:
+            if pair["apart_px"] is not None:
+                self._apart_px.setdefault(pair["band"], []).append(pair["apart_px"])
+        self.told.append(told)
+        self._captures.append(self._capture(base, sidecar, told, pairs))
+
+    @property
+    def residuals_px(self) -> list[float]:
+        """Of the pairs that are aligned, sorted."""
+        return sorted(r for b in self.bands if (r := _residual_px(b)) is not None)
+
+    def by_band(self) -> list[BandRow]:
+        """Each band in all captures."""
+        rows = []
+        for name in dict.fromkeys(b.band for b in self.bands):
+            mine = [b for b in self.bands if b.band == name]
+            known = [r for b in mine if (r := _residual_px(b)) is not None]
+            apart = self._apart_px.get(name)
+            rows.append(
+                BandRow(
+                    name, sum(b.status == "aligned" for b in mine), len(mine), median(apart) if apart else None,
+                    median(known) if known else None, max(known, default=None), median(b.seconds for b in mine),
+                )
+            )  # fmt: skip
+        return rows
+
+    def as_json(self) -> dict[str, Any]:
+        """Schema `agalign-report/1`, as the page's script declares it."""
+        return {
+            "schema": SCHEMA, "captures": self._captures, "shift_step_px": _SHIFT_STEP_PX,
+            "lattices": [list(centres) for centres in self._lattices],
+        }  # fmt: skip
+
+    def _capture(self, base: str, sidecar: Sidecar, told: Told, pairs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        output, preview, reference = sidecar.output, sidecar.preview, sidecar.reference
+        crop = (0, 0, reference.width, reference.height) if output is None else output.crop
+        picture = f"{base}{sidecar.capture}.png"
+        return {
+            "label": told.label, "captured_at": told.captured_at, "camera": told.camera, "status": told.status,
+            "position": told.position, "altitude_m": None if sidecar.position is None else sidecar.position.altitude_m,
+            "missing": sidecar.missing_bands, "reference": reference.band, "seconds": round(told.seconds, 2),
+            "crop": crop, "scale": (1.0, 1.0) if output is None else output.scale,
+            "stack": quote(f"{base}{output.file}") if output is not None and output.file else None,
+            "sidecar": quote(f"{base}{sidecar.capture}.json"),
+            "picture": quote(picture) if (self.out / picture).is_file() else None,
+            "preview": None if preview is None else {
+                **preview.model_dump(exclude={"file"}), "file": quote(f"{base}{preview.file}"),
+                "detail": [round(v, 5) for v in preview.detail],
+            },
+            "bands": pairs,
+        }  # fmt: skip
+
+    def _pair(self, band: BandPart, sidecar: Sidecar) -> dict[str, Any]:
+        joint, metrics, local, prediction = band.joint, band.metrics, band.local, band.prediction
+        after = None if metrics is None else metrics.after
+        tiles = [] if metrics is None else metrics.tiles
+        offset, apart = _lies(band.grid, sidecar)
+        lattice = tuple(v for t in tiles for v in t.centre_px)
+        return {
+            "band": band.band, "wavelength_nm": band.wavelength_nm, "status": band.status, "reason": band.reason,
+            "seed": band.seed.kind if band.seed else None, "seconds": round(band.seconds, 2),
+            "written": band.place is not None, "offset_px": offset, "apart_px": apart,
+            "residual_px": None if after is None else _rounded(after.residual_px),
+            "residual_p95_px": None if after is None else _rounded(after.residual_p95_px),
+            "coverage": None if after is None else _rounded(after.residual_coverage),
+            "retrieval": _rounded(joint.retrieval) if joint else None,
+            "corner_std_px": _rounded(joint.corner_std_px) if joint else None,
+            "similarity": None if metrics is None else _similarity(metrics.before, metrics.after),
+            "prediction": None if prediction is None else prediction.model_dump(by_alias=True),
+            "local": None if local is None else local.model_dump(),
+            "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
+            "shifts": [None if v is None else round(v / _SHIFT_STEP_PX) for t in tiles for v in t.shift_px],
+        }  # fmt: skip
+
+
+def _camera(result: CaptureResult) -> str:
+    return f"{result.camera.make} {result.camera.model}".strip() or "unknown camera"
+
+
+def _residual_px(band: BandResult) -> float | None:
+    return band.metrics.after.residual_px if band.status == "aligned" and band.metrics else None
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)
+
+
+def _similarity(before: SimilarityPart, after: SimilarityPart) -> dict[str, tuple[float | None, float | None]]:
+    names = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
+    return {n: (_rounded(getattr(before, n)), _rounded(getattr(after, n))) for n in names}
+
+
+def _lies(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:
+    """((x, y) of the reference's middle in the moving file beside where it is in the reference's, median distance
+    between the pixels of the two files that show the same), px; None where the files have different scales.
+    """
+    if grid is None:
+        return None, None
+    here, there = np.array(grid.reference_px), np.array(grid.moving_px)
+    along, moved = np.ptp(here, axis=0), np.ptp(there, axis=0)
+    if not (np.abs(moved / along - 1) < _LIKE_SCALES).all():
+        return None, None
+    apart = there - here
+    middle = np.array([sidecar.reference.width - 1, sidecar.reference.height - 1]) / 2
+    dx, dy = apart[np.linalg.norm(here - middle, axis=1).argmin()].tolist()
+    return (round(dx, 3), round(dy, 3)), round(float(np.median(np.linalg.norm(apart, axis=1))), 3)

@@ -1,0 +1,806 @@
+// @ts-check
+"use strict";
+/**
+ * What moves on the report: the map, the table, and the capture that is looked at. Everything that is shown comes from
+ * the facts in the page itself; the only files that are loaded are the previews beside the rasters, one as it is looked
+ * at. Canvases are drawn on and never read, which a page from a file may not do.
+ */
+
+/**
+ * @typedef {{from: string, std_px: number, off_px: number | null}} Prediction
+ * @typedef {{applied: boolean, before_p95_px: number | null, after_p95_px: number | null}} Local
+ * @typedef {{band: string, wavelength_nm: number | null, status: string, reason: string | null, seed: string | null,
+ *   seconds: number, written: boolean, offset_px: [number, number] | null, apart_px: number | null,
+ *   residual_px: number | null, residual_p95_px: number | null, coverage: number | null, retrieval: number | null,
+ *   corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
+ *   prediction: Prediction | null, local: Local | null, lattice: number, shifts: (number | null)[]}} Pair
+ * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
+ *   detail: [number, number, number, number], error_full_px: number | null}} Preview
+ * @typedef {{label: string, captured_at: string, camera: string, status: string, position: [number, number] | null,
+ *   altitude_m: number | null, missing: string[], reference: string, seconds: number,
+ *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
+ *   picture: string | null, preview: Preview | null, bands: Pair[]}} Capture
+ * @typedef {{schema: string, captures: Capture[], shift_step_px: number, lattices: number[][]}} Facts
+ * @typedef {"before" | "after"} When
+ */
+
+/** @type {Facts} */
+const facts = JSON.parse(byId("facts").textContent ?? "");
+const captures = facts.captures;
+
+// ---- small things
+
+/** @param {string} id @returns {HTMLElement} */
+function byId(id) {
+  const found = document.getElementById(id);
+  if (found === null) throw new Error(`no element ${id}`);
+  return found;
+}
+
+/**
+ * An element; texts are never taken for HTML.
+ * @template {keyof HTMLElementTagNameMap} T
+ * @param {T} tag @param {Record<string, string | number | boolean>} [attributes]
+ * @param {...(Node | string)} children
+ * @returns {HTMLElementTagNameMap[T]}
+ */
+function el(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  set(made, attributes);
+  made.append(...children);
+  return made;
+}
+
+/** @param {string} tag @param {Record<string, string | number | boolean>} attributes @param {...(Node | string)} children */
+function svg(tag, attributes, ...children) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  set(made, attributes);
+  made.append(...children);
+  return made;
+}
+
+/** @param {Element} element @param {Record<string, string | number | boolean>} attributes */
+function set(element, attributes) {
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value === true) element.setAttribute(name, "");
+    else if (value !== false) element.setAttribute(name, String(value));
+  }
+}
+
+/** @param {number | null | undefined} value @param {number} [digits] */
+function fixed(value, digits = 2) {
+  return value === null || value === undefined ? "–" : value.toFixed(digits);
+}
+
+/** @param {string} status */
+function inWords(status) {
+  return status.replace("_", " ");
+}
+
+/** @param {Capture} capture @returns {Pair[]} */
+function moving(capture) {
+  return capture.bands.filter((b) => b.status !== "reference");
+}
+
+/**
+ * The largest of what the aligned pairs of a capture have.
+ * @param {Capture} capture @param {"residual_px" | "corner_std_px"} what @returns {number | null}
+ */
+function worst(capture, what) {
+  const known = moving(capture).flatMap((b) => (b.status === "aligned" ? (b[what] ?? []) : []));
+  return known.length ? Math.max(...known) : null;
+}
+
+/** @param {Capture} capture */
+function address(capture) {
+  return `#capture=${encodeURIComponent(capture.label)}`;
+}
+
+// ---- the table
+
+/** @type {{title: string, numeric: boolean, value: (c: Capture) => string | number | null, cell: (c: Capture) => Node | string}[]} */
+const columns = [
+  { title: "Capture", numeric: false, value: (c) => c.label, cell: (c) => el("a", { href: address(c) }, c.label) },
+  { title: "Taken", numeric: false, value: (c) => c.captured_at, cell: (c) => c.captured_at.slice(0, 19).replace("T", " ") },
+  { title: "Status", numeric: false, value: (c) => ["failed", "degraded", "ok"].indexOf(c.status), cell: (c) => badge(c.status) },
+  { title: "Bands", numeric: true, value: (c) => moving(c).filter((b) => b.status === "aligned").length / Math.max(1, moving(c).length + c.missing.length), cell: chips },
+  { title: "Largest residual, px", numeric: true, value: (c) => worst(c, "residual_px"), cell: (c) => fixed(worst(c, "residual_px"), 3) },
+  { title: "Corner error, px", numeric: true, value: (c) => worst(c, "corner_std_px"), cell: (c) => fixed(worst(c, "corner_std_px"), 3) },
+  { title: "Seconds", numeric: true, value: (c) => c.seconds, cell: (c) => c.seconds.toFixed(1) },
+];
+const table = { sorted: 0, up: true, /** @type {Map<Capture, HTMLTableRowElement>} */ rows: new Map() };
+
+/** @param {string} status */
+function badge(status) {
+  return el("span", { class: `badge ${status}` }, inWords(status));
+}
+
+/** @param {Capture} capture */
+function chips(capture) {
+  const line = el("span");
+  for (const b of moving(capture)) line.append(el("span", { class: `chip ${b.status}`, title: `${b.band}: ${inWords(b.status)}` }, b.band), " ");
+  for (const name of capture.missing) line.append(el("span", { class: "chip missing", title: `${name}: missing` }, name), " ");
+  return line;
+}
+
+function tableHead() {
+  const line = el("tr");
+  columns.forEach((column, i) => {
+    const button = el("button", { type: "button" }, column.title);
+    button.addEventListener("click", () => {
+      table.up = table.sorted === i ? !table.up : true;
+      table.sorted = i;
+      tableBody();
+    });
+    line.append(el("th", { scope: "col", class: column.numeric && column.title !== "Bands" ? "n" : "" }, button));
+  });
+  byId("table").querySelector("thead")?.replaceChildren(line);
+}
+
+/** @param {Capture} capture */
+function row(capture) {
+  const made = table.rows.get(capture) ?? el("tr");
+  if (!table.rows.has(capture)) {
+    columns.forEach((column, i) => {
+      const attributes = { class: column.numeric && column.title !== "Bands" ? "n" : "" };
+      made.append(i === 0 ? el("th", { scope: "row", ...attributes }, column.cell(capture)) : el("td", attributes, column.cell(capture)));
+    });
+    table.rows.set(capture, made);
+  }
+  return made;
+}
+
+/** The captures that the filters let through, in the order that was chosen; those without a value last. */
+function chosen() {
+  const text = /** @type {HTMLInputElement} */ (byId("find")).value.trim().toLowerCase();
+  const only = /** @type {HTMLSelectElement} */ (byId("only")).value;
+  const value = columns[table.sorted].value;
+  const sign = table.up ? 1 : -1;
+  return captures
+    .filter((c) => !text || `${c.label} ${c.captured_at} ${c.camera}`.toLowerCase().includes(text))
+    .filter((c) => only === "all" || only === c.status || (only === "short" && isShort(c)) || (only === "predicted" && moving(c).some((b) => b.status === "predicted")))
+    .sort((a, b) => {
+      const [x, y] = [value(a), value(b)];
+      if (x === null || y === null) return Number(x === null) - Number(y === null);
+      return sign * (typeof x === "string" ? x.localeCompare(String(y), undefined, { numeric: true }) : Number(x) - Number(y));
+    });
+}
+
+/** @param {Capture} capture */
+function isShort(capture) {
+  return capture.missing.length > 0 || moving(capture).some((b) => b.status !== "aligned");
+}
+
+function tableBody() {
+  const shown = chosen();
+  byId("table").querySelector("tbody")?.replaceChildren(...shown.map(row));
+  byId("table").querySelectorAll("thead th").forEach((head, i) => {
+    set(head, { "aria-sort": i !== table.sorted ? "none" : table.up ? "ascending" : "descending" });
+  });
+  byId("count").textContent = `${shown.length} of ${captures.length} shown`;
+}
+
+// ---- the map
+
+const MAP = { width: 900, height: 420, margin: 34 };
+const ONE_PLACE_M = 0.5;
+const STATUS_COLOURS = { ok: "#2f9e61", degraded: "#d98a1b", failed: "#d43c3c" };
+/** @type {Map<Capture, Element>} */
+const dots = new Map();
+
+/** The captures where they were taken, metres along and across; drawn without any map behind it. */
+function drawMap() {
+  const place = document.getElementById("map-place");
+  if (place === null) return;
+  const placed = captures.filter((c) => c.position !== null);
+  const [lat, lon] = [0, 1].map((i) => placed.reduce((sum, c) => sum + (c.position ?? [0, 0])[i], 0) / placed.length);
+  const metres = placed.map((c) => {
+    const [y, x] = c.position ?? [0, 0];
+    return [(x - lon) * 111320 * Math.cos((lat * Math.PI) / 180), (y - lat) * 110540];
+  });
+  const reach = [0, 1].map((i) => Math.max(...metres.map((m) => Math.abs(m[i])), 1e-9));
+  if (Math.max(...reach) < ONE_PLACE_M) {
+    place.replaceChildren(el("p", {}, `All at ${lat.toFixed(6)}, ${lon.toFixed(6)}.`));
+    byId("map").querySelectorAll("label, #map-legend").forEach((part) => { part.remove(); });
+    return;
+  }
+  const scale = Math.min((MAP.width / 2 - MAP.margin) / reach[0], (MAP.height / 2 - MAP.margin) / reach[1], 200);
+  const at = metres.map(([x, y]) => [MAP.width / 2 + x * scale, MAP.height / 2 - y * scale]);
+  const inTime = placed.map((c, i) => ({ c, at: at[i] })).sort((a, b) => a.c.captured_at.localeCompare(b.c.captured_at));
+  const radius = placed.length > 400 ? 4 : placed.length > 60 ? 5.5 : 8;
+  const drawn = svg("svg", { viewBox: `0 0 ${MAP.width} ${MAP.height}`, role: "img", "aria-label": `Positions of ${placed.length} captures; the table below has the same captures` });
+  drawn.append(svg("polyline", { class: "track", points: inTime.map((p) => p.at.map((v) => v.toFixed(1)).join(",")).join(" ") }));
+  for (const { c, at: [x, y] } of inTime) {
+    const dot = svg("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: radius }, svg("title", {}, c.label));
+    dot.addEventListener("click", () => { location.hash = address(c); });
+    dots.set(c, dot);
+    drawn.append(dot);
+  }
+  drawn.append(...scaleBar(scale));
+  place.replaceChildren(drawn);
+  const colour = byId("map-colour");
+  colour.addEventListener("change", colourMap);
+  colourMap();
+}
+
+/** @param {number} scale Pixels a metre. */
+function scaleBar(scale) {
+  const power = 10 ** Math.floor(Math.log10(140 / scale));
+  const length = [5, 2, 1].map((n) => n * power).find((n) => n * scale <= 140) ?? power;
+  const y = MAP.height - 14;
+  const name = length >= 1000 ? `${length / 1000} km` : length >= 1 ? `${length} m` : `${Math.round(length * 100)} cm`;
+  return [
+    svg("path", { class: "scale", d: `M14 ${y}h${(length * scale).toFixed(1)}` }),
+    svg("text", { x: 14, y: y - 6 }, name),
+    svg("text", { x: MAP.width - 24, y: 24 }, "N ↑"),
+  ];
+}
+
+function colourMap() {
+  const what = /** @type {HTMLSelectElement} */ (byId("map-colour")).value;
+  const legend = byId("map-legend");
+  if (what === "status") {
+    for (const [c, dot] of dots) set(dot, { fill: colourOf(c.status) });
+    const present = Object.keys(STATUS_COLOURS).filter((s) => captures.some((c) => c.status === s));
+    legend.replaceChildren(...present.map((s) => el("span", { class: "key", style: `--key:${colourOf(s)}` }, s)));
+    return;
+  }
+  const values = [...dots.keys()].flatMap((c) => worst(c, /** @type {"residual_px"} */ (what)) ?? []).sort((a, b) => a - b);
+  const full = Math.max(values[Math.floor(0.98 * (values.length - 1))] ?? 1, 0.05);
+  for (const [c, dot] of dots) {
+    const value = worst(c, /** @type {"residual_px"} */ (what));
+    set(dot, { fill: value === null ? STATUS_COLOURS.failed : ramp(value / full) });
+  }
+  const steps = [0, 0.5, 1].map((s) => el("span", { class: "key", style: `--key:${ramp(s)}` }, `${(s * full).toFixed(2)} px${s === 1 ? " and more" : ""}`));
+  legend.replaceChildren(...steps, el("span", { class: "key", style: `--key:${STATUS_COLOURS.failed}` }, "no band aligned"));
+}
+
+/** @param {string} status */
+function colourOf(status) {
+  return /** @type {Record<string, string>} */ (STATUS_COLOURS)[status] ?? "#888";
+}
+
+/**
+ * From blue-green to red, of equal lightness.
+ * @param {number} share
+ */
+function ramp(share) {
+  return `hsl(${Math.round(200 - 200 * Math.min(1, Math.max(0, share)))} 70% 45%)`;
+}
+
+// ---- one capture
+
+const CHANNELS = ["#f00", "#0f0", "#00f"];
+const LARGEST_ZOOM = 40;
+const FULL_PX = 0.5; // a residual's colour and arrow are full
+/** @type {Record<string, string>} */
+const NOTES = {
+  vectors: `What is left of the shift in each window; an arrow of ${FULL_PX} px reaches most of the way to the next window. Grey: none could be measured.`,
+  heat: `What is left of the shift in each window, from blue to red at ${FULL_PX} px.`,
+  error: "The error to be expected at every pixel, as far as it is known: the more orange, the larger, full at 0.5 px.",
+};
+const BLINK_MS = 700;
+const SCREEN_SHARE = 78; // of its height, at most, for a picture
+const CLOSE_ENOUGH = 1.5; // as wide as the small picture has pixels, the detail is laid over it
+
+/** What is looked at, and how; it stays from capture to capture. */
+const look = {
+  /** @type {Capture | null} */ capture: null,
+  /** @type {HTMLImageElement | null} */ sheet: null,
+  /** @type {[string, string, string] | null} */ bands: null,
+  /** @type {"swipe" | "blink" | "side"} */ mode: "swipe",
+  split: 0.5,
+  /** @type {When} */ blinking: "before",
+  timer: 0,
+  zoom: 1, x: 0, y: 0,
+  overlay: "none", overlayBand: "",
+  /** @type {Record<string, HTMLCanvasElement>} */ composed: {},
+};
+/** @type {HTMLCanvasElement} */
+const stage = el("canvas", { tabindex: 0, role: "img", "aria-label": "The composite before and after" });
+
+/** @param {Capture} capture */
+function show(capture) {
+  const before = look.capture;
+  if (before !== null) {
+    table.rows.get(before)?.classList.remove("open");
+    dots.get(before)?.classList.remove("open");
+  }
+  look.capture = capture;
+  look.sheet = null;
+  look.composed = {};
+  const names = capture.bands.map((b) => b.band);
+  if (look.bands === null || look.bands.some((b) => !names.includes(b))) look.bands = presets(capture)[0].bands;
+  if (!names.includes(look.overlayBand)) look.overlayBand = moving(capture)[0]?.band ?? "";
+  table.rows.get(capture)?.classList.add("open");
+  const dot = dots.get(capture);
+  dot?.classList.add("open");
+  dot?.parentNode?.append(dot); // nothing lies over it
+  const place = byId("capture");
+  place.hidden = false;
+  place.replaceChildren(...heading(capture), ...pictures(capture), words(capture), numbers(capture));
+  paint();
+}
+
+/** @param {Capture} capture */
+function heading(capture) {
+  const order = chosen();
+  const at = order.indexOf(capture);
+  /** @param {string} text @param {Capture | undefined} to */
+  const step = (text, to) => {
+    const button = el("button", { type: "button", class: "button", disabled: to === undefined }, text);
+    button.addEventListener("click", () => { if (to !== undefined) location.hash = address(to); });
+    return button;
+  };
+  const where = capture.position === null ? "" : ` · ${capture.position.map((v) => v.toFixed(6)).join(", ")}${capture.altitude_m === null ? "" : `, ${capture.altitude_m.toFixed(0)} m`}`;
+  const files = el("span");
+  for (const [file, name] of [[capture.stack, "aligned stack"], [capture.sidecar, "sidecar"], [capture.picture, "picture"]]) {
+    if (file !== null) files.append(" · ", el("a", { href: String(file) }, String(name)));
+  }
+  return [
+    el("div", { class: "heading" }, el("h2", { id: "capture-title" }, capture.label, " ", badge(capture.status)), step("Previous", at < 0 ? undefined : order[at - 1]), step("Next", at < 0 ? undefined : order[at + 1])),
+    el("p", { class: "soft" }, `${capture.camera} · ${capture.captured_at.slice(0, 19).replace("T", " ")}${where} · reference ${capture.reference}`, files),
+  ];
+}
+
+/**
+ * Composites by what the bands are, each where the bands are there.
+ * @param {Capture} capture @returns {{name: string, bands: [string, string, string]}[]}
+ */
+function presets(capture) {
+  /** @param {number} low @param {number} high @param {RegExp} name */
+  const find = (low, high, name) =>
+    (capture.bands.find((b) => b.wavelength_nm !== null && b.wavelength_nm >= low && b.wavelength_nm < high) ?? capture.bands.find((b) => b.wavelength_nm === null && name.test(b.band)))?.band;
+  const [blue, green, red, nir, edge] = [find(430, 495, /^blue/i), find(520, 585, /^green/i), find(620, 690, /^red$/i), find(760, 1000, /^nir/i), find(695, 755, /red ?edge/i)];
+  const others = capture.bands.filter((b) => b.status !== "reference").map((b) => b.band);
+  /** @type {[string, (string | undefined)[]][]} */
+  const known = [["false colour", [nir, red, green]], ["true colour", [red, green, blue]], ["red edge", [nir, edge, green]], ["first bands", [others[0], others[1] ?? others[0], capture.reference]]];
+  return known.flatMap(([name, bands]) => (bands.every((b) => b !== undefined) ? [{ name, bands: /** @type {[string, string, string]} */ (bands) }] : []));
+}
+
+/** @param {Capture} capture */
+function pictures(capture) {
+  if (capture.preview === null) {
+    return capture.picture === null ? [] : [el("img", { class: "wide", src: capture.picture, loading: "lazy", alt: "Before and after alignment" })];
+  }
+  const sheet = new Image();
+  sheet.addEventListener("load", () => {
+    if (look.capture !== capture) return;
+    look.sheet = sheet;
+    paint();
+  });
+  sheet.addEventListener("error", () => { if (look.capture === capture) byId("tag-right").textContent = "the preview is not there"; });
+  sheet.src = capture.preview.file;
+  const frame = el("div", { class: "stage" }, stage, el("span", { class: "tag left", id: "tag-left" }), el("span", { class: "tag right", id: "tag-right" }));
+  const swipe = el("input", { type: "range", id: "swipe", min: 0, max: 1000, value: Math.round(look.split * 1000), "aria-label": "How much of the picture is before: the rest is after" });
+  swipe.addEventListener("input", () => {
+    look.split = Number(swipe.value) / 1000;
+    setMode("swipe");
+  });
+  return [compositeTools(capture), viewTools(capture), el("div", { id: "viewer" }, frame, swipe), el("p", { class: "soft", id: "over-note" }), el("p", { class: "soft hint" }, "Drag the line, or drag the picture; on it the keys + and − zoom, arrows move, 0 shows all, the space bar changes between before and after.")];
+}
+
+/**
+ * @param {string} label @param {string[][]} options Value and text. @param {string} value
+ * @param {(value: string) => void} then @param {string} [spoken] The label for who does not see what stands around it.
+ */
+function choice(label, options, value, then, spoken = label) {
+  const made = el("select", { "aria-label": spoken }, ...options.map(([v, text]) => el("option", { value: v, selected: v === value }, text)));
+  made.addEventListener("change", () => then(made.value));
+  return el("label", { class: "tool" }, `${label} `, made);
+}
+
+/** @param {Capture} capture */
+function compositeTools(capture) {
+  const known = presets(capture);
+  const bands = look.bands ?? known[0].bands;
+  const named = known.find((p) => p.bands.every((b, i) => b === bands[i]))?.name ?? "other";
+  const line = el("div", { class: "tools" });
+  const again = () => {
+    look.composed = {};
+    line.replaceWith(compositeTools(capture));
+    paint();
+  };
+  line.append(
+    choice("Composite", [...known.map((p) => [p.name, p.name]), ...(named === "other" ? [["other", "other"]] : [])], named, (name) => {
+      look.bands = known.find((p) => p.name === name)?.bands ?? bands;
+      again();
+    }),
+    ...["Red", "Green", "Blue"].map((channel, i) =>
+      choice(channel, capture.bands.map((b) => [b.band, b.band]), bands[i], (name) => {
+        look.bands = /** @type {[string, string, string]} */ (bands.map((b, k) => (k === i ? name : b)));
+        again();
+      }, `${channel} channel`),
+    ),
+  );
+  return line;
+}
+
+/** @param {Capture} capture */
+function viewTools(capture) {
+  const line = el("div", { class: "tools", id: "view-tools" });
+  /** @param {string} text @param {() => void} then @param {string} [mode] */
+  const button = (text, then, mode) => {
+    const made = el("button", { type: "button", class: "button", ...(mode === undefined ? {} : { "data-mode": mode, "aria-pressed": String(look.mode === mode) }) }, text);
+    made.addEventListener("click", then);
+    return made;
+  };
+  line.append(
+    button("Swipe", () => setMode("swipe"), "swipe"),
+    button("Blink", () => setMode("blink"), "blink"),
+    button("Side by side", () => setMode("side"), "side"),
+    button("−", () => zoomBy(1 / 1.6), undefined),
+    button("+", () => zoomBy(1.6), undefined),
+    button("All", () => showAll(), undefined),
+    button("Detail", () => showDetail(), undefined),
+  );
+  line.querySelectorAll("button").forEach((b) => {
+    if (b.textContent === "−") set(b, { "aria-label": "Zoom out" });
+    if (b.textContent === "+") set(b, { "aria-label": "Zoom in" });
+  });
+  const overlays = [["none", "nothing"], ["vectors", "residual vectors"], ["heat", "residual heat map"]];
+  if (capture.preview?.error_full_px) overlays.push(["error", "error to be expected"]);
+  line.append(
+    choice("Over it", overlays, look.overlay, (value) => { look.overlay = value; paint(); }, "What lies over it"),
+    choice("of", moving(capture).map((b) => [b.band, b.band]), look.overlayBand, (value) => { look.overlayBand = value; paint(); }, "Band of what lies over it"),
+  );
+  return line;
+}
+
+/** @param {"swipe" | "blink" | "side"} mode */
+function setMode(mode) {
+  look.mode = mode;
+  window.clearInterval(look.timer);
+  if (mode === "blink") look.timer = window.setInterval(flip, BLINK_MS);
+  document.querySelectorAll("#view-tools [data-mode]").forEach((b) => set(b, { "aria-pressed": String(b.getAttribute("data-mode") === mode) }));
+  paint();
+}
+
+function flip() {
+  look.blinking = look.blinking === "before" ? "after" : "before";
+  paint();
+}
+
+/** The width of what one picture is shown in, px of the canvas. */
+function frameWidth() {
+  return look.mode === "side" ? Math.floor(stage.width / 2) : stage.width;
+}
+
+/**
+ * About a point, in shares of what is seen.
+ * @param {number} factor @param {number} [atX] @param {number} [atY]
+ */
+function zoomBy(factor, atX = 0.5, atY = 0.5) {
+  const zoom = Math.min(LARGEST_ZOOM, Math.max(1, look.zoom * factor));
+  look.x += atX / look.zoom - atX / zoom;
+  look.y += atY / look.zoom - atY / zoom;
+  look.zoom = zoom;
+  pan(0, 0);
+}
+
+/**
+ * In shares of what is seen.
+ * @param {number} dx @param {number} dy
+ */
+function pan(dx, dy) {
+  const most = 1 - 1 / look.zoom;
+  look.x = Math.min(most, Math.max(0, look.x + dx / look.zoom));
+  look.y = Math.min(most, Math.max(0, look.y + dy / look.zoom));
+  paint();
+}
+
+function showAll() {
+  look.zoom = 1;
+  pan(0, 0);
+}
+
+function showDetail() {
+  const detail = look.capture?.preview?.detail;
+  if (!detail) return;
+  look.zoom = Math.min(LARGEST_ZOOM, 1 / Math.max(detail[2], detail[3]));
+  look.x = detail[0] + (detail[2] - 1 / look.zoom) / 2;
+  look.y = detail[1] + (detail[3] - 1 / look.zoom) / 2;
+  pan(0, 0);
+}
+
+/**
+ * Where a picture lies on the sheet: x, y, width, height. Rows are those of agalign/products/preview.py.
+ * @param {Preview} preview @param {number} column @param {number} line @returns {[number, number, number, number]}
+ */
+function onSheet(preview, column, line) {
+  const [w, h] = preview.tile_px;
+  const [dw, dh] = preview.detail_px;
+  if (line < 2) return [column * w, line * h, w, h];
+  if (line < 4) return [column * dw, 2 * h + (line - 2) * dh, dw, dh];
+  return [column * w, 2 * h + 2 * dh, w, h];
+}
+
+/**
+ * Grey pictures of a row of the sheet as the channels of one: each is dyed in its colour, and they add up.
+ * @param {HTMLImageElement} sheet @param {Preview} preview @param {number} line
+ * @param {{column: number, colour: string}[]} channels
+ */
+function compose(sheet, preview, line, channels) {
+  const [, , width, height] = onSheet(preview, 0, line);
+  const whole = el("canvas", { width, height });
+  const sum = /** @type {CanvasRenderingContext2D} */ (whole.getContext("2d"));
+  sum.fillRect(0, 0, width, height);
+  sum.globalCompositeOperation = "lighter";
+  for (const { column, colour } of channels) {
+    const one = el("canvas", { width, height });
+    const dyed = /** @type {CanvasRenderingContext2D} */ (one.getContext("2d"));
+    dyed.drawImage(sheet, ...onSheet(preview, column, line), 0, 0, width, height);
+    dyed.globalCompositeOperation = "multiply";
+    dyed.fillStyle = colour;
+    dyed.fillRect(0, 0, width, height);
+    sum.drawImage(one, 0, 0);
+  }
+  return whole;
+}
+
+/**
+ * The composite of a row, made when it is first needed.
+ * @param {number} line @param {{column: number, colour: string}[]} channels
+ */
+function composed(line, channels) {
+  const preview = look.capture?.preview;
+  if (look.sheet === null || !preview) return null;
+  const key = `${line} ${channels.map((c) => c.column).join(" ")}`;
+  look.composed[key] ??= compose(look.sheet, preview, line, channels);
+  return look.composed[key];
+}
+
+function paint() {
+  const capture = look.capture;
+  const preview = capture?.preview;
+  if (!capture || !preview || !stage.isConnected) return;
+  const aspect = capture.crop[3] / capture.crop[2] / (look.mode === "side" ? 2 : 1);
+  byId("viewer").style.maxWidth = `${SCREEN_SHARE / aspect}vh`;
+  const wide = Math.max(1, Math.round(stage.clientWidth * window.devicePixelRatio));
+  const high = Math.round(wide * aspect);
+  if (stage.width !== wide || stage.height !== high) {
+    stage.width = wide;
+    stage.height = high;
+  }
+  const pen = /** @type {CanvasRenderingContext2D} */ (stage.getContext("2d"));
+  pen.clearRect(0, 0, wide, high);
+  const frame = frameWidth();
+  const split = Math.round(look.split * wide);
+  if (look.mode === "blink") picture(pen, capture, look.blinking, 0, 0, wide);
+  else {
+    const middle = look.mode === "side" ? frame : split;
+    picture(pen, capture, "before", 0, 0, middle);
+    picture(pen, capture, "after", look.mode === "side" ? frame : 0, middle, wide - middle);
+    pen.fillStyle = "#fff";
+    pen.fillRect(middle - 1, 0, 2, high);
+  }
+  byId("over-note").textContent = NOTES[look.overlay] ?? "";
+  const now = look.mode === "blink" ? look.blinking : "";
+  byId("tag-left").textContent = now || "before";
+  byId("tag-right").textContent = now ? "" : "after";
+  byId("tag-right").hidden = Boolean(now);
+  stage.dataset["blinking"] = now;
+}
+
+/**
+ * One picture, and what is laid over it, within a strip of the canvas.
+ * @param {CanvasRenderingContext2D} pen @param {Capture} capture @param {When} when
+ * @param {number} origin Where the picture's frame begins. @param {number} from @param {number} width Of the strip.
+ */
+function picture(pen, capture, when, origin, from, width) {
+  const preview = /** @type {Preview} */ (capture.preview);
+  const [frame, high] = [frameWidth(), stage.height];
+  const columns = (look.bands ?? []).map((name, i) => ({ column: capture.bands.findIndex((b) => b.band === name), colour: CHANNELS[i] }));
+  const line = when === "before" ? 0 : 1;
+  /** @param {number} u @param {number} v Shares of the picture's sides. @returns {[number, number]} */
+  const at = (u, v) => [origin + (u - look.x) * look.zoom * frame, (v - look.y) * look.zoom * high];
+  pen.save();
+  pen.beginPath();
+  pen.rect(from, 0, width, high);
+  pen.clip();
+  const whole = composed(line, columns);
+  const close = composed(line + 2, columns);
+  if (whole) pen.drawImage(whole, ...at(0, 0), look.zoom * frame, look.zoom * high);
+  const [x, y, w, h] = preview.detail;
+  if (close && look.zoom > 1 && (look.zoom * frame) / preview.tile_px[0] > CLOSE_ENOUGH) {
+    pen.imageSmoothingEnabled = (w * look.zoom * frame) / preview.detail_px[0] < 3; // pixels are to be seen as such
+    pen.drawImage(close, ...at(x, y), w * look.zoom * frame, h * look.zoom * high);
+  }
+  pen.strokeStyle = "#fff8";
+  pen.strokeRect(...at(x, y), w * look.zoom * frame, h * look.zoom * high);
+  if (when === "after") over(pen, capture, at);
+  pen.restore();
+}
+
+/** @param {CanvasRenderingContext2D} pen @param {Capture} capture @param {(u: number, v: number) => [number, number]} at */
+function over(pen, capture, at) {
+  const column = capture.bands.findIndex((b) => b.band === look.overlayBand);
+  const pair = capture.bands[column];
+  if (!pair || look.overlay === "none") return;
+  if (look.overlay === "error") {
+    const errors = composed(4, [{ column, colour: "#ff5a1f" }]);
+    pen.globalCompositeOperation = "screen";
+    const [x, y] = at(0, 0);
+    const [right, bottom] = at(1, 1);
+    if (errors) pen.drawImage(errors, x, y, right - x, bottom - y);
+    return;
+  }
+  const lattice = facts.lattices[pair.lattice];
+  const [x0, y0, width, height] = capture.crop;
+  const [sx, sy] = capture.scale;
+  const apart = 0.5 * nearest(lattice);
+  const cell = at((apart * sx) / width, (apart * sy) / height).map((v, i) => Math.abs(v - at(0, 0)[i]));
+  for (let i = 0; i < lattice.length; i += 2) {
+    const [dx, dy] = [pair.shifts[i], pair.shifts[i + 1]];
+    const [x, y] = at((sx * (lattice[i] + 0.5) - x0) / width, (sy * (lattice[i + 1] + 0.5) - y0) / height);
+    const shift = dx === null || dy === null ? null : [dx * facts.shift_step_px, dy * facts.shift_step_px];
+    pen.fillStyle = shift === null ? "#bbb" : ramp(Math.hypot(...shift) / FULL_PX);
+    if (look.overlay === "heat") {
+      if (shift === null) continue;
+      pen.globalAlpha = 0.55;
+      pen.fillRect(x - cell[0], y - cell[1], 2 * cell[0], 2 * cell[1]);
+      continue;
+    }
+    arrow(pen, x, y, shift === null ? [0, 0] : shift.map((v, k) => 1.6 * cell[k] * v / Math.max(FULL_PX, Math.hypot(...shift))));
+  }
+}
+
+/**
+ * In the pen's colour on a white edge, which shows on any picture.
+ * @param {CanvasRenderingContext2D} pen @param {number} x @param {number} y @param {number[]} along
+ */
+function arrow(pen, x, y, along) {
+  const unit = window.devicePixelRatio;
+  const colour = pen.fillStyle;
+  for (const [paint, edge] of /** @type {[typeof colour, number][]} */ ([["#fff", 1.5], [colour, 0]])) {
+    pen.fillStyle = pen.strokeStyle = paint;
+    pen.lineWidth = (2.5 + 2 * edge) * unit;
+    pen.beginPath();
+    pen.arc(x, y, (4 + edge) * unit, 0, 7);
+    pen.fill();
+    pen.beginPath();
+    pen.moveTo(x, y);
+    pen.lineTo(x + along[0], y + along[1]);
+    pen.stroke();
+  }
+}
+
+/**
+ * The distance between windows, px.
+ * @param {number[]} lattice
+ */
+function nearest(lattice) {
+  let found = Infinity;
+  for (let i = 2; i < lattice.length; i += 2) {
+    const step = Math.max(Math.abs(lattice[i] - lattice[0]), Math.abs(lattice[i + 1] - lattice[1]));
+    if (step > 0) found = Math.min(found, step);
+  }
+  return Number.isFinite(found) ? found : 64;
+}
+
+/** @param {PointerEvent} down */
+function drag(down) {
+  if (down.button !== 0) return;
+  const box = stage.getBoundingClientRect();
+  const grabs = look.mode === "swipe" && Math.abs(down.clientX - box.left - look.split * box.width) < 18;
+  let [x, y] = [down.clientX, down.clientY];
+  stage.setPointerCapture(down.pointerId);
+  /** @param {PointerEvent} move */
+  const follow = (move) => {
+    if (grabs) {
+      look.split = Math.min(1, Math.max(0, (move.clientX - box.left) / box.width));
+      /** @type {HTMLInputElement} */ (byId("swipe")).value = String(Math.round(look.split * 1000));
+      paint();
+    } else {
+      const across = look.mode === "side" ? box.width / 2 : box.width;
+      pan((x - move.clientX) / across, (y - move.clientY) / box.height);
+    }
+    [x, y] = [move.clientX, move.clientY];
+  };
+  stage.addEventListener("pointermove", follow);
+  for (const end of ["pointerup", "pointercancel"]) {
+    stage.addEventListener(end, () => stage.removeEventListener("pointermove", follow), { once: true });
+  }
+}
+
+/** @type {Record<string, () => void>} */
+const keys = {
+  "+": () => zoomBy(1.6), "=": () => zoomBy(1.6), "-": () => zoomBy(1 / 1.6), "0": showAll,
+  ArrowLeft: () => pan(-0.1, 0), ArrowRight: () => pan(0.1, 0), ArrowUp: () => pan(0, -0.1), ArrowDown: () => pan(0, 0.1),
+  " ": () => {
+    if (look.mode !== "blink") setMode("blink");
+    window.clearInterval(look.timer); // from here on it is changed by hand
+    flip();
+  },
+};
+
+function listenToStage() {
+  stage.addEventListener("pointerdown", drag);
+  stage.addEventListener("dblclick", (event) => {
+    const box = stage.getBoundingClientRect();
+    zoomBy(2, ((event.clientX - box.left) / box.width * (look.mode === "side" ? 2 : 1)) % 1, (event.clientY - box.top) / box.height);
+  });
+  stage.addEventListener("wheel", (event) => {
+    if (!event.ctrlKey && !event.metaKey) return; // the page scrolls
+    event.preventDefault();
+    const box = stage.getBoundingClientRect();
+    zoomBy(event.deltaY < 0 ? 1.2 : 1 / 1.2, (event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
+  }, { passive: false });
+  stage.addEventListener("keydown", (event) => {
+    const act = keys[event.key];
+    if (act === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    act();
+  });
+  window.addEventListener("resize", paint);
+}
+
+// ---- a capture in words and in numbers
+
+/** @param {Capture} capture */
+function words(capture) {
+  const list = el("ul", { class: "words" });
+  for (const pair of moving(capture)) list.append(el("li", {}, el("b", {}, pair.band), ` ${sentence(pair, capture.reference)}`));
+  for (const name of capture.missing) list.append(el("li", {}, el("b", {}, name), " is missing: other captures of this camera have it."));
+  return list;
+}
+
+/**
+ * What became of a band, for who delivers the map.
+ * @param {Pair} pair @param {string} reference
+ */
+function sentence(pair, reference) {
+  const lay = pair.apart_px === null || pair.apart_px < 0.05 ? "" : `lay ${fixed(pair.apart_px, pair.apart_px < 10 ? 1 : 0)} px beside ${reference} and `;
+  if (pair.status === "aligned") {
+    const left = pair.residual_px;
+    if (left === null) return `${lay}is aligned; no window could measure what is left.`;
+    const use = left <= 0.5 ? "fit for indices of single plants" : left <= 1 ? "fit for indices of rows and plots; edges of single leaves may be off" : "fit for averages over an area";
+    return `${lay}is now within ${fixed(left)} px: ${use}.`;
+  }
+  if (pair.status === "predicted") {
+    return `${lay}is placed by the rig of the flight, to ±${fixed(pair.prediction?.std_px)} px: ${pair.reason ?? "no reason on record"}.`;
+  }
+  if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason on record"}. It lies at its first guess; leave it out of indices.`;
+  return `is lost: ${pair.reason ?? "no reason on record"}. It is empty in the stack.`;
+}
+
+/** @param {Capture} capture */
+function numbers(capture) {
+  const heads = ["Band", "Status", "Start", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Mattes MI", "NMI", "NCC", "Gradients", "SSIM", "Local field, 95 %", "Seconds"];
+  const body = moving(capture).map((pair) => {
+    /** @param {string} name @param {number} [digits] */
+    const change = (name, digits = 3) => {
+      const [before, after] = pair.similarity?.[name] ?? [null, null];
+      return before === null && after === null ? "–" : `${fixed(before, digits)} → ${fixed(after, digits)}`;
+    };
+    const local = pair.local === null ? "–" : pair.local.applied ? `${fixed(pair.local.before_p95_px)} → ${fixed(pair.local.after_p95_px)}` : "not needed";
+    const cells = [
+      pair.seed ?? "–", fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3), pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`,
+      fixed(pair.corner_std_px, 3), fixed(pair.retrieval), change("mattes_mi"), change("nmi"), change("ncc", 2), change("gradient_correlation", 2), change("structure_ssim", 2), local, pair.seconds.toFixed(1),
+    ];
+    return el("tr", {}, el("th", { scope: "row" }, pair.band), el("td", {}, badge(pair.status)), ...cells.map((text, i) => el("td", { class: i === 0 ? "" : "n" }, text)));
+  });
+  const head = el("tr", {}, ...heads.map((text, i) => el("th", { scope: "col", class: i < 3 ? "" : "n" }, text)));
+  return el("div", { class: "scroll" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...body)));
+}
+
+// ---- what happens
+
+function follow() {
+  const wanted = location.hash.startsWith("#capture=") ? decodeURIComponent(location.hash.slice(9)) : null;
+  const capture = wanted === null ? undefined : captures.find((c) => c.label === wanted);
+  if (capture === undefined) return;
+  show(capture);
+  byId("capture").scrollIntoView({ block: "start" });
+  byId("capture").focus({ preventScroll: true });
+}
+
+tableHead();
+tableBody();
+drawMap();
+listenToStage();
+byId("find").addEventListener("input", tableBody);
+byId("only").addEventListener("change", tableBody);
+window.addEventListener("hashchange", follow);
+if (location.hash.startsWith("#capture=")) follow();
+else if (captures.length) show(captures.find(isShort) ?? captures[0]);

@@ -1,0 +1,142 @@
+"""OUT/index.html and OUT/summary.csv."""
+
+import base64
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+from agalign._version import __version__
+from agalign.errors import SidecarError
+from agalign.products.panels import PANELS_FILE, PanelPart, read_panels
+from agalign.products.report.facts import Facts
+from agalign.products.report.rigs import drifts_of, rig_views
+from agalign.products.run_record import RunPart, read_run_record
+from agalign.products.shortfalls import Shortfall
+from agalign.products.sidecar import find_sidecars, read_sidecar
+from agalign.products.summary import panel_rows, summary_rows, write_summary
+from agalign.values.files import write_text
+
+REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
+_SLOWEST = 5
+
+
+@dataclass(frozen=True)
+class Pages:
+    """What tells of a run as a whole."""
+
+    report: Path
+    summary: Path
+    shortfalls: Sequence[Shortfall]
+    slowest: tuple[tuple[str, float], ...]
+    """Labels of the captures that took longest, with their seconds."""
+
+
+def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
+    """OUT/index.html and OUT/summary.csv from all sidecars below OUT; what cannot be read is told to `on_problem`.
+
+    Raises OutputError.
+    """
+    rows: list[dict[str, object]] = []
+    facts = Facts(out)
+    for path in find_sidecars(out):
+        folder = path.parent.relative_to(out).as_posix()
+        try:
+            sidecar = read_sidecar(path)
+        except SidecarError as error:
+            on_problem(str(error))
+            continue
+        rows += summary_rows(folder, sidecar)
+        facts.add(folder, sidecar)
+    panels: list[PanelPart] = []
+    run: RunPart | None = None
+    try:
+        panels, run = read_panels(out), read_run_record(out)
+    except SidecarError as error:
+        on_problem(str(error))
+    rows += [row for panel in panels for row in panel_rows(panel)]
+    write_summary(rows, out / SUMMARY_FILE)
+    shortfalls = facts.shortfalls.groups()
+    slowest = sorted(((c.label, c.seconds) for c in facts.told), key=lambda c: -c[1])[:_SLOWEST]
+    write_text(out / REPORT_FILE, _page(out, facts, panels, run, on_problem))
+    return Pages(out / REPORT_FILE, out / SUMMARY_FILE, shortfalls, tuple(slowest))
+
+
+def pages_stand(out: Path) -> bool:
+    """True where the pages of an earlier run are newer than all that they tell of."""
+    try:
+        written = min((out / name).stat().st_mtime_ns for name in (REPORT_FILE, SUMMARY_FILE))
+        told = [*find_sidecars(out), *([out / PANELS_FILE] if (out / PANELS_FILE).exists() else [])]
+        return all(path.stat().st_mtime_ns < written for path in told)
+    except OSError:
+        return False
+
+
+def _page(
+    out: Path, facts: Facts, panels: Sequence[PanelPart], run: RunPart | None, on_problem: Callable[[str], None]
+) -> str:
+    environment = Environment(
+        loader=PackageLoader("agalign.products.report", "."),
+        autoescape=select_autoescape(["j2"]),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    script = _own("page.js")
+    return environment.get_template("page.html.j2").render(
+        version=__version__,
+        style=_own("page.css"),
+        script=script,
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        facts=_in_a_page(facts.as_json()),
+        captures=facts.told,
+        counts=Counter(c.status for c in facts.told),
+        statuses=Counter(b.status for b in facts.bands),
+        pairs=len(facts.bands),
+        cameras=Counter(c.camera for c in facts.told),
+        residuals_px=facts.residuals_px,
+        seconds=_Seconds.of(facts, run),
+        shortfalls=facts.shortfalls.groups(),
+        problems=[] if run is None else run.problems,
+        unfinished=run is not None and run.state == "interrupted",
+        bands=facts.by_band(),
+        rigs=rig_views(out, on_problem),
+        drifts=drifts_of(facts.told),
+        panels=panels,
+        mapped=sum(c.position is not None for c in facts.told),
+    )
+
+
+def _own(name: str) -> str:
+    return resources.files("agalign.products.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _in_a_page(facts: dict[str, Any]) -> str:
+    """JSON that ends no script, whatever names are in it."""
+    text = json.dumps(facts, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+@dataclass(frozen=True)
+class _Seconds:
+    """What it took."""
+
+    capture: float | None
+    """Median of a capture's alignment."""
+    run: float | None
+    """The whole of the run, where one run did it all."""
+
+    @classmethod
+    def of(cls, facts: Facts, run: RunPart | None) -> "_Seconds":
+        at_once = run is not None and run.captures.get("done") == len(facts.told)
+        return cls(
+            median(c.seconds for c in facts.told) if facts.told else None,
+            run.seconds if run is not None and at_once else None,
+        )

@@ -1,0 +1,166 @@
+"""Drawings of what a flight knows of its camera, in the units of their SVGs."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from agalign.errors import InputError
+from agalign.flight.rig import Rig
+from agalign.flight.rig_file import read_rig, rig_rows
+from agalign.products.report.facts import Told
+from agalign.values import geometry
+
+PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
+_FIELD_FULL_PX, _FIELD_REACH = 0.25, 9.0
+"""An arrow of a lens field is this long at so many px."""
+_FIELD_COLUMNS, _FIELD_ROWS = 13, 10
+_LEAST_SPREAD_PX = 0.2
+_MOST_POINTS = 400
+
+
+@dataclass(frozen=True)
+class BandView:
+    """A band of a rig: where its lens stands beside the reference's, and what it does that its model does not say."""
+
+    name: str
+    hue: float
+    x: float
+    y: float
+    offset_px: tuple[float, float]
+    from_bands_px: float
+    from_flight_px: float
+    field_px: float | None
+    arrows: tuple[tuple[float, float, float, float], ...]
+    """x1, y1, x2, y2."""
+
+
+@dataclass(frozen=True)
+class RigView:
+    """The rig of a camera in a flight."""
+
+    camera: str
+    captures: int
+    shared: str
+    field_height: float
+    bands: tuple[BandView, ...]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One band over a flight: how far it is from its median, along the direction in which it moves most."""
+
+    name: str
+    hue: float
+    points: tuple[str, ...]
+    """Runs of points of captures in which the band is known, as an SVG takes them."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The bands of a camera from capture to capture."""
+
+    camera: str
+    full_px: float
+    """What the chart's upper and lower edges stand for."""
+    captures: int
+    lines: tuple[Line, ...]
+
+
+def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
+    """Of the models below OUT/models; what cannot be read is told to `on_problem`."""
+    views = []
+    for path in sorted((out / "models").glob("*.safetensors")):
+        try:
+            _, rig = read_rig(path)
+        except InputError as error:
+            on_problem(str(error))
+            continue
+        if rig is not None:
+            views.append(_rig_view(path.stem, rig))
+    return views
+
+
+def _rig_view(camera: str, rig: Rig) -> RigView:
+    rows = rig_rows(rig)
+    reach = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
+    to_plan = 0.36 * PLAN_WIDTH / reach
+    width, height = rig.size_px
+    bands = []
+    for number, row in enumerate(rows):
+        x, y = (PLAN_WIDTH / 2 + to_plan * v for v in row["baseline"])
+        bands.append(
+            BandView(
+                row["band"], hue_of(number, len(rows)), x, y, tuple(row["offset_px"]), row["from_bands_px"],
+                row["from_flight_px"], row["field_px"], _arrows(rig, row["band"]),
+            )
+        )  # fmt: skip
+    shared = ", ".join(rig.factors) or "nothing"
+    return RigView(camera, len(rig.seen), shared, FIELD_WIDTH * height / width, tuple(bands))
+
+
+def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...]:
+    if band not in rig.fields:
+        return ()
+    points = geometry.lattice(*rig.size_px, _FIELD_COLUMNS, _FIELD_ROWS)
+    scale = FIELD_WIDTH / rig.size_px[0]
+    begins, reach = points * scale, rig.fields[band](points) * _FIELD_REACH / _FIELD_FULL_PX
+    return tuple((x, y, x + dx, y + dy) for (x, y), (dx, dy) in zip(begins.tolist(), reach.tolist(), strict=True))
+
+
+def hue_of(number: int, count: int) -> float:
+    """Colours that lie apart."""
+    return round(205 + 360 * number / max(count, 1)) % 360
+
+
+def drifts_of(captures: Sequence[Told]) -> list[Drift]:
+    """A chart for each camera that took three captures or more, in the order in which they were taken."""
+    found = []
+    for camera in dict.fromkeys(c.camera for c in captures):
+        mine = sorted((c for c in captures if c.camera == camera), key=lambda c: (c.captured_at, c.label))
+        names = list(dict.fromkeys(name for c in mine for name in c.offsets_px))
+        if len(mine) >= 3 and names:
+            found.append(_drift(camera, mine, names))
+    return found
+
+
+def _drift(camera: str, captures: Sequence[Told], names: Sequence[str]) -> Drift:
+    along = {name: _along([c.offsets_px.get(name) for c in captures]) for name in names}
+    full = max([_LEAST_SPREAD_PX, *(abs(v) for values in along.values() for v in values if v is not None)])
+    step = max(1, math.ceil(len(captures) / _MOST_POINTS))
+    lines = tuple(
+        Line(name, hue_of(number, len(names)), _runs(along[name], full, step)) for number, name in enumerate(names)
+    )
+    return Drift(camera, full, len(captures), lines)
+
+
+def _along(offsets: Sequence[tuple[float, float] | None]) -> list[float | None]:
+    """Distances from the median along the direction of most change, with its sign."""
+    known = [o for o in offsets if o is not None]
+    middle = np.array([median(o[0] for o in known), median(o[1] for o in known)])
+    _, _, directions = np.linalg.svd(np.array(known) - middle)
+    axis = directions[0] * (1 if directions[0].sum() >= 0 else -1)
+    return [None if o is None else float((np.array(o) - middle) @ axis) for o in offsets]
+
+
+def _runs(values: Sequence[float | None], full: float, step: int) -> tuple[str, ...]:
+    """Pieces of a line; of many captures the mean of so many that follow each other."""
+    parts = [[v for v in values[i : i + step] if v is not None] for i in range(0, len(values), step)]
+    places = [
+        None if not part else (
+            CHART_WIDTH * (i + 0.5) / len(parts), CHART_HEIGHT / 2 * (1 - 0.92 * sum(part) / len(part) / full),
+        )
+        for i, part in enumerate(parts)
+    ]  # fmt: skip
+    runs: list[list[str]] = [[]]
+    for before, here in pairwise([None, *places]):
+        if here is None:
+            continue
+        if before is None and runs[-1]:
+            runs.append([])
+        runs[-1].append(f"{here[0]:.1f},{here[1]:.1f}")
+    return tuple(" ".join(run) for run in runs if run)

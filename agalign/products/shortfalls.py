@@ -1,0 +1,79 @@
+"""What fell short in a run, told once for each cause, with what to try."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from agalign.products.sidecar import BandResult, CaptureResult
+from agalign.values.doubts import MISSING_BAND, Remedy, remedy
+
+_GRAVITY = {"failed": 0, "seed_only": 1, "missing": 2, "predicted": 3}
+"""The worse comes first."""
+_UNTOLD = Remedy("no reason is on record", "run again with --overwrite")
+
+
+@dataclass(frozen=True)
+class Short:
+    """One band of one capture that is not aligned."""
+
+    capture: str
+    band: str
+    status: str
+    """`predicted`, `seed_only`, `failed`, or `missing`."""
+    reason: str
+
+
+@dataclass
+class Shortfall:
+    """The bands of a run that fell short by one cause to one status."""
+
+    status: str
+    remedy: Remedy
+    bands: list[Short] = field(default_factory=list)
+
+    @property
+    def advice(self) -> str:
+        """What to try, where something must be tried."""
+        usable = (
+            "each may be used within its error bar (prediction in the sidecar); " if self.status == "predicted" else ""
+        )
+        return usable + self.remedy.advice
+
+    @property
+    def captures(self) -> int:
+        """How many captures it happened to."""
+        return len({b.capture for b in self.bands})
+
+
+@dataclass
+class Shortfalls:
+    """All of a run, as its captures are added."""
+
+    _by_cause: dict[tuple[str, Remedy], Shortfall] = field(default_factory=dict)
+
+    def add(self, label: str, result: CaptureResult) -> None:
+        """One capture more."""
+        for band in result.bands:
+            if band.status not in ("reference", "aligned"):
+                self._put(Short(label, band.band, band.status, band.reason or ""), _remedy_of(band))
+        for name in result.missing_bands:
+            self._put(Short(label, name, "missing", MISSING_BAND.cause), MISSING_BAND)
+
+    def groups(self) -> list[Shortfall]:
+        """The gravest first, and of those the most frequent."""
+        return sorted(self._by_cause.values(), key=lambda s: (_GRAVITY[s.status], -len(s.bands), s.remedy.cause))
+
+    def _put(self, short: Short, cause: Remedy) -> None:
+        self._by_cause.setdefault((short.status, cause), Shortfall(short.status, cause)).bands.append(short)
+
+
+def shortfalls_of(captures: Iterable[tuple[str, CaptureResult]]) -> Shortfalls:
+    """Of captures with their labels."""
+    found = Shortfalls()
+    for label, result in captures:
+        found.add(label, result)
+    return found
+
+
+def _remedy_of(band: BandResult) -> Remedy:
+    """The first doubt is the one that the reason tells."""
+    return remedy(band.doubts[0].kind) if band.doubts else _UNTOLD

@@ -1,0 +1,71 @@
+"""A capture's bands as grey pictures, before and after: what the picture and the preview beside a stack are made of."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.errors import UnreadableFileError
+from agalign.pixels.raster import read_preview
+from agalign.values.capture import Band, Capture
+from agalign.values.image import OutputGrid
+
+Grey = NDArray[np.uint8]
+"""(height, width)"""
+_LONGEST_PX = 2048
+
+
+@dataclass(frozen=True)
+class Views:
+    """The bands of a capture on the grid of its aligned files, reduced where that is larger than a screen."""
+
+    before: Mapping[str, Grey]
+    """By band that can be read: the raw file laid on the reference's as it is."""
+    after: Mapping[str, Grey]
+    """By band that was written: what was written."""
+    size_px: tuple[int, int]
+    """(width, height) of all of them."""
+
+
+def read_views(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> Views:
+    """Views of a capture whose bands were written to `places` on a grid. Raises UnreadableFileError."""
+    size_px = _reduced(grid.width, grid.height)
+    whole = 0, 0, grid.width, grid.height
+    before = {}
+    for band in capture.bands:
+        with suppress(UnreadableFileError):  # its pair has failed, and says so
+            before[band.name] = _grey(_before(band, capture.reference, grid, size_px))
+    after = {name: _grey(read_preview(*place, whole, size_px)) for name, place in places.items()}
+    return Views(before, after, size_px)
+
+
+def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, int]) -> NDArray[np.float32]:
+    sx, sy = (n / (s * m) for n, s, m in zip(band.size_px, grid.scale_xy, reference.size_px, strict=True))
+    window = (
+        round(grid.x0 * sx), round(grid.y0 * sy), max(1, round(grid.width * sx)), max(1, round(grid.height * sy)),
+    )  # fmt: skip
+    return read_preview(band.path, band.band_index, window, size_px)
+
+
+def _reduced(width: int, height: int) -> tuple[int, int]:
+    reduction = max(1.0, max(width, height) / _LONGEST_PX)
+    return round(width / reduction), round(height / reduction)
+
+
+def _grey(plane: NDArray[np.float32]) -> Grey:
+    """Each by its own limits: what is written may be reflectance of what the files have as numbers."""
+    low, high = _limits(plane)
+    scaled = (plane - low) * np.float32(255.0 / (high - low))
+    return np.asarray(np.nan_to_num(scaled, copy=False).clip(0, 255).astype(np.uint8))
+
+
+def _limits(plane: NDArray[np.float32]) -> tuple[float, float]:
+    sample = plane.ravel()[:: max(1, plane.size // 200_000)]
+    sample = sample[np.isfinite(sample) & (sample != 0)]
+    if sample.size == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(sample, (1.5, 98.5))
+    return float(low), max(float(high), float(low) + 1e-9)

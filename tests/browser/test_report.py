@@ -1,0 +1,327 @@
+"""The report in a real browser: what it loads, what its parts do, and that names in it are never more than names."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+import agalign
+from agalign.config import Settings, WriteSettings
+from agalign.products.report import write_pages
+from agalign.synthetic import flight as synthetic
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+HOSTILE = '<img src=x onerror="window.broken=1">\'</script><script>window.broken=1</script>'
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three captures of a flight: one in order, one whose NIR is black, one of which nothing is known but hostile
+    names.
+    """
+    folder = tmp_path_factory.mktemp("report")
+    synthetic.make_flight(folder / "in", captures=2, size_px=(480, 360), rng_seed=3)
+    black = folder / "in" / "0000SET" / "000" / "IMG_0002_4.tif"
+    with tifffile.TiffFile(black, mode="r+b") as file:
+        file.filehandle.seek(file.pages[0].dataoffsets[0])  # type: ignore[union-attr]
+        file.filehandle.write(np.full((360, 480), 9, np.uint16).tobytes())
+    out = folder / "out"
+    agalign.align_folder(folder / "in", out, settings=Settings(write=WriteSettings(error_map=True)))
+    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+    sidecar |= {"capture": "a'b&c\"d", "missing_bands": [HOSTILE], "status": "degraded", "position": None}
+    sidecar["camera"]["model"] = HOSTILE
+    for band in sidecar["bands"]:
+        if band["band"] == "Red":
+            band |= {"band": HOSTILE, "status": "seed_only", "reason": HOSTILE}
+    sidecar["preview"]["file"] = "a'b&c\"d.preview.jpg"
+    (out / "a'b&c\"d.json").write_text(json.dumps(sidecar))
+    shutil.copy(out / "0000SET" / "000" / "IMG_0001.preview.jpg", out / "a'b&c\"d.preview.jpg")
+    write_pages(out, lambda text: pytest.fail(text))
+    return out
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    path = next((p for name in BROWSERS if (p := shutil.which(name))), None)
+    if path is None:
+        pytest.skip(f"no browser on this machine ({', '.join(BROWSERS)})")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser: Any, out: Path) -> Iterator[Any]:
+    """The report; whatever the console or the network says besides the previews fails the test."""
+    page, said = browser.new_page(viewport={"width": 1100, "height": 900}), []
+    page.on("console", lambda m: said.append(m.text))
+    page.on("pageerror", lambda e: said.append(str(e)))
+    page.on("request", lambda r: said.append(r.url) if not r.url.startswith(out.as_uri()) else None)
+    page.on("requestfailed", lambda r: said.append(r.url))
+    page.goto((out / "index.html").as_uri())
+    yield page
+    page.close()
+    assert said == []
+
+
+def drawn(page: Any) -> np.ndarray:
+    """(height, width, 3): what the stage shows."""
+    page.wait_for_timeout(150)
+    data = page.locator("canvas").screenshot()
+    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.int32)
+
+
+def look_at(page: Any, label: str) -> None:
+    page.locator("#table tbody th a", has_text=label).click()
+    page.wait_for_function("label => document.querySelector('#capture-title').textContent.includes(label)", arg=label)
+    page.wait_for_function("() => document.querySelector('canvas').width > 300")
+
+
+def test_what_fell_short_stands_first(page: Any) -> None:
+    """And is shown without being asked for."""
+    first = page.locator("section h2").first
+    assert first.inner_text() == "What fell short"
+    assert "IMG_0002" in page.locator("#capture-title").inner_text()
+    assert page.locator(".short").count() >= 2
+    assert "What to try" in page.locator(".short p").first.inner_text()
+
+
+def test_only_the_capture_that_is_looked_at_is_loaded(browser: Any, out: Path) -> None:
+    page, loaded = browser.new_page(), []
+    page.on("request", lambda r: loaded.append(r.url.rsplit("/", 1)[1]))
+    page.goto((out / "index.html").as_uri() + "#capture=0000SET%2F000%2FIMG_0001")
+    page.wait_for_timeout(300)
+    assert loaded == ["index.html", "IMG_0001.preview.jpg"]
+    page.close()
+
+
+def test_the_slider_moves_the_picture(page: Any) -> None:
+    look_at(page, "IMG_0001")
+    middle = drawn(page)
+    page.locator("#swipe").focus()
+    page.keyboard.press("Home")
+    after = drawn(page)
+    page.keyboard.press("End")
+    before = drawn(page)
+    width = middle.shape[1]
+    assert np.abs(before - after).mean() > 8
+    # Left of the line is before, right of it after.
+    left, right = slice(20, width // 2 - 20), slice(width // 2 + 20, width - 20)
+    tags = slice(60, None)
+    assert np.abs(middle[tags, left] - before[tags, left]).mean() < 1
+    assert np.abs(middle[tags, right] - after[tags, right]).mean() < 1
+    box = page.locator("canvas").bounding_box()
+    page.mouse.move(box["x"] + box["width"] - 2, box["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 5, box["y"] + 200, steps=4)
+    page.mouse.up()
+    assert int(page.locator("#swipe").input_value()) < 30
+
+
+def test_after_the_bands_agree(page: Any) -> None:
+    """The stack's own pixels are shown: where bands lie apart a composite of them is coloured at every edge."""
+    look_at(page, "IMG_0001")
+    page.get_by_label("Composite", exact=True).select_option("true colour")
+
+    def colour(image: np.ndarray) -> float:
+        """How much of the change from pixel to pixel the channels do not share."""
+        steps = np.diff(image.astype(float), axis=1)
+        return float(np.abs(steps - steps.mean(axis=2, keepdims=True)).mean() / np.abs(steps).mean())
+
+    page.locator("#swipe").focus()
+    page.keyboard.press("Home")
+    after = colour(drawn(page)[60:])
+    page.keyboard.press("End")
+    assert after < 0.8 * colour(drawn(page)[60:])
+
+
+def test_any_three_bands(page: Any) -> None:
+    look_at(page, "IMG_0001")
+    first = drawn(page)
+    for channel in ("Red", "Green", "Blue"):
+        page.get_by_label(f"{channel} channel").select_option("Blue")
+    grey = drawn(page)[60:]
+    assert np.abs(first[60:] - grey).mean() > 5
+    # One band in all three channels has no colour.
+    assert np.abs(grey - grey.mean(axis=2, keepdims=True))[:, :200].mean() < 2
+
+
+def test_both_sides_zoom_in_step(page: Any) -> None:
+    look_at(page, "IMG_0001")
+    page.get_by_role("button", name="Side by side").click()
+    page.get_by_role("button", name="Detail").click()
+    zoomed = drawn(page)
+    half = zoomed.shape[1] // 2
+    left, right = zoomed[60:, 10 : half - 10].mean(axis=2), zoomed[60:, half + 10 : 2 * half - 10].mean(axis=2)
+    page.get_by_role("button", name="All").click()
+    whole = drawn(page)
+    assert np.abs(whole - zoomed).mean() > 5
+    # The reference lies in both at the same place.
+    assert np.corrcoef(left[:, : right.shape[1]].ravel(), right[:, : left.shape[1]].ravel())[0, 1] > 0.2
+
+
+def test_blinking_and_the_keys_of_the_picture(page: Any) -> None:
+    look_at(page, "IMG_0001")
+    page.locator("canvas").focus()
+    page.keyboard.press(" ")
+    first = drawn(page)
+    page.keyboard.press(" ")
+    second = drawn(page)
+    assert np.abs(first - second).mean() > 8
+    page.keyboard.press("+")
+    page.keyboard.press("+")
+    near = drawn(page)
+    page.keyboard.press("ArrowRight")
+    assert np.abs(drawn(page) - near).mean() > 3
+    page.keyboard.press("0")
+    assert np.abs(drawn(page) - second).mean() < 1
+    page.get_by_role("button", name="Blink").click()
+    seen = {page.locator("canvas").get_attribute("data-blinking")}
+    page.wait_for_timeout(900)
+    seen.add(page.locator("canvas").get_attribute("data-blinking"))
+    assert seen == {"before", "after"}
+
+
+@pytest.mark.parametrize("overlay", ["vectors", "heat", "error"])
+def test_what_is_laid_over_the_picture(page: Any, overlay: str) -> None:
+    look_at(page, "IMG_0001")
+    page.locator("#swipe").focus()
+    page.keyboard.press("Home")
+    bare = drawn(page)
+    page.get_by_label("What lies over it", exact=True).select_option(overlay)
+    # The errors of this flight are small: what is laid over it for them is faint.
+    assert (np.abs(drawn(page) - bare).max(axis=2) > (5 if overlay == "error" else 40)).sum() > 400
+    page.locator("#swipe").focus()
+    page.keyboard.press("End")
+    before = drawn(page)
+    page.get_by_label("What lies over it", exact=True).select_option("none")
+    assert np.abs(drawn(page) - before).mean() < 0.3, "residuals are those of after"
+
+
+def test_the_table_sorts_and_filters(page: Any) -> None:
+    def labels() -> list[str]:
+        return page.locator("#table tbody th").all_inner_texts()
+
+    def residuals() -> list[float]:
+        cells = page.locator("#table tbody tr td:nth-child(5)").all_inner_texts()
+        return [float(text) for text in cells if text[0].isdigit()]
+
+    assert len(labels()) == 3
+    page.locator("#table thead button", has_text="Largest residual").click()
+    head = page.locator("#table thead th", has_text="Largest residual")
+    assert head.get_attribute("aria-sort") == "ascending"
+    known = residuals()
+    assert known == sorted(known)
+    page.locator("#table thead button", has_text="Largest residual").press("Enter")
+    assert head.get_attribute("aria-sort") == "descending"
+    assert residuals() == known[::-1]
+    page.locator("#find").fill("img_0002")
+    assert labels() == ["0000SET/000/IMG_0002"]
+    assert page.locator("#count").inner_text() == "1 of 3 shown"
+    page.locator("#find").fill("")
+    page.locator("#only").select_option("ok")
+    assert labels() == ["0000SET/000/IMG_0001"]
+    page.locator("#only").select_option("short")
+    assert "0000SET/000/IMG_0001" not in labels()
+
+
+def test_the_map_leads_to_the_captures(page: Any) -> None:
+    dots = page.locator("#map circle")
+    assert dots.count() == 2, "one has no position"
+    dots.nth(0).click()
+    assert "IMG_000" in page.locator("#capture-title").inner_text()
+    before = dots.nth(0).get_attribute("fill")
+    page.locator("#map-colour").select_option("residual_px")
+    assert dots.nth(0).get_attribute("fill") != before
+    assert "px" in page.locator("#map-legend").inner_text()
+
+
+def test_next_and_previous_follow_the_table(page: Any) -> None:
+    look_at(page, "IMG_0001")
+    page.get_by_role("button", name="Next").click()
+    page.wait_for_function("() => document.querySelector('#capture-title').textContent.includes('IMG_0002')")
+    assert page.evaluate("document.activeElement.id") == "capture"
+    page.get_by_role("button", name="Previous").click()
+    page.wait_for_function("() => document.querySelector('#capture-title').textContent.includes('IMG_0001')")
+
+
+def test_names_are_never_more_than_names(page: Any) -> None:
+    look_at(page, "a'b&c")
+    for overlay in ("vectors", "error"):
+        page.get_by_label("What lies over it", exact=True).select_option(overlay)
+    page.get_by_label("Band of what lies over it").select_option(HOSTILE)
+    assert HOSTILE in page.locator("#capture").inner_text()
+    page.locator("details").evaluate_all("all => all.forEach((d) => { d.open = true; })")
+    assert any(HOSTILE in text for text in page.locator(".short").all_inner_texts())
+    assert page.evaluate("window.broken") is None
+    assert page.locator("main img[src=x]").count() == 0
+
+
+def test_in_words_and_in_numbers(page: Any) -> None:
+    look_at(page, "IMG_0002")
+    words = page.locator(".words").inner_text()
+    assert "fit for indices of single plants" in words
+    assert "NIR is lost" in words
+    assert "→" in page.locator("#capture table").inner_text()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_words_can_be_read_in_light_and_in_dark(browser: Any, out: Path, scheme: str) -> None:
+    """Contrast of at least 4.5 (WCAG AA) of all kinds of text."""
+    page = browser.new_page(color_scheme=scheme)
+    page.goto((out / "index.html").as_uri())
+    ratios = page.evaluate(
+        """() => {
+          const light = (colour) => {
+            const [r, g, b] = colour.match(/[\\d.]+/g).slice(0, 3).map((v) => {
+              const s = v / 255;
+              return s <= 0.03928 ? s / 12.92 : ((s + 0.055) / 1.055) ** 2.4;
+            });
+            return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+          };
+          const behind = (e) => {
+            for (; e; e = e.parentElement) {
+              const found = getComputedStyle(e).backgroundColor;
+              if (!found.endsWith(", 0)")) return found;
+            }
+            return "rgb(255,255,255)";
+          };
+          return [...document.querySelectorAll("p, a, td, th, dt, dd, h1, h2, .badge, .chip, summary, button")]
+            .filter((e) => e.offsetParent && e.textContent.trim())
+            .map((e) => {
+              const [x, y] = [light(getComputedStyle(e).color), light(behind(e))].sort((a, b) => b - a);
+              return [(x + 0.05) / (y + 0.05), e.className + " " + e.textContent.slice(0, 40)];
+            });
+        }"""
+    )
+    page.close()
+    assert len(ratios) > 40
+    assert [r for r in ratios if r[0] < 4.5] == []
+
+
+def test_it_prints_and_fits_a_telephone(browser: Any, out: Path) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 800})
+    page.goto((out / "index.html").as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.emulate_media(media="print")
+    assert not page.locator("#find").is_visible()
+    assert page.locator("canvas").is_visible()
+    page.close()
+
+
+def test_without_scripts_the_numbers_are_pointed_to(browser: Any, out: Path) -> None:
+    page = browser.new_context(java_script_enabled=False).new_page()
+    page.goto((out / "index.html").as_uri())
+    assert "holds the same numbers" in page.locator("noscript").inner_text()
+    assert page.locator(".facts").is_visible()
+    page.close()

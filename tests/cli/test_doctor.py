@@ -1,0 +1,53 @@
+"""What `agalign doctor` says of a machine."""
+
+import json
+import re
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from agalign.cli import doctor
+
+
+def told(*arguments: str) -> tuple[int, str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "agalign", "doctor", *arguments], capture_output=True, text=True, check=False
+    )
+    assert "Traceback" not in done.stderr
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_it_knows_versions_devices_and_the_disk(tmp_path: Path) -> None:
+    code, text = told(str(tmp_path), "--json")
+    facts = json.loads(text)
+    assert code == (1 if facts["problems"] else 0)
+    assert facts["machine"]["torch"] == metadata.version("torch")
+    assert facts["machine"]["cores"] >= 1
+    assert next(d for d in facts["devices"] if d["device"] == "cpu")["problem"] == ""
+    assert facts["disk"]["folder"] == str(tmp_path)
+    assert "device cpu" in told(str(tmp_path))[1]
+
+
+def test_it_names_every_extra_that_a_user_may_want() -> None:
+    offered = set(metadata.metadata("agalign").get_all("Provides-Extra") or [])
+    assert offered - {"bench", "dev", "docs", "fuzz"} == set(doctor.EXTRAS)
+    for extra in doctor.EXTRAS:
+        assert doctor._needs(extra), "what an extra needs is found in the package's own metadata"
+        assert all(re.fullmatch(r"[\w.-]+", name) for name in doctor._needs(extra))
+
+
+def test_what_is_in_the_way_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = dict.fromkeys(doctor._LIBRARIES, "1")
+    well = {"machine": machine, "devices": [], "disk": {"folder": "/data", "writable": True, "free_gb": 100.0}}
+    assert doctor._problems(well) == []
+    broken = {
+        "machine": machine | {"torch": None},
+        "devices": [{"device": "cuda:0", "problem": "no kernel image"}],
+        "disk": {"folder": "/data", "writable": False, "free_gb": 0.2},
+    }
+    text = "\n".join(doctor._problems(broken))
+    for word in ("torch", "--device", "-o", "0.2 GB"):
+        assert word in text

@@ -1,0 +1,59 @@
+"""The sheet of small pictures beside a capture: where each lies on it, and how large it may be."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from agalign.products.preview import preview_bytes, write_preview
+from agalign.products.views import Views
+
+from ..conftest import textured_image
+
+
+def grey(seed: int, width: int = 640, height: int = 480) -> np.ndarray:
+    return (128 + 40 * textured_image(width, height, seed)).clip(0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def views() -> Views:
+    """Green and NIR, of which only Green was written."""
+    return Views({"Green": grey(1), "NIR": grey(2)}, {"Green": grey(3)}, (640, 480))
+
+
+def test_every_picture_lies_where_the_sidecar_says(views: Views, tmp_path: Path) -> None:
+    errors = {"NIR": np.full((4, 5), 0.25, np.float32)}
+    part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1))
+    sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)
+    (w, h), (dw, dh) = part.tile_px, part.detail_px
+    assert sheet.shape == (3 * h + 2 * dh, 2 * w)
+
+    def like(found: np.ndarray, image: np.ndarray) -> float:
+        there = cv2.resize(image, found.shape[::-1], interpolation=cv2.INTER_AREA)
+        return float(np.corrcoef(found.ravel(), there.ravel())[0, 1])
+
+    assert like(sheet[:h, :w], views.before["Green"]) > 0.98
+    assert like(sheet[:h, w:], views.before["NIR"]) > 0.98
+    assert like(sheet[h : 2 * h, :w], views.after["Green"]) > 0.98
+    assert sheet[h : 2 * h, w:].max() < 4, "what was not written is black"
+    x, y = round(part.detail[0] * 640), round(part.detail[1] * 480)
+    assert like(sheet[2 * h : 2 * h + dh, dw : 2 * dw], views.before["NIR"][y : y + dh, x : x + dw]) > 0.98
+    assert like(sheet[2 * h + dh : 2 * h + 2 * dh, :dw], views.after["Green"][y : y + dh, x : x + dw]) > 0.98
+    assert np.median(sheet[2 * h + 2 * dh :, w:]) == pytest.approx(255 * 0.25 / part.error_full_px, abs=3)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("captures", [1, 200, 1000])
+def test_all_previews_of_a_flight_have_a_limit(views: Views, tmp_path: Path, captures: int) -> None:
+    path = tmp_path / "a.preview.jpg"
+    write_preview(views, ["Green", "NIR"], {}, path, preview_bytes(captures))
+    assert path.stat().st_size <= preview_bytes(captures)
+    assert captures * preview_bytes(captures) <= max(400_000, 44_000_000)
+
+
+def test_images_smaller_than_a_tile_are_shown_as_they_are(tmp_path: Path) -> None:
+    tiny = {"Green": grey(1, 60, 41), "NIR": grey(2, 60, 41)}
+    part = write_preview(Views(tiny, tiny, (60, 41)), ["Green", "NIR"], {}, tmp_path / "a.preview.jpg", 10_000)
+    assert part.tile_px == (56, 40)
+    assert part.detail[2] <= 1
+    assert part.detail[3] <= 1
