@@ -25,7 +25,7 @@ def prepare_output(out: Path) -> None:
     except FileExistsError:
         raise OutputError(f"{out}: is a file; choose another folder with -o") from None
     except OSError as error:
-        raise OutputError(f"{out}: cannot be made ({error.strerror or error})") from None
+        raise OutputError(f"{out}: cannot be made ({error.strerror or error}); choose another folder with -o") from None
 
 
 @contextmanager
