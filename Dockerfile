@@ -1,24 +1,56 @@
-# The base may be any Debian or Ubuntu with Python 3.11 or newer to be had from apt.
+# The program in a virtual environment, without what built it. How it is run: docs/container.md.
+#
+# The base may be any Debian or Ubuntu whose python3 is 3.11, of which locks/torch-cpu.txt has the hashes.
 ARG BASE=debian:bookworm-slim
-FROM ${BASE}
 
+FROM ${BASE} AS python
 RUN apt-get update \
-    && apt-get install --yes --no-install-recommends python3 python3-venv \
+    && apt-get install --yes --no-install-recommends python3 \
     && rm -rf /var/lib/apt/lists/*
 
-RUN useradd --create-home --uid 1000 agalign
-WORKDIR /opt/agalign
-ENV PATH=/opt/venv/bin:$PATH PIP_NO_CACHE_DIR=1 PYTHONDONTWRITEBYTECODE=1
 
-# PyTorch first, in a layer of its own: it is large and changes seldom.
-COPY constraints.txt ./
-RUN python3 -m venv /opt/venv && pip install -c constraints.txt torch
+FROM python AS build
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends python3-venv \
+    && rm -rf /var/lib/apt/lists/*
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore
+WORKDIR /build
+
+# pip stays in an environment of its own: the one that is kept has none.
+RUN python3 -m venv /opt/pip && python3 -m venv --without-pip /opt/venv
+
+# PyTorch first, in a layer of its own: it is large and changes seldom. Wheels without CUDA are on PyTorch's own index
+# of CPU wheels, whose address must be said; with CUDA they are where pip looks by itself.
+ARG TORCH=cpu
+ARG TORCH_INDEX=
+COPY locks/torch-${TORCH}.txt ./
+RUN /opt/pip/bin/pip --python /opt/venv/bin/python install --no-deps --require-hashes \
+        ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} --requirement "torch-${TORCH}.txt" \
+    || { echo "No PyTorch: give --build-arg TORCH_INDEX=(PyTorch's index of CPU wheels) or TORCH=cuda" >&2; exit 1; }
+# Without what compiles against it, and its own tests.
+RUN cd /opt/venv/lib/python3*/site-packages/torch && rm -r include test bin/test_*
+
+COPY locks/image.txt locks/build.txt ./
+RUN /opt/pip/bin/pip --python /opt/venv/bin/python install --no-deps --require-hashes --requirement image.txt \
+    && /opt/pip/bin/pip install --require-hashes --requirement build.txt
 
 COPY pyproject.toml README.md LICENSE ./
 COPY agalign ./agalign
-RUN pip install -c constraints.txt .
+RUN /opt/pip/bin/pip wheel --no-deps --no-index --no-build-isolation --wheel-dir dist . \
+    && /opt/pip/bin/pip --python /opt/venv/bin/python install --no-deps --no-index dist/*.whl \
+    && /opt/pip/bin/pip --python /opt/venv/bin/python check
 
-USER agalign
+
+FROM python
+LABEL org.opencontainers.image.title="agalign" \
+      org.opencontainers.image.description="Co-registers the bands of multispectral drone cameras" \
+      org.opencontainers.image.licenses="MIT"
+COPY --from=build /opt/venv /opt/venv
+# Nothing is written but the output and, while it runs, /tmp; so any user may run it (--user), known here or not.
+RUN useradd --uid 1000 --no-create-home --home-dir /tmp agalign && install --directory --owner=agalign /data
+ENV PATH=/opt/venv/bin:$PATH HOME=/tmp PYTHONDONTWRITEBYTECODE=1
+# By its number, which is how a cluster sees that it is not root.
+USER 1000:1000
 WORKDIR /data
 ENTRYPOINT ["agalign"]
 CMD ["--help"]
