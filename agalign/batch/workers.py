@@ -2,6 +2,7 @@
 
 import logging
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import (
@@ -287,8 +288,11 @@ def start_worker(threads: int) -> None:
 
 
 def worker_context() -> BaseContext:
-    """How processes are started: from one that has loaded this module, where the system can, else each anew."""
-    if "forkserver" not in get_all_start_methods():
+    """How processes are started: from one that has loaded this module, where the system bears that, else each anew.
+
+    On macOS a copy of a process that has loaded Apple's libraries may crash or hang.
+    """
+    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods():
         return get_context("spawn")
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])

@@ -118,7 +118,7 @@ def _write(
 
 def _write_truth(folder: Path, truth: dict[str, Any]) -> Path:
     path = folder / "truth.json"
-    path.write_text(json.dumps(truth))
+    path.write_text(json.dumps(truth), encoding="utf-8")
     return path
 
 

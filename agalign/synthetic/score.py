@@ -27,7 +27,7 @@ class Score:
 
 def score_against_truth(reports: list[CaptureReport], truth_path: Path) -> list[Score]:
     """Errors of every pair in px, read from the sidecars' grids as anyone else would."""
-    truth = json.loads(truth_path.read_text())
+    truth = json.loads(truth_path.read_text(encoding="utf-8"))
     scores = []
     for report in reports:
         if report.sidecar is None:

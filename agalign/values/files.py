@@ -1,5 +1,6 @@
 """Files that are complete or not there, and the names that they may have."""
 
+import errno
 import os
 import secrets
 from collections.abc import Iterator
@@ -47,9 +48,9 @@ def scratch_file(beside: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, complete or not at all. Raises OutputError."""
+    """Write a text file, complete or not at all, the same on every system. Raises OutputError."""
     with complete_file(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_text(text, encoding="utf-8", newline="\n")
 
 
 def remove_partial_files(folder: Path) -> None:
@@ -69,11 +70,15 @@ def lies_within(name: str) -> bool:
 
 
 def _to_disk(path: Path) -> None:
-    """A folder's entries are written to disk like a file's contents, where the system has that."""
-    if path.is_dir() and os.name == "nt":
+    """A folder's entries are written to disk like a file's contents, where system and file system have that."""
+    folder = path.is_dir()
+    if folder and os.name == "nt":
         return
     descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if not (folder and error.errno in (errno.EINVAL, errno.ENOTSUP)):  # as some network drives say of a folder
+            raise
     finally:
         os.close(descriptor)

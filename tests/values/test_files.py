@@ -1,3 +1,6 @@
+import errno
+import os
+import stat
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,6 +29,30 @@ def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
         partial.write_text("after")
     assert path.read_text() == "after"
     assert [p.name for p in path.parent.iterdir()] == ["a.png"]
+
+
+def test_a_text_is_the_same_bytes_on_every_system(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.csv", "größe\n1\n")
+    assert (tmp_path / "a.csv").read_bytes() == "größe\n1\n".encode()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows writes no folder to disk")
+def test_a_drive_that_cannot_write_a_folder_to_disk_is_no_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fsync = os.fsync
+
+    def of_files_only(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(said, os.strerror(said))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", of_files_only)
+    said = errno.EINVAL
+    write_text(tmp_path / "a.txt", "a")
+    said = errno.EIO
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_text(tmp_path / "b.txt", "b")
 
 
 def test_two_threads_at_a_time_do_not_meet(tmp_path: Path) -> None:
