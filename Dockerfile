@@ -28,7 +28,7 @@ RUN /opt/pip/bin/pip --python /opt/venv/bin/python install --no-deps --require-h
         ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} --requirement "torch-${TORCH}.txt" \
     || { echo "No PyTorch: give --build-arg TORCH_INDEX=(PyTorch's index of CPU wheels) or TORCH=cuda" >&2; exit 1; }
 # Without what compiles against it, and its own tests.
-RUN cd /opt/venv/lib/python3*/site-packages/torch && rm -r include test bin/test_*
+RUN cd /opt/venv/lib/python3*/site-packages/torch && rm -rf include test bin/test_*
 
 COPY locks/image.txt locks/build.txt ./
 RUN /opt/pip/bin/pip --python /opt/venv/bin/python install --no-deps --require-hashes --requirement image.txt \
