@@ -20,13 +20,17 @@ WORKDIR /build
 RUN python3 -m venv /opt/pip && python3 -m venv --without-pip /opt/venv
 
 # PyTorch first, in a layer of its own: it is large and changes seldom. Wheels without CUDA are on PyTorch's own index
-# of CPU wheels, whose address must be said; with CUDA they are where pip looks by itself.
-ARG TORCH=cpu
+# of CPU wheels, whose address is TORCH_INDEX; where pip finds none, auto takes the larger one with CUDA, which runs
+# without a GPU too.
+ARG TORCH=auto
 ARG TORCH_INDEX=
-COPY locks/torch-${TORCH}.txt ./
-RUN /opt/pip/bin/pip --python /opt/venv/bin/python install --no-deps --require-hashes \
-        ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} --requirement "torch-${TORCH}.txt" \
-    || { echo "No PyTorch: give --build-arg TORCH_INDEX=(PyTorch's index of CPU wheels) or TORCH=cuda" >&2; exit 1; }
+COPY locks/torch-*.txt ./
+RUN torch() { \
+        /opt/pip/bin/pip --python /opt/venv/bin/python install --no-deps --require-hashes \
+            ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} --requirement "torch-$1.txt"; \
+    }; \
+    if [ "$TORCH" != auto ]; then torch "$TORCH"; \
+    else torch cpu || { echo "No PyTorch without CUDA where pip looks: taking the one with it" >&2; torch cuda; }; fi
 # Without what compiles against it, and its own tests.
 RUN cd /opt/venv/lib/python3*/site-packages/torch && rm -rf include test bin/test_*
 

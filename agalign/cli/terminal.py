@@ -26,7 +26,8 @@ _SIGNALLED = 128
 """What shells add to the number of the signal that ended a program: 130 for the interrupt key, 143 for a request."""
 _PLAIN_WIDTH = 160
 _OUT_OF_MEMORY = "out of memory; close other programs or try a smaller image"
-_ENDING = ("SIGINT", "SIGTERM", "SIGHUP")
+_ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+"""As far as the system has them."""
 
 
 class Stopped(KeyboardInterrupt):

@@ -115,7 +115,7 @@ def write_collections(captures: Sequence[Capture], out: Path) -> list[Path]:
     written = []
     for name, flight in flights.items():
         paths = [out / c.folder / f"{c.name}{_ITEM_SUFFIX}" for c in flight]
-        items = [pystac.Item.from_dict(json.loads(p.read_text())) for p in paths if p.is_file()]
+        items = [pystac.Item.from_dict(json.loads(p.read_text(encoding="utf-8"))) for p in paths if p.is_file()]
         if not items:
             continue
         collection = pystac.Collection(
