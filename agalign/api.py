@@ -39,13 +39,16 @@ def align(
 ) -> Alignment:
     """Find the homography from one image to another of the same scene, whatever their modalities.
 
-    fixed, moving: (H, W), (H, W, C) or (C, H, W) arrays of any numeric type; their sizes may differ. Integer images
-        are taken as saturated at their type's largest value; constant fill that runs in from the border, and nan,
-        is left aside.
-    seed: 3x3 fixed_to_moving to start from, good to some 10 % of the image; None starts from the images themselves.
-    seed_std_px: how well the seed is known, standard deviation in px of `fixed`. Where a scene repeats, the place
-        within three of these is taken; without it such a scene is not aligned.
-    fixed_valid, moving_valid: (H, W), False where pixels must not be used.
+    fixed, moving
+        (H, W), (H, W, C) or (C, H, W) arrays of any numeric type; their sizes may differ. Integer images are taken as
+        saturated at their type's largest value; constant fill that runs in from the border, and nan, is left aside.
+    seed
+        3x3 fixed_to_moving to start from, good to some 10 % of the image; None starts from the images themselves.
+    seed_std_px
+        How well the seed is known, standard deviation in px of `fixed`. Where a scene repeats, the place within three
+        of these is taken; without it such a scene is not aligned.
+    fixed_valid, moving_valid
+        (H, W), False where pixels must not be used.
 
     Returns an Alignment whose `fixed_to_moving` (3x3) maps a pixel of `fixed` to a pixel of `moving`: x right, y down,
     (0, 0) the centre of the top-left pixel. Look at its `status`: only `aligned` has passed the checks; `seed_only`

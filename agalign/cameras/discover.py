@@ -91,14 +91,14 @@ class DiscoverOptions:
 
 
 def discover(
-    folder: Path, options: DiscoverOptions | None = None, progress: Callable[[int, int], None] | None = None
+    folder: str | Path, options: DiscoverOptions | None = None, progress: Callable[[int, int], None] | None = None
 ) -> Flight:
     """All captures below `folder`, sorted by folder and name. `progress` gets (files done, files in all).
 
     Raises InputError where the folder does not exist or holds no image, ConfigurationError for a band that no capture
     has.
     """
-    options = options or DiscoverOptions()
+    folder, options = Path(folder), options or DiscoverOptions()
     _check_folder(folder)
     files: list[_File] = []
     paths, problems = _images(folder, options.skip)

@@ -14,13 +14,17 @@ _MOST_NAMED = 3
 def explain(shortfalls: "Sequence[Shortfall]", voice: Voice) -> None:
     """The gravest first: how many bands, why, of which captures, and what to do."""
     for short in shortfalls:
-        bands, captures = _count(len(short.bands), "band"), _count(short.captures, "capture")
-        status = short.status.replace("_", " ")
-        named = list(dict.fromkeys(f"{b.capture} {b.band}" for b in short.bands))
-        more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+        status, first = short.status.replace("_", " "), short.bands[0]
+        if len(short.bands) == 1:
+            text, named = f"{first.capture} {first.band}: {status}: {first.reason}", []
+        else:
+            bands, captures = _count(len(short.bands), "band"), _count(short.captures, "capture")
+            text = f"{status}: {bands} of {captures}: {short.remedy.cause}"
+            names = [f"{b.capture} {b.band}" for b in short.bands]
+            more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+            named = [f"{', '.join(names[:_MOST_NAMED])}{more}: {first.reason}"]
         voice.problem(
-            f"{status}: {bands} of {captures}: {short.remedy.cause}",
-            (f"{', '.join(named[:_MOST_NAMED])}{more}: {short.bands[0].reason}", f"try: {short.advice}"),
+            text, (*named, f"try: {short.advice}"),
             status=short.status, bands=len(short.bands), captures=short.captures, advice=short.advice,
         )  # fmt: skip
 

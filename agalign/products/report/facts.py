@@ -179,7 +179,7 @@ def _lies(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] 
         return None, None
     here, there = np.array(grid.reference_px), np.array(grid.moving_px)
     along, moved = np.ptp(here, axis=0), np.ptp(there, axis=0)
-    if not (np.abs(moved / along - 1) < _LIKE_SCALES).all():
+    if not (np.abs(moved - along) < _LIKE_SCALES * along).all():
         return None, None
     apart = there - here
     middle = np.array([sidecar.reference.width - 1, sidecar.reference.height - 1]) / 2

@@ -1,0 +1,21 @@
+"""One capture of a flight: its bands found, aligned and written, and what became of each.
+
+python examples/one_capture.py FLIGHT OUT
+"""
+
+import sys
+
+import agalign
+from agalign.cameras.discover import discover
+
+flight = discover(sys.argv[1])
+capture = flight.captures[0]
+print(capture.label, *(band.name for band in capture.bands))
+
+outcome = agalign.align_capture(capture, sys.argv[2])
+for band in outcome.sidecar.bands:
+    if band.status == "reference":
+        continue
+    # Where the middle of the reference lies in the band's own file, lens and all.
+    here, there = (points[len(points) // 2] for points in (band.grid.reference_px, band.grid.moving_px))
+    print(f"{band.band}: {band.status}, {here} lies at {there}, residual {band.metrics.after.residual_px} px")

@@ -1,0 +1,32 @@
+"""How a field changed between two mosaics: the later one is laid on the earlier one's pixels, then they are subtracted.
+
+python examples/two_dates.py EARLIER.tif LATER.tif CHANGE.tif
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import rasterio
+
+from agalign.batch import run_flight
+from agalign.cameras.discover import Flight, captures_onto
+from agalign.config import FlightSettings, Settings, WriteSettings
+
+earlier, later, target = map(Path, sys.argv[1:4])
+with tempfile.TemporaryDirectory() as folder:
+    pair = Flight(earlier.parent, tuple(captures_onto(earlier, [later])), ())
+    settings = Settings(flight=FlightSettings(together=False), write=WriteSettings(crop="none"))
+    (report,) = run_flight(pair, Path(folder), settings)
+    moving = report.sidecar.bands[1]
+    if moving.status != "aligned":
+        sys.exit(f"{later} cannot be laid on {earlier}: {moving.reason}")
+    apart_px = np.subtract(moving.grid.moving_px, moving.grid.reference_px)
+    print(f"they lay {np.hypot(*np.median(apart_px, axis=0)):.1f} px apart")
+    with rasterio.open(report.path.with_suffix(".tif")) as both:
+        change = both.read(moving.place.band_index, masked=True).astype("float32") - both.read(1, masked=True)
+        profile = both.profile | {"count": 1, "dtype": "float32", "nodata": np.nan}
+with rasterio.open(target, "w", **profile) as out:
+    out.write(change.filled(np.nan), 1)
+print(f"{target}: {float(change.mean()):+.3f} on average")

@@ -1,0 +1,52 @@
+"""The commands and the Python of the documents, in the order in which a reader meets them.
+
+A block of ```sh``` is commands, one a line; one of ```python``` is a script; ```text``` is neither.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block of a page."""
+
+    page: Path
+    line: int
+    kind: str
+    text: str
+
+    @property
+    def where(self) -> str:
+        """For whoever looks for it."""
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+
+def blocks_of(page: Path) -> Iterator[Block]:
+    """All fenced blocks of a page."""
+    lines = page.read_text(encoding="utf-8").splitlines()
+    begin: int | None = None
+    for number, line in enumerate(lines):
+        if not line.startswith("```"):
+            continue
+        if begin is None:
+            begin = number
+            continue
+        yield Block(page, begin + 1, lines[begin][3:].strip(), "\n".join(lines[begin + 1 : number]))
+        begin = None
+
+
+def commands_of(block: Block) -> list[str]:
+    """The commands of a block, with lines that go on put together, without comments."""
+    whole = re.sub(r"\s*\\\n\s*", " ", block.text)
+    return [bare for line in whole.splitlines() if (bare := re.sub(r"(^|\s)#.*$", "", line).strip())]
+
+
+def program(command: str) -> str:
+    """The name of the program that a command starts, whatever is set before it."""
+    return next(word for word in command.split() if not re.fullmatch(r"\w+=\S*", word))

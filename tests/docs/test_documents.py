@@ -1,0 +1,123 @@
+"""Nothing in the documents rots: every command and every script in them is run, every link leads somewhere."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from .blocks import PAGES, ROOT, Block, blocks_of, commands_of, program
+
+RUN_BY = {
+    "docker": "tools/container.sh",
+    "dask": "tools/dask_cluster.sh",
+    "pip": ".ci/run",
+}
+"""What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
+KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
+RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
+PREAMBLE = """
+import tifffile
+green = tifffile.imread("flight/0000SET/000/IMG_0001_2.tif")
+nir = tifffile.imread("flight/0000SET/000/IMG_0001_4.tif")
+"""
+
+
+def run(block: Block, command: list[str], folder: Path) -> None:
+    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    tools = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": paths, "PATH": tools},
+    )  # fmt: skip
+    assert done.returncode == 0, f"{block.where}: {shlex.join(command)}\n{done.stdout[-1500:]}{done.stderr[-3000:]}"
+
+
+@pytest.mark.parametrize("page", RUNNABLE, ids=[p.relative_to(ROOT).as_posix() for p in RUNNABLE])
+def test_a_page_does_what_it_says(page: Path, desk: Path, tmp_path: Path) -> None:
+    """Read from top to bottom, in a folder with a flight in it."""
+    folder = tmp_path / "desk"
+    subprocess.run(["cp", "-r", str(desk), str(folder)], check=True)
+    for block in blocks_of(page):
+        if block.kind == "python":
+            run(block, [sys.executable, "-c", PREAMBLE + block.text], folder)
+        commands = commands_of(block) if block.kind == "sh" else []
+        if not any(program(command) in RUN_BY for command in commands):
+            for command in commands:
+                run(block, ["bash", "-c", command], folder)
+
+
+def test_every_block_says_what_it_is() -> None:
+    """One without a kind would be run by nobody."""
+    for page in PAGES:
+        for block in blocks_of(page):
+            assert block.kind in KINDS, block.where
+
+
+def test_what_is_not_run_here_is_run_elsewhere() -> None:
+    seen = set()
+    for page in PAGES:
+        for block in blocks_of(page):
+            for command in commands_of(block) if block.kind == "sh" else ():
+                if program(command) in RUN_BY:
+                    seen.add(program(command))
+    assert seen == set(RUN_BY)
+    assert all((ROOT / script).is_file() for script in RUN_BY.values())
+
+
+def test_extras_that_are_named_can_be_had() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    for page in PAGES:
+        for names in re.findall(r"agalign\[([\w,]+)\]", page.read_text(encoding="utf-8")):
+            assert set(names.split(",")) <= set(extras), page
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[p.relative_to(ROOT).as_posix() for p in PAGES])
+def test_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        found = (page.parent / path) if path else page
+        if not found.suffix and not found.exists():
+            found = found.with_suffix(".md")
+        assert found.exists(), target
+        if anchor:
+            heads = re.findall(r"^#+ (.+)$", found.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w -]", "", h).strip().lower().replace(" ", "-") for h in heads}, target
+
+
+def test_options_that_are_spoken_of_exist() -> None:
+    """Also those in a sentence."""
+    done = subprocess.run(
+        [sys.executable, "-m", "agalign", "align", "--help"], capture_output=True, text=True, check=True,
+        env=os.environ | {"COLUMNS": "300"},
+    )  # fmt: skip
+    known = set(re.findall(r"--[a-z][\w-]+", done.stdout))
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("quickstart.md"), ROOT / "docs" / "troubleshooting.md"):
+        rows = re.findall(r"^\| `(--[a-z][\w-]+)", page.read_text(encoding="utf-8"), re.MULTILINE)
+        assert set(rows) <= known, page
+
+
+def test_the_table_of_doubts_is_the_programs() -> None:
+    done = subprocess.run(
+        [sys.executable, "tools/doubts.py", "--check"], cwd=ROOT, capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_site_is_built(tmp_path: Path) -> None:
+    """Every page, and what the docstrings say, without a warning."""
+    pytest.importorskip("sphinx")
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(ROOT / "docs"), str(tmp_path / "site")],
+        capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "fixed_to_moving" in (tmp_path / "site" / "api.html").read_text(encoding="utf-8")

@@ -1,0 +1,47 @@
+"""The pictures of the README, made by the demo: before and after, and the report in a browser.
+
+    python tools/readme_figures.py [DEMO]        # a demo that was run before, else one is run
+
+Writes docs/figures/demo.jpg and report.jpg; the second wants playwright and a Chromium.
+"""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+from playwright.sync_api import sync_playwright
+
+FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
+WIDTH_PX, SCREEN_PX = 880, (1100, 1150)
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        demo = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(folder)
+        if len(sys.argv) == 1:
+            subprocess.run([sys.executable, "-m", "agalign", "demo", str(demo), "--captures", "12"], check=True)
+        aligned = demo / "aligned"
+        picture = Image.open(aligned / "0000SET" / "000" / "IMG_0001.png").convert("RGB")
+        smaller(picture).save(FIGURES / "demo.jpg", quality=78, optimize=True)
+        with sync_playwright() as playwright:
+            path = shutil.which("chromium") or shutil.which("google-chrome")
+            browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+            page = browser.new_page(viewport=dict(zip(("width", "height"), SCREEN_PX, strict=True)))
+            page.goto((aligned / "index.html").absolute().as_uri() + "#capture=0000SET%2F000%2FIMG_0001")
+            page.wait_for_timeout(1000)
+            page.screenshot(path=Path(folder) / "report.png")
+            browser.close()
+        smaller(Image.open(Path(folder) / "report.png").convert("RGB")).save(
+            FIGURES / "report.jpg", quality=80, optimize=True
+        )
+
+
+def smaller(picture: Image.Image) -> Image.Image:
+    return picture.resize((WIDTH_PX, round(picture.height * WIDTH_PX / picture.width)), Image.Resampling.LANCZOS)
+
+
+if __name__ == "__main__":
+    main()
