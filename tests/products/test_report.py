@@ -109,14 +109,18 @@ def told(label: str, offsets: dict[str, tuple[float, float]]) -> Told:
 
 
 def test_drift_is_drawn_along_the_direction_of_change_and_breaks_where_nothing_is_known() -> None:
-    captures = [told(f"{i:02d}", {"NIR": (10 + 3 * i, 4 * i)} if i != 3 else {}) for i in range(7)]
+    captures = [
+        told(f"{i:02d}", {"NIR": (10 + 3 * i, 4 * i), "Blue": (-i, 0)} if i != 3 else {"Blue": (-3, 0)})
+        for i in range(7)
+    ]
     (drift,) = drifts_of(captures)
     assert drift.full_px == pytest.approx(15, abs=0.01)
-    (line,) = drift.lines
-    assert len(line.points) == 2
-    heights = [float(p.split(",")[1]) for run in line.points for p in run.split()]
-    assert heights == sorted(heights, reverse=True)
-    assert heights[0] == pytest.approx(CHART_HEIGHT / 2 * 1.92, abs=0.1)
+    assert [len(line.points) for line in drift.lines] == [2, 1]
+    heights = [[float(p.split(",")[1]) for run in line.points for p in run.split()] for line in drift.lines]
+    ends = sorted((heights[0][0], heights[0][-1]))
+    assert ends == pytest.approx([CHART_HEIGHT / 2 * (1 - 0.92 * s) for s in (1, -1)], abs=0.1)
+    # Along the same baseline in the other direction, a band is drawn beside the first, not against it.
+    assert np.sign(np.diff(heights[0])).tolist() == np.sign(np.diff(heights[1][:3] + heights[1][4:])).tolist()
     assert drifts_of(captures[:2]) == []
 
 

@@ -577,7 +577,7 @@ function paint() {
   byId("over-note").textContent = NOTES[look.overlay] ?? "";
   const now = look.mode === "blink" ? look.blinking : "";
   byId("tag-left").textContent = now || "before";
-  byId("tag-right").textContent = now ? "" : "after";
+  byId("tag-right").textContent = capture.bands.some((b) => b.written) ? "after" : "after: nothing was written";
   byId("tag-right").hidden = Boolean(now);
   stage.dataset["blinking"] = now;
 }
@@ -761,7 +761,7 @@ function sentence(pair, reference) {
     return `${lay}is placed by the rig of the flight, to ±${fixed(pair.prediction?.std_px)} px: ${pair.reason ?? "no reason on record"}.`;
   }
   if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason on record"}. It lies at its first guess; leave it out of indices.`;
-  return `is lost: ${pair.reason ?? "no reason on record"}. It is empty in the stack.`;
+  return `is lost: ${pair.reason ?? "no reason on record"}. Nothing is written of it.`;
 }
 
 /** @param {Capture} capture */
@@ -803,4 +803,4 @@ byId("find").addEventListener("input", tableBody);
 byId("only").addEventListener("change", tableBody);
 window.addEventListener("hashchange", follow);
 if (location.hash.startsWith("#capture=")) follow();
-else if (captures.length) show(captures.find(isShort) ?? captures[0]);
+else if (captures.length) show(captures.find((c) => c.status === "failed") ?? captures.find(isShort) ?? captures[0]);

@@ -130,6 +130,10 @@ def drifts_of(captures: Sequence[Told]) -> list[Drift]:
 
 def _drift(camera: str, captures: Sequence[Told], names: Sequence[str]) -> Drift:
     along = {name: _along([c.offsets_px.get(name) for c in captures]) for name in names}
+    # Which end of a direction is up is nobody's: all as the first band goes.
+    first = along[names[0]]
+    along = {name: values if _together(first, values) else [None if v is None else -v for v in values]
+             for name, values in along.items()}  # fmt: skip
     full = max([_LEAST_SPREAD_PX, *(abs(v) for values in along.values() for v in values if v is not None)])
     step = max(1, math.ceil(len(captures) / _MOST_POINTS))
     lines = tuple(
@@ -143,8 +147,11 @@ def _along(offsets: Sequence[tuple[float, float] | None]) -> list[float | None]:
     known = [o for o in offsets if o is not None]
     middle = np.array([median(o[0] for o in known), median(o[1] for o in known)])
     _, _, directions = np.linalg.svd(np.array(known) - middle)
-    axis = directions[0] * (1 if directions[0].sum() >= 0 else -1)
-    return [None if o is None else float((np.array(o) - middle) @ axis) for o in offsets]
+    return [None if o is None else float((np.array(o) - middle) @ directions[0]) for o in offsets]
+
+
+def _together(one: Sequence[float | None], other: Sequence[float | None]) -> bool:
+    return sum(a * b for a, b in zip(one, other, strict=True) if a is not None and b is not None) >= 0
 
 
 def _runs(values: Sequence[float | None], full: float, step: int) -> tuple[str, ...]:
