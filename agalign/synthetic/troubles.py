@@ -47,7 +47,7 @@ def make_two_headings(
         pose = replace(_pose(rng, number), yaw_deg=float(rng.normal(12.0, 1.5)), velocity_m_s=(drift, -speed))
         turns = lakes and number % line in (0, line - 1) and 0 < number < captures - 1
         ground = paint_ground(rng, [_above_the_origin(pose)], size_px, camera=camera)
-        shots.append(_shot(pose, ground, *(("a lake",) if turns else ()), spoil=_water if turns else None))
+        shots.append(_shot(pose, ground, *(("a lake",) if turns else ()), spoil=water if turns else None))
     return write_shots(folder, shots, size_px, camera, rng)
 
 
@@ -56,11 +56,11 @@ def _plan(captures: int) -> list[Make]:
     start: list[Make] = [_panel, _panel, *(_at(h, "take-off") for h in (4.0, 8.0, 13.0, 19.0))]
     end: list[Make] = [*(_at(h, "landing") for h in (15.0, 6.0)), _panel]
     between: list[Make] = [
-        _spoilt("a lake", _water), _spoilt("a lake", _water), _spoilt("fog", _fog), _spoilt("fog", _fog),
-        _spoilt("blur, 3 px", _blur), _spoilt("blur, 3 px", _blur), _spoilt("motion, 25 px", _motion),
-        _spoilt("noise, 30 %", _noise), _spoilt("noise, 30 %", _noise), _spoilt("half saturated", _half_saturated),
-        _planted, _planted, _planted, _terraces, _terraces, _without("NIR"), _spoilt("NIR lost", _nothing, ("NIR",)),
-        _spoilt("Blue lost", _nothing, ("Blue",)),
+        _spoilt("a lake", water), _spoilt("a lake", water), _spoilt("fog", fog), _spoilt("fog", fog),
+        _spoilt("blur, 3 px", blur), _spoilt("blur, 3 px", blur), _spoilt("motion, 25 px", motion),
+        _spoilt("noise, 30 %", noise), _spoilt("noise, 30 %", noise), _spoilt("half saturated", half_saturated),
+        _planted, _planted, _planted, _terraces, _terraces, _without("NIR"), _spoilt("NIR lost", nothing, ("NIR",)),
+        _spoilt("Blue lost", nothing, ("Blue",)),
     ]  # fmt: skip
     middle: list[Make] = [_plain] * max(0, captures - len(start) - len(end) - len(between))
     # Of each few captures one is troubled, the first few being good.
@@ -167,32 +167,32 @@ def _terraces(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) ->
 # ---- what becomes of the light
 
 
-def _water(light: Field, rng: np.random.Generator) -> Field:
+def water(light: Field, rng: np.random.Generator) -> Field:
     """Ripples that no two bands see alike: they move between the exposures, and mirror the sky."""
     ripples = cv2.GaussianBlur(rng.normal(size=light.shape).astype(np.float32), (0, 0), 3.0)
     return np.asarray(0.12 + 0.01 * ripples / ripples.std(), np.float32)
 
 
-def _nothing(light: Field, _rng: np.random.Generator) -> Field:
+def nothing(light: Field, _rng: np.random.Generator) -> Field:
     return np.full_like(light, 0.1)
 
 
-def _fog(light: Field, _rng: np.random.Generator) -> Field:
+def fog(light: Field, _rng: np.random.Generator) -> Field:
     return np.asarray(0.4 + 0.15 * cv2.GaussianBlur(light, (0, 0), 1.5), np.float32)
 
 
-def _blur(light: Field, _rng: np.random.Generator) -> Field:
+def blur(light: Field, _rng: np.random.Generator) -> Field:
     return np.asarray(cv2.GaussianBlur(light, (0, 0), 3.0))
 
 
-def _motion(light: Field, _rng: np.random.Generator) -> Field:
+def motion(light: Field, _rng: np.random.Generator) -> Field:
     return np.asarray(cv2.filter2D(light, -1, np.full((1, 25), 1 / 25, np.float32)))
 
 
-def _noise(light: Field, rng: np.random.Generator) -> Field:
+def noise(light: Field, rng: np.random.Generator) -> Field:
     low, high = np.percentile(light, (1, 99))
     return np.asarray(light + 0.3 * (high - low) * rng.normal(size=light.shape), np.float32)
 
 
-def _half_saturated(light: Field, _rng: np.random.Generator) -> Field:
+def half_saturated(light: Field, _rng: np.random.Generator) -> Field:
     return np.asarray(light / np.median(light))
