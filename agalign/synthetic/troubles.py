@@ -174,25 +174,31 @@ def water(light: Field, rng: np.random.Generator) -> Field:
 
 
 def nothing(light: Field, _rng: np.random.Generator) -> Field:
+    """No light from the scene at all."""
     return np.full_like(light, 0.1)
 
 
 def fog(light: Field, _rng: np.random.Generator) -> Field:
+    """A veil that takes most of the contrast, and some of the sharpness."""
     return np.asarray(0.4 + 0.15 * cv2.GaussianBlur(light, (0, 0), 1.5), np.float32)
 
 
 def blur(light: Field, _rng: np.random.Generator) -> Field:
+    """Out of focus, by 3 px."""
     return np.asarray(cv2.GaussianBlur(light, (0, 0), 3.0))
 
 
 def motion(light: Field, _rng: np.random.Generator) -> Field:
+    """Moved along x by 25 px during the exposure."""
     return np.asarray(cv2.filter2D(light, -1, np.full((1, 25), 1 / 25, np.float32)))
 
 
 def noise(light: Field, rng: np.random.Generator) -> Field:
+    """Noise of 30 % of the range that the light has."""
     low, high = np.percentile(light, (1, 99))
     return np.asarray(light + 0.3 * (high - low) * rng.normal(size=light.shape), np.float32)
 
 
 def half_saturated(light: Field, _rng: np.random.Generator) -> Field:
+    """Exposed so that the brighter half is 1 or more."""
     return np.asarray(light / np.median(light))
