@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from peers import cases
+from cases import cases
 
 from agalign.batch.capture import quiet
 from agalign.capture.align import align_pairs

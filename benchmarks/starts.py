@@ -16,7 +16,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from peers import Case, cases, sift
+from bands.methods import sift
+from cases import Case, cases
 
 import agalign
 from agalign.evaluation.methods import elastix_affinity
@@ -58,7 +59,7 @@ def ours(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
 
 
 def by_sift(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
-    return sift(fixed, moving, np.eye(3)), True
+    return sift(fixed.pixels, moving.pixels), True
 
 
 def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:

@@ -1,0 +1,92 @@
+"""The images of the sets: found on disk by their checksums, read, and spoilt in known ways."""
+
+import hashlib
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.synthetic import troubles
+from bands.score import AS_IT_IS, LOST, Pair, movement
+
+Image = NDArray[Any]
+"""(H, W), or (H, W, 3) with red first, uint8 or uint16."""
+
+LENS_CORRECTED = "lens-corrected"
+_LIGHT: dict[str, Callable[[troubles.Field, np.random.Generator], troubles.Field]] = {
+    "blur 3 px": troubles.blur, "motion 25 px": troubles.motion, "noise 30 %": troubles.noise,
+    "half saturated": troubles.half_saturated,
+}  # fmt: skip
+VARIANTS = (
+    AS_IT_IS, LENS_CORRECTED, *_LIGHT, "turn 3", "turn 10", "turn 20", "scale 0.8", LOST,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Located:
+    """Which files of the sets are on disk."""
+
+    paths: dict[str, dict[str, Path]]
+    """By set and name; only sets of which every file is there."""
+    missing: dict[str, list[str]]
+    """The names that are not, by set."""
+
+
+def locate(folder: Path, sets: Mapping[str, Mapping[str, Any]]) -> Located:
+    """Every file below `folder` that a set wants, whatever its name and place."""
+    sizes = {entry["bytes"] for s in sets.values() for entry in s["files"].values()}
+    by_sum = {}
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        if path.stat().st_size in sizes:
+            by_sum[hashlib.sha256(path.read_bytes()).hexdigest()] = path
+    paths: dict[str, dict[str, Path]] = {}
+    missing: dict[str, list[str]] = {}
+    for name, description in sets.items():
+        found = {f: by_sum.get(entry["sha256"]) for f, entry in description["files"].items()}
+        absent = [f for f, path in found.items() if path is None]
+        if absent:
+            missing[name] = absent
+        else:
+            paths[name] = {f: path for f, path in found.items() if path is not None}
+    return Located(paths, missing)
+
+
+def read(path: Path) -> Image:
+    """An image file as it is stored. Raises OSError."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise OSError(f"{path}: is no image that can be read")
+    return np.asarray(image if image.ndim == 2 else image[..., 2::-1])
+
+
+def spoilt(image: Image, pair: Pair, variant: str) -> Image:
+    """The moving image of a pair as a variant has it; the same in every run."""
+    rng = np.random.default_rng(zlib.crc32("/".join((*pair.key, variant)).encode()))
+    full = float(np.iinfo(image.dtype).max)
+    if variant in _LIGHT:
+        planes = np.atleast_3d(image).astype(np.float32) / full
+        light = np.dstack([_LIGHT[variant](np.ascontiguousarray(planes[..., k]), rng) for k in range(planes.shape[2])])
+        return _as(light.reshape(image.shape) * full, image)
+    if variant == LOST:
+        # Noise about its own brightness: a frame that a camera wrote without having seen anything.
+        return _as(np.median(image) + 0.5 * image.std() * rng.normal(size=image.shape), image)
+    return moved(image, movement(variant, pair.size_px))
+
+
+def moved(image: Image, matrix: NDArray[np.float64]) -> Image:
+    """The image with its content moved by an affinity within its frame, black where nothing comes to lie."""
+    if np.array_equal(matrix, np.eye(3)):
+        return image
+    shrink = np.sqrt(abs(np.linalg.det(matrix[:2, :2])))
+    # What the smaller image cannot hold would fold back into it.
+    source = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / shrink**2 - 1)) if shrink < 0.999 else image
+    return np.asarray(cv2.warpAffine(source, matrix[:2], image.shape[1::-1], flags=cv2.INTER_CUBIC))
+
+
+def _as(values: NDArray[Any], like: Image) -> Image:
+    return np.asarray(values.clip(0, np.iinfo(like.dtype).max).round().astype(like.dtype))

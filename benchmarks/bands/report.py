@@ -1,0 +1,49 @@
+"""Tables and a figure of what was scored."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bands.score import AS_IT_IS, Score, Scored, markdown, summary
+
+
+def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
+    """As it is, set by set; then the variants with the sets pooled; then the memory that each method took."""
+    groups: dict[str, list[Score]] = {}
+    for score in summary([s for s in scored if s.variant == AS_IT_IS]):
+        groups.setdefault(score.set, []).append(score)
+    for score in summary([s for s in scored if s.variant != AS_IT_IS], "all sets"):
+        groups.setdefault(score.variant, []).append(score)
+    parts = [f"### {title}\n\n{markdown(scores)}\n" for title, scores in groups.items()]
+    memory = "; ".join(f"{name} {value:.1f}" for name, value in gigabytes.items())
+    return "\n".join([*parts, f"Largest process, GB: {memory}.\n"])
+
+
+def draw(scored: Sequence[Scored], path: Path) -> None:
+    """Two heat maps, methods by variants: the share of pairs claimed to half a px, and of wrong claims."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    scores = {(s.method, s.variant): s for s in summary(scored, "all sets")}
+    methods, variants = (list(dict.fromkeys(key[k] for key in scores)) for k in (0, 1))
+    figure, axes = plt.subplots(1, 2, figsize=(13, 0.5 + 0.42 * len(methods) + 1.2), sharey=True, layout="constrained")
+    for axis, title, colours, values in (
+        (axes[0], "claimed, and within 0.5 px: % of pairs", "Greens", lambda s: 100 * s.under_half_px),
+        (axes[1], "wrong claims, more than 1 px off: % of pairs", "Reds", lambda s: 100 * s.wrong_claims / s.pairs),
+    ):
+        grid = np.array([[_value(scores.get((m, v)), values) for v in variants] for m in methods])
+        axis.imshow(np.nan_to_num(grid), cmap=colours, vmin=0, vmax=100, aspect="auto")
+        for (row, column), value in np.ndenumerate(grid):
+            text = "-" if np.isnan(value) else f"{value:.0f}"
+            axis.text(column, row, text, ha="center", va="center", color="white" if value > 60 else "black", fontsize=9)
+        axis.set_xticks(range(len(variants)), variants, rotation=40, ha="right")
+        axis.set_yticks(range(len(methods)), methods)
+        axis.set_title(title, fontsize=11)
+    figure.savefig(path, dpi=85)
+
+
+def _value(score: Score | None, of: object) -> float:
+    return np.nan if score is None else of(score)  # type: ignore[operator]

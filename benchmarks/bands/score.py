@@ -1,0 +1,333 @@
+"""Scores what a method says of band pairs against their truth. Needs numpy and scipy, and nothing of agalign.
+
+    python benchmarks/bands/score.py RESULTS [-o TABLE.csv] [--sets FOLDER]
+
+RESULTS is CSV with a header, or JSON with a list of objects. A row is a band pair: `set`, `capture`, `file` (the moving
+one), and `homography` (nine numbers, row by row) or `grid` (JSON {"reference_px": [[x, y], ...], "moving_px": ...}:
+where the mapping sends some pixels of the reference). Both map a raw pixel of the reference file to a raw pixel of the
+moving file: x right, y down, (0, 0) the centre of the top-left pixel. A row with neither is a refusal. Optional are
+`method`, `variant`, `seconds`, and `claimed`: "no" for an estimate that the method itself does not vouch for.
+"""
+
+import argparse
+import csv
+import json
+import re
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CloughTocher2DInterpolator
+
+Matrix = NDArray[np.float64]
+Points = NDArray[np.float64]
+
+SETS = Path(__file__).parent / "sets"
+AS_IT_IS = "as it is"
+LOST = "lost"
+WRONG_PX = 1.0
+"""A pair that is claimed and lies further off in the median is a wrong claim."""
+GOOD_PX = 0.5
+_LATTICE = 20
+_PAIRS_OF_A_VARIANT = 3
+_LARGEST_CELL = 1 << 24
+"""Characters: a grid as fine as anyone may want."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A band pair and where pixels of its reference lie in the moving file."""
+
+    set: str
+    capture: str
+    reference: str
+    file: str
+    reference_px: Points
+    """(n, 2) raw px."""
+    moving_px: Points
+    """(n, 2) raw px."""
+    size_px: tuple[int, int]
+    """(width, height) of the moving file."""
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """What a row names it by."""
+        return self.set, self.capture, self.file
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What became of one pair."""
+
+    set: str
+    variant: str
+    method: str
+    claimed: bool
+    given: bool
+    """An estimate is there, claimed or not."""
+    median_px: float
+    p95_px: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """A method on the pairs of a set and a variant. Medians are over its claims, shares over all pairs."""
+
+    set: str
+    variant: str
+    method: str
+    pairs: int
+    claimed: int
+    wrong_claims: int
+    """Claimed, and more than 1 px off in the median."""
+    refused: int
+    unclaimed: int
+    """Estimates that the method does not vouch for; neither claims nor refusals."""
+    under_half_px: float
+    under_1_px: float
+    median_px: float
+    """Of the pairs' median errors, the median."""
+    p95_px: float
+    """Of the pairs' 95 % errors, the median."""
+    worst_px: float
+    """Of the pairs' median errors, the largest."""
+    unclaimed_median_px: float
+    seconds: float
+    """Median over pairs."""
+
+
+# ---- the truth
+
+
+def read_sets(folder: Path = SETS) -> dict[str, dict[str, Any]]:
+    """The descriptions of all sets, by name."""
+    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))}
+
+
+def pairs_of(description: Mapping[str, Any], variant: str = AS_IT_IS) -> list[Pair]:
+    """The pairs of a set that a variant is made of, with their truth there: all of a set as it is, at most three
+    otherwise, which are of one capture where that has several; where bands are lost, another one of each capture.
+    """
+    pairs = [
+        _pair(description, capture, truth["reference"], file, entry)
+        for capture, truth in description["captures"].items()
+        for file, entry in truth["pairs"].items()
+    ]
+    return [_moved(pair, variant) for pair in _chosen(pairs, variant)]
+
+
+def _pair(description: Mapping[str, Any], capture: str, reference: str, file: str, entry: Mapping[str, Any]) -> Pair:
+    width, height = description["files"][file]["size_px"]
+    if "ties" in entry:
+        here, there = np.hsplit(np.array(entry["ties"], float), 2)
+    else:
+        w, h = description["files"][reference]["size_px"]
+        x, y = np.meshgrid(np.linspace(0, w - 1, _LATTICE), np.linspace(0, h - 1, _LATTICE))
+        here = np.stack([x.ravel(), y.ravel()], axis=1)
+        there = apply(np.array(entry["homography"], float), here)
+        inside = _inside(there, (width, height))
+        here, there = here[inside], there[inside]
+    return Pair(description["set"], capture, reference, file, here, there, (width, height))
+
+
+def _chosen(pairs: list[Pair], variant: str) -> list[Pair]:
+    if variant in (AS_IT_IS, "lens-corrected"):
+        return pairs
+    captures = list(dict.fromkeys(p.capture for p in pairs))
+    by_capture = [[p for p in pairs if p.capture == c] for c in captures]
+    if len(by_capture[0]) == 1:
+        some = pairs
+    elif variant == LOST:
+        some = [group[number % len(group)] for number, group in enumerate(by_capture)]
+    else:
+        some = by_capture[0]
+    spread = np.linspace(0, len(some) - 1, min(len(some), _PAIRS_OF_A_VARIANT)).round().astype(int)
+    return [some[i] for i in spread]
+
+
+def _moved(pair: Pair, variant: str) -> Pair:
+    there = apply(movement(variant, pair.size_px), pair.moving_px)
+    inside = _inside(there, pair.size_px)
+    return Pair(
+        pair.set, pair.capture, pair.reference, pair.file, pair.reference_px[inside], there[inside], pair.size_px
+    )  # fmt: skip
+
+
+def movement(variant: str, size_px: tuple[int, int]) -> Matrix:
+    """Where a variant puts the pixels of a moving file (width, height): `turn DEGREES` (clockwise as seen) and `scale
+    FACTOR` about its centre and within its frame; all others leave them in their places.
+    """
+    found = re.fullmatch(r"(turn|scale) ([\d.]+)", variant)
+    matrix = np.eye(3)
+    if found:
+        angle, scale = (np.radians(float(found[2])), 1.0) if found[1] == "turn" else (0.0, float(found[2]))
+        cos, sin = scale * np.cos(angle), scale * np.sin(angle)
+        matrix[:2, :2] = [[cos, -sin], [sin, cos]]
+        centre = (np.array(size_px) - 1) / 2
+        matrix[:2, 2] = centre - matrix[:2, :2] @ centre
+    return matrix
+
+
+def apply(matrix: Matrix, points_px: Points) -> Points:
+    """Points (n, 2) through a homography; inf or nan on its horizon."""
+    mapped = points_px @ matrix[:, :2].T + matrix[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def _inside(points_px: Points, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+    return np.asarray(((points_px >= 0) & (points_px <= np.subtract(size_px, 1))).all(axis=1))
+
+
+# ---- what a method says
+
+
+def read_results(path: Path) -> list[dict[str, Any]]:
+    """The rows of a CSV or JSON file; those without a method are named after the file."""
+    csv.field_size_limit(_LARGEST_CELL)
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        rows = json.load(file) if path.suffix == ".json" else list(csv.DictReader(file))
+    return [{"method": path.stem, **{k: v for k, v in row.items() if v not in (None, "")}} for row in rows]
+
+
+def _decoded(value: Any) -> Any:
+    """A cell of a CSV file as the JSON value that it stands for."""
+    if not isinstance(value, str):
+        return value
+    return json.loads(value) if value.lstrip().startswith(("[", "{")) else [float(v) for v in value.split()]
+
+
+def errors_px(row: Mapping[str, Any], pair: Pair) -> Points | None:
+    """(n,) distances from the truth, inf where a mapping says nothing; None where the row has no mapping.
+
+    Raises ValueError for what is no mapping.
+    """
+    if row.get("homography") is not None:
+        there = apply(np.array(_decoded(row["homography"]), float).reshape(3, 3), pair.reference_px)
+    elif row.get("grid") is not None:
+        grid = _decoded(row["grid"])
+        there = CloughTocher2DInterpolator(grid["reference_px"], grid["moving_px"])(pair.reference_px)
+    else:
+        return None
+    return np.asarray(np.nan_to_num(np.linalg.norm(there - pair.moving_px, axis=1), nan=np.inf))
+
+
+def score_pairs(rows: Iterable[Mapping[str, Any]], sets: Mapping[str, Mapping[str, Any]]) -> list[Scored]:
+    """A row for each pair of each set and variant that a method says anything of; what it leaves out it refuses.
+
+    Raises ValueError for rows of unknown pairs, for two rows of one pair, and for mappings that are none.
+    """
+    said: dict[tuple[str, str, str], dict[tuple[str, str, str], Mapping[str, Any]]] = {}
+    for row in rows:
+        group = said.setdefault((row["set"], row.get("variant", AS_IT_IS), row["method"]), {})
+        key = row["set"], str(row["capture"]), row["file"]
+        if key in group:
+            raise ValueError(f"{row['method']}: two rows for {key}")
+        group[key] = row
+    scored = []
+    for (name, variant, method), group in said.items():
+        if name not in sets:
+            raise ValueError(f"{method}: there is no set {name}")
+        pairs = pairs_of(sets[name], variant)
+        unknown = set(group) - {p.key for p in pairs}
+        if unknown:
+            raise ValueError(f"{method}, {variant}: no such pair: {sorted(unknown)[0]}")
+        scored += [_scored(group.get(p.key, {}), p, variant, method) for p in pairs]
+    return scored
+
+
+def _scored(row: Mapping[str, Any], pair: Pair, variant: str, method: str) -> Scored:
+    try:
+        error = errors_px(row, pair)
+    except (ValueError, KeyError, TypeError) as problem:
+        raise ValueError(f"{method}: {pair.key}: no mapping ({problem})") from None
+    given = error is not None
+    # Of the order statistics the upper one, for between a number and inf nothing can be interpolated.
+    median, p95 = (np.nan, np.nan) if error is None else np.percentile(error, (50, 95), method="higher")
+    claimed = given and str(row.get("claimed", "yes")).lower() not in ("no", "false", "0")
+    return Scored(
+        pair.set, variant, method, claimed, given, float(median), float(p95), float(row.get("seconds", "nan"))
+    )
+
+
+def summary(scored: Sequence[Scored], name: str | None = None) -> list[Score]:
+    """A score for each set, variant and method, in the order in which they come; `name` pools the sets under it."""
+    groups: dict[tuple[str, str, str], list[Scored]] = {}
+    for s in scored:
+        groups.setdefault((name or s.set, s.variant, s.method), []).append(s)
+    return [_score(*key, group) for key, group in groups.items()]
+
+
+def _score(set_name: str, variant: str, method: str, group: Sequence[Scored]) -> Score:
+    claims = [s for s in group if s.claimed]
+    medians, p95 = np.array([s.median_px for s in claims]), np.array([s.p95_px for s in claims])
+    unclaimed = np.array([s.median_px for s in group if s.given and not s.claimed])
+    seconds = np.array([s.seconds for s in group])
+    return Score(
+        set_name, variant, method, len(group), len(claims), int((medians > WRONG_PX).sum()),
+        sum(not s.given for s in group), len(unclaimed), float((medians <= GOOD_PX).sum() / len(group)),
+        float((medians <= WRONG_PX).sum() / len(group)), _median(medians), _median(p95),
+        float(medians.max()) if len(claims) else np.nan, _median(unclaimed), _median(seconds[np.isfinite(seconds)]),
+    )  # fmt: skip
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+# ---- tables
+
+
+def write_csv(scores: Sequence[Score], path: Path) -> None:
+    """Every score, with what cannot be told left empty."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([f.name for f in fields(Score)])
+        writer.writerows([_cell(v, 4) for v in asdict(s).values()] for s in scores)
+
+
+def markdown(scores: Sequence[Score]) -> str:
+    """A table of the scores of one set and variant."""
+    head = ("method", "pairs", "claimed", "**wrong claims**", "refused", "unclaimed", "under 0.5 px", "under 1 px",
+            "median, px", "95 %, px", "worst pair, px", "s a pair")  # fmt: skip
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for s in scores:
+        unclaimed = f"{s.unclaimed} ({s.unclaimed_median_px:.2f} px)" if s.unclaimed else "0"
+        cells = (s.method, s.pairs, s.claimed, f"**{s.wrong_claims}**", s.refused, unclaimed,
+                 f"{s.under_half_px:.0%}", f"{s.under_1_px:.0%}", _cell(s.median_px, 3), _cell(s.p95_px, 2),
+                 _cell(s.worst_px, 2), _cell(s.seconds, 2))  # fmt: skip
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines)
+
+
+def _cell(value: object, digits: int) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return "" if np.isnan(value) else f"{value:.{digits}f}" if abs(value) < 1e4 else f"{value:.0e}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", type=Path, nargs="+")
+    parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("--sets", type=Path, default=SETS)
+    options = parser.parse_args()
+    try:
+        rows = [row for path in options.results for row in read_results(path)]
+        scores = summary(score_pairs(rows, read_sets(options.sets)))
+    except (ValueError, KeyError, OSError) as error:
+        sys.exit(str(error))
+    for set_name, variant in dict.fromkeys((s.set, s.variant) for s in scores):
+        print(f"\n### {set_name}, {variant}\n")
+        print(markdown([s for s in scores if (s.set, s.variant) == (set_name, variant)]))
+    if options.output:
+        write_csv(scores, options.output)
+
+
+if __name__ == "__main__":
+    main()
