@@ -25,12 +25,15 @@ from bands.images import LENS_CORRECTED, Image, read, spoilt
 from bands.methods import Align, grey_raster
 from bands.score import AS_IT_IS, Pair
 
-WHOLE = "agalign, capture"
+WHOLE = {"agalign, capture": (), "agalign, capture, no tags": ("--ignore-metadata",)}
+"""By their names, the options of the command line."""
 Row = dict[str, Any]
 _GRID = (33, 25)
 
 
-def by_command_line(paths: Mapping[str, Path], pairs: Sequence[Pair], variant: str, folder: Path) -> list[Row]:
+def by_command_line(
+    method: str, paths: Mapping[str, Path], pairs: Sequence[Pair], variant: str, folder: Path
+) -> list[Row]:
     """`agalign FOLDER` on the set's files, of which the moving ones of the pairs are spoilt; the rest of the flight is
     as it is. A band is claimed where it is called aligned; one that is predicted is given and not claimed.
     """
@@ -42,7 +45,9 @@ def by_command_line(paths: Mapping[str, Path], pairs: Sequence[Pair], variant: s
         for pair in pairs:
             _replace_pixels(flight / pair.file, spoilt(read(paths[pair.file]), pair, variant))
     began = time.perf_counter()
-    subprocess.run([sys.executable, "-m", "agalign", str(flight), "-o", str(out), "-q"], check=False)
+    command = [sys.executable, "-m", "agalign", str(flight), "-o", str(out), "-q", *WHOLE[method]]
+    # Exit code 3 is that of bands which are not aligned; what it says of each is in the sidecars.
+    subprocess.run(command, check=False, stderr=subprocess.DEVNULL)
     seconds = (time.perf_counter() - began) / (len(paths) - len({p.reference for p in pairs}))
     said = {band["file"]: band for side in _sidecars(out) for band in side["bands"]}
     return [_row(said.get(pair.file), seconds) for pair in pairs]
@@ -112,5 +117,5 @@ def applies(method: str, variant: str, pairs: Sequence[Pair], bands: Mapping[str
     """
     if variant == LENS_CORRECTED:
         known = [bands.get(name) for p in pairs for name in (p.reference, p.file)]
-        return method != WHOLE and all(b is not None and lens.is_distorting(b.lens) for b in known)
-    return method != WHOLE or tags
+        return method not in WHOLE and all(b is not None and lens.is_distorting(b.lens) for b in known)
+    return method not in WHOLE or tags

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.synthetic import troubles
+from agalign.synthetic.ground import Field
 from bands.score import AS_IT_IS, LOST, Pair, movement
 
 Image = NDArray[Any]
 """(H, W), or (H, W, 3) with red first, uint8 or uint16."""
 
 LENS_CORRECTED = "lens-corrected"
-_LIGHT: dict[str, Callable[[troubles.Field, np.random.Generator], troubles.Field]] = {
+_LIGHT: dict[str, Callable[[Field, np.random.Generator], Field]] = {
     "blur 3 px": troubles.blur, "motion 25 px": troubles.motion, "noise 30 %": troubles.noise,
     "half saturated": troubles.half_saturated,
 }  # fmt: skip
@@ -66,16 +67,24 @@ def read(path: Path) -> Image:
 
 def spoilt(image: Image, pair: Pair, variant: str) -> Image:
     """The moving image of a pair as a variant has it; the same in every run."""
-    rng = np.random.default_rng(zlib.crc32("/".join((*pair.key, variant)).encode()))
-    full = float(np.iinfo(image.dtype).max)
+    seed = zlib.crc32("/".join((*pair.key, variant)).encode())
+    rng = np.random.default_rng(seed)
     if variant in _LIGHT:
-        planes = np.atleast_3d(image).astype(np.float32) / full
-        light = np.dstack([_LIGHT[variant](np.ascontiguousarray(planes[..., k]), rng) for k in range(planes.shape[2])])
-        return _as(light.reshape(image.shape) * full, image)
+        planes = np.moveaxis(np.atleast_3d(image), -1, 0)
+        made = [_in_other_light(plane, variant, np.random.default_rng(seed)) for plane in planes]
+        return _as(np.dstack(made).reshape(image.shape), image)
     if variant == LOST:
         # Noise about its own brightness: a frame that a camera wrote without having seen anything.
         return _as(np.median(image) + 0.5 * image.std() * rng.normal(size=image.shape), image)
     return moved(image, movement(variant, pair.size_px))
+
+
+def _in_other_light(plane: Image, variant: str, rng: np.random.Generator) -> NDArray[np.float32]:
+    """(H, W). Black that an earlier warp has left stays black: it is no part of the scene."""
+    full = float(np.iinfo(plane.dtype).max)
+    lit = plane > 0
+    light = np.where(lit, plane, np.median(plane[lit])).astype(np.float32) / full
+    return np.where(lit, _LIGHT[variant](light, rng) * np.float32(full), np.float32(0))
 
 
 def moved(image: Image, matrix: NDArray[np.float64]) -> Image:

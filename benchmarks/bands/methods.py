@@ -91,7 +91,7 @@ def phase_correlation(fixed: Image, moving: Image) -> Matrix | None:
 
 def sift(fixed: Image, moving: Image) -> Matrix | None:
     """SIFT, ratio test 0.8, RANSAC at 3 px: the textbook recipe."""
-    detector = cv2.SIFT_create(5000)
+    detector = cv2.SIFT.create(5000)
     (k1, d1), (k2, d2) = (detector.detectAndCompute(grey_8_bit(image), None) for image in (fixed, moving))
     if d1 is None or d2 is None or min(len(d1), len(d2)) < 4:
         return None

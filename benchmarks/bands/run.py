@@ -31,7 +31,7 @@ from bands.report import draw, tables
 from bands.score import Pair, pairs_of, read_sets, score_pairs, summary, write_csv
 
 Row = dict[str, Any]
-METHODS = (*PAIR_METHODS, capture.WHOLE)
+METHODS = (*PAIR_METHODS, *capture.WHOLE)
 SLOW = ("kornia ImageRegistrator",)
 """Run where they are named."""
 _FIELDS = ("method", "set", "capture", "file", "variant", "claimed", "seconds", "homography", "grid")
@@ -56,7 +56,7 @@ def asked(align: Align, pair: Pair, variant: str, paths: dict[str, Path], bands:
 
 def run_method(name: str, located: Located, sets: dict[str, Any], variants: Sequence[str]) -> list[Row]:
     """What one method says of everything. Raises UnavailableError."""
-    align = None if name == capture.WHOLE else method_named(name)
+    align = None if name in capture.WHOLE else method_named(name)
     rows: list[Row] = []
     for set_name, paths in located.paths.items():
         tags = capture.has_tags(paths)
@@ -68,7 +68,7 @@ def run_method(name: str, located: Located, sets: dict[str, Any], variants: Sequ
                 continue
             if align is None:
                 with tempfile.TemporaryDirectory() as folder:
-                    said = capture.by_command_line(paths, pairs, variant, Path(folder))
+                    said = capture.by_command_line(name, paths, pairs, variant, Path(folder))
             else:
                 said = [asked(align, pair, variant, paths, bands) for pair in pairs]
             of = {"method": name, "variant": variant}
