@@ -1,0 +1,216 @@
+"""The benchmark of band pairs: its scorer on known homographies, its sets, and how it treats methods."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from bands import capture, score
+from bands.images import VARIANTS, locate, read, spoilt
+from bands.methods import UnavailableError, identity, method_named
+from bands.run import asked, write_said
+
+from agalign.cameras.discover import discover
+
+TRUE = np.array([[1.01, 0.02, 30.0], [-0.015, 0.99, -12.0], [1e-5, 2e-5, 1.0]])
+TIES_PX = np.stack(np.meshgrid(np.arange(40.0, 600, 40), np.arange(40.0, 440, 40)), axis=-1).reshape(-1, 2)
+
+
+def shifted(dx: float, dy: float) -> np.ndarray:
+    return np.array([[1, 0, dx], [0, 1, dy], [0, 0, 1.0]]) @ TRUE
+
+
+@pytest.fixture
+def sets() -> dict[str, Any]:
+    """One set of two captures with two bands each, whose truth is exact."""
+    there = score.apply(TRUE, TIES_PX)
+    inside = ((there >= 0) & (there <= (639, 479))).all(axis=1)
+    ties = np.hstack([TIES_PX, there])[inside].tolist()
+    captures = {
+        c: {"reference": f"{c}_g.png", "pairs": {f"{c}_{b}.png": {"ties": ties} for b in "rn"}} for c in ("1", "2")
+    }
+    files = {f"{c}_{b}.png": {"size_px": [640, 480], "bytes": 1, "sha256": ""} for c in "12" for b in "grn"}
+    return {"field": {"set": "field", "files": files, "captures": captures}}
+
+
+def row(file: str, **said: Any) -> dict[str, Any]:
+    return {"method": "m", "set": "field", "capture": file[0], "file": file, **said}
+
+
+def test_the_error_of_a_known_homography_is_exact(sets: dict[str, Any]) -> None:
+    rows = [row("1_r.png", homography=shifted(0.3, 0.4).tolist()), row("1_n.png", homography=TRUE.tolist())]
+    found = score.score_pairs(rows, sets)
+    assert [s.median_px for s in found[:2]] == pytest.approx([0.5, 0.0], abs=1e-9)
+    assert [s.p95_px for s in found[:2]] == pytest.approx([0.5, 0.0], abs=1e-9)
+
+
+def test_a_grid_says_what_its_homography_says(sets: dict[str, Any]) -> None:
+    x, y = np.meshgrid(np.linspace(0, 639, 33), np.linspace(0, 479, 25))
+    here = np.stack([x.ravel(), y.ravel()], axis=1)
+    grid = {"reference_px": here.tolist(), "moving_px": score.apply(shifted(0.6, 0.8), here).tolist()}
+    (first, *_) = score.score_pairs([row("1_r.png", grid=grid)], sets)
+    assert first.median_px == pytest.approx(1.0, abs=1e-3)
+
+
+def test_what_a_grid_leaves_out_it_has_wrong(sets: dict[str, Any]) -> None:
+    here = np.array([[0, 0], [200, 0], [200, 200], [0, 200], [100, 100.0]])
+    grid = {"reference_px": here.tolist(), "moving_px": score.apply(TRUE, here).tolist()}
+    (first, *_) = score.score_pairs([row("1_r.png", grid=grid)], sets)
+    assert first.median_px == np.inf
+    assert score.summary([first])[0].wrong_claims == 1
+
+
+def test_wrong_claims_refusals_and_estimates_without_a_claim_are_counted_apart(sets: dict[str, Any]) -> None:
+    rows = [
+        row("1_r.png", homography=shifted(0.1, 0).tolist()), row("1_n.png", homography=shifted(7, 0).tolist()),
+        row("2_r.png"), row("2_n.png", homography=shifted(9, 0).tolist(), claimed="no"),
+    ]  # fmt: skip
+    (found,) = score.summary(score.score_pairs(rows, sets))
+    assert (found.pairs, found.claimed, found.wrong_claims, found.refused, found.unclaimed) == (4, 2, 1, 1, 1)
+    assert (found.under_half_px, found.under_1_px) == (0.25, 0.25)
+    assert (found.median_px, found.worst_px, found.unclaimed_median_px) == pytest.approx((3.55, 7.0, 9.0))
+    assert "| m | 4 | 2 | **1** | 1 | 1 (9.00 px) | 25% |" in score.markdown([found])
+
+
+def test_what_is_left_out_is_refused_and_what_is_not_asked_raises(sets: dict[str, Any]) -> None:
+    one = row("1_r.png", homography=TRUE.tolist())
+    (found,) = score.summary(score.score_pairs([one], sets))
+    assert (found.claimed, found.refused) == (1, 3)
+    for rows, problem in (
+        ([one, one], "two rows"), ([row("1_x.png")], "no such pair"), ([{**one, "set": "moon"}], "no set"),
+        ([row("1_r.png", homography="1 2 3")], "no mapping"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=problem):
+            score.score_pairs(rows, sets)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".json"])
+def test_what_is_written_is_read_again(sets: dict[str, Any], tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"mine{suffix}"
+    rows = [row("1_r.png", homography=shifted(0, 0.25).tolist(), variant="turn 10", seconds=0.5), row("1_n.png")]
+    if suffix == ".csv":
+        write_said(rows, path)
+    else:
+        path.write_text(json.dumps(rows))
+    turned, plain = score.summary(score.score_pairs(score.read_results(path), sets))
+    assert (turned.variant, turned.pairs, turned.seconds) == ("turn 10", 2, 0.5)
+    assert (plain.variant, plain.refused) == (score.AS_IT_IS, 4)
+
+
+def test_a_method_without_a_name_is_called_by_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "theirs.csv"
+    path.write_text("set,capture,file,homography\nfield,1,1_r.png,1 0 0 0 1 0 0 0 1\n")
+    assert score.read_results(path)[0]["method"] == "theirs"
+
+
+def test_the_scorer_needs_nothing_of_agalign() -> None:
+    code = "import sys, score; print(any(m.split('.')[0] in ('agalign', 'cv2', 'torch') for m in sys.modules))"
+    folder = Path(score.__file__).parent
+    assert subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True).stdout == "False\n"
+
+
+@pytest.mark.parametrize("variant", ["turn 3", "turn 20", "scale 0.8"])
+def test_an_image_moves_as_its_truth_does(sets: dict[str, Any], variant: str) -> None:
+    pair = score.pairs_of(sets["field"])[0]
+    y, x = np.mgrid[:480, :640]
+    image = (60000 * np.exp(-((x - 400.0) ** 2 + (y - 150.0) ** 2) / 50)).astype(np.uint16)
+    found = spoilt(image, pair, variant).astype(float)
+    centre = np.array([(found * x).sum(), (found * y).sum()]) / found.sum()
+    (there,) = score.apply(score.movement(variant, (640, 480)), np.array([[400.0, 150.0]]))
+    assert centre == pytest.approx(there, abs=0.02)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_variants_are_the_same_in_every_run_and_keep_size_and_type(sets: dict[str, Any], variant: str) -> None:
+    pair = score.pairs_of(sets["field"])[0]
+    image = np.random.default_rng(1).integers(1, 60000, (480, 640)).astype(np.uint16)
+    image[:50] = 0
+    one, other = (spoilt(image, pair, variant) for _ in range(2))
+    assert np.array_equal(one, other)
+    assert (one.shape, one.dtype) == (image.shape, image.dtype)
+    assert np.array_equal(one, image) == (variant in ("as it is", "lens-corrected"))
+
+
+@pytest.mark.parametrize("name", sorted(score.read_sets()))
+def test_a_set_is_sound(name: str) -> None:
+    path = score.SETS / f"{name}.json"
+    assert path.stat().st_size < 200_000
+    description = score.read_sets()[name]
+    assert description["set"] == name
+    assert {"camera", "difficulty", "published", "convention", "truth", "truth_std_px"} <= set(description)
+    for entry in description["files"].values():
+        assert re.fullmatch("[0-9a-f]{64}", entry["sha256"])
+        assert entry["bytes"] > 0
+    for pair in score.pairs_of(description):
+        assert pair.reference in description["files"]
+        assert 30 < len(pair.reference_px) <= 400
+        w, h = description["files"][pair.reference]["size_px"]
+        assert ((pair.reference_px >= 0) & (pair.reference_px <= (w - 1, h - 1))).all()
+    assert all(score.pairs_of(description, variant) for variant in VARIANTS)
+
+
+@pytest.mark.real
+def test_the_images_are_those_of_the_checksums(real_data: Path) -> None:
+    sets = score.read_sets()
+    located = locate(real_data, sets)
+    assert not located.missing
+    assert {name: len(paths) for name, paths in located.paths.items()} == {n: len(s["files"]) for n, s in sets.items()}
+
+
+def test_images_that_are_not_there_are_named(tmp_path: Path) -> None:
+    sets = score.read_sets()
+    file = next(iter(sets["p4m_forest"]["files"].values()))
+    (tmp_path / "as large.TIF").write_bytes(bytes(file["bytes"]))
+    located = locate(tmp_path, sets)
+    assert not located.paths
+    assert len(located.missing["p4m_forest"]) == 5
+
+
+def test_a_method_that_raises_has_refused(
+    sets: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pair = score.pairs_of(sets["field"])[0]
+    paths = {name: tmp_path / name for name in (pair.reference, pair.file)}
+    for path in paths.values():
+        cv2.imwrite(str(path), np.full((480, 640), 9, np.uint8))
+
+    def dies(_fixed: np.ndarray, _moving: np.ndarray) -> None:
+        raise RuntimeError("out of luck")
+
+    said = asked(dies, pair, score.AS_IT_IS, paths, {})
+    assert set(said) == {"seconds"}
+    assert "refused (RuntimeError: out of luck)" in capsys.readouterr().err
+    assert asked(identity, pair, score.AS_IT_IS, paths, {})["homography"] == np.eye(3).tolist()
+
+
+def test_anyones_method_is_taken_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text("def align(fixed, moving):\n    return None\n")
+    assert method_named(f"{path}:align")(np.eye(3), np.eye(3)) is None
+    for name in ("nothing of the kind", f"{tmp_path}/other.py:align"):
+        with pytest.raises(UnavailableError):
+            method_named(name)
+
+
+def test_only_what_is_called_aligned_is_claimed() -> None:
+    grid = {"reference_px": [[0, 0], [1, 0], [0, 1]], "moving_px": [[0, 0], [1, 0], [0, 1]]}
+    said = {s: capture._row({"status": s, "grid": grid}, 1.0) for s in ("aligned", "predicted", "seed_only", "failed")}
+    assert (said["aligned"]["claimed"], said["predicted"]["claimed"]) == ("yes", "no")
+    assert said["seed_only"] == said["failed"] == capture._row(None, 1.0) == {"seconds": 1.0}
+
+
+def test_lens_corrected_images_are_scored_between_raw_pixels(flight: Path) -> None:
+    truth = json.loads((flight / "truth.json").read_text())["IMG_0001"]
+    bands = {b.path.name: b for c in discover(flight).captures for b in c.bands}
+    file = "IMG_0001_4.tif"
+    both = [(read(bands[name].path), bands[name]) for name in (truth["reference"], file)]
+    known = truth["bands"][file]
+    said = capture.lens_corrected(lambda _f, _m: np.array(known["fixed_to_moving"]), *both)
+    here, there = np.hsplit(np.array(known["ties"]), 2)
+    pair = score.Pair("synthetic", "1", truth["reference"], file, here, there, bands[file].size_px)
+    assert np.median(score.errors_px(said, pair)) < 0.02
