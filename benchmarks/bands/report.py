@@ -9,15 +9,40 @@ from bands.score import AS_IT_IS, Score, Scored, markdown, summary
 
 
 def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
-    """As it is, set by set; then the variants with the sets pooled; then the memory that each method took."""
+    """An overview; as it is, set by set; the variants with the sets pooled; and the memory that each method took."""
     groups: dict[str, list[Score]] = {}
     for score in summary([s for s in scored if s.variant == AS_IT_IS]):
         groups.setdefault(score.set, []).append(score)
     for score in summary([s for s in scored if s.variant != AS_IT_IS], "all sets"):
         groups.setdefault(score.variant, []).append(score)
-    parts = [f"### {title}\n\n{markdown(scores)}\n" for title, scores in groups.items()]
+    parts = [overview(scored), *(f"### {title}\n\n{markdown(scores)}\n" for title, scores in groups.items())]
     memory = "; ".join(f"{name} {value:.1f}" for name, value in gigabytes.items())
     return "\n".join([*parts, f"Largest process, GB: {memory}.\n"])
+
+
+def overview(scored: Sequence[Scored]) -> str:
+    """Methods by variants, all sets together: pairs claimed within 0.5 px, and wrong claims."""
+    scores, methods, variants = _by_method_and_variant(scored)
+    pairs = {v: max(s.pairs for (_, w), s in scores.items() if v == w) for v in variants}
+    lines = ["| | " + " | ".join(f"{v} ({n})" for v, n in pairs.items()) + " |", "|---" * (1 + len(variants)) + "|"]
+    for method in methods:
+        cells = [_overview_cell(scores.get((method, v)), pairs[v]) for v in variants]
+        lines.append(f"| {method} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _overview_cell(score: Score | None, pairs: int) -> str:
+    """A method that is not asked of all pairs says of how many it was."""
+    if score is None:
+        return "-"
+    of = "" if score.pairs == pairs else f" of {score.pairs}"
+    return f"{round(score.under_half_px * score.pairs)}{of} / **{score.wrong_claims}**"
+
+
+def _by_method_and_variant(scored: Sequence[Scored]) -> tuple[dict[tuple[str, str], Score], list[str], list[str]]:
+    scores = {(s.method, s.variant): s for s in summary(scored, "all sets")}
+    methods, variants = (list(dict.fromkeys(key[k] for key in scores)) for k in (0, 1))
+    return scores, methods, variants
 
 
 def draw(scored: Sequence[Scored], path: Path) -> None:
@@ -27,8 +52,7 @@ def draw(scored: Sequence[Scored], path: Path) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    scores = {(s.method, s.variant): s for s in summary(scored, "all sets")}
-    methods, variants = (list(dict.fromkeys(key[k] for key in scores)) for k in (0, 1))
+    scores, methods, variants = _by_method_and_variant(scored)
     figure, axes = plt.subplots(1, 2, figsize=(13, 0.5 + 0.42 * len(methods) + 1.2), sharey=True, layout="constrained")
     for axis, title, colours, values in (
         (axes[0], "claimed, and within 0.5 px: % of pairs", "Greens", lambda s: 100 * s.under_half_px),

@@ -22,6 +22,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not to be found
 
 from bands import capture
@@ -140,6 +142,7 @@ def main() -> None:
         sys.exit(f"there is no variant {unknown.pop()}")
     located = locate(options.data, sets)
     if options.only:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every tag it does not know
         try:
             options.output.write_text(json.dumps(run_method(options.only, located, sets, variants)))
         except UnavailableError as error:
