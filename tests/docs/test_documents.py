@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from ..conftest import REAL_DATA
 from .blocks import PAGES, ROOT, Block, blocks_of, commands_of, program
 
 RUN_BY = {
@@ -43,11 +44,18 @@ def test_a_page_does_what_it_says(page: Path, desk: Path, tmp_path: Path) -> Non
     """Read from top to bottom, in a folder with a flight in it."""
     folder = tmp_path / "desk"
     shutil.copytree(desk, folder)
-    (folder / "examples").symlink_to(ROOT / "examples")
+    for name in ("examples", "benchmarks"):
+        (folder / name).symlink_to(ROOT / name)
+    if REAL_DATA.is_dir():
+        (folder / "DATA").symlink_to(REAL_DATA)
     for block in blocks_of(page):
+        if named := re.match(r"# (\w+\.py)\n", block.text):
+            (folder / named[1]).write_text(block.text, encoding="utf-8")
         if block.kind == "python":
             run(block, [sys.executable, "-c", PREAMBLE + block.text], folder)
         commands = commands_of(block) if block.kind == "sh" else []
+        if " DATA " in block.text and not REAL_DATA.is_dir():
+            pytest.skip(f"{block.where} is about real captures, which are not at {REAL_DATA}")
         if not any(program(command) in RUN_BY for command in commands):
             for command in commands:
                 run(block, ["bash", "-c", command], folder)
