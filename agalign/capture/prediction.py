@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.evidence import as_predicted
+from agalign.capture.seeding import found_turned
 from agalign.config import CheckSettings
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.values import geometry
@@ -41,7 +42,7 @@ def with_predictions(
     """Each alignment with what the rig says beside it; a band that is not aligned lies where the rig says.
 
     A band that lies where the rig has it impossible is not aligned either: of a scene that repeats, the images agree
-    whole periods away.
+    whole periods away. One whose image shows itself turned or scaled is not of this rig, and stays as it was found.
     """
     known = observed([p for p in pairs if p.is_the_rigs], found, capture)
     checked = dict(found)
@@ -58,7 +59,14 @@ def with_predictions(
                 checked[pair.name] = replace(alignment, prediction=_in_image_px(prediction, pair))
                 continue
             alignment = replace(alignment, doubts=(Doubt("unexpected_px", off_px, limit_px),))
-        checked[pair.name] = as_predicted(alignment, pair, _in_image_px(prediction, pair))
+        there = _in_image_px(prediction, pair)
+        turned = found_turned(pair, there.fixed_to_moving)
+        if turned is not None:
+            off_px = distance_px(pair.in_file_px(turned), prediction.fixed_to_moving, rig.size_px)
+            doubt = Doubt("unexpected_px", off_px, check.most_unexpected_px)
+            checked[pair.name] = replace(alignment, doubts=(doubt, *alignment.doubts))
+            continue
+        checked[pair.name] = as_predicted(alignment, pair, there)
     return checked
 
 

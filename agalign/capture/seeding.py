@@ -30,6 +30,8 @@ three degrees of 17."""
 _CLOSE_PX = 3.0
 """Where nearly all windows lie this close under a match, no better one is looked for."""
 _LEAST_WINDOWS = 12
+_MOST_TURN_DEGREES, _MOST_SCALE = 1.0, 0.02
+"""By which a band may lie otherwise than a rig has it."""
 _MOST_KEYPOINTS = 1000
 """Where learnt descriptors are the last resort."""
 _SAME_PEAK_PX = 2.0
@@ -49,9 +51,13 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
             return Doubt("no_such_seed", detail="match")
         candidates = {"match": found}
     best = best_seed(pair, candidates)
-    if best.score >= _PLAIN_SIGMA or _is_known(pair) or (best.trusted and pair.is_expected(best.fixed_to_moving)):
+    if best.score >= _PLAIN_SIGMA or _is_known(pair):
         return best
     shown = _windows_under(pair, best)
+    # Tags that a peak agrees with say no more of the middle than of the corners: the windows do.
+    expected = best.trusted and pair.is_expected(best.fixed_to_moving)
+    if expected and seed_fits(shown, pair.reference.settings.check):
+        return best
     for found in _matched(pair, model, by_learnt_descriptors=not best.trusted):
         there = _windows_under(pair, matched := _at_its_place(pair, found))
         sharpened = _sharpened(pair, found, there)
@@ -64,6 +70,31 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
         if best.kind == "match" and shown.p95_px <= _CLOSE_PX:
             break
     return best
+
+
+def found_turned(pair: BandPair, fixed_to_moving: Matrix) -> Matrix | None:
+    """A mapping that landmarks of both images agree on, and their windows better than under the one that is given, and
+    that is turned or scaled beside it, as no rigid camera's bands are; None where there is none. One that is merely
+    shifted may be a scene that repeats.
+    """
+    under = Look.at(pair, pair.mapping(fixed_to_moving)).residual
+    if seed_fits(under, pair.reference.settings.check):
+        return None
+    for found in _matched(pair, None, by_learnt_descriptors=False):
+        there = Look.at(pair, pair.mapping(found)).residual
+        fits = seed_fits(there, pair.reference.settings.check) and there.is_better_than(under)
+        if fits and _is_turned(geometry.compose(geometry.invert(fixed_to_moving), found), pair.fixed.size_px):
+            return found
+    return None
+
+
+def _is_turned(matrix: Matrix, size_px: tuple[int, int]) -> bool:
+    """By what a homography does to a step right and a step down in the middle of the image."""
+    middle = (np.array(size_px) - 1) / 2
+    here, right, down = geometry.apply(matrix, middle + np.array([(0, 0), (1, 0), (0, 1)]))
+    angle = np.degrees(np.arctan2(*(right - here)[::-1]))
+    scale = np.sqrt(abs(np.linalg.det([right - here, down - here])))
+    return bool(abs(angle) > _MOST_TURN_DEGREES or abs(scale - 1) > _MOST_SCALE)
 
 
 def _sharpened(pair: BandPair, fixed_to_moving: Matrix, shown: Residual) -> Matrix | None:
