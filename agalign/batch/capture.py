@@ -12,6 +12,7 @@ from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
 from agalign.products.error_map import error_lattice_px, write_error_map
 from agalign.products.fill_sidecar import sidecar_of
+from agalign.products.indices import INDICES
 from agalign.products.layout import lay_out
 from agalign.products.pan_sharpen import need_panchromatic, write_pan_sharpened
 from agalign.products.picture import choose_bands, write_picture
@@ -146,8 +147,8 @@ def _beside(stack: Path, sidecar: Path) -> list[Path]:
 
 
 def discard_outputs(stack: Path, sidecar: Path) -> None:
-    """What an earlier run wrote of a capture goes before something else takes its place: a sidecar never stands beside
-    rasters that it does not describe, nor a band on an old grid beside new ones.
+    """What an earlier run wrote of a capture, and what indices were made of it, goes before something else takes its
+    place: a sidecar never stands beside rasters that it does not describe, nor a band on an old grid beside new ones.
 
     What cannot be removed is written over, or told by the writing that fails.
     """
@@ -155,6 +156,10 @@ def discard_outputs(stack: Path, sidecar: Path) -> None:
     with suppress(SidecarError):
         output = read_sidecar(sidecar).output
         old += [sidecar.parent / part.file for part in output.band_files] if output else []
+    for name in INDICES:
+        # Unless a capture has that name.
+        if not stack.with_name(f"{stack.stem}_{name}.json").exists():
+            old += [stack.with_name(f"{stack.stem}_{name}{suffix}") for suffix in (".tif", ".png")]
     for path in old:
         with suppress(OSError):
             path.unlink(missing_ok=True)

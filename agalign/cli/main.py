@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -23,6 +24,7 @@ from agalign.cli.terminal import (
     EXIT_NOTHING,
     EXIT_OK,
     EXIT_PARTIAL,
+    EXIT_USAGE,
     LogJson,
     Quiet,
     RngSeed,
@@ -166,16 +168,17 @@ def ndvi(
                 "the bands are raw numbers, not reflectance: their indices compare places within a capture, not "
                 "captures or cameras; align with --radiometry where the camera's tags allow it"
             )
-        table = Table("Index", title=f"{len(written)} of {len(reports)} written")
-        for name in ("Captures", "Median", "Lowest", "Highest"):
+        table = Table("Index", title=f"{len(written)} of {len(reports)} written; medians of captures")
+        for name in ("Captures", "Middle", "Lowest", "Highest"):
             table.add_column(name, justify="right")
         for one in chosen:
             values = [r.median for r in written if r.index == one.name]
             if values:
-                shown = (f"{v:.3f}" for v in (median(values), min(values), max(values)))
-                table.add_row(one.name, str(len(values)), *shown)
+                numbers = (f"{v:.3f}" for v in (median(values), min(values), max(values)))
+                table.add_row(one.name, str(len(values)), *numbers)
         if written:
             voice.result(table)
+            voice.result(shown(f"Rasters and pictures beside each capture: {written[0].path}, …"))
         raise typer.Exit(EXIT_NOTHING if not written else EXIT_OK if len(written) == len(reports) else EXIT_PARTIAL)
 
 
@@ -189,6 +192,7 @@ def main() -> None:
     """Entry point: a first argument that is no command is the folder to align."""
     arguments = sys.argv[1:]
     if arguments and arguments[0] not in _COMMANDS and not _is_root_option(arguments[0]):
+        _refuse_misspelt(arguments[0])
         arguments = ["align", *arguments]
     _give_value(arguments, "--local", get_args(LocalUse), "always")
     _give_value(arguments, "--radiometry", get_args(RadiometryChoice), "auto")
@@ -200,6 +204,15 @@ def main() -> None:
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     with printed():
         app(args=arguments, prog_name="agalign")
+
+
+def _refuse_misspelt(first: str) -> None:
+    """A word that is nearly a command is no folder that is missing. Raises SystemExit."""
+    meant = get_close_matches(first, _COMMANDS, 1, cutoff=0.7)
+    if meant and not Path(first).exists():
+        voice = Voice(quiet=False, verbose=False, log_json=False)
+        voice.problem(f"'{first}' is no command and no folder; did you mean '{meant[0]}'?")
+        raise SystemExit(EXIT_USAGE)
 
 
 def _give_value(arguments: list[str], option: str, values: Sequence[str], alone: str) -> None:

@@ -89,6 +89,8 @@ class Outcome:
     """Some band pair is aligned or predicted."""
     good: bool = True
     """Nothing is left to be wished for, of captures, of files that were found and of the report."""
+    radiometry: Counter[str] = field(default_factory=Counter)
+    """What was made of raw numbers, and in how many captures."""
     shortfalls: "Shortfalls" = field(default_factory=_no_shortfalls)
 
     def add(self, report: "CaptureReport") -> None:
@@ -99,6 +101,8 @@ class Outcome:
         if report.result is None:
             return
         self.shortfalls.add(report.label, report.result)
+        if report.result.output is not None and report.result.output.radiometry is not None:
+            self.radiometry[report.result.output.radiometry] += 1
         for band in report.result.bands:
             if band.status == "reference":
                 continue
@@ -287,11 +291,13 @@ def conclude(outcome: Outcome, out: Path, voice: Voice) -> int:
     if outcome.bands:
         voice.result(table)
     explain(outcome.shortfalls.groups(), voice)
+    for made, count in outcome.radiometry.items():
+        voice.result(shown(f"Written as {made}: {count} captures"))
     voice.result(shown(f"Report: {out / 'index.html'}"))
     if outcome.states and set(outcome.states) == {"panel"}:
         voice.problem("nothing but calibration panels there; --align-panels aligns them all the same")
         return EXIT_NOTHING
     if not outcome.useful:
-        voice.problem("no band pair could be aligned")
+        voice.problem("no band pair could be aligned" if outcome.bands else "no capture could be done")
         return EXIT_PARTIAL if outcome.bands else EXIT_NOTHING
     return EXIT_OK if outcome.good else EXIT_PARTIAL

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.values.capture import Capture, Quantity, Radiometry
+from agalign.values.capture import Capture, Quantity, Radiometry, RadiometrySource
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage
 
@@ -76,7 +76,8 @@ def _chosen(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: fl
     if told is None:
         return None
     factor, quantity = told
-    return replace(of_camera, gain=of_camera.gain * factor, quantity=quantity, by_sun=None)
+    told_by: RadiometrySource = "panel" if choice == "panel" else "light sensor"
+    return replace(of_camera, gain=of_camera.gain * factor, quantity=quantity, told_by=told_by, by_sun=None)
 
 
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign._version import __version__
-from agalign.config import Settings
+from agalign.config import Settings, WriteSettings
 from agalign.flight.fingerprint import fingerprint
 from agalign.products.sidecar import (
     BandPart,
@@ -104,13 +104,13 @@ def sidecar_of(
             height=reference.height_px,
         ),
         bands=parts,
-        output=None if written is None else _output_part(written),
+        output=None if written is None else _output_part(capture, written, settings.write),
         preview=preview,
         settings=fingerprint(capture, settings),
     )
 
 
-def _output_part(written: Written) -> OutputPart:
+def _output_part(capture: Capture, written: Written, settings: WriteSettings) -> OutputPart:
     grid, stack = written.grid, written.stack
     values = {path: _nodata(value) for path, value in written.nodata.items()}
     alike = set(values.values() if stack is None else [values[stack]])
@@ -123,10 +123,16 @@ def _output_part(written: Written) -> OutputPart:
             )
             for path in written.band_files
         ],
+        radiometry=None if settings.radiometry == "off" else _radiometry(capture),
         crop=(grid.x0, grid.y0, grid.width, grid.height),
         scale=grid.scale_xy,
         nodata=alike.pop() if len(alike) == 1 else None,
     )  # fmt: skip
+
+
+def _radiometry(capture: Capture) -> str | None:
+    made = dict.fromkeys(f"{b.radiometry.quantity} by {b.radiometry.told_by}" for b in capture.bands if b.radiometry)
+    return " and ".join(made) or None
 
 
 def _nodata(value: float | None) -> float | str | None:

@@ -27,7 +27,8 @@ from agalign.values.image import FloatImage
 
 _TILE_PX = 256
 _WORK_PX = 2048
-_BINS = 120
+_BINS, _BARS = 1200, 120
+"""Of the values, and of the picture's histogram."""
 _PICTURE_PX = 720
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Water, soil, and the greens, red green blue, over an index's span."""
@@ -85,7 +86,10 @@ def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> 
     chosen = [parts[i] for i in bands_for(index, [p.band for p in parts], [p.wavelength_nm for p in parts])]
     for part in chosen:
         if not is_delivered(part, _MOST_PREDICTED_PX) or part.place is None:
-            raise InputError(f"{index.name} is left out: {part.band} is {part.status} ({part.reason})")
+            known = (
+                "" if part.prediction is None else f" to {part.prediction.std_px:.1f} px, not {_MOST_PREDICTED_PX:g}"
+            )
+            raise InputError(f"{index.name} is left out: {part.band} is {part.status}{known} ({part.reason})")
     target = path.with_name(f"{path.stem}_{index.name}.tif")
     counts, edges = np.zeros(_BINS, np.int64), np.linspace(*index.span, _BINS + 1)
     with ExitStack() as stack:
@@ -93,7 +97,7 @@ def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> 
         unit = _unit(index, sources)
         with complete_file(target) as partial:
             _write_values(partial, target, index, sources, unit, counts, edges)
-    _write_picture(target, index, counts)
+    _write_picture(target, index, counts, raw=unit == _RAW)
     middle = np.searchsorted(np.cumsum(counts), counts.sum() / 2)
     median = float(edges[middle : middle + 2].mean()) if counts.any() else math.nan
     return IndexReport(label, index.name, target, median, unit == _RAW)
@@ -190,13 +194,14 @@ def _create(stack: ExitStack, path: Path, like: rasterio.DatasetReader, index: I
 # ---- the picture
 
 
-def _write_picture(raster: Path, index: Index, counts: NDArray[np.int64]) -> None:
+def _write_picture(raster: Path, index: Index, counts: NDArray[np.int64], *, raw: bool) -> None:
     """The index in colours over its histogram, whose bars are coloured alike."""
     with open_raster(raster) as source:
         scale = min(1.0, _PICTURE_PX / max(source.width, source.height))
         shape = max(1, round(source.height * scale)), max(1, round(source.width * scale))
         values = source.read(1, out_shape=shape)
     width, margin, bars = max(shape[1], 360), 24, 90
+    counts = counts.reshape(_BARS, -1).sum(axis=1)
     sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
     sheet[: shape[0], : shape[1]] = _coloured(values, index)
     base = shape[0] + margin + bars
@@ -210,7 +215,8 @@ def _write_picture(raster: Path, index: Index, counts: NDArray[np.int64]) -> Non
     for value in np.linspace(*index.span, 5):
         at = round(margin + (value - index.span[0]) / (index.span[1] - index.span[0]) * (width - 2 * margin))
         sheet = with_text(sheet, f"{value:.2f}", (at, base + 18), anchor="ms")
-    sheet = with_text(sheet, index.name.upper(), (margin, shape[0] + 18), 16)
+    title = f"{index.name.upper()} of {raster.stem.removesuffix(f'_{index.name}')}"
+    sheet = with_text(sheet, f"{title}, of raw numbers" if raw else title, (margin, shape[0] + 18), 16)
     write_png(sheet, raster.with_suffix(".png"))
 
 

@@ -25,11 +25,11 @@ from agalign.values.files import complete_file
 from agalign.values.image import Tile
 
 ERROR_FULL_PX = 0.5
-_WIDEST_PX, _NARROWEST_PX, _DETAIL_SHARE = 480, 96, 0.45
+_WIDEST_PX, _NARROWEST_PX, _DETAIL_SHARE = 640, 96, 0.35
 """Of a tile, and how wide a detail is beside it."""
 _QUALITY, _BLOCK_PX = 35, 8
 """Of the JPEG: pictures that share no block do not show in each other."""
-_MOST_BYTES_EACH, _MOST_BYTES_IN_ALL = 400_000, 44_000_000
+_MOST_BYTES_EACH, _MOST_BYTES_IN_ALL = 600_000, 44_000_000
 """A season's report can still be sent to somebody."""
 
 

@@ -33,10 +33,10 @@ class Shortfall:
     @property
     def advice(self) -> str:
         """What to try, where something must be tried."""
-        usable = (
-            "each may be used within its error bar (prediction in the sidecar); " if self.status == "predicted" else ""
-        )
-        return usable + self.remedy.advice
+        if self.status != "predicted":
+            return self.remedy.advice
+        usable = "those known to a px or better may be used, as indices do (prediction in the sidecar)"
+        return f"{usable}; {self.remedy.advice}"
 
     @property
     def captures(self) -> int:

@@ -235,6 +235,8 @@ class OutputPart(_Part):
     file: BesideIt | None
     bytes: int | None
     band_files: list[FilePart] = []
+    radiometry: str | None = None
+    """What was made of raw numbers, and by what, such as "reflectance by light sensor"; null for raw numbers."""
     crop: tuple[int, int, int, int]
     scale: tuple[float, float] = (1.0, 1.0)
     nodata: float | str | None

@@ -337,6 +337,8 @@ def _describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings:
     raw = settings.radiometry == "off"
     quantities = [None if raw or layer.band.radiometry is None else layer.band.radiometry.quantity for layer in layers]
     facts["RADIOMETRY"] = " and ".join(dict.fromkeys(q for q in quantities if q is not None))
+    sources = [] if raw else [b.radiometry.told_by for layer in layers if (b := layer.band).radiometry is not None]
+    facts["RADIOMETRY_SOURCE"] = " and ".join(dict.fromkeys(sources))
     dataset.update_tags(**{k: v for k, v in facts.items() if v})
     if any(quantities):
         dataset.units = [UNITS[q] if q is not None else "" for q in quantities]

@@ -26,6 +26,9 @@ temperature in degrees Celsius.
 """
 
 
+RadiometrySource = Literal["camera calibration", "light sensor", "panel"]
+
+
 @dataclass(frozen=True)
 class Radiometry:
     """What turns a band's raw numbers into a physical quantity; `pixels.radiometry` has the equation."""
@@ -42,6 +45,8 @@ class Radiometry:
     """Share of the signal that each row has more than the one above it."""
     by_sun: tuple[float, Quantity] | None = None
     """What radiance is to be multiplied by for reflectance, by the light sensor, and which kind of it that gives."""
+    told_by: RadiometrySource = "camera calibration"
+    """What made reflectance of radiance, if anything did."""
 
     @property
     def is_of_light(self) -> bool:

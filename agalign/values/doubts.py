@@ -75,8 +75,8 @@ _BLANK = Remedy(
 _ASKED = Remedy("only the first guess was asked for", "leave --seed and --only-seed out")
 _TEXTURELESS = Remedy(
     "too little in common to hold on to: water, fog, blur or noise in one of the bands",
-    "where the flight has three captures with texture its rig places such bands; --model OUT/models/… of an earlier "
-    "flight of the camera does so from the first capture on",
+    "take part with all bands and the default reference, which hold most; where three captures of the flight have "
+    "texture its rig places such bands, and --model OUT/models/… of an earlier flight does so from the first on",
 )
 _UNLIKE = Remedy(
     "the bands do not show the same thing",

@@ -1,8 +1,10 @@
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -115,3 +117,21 @@ def test_an_alignment_where_the_rig_cannot_be_is_not_believed(five: Path, model:
     assert found["NIR"].doubts[0].kind == "unexpected_px"
     assert found["NIR"].doubts[0].value == pytest.approx(25, abs=3)
     assert found["Red"].status == "aligned"
+
+
+def test_a_band_that_shows_itself_turned_is_not_placed_by_the_rig(
+    five: Path, model: FlightModel, tmp_path: Path
+) -> None:
+    """No rig turns a lens: where the rig says is not where such an image lies, and it must not count as delivered."""
+    copy = tmp_path / "five"
+    shutil.copytree(five, copy)
+    path = copy / "0000SET" / "000" / "IMG_0001_3.tif"
+    with rasterio.open(path, "r+") as dataset:
+        about = cv2.getRotationMatrix2D((199.5, 149.5), 5.0, 1.0)
+        image = cv2.warpAffine(dataset.read(1), about, (400, 300), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        dataset.write(image, 1)
+    capture = next(c for c in discover(copy).captures if c.name == "IMG_0001")
+    found = align_capture_bands(capture, Settings(), model, lambda *_: None)
+    assert found["Red"].status == "failed"
+    assert found["Red"].doubts[0].kind == "unexpected_px"
+    assert found["NIR"].status == "aligned"

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from agalign.capture.band_pair import BandPair, Candidates
-from agalign.capture.seeding import best_seed, find_seed
+from agalign.capture.seeding import best_seed, find_seed, found_turned
 from agalign.capture.tag_seeds import geo_seed
 from agalign.config import SeedSettings, Settings
 from agalign.errors import GeometryError
@@ -117,6 +117,40 @@ def test_landmarks_find_what_is_turned_or_scaled(degrees: float, scale: float) -
     assert isinstance(seed, Seed)
     assert (seed.kind, seed.trusted) == ("match", True)
     assert mean_error_px(seed.fixed_to_moving, geometry.compose(to_turned, SHIFTED), 400, 320) < 2 * scale
+
+
+def pair_turned(degrees: float, candidates: Candidates, known_to_px: dict[str, float] | None = None) -> BandPair:
+    fixed, moving = textured_pair(np.eye(3), 640, 480)
+    image, valid, _ = turned(moving, degrees, 1.0)
+    images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
+    return BandPair.of_images("moving", *images, candidates, Settings(), known_to_px or {})  # type: ignore[arg-type]
+
+
+def test_tags_that_are_wrong_by_a_turn_are_found_out() -> None:
+    """The middle lies where they say, and the peak of the structures agrees: the corners do not."""
+    _, _, truth = turned(np.zeros((480, 640), np.float32), 3.0, 1.0)
+    middle = np.array([(639 / 2, 479 / 2)])
+    ((dx, dy),) = geometry.apply(truth, middle) - middle
+    told: Candidates = {"rig": geometry.translation(dx, dy)}
+    pair = pair_turned(3.0, told, {"rig": 8.0})
+    first = best_seed(pair, told)
+    assert first.trusted, "by the peak alone it looks right"
+    assert pair.is_expected(first.fixed_to_moving)
+    found = find_seed(pair)
+    assert isinstance(found, Seed)
+    assert found.kind == "match"
+    assert mean_error_px(found.fixed_to_moving, truth, 640, 480) < 2
+
+
+def test_a_turn_that_no_rig_has_is_told_from_a_shift() -> None:
+    _, _, truth = turned(np.zeros((480, 640), np.float32), 4.0, 1.0)
+    pair = pair_turned(4.0, {"identity": np.eye(3)})
+    found = found_turned(pair, np.eye(3))
+    assert found is not None
+    assert mean_error_px(found, truth, 640, 480) < 2
+    assert found_turned(pair, truth) is None, "where it fits there is nothing to be found"
+    shifted = geometry.compose(truth, geometry.translation(60, 25))
+    assert found_turned(pair, shifted) is None, "a scene that repeats looks so too"
 
 
 def test_what_a_user_knows_is_not_left_for_landmarks() -> None:

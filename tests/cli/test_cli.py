@@ -350,6 +350,8 @@ def test_indices_of_a_run(aligned: tuple[Path, subprocess.CompletedProcess[str]]
     assert "4 of 4 written" in done.stdout
     assert "raw numbers, not reflectance" in done.stderr
     assert len(list(out.rglob("*_gndvi.tif"))) == len(list(out.rglob("*_ndvi.png"))) == 2
+    misspelt = agalign("ndiv", out)
+    assert (misspelt.returncode, "did you mean 'ndvi'" in misspelt.stderr) == (2, True)
     assert agalign("ndvi", out, "--index", "xyz").returncode == 2
     assert agalign("ndvi", out, "--index", "savi").returncode == 1
     assert agalign("ndvi", out / "nowhere").returncode == 1

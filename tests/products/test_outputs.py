@@ -10,6 +10,7 @@ import rasterio
 import tifffile
 
 import agalign
+from agalign.batch import RunOptions
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.tag_seeds import geo_seed
 from agalign.config import JointSettings, LocalSettings, SeedSettings, Settings, WriteSettings
@@ -149,6 +150,8 @@ def test_ndvi_of_the_synthetic_flight_is_its_truth(tmp_path: Path) -> None:
         assert dataset.dtypes == ("float32",)
         assert np.isnan(dataset.nodata)
         assert dataset.tags()["RADIOMETRY"] == "reflectance"
+    sidecar = json.loads(next((tmp_path / "out").rglob("IMG_0001.json")).read_text())
+    assert sidecar["output"]["radiometry"] == "reflectance by light sensor"
     # Bare soil and full crop of the generator, by their reflectances.
     bare, crop = (0.265 - 0.185) / (0.265 + 0.185), (0.52 - 0.055) / (0.52 + 0.055)
     low, high = np.nanpercentile(value, (5, 95))
@@ -166,6 +169,18 @@ def test_an_index_of_bands_that_are_not_aligned_is_left_out(aligned_capture: Pat
         list(write_indices(tmp_path, [INDICES["ndvi"]])) if not list(tmp_path.rglob("*.json")) else list(
             write_indices(tmp_path / "nowhere", [INDICES["ndvi"]])
         )
+
+
+def test_indices_go_with_the_stack_that_they_were_made_of(aligned_capture: Path, tmp_path: Path) -> None:
+    """An index of raw numbers must not stand beside reflectance."""
+    out = tmp_path / "out"
+    agalign.align_folder(aligned_capture, out, settings=ONLY_SEED)
+    for name in ("field_ndvi.tif", "field_ndvi.png", "field_notes.tif"):
+        (out / name).write_bytes(b"x")
+    agalign.align_folder(aligned_capture, out, settings=ONLY_SEED)
+    assert (out / "field_ndvi.tif").exists(), "nothing was written anew"
+    agalign.align_folder(aligned_capture, out, settings=ONLY_SEED, run=RunOptions(overwrite=True))
+    assert {p.name for p in out.glob("field_*")} == {"field_notes.tif"}
 
 
 def test_geo_seed_between_coordinate_systems() -> None:

@@ -48,7 +48,7 @@ def test_all_previews_of_a_flight_have_a_limit(views: Views, tmp_path: Path, cap
     path = tmp_path / "a.preview.jpg"
     write_preview(views, ["Green", "NIR"], {}, path, preview_bytes(captures))
     assert path.stat().st_size <= preview_bytes(captures)
-    assert captures * preview_bytes(captures) <= max(400_000, 44_000_000)
+    assert captures * preview_bytes(captures) <= 44_000_000
 
 
 def test_images_smaller_than_a_tile_are_shown_as_they_are(tmp_path: Path) -> None:

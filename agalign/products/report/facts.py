@@ -121,6 +121,7 @@ class Facts:
             "position": told.position, "altitude_m": None if sidecar.position is None else sidecar.position.altitude_m,
             "missing": sidecar.missing_bands, "reference": reference.band, "seconds": round(told.seconds, 2),
             "crop": crop, "scale": (1.0, 1.0) if output is None else output.scale,
+            "radiometry": None if output is None else output.radiometry,
             "stack": quote(f"{base}{output.file}") if output is not None and output.file else None,
             "sidecar": quote(f"{base}{sidecar.capture}.json"),
             "picture": quote(picture) if (self.out / picture).is_file() else None,

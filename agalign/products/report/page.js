@@ -17,7 +17,7 @@
  * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
  *   detail: [number, number, number, number], error_full_px: number | null}} Preview
  * @typedef {{label: string, captured_at: string, camera: string, status: string, position: [number, number] | null,
- *   altitude_m: number | null, missing: string[], reference: string, seconds: number,
+ *   radiometry: string | null, altitude_m: number | null, missing: string[], reference: string, seconds: number,
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
  *   picture: string | null, preview: Preview | null, bands: Pair[]}} Capture
  * @typedef {{schema: string, captures: Capture[], shift_step_px: number, lattices: number[][]}} Facts
@@ -182,7 +182,7 @@ function tableBody() {
 
 // ---- the map
 
-const MAP = { width: 900, height: 420, margin: 34 };
+const MAP = { width: 900, height: 420, few: 230, margin: 34 };
 const ONE_PLACE_M = 0.5;
 const STATUS_COLOURS = { ok: "#2f9e61", degraded: "#d98a1b", failed: "#d43c3c" };
 /** @type {Map<Capture, Element>} */
@@ -204,11 +204,13 @@ function drawMap() {
     byId("map").querySelectorAll("label, #map-legend").forEach((part) => { part.remove(); });
     return;
   }
-  const scale = Math.min((MAP.width / 2 - MAP.margin) / reach[0], (MAP.height / 2 - MAP.margin) / reach[1], 200);
-  const at = metres.map(([x, y]) => [MAP.width / 2 + x * scale, MAP.height / 2 - y * scale]);
+  const width = Math.min(MAP.width, Math.max(place.clientWidth, 300));
+  const height = placed.length < 25 ? MAP.few : MAP.height;
+  const scale = Math.min((width / 2 - MAP.margin) / reach[0], (height / 2 - MAP.margin) / reach[1], 200);
+  const at = metres.map(([x, y]) => [width / 2 + x * scale, height / 2 - y * scale]);
   const inTime = placed.map((c, i) => ({ c, at: at[i] })).sort((a, b) => a.c.captured_at.localeCompare(b.c.captured_at));
   const radius = placed.length > 400 ? 4 : placed.length > 60 ? 5.5 : 8;
-  const drawn = svg("svg", { viewBox: `0 0 ${MAP.width} ${MAP.height}`, role: "img", "aria-label": `Positions of ${placed.length} captures; the table below has the same captures` });
+  const drawn = svg("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `Positions of ${placed.length} captures; the table below has the same captures` });
   drawn.append(svg("polyline", { class: "track", points: inTime.map((p) => p.at.map((v) => v.toFixed(1)).join(",")).join(" ") }));
   for (const { c, at: [x, y] } of inTime) {
     const dot = svg("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: radius }, svg("title", {}, c.label));
@@ -216,23 +218,23 @@ function drawMap() {
     dots.set(c, dot);
     drawn.append(dot);
   }
-  drawn.append(...scaleBar(scale));
+  drawn.append(...scaleBar(scale, width, height));
   place.replaceChildren(drawn);
   const colour = byId("map-colour");
   colour.addEventListener("change", colourMap);
   colourMap();
 }
 
-/** @param {number} scale Pixels a metre. */
-function scaleBar(scale) {
+/** @param {number} scale Pixels a metre. @param {number} width @param {number} height */
+function scaleBar(scale, width, height) {
   const power = 10 ** Math.floor(Math.log10(140 / scale));
   const length = [5, 2, 1].map((n) => n * power).find((n) => n * scale <= 140) ?? power;
-  const y = MAP.height - 14;
+  const y = height - 14;
   const name = length >= 1000 ? `${length / 1000} km` : length >= 1 ? `${length} m` : `${Math.round(length * 100)} cm`;
   return [
     svg("path", { class: "scale", d: `M14 ${y}h${(length * scale).toFixed(1)}` }),
     svg("text", { x: 14, y: y - 6 }, name),
-    svg("text", { x: MAP.width - 24, y: 24 }, "N ↑"),
+    svg("text", { x: width - 34, y: 24 }, "N ↑"),
   ];
 }
 
@@ -276,7 +278,7 @@ const FULL_PX = 0.5; // a residual's colour and arrow are full
 /** @type {Record<string, string>} */
 const NOTES = {
   vectors: `What is left of the shift in each window; an arrow of ${FULL_PX} px reaches most of the way to the next window. Grey: none could be measured.`,
-  heat: `What is left of the shift in each window, from blue to red at ${FULL_PX} px.`,
+  heat: `What is left of the shift in each window, full at ${FULL_PX} px.`,
   error: "The error to be expected at every pixel, as far as it is known: the more orange, the larger, full at 0.5 px.",
 };
 const BLINK_MS = 700;
@@ -333,7 +335,7 @@ function heading(capture) {
     return button;
   };
   const where = capture.position === null ? "" : ` · ${capture.position.map((v) => v.toFixed(6)).join(", ")}${capture.altitude_m === null ? "" : `, ${capture.altitude_m.toFixed(0)} m`}`;
-  const files = el("span");
+  const files = el("span", {}, capture.radiometry === null ? "" : ` · ${capture.radiometry}`);
   for (const [file, name] of [[capture.stack, "aligned stack"], [capture.sidecar, "sidecar"], [capture.picture, "picture"]]) {
     if (file !== null) files.append(" · ", el("a", { href: String(file) }, String(name)));
   }
@@ -377,7 +379,7 @@ function pictures(capture) {
     look.split = Number(swipe.value) / 1000;
     setMode("swipe");
   });
-  return [compositeTools(capture), viewTools(capture), el("div", { id: "viewer" }, frame, swipe), el("p", { class: "soft", id: "over-note" }), el("p", { class: "soft hint" }, "Drag the line, or drag the picture; on it the keys + and − zoom, arrows move, 0 shows all, the space bar changes between before and after.")];
+  return [compositeTools(capture), viewTools(capture), el("div", { id: "viewer" }, frame, swipe), el("p", { class: "soft", id: "over-note" }), el("p", { class: "soft hint" }, "Drag the line, or drag the picture. The thin frame is the detail, which is shown at full resolution. On the picture the keys + and − zoom, arrows move, 0 shows all, the space bar changes between before and after.")];
 }
 
 /**
@@ -574,7 +576,8 @@ function paint() {
     pen.fillStyle = "#fff";
     pen.fillRect(middle - 1, 0, 2, high);
   }
-  byId("over-note").textContent = NOTES[look.overlay] ?? "";
+  const keys = ["vectors", "heat"].includes(look.overlay) ? [0, 0.5, 1] : [];
+  byId("over-note").replaceChildren(NOTES[look.overlay] ?? "", " ", ...keys.map((share) => el("span", { class: "key", style: `--key:${ramp(share)}` }, `${(share * FULL_PX).toFixed(2)} px`)));
   const now = look.mode === "blink" ? look.blinking : "";
   byId("tag-left").textContent = now || "before";
   byId("tag-right").textContent = capture.bands.some((b) => b.written) ? "after" : "after: nothing was written";
@@ -637,7 +640,7 @@ function over(pen, capture, at) {
     pen.fillStyle = shift === null ? "#bbb" : ramp(Math.hypot(...shift) / FULL_PX);
     if (look.overlay === "heat") {
       if (shift === null) continue;
-      pen.globalAlpha = 0.55;
+      pen.globalAlpha = 0.75;
       pen.fillRect(x - cell[0], y - cell[1], 2 * cell[0], 2 * cell[1]);
       continue;
     }
@@ -755,10 +758,13 @@ function sentence(pair, reference) {
     const left = pair.residual_px;
     if (left === null) return `${lay}is aligned; no window could measure what is left.`;
     const use = left <= 0.5 ? "fit for indices of single plants" : left <= 1 ? "fit for indices of rows and plots; edges of single leaves may be off" : "fit for averages over an area";
-    return `${lay}is now within ${fixed(left)} px: ${use}.`;
+    const most = pair.residual_p95_px === null ? "" : `, and 95 % within ${fixed(pair.residual_p95_px)} px`;
+    return `${lay}is aligned: half of its windows now lie within ${fixed(left)} px${most}; ${use}.`;
   }
   if (pair.status === "predicted") {
-    return `${lay}is placed by the rig of the flight, to ±${fixed(pair.prediction?.std_px)} px: ${pair.reason ?? "no reason on record"}.`;
+    const std = pair.prediction?.std_px ?? Infinity;
+    const use = std <= 1 ? "fit for indices, within that" : "too far off for indices";
+    return `${lay}is placed by the rig of the flight, to ±${fixed(std)} px (${use}): ${pair.reason ?? "no reason on record"}.`;
   }
   if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason on record"}. It lies at its first guess; leave it out of indices.`;
   return `is lost: ${pair.reason ?? "no reason on record"}. Nothing is written of it.`;

@@ -16,8 +16,8 @@ from agalign.products.report.facts import Told
 from agalign.values import geometry
 
 PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
-_FIELD_FULL_PX, _FIELD_REACH = 0.25, 9.0
-"""An arrow of a lens field is this long at so many px."""
+_FIELD_REACH = 11.0
+"""Of the longest arrow of a lens field."""
 _FIELD_COLUMNS, _FIELD_ROWS = 13, 10
 _LEAST_SPREAD_PX = 0.2
 _MOST_POINTS = 400
@@ -108,7 +108,8 @@ def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...
         return ()
     points = geometry.lattice(*rig.size_px, _FIELD_COLUMNS, _FIELD_ROWS)
     scale = FIELD_WIDTH / rig.size_px[0]
-    begins, reach = points * scale, rig.fields[band](points) * _FIELD_REACH / _FIELD_FULL_PX
+    field = rig.fields[band](points)
+    begins, reach = points * scale, field * _FIELD_REACH / max(float(np.linalg.norm(field, axis=1).max()), 1e-6)
     return tuple((x, y, x + dx, y + dy) for (x, y), (dx, dy) in zip(begins.tolist(), reach.tolist(), strict=True))
 
 
