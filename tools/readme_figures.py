@@ -35,7 +35,7 @@ def main() -> None:
             page.screenshot(path=Path(folder) / "report.png")
             browser.close()
         smaller(Image.open(Path(folder) / "report.png").convert("RGB")).save(
-            FIGURES / "report.jpg", quality=80, optimize=True
+            FIGURES / "report.jpg", quality=72, optimize=True
         )
 
 

@@ -209,7 +209,8 @@ function drawMap() {
   const scale = Math.min((width / 2 - MAP.margin) / reach[0], (height / 2 - MAP.margin) / reach[1], 200);
   const at = metres.map(([x, y]) => [width / 2 + x * scale, height / 2 - y * scale]);
   const inTime = placed.map((c, i) => ({ c, at: at[i] })).sort((a, b) => a.c.captured_at.localeCompare(b.c.captured_at));
-  const radius = placed.length > 400 ? 4 : placed.length > 60 ? 5.5 : 8;
+  const steps = inTime.slice(1).map((p, i) => Math.hypot(p.at[0] - inTime[i].at[0], p.at[1] - inTime[i].at[1])).sort((a, b) => a - b);
+  const radius = Math.min(8, Math.max(2.5, 0.5 * (steps[Math.floor(steps.length / 2)] ?? 8)));
   const drawn = svg("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `Positions of ${placed.length} captures; the table below has the same captures` });
   drawn.append(svg("polyline", { class: "track", points: inTime.map((p) => p.at.map((v) => v.toFixed(1)).join(",")).join(" ") }));
   for (const { c, at: [x, y] } of inTime) {
