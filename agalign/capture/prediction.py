@@ -59,14 +59,15 @@ def with_predictions(
                 checked[pair.name] = replace(alignment, prediction=_in_image_px(prediction, pair))
                 continue
             alignment = replace(alignment, doubts=(Doubt("unexpected_px", off_px, limit_px),))
-        there = _in_image_px(prediction, pair)
-        turned = found_turned(pair, there.fixed_to_moving)
+        predicted = as_predicted(alignment, pair, _in_image_px(prediction, pair))
+        assert predicted.residual is not None
+        turned = found_turned(pair, predicted.fixed_to_moving, predicted.residual)
         if turned is not None:
             off_px = distance_px(pair.in_file_px(turned), prediction.fixed_to_moving, rig.size_px)
             doubt = Doubt("unexpected_px", off_px, check.most_unexpected_px)
             checked[pair.name] = replace(alignment, doubts=(doubt, *alignment.doubts))
             continue
-        checked[pair.name] = as_predicted(alignment, pair, there)
+        checked[pair.name] = predicted
     return checked
 
 

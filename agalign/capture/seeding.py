@@ -72,12 +72,11 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
     return best
 
 
-def found_turned(pair: BandPair, fixed_to_moving: Matrix) -> Matrix | None:
-    """A mapping that landmarks of both images agree on, and their windows better than under the one that is given, and
-    that is turned or scaled beside it, as no rigid camera's bands are; None where there is none. One that is merely
+def found_turned(pair: BandPair, fixed_to_moving: Matrix, under: Residual) -> Matrix | None:
+    """A mapping that landmarks of both images agree on, and their windows better than `under` the one that is given,
+    and that is turned or scaled beside it, as no rigid camera's bands are; None where there is none. One that is merely
     shifted may be a scene that repeats.
     """
-    under = Look.at(pair, pair.mapping(fixed_to_moving)).residual
     if seed_fits(under, pair.reference.settings.check):
         return None
     for found in _matched(pair, None, by_learnt_descriptors=False):

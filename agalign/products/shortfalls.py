@@ -1,6 +1,5 @@
 """What fell short in a run, told once for each cause, with what to try."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from agalign.products.sidecar import BandResult, CaptureResult
@@ -64,14 +63,6 @@ class Shortfalls:
 
     def _put(self, short: Short, cause: Remedy) -> None:
         self._by_cause.setdefault((short.status, cause), Shortfall(short.status, cause)).bands.append(short)
-
-
-def shortfalls_of(captures: Iterable[tuple[str, CaptureResult]]) -> Shortfalls:
-    """Of captures with their labels."""
-    found = Shortfalls()
-    for label, result in captures:
-        found.add(label, result)
-    return found
 
 
 def _remedy_of(band: BandResult) -> Remedy:

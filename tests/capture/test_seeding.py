@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from agalign.capture.band_pair import BandPair, Candidates
+from agalign.capture.evidence import Look
 from agalign.capture.seeding import best_seed, find_seed, found_turned
 from agalign.capture.tag_seeds import geo_seed
 from agalign.config import SeedSettings, Settings
@@ -145,12 +146,16 @@ def test_tags_that_are_wrong_by_a_turn_are_found_out() -> None:
 def test_a_turn_that_no_rig_has_is_told_from_a_shift() -> None:
     _, _, truth = turned(np.zeros((480, 640), np.float32), 4.0, 1.0)
     pair = pair_turned(4.0, {"identity": np.eye(3)})
-    found = found_turned(pair, np.eye(3))
+
+    def turned_beside(mapping: np.ndarray) -> np.ndarray | None:
+        return found_turned(pair, mapping, Look.at(pair, pair.mapping(mapping)).residual)
+
+    found = turned_beside(np.eye(3))
     assert found is not None
     assert mean_error_px(found, truth, 640, 480) < 2
-    assert found_turned(pair, truth) is None, "where it fits there is nothing to be found"
+    assert turned_beside(truth) is None, "where it fits there is nothing to be found"
     shifted = geometry.compose(truth, geometry.translation(60, 25))
-    assert found_turned(pair, shifted) is None, "a scene that repeats looks so too"
+    assert turned_beside(shifted) is None, "a scene that repeats looks so too"
 
 
 def test_what_a_user_knows_is_not_left_for_landmarks() -> None:

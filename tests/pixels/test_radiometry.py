@@ -82,9 +82,11 @@ def test_radiometry_is_what_was_chosen(tmp_path: Path) -> None:
     assert sun is not None
     assert raw == camera
     assert (camera.quantity, sun.quantity) == ("radiance", "reflectance")
+    assert (camera.told_by, sun.told_by) == ("camera calibration", "light sensor")
     assert sun.gain == pytest.approx(camera.gain * np.pi / 0.8)
     panel = by(path, "panel", {"Blue": 2.5}).radiometry
     assert panel is not None
+    assert panel.told_by == "panel"
     assert (panel.quantity, panel.gain) == ("reflectance", pytest.approx(2.5 * camera.gain))
     assert by(path, "panel", {"Green": 2.5}).radiometry is None
     assert by(path, "auto", {"Blue": 2.5}).radiometry == panel
