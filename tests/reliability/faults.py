@@ -583,7 +583,7 @@ FAULTS = (
     Fault("a file that vanishes during the run", vanishing, 3, r"b_nir\.tif: cannot be read \(No such file"),
     Fault("the disk full", full_disk, 3, "the disk is full|cannot be written", ("a",)),
     Fault("a worker killed by SIGKILL", when_begun(kill_worker, "-j", "2", "--timeout", "100"), 3,
-          "its worker process was killed .signal 9", (), 1),
+          "its worker process was killed", (), 1),
     Fault("memory short in the workers", both(when_begun(starve_workers, "-j", "2", "--timeout", "100"), larger), 3,
           "out of memory|killed", ()),
     # Stopped while it hands over what it has done, a worker may be seen as dead before it is seen as late.
