@@ -11,7 +11,7 @@ from agalign.batch.capture import CaptureOutcome, process_capture, quiet
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.align import align_pairs
 from agalign.capture.band_pair import BandPair, Candidates
-from agalign.capture.evidence import with_metrics
+from agalign.capture.verification import with_metrics
 from agalign.config import Settings
 from agalign.errors import InputError
 from agalign.pixels.masks import raster_of
@@ -116,8 +116,8 @@ def align_folder(
     from agalign.products.report import write_pages
 
     source, target = Path(folder), Path(out)
-    found = discover(source, options or DiscoverOptions(skip=(target,)))
+    result = discover(source, options or DiscoverOptions(skip=(target,)))
     start = None if model is None else Path(model)
-    reports = list(run_flight(found, target, settings or Settings(), run, model=start))
+    reports = list(run_flight(result, target, settings or Settings(), run, model=start))
     write_pages(target, _LOG.warning)
     return reports

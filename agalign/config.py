@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from agalign.values.choices import (
-    MOST_RNG_SEED,
+    MAX_RNG_SEED,
     Compression,
     Crop,
     FamilyChoice,
@@ -19,7 +19,7 @@ from agalign.values.choices import (
     SeedKind,
     Sharing,
 )
-from agalign.values.doubts import Doubt
+from agalign.values.issues import Issue
 
 Positive = Annotated[int, Field(gt=0)]
 
@@ -47,7 +47,7 @@ class FastRecipe(Stage):
     batch: Positive = 128
     temperature: float = 0.07
     learning_rate: float = 2e-3
-    most_steps: Positive = 150
+    max_steps: Positive = 150
     warm_up_steps: int = 50
     """Steps on random weights before psi may move."""
     first_updates: Positive = 5
@@ -61,7 +61,7 @@ class FastRecipe(Stage):
     """Held-out retrieval at which learning may stop once psi is at rest."""
     rest_px: float = 0.5
     """psi is at rest when a step moves no corner by more than this, in px of the level."""
-    least_negative_px: float = 8.0
+    min_negative_px: float = 8.0
     """Keypoints closer than this are not negatives of each other."""
     test_keypoints: Positive = 256
     """Held-out keypoints among which retrieval is measured."""
@@ -84,7 +84,7 @@ class FastRecipe(Stage):
     longest_step_px: float = 4.0
     difference_px: float = 0.75
     """Half width of the central differences that give a descriptor's gradient."""
-    most_corner_std_px: float = 0.5
+    max_corner_std_px: float = 0.5
     """A model family is rich enough only while its corners are known this well, px of the level."""
 
 
@@ -92,13 +92,13 @@ class PaperRecipe(Stage):
     """The hyperparameters of Dong et al. 2018, Sec. 5.3, and, said so, what the paper leaves open."""
 
     keypoints: Positive = 4000
-    least_gradient: float = 0.05
+    min_gradient: float = 0.05
     octaves: float = 4.0
     """log2 s is uniform in [0, octaves]."""
     spacing_px: float = 0.25
     """Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. The paper does not say."""
     margin: float = 1.0
-    least_negative_px: float = 16.0
+    min_negative_px: float = 16.0
     """tau: least distance of a negative from the true position. The paper does not say."""
     batch: Positive = 64
     momentum: float = 0.9
@@ -117,7 +117,7 @@ class JointSettings(Stage):
     sharing: Sharing = "pseudo-siamese"
     model_family: FamilyChoice = "auto"
     device: str = "auto"
-    rng_seed: Annotated[int, Field(ge=0, le=MOST_RNG_SEED)] = 0
+    rng_seed: Annotated[int, Field(ge=0, le=MAX_RNG_SEED)] = 0
     fast: FastRecipe = FastRecipe()
     paper: PaperRecipe = PaperRecipe()
     longest_side_px: Positive = 4096
@@ -127,7 +127,7 @@ class JointSettings(Stage):
     is reduced for it"""
     coarse_oversampling: float = 2.0
     """to so many along one of the band's,"""
-    coarse_least_px: Positive = 128
+    coarse_min_px: Positive = 128
     """but to no fewer along its longer side."""
 
 
@@ -140,7 +140,7 @@ class FlightSettings(Stage):
     """How many the network is learnt on, spread over the flight."""
     rig_captures: Positive = 48
     """The rig is learnt on an eighth of the flight, but on no more than these,"""
-    least_rig_captures: Positive = 6
+    min_rig_captures: Positive = 6
     """and on no fewer than these, or all."""
     start: str = ""
     """Fingerprint of the network that theta starts from, where one is given: results depend on it."""
@@ -156,13 +156,13 @@ class SeedSettings(Stage):
     working_px: Positive = 384
     """Longer side of the images on which seeds are scored."""
     smoothing_px: float = 1.0
-    least_overlap: float = 0.2
+    min_overlap: float = 0.2
     """Share of the reference that the moving image must cover for a candidate to be scored."""
     trusted_sigma: float = 12.0
     """Correlation peak, in standard deviations, of a seed that is good to a few pixels. Unrelated images reach 9."""
     trusted_ratio: float = 1.5
     """How far a trusted seed's peak must stand above the second highest."""
-    least_shift_px: float = 0.25
+    min_shift_px: float = 0.25
     """Structure shifts below this, in working px, are noise and leave a candidate as it is."""
 
 
@@ -172,40 +172,40 @@ class CheckSettings(Stage):
     tile_px: Positive = 112
     """Side of the windows in which residual shifts are measured."""
     smoothing_px: float = 1.0
-    least_strength: float = 0.05
+    min_strength: float = 0.05
     """Mean structure below which a window holds nothing to measure."""
-    least_peak_sigma: float = 7.0
+    min_peak_sigma: float = 7.0
     """Correlation peak, in standard deviations of its surface, from which a window's shift is believed."""
-    least_retrieval: float = 0.2
+    min_retrieval: float = 0.2
     """Held-out retrieval; chance is below 0.01, unrelated images reach 0.05."""
-    least_times_chance: float = 5.0
+    min_times_chance: float = 5.0
     """The same in multiples of what guessing gives, where few keypoints could be drawn."""
-    most_residual_px: float = 1.0
+    max_residual_px: float = 1.0
     """Median length of the windows' residual shifts."""
-    least_coverage: float = 0.6
+    min_coverage: float = 0.6
     """Share of the windows with structure in which a shift could be measured."""
-    least_close: float = 0.9
-    """Share of the windows in which a shift was measured where it is at most `most_residual_px`."""
-    least_cluster: Positive = 5
+    min_close: float = 0.9
+    """Share of the windows in which a shift was measured where it is at most `max_residual_px`."""
+    min_cluster: Positive = 5
     """So many windows beside each other that lie farther apart are a place that is not aligned,"""
-    most_cluster: float = 0.04
+    max_cluster: float = 0.04
     """where they are also this share of those measured."""
-    most_rival: float = 0.75
+    max_alias_peak: float = 0.75
     """Height of the next correlation peak over that of the place found, from which the scene is taken to repeat."""
-    least_windows: Positive = 4
-    least_seed_coverage: float = 0.3
-    """The same as `least_coverage` for a seed that is used as it is."""
-    most_seed_residual_px: float = 8.0
-    """The same as `most_residual_px` for a seed that is used as it is."""
-    most_corner_std_px: float = 2.0
+    min_windows: Positive = 4
+    min_seed_coverage: float = 0.3
+    """The same as `min_coverage` for a seed that is used as it is."""
+    max_seed_residual_px: float = 8.0
+    """The same as `max_residual_px` for a seed that is used as it is."""
+    max_corner_std_px: float = 2.0
     """Standard deviation of the mapped corners."""
-    most_unexpected_px: float = 3.0
+    max_unexpected_px: float = 3.0
     """An alignment farther than this from what the flight's rig says is not believed,"""
-    most_unexpected_std: float = 5.0
+    max_unexpected_std: float = 5.0
     """where that is also so many of the prediction's standard deviations."""
     accept_predicted_px: Annotated[float, Field(ge=0)] = 1.0
     """A band whose place the rig predicts this well counts as delivered."""
-    most_snap_px: float = 0.25
+    max_snap_px: float = 0.25
     """An input already aligned is left untouched where the result is within three standard deviations of no change,
     and within this."""
 
@@ -227,23 +227,23 @@ class LocalSettings(Stage):
     scale: LocalScale = LocalScale(window_px=64, lattice_px=48)
     finer_scale: LocalScale = LocalScale(window_px=32, lattice_px=24)
     """For what stands so high above the ground that the first cannot follow it."""
-    most_windows: Positive = 4000
+    max_windows: Positive = 4000
     """In larger images they lie farther apart."""
     smoothness: tuple[float, ...] = (0.3, 1.0, 4.0, 16.0, 64.0)
     """Weights of the field's second differences beside one window's shift, of which the windows left out of a fit
     choose."""
     pull: float = 0.003
     """The same of its own length."""
-    least_spread_px: float = 0.05
+    min_spread_px: float = 0.05
     outlier_spreads: float = 4.0
     """A window that the field misses by so many times what it misses most by has half a vote."""
     reweightings: Positive = 4
     rounds: Positive = 2
-    most_rounds: Positive = 4
+    max_rounds: Positive = 4
     settled_px: float = 0.2
     """Median of what the windows still show, above which there are as many rounds."""
-    least_windows: Positive = 24
-    least_gain_sigma: float = 4.0
+    min_windows: Positive = 24
+    min_gain_sigma: float = 4.0
     """A field is kept where the squared shifts of windows left out of its fit fall by so many standard errors, and
     their 95th percentile does not rise."""
 
@@ -252,10 +252,10 @@ class LocalSettings(Stage):
     def _yes_or_no(cls, value: object) -> object:
         return {True: "always", False: "never"}.get(value, value) if isinstance(value, bool) else value
 
-    def is_wanted_for(self, doubts: tuple[Doubt, ...], *, rig_known: bool) -> bool:
+    def is_wanted_for(self, issues: tuple[Issue, ...], *, rig_known: bool) -> bool:
         """True where a field is to be tried for a result that has these doubts."""
-        mendable = all(d.kind in ("close_windows", "cluster", "residual_px") for d in doubts)
-        return mendable and (self.use == "always" or (self.use == "auto" and (bool(doubts) or not rig_known)))
+        mendable = all(d.kind in ("close_windows", "cluster", "residual_px") for d in issues)
+        return mendable and (self.use == "always" or (self.use == "auto" and (bool(issues) or not rig_known)))
 
 
 class WriteSettings(Stage):

@@ -28,9 +28,9 @@ class GeometryError(AgalignError):
 class NotEnoughTextureError(AgalignError):
     """Too few keypoints lie on the common valid area to learn from."""
 
-    def __init__(self, keypoints: int, least: int) -> None:
-        super().__init__(keypoints, least)
-        self.keypoints, self.least = keypoints, least
+    def __init__(self, keypoints: int, minimum: int) -> None:
+        super().__init__(keypoints, minimum)
+        self.keypoints, self.minimum = keypoints, minimum
 
     def __str__(self) -> str:
         return f"only {self.keypoints} keypoints lie on the common valid area"

@@ -36,8 +36,8 @@ class Case:
     @property
     def rig(self) -> Matrix:
         """The rig's mapping, or identity where no tag tells."""
-        found = rig_seed(self.reference, self.band)
-        return np.eye(3) if found is None else found
+        result = rig_seed(self.reference, self.band)
+        return np.eye(3) if result is None else result
 
     def straight(self) -> tuple[Raster, Raster]:
         """Both images lens-corrected."""

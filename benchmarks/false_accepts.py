@@ -105,13 +105,13 @@ def main() -> None:
         kind = kinds[number % len(kinds)]
         fixed, moving, seed, truth = pair(kind, np.random.default_rng(number))
         began = time.perf_counter()
-        found = agalign.align(fixed, moving, seed=seed)
+        result = agalign.align(fixed, moving, seed=seed)
         error = np.nan
         if truth is not None:
             # The lenses bend the truth by a few pixels, which one homography follows only in part.
-            error = lens_free_error(found.fixed_to_moving, truth, fixed.shape[::-1])
-        tally[kind].append((found.status, error, time.perf_counter() - began))
-        print(f"{number:4d} {kind:28s} {found.status:9s} {error:7.2f} {tally[kind][-1][2]:5.1f} s", flush=True)
+            error = lens_free_error(result.fixed_to_moving, truth, fixed.shape[::-1])
+        tally[kind].append((result.status, error, time.perf_counter() - began))
+        print(f"{number:4d} {kind:28s} {result.status:9s} {error:7.2f} {tally[kind][-1][2]:5.1f} s", flush=True)
     print("| kind | pairs | aligned | seed_only | failed | wrongly aligned | rejected | worst error, px | seconds |")
     print("|---|---|---|---|---|---|---|---|---|")
     for kind in (*GOOD, GRID, *BAD):
@@ -130,11 +130,11 @@ def main() -> None:
         )
 
 
-def lens_free_error(found: np.ndarray, truth: np.ndarray, size: tuple[int, int]) -> float:
+def lens_free_error(result: np.ndarray, truth: np.ndarray, size: tuple[int, int]) -> float:
     """Mean distance in px between two homographies over the middle of the image, where the lenses bend little."""
     points = geometry.lattice(*size, 20, 20)
     middle = points[(np.abs(points - np.divide(size, 2)) < np.multiply(size, 0.3)).all(axis=1)]
-    return float(np.linalg.norm(geometry.apply(found, middle) - geometry.apply(truth, middle), axis=1).mean())
+    return float(np.linalg.norm(geometry.apply(result, middle) - geometry.apply(truth, middle), axis=1).mean())
 
 
 if __name__ == "__main__":

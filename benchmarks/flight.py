@@ -25,8 +25,8 @@ def watched(command: list[str]) -> tuple[resource.struct_rusage, list[tuple[floa
         pid, _, usage = os.wait4(process.pid, os.WNOHANG)
         if pid:
             return usage, held or [(0.0, 0)]
-        found = [holds(p) for p in descendants(process.pid)]
-        held.append((sum(memory for memory, _ in found), sum(files for _, files in found)))
+        result = [holds(p) for p in descendants(process.pid)]
+        held.append((sum(memory for memory, _ in result), sum(files for _, files in result)))
         time.sleep(0.5)
 
 

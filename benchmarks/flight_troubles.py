@@ -33,7 +33,7 @@ def align(flight: Path, out: Path) -> float:
 
 def rows(out: Path, truth: dict) -> list[tuple[str, str, str, float, float]]:
     """(trouble, capture and band, status, median error, error bar) of every moving band that was written."""
-    found = []
+    result = []
     for path in find_sidecars(out):
         sidecar = json.loads(path.read_text())
         known = truth.get(sidecar.get("capture"))
@@ -47,18 +47,18 @@ def rows(out: Path, truth: dict) -> list[tuple[str, str, str, float, float]]:
             if band["status"] == "predicted":
                 bar = band["prediction"]["std_px"]
             label = f"{sidecar['capture']} {band['band']}"
-            found.append((known["trouble"] or "none", label, band["status"], float(np.nanmedian(error)), bar))
-    return found
+            result.append((known["trouble"] or "none", label, band["status"], float(np.nanmedian(error)), bar))
+    return result
 
 
 def report(flight: Path, out: Path) -> None:
     """Print a table of one aligned flight."""
     truth = json.loads((flight / "truth.json").read_text())
-    found = rows(out, truth)
+    result = rows(out, truth)
     print("| trouble | captures | bands | statuses | median error, px | worst error, px | worst error in error bars |")
     print("|---|---|---|---|---|---|---|")
-    for trouble in dict.fromkeys(r[0] for r in found):
-        some = [r for r in found if r[0] == trouble]
+    for trouble in dict.fromkeys(r[0] for r in result):
+        some = [r for r in result if r[0] == trouble]
         errors, bars = np.array([r[3] for r in some]), np.array([r[4] for r in some])
         counts = ", ".join(f"{n} {status}" for status, n in Counter(r[2] for r in some).most_common())
         captures = len({r[1].split()[0] for r in some})
@@ -66,11 +66,11 @@ def report(flight: Path, out: Path) -> None:
         print(f"| {trouble} | {captures} | {len(some)} | {counts} | {np.median(errors):.3f} | {errors.max():.3f} "
               f"| {worst:.1f} |")  # fmt: skip
     wanted = sum(len(c["bands"]) for c in truth.values())
-    wrong = [r for r in found if r[2] == "aligned" and r[3] > WRONG_PX]
-    lost = [r for r in found if r[2] not in ("aligned", "predicted")]
-    predicted = [r for r in found if r[2] == "predicted"]
+    wrong = [r for r in result if r[2] == "aligned" and r[3] > WRONG_PX]
+    lost = [r for r in result if r[2] not in ("aligned", "predicted")]
+    predicted = [r for r in result if r[2] == "predicted"]
     within = [f"{np.mean([r[3] <= k * r[4] for r in predicted]):.0%}" for k in (1, 2)] if predicted else ["-", "-"]
-    print(f"{len(found)} of {wanted} bands written, {len(lost)} neither aligned nor predicted, {len(wrong)} wrongly "
+    print(f"{len(result)} of {wanted} bands written, {len(lost)} neither aligned nor predicted, {len(wrong)} wrongly "
           f"aligned; of the predicted within one error bar {within[0]}, two {within[1]}")  # fmt: skip
     for trouble, label, status, error, bar in wrong + lost:
         print(f"  {label} ({trouble}): {status}, {error:.2f} px, error bar {bar:.2f}")

@@ -59,13 +59,13 @@ def main() -> None:
         off = {"none": 0.0, "good": 0.25 * rng.uniform() * period, "bad": period * rng.integers(1, 4)}[kind]
         seed = geometry.compose(truth, geometry.translation(off * np.cos(angle), off * np.sin(angle)))
         began = time.perf_counter()
-        found = agalign.align(
+        result = agalign.align(
             fixed, moving, seed=None if kind == "none" else seed, seed_std_px=period / 6 if kind == "good" else None
         )
-        error = geometry.corner_error_px(found.fixed_to_moving, truth, *SIZE)
-        table[kind].append((found.status, error, time.perf_counter() - began))
+        error = geometry.corner_error_px(result.fixed_to_moving, truth, *SIZE)
+        table[kind].append((result.status, error, time.perf_counter() - began))
         print(
-            f"{number} {kind:5} period {period:5.1f}  {found.status:9} {error:7.2f} px  {found.reason or ''}",
+            f"{number} {kind:5} period {period:5.1f}  {result.status:9} {error:7.2f} px  {result.reason or ''}",
             flush=True,
         )
     print("\n| seed | pairs | aligned | rightly, to 1 px | wrongly | seconds |\n|---|---|---|---|---|---|")

@@ -43,7 +43,7 @@ def align(flight: Path, out: Path) -> None:
 
 def rows(out: Path, truth: dict, kind: str, lost: set[str]) -> list[Row]:
     """(kind, band, status, error, error bar) of each lost file."""
-    found = []
+    result = []
     for path in find_sidecars(out):
         for band in json.loads(path.read_text())["bands"]:
             if band["file"] not in lost or band["file"] not in truth:
@@ -53,13 +53,13 @@ def rows(out: Path, truth: dict, kind: str, lost: set[str]) -> list[Row]:
             error = float(np.nanmedian(np.linalg.norm(mapping(ties[:, :2]) - ties[:, 2:], axis=1)))
             bar = band["prediction"]["std_px"] if band["prediction"] else float("nan")
             source = f" ({band['prediction']['from']})" if band["prediction"] else ""
-            found.append((kind, f"{path.stem} {band['band']}", band["status"] + source, error, bar))
-    return found
+            result.append((kind, f"{path.stem} {band['band']}", band["status"] + source, error, bar))
+    return result
 
 
 def main() -> None:
     rng = np.random.default_rng(0)
-    found: list[Row] = []
+    result: list[Row] = []
     for flight in map(Path, sys.argv[1:]):
         captures = json.loads((flight / "ties.json").read_text())
         truth = {file: e["ties"] for c in captures.values() for file, e in c["bands"].items()}
@@ -80,12 +80,12 @@ def main() -> None:
                 for name in lost:
                     spoil(next(copy.rglob(name)), "noise" if turn < count else "water", rng)
                 align(copy, out)
-                found += rows(out, truth, f"{flight.name}, {kind}", lost)
+                result += rows(out, truth, f"{flight.name}, {kind}", lost)
     print("| lost | band | what it is called | error at the ties, px | error bar, px |\n|---|---|---|---|---|")
-    for kind, band, status, error, bar in found:
+    for kind, band, status, error, bar in result:
         print(f"| {kind} | {band} | {status} | {error:.3f} | {bar:.3f} |")
-    for kind in dict.fromkeys(r[0] for r in found):
-        errors, bars = (np.array([r[k] for r in found if r[0] == kind]) for k in (3, 4))
+    for kind in dict.fromkeys(r[0] for r in result):
+        errors, bars = (np.array([r[k] for r in result if r[0] == kind]) for k in (3, 4))
         within = [f"{np.mean(errors <= times * bars):.0%}" for times in (1, 2)]
         print(f"{kind}: median {np.median(errors):.3f}, worst {errors.max():.3f} px; within one error bar {within[0]}, "
               f"two {within[1]}")  # fmt: skip

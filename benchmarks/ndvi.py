@@ -32,7 +32,7 @@ def main(captures: int) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder, out = Path(temporary) / "flight", Path(temporary) / "aligned"
         synthetic.make_flight(folder, captures, SIZE_PX)
-        poses, ground, _ = synthetic.lay_out_flight(captures, SIZE_PX)
+        poses, ground, _ = synthetic.plan_flight(captures, SIZE_PX)
         settings = Settings(write=WriteSettings(radiometry="auto"))
         agalign.align_folder(folder, out, settings=settings)
         bands = {b.name: b for b in cameras.BANDS}
@@ -48,8 +48,8 @@ def main(captures: int) -> None:
             errors["before"].append(np.abs(before[window] - truth[window]))
             errors["after"].append(np.abs(after - truth[window]))
     print("| NDVI | median error | mean | 95 % | pixels off by more than 0.1 |\n|---|---|---|---|---|")
-    for name, found in errors.items():
-        all_of = np.concatenate([e[np.isfinite(e)] for e in found])
+    for name, result in errors.items():
+        all_of = np.concatenate([e[np.isfinite(e)] for e in result])
         middle, p95 = np.percentile(all_of, (50, 95))
         print(f"| {name} | {middle:.3f} | {all_of.mean():.3f} | {p95:.3f} | {(all_of > 0.1).mean():.1%} |")
 

@@ -29,12 +29,12 @@ SPLIT_SEED = 2018
 
 
 def pairs_of(folder: Path) -> list[PairFiles]:
-    found = []
+    result = []
     for truth in sorted(folder.glob("GT_*.txt"), key=lambda p: int(p.stem[3:])):
         number = truth.stem[3:]
         images = folder / f"VIS_{number}.png", folder / f"NIR_TF_{number}.png"
-        found.append(PairFiles(number, "aerial", *images, np.loadtxt(truth)))
-    return found
+        result.append(PairFiles(number, "aerial", *images, np.loadtxt(truth)))
+    return result
 
 
 def split(pairs: list[PairFiles]) -> tuple[list[PairFiles], list[PairFiles]]:

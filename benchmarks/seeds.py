@@ -26,20 +26,20 @@ KINDS = ("identity", "rig", "structure", "chosen")
 def seeds_of(pair: BandPair) -> dict[str, PixelMapping]:
     """Mappings between raw px by each kind of seed, and by the one that a run starts from."""
     plain = geometry.overlay(pair.fixed.size_px, pair.moving.size_px)
-    found = {"identity": PixelMapping(plain)}
+    result = {"identity": PixelMapping(plain)}
     if "rig" in pair.candidates:
-        found["rig"] = pair.mapping(pair.candidates["rig"])
+        result["rig"] = pair.mapping(pair.candidates["rig"])
     shifted = best_seed(pair, {"identity": plain})
     if shifted.kind == "structure":
-        found["structure"] = pair.mapping(shifted.fixed_to_moving)
-    found["chosen"] = pair.mapping(best_seed(pair, pair.candidates).fixed_to_moving)
-    return found
+        result["structure"] = pair.mapping(shifted.fixed_to_moving)
+    result["chosen"] = pair.mapping(best_seed(pair, pair.candidates).fixed_to_moving)
+    return result
 
 
 def errors(capture: Capture, ties: dict | None) -> dict[str, list[float]]:
     """Median error of each pair in px, by kind of seed."""
     pairs, _ = read_pairs(capture, Settings())
-    found: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    result: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for pair in pairs:
         known = None if ties is None else ties["bands"].get(pair.bands[0].path.name)
         if ties is not None and known is None:
@@ -48,10 +48,10 @@ def errors(capture: Capture, ties: dict | None) -> dict[str, list[float]]:
             if known is not None:
                 points = np.array(known["ties"])
                 error = np.linalg.norm(mapping(points[:, :2]) - points[:, 2:], axis=1)
-                found[kind].append(float(np.median(error)))
+                result[kind].append(float(np.median(error)))
             else:
-                found[kind].append(pair.reference.windows.residuals(pair.laid(mapping)).median_px)
-    return found
+                result[kind].append(pair.reference.windows.residuals(pair.laid(mapping)).median_px)
+    return result
 
 
 def main(data: Path) -> None:

@@ -71,10 +71,10 @@ def main() -> None:
                 began = time.perf_counter()
                 reference = Reference(images[0][1], settings)
                 pairs_here = [BandPair(name, reference, moving, starts) for name, _, moving, starts in images]
-                found = align_pairs(pairs_here, settings, quiet)
+                result = align_pairs(pairs_here, settings, quiet)
                 seconds += [(time.perf_counter() - began) / len(images)] * len(images)
                 pairs += len(images)
-                for name, alignment in found.items():
+                for name, alignment in result.items():
                     if alignment.status == "aligned":
                         moved = geometry.apply(alignment.fixed_to_moving, ties[name][:, :2])
                         errors.append(np.median(np.linalg.norm(moved - ties[name][:, 2:], axis=1)))

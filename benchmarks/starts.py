@@ -54,8 +54,8 @@ def moved(raster: Raster, shift: float, degrees: float, scale: float) -> tuple[R
 
 
 def ours(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
-    found = agalign.align(fixed.pixels, moving.pixels, fixed_valid=fixed.valid, moving_valid=moving.valid)
-    return found.fixed_to_moving, found.status == "aligned"
+    result = agalign.align(fixed.pixels, moving.pixels, fixed_valid=fixed.valid, moving_valid=moving.valid)
+    return result.fixed_to_moving, result.status == "aligned"
 
 
 def by_sift(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
@@ -66,19 +66,19 @@ def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
     """On the moving image laid over the fixed one: images of other sizes are beyond it."""
     overlay = geometry.overlay(fixed.size_px, moving.size_px)
     laid = cv2.warpPerspective(moving.pixels, overlay, fixed.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    found = elastix_affinity(fixed, Raster(laid, fixed.valid))
-    return None if found is None else geometry.compose(overlay, found), True
+    result = elastix_affinity(fixed, Raster(laid, fixed.valid))
+    return None if result is None else geometry.compose(overlay, result), True
 
 
 METHODS: dict[str, Aligner] = {"agalign": ours, "SIFT + RANSAC": by_sift, "elastix affine": by_elastix}
 
 
-def error_px(case: Case, to_moved: Matrix, found: Matrix | None) -> float:
+def error_px(case: Case, to_moved: Matrix, result: Matrix | None) -> float:
     """Median over the ties that lie in the moved image too, px of the moving file."""
-    if found is None:
+    if result is None:
         return float("inf")
     there = geometry.apply(to_moved, case.ties[:, 2:])
-    off = np.linalg.norm(geometry.apply(found, case.ties[:, :2]) - there, axis=1)
+    off = np.linalg.norm(geometry.apply(result, case.ties[:, :2]) - there, axis=1)
     return float(np.median(off) / np.sqrt(abs(np.linalg.det(to_moved[:2, :2]))))
 
 
@@ -110,9 +110,9 @@ def main() -> None:
                     fixed, moving = case.straight()
                     image, to_moved = moved(moving, *start)
                     began = time.perf_counter()
-                    found, is_sure = METHODS[name](fixed, image)
+                    result, is_sure = METHODS[name](fixed, image)
                     seconds.append(time.perf_counter() - began)
-                    errors.append(error_px(case, to_moved, found))
+                    errors.append(error_px(case, to_moved, result))
                     sure.append(is_sure)
                 off, says = np.array(errors), np.array(sure)
                 hit = off <= FOUND_PX
@@ -137,8 +137,8 @@ def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path)
     across = [(s, 1.0) for s in SHIFTS] + [(0.0, s) for s in SCALES]
     labels = [f"{shift:.0%}" for shift in SHIFTS] + [f"x{scale:g}" for scale in SCALES]
     figure, axes = plt.subplots(1, len(shares), figsize=(5.4 * len(shares), 3.6), sharey=True, squeeze=False)
-    for axis, (name, found) in zip(axes[0], shares.items(), strict=True):
-        table = np.array([[found[shift, turn, scale] for shift, scale in across] for turn in TURNS])
+    for axis, (name, result) in zip(axes[0], shares.items(), strict=True):
+        table = np.array([[result[shift, turn, scale] for shift, scale in across] for turn in TURNS])
         image = axis.imshow(table, cmap="RdYlGn", vmin=0, vmax=1, aspect="auto")
         for (row, column), share in np.ndenumerate(table):
             axis.text(column, row, f"{share:.0%}", ha="center", va="center", fontsize=7)

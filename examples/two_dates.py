@@ -11,12 +11,12 @@ import numpy as np
 import rasterio
 
 from agalign.batch import run_flight
-from agalign.cameras.discover import Flight, captures_onto
+from agalign.cameras.discover import FolderScan, captures_onto
 from agalign.config import FlightSettings, Settings, WriteSettings
 
 earlier, later, target = map(Path, sys.argv[1:4])
 with tempfile.TemporaryDirectory() as folder:
-    pair = Flight(earlier.parent, tuple(captures_onto(earlier, [later])), ())
+    pair = FolderScan(earlier.parent, tuple(captures_onto(earlier, [later])), ())
     settings = Settings(flight=FlightSettings(together=False), write=WriteSettings(crop="none"))
     (report,) = run_flight(pair, Path(folder), settings)
     moving = report.sidecar.bands[1]

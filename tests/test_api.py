@@ -18,38 +18,38 @@ def as_uint8(image: np.ndarray) -> np.ndarray:
 
 def test_two_arrays_without_any_hint() -> None:
     fixed, moving = textured_pair(TRUTH)
-    found = agalign.align(as_uint8(fixed), as_uint8(moving))
-    assert found.status == "aligned"
-    assert found.reason is None
-    assert mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.1
-    assert found.after["mattes_mi"] < found.before["mattes_mi"]
-    assert found.residual is not None
-    assert found.residual.median_px < 0.2
+    result = agalign.align(as_uint8(fixed), as_uint8(moving))
+    assert result.status == "aligned"
+    assert result.reason is None
+    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.1
+    assert result.after["mattes_mi"] < result.before["mattes_mi"]
+    assert result.residual is not None
+    assert result.residual.median_px < 0.2
 
 
 def test_a_seed_and_borders_filled_with_zeros() -> None:
     fixed, moving = textured_pair(TRUTH)
     moving = as_uint8(moving)
     moving[:, :60] = 0
-    found = agalign.align(as_uint8(fixed), moving, seed=geometry.translation(14, -12))
-    assert found.status == "aligned"
-    assert mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
+    result = agalign.align(as_uint8(fixed), moving, seed=geometry.translation(14, -12))
+    assert result.status == "aligned"
+    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
 
 
 def test_rgb_in_either_order_of_axes() -> None:
     fixed, moving = textured_pair(TRUTH)
     rgb = np.stack([as_uint8(fixed), as_uint8(0.5 * fixed), as_uint8(fixed**2)], axis=-1)
     for image in (rgb, np.moveaxis(rgb, -1, 0)):
-        found = agalign.align(image, as_uint8(moving))
-        assert found.status == "aligned"
-        assert mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
+        result = agalign.align(image, as_uint8(moving))
+        assert result.status == "aligned"
+        assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
 
 
 def test_what_is_aligned_stays_untouched() -> None:
     fixed, moving = textured_pair(np.eye(3))
-    found = agalign.align(fixed, moving)
-    assert found.status == "aligned"
-    np.testing.assert_array_equal(found.fixed_to_moving, np.eye(3))
+    result = agalign.align(fixed, moving)
+    assert result.status == "aligned"
+    np.testing.assert_array_equal(result.fixed_to_moving, np.eye(3))
 
 
 @pytest.mark.parametrize(
@@ -64,15 +64,15 @@ def test_what_is_aligned_stays_untouched() -> None:
     ids=["unrelated", "constant", "noise", "nan", "zeros"],
 )
 def test_what_cannot_be_aligned_is_said_so(moving: np.ndarray) -> None:
-    found = agalign.align(textured_image(400, 320), moving)
-    assert found.status in ("failed", "seed_only")
-    assert found.reason
+    result = agalign.align(textured_image(400, 320), moving)
+    assert result.status in ("failed", "seed_only")
+    assert result.reason
 
 
 def test_ten_per_cent_of_overlap() -> None:
     wide, other = textured_pair(np.eye(3), width=760)
-    found = agalign.align(wide[:, :400], other[:, 360:])
-    assert found.status in ("failed", "seed_only")
+    result = agalign.align(wide[:, :400], other[:, 360:])
+    assert result.status in ("failed", "seed_only")
 
 
 def test_bad_arguments_are_told() -> None:
@@ -102,9 +102,9 @@ def test_undeclared_fill_costs_a_good_pair_nothing() -> None:
     fixed, moving = textured_pair(TRUTH)
     spoiled = moving.copy()
     spoiled[60:140, 200:300] = -9999
-    found = agalign.align(fixed, spoiled)
-    assert found.status == "aligned"
-    assert mean_error_px(found.fixed_to_moving, TRUTH, 400, 320) < 0.15
+    result = agalign.align(fixed, spoiled)
+    assert result.status == "aligned"
+    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
 
 
 def test_alignment_takes_one_thread_and_gives_the_others_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,7 +129,7 @@ def test_alignment_takes_one_thread_and_gives_the_others_back(monkeypatch: pytes
 def test_warp_onto_takes_masks() -> None:
     mask = np.zeros((60, 80), bool)
     mask[20:40, 30:60] = True
-    found, valid = agalign.warp_onto(mask, geometry.translation(3, 2), (80, 60))
-    assert found.dtype == bool
-    np.testing.assert_array_equal(found[:58, :77], mask[2:, 3:])
+    result, valid = agalign.warp_onto(mask, geometry.translation(3, 2), (80, 60))
+    assert result.dtype == bool
+    np.testing.assert_array_equal(result[:58, :77], mask[2:, 3:])
     assert valid[:58, :77].all()

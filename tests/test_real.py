@@ -77,12 +77,12 @@ def test_aerial_rgb_nir_from_a_shifted_seed(real_data: Path, number: int) -> Non
     visible = cv2.cvtColor(cv2.imread(str(folder / f"VIS_{number}.png")), cv2.COLOR_BGR2RGB)
     infrared = cv2.imread(str(folder / f"NIR_TF_{number}.png"), cv2.IMREAD_GRAYSCALE)
     truth = np.loadtxt(folder / f"GT_{number}.txt")
-    found = agalign.align(visible, infrared, seed=truth @ geometry.translation(18.1, -18.1))
+    result = agalign.align(visible, infrared, seed=truth @ geometry.translation(18.1, -18.1))
     points = geometry.lattice(512, 512, 40, 40)
     there = geometry.apply(truth, points)
     common = ((there >= 0) & (there <= 511)).all(axis=1)
-    error = np.linalg.norm(geometry.apply(found.fixed_to_moving, points) - there, axis=1)[common].mean()
-    assert found.status == "aligned"
+    error = np.linalg.norm(geometry.apply(result.fixed_to_moving, points) - there, axis=1)[common].mean()
+    assert result.status == "aligned"
     assert error < 0.3
 
 
@@ -129,10 +129,10 @@ def test_the_panel_of_the_row_crop_is_recognised_with_and_without_its_tags(real_
     assert {(b.band.panel.seen_by, b.band.panel.serial) for b in told.bands} == {("tags", "RP04-1826246-SC")}
     bare = replace(capture, bands=tuple(replace(b, panel=None) for b in capture.bands))
     (seen,) = with_panels([bare])
-    for tags, look in zip(told.bands, read_panel(seen, {}).bands, strict=True):
-        assert look.band.panel.seen_by == "QR code"
-        assert look.albedo == pytest.approx(tags.albedo, abs=1e-6)
-        assert look.radiance == pytest.approx(tags.radiance, rel=0.01)
+    for tags, warped_pair in zip(told.bands, read_panel(seen, {}).bands, strict=True):
+        assert warped_pair.band.panel.seen_by == "QR code"
+        assert warped_pair.albedo == pytest.approx(tags.albedo, abs=1e-6)
+        assert warped_pair.radiance == pytest.approx(tags.radiance, rel=0.01)
     assert not any(c.panel for c in with_panels(discover(real_data / "flights/rededge_m_rowcrop").captures))
 
 
@@ -142,9 +142,9 @@ def test_temperature_is_what_the_altum_says_itself(real_data: Path) -> None:
         tags = read_tags(path)
         (band,) = MicaSense().bands(path, tags, probe(path))
         with open_raster(path) as file:
-            found = calibrated(file.read(1), band.radiometry, 0, 0)
+            result = calibrated(file.read(1), band.radiometry, 0, 0)
         said = tags.number("micasense.com/MicaSense", "SceneTemperature")
-        assert found.min() - 1 < said < found.max() + 1
+        assert result.min() - 1 < said < result.max() + 1
 
 
 def test_bananas_from_close_by_with_the_photograph(real_data: Path, tmp_path: Path) -> None:

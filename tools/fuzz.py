@@ -24,7 +24,7 @@ import numpy as np
 import tifffile
 
 SHARES = {"xmp": 0.5, "tags": 0.35, "names": 0.15}
-MOST_SECONDS, MOST_MEGABYTES = 1, 500
+MAX_SECONDS, MAX_MEGABYTES = 1, 500
 LONGEST_BYTES = {"xmp": 20_000, "tags": 30_000, "names": 300}
 SIZE_PX = 32, 24
 
@@ -107,7 +107,7 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
         folder.rmdir()
 
     options = [
-        f"-timeout={MOST_SECONDS}", f"-rss_limit_mb={MOST_MEGABYTES}", f"-max_len={LONGEST_BYTES[target]}",
+        f"-timeout={MAX_SECONDS}", f"-rss_limit_mb={MAX_MEGABYTES}", f"-max_len={LONGEST_BYTES[target]}",
         "-print_final_stats=1", "-verbosity=1",
     ]  # fmt: skip
     test_one = {"xmp": on_xmp, "tags": on_tags, "names": on_names}[target]

@@ -36,15 +36,15 @@ def main() -> None:
             folder = Path(temporary) / str(number)
             make_flight(folder, 1, rng_seed=1000 + number)
             captures += discover(folder).captures
-        subjects = [read_subject(c, Settings())[0] for c in captures]
+        groups = [read_subject(c, Settings())[0] for c in captures]
     for rate, steps in SCHEDULE:
         # psi may move as always, but nothing is ever learnt well enough to stop.
-        recipe = FastRecipe(start="random", learning_rate=rate, most_steps=steps, enough_retrieval=1.0)
+        recipe = FastRecipe(start="random", learning_rate=rate, max_steps=steps, enough_retrieval=1.0)
         settings = JointSettings(sharing="siamese", fast=recipe)
         state = JointState(settings, lambda _, share, rate=rate: print(f"rate {rate:g}: {share:.0%}", flush=True))
         if net is None:
-            net = state.fast_descriptor([1] * (1 + len(subjects[0].moving)))
-        learn(state, subjects, net)
+            net = state.fast_descriptor([1] * (1 + len(groups[0].moving)))
+        learn(state, groups, net)
     save_starter(net, Path(agalign.__file__).parent / "method" / "starter.safetensors")
 
 

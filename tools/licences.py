@@ -77,13 +77,13 @@ def check(wanted: dict[str, tuple[str, str]], table: str) -> list[str]:
         if row and not (row.startswith(f"| {name} | {versions} |") and row.endswith(f"| {groups} |")):
             problems.append(f"docs/licences.md says otherwise of {name}: python tools/licences.py")
     page = PAGE.read_text(encoding="utf-8").lower()
-    for found in sorted({d.name.lower() for d in distributions()}):
+    for result in sorted({d.name.lower() for d in distributions()}):
         try:
-            said = licence(found)
+            said = licence(result)
         except PackageNotFoundError:
             continue
-        if NOT_PERMISSIVE.search(said) and found not in page:
-            problems.append(f"{found} is under {said}: say so in docs/licences.md")
+        if NOT_PERMISSIVE.search(said) and result not in page:
+            problems.append(f"{result} is under {said}: say so in docs/licences.md")
     return problems
 
 

@@ -13,13 +13,13 @@ from agalign.flight.rig import Rig
 from agalign.products.error_map import error_lattice_px, write_error_map
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.indices import INDICES
-from agalign.products.layout import lay_out
+from agalign.products.layout import output_layers
 from agalign.products.pan_sharpen import need_panchromatic, write_pan_sharpened
 from agalign.products.picture import choose_bands, write_picture
 from agalign.products.preview import preview_bytes, write_preview
+from agalign.products.reduced_bands import read_reduced_bands
 from agalign.products.sidecar import PreviewPart, Sidecar, read_sidecar, write_sidecar
 from agalign.products.stac import write_item
-from agalign.products.views import read_views
 from agalign.products.write import Written, band_file_names, write_capture
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
@@ -69,7 +69,7 @@ def pan_sharpened_path(stack: Path) -> Path:
 
 def process_capture(
     capture: Capture, out: Path, settings: Settings, progress: PairProgress = quiet,
-    model: FlightModel | None = None, most_preview_bytes: int = preview_bytes(1),
+    model: FlightModel | None = None, max_preview_bytes: int = preview_bytes(1),
 ) -> CaptureOutcome:  # fmt: skip
     """Align a capture and write its stack and sidecar; a band that cannot be aligned does not stop the others.
 
@@ -91,7 +91,7 @@ def process_capture(
     preview: PreviewPart | None = None
     shortcomings: tuple[str, ...] = ()
     try:
-        preview = _write_pictures(capture, usable, written, stack_path, settings.write, most_preview_bytes)
+        preview = _write_pictures(capture, usable, written, stack_path, settings.write, max_preview_bytes)
     except AgalignError as error:
         # Pictures are a convenience: they must not cost the sidecar.
         shortcomings = (str(error),)
@@ -107,7 +107,7 @@ def process_capture(
 def _write_rasters(
     capture: Capture, usable: Mapping[str, Alignment], stack: Path, settings: WriteSettings, rig: Rig | None
 ) -> Written:
-    layers, grid = lay_out(capture, usable, settings, rig)
+    layers, grid = output_layers(capture, usable, settings, rig)
     written = write_capture(capture, layers, grid, stack, settings)
     if settings.pan_sharpen:
         write_pan_sharpened(capture, usable, pan_sharpened_path(stack), settings, rig)
@@ -118,18 +118,18 @@ def _write_rasters(
 
 def _write_pictures(
     capture: Capture, usable: Mapping[str, Alignment], written: Written | None, stack: Path, settings: WriteSettings,
-    most_bytes: int,
+    max_bytes: int,
 ) -> PreviewPart:  # fmt: skip
     """The picture, where something was written, and the preview: that of a capture which came to nothing shows why."""
     reference = capture.reference
     grid = OutputGrid(0, 0, *reference.size_px) if written is None else written.grid
-    views = read_views(capture, {} if written is None else written.places, grid)
+    views = read_reduced_bands(capture, {} if written is None else written.places, grid)
     if written is not None:
         chosen = choose_bands([b for b in capture.moving if b.name in usable], reference)
         write_picture(views, [b.name for b in chosen], picture_path(stack))
     errors_px = {n: error_lattice_px(a, reference.size_px, grid) for n, a in usable.items()}
     return write_preview(
-        views, [b.name for b in capture.bands], errors_px if settings.error_map else {}, preview_path(stack), most_bytes
+        views, [b.name for b in capture.bands], errors_px if settings.error_map else {}, preview_path(stack), max_bytes
     )
 
 

@@ -8,27 +8,27 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from agalign.capture.align import align_pairs, judge_together
+from agalign.capture.align import align_pairs, verify_together
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.prediction import observed, with_predictions
-from agalign.capture.seeding import find_seed, subjects_of
+from agalign.capture.seeding import find_seed, image_groups
 from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.fingerprint import fingerprint, hashed
 from agalign.flight.groups import camera_key
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
-from agalign.flight.rig import LEAST_CAPTURES, Observation, Rig, median_mapping
-from agalign.judge.local import common_field
+from agalign.flight.rig import MIN_CAPTURES, Observation, Rig, median_mapping
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
 from agalign.method.joint import Results, refine_with
 from agalign.method.starter import start_from
-from agalign.method.state import JointState, Progress, Subject
+from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values.alignment import JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
+from agalign.verify.displacement_field import common_field
 
 _LOG = logging.getLogger(__name__)
 
@@ -53,29 +53,29 @@ def learn_flight(
     if not loaded:
         return None
     state = JointState(settings.joint, progress)
-    subjects = [subject for one in loaded for _, subject in one.subjects]
+    groups = [group for one in loaded for _, group in one.groups]
     bands = _sides(captures[0])
     net = state.fast_descriptor([1] * (1 + len(bands)))
     if start is not None:
         start_from(net, start.net.state_dict())
     try:
-        learn(state, subjects, net, at_once)
+        learn(state, groups, net, at_once)
         with ThreadPoolExecutor(at_once) as pool:
-            refined = iter(list(pool.map(lambda s: refine_with(net, s, settings.joint, progress), subjects)))
+            refined = iter(list(pool.map(lambda s: refine_with(net, s, settings.joint, progress), groups)))
     except (AgalignError, cv2.error) as why_not:
         # What one capture does to the others' learning must not cost the flight: each is learnt alone then.
         _LOG.debug("the flight could not be learnt from: %s", why_not)
         return None
     results = [one.in_order(refined) for one in loaded]
-    found: dict[str, list[Matrix]] = {}
+    outcome: dict[str, list[Matrix]] = {}
     for one, of_capture in zip(loaded, results, strict=True):
         for pair, result in zip(one.pairs, of_capture, strict=True):
             if isinstance(result, JointResult) and result.retrieval >= settings.joint.fast.step_gate:
-                found.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
-    if not found:
+                outcome.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
+    if not outcome:
         return None
     size = captures[0].reference.size_px
-    mappings = {name: median_mapping(matrices, size) for name, matrices in found.items()}
+    mappings = {name: median_mapping(matrices, size) for name, matrices in outcome.items()}
     model = FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings))
     known = {one.capture.label: _Refined(one, of) for one, of in zip(loaded, results, strict=True)}
     rig = _learn_rig(captures, settings, model, known, progress, at_once)
@@ -97,11 +97,11 @@ def _still_holds(model: FlightModel, captures: Sequence[Capture], settings: Sett
         """(bands that are aligned, those of which that the rig foretells)."""
         try:
             pairs, _ = read_pairs(capture, plain, model)
-            found = align_pairs(pairs, plain, lambda *_: None, model, scratch=False)
-            told = with_predictions(pairs, found, rig, capture, settings.check)
+            result = align_pairs(pairs, plain, lambda *_: None, model, scratch=False)
+            told = with_predictions(pairs, result, rig, capture, settings.check)
         except (AgalignError, cv2.error):
             return 0, 0
-        aligned = [told[name] for name, a in found.items() if a.status == "aligned"]
+        aligned = [told[name] for name, a in result.items() if a.status == "aligned"]
         limit_px = settings.check.accept_predicted_px
         foretold = [a for a in aligned if a.prediction is not None and a.prediction.std_px <= limit_px]
         return len(aligned), len(foretold)
@@ -122,8 +122,8 @@ def _learn_rig(
 ) -> Rig | None:  # fmt: skip
     """What captures spread over the flight, refined with its network, have in common; some, by label, are already."""
     stage = settings.flight
-    count = min(stage.rig_captures, max(stage.least_rig_captures, len(captures) // 8))
-    if len(captures) < LEAST_CAPTURES:
+    count = min(stage.rig_captures, max(stage.min_rig_captures, len(captures) // 8))
+    if len(captures) < MIN_CAPTURES:
         return None
     plain = _without_local(settings)
 
@@ -182,15 +182,15 @@ class _Loaded:
     """A capture to learn from."""
 
     capture: Capture
-    subjects: list[tuple[list[int], Subject]]
+    groups: list[tuple[list[int], ImageGroup]]
     """Each with the places of its pairs."""
     pairs: list[BandPair]
     seeds: list[Seed]
 
     def in_order(self, refined: Iterator[Results]) -> Results:
         """The results of its pairs, from those of its subjects."""
-        found = {i: r for places, _ in self.subjects for i, r in zip(places, next(refined), strict=True)}
-        return [found[i] for i in range(len(self.pairs))]
+        result = {i: r for places, _ in self.groups for i, r in zip(places, next(refined), strict=True)}
+        return [result[i] for i in range(len(self.pairs))]
 
     @property
     def shows(self) -> float:
@@ -218,15 +218,15 @@ def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Ref
     """Raises UnreadableFileError where the reference cannot be read."""
     if known is None:
         pairs, _ = read_pairs(capture, settings, model)
-        found = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
+        result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
     else:
         pairs = known.loaded.pairs
         starts = list(zip(pairs, known.loaded.seeds, strict=True))
-        found = dict(judge_together(starts, known.results, model, settings))
+        result = dict(verify_together(starts, known.results, model, settings))
     pairs = [p for p in pairs if p.is_the_rigs]
-    in_file_px = {p.name: found[p.name].between_files(*p.scales) for p in pairs}
+    in_file_px = {p.name: result[p.name].between_files(*p.scales) for p in pairs}
     good = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
-    return _Shown(observed(pairs, found, capture), good)
+    return _Shown(observed(pairs, result, capture), good)
 
 
 def _load(captures: Sequence[Capture], settings: Settings, start: FlightModel | None) -> list[_Loaded]:
@@ -237,9 +237,9 @@ def _load(captures: Sequence[Capture], settings: Settings, start: FlightModel | 
     for stretch in np.array_split(np.arange(len(captures)), min(settings.flight.captures, len(captures))):
         best: _Loaded | None = None
         for k in dict.fromkeys((len(stretch) // 2, 0, len(stretch) - 1)):
-            found = _read(captures[stretch[k]], settings, start)
-            if found is not None and (best is None or found.shows > best.shows):
-                best = found
+            result = _read(captures[stretch[k]], settings, start)
+            if result is not None and (best is None or result.shows > best.shows):
+                best = result
             if best is not None and all(s.trusted for s in best.seeds):
                 break
         if best is not None:
@@ -257,11 +257,11 @@ def _read(capture: Capture, settings: Settings, start: FlightModel | None) -> _L
     except AgalignError:
         return None
     sides = _sides(capture)
-    found = [(p, seed) for p in pairs if p.is_the_rigs and isinstance(seed := find_seed(p, start), Seed)]
-    if not found:
+    result = [(p, seed) for p in pairs if p.is_the_rigs and isinstance(seed := find_seed(p, start), Seed)]
+    if not result:
         return None
-    usable, seeds = [p for p, _ in found], [seed for _, seed in found]
-    return _Loaded(capture, subjects_of(usable, seeds, [sides.index(p.name) + 1 for p in usable]), usable, seeds)
+    usable, seeds = [p for p, _ in result], [seed for _, seed in result]
+    return _Loaded(capture, image_groups(usable, seeds, [sides.index(p.name) + 1 for p in usable]), usable, seeds)
 
 
 def _sides(capture: Capture) -> tuple[str, ...]:

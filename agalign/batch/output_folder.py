@@ -13,7 +13,7 @@ from agalign.errors import OutputError
 from agalign.values.files import remove_partial_files
 
 _LOCK_FILE = ".agalign.lock"
-_LEAST_FREE_BYTES = 1 << 20
+_MIN_FREE_BYTES = 1 << 20
 
 
 def prepare_output(out: Path) -> None:
@@ -29,7 +29,7 @@ def prepare_output(out: Path) -> None:
 
 
 @contextmanager
-def held(out: Path) -> Iterator[None]:
+def locked(out: Path) -> Iterator[None]:
     """The output folder, made and for this run alone. Raises OutputError, also where another run holds it.
 
     The system lets go of the lock of a process that ends, however it does: one that was killed keeps nobody out.
@@ -40,7 +40,7 @@ def held(out: Path) -> Iterator[None]:
     try:
         lock.acquire(blocking=False)
     except (Timeout, RuntimeError):
-        raise OutputError(f"{out}: another run writes there{_holder(path)}; wait for it, or choose -o") from None
+        raise OutputError(f"{out}: another run writes there{_lock_owner(path)}; wait for it, or choose -o") from None
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
     try:
@@ -58,12 +58,12 @@ def held(out: Path) -> Iterator[None]:
 def is_full(out: Path) -> bool:
     """True where nothing more can be written: what follows would fare no better."""
     try:
-        return shutil.disk_usage(out).free < _LEAST_FREE_BYTES
+        return shutil.disk_usage(out).free < _MIN_FREE_BYTES
     except OSError:
         return False
 
 
-def _holder(lock_file: Path) -> str:
+def _lock_owner(lock_file: Path) -> str:
     with suppress(OSError, UnicodeDecodeError):
         text = lock_file.read_text(encoding="utf-8")
         return f" ({text})" if text else ""

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from agalign.batch.capture import discard_outputs, output_paths, paths_written, quiet
 from agalign.batch.learn import learn_flight, learning_fingerprint
-from agalign.batch.output_folder import held, is_full
+from agalign.batch.output_folder import is_full, locked
 from agalign.batch.workers import (
-    MOST_HANDED_OVER,
+    MAX_HANDED_OVER,
     CaptureReport,
     Submit,
     Task,
@@ -24,14 +24,14 @@ from agalign.batch.workers import (
     read_ahead,
     stamp,
 )
-from agalign.cameras.discover import Flight
+from agalign.cameras.discover import FolderScan
 from agalign.capture.align import PairProgress
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
 from agalign.flight.fingerprint import fingerprint
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
-from agalign.flight.panels import PanelReading, factors_for, read_panel, with_height, with_panels
+from agalign.flight.panels import PanelReading, read_panel, reflectance_factors, with_height, with_panels
 from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
@@ -45,7 +45,7 @@ from agalign.values.choices import Layout
 
 _CAPTURES_WORTH_A_PROCESS = 4
 """To start one takes as long as these."""
-MOST_THREADS = 4
+MAX_THREADS = 4
 """Of one process: more wait for the interpreter."""
 
 
@@ -82,7 +82,7 @@ class Listener:
 
 
 def run_flight(
-    flight: Flight, out: Path, settings: Settings, options: RunOptions | None = None,
+    flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None,
     listener: Listener | None = None, model: Path | None = None,
 ) -> Iterator[CaptureReport]:  # fmt: skip
     """Align the captures, yielding each as it is done; those done before are kept.
@@ -99,7 +99,7 @@ def run_flight(
     if known is not None:
         used = settings.flight.model_copy(update={"start": known.fingerprint})
         settings = settings.model_copy(update={"flight": used})
-    with held(out), _recorded(flight, out, settings) as tally:
+    with locked(out), _recorded(flight, out, settings) as tally:
         for report in _reports(flight, out, settings, options, _with_seconds(listener, tally), known):
             tally.add(report.label, report.state, report.result, report.problems)
             if report.state == "done":
@@ -112,7 +112,7 @@ def run_flight(
 
 
 @contextmanager
-def _recorded(flight: Flight, out: Path, settings: Settings) -> Iterator[Tally]:
+def _recorded(flight: FolderScan, out: Path, settings: Settings) -> Iterator[Tally]:
     """A tally that is written at the beginning and at the end of a run, however it ends."""
     tally, began = Tally(), time.monotonic()
     tally.captures["found"] = len(flight.captures)
@@ -141,7 +141,12 @@ def _with_seconds(listener: Listener, tally: Tally) -> Listener:
 
 
 def _reports(
-    flight: Flight, out: Path, settings: Settings, options: RunOptions, listener: Listener, known: FlightModel | None
+    flight: FolderScan,
+    out: Path,
+    settings: Settings,
+    options: RunOptions,
+    listener: Listener,
+    known: FlightModel | None,
 ) -> Iterator[CaptureReport]:
     panels, captures = _panels(flight.captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
@@ -152,7 +157,7 @@ def _reports(
     for group, name in zip(groups, model_names(groups), strict=True):
         mine = []
         for raw in group:
-            capture = with_radiometry(raw, settings.write.radiometry, factors_for(raw, panels))
+            capture = with_radiometry(raw, settings.write.radiometry, reflectance_factors(raw, panels))
             capture = with_height(capture, panels)
             earlier = None if options.overwrite else finished_before(capture, out, settings)
             if earlier is None or (options.retry_failed and earlier.status != "ok"):
@@ -161,16 +166,16 @@ def _reports(
                 yield CaptureReport(capture.label, "kept", earlier, output_paths(capture, out)[1])
         if mine:
             left.append((group, name, mine))
-    with _workers(sum(len(mine) for _, _, mine in left), options, settings) as (submit, most):
+    with _workers(sum(len(mine) for _, _, mine in left), options, settings) as (submit, maximum):
         waiting: list[Task] = []
         for whole, name, mine in left:
-            at_once = min(MOST_THREADS, _cores(options, settings))
+            at_once = min(MAX_THREADS, _cores(options, settings))
             path = _learn(whole, out / "models" / name, settings, listener, known, at_once)
             waiting += [Task(c, out, settings, path, preview_bytes(len(flight.captures))) for c in mine]
         if submit is None:
             yield from _one_by_one(waiting, listener)
         else:
-            yield from done_by(submit, [t.absolute() for t in waiting], most, options.timeout_s)
+            yield from done_by(submit, [t.absolute() for t in waiting], maximum, options.timeout_s)
     if settings.write.stac:
         write_collections(captures, out)
 
@@ -205,7 +210,7 @@ def _workers(captures: int, options: RunOptions, settings: Settings) -> Iterator
     """
     if options.executor is not None:
         executor = options.executor
-        yield lambda task: executor.submit(do_capture, task), MOST_HANDED_OVER
+        yield lambda task: executor.submit(do_capture, task), MAX_HANDED_OVER
         return
     cores, must_end = _cores(options, settings), options.timeout_s is not None
     processes = min(cores, captures if must_end else captures // _CAPTURES_WORTH_A_PROCESS)
@@ -213,7 +218,7 @@ def _workers(captures: int, options: RunOptions, settings: Settings) -> Iterator
         with own_processes(processes, options.timeout_s) as submit:
             yield submit, 2 * processes
         return
-    threads = min(cores, captures, MOST_THREADS)
+    threads = min(cores, captures, MAX_THREADS)
     if threads <= 1:
         yield None, 0
         return
@@ -227,7 +232,7 @@ def _cores(options: RunOptions, settings: Settings) -> int:
     return options.jobs or ((os.cpu_count() or 1) if on_cpu else 1)
 
 
-def _given_model(path: Path, flight: Flight, settings: Settings) -> FlightModel:
+def _given_model(path: Path, flight: FolderScan, settings: Settings) -> FlightModel:
     """The model to start from. Raises ConfigurationError where it is of no use here."""
     if not settings.learns_flights:
         raise ConfigurationError("a model is of use only where one network is learnt for a flight, by recipe fast")
@@ -266,7 +271,7 @@ def _learn(
     return path
 
 
-def _refuse_to_overwrite(flight: Flight, out: Path, layout: Layout) -> None:
+def _refuse_to_overwrite(flight: FolderScan, out: Path, layout: Layout) -> None:
     """Neither an input nor what another capture writes. Raises ConfigurationError."""
     if out.resolve() == flight.folder.resolve():
         raise ConfigurationError(f"{out}: is the folder of the images; choose another output folder with -o")

@@ -40,15 +40,15 @@ from agalign.values.processes import follow_parent, without_interrupt_key
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 _LOG = logging.getLogger(__name__)
-_MOST_READ_AHEAD_BYTES = 64 << 20
+_MAX_READ_AHEAD_BYTES = 64 << 20
 _DASK_ANSWERS_WITHIN_S = 10
 _GIVEN_UP_EXIT_CODE = 75
 _OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
-_MOST_BREAKS = 100
+_MAX_BREAKS = 100
 """Captures that are handed over again in a run because all processes were lost."""
 _CAPTURES_A_PROCESS = 500
 """Libraries keep some kilobytes of each; then a process makes room for a new one."""
-MOST_HANDED_OVER = 1000
+MAX_HANDED_OVER = 1000
 """Captures that wait in an executor at a time: enough for any cluster, and little memory."""
 
 
@@ -107,7 +107,7 @@ class Task:
     out: Path
     settings: Settings
     model: Path | None
-    most_preview_bytes: int = preview_bytes(1)
+    max_preview_bytes: int = preview_bytes(1)
 
     def absolute(self) -> "Task":
         """With absolute paths: workers elsewhere have another working folder."""
@@ -127,7 +127,7 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
         device = task.settings.joint.device
         model = None if task.model is None else loaded_model(task.model, device, stamp(task.model))
         with one_thread(), one_memory_error():
-            outcome = process_capture(task.capture, task.out, task.settings, clock, model, task.most_preview_bytes)
+            outcome = process_capture(task.capture, task.out, task.settings, clock, model, task.max_preview_bytes)
     except AgalignError as error:
         problem = str(error)
     except MemoryError:
@@ -145,20 +145,20 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
 
 
 def done_by(
-    submit: Submit, tasks: Sequence[Task], most: int, timeout_s: float | None = None
+    submit: Submit, tasks: Sequence[Task], maximum: int, timeout_s: float | None = None
 ) -> Iterator[CaptureReport]:
     """Never more than `most` handed over at a time, so that a season's captures do not wait in memory."""
     futures: dict[Future[CaptureReport], Task] = {}
     remaining, breaks = iter(tasks), 0
     try:
-        for task in islice(remaining, most):
+        for task in islice(remaining, maximum):
             futures[submit(task)] = task
         while futures:
             done, _ = wait(futures, return_when=FIRST_COMPLETED)
             for future in done:
                 task = futures.pop(future)
                 broken = not future.cancelled() and isinstance(future.exception(), BrokenExecutor)
-                if broken and breaks < _MOST_BREAKS:
+                if broken and breaks < _MAX_BREAKS:
                     breaks += 1
                     futures[submit(task)] = task
                     continue
@@ -216,8 +216,8 @@ def own_processes(jobs: int, timeout_s: float | None) -> Iterator[Submit]:
             if not started.result().active:  # a process that was killed while it waited breaks a pool
                 started.result().stop()
                 started = meanwhile.submit(new_pool)
-            found: Future[CaptureReport] = started.result().schedule(do_capture, args=(task,), timeout=timeout_s)
-            return found
+            result: Future[CaptureReport] = started.result().schedule(do_capture, args=(task,), timeout=timeout_s)
+            return result
 
         try:
             yield submit
@@ -321,7 +321,7 @@ def read_ahead(capture: Capture) -> None:
     """Bring the files of the capture to come into the system's cache."""
     for path in {b.path for b in capture.bands}:
         with suppress(OSError):
-            if path.stat().st_size <= _MOST_READ_AHEAD_BYTES:
+            if path.stat().st_size <= _MAX_READ_AHEAD_BYTES:
                 path.read_bytes()
 
 

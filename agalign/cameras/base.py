@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import Carrying
+from agalign.cameras.pix4d import TagTransfer
 from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError
 from agalign.pixels.raster import RasterInfo
@@ -35,7 +35,7 @@ class Camera(ABC):
     """Where an id stands that the bands of a capture share."""
     flight_ids: tuple[Name, ...] = ()
     """Where one stands that a flight shares."""
-    carrying: Carrying = Carrying()
+    tag_transfer: TagTransfer = TagTransfer()
     """What becomes of its tags when a band is written on the reference's grid."""
 
     @abstractmethod

@@ -21,7 +21,7 @@ from agalign.errors import AgalignError, ConfigurationError, InputError, NoSuchB
 from agalign.pixels.radiometry import is_physical
 from agalign.pixels.raster import JPEG_SUFFIXES, TIFF_SUFFIXES, RasterInfo, probe
 from agalign.values.capture import Band, CameraIdentity, Capture
-from agalign.values.choices import MOST_MOSAIC_PIXELS, MOST_PIXELS, BandOrder
+from agalign.values.choices import MAX_MOSAIC_PIXELS, MAX_PIXELS, BandOrder
 from agalign.values.files import RUN_FILE
 from agalign.values.processes import follow_parent, without_interrupt_key
 
@@ -40,7 +40,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Flight:
+class FolderScan:
     """Everything found below a folder."""
 
     folder: Path
@@ -84,7 +84,7 @@ class DiscoverOptions:
     """Of the bands in the stacks: as the camera counts them, by wavelength, or by name."""
     skip: tuple[Path, ...] = field(default=())
     """Folders not to look into, such as the output's."""
-    most_pixels: int = MOST_PIXELS
+    max_pixels: int = MAX_PIXELS
     """Images that declare more are refused before anything is made of them."""
     jobs: int = 1
     """Processes that look at files, where these are many; the calling script must be importable then."""
@@ -92,7 +92,7 @@ class DiscoverOptions:
 
 def discover(
     folder: str | Path, options: DiscoverOptions | None = None, progress: Callable[[int, int], None] | None = None
-) -> Flight:
+) -> FolderScan:
     """All captures below `folder`, sorted by folder and name. `progress` gets (files done, files in all).
 
     Raises InputError where the folder does not exist or holds no image, ConfigurationError for a band that no capture
@@ -106,13 +106,13 @@ def discover(
         raise problems[0].error
     if not paths:
         raise InputError(f"{folder}: no .tif, .tiff, .jpg or .jpeg file in it or below it")
-    for number, found in enumerate(_examined(paths, options), start=1):
-        if isinstance(found, _File):
-            if found.bands:
-                files.append(found)
+    for number, result in enumerate(_examined(paths, options), start=1):
+        if isinstance(result, _File):
+            if result.bands:
+                files.append(result)
         # A colour photograph that does not take part does no harm either.
-        elif options.with_rgb or found.path.suffix.lower() in TIFF_SUFFIXES:
-            problems.append(found)
+        elif options.with_rgb or result.path.suffix.lower() in TIFF_SUFFIXES:
+            problems.append(result)
         if progress is not None:
             progress(number, len(paths))
     captures: list[Capture] = []
@@ -129,7 +129,7 @@ def discover(
         raise ConfigurationError(f"{folder}: no capture has a band {' or '.join(map(repr, unknown))}, as --bands asks")
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = _with_missing_bands(_with_unique_names(captures, _names_of_files(captures)))
-    return Flight(folder, tuple(captures), tuple(problems))
+    return FolderScan(folder, tuple(captures), tuple(problems))
 
 
 def _check_folder(folder: Path) -> None:
@@ -146,28 +146,28 @@ def _check_folder(folder: Path) -> None:
 
 
 def captures_onto(
-    reference: Path, moving: Sequence[Path], band: str | None = None, most_pixels: int = MOST_MOSAIC_PIXELS
+    reference: Path, moving: Sequence[Path], band: str | None = None, max_pixels: int = MAX_MOSAIC_PIXELS
 ) -> list[Capture]:
     """Georeferenced images that are to be laid on the grid of another one: of each, a capture of the reference's `band`
     (by default the green one) and of all its own bands, which share one mapping.
 
     Raises UnreadableFileError, InputError where one is not georeferenced, NoSuchBandError.
     """
-    here = _georeferenced_bands(reference, most_pixels)
+    here = _georeferenced_bands(reference, max_pixels)
     fixed = here[_reference_index(here, band, reference)]
     fixed = replace(fixed, name=f"{reference.stem} {fixed.name}")
     captures = []
     for path in moving:
         if path.resolve() == reference.resolve():
             raise InputError(f"{path}: is the reference itself; name the mosaics that are to be laid on it")
-        bands = [fixed, *(replace(b, one_lens=True, companion=False) for b in _georeferenced_bands(path, most_pixels))]
+        bands = [fixed, *(replace(b, one_lens=True, companion=False) for b in _georeferenced_bands(path, max_pixels))]
         taken_at = read_tags(path).captured_at
         captures.append(Capture(path.stem, Path(), tuple(_with_unique_band_names(bands)), 0, captured_at=taken_at))
     return _with_unique_names(captures)
 
 
-def _georeferenced_bands(path: Path, most_pixels: int) -> tuple[Band, ...]:
-    info = probe(path, most_pixels)
+def _georeferenced_bands(path: Path, max_pixels: int) -> tuple[Band, ...]:
+    info = probe(path, max_pixels)
     if info.georeference is None:
         raise InputError(f"{path}: has no coordinates; align images without by 'agalign FOLDER'")
     *_, generic = known_cameras(None)
@@ -177,7 +177,7 @@ def _georeferenced_bands(path: Path, most_pixels: int) -> tuple[Band, ...]:
 def _images(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Problem]]:
     """(the image files below a folder, the folders that cannot be looked into)."""
     skipped = {p.resolve() for p in skip}
-    found: list[Path] = []
+    result: list[Path] = []
     problems: list[Problem] = []
 
     def refused(error: OSError) -> None:
@@ -193,8 +193,8 @@ def _images(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Proble
         )  # fmt: skip
         images = [n for n in names if Path(n).suffix.lower() in _SUFFIXES and not n.startswith(".")]
         images.sort(key=_natural)
-        found.extend(here / n for n in images)
-    return found, problems
+        result.extend(here / n for n in images)
+    return result, problems
 
 
 def _natural(name: str) -> list[tuple[bool, int, str]]:
@@ -244,17 +244,17 @@ def _examined(paths: Sequence[Path], options: DiscoverOptions) -> Iterator["_Fil
 
 def _look_at(paths: Sequence[Path], options: DiscoverOptions) -> list["_File | Problem"]:
     cameras = known_cameras(options.pattern)
-    found: list[_File | Problem] = []
+    result: list[_File | Problem] = []
     for path in paths:
         try:
-            found.append(_examine(path, cameras, options))
+            result.append(_examine(path, cameras, options))
         except UnreadableFileError as error:
-            found.append(Problem(path, error))
-    return found
+            result.append(Problem(path, error))
+    return result
 
 
 def _examine(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> _File:
-    info = probe(path, options.most_pixels)
+    info = probe(path, options.max_pixels)
     tags = read_tags(path)
     # Cameras write one band a file, or photographs: a stack is someone's product, whatever make it carries on.
     *_, generic = cameras
@@ -305,7 +305,7 @@ def _alike(files: Sequence[_File], options: DiscoverOptions) -> list[Problem]:
     if options.pattern is None:
         return []
     first: dict[str, Path] = {}
-    found = []
+    result = []
     for file in files:
         for name in {b.name for b in file.bands}:
             if first.setdefault(name, file.path) != file.path:
@@ -313,8 +313,8 @@ def _alike(files: Sequence[_File], options: DiscoverOptions) -> list[Problem]:
                     f"{file.path}: is band '{name}' of one capture with {first[name].name} by the pattern "
                     f"'{options.pattern}'; give one that tells them apart"
                 )
-                found.append(Problem(file.path, InputError(text)))
-    return found
+                result.append(Problem(file.path, InputError(text)))
+    return result
 
 
 def _capture(folder: Path, files: list[_File], options: DiscoverOptions) -> Capture | Problem:

@@ -20,7 +20,7 @@ import numpy as np
 
 from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import BAND_NAME, CAMERA, Carrying, number_text, spectral
+from agalign.cameras.pix4d import BAND_NAME, CAMERA, TagTransfer, number_text, spectral
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import GeometryError
 from agalign.pixels.raster import RasterInfo
@@ -48,12 +48,12 @@ _VIGNETTING: Name = (_DJI, "VignettingData")
 _TO_COLOUR: Name = (_DJI, "DewarpHMatrix")
 
 
-class _Carrying(Carrying):
-    geometry = Carrying.geometry | {
+class _TagTransfer(TagTransfer):
+    geometry = TagTransfer.geometry | {
         *_CENTRE, *_RELATIVE_CENTRE, _DEWARP_DATA, _FOCAL_LENGTH_PX, _H_MATRIX, _DEWARP_FLAG, _TO_COLOUR,
     }  # fmt: skip
-    of_the_sensor = Carrying.of_the_sensor | {_VIGNETTING}
-    radiometry = Carrying.radiometry | {(_DJI, "BlackLevel")}
+    of_the_sensor = TagTransfer.of_the_sensor | {_VIGNETTING}
+    radiometry = TagTransfer.radiometry | {(_DJI, "BlackLevel")}
     in_px = (_FOCAL_LENGTH_PX, *_RELATIVE_CENTRE)
 
     def put_geometry(self, packet: Packet, theirs: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
@@ -80,7 +80,7 @@ class Dji(Camera):
 
     name = "DJI"
     capture_ids = (_CAPTURE_UUID,)
-    carrying = _Carrying()
+    tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.upper() == "DJI" or _CAPTURE_UUID in tags.xmp

@@ -42,14 +42,14 @@ class Generic(Camera):
             return colour_bands(path, info)
         own_name = tags.text(*BAND_NAME) or self.split(path)[1]
         indexes = [i for i in range(1, len(info.dtypes) + 1) if i != info.alpha_index]
-        found = []
+        result = []
         for i in indexes:
             name = info.descriptions[i - 1] or (own_name if len(indexes) == 1 else "") or f"band_{i}"
             wavelength = (
                 info.wavelengths_nm[i - 1] or tags.number(CAMERA, "CentralWavelength") or _wavelength_in(own_name)
             )
-            found.append(replace(band_of(path, info, name, i), wavelength_nm=wavelength))
-        return tuple(found)
+            result.append(replace(band_of(path, info, name, i), wavelength_nm=wavelength))
+        return tuple(result)
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         return self.split(path)[0]

@@ -31,12 +31,12 @@ class Mapir(Camera):
         if len(info.dtypes) > 1:
             names = [f"band_{i}" for i in range(1, len(info.dtypes) + 1) if i != info.alpha_index]
             return tuple(replace(band_of(path, info, n, i), one_lens=True) for i, n in enumerate(names, start=1))
-        found = _FILTER.search(tags.model)
-        if not found:
+        result = _FILTER.search(tags.model)
+        if not result:
             file = _FILE.match(path.stem)
             return (band_of(path, info, f"band_{file['serial']}" if file else path.stem),)
-        wavelength = float(found["wavelength"])
-        name = next((n for most, n in _NAMES if wavelength <= most), f"{wavelength:g}nm")
+        wavelength = float(result["wavelength"])
+        name = next((n for maximum, n in _NAMES if wavelength <= maximum), f"{wavelength:g}nm")
         return (replace(band_of(path, info, name), wavelength_nm=wavelength),)
 
     def capture_key(self, path: Path, tags: Tags) -> str:

@@ -17,7 +17,7 @@ from agalign.cameras.pix4d import (
     CAMERA,
     VIGNETTING_CENTRE,
     VIGNETTING_POLYNOMIAL,
-    Carrying,
+    TagTransfer,
     focal_length_px,
     parallax_of,
     perspective_lens,
@@ -47,8 +47,8 @@ _LAYOUT = {
 a twentieth (docs/method.md)."""
 
 
-class _Carrying(Carrying):
-    radiometry = Carrying.radiometry | {_CALIBRATION, (_MICASENSE, "DarkRowValue")}
+class _TagTransfer(TagTransfer):
+    radiometry = TagTransfer.radiometry | {_CALIBRATION, (_MICASENSE, "DarkRowValue")}
 
 
 class MicaSense(Camera):
@@ -57,7 +57,7 @@ class MicaSense(Camera):
     name = "MicaSense"
     capture_ids = (_CAPTURE_ID,)
     flight_ids = ((_MICASENSE, "FlightId"),)
-    carrying = _Carrying()
+    tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "micasense" or _CAPTURE_ID in tags.xmp
@@ -110,12 +110,12 @@ def _irradiance(tags: Tags) -> float | None:
     light sensor measured in its own plane.
     """
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
-    found = [
+    result = [
         (tags.number(_DLS, "HorizontalIrradiance"), scale or 0.01),
         (tags.number(_DLS, "SpectralIrradiance"), scale or 1.0),
         (tags.number(CAMERA, "Irradiance"), scale or 1.0),
     ]
-    return next((value * unit for value, unit in found if value is not None and value * unit > 0), None)
+    return next((value * unit for value, unit in result if value is not None and value * unit > 0), None)
 
 
 def _index_in_name(path: Path) -> str:

@@ -23,7 +23,7 @@ from agalign.cameras.pix4d import (
     FOCAL_LENGTH,
     FOCAL_LENGTH_UNITS,
     MODEL_TYPE,
-    Carrying,
+    TagTransfer,
     number_text,
     perspective_lens,
     principal_point_px,
@@ -42,7 +42,7 @@ _NAMES = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
 _SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
 _WIDEST_RAY = 3.0
 """tan of the largest angle from the axis that is looked for in an image: 72 degrees."""
-_MOST_SHEAR = 1e-3
+_MAX_SHEAR = 1e-3
 """Of a fisheye's affine matrix, relative to its scale: more cannot be expressed and leaves the lens out."""
 
 
@@ -51,8 +51,8 @@ _AFFINE: Name = (CAMERA, "FisheyeAffineMatrix")
 _FISHEYE: tuple[Name, ...] = (_POLYNOMIAL, _AFFINE, (CAMERA, "FisheyeAffineSymmetric"))
 
 
-class _Carrying(Carrying):
-    geometry = Carrying.geometry | {*_FISHEYE}
+class _TagTransfer(TagTransfer):
+    geometry = TagTransfer.geometry | {*_FISHEYE}
     in_px = (_AFFINE,)
     turned_where_orientation_is_3 = True
 
@@ -73,7 +73,7 @@ class Sequoia(Camera):
     name = "Parrot Sequoia"
     capture_ids = (CAPTURE_UUID,)
     flight_ids = (FLIGHT_UUID,)
-    carrying = _Carrying()
+    tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "parrot" or tags.text(CAMERA, "RigName").lower().startswith("sequoia")
@@ -82,7 +82,7 @@ class Sequoia(Camera):
         fisheye = "fisheye" in tags.text(*MODEL_TYPE).lower()
         lens = _fisheye_lens(tags, info) if fisheye else perspective_lens(tags)
         to_camera = np.eye(3)
-        if self.carrying.is_turned(tags):
+        if self.tag_transfer.is_turned(tags):
             lens, to_camera = lens and _upside_down(lens, info), np.diag([-1.0, -1.0, 1.0])
         to_rig = rays_to_rig(lens, rotation(*rig_degrees(tags)) @ to_camera)
         if len(info.dtypes) > 1:
@@ -101,7 +101,7 @@ def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
         return None
     c, d, e, f = affine
     slope = polynomial[1]
-    if not (c > 0 and f > 0 and slope > 0) or polynomial[0] != 0 or max(abs(d), abs(e)) > _MOST_SHEAR * c:
+    if not (c > 0 and f > 0 and slope > 0) or polynomial[0] != 0 or max(abs(d), abs(e)) > _MAX_SHEAR * c:
         return None
     fx, fy = slope * 2 * c / math.pi, slope * 2 * f / math.pi
     cx, cy = centre_px

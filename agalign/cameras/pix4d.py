@@ -1,7 +1,7 @@
 """The tags that most makers share, in the namespace that Pix4D gave them: lens, rig, band, and vignetting.
 
-What they mean for a band that is written on the reference's grid is here too (`Carrying`); a maker with tags of its own
-adds to it.
+What they mean for a band that is written on the reference's grid is here too (`TagTransfer`); a maker with tags
+of its own adds to it.
 """
 
 import math
@@ -32,7 +32,7 @@ VIGNETTING_POLYNOMIAL: Name = (CAMERA, "VignettingPolynomial")
 _PANEL_SERIALS: tuple[Name, ...] = (("micasense.com/MicaSense", "PanelSerial"), (CAMERA, "PanelSerial"))
 _AREA_NUMBERS = 8
 _LONGEST_FOCAL_LENGTH_MM = 100.0
-_MOST_MAGNIFICATION = 1.02
+_MAX_MAGNIFICATION = 1.02
 """Beyond this a polynomial of vignetting in the band's own pixels is dropped."""
 
 FromSource = Callable[[float, float], tuple[float, float]]
@@ -129,7 +129,7 @@ def panel_in(tags: Tags, size_px: tuple[int, int]) -> Panel | None:
 # ---- what becomes of them
 
 
-class Carrying:
+class TagTransfer:
     """How XMP values follow a band onto the reference's grid."""
 
     geometry: frozenset[Name] = frozenset({
@@ -188,7 +188,7 @@ class Carrying:
         here, beside = from_source(*centre), from_source(centre[0] + 1, centre[1])
         magnification = math.dist(here, beside)
         # Written so that nan passes nowhere.
-        if not 1 / _MOST_MAGNIFICATION < magnification < _MOST_MAGNIFICATION:
+        if not 1 / _MAX_MAGNIFICATION < magnification < _MAX_MAGNIFICATION:
             packet.remove([VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL])
             return
         packet.put(VIGNETTING_CENTRE, [number_text(v) for v in grid.px(*here)])

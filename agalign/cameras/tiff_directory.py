@@ -19,9 +19,9 @@ _SIZE = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12:
 _SWAPPED = {**_SIZE, 5: 4, 10: 4}
 """Bytes that a byte order turns round together: a rational is two numbers."""
 _LONGEST_VALUE = 1 << 25
-_MOST_BYTES = 1 << 25
+_MAX_BYTES = 1 << 25
 """Of the tags of one file, which are a few thousand; its pixels are elsewhere."""
-_MOST_ENTRIES = 4096
+_MAX_ENTRIES = 4096
 _TOP = (1 << 32) - 1
 
 
@@ -88,10 +88,10 @@ def read_directories(path: Path) -> dict[int, Directory]:
             return _read_all(file)
     with Image.open(path, formats=("JPEG",)) as image:
         block, packet = image.info.get("exif", b""), image.info.get("xmp", b"")
-    found = _read_all(BytesIO(block[6:])) if block.startswith(b"Exif\0\0") else {0: {}, EXIF: {}, GPS: {}}
+    result = _read_all(BytesIO(block[6:])) if block.startswith(b"Exif\0\0") else {0: {}, EXIF: {}, GPS: {}}
     if packet:
-        found[0][XMP] = byte_string(packet)
-    return found
+        result[0][XMP] = byte_string(packet)
+    return result
 
 
 def check_directories(path: Path) -> None:
@@ -104,7 +104,7 @@ def check_directories(path: Path) -> None:
             if tag in (EXIF, GPS) and kind in _SIZE:
                 place = _turned(value[: _SIZE[kind]], kind, layout.order)
                 declared += sum(e[3] for e in _entries(file, layout, int.from_bytes(place, "little"))[0])
-    if declared > _MOST_BYTES:
+    if declared > _MAX_BYTES:
         raise ValueError(f"its tags declare {declared >> 20} MB")
 
 
@@ -151,12 +151,12 @@ class _Layout:
 def _read_all(file: BinaryIO) -> dict[int, Directory]:
     layout, at, _ = _header(file)
     first, _ = _read_directory(file, layout, at)
-    found = {0: first, EXIF: Directory(), GPS: Directory()}
+    result = {0: first, EXIF: Directory(), GPS: Directory()}
     for tag in (EXIF, GPS):
         if tag in first:
             place = int.from_bytes(first[tag].data[: _SIZE[first[tag].type]], "little")
-            found[tag] = _read_directory(file, layout, place)[0]
-    return found
+            result[tag] = _read_directory(file, layout, place)[0]
+    return result
 
 
 def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
@@ -177,8 +177,8 @@ def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
 def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory, int]:
     """(entries, where the next directory is)."""
     entries, following = _entries(file, layout, at)
-    found: Directory = {}
-    left = _MOST_BYTES
+    result: Directory = {}
+    left = _MAX_BYTES
     for tag, kind, number, length, value in entries:
         if length == 0 or length > min(left, _LONGEST_VALUE):
             continue
@@ -186,8 +186,8 @@ def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory
         if length > layout.inline_bytes:
             file.seek(struct.unpack(layout.order + layout.offset, value)[0])
             value = _exactly(file, length)
-        found[tag] = Entry(kind, number, _turned(value[:length], kind, layout.order))
-    return found, following
+        result[tag] = Entry(kind, number, _turned(value[:length], kind, layout.order))
+    return result, following
 
 
 def _entries(file: BinaryIO, layout: _Layout, at: int) -> tuple[list[tuple[int, int, int, int, bytes]], int]:
@@ -196,16 +196,16 @@ def _entries(file: BinaryIO, layout: _Layout, at: int) -> tuple[list[tuple[int, 
     fixed = struct.calcsize(entry_format)
     file.seek(at)
     (count,) = struct.unpack(layout.order + layout.entries, _exactly(file, struct.calcsize(layout.entries)))
-    if count > _MOST_ENTRIES:
+    if count > _MAX_ENTRIES:
         raise ValueError(f"a directory of {count} tags")
     size = fixed + layout.inline_bytes
     raw = _exactly(file, count * size)
     (following,) = struct.unpack(layout.order + layout.offset, _exactly(file, layout.inline_bytes))
-    found = []
+    result = []
     for start in range(0, len(raw), size):
         tag, kind, number = struct.unpack_from(entry_format, raw, start)
-        found.append((tag, kind, number, _SIZE.get(kind, 0) * number, raw[start + fixed : start + size]))
-    return found, following
+        result.append((tag, kind, number, _SIZE.get(kind, 0) * number, raw[start + fixed : start + size]))
+    return result, following
 
 
 def _write_directory(file: BinaryIO, layout: _Layout, entries: Directory, following: int) -> int:

@@ -60,14 +60,14 @@ class Packet:
         """{(namespace, name): values} from all rdf:Description blocks; the first of two counts. A value is found by
         its own namespace and by those that it lies in.
         """
-        found: dict[Name, tuple[str, ...]] = {}
+        result: dict[Name, tuple[str, ...]] = {}
         for description in self._descriptions():
             attributes = [(tag, (value,)) for tag, value in description.attrib.items()]
             for tag, raw in [*attributes, *((child.tag, _texts(child)) for child in description)]:
                 cleaned = tuple(without_controls(v).strip() for v in raw)
                 for name in _names(tag) if any(cleaned) else ():
-                    found.setdefault(name, cleaned)
-        return found
+                    result.setdefault(name, cleaned)
+        return result
 
     def remove(self, names: Collection[Name]) -> None:
         """Take values out."""

@@ -14,12 +14,12 @@ from agalign.flight.model import FlightModel
 from agalign.pixels.raster import read_for_alignment
 from agalign.pixels.resample import single, warped
 from agalign.values import geometry
-from agalign.values.alignment import LocalField
+from agalign.values.alignment import DisplacementField
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import SeedKind, Space
-from agalign.values.doubts import Doubt
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
+from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
 
 Candidates = Mapping[SeedKind, Matrix]
@@ -27,7 +27,7 @@ Candidates = Mapping[SeedKind, Matrix]
 _STANDARD_DEVIATIONS = 3.0
 _TAGS_STD_PX = 5.0
 """Rig tags are off by 2 px in the median and 12 at most on five cameras (docs/cameras.md)."""
-_LEAST_MODEL_STD_PX = 1.0
+_MIN_MODEL_STD_PX = 1.0
 _PLAINLY_REDUCED = 0.7
 _NOT_REDUCED = (1.0, 1.0), (1.0, 1.0)
 
@@ -49,7 +49,7 @@ class BandPair:
     """Standard deviation of candidates of which one is known: px of the fixed image."""
     is_coarse: bool = False
     """The moving image shows so much less that the reference's is reduced for it."""
-    field: LocalField | None = None
+    field: DisplacementField | None = None
     """Displacements before any homography, px of the fixed image: what the flight's rig knows of the lenses."""
 
     @classmethod
@@ -98,11 +98,11 @@ class BandPair:
         """The moving image, likewise."""
         return self.moving_image if self.space == "undistorted" else replace(self.moving_image, lens=None)
 
-    def mapping(self, fixed_to_moving: Matrix, local: LocalField | None = None) -> PixelMapping:
+    def mapping(self, fixed_to_moving: Matrix, local: DisplacementField | None = None) -> PixelMapping:
         """The complete mapping between the raw pixels of the two images, by all displacements or else the rig's."""
         return PixelMapping(fixed_to_moving, self.fixed.lens, self.moving.lens, local=local or self.field)
 
-    def laid(self, mapping: PixelMapping) -> Raster:
+    def warped_moving(self, mapping: PixelMapping) -> Raster:
         """The moving image, one channel, on the reference's pixels."""
         return warped(single(self.moving_image), mapping, self.fixed.size_px)
 
@@ -130,7 +130,7 @@ class BandPair:
 
 def read_pairs(
     capture: Capture, settings: Settings, model: FlightModel | None = None
-) -> tuple[list[BandPair], dict[str, Doubt]]:
+) -> tuple[list[BandPair], dict[str, Issue]]:
     """(the pairs, one for each lens; {band: why it cannot take part}).
 
     What a flight's `model` knows is tried before what the tags say.
@@ -139,25 +139,25 @@ def read_pairs(
     longest = settings.joint.longest_side_px
     references = {longest: Reference(read_for_alignment(capture.reference, longest), settings)}
     pairs: list[BandPair] = []
-    left_out: dict[str, Doubt] = {}
+    left_out: dict[str, Issue] = {}
     for bands in capture.moving_lenses:
         candidates = seed_candidates(capture.reference, bands[0], settings.seed)
         name = bands[0].name
         if model is not None and name in model.mappings and settings.seed.force is None:
             candidates = {"model": model.mappings[name], **candidates}
         if not candidates:
-            absent = Doubt("no_such_seed", detail=str(settings.seed.force))
+            absent = Issue("no_such_seed", detail=str(settings.seed.force))
             left_out |= dict.fromkeys((b.name for b in bands), absent)
             continue
         try:
             moving = _mean(read_for_alignment(b, longest) for b in bands)
         except AgalignError as error:
-            left_out |= dict.fromkeys((b.name for b in bands), Doubt("unreadable", detail=str(error)))
+            left_out |= dict.fromkeys((b.name for b in bands), Issue("unreadable", detail=str(error)))
             continue
-        most = longest_for(capture.reference, next(iter(candidates.values())), settings.joint)
-        if most not in references:
-            references[most] = Reference(read_for_alignment(capture.reference, most), settings)
-        reference, is_coarse = references[most], most < min(longest, max(capture.reference.size_px))
+        maximum = longest_for(capture.reference, next(iter(candidates.values())), settings.joint)
+        if maximum not in references:
+            references[maximum] = Reference(read_for_alignment(capture.reference, maximum), settings)
+        reference, is_coarse = references[maximum], maximum < min(longest, max(capture.reference.size_px))
         scales = _scale(reference.image, capture.reference), _scale(moving, bands[0])
         down: Candidates = {kind: geometry.rescale(m, *scales) for kind, m in candidates.items()}
         field = None if model is None or model.rig is None else model.rig.fields.get(name)
@@ -175,7 +175,7 @@ def longest_for(reference: Band, fixed_to_moving: Matrix, settings: JointSetting
     if not 0 < ratio < settings.coarse_ratio:
         return settings.longest_side_px
     side = round(settings.coarse_oversampling * ratio * max(reference.size_px))
-    return min(settings.longest_side_px, max(side, settings.coarse_least_px))
+    return min(settings.longest_side_px, max(side, settings.coarse_min_px))
 
 
 def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float]) -> dict[SeedKind, float]:
@@ -185,7 +185,7 @@ def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float
         mean, rig = model.rig.mean[band], model.rig
         # What a rig misses is in px of the band's own file.
         ratio = abs(float(geometry.local_scale(mean, *rig.size_px)[-1]))
-        known["model"] = max(rig.missed_px(band, by_neighbours=False) / ratio, _LEAST_MODEL_STD_PX) * scale[0]
+        known["model"] = max(rig.missed_px(band, by_neighbours=False) / ratio, _MIN_MODEL_STD_PX) * scale[0]
     return known
 
 

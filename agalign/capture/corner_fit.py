@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 _SPREADS = 2.0
 """A window that lies so many times farther out than most has half a vote."""
-_LEAST_SPREAD_PX = 0.05
+_MIN_SPREAD_PX = 0.05
 _REWEIGHTINGS = 6
 _NOTHING = 1e-9
 """Of all that is known: what directions get of which nothing is."""
@@ -39,9 +39,9 @@ def fit_corners(at_px: Array, shifts_px: Array, peaks_sigma: Array, size_px: tup
         mean = np.linalg.lstsq(normal, np.einsum("n,nki,nk->i", weight, design, shifts_px), rcond=None)[0]
         left = shifts_px - design @ mean
         off = np.linalg.norm(left, axis=1)
-        vote = 1 / (1 + (off / (_SPREADS * max(1.4826 * float(np.median(off)), _LEAST_SPREAD_PX))) ** 2)
+        vote = 1 / (1 + (off / (_SPREADS * max(1.4826 * float(np.median(off)), _MIN_SPREAD_PX))) ** 2)
     score = np.einsum("n,nki,nk->ni", weight, design, left)
     # Windows in a line agree, and say nothing of what lies beside it.
     inverse = np.linalg.inv(normal + _NOTHING * np.trace(normal) * np.eye(8))
     disagreement = inverse @ (score.T @ score) @ inverse
-    return CornerFit(mean, np.asarray(disagreement + (_LEAST_SPREAD_PX**2 / np.median(weight)) * inverse))
+    return CornerFit(mean, np.asarray(disagreement + (_MIN_SPREAD_PX**2 / np.median(weight)) * inverse))

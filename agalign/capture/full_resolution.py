@@ -12,7 +12,6 @@ import numpy as np
 
 from agalign.capture.corner_fit import fit_corners
 from agalign.config import CheckSettings
-from agalign.judge.residuals import FixedWindows
 from agalign.pixels.masks import learnable
 from agalign.pixels.raster import open_raster, read_window
 from agalign.pixels.resample import resample_tile
@@ -22,14 +21,15 @@ from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Band
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping, mapping_of
+from agalign.verify.residuals import FixedWindows
 
 _TILE_PX = 640
 _COLUMNS, _ROWS = 8, 6
 """A tile in each cell of the image."""
 _ROUNDS = 3
-_LEAST_WINDOWS = 24
+_MIN_WINDOWS = 24
 _REST_PX = 0.02
-_MOST_STEP_PX = 40.0
+_MAX_STEP_PX = 40.0
 """Of a corner: beyond, the windows contradict what the reduced images say."""
 
 
@@ -42,12 +42,12 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment, chec
     shown = _shifts(reference, moving, mapping_of(reference, moving, best), tiles, check)
     for _ in range(_ROUNDS):
         known = np.isfinite(shown.shifts_px[:, 0])
-        if known.sum() < _LEAST_WINDOWS:
+        if known.sum() < _MIN_WINDOWS:
             return best
         fixed_lens = reference.lens if alignment.space == "undistorted" else None
         at, there = (lens.undistort(fixed_lens, p[known]) for p in (shown.centres_px, _seen_at(shown)))
         fit = fit_corners(at, there - at, shown.peaks_sigma[known], reference.size_px)
-        if not np.abs(fit.mean_px).max() <= _MOST_STEP_PX:
+        if not np.abs(fit.mean_px).max() <= _MAX_STEP_PX:
             return best
         change = geometry.moving_corners(fit.mean_px, *reference.size_px)
         step = replace(best, fixed_to_moving=geometry.compose(best.fixed_to_moving, change))
@@ -99,10 +99,10 @@ def _shifts(
     reference: Band, moving: Band, mapping: PixelMapping, tiles: Sequence[Tile], check: CheckSettings
 ) -> Residual:
     """What the windows of all tiles show, px of the reference's file."""
-    found = list(_in_tiles(reference, moving, mapping, tiles, check))
-    if not found:
+    result = list(_in_tiles(reference, moving, mapping, tiles, check))
+    if not result:
         return Residual.of(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
-    centres, shifts, sigma = (np.concatenate(part) for part in zip(*found, strict=True))
+    centres, shifts, sigma = (np.concatenate(part) for part in zip(*result, strict=True))
     return Residual.of(centres, shifts, sigma)
 
 

@@ -4,22 +4,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.evidence import as_predicted
-from agalign.capture.seeding import found_turned
+from agalign.capture.seeding import find_rotated
+from agalign.capture.verification import as_predicted
 from agalign.config import CheckSettings
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction
 from agalign.values.capture import Capture
-from agalign.values.doubts import Doubt
+from agalign.values.issues import Issue
 
 _PLAINLY_MORE = 5.0
 """Times what guessing tells of held-out patches: there is something in common."""
 
 
-def observed(pairs: Sequence[BandPair], found: Mapping[str, Alignment], capture: Capture) -> Observation:
+def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment], capture: Capture) -> Observation:
     """The mappings of a capture that are aligned, as the rig takes them."""
-    good = {p.name: (p, a) for p in pairs if (a := found[p.name]).status == "aligned" and a.joint is not None}
+    good = {p.name: (p, a) for p in pairs if (a := result[p.name]).status == "aligned" and a.joint is not None}
     return Observation(
         capture.seconds,
         {name: pair.in_file_px(a.fixed_to_moving) for name, (pair, a) in good.items()},
@@ -37,15 +37,15 @@ def _std_there_px(pair: BandPair, alignment: Alignment) -> float:
 
 
 def with_predictions(
-    pairs: Sequence[BandPair], found: Mapping[str, Alignment], rig: Rig, capture: Capture, check: CheckSettings
+    pairs: Sequence[BandPair], result: Mapping[str, Alignment], rig: Rig, capture: Capture, check: CheckSettings
 ) -> dict[str, Alignment]:
     """Each alignment with what the rig says beside it; a band that is not aligned lies where the rig says.
 
     A band that lies where the rig has it impossible is not aligned either: of a scene that repeats, the images agree
     whole periods away. One whose image shows itself turned or scaled is not of this rig, and stays as it was found.
     """
-    known = observed([p for p in pairs if p.is_the_rigs], found, capture)
-    checked = dict(found)
+    known = observed([p for p in pairs if p.is_the_rigs], result, capture)
+    checked = dict(result)
     for pair in pairs:
         alignment = checked[pair.name]
         if pair.name not in rig.mean or not pair.is_the_rigs:
@@ -54,34 +54,34 @@ def with_predictions(
         if pair.name in known.mappings:
             off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
             prediction = replace(prediction, off_px=off_px)
-            limit_px = max(check.most_unexpected_px, check.most_unexpected_std * prediction.std_px)
+            limit_px = max(check.max_unexpected_px, check.max_unexpected_std * prediction.std_px)
             if off_px <= limit_px:
                 checked[pair.name] = replace(alignment, prediction=_in_image_px(prediction, pair))
                 continue
-            alignment = replace(alignment, doubts=(Doubt("unexpected_px", off_px, limit_px),))
+            alignment = replace(alignment, issues=(Issue("unexpected_px", off_px, limit_px),))
         predicted = as_predicted(alignment, pair, _in_image_px(prediction, pair))
         assert predicted.residual is not None
-        turned = found_turned(pair, predicted.fixed_to_moving, predicted.residual)
+        turned = find_rotated(pair, predicted.fixed_to_moving, predicted.residual)
         if turned is not None:
             off_px = distance_px(pair.in_file_px(turned), prediction.fixed_to_moving, rig.size_px)
-            doubt = Doubt("unexpected_px", off_px, check.most_unexpected_px)
-            checked[pair.name] = replace(alignment, doubts=(doubt, *alignment.doubts))
+            issue = Issue("unexpected_px", off_px, check.max_unexpected_px)
+            checked[pair.name] = replace(alignment, issues=(issue, *alignment.issues))
             continue
         checked[pair.name] = predicted
     return checked
 
 
 def worth_learning(
-    pairs: Sequence[BandPair], found: Mapping[str, Alignment], rig: Rig, capture: Capture, check: CheckSettings
+    pairs: Sequence[BandPair], result: Mapping[str, Alignment], rig: Rig, capture: Capture, check: CheckSettings
 ) -> set[str]:
     """The bands that are to be learnt from scratch where the flight's network did not align them: those that show
     something in common with the reference, and that the rig does not place well enough. A low capture shows much that
     the flight has not seen; water shows nothing, and the rig knows where blurred bands lie.
     """
-    known = observed([p for p in pairs if p.is_the_rigs and p.name in found], found, capture)
+    known = observed([p for p in pairs if p.is_the_rigs and p.name in result], result, capture)
     worth = set()
     for pair in pairs:
-        tried = found.get(pair.name)
+        tried = result.get(pair.name)
         if (
             tried is None
             or pair.name not in rig.mean

@@ -4,13 +4,13 @@ from dataclasses import replace
 from functools import cached_property
 
 from agalign.config import LocalScale, Settings
-from agalign.judge.local import LocalRefiner
-from agalign.judge.metrics import FixedSimilarity
-from agalign.judge.residuals import FixedWindows
-from agalign.pixels.landmarks import Landmarks, View, landmarks
+from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
 from agalign.pixels.resample import shrink, single, textured
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values.image import Raster
+from agalign.verify.displacement_field import DisplacementEstimator
+from agalign.verify.metrics import FixedSimilarity
+from agalign.verify.residuals import FixedWindows
 
 
 class Reference:
@@ -19,7 +19,7 @@ class Reference:
     def __init__(self, image: Raster, settings: Settings) -> None:
         self.image = image
         self.settings = settings
-        self._landmarks: dict[View, Landmarks] = {}
+        self._landmarks: dict[LandmarkInput, Landmarks] = {}
 
     @cached_property
     def grey(self) -> Raster:
@@ -56,11 +56,11 @@ class Reference:
         small = shrink(self.grey, self.seed_size_px)
         return windowed_spectra(structure_field(small, self.settings.seed.smoothing_px))
 
-    def landmarks(self, view: View) -> Landmarks:
+    def landmarks(self, source: LandmarkInput) -> Landmarks:
         """What is recognised however a moving image is turned, raw px."""
-        if view not in self._landmarks:
-            self._landmarks[view] = landmarks(self.image, view)
-        return self._landmarks[view]
+        if source not in self._landmarks:
+            self._landmarks[source] = landmarks(self.image, source)
+        return self._landmarks[source]
 
     # ---- for checks and metrics
 
@@ -75,17 +75,17 @@ class Reference:
         return FixedWindows(self.grey.valid, self.structure, self.settings.check)
 
     @cached_property
-    def local(self) -> LocalRefiner:
+    def local(self) -> DisplacementEstimator:
         """Smaller ones, which local displacements are fitted to."""
         return self._local_at(self.settings.local.scale)
 
     @cached_property
-    def finer_local(self) -> LocalRefiner:
+    def finer_local(self) -> DisplacementEstimator:
         """The smallest."""
         return self._local_at(self.settings.local.finer_scale)
 
-    def _local_at(self, scale: LocalScale) -> LocalRefiner:
-        return LocalRefiner(self.grey.valid, self.structure, self.settings.local, self.settings.check, scale)
+    def _local_at(self, scale: LocalScale) -> DisplacementEstimator:
+        return DisplacementEstimator(self.grey.valid, self.structure, self.settings.local, self.settings.check, scale)
 
     @cached_property
     def similarity(self) -> FixedSimilarity:

@@ -7,49 +7,49 @@ import numpy as np
 
 from agalign.capture.band_pair import BandPair, Candidates
 from agalign.capture.corner_fit import fit_corners
-from agalign.capture.evidence import Look
+from agalign.capture.verification import WarpedPair
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
 from agalign.flight.model import FlightModel
-from agalign.judge.verdict import seed_fits
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import match_seed, starter_for_matching
-from agalign.method.state import Subject
-from agalign.pixels.landmarks import VIEWS, agreed_homography, landmarks
+from agalign.method.state import ImageGroup
+from agalign.pixels.landmarks import LANDMARK_INPUTS, agreed_homography, landmarks
 from agalign.pixels.resample import single, textured, warped
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry, lens
 from agalign.values.alignment import Residual, Seed
 from agalign.values.choices import SeedKind, Space
-from agalign.values.doubts import Doubt
 from agalign.values.geometry import Matrix
+from agalign.values.issues import Issue
+from agalign.verify.acceptance import seed_fits
 
 _PLAIN_SIGMA = 120.0
 """A peak that only images reach which lie on each other everywhere: turned by one degree they have one of 60 to 120, by
 three degrees of 17."""
 _CLOSE_PX = 3.0
 """Where nearly all windows lie this close under a match, no better one is looked for."""
-_LEAST_WINDOWS = 12
-_MOST_TURN_DEGREES, _MOST_SCALE = 1.0, 0.02
+_MIN_WINDOWS = 12
+_MAX_TURN_DEGREES, _MAX_SCALE = 1.0, 0.02
 """By which a band may lie otherwise than a rig has it."""
-_MOST_KEYPOINTS = 1000
+_MAX_KEYPOINTS = 1000
 """Where learnt descriptors are the last resort."""
 _SAME_PEAK_PX = 2.0
 """A candidate no farther from the peak than this, in working px, is on its flank."""
 
 
-def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
+def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Issue:
     """The best seed of a pair, or why it can have none. `model` is the network that a `match` is found with."""
     if not pair.reference.is_textured:
-        return Doubt("blank_reference")
+        return Issue("blank_reference")
     if not textured(pair.moving):
-        return Doubt("blank_moving")
+        return Issue("blank_moving")
     candidates = pair.candidates
     if pair.reference.settings.seed.force == "match":
-        found = match_seed(_network(pair, model), pair.fixed, pair.moving)
-        if found is None:
-            return Doubt("no_such_seed", detail="match")
-        candidates = {"match": found}
+        result = match_seed(_network(pair, model), pair.fixed, pair.moving)
+        if result is None:
+            return Issue("no_such_seed", detail="match")
+        candidates = {"match": result}
     best = best_seed(pair, candidates)
     if best.score >= _PLAIN_SIGMA or _is_known(pair):
         return best
@@ -58,9 +58,9 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
     expected = best.trusted and pair.is_expected(best.fixed_to_moving)
     if expected and seed_fits(shown, pair.reference.settings.check):
         return best
-    for found in _matched(pair, model, by_learnt_descriptors=not best.trusted):
-        there = _windows_under(pair, matched := _at_its_place(pair, found))
-        sharpened = _sharpened(pair, found, there)
+    for result in _matched(pair, model, by_learnt_descriptors=not best.trusted):
+        there = _windows_under(pair, matched := _at_its_place(pair, result))
+        sharpened = _sharpened(pair, result, there)
         if sharpened is not None:
             again = _windows_under(pair, other := _at_its_place(pair, sharpened))
             if again.is_better_than(there):
@@ -72,34 +72,36 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Doubt:
     return best
 
 
-def found_turned(pair: BandPair, fixed_to_moving: Matrix, under: Residual) -> Matrix | None:
+def find_rotated(pair: BandPair, fixed_to_moving: Matrix, under: Residual) -> Matrix | None:
     """A mapping that landmarks of both images agree on, and their windows better than `under` the one that is given,
     and that is turned or scaled beside it, as no rigid camera's bands are; None where there is none. One that is merely
     shifted may be a scene that repeats.
     """
     if seed_fits(under, pair.reference.settings.check):
         return None
-    for found in _matched(pair, None, by_learnt_descriptors=False):
-        there = Look.at(pair, pair.mapping(found)).residual
+    for result in _matched(pair, None, by_learnt_descriptors=False):
+        there = WarpedPair.at(pair, pair.mapping(result)).residual
         fits = seed_fits(there, pair.reference.settings.check) and there.is_better_than(under)
-        if fits and _is_turned(geometry.compose(geometry.invert(fixed_to_moving), found), pair.fixed.size_px):
-            return found
+        if fits and _is_rotated_or_scaled(
+            geometry.compose(geometry.invert(fixed_to_moving), result), pair.fixed.size_px
+        ):
+            return result
     return None
 
 
-def _is_turned(matrix: Matrix, size_px: tuple[int, int]) -> bool:
+def _is_rotated_or_scaled(matrix: Matrix, size_px: tuple[int, int]) -> bool:
     """By what a homography does to a step right and a step down in the middle of the image."""
     middle = (np.array(size_px) - 1) / 2
     here, right, down = geometry.apply(matrix, middle + np.array([(0, 0), (1, 0), (0, 1)]))
     angle = np.degrees(np.arctan2(*(right - here)[::-1]))
     scale = np.sqrt(abs(np.linalg.det([right - here, down - here])))
-    return bool(abs(angle) > _MOST_TURN_DEGREES or abs(scale - 1) > _MOST_SCALE)
+    return bool(abs(angle) > _MAX_TURN_DEGREES or abs(scale - 1) > _MAX_SCALE)
 
 
 def _sharpened(pair: BandPair, fixed_to_moving: Matrix, shown: Residual) -> Matrix | None:
     """A mapping moved to where most of the windows have it; None where they are few."""
     known = np.isfinite(shown.shifts_px[:, 0])
-    if known.sum() < _LEAST_WINDOWS:
+    if known.sum() < _MIN_WINDOWS:
         return None
     at, there = (
         lens.undistort(pair.fixed.lens, p[known]) for p in (shown.centres_px, shown.centres_px + shown.shifts_px)
@@ -119,20 +121,20 @@ def _is_known(pair: BandPair) -> bool:
 
 def _matched(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors: bool) -> Iterator[Matrix]:
     """Mappings, however turned, scaled or far apart, that landmarks or learnt descriptors of both images agree on."""
-    for view in VIEWS:
-        here = pair.reference.landmarks(view).undistorted(pair.fixed.lens)
-        there = landmarks(pair.moving, view).undistorted(pair.moving.lens)
-        found = agreed_homography(here, there, pair.fixed.size_px)
-        if found is not None:
-            yield found
+    for source in LANDMARK_INPUTS:
+        here = pair.reference.landmarks(source).undistorted(pair.fixed.lens)
+        there = landmarks(pair.moving, source).undistorted(pair.moving.lens)
+        result = agreed_homography(here, there, pair.fixed.size_px)
+        if result is not None:
+            yield result
     if by_learnt_descriptors:
-        found = match_seed(_network(pair, model), pair.fixed, pair.moving, _MOST_KEYPOINTS)
-        if found is not None:
-            yield found
+        result = match_seed(_network(pair, model), pair.fixed, pair.moving, _MAX_KEYPOINTS)
+        if result is not None:
+            yield result
 
 
 def _windows_under(pair: BandPair, seed: Seed) -> Residual:
-    return Look.at(pair, pair.mapping(seed.fixed_to_moving)).residual
+    return WarpedPair.at(pair, pair.mapping(seed.fixed_to_moving)).residual
 
 
 def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
@@ -140,9 +142,9 @@ def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
     return starter_for_matching(channels) if model is None else model.matching_network(pair.name, channels)
 
 
-def subjects_of(
+def image_groups(
     pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int] = ()
-) -> list[tuple[list[int], Subject]]:
+) -> list[tuple[list[int], ImageGroup]]:
     """What the method works on: the pairs of a capture that see one image of the reference in one space, with their
     seeds and the network's side for each, by default counted; and which of the pairs those are.
     """
@@ -159,10 +161,10 @@ def subjects_of(
     ]  # fmt: skip
 
 
-def _subject(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> Subject:
+def _subject(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> ImageGroup:
     mappings = [s.fixed_to_moving for s in seeds]
     fields = [p.field for p in pairs]
-    return Subject(
+    return ImageGroup(
         pairs[0].fixed, [p.moving for p in pairs], mappings, sides, [s.trusted for s in seeds],
         [p.reach_px for p in pairs], fields=fields if any(f is not None for f in fields) else (),
     )  # fmt: skip
@@ -171,7 +173,7 @@ def _subject(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[i
 def best_seed(pair: BandPair, candidates: Candidates) -> Seed:
     """The candidate under which the structures agree best, or one shifted onto the peak of their correlation.
 
-    Each is scored at no shift and at its best shift; a candidate whose best shift is below `least_shift_px` stays as it
+    Each is scored at no shift and at its best shift; a candidate whose best shift is below `min_shift_px` stays as it
     is. Where the flight's own mapping leaves no doubt, the others are not looked at.
     """
     scored: list[Seed] = []
@@ -197,7 +199,7 @@ def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[See
     reference, settings = pair.reference, pair.reference.settings.seed
     size, scale = reference.seed_size_px, reference.seed_scale
     small_moving = warped(single(pair.moving), pair.mapping(fixed_to_moving), size, scale)
-    if small_moving.valid.mean() < settings.least_overlap:
+    if small_moving.valid.mean() < settings.min_overlap:
         return [Seed(kind, fixed_to_moving, 0.0)]
     spectrum = windowed_spectra(structure_field(small_moving, settings.smoothing_px))
     surface = correlation_surfaces(reference.seed_spectrum, spectrum)
@@ -206,9 +208,9 @@ def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[See
     peak = find_peak(surface, apart_px=max(size) // 16, within_px=within_px)
 
     def seed(kind: SeedKind, matrix: Matrix, sigma: float, rival: float) -> Seed:
-        return Seed(kind, matrix, sigma, sigma, rival, _leaves_no_doubt(sigma, rival, settings))
+        return Seed(kind, matrix, sigma, sigma, rival, _is_unambiguous(sigma, rival, settings))
 
-    if np.hypot(*peak.shift_px) < settings.least_shift_px:
+    if np.hypot(*peak.shift_px) < settings.min_shift_px:
         return [seed(kind, fixed_to_moving, peak.sigma, peak.runner_up_sigma)]
     shift = geometry.translation(peak.shift_px[0] / scale[0], peak.shift_px[1] / scale[1])
     shifted = geometry.compose(fixed_to_moving, shift)
@@ -218,12 +220,12 @@ def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[See
     # The correlation is circular: its peak may lay the images beside each other.
     points = pair.mapping(shifted)(geometry.lattice(*pair.fixed.size_px, 16, 12))
     within = ((points >= 0) & (points <= np.subtract(pair.moving.size_px, 1))).all(axis=1)
-    if within.mean() < settings.least_overlap:
+    if within.mean() < settings.min_overlap:
         return [unmoved]
     return [unmoved, seed("structure", shifted, peak.sigma, peak.runner_up_sigma)]
 
 
-def _leaves_no_doubt(sigma: float, rival: float, settings: SeedSettings) -> bool:
+def _is_unambiguous(sigma: float, rival: float, settings: SeedSettings) -> bool:
     return sigma >= max(settings.trusted_sigma, settings.trusted_ratio * rival)
 
 

@@ -59,7 +59,7 @@ def geo_seed(reference: Band, moving: Band) -> Matrix | None:
         return geometry.compose(geometry.invert(to_corner), map_to_there, here.transform, to_corner)
     points = geometry.lattice(*reference.size_px, 9, 7)
     on_map = transformed(geometry.apply(here.transform, points + 0.5), here.crs_wkt, there.crs_wkt)
-    found, _ = cv2.findHomography(points, geometry.apply(map_to_there, on_map) - 0.5, 0)
-    if found is None or not np.isfinite(found).all():
+    result, _ = cv2.findHomography(points, geometry.apply(map_to_there, on_map) - 0.5, 0)
+    if result is None or not np.isfinite(result).all():
         raise GeometryError(f"{moving.path}: lies where {reference.path.name}'s coordinates do not reach")
-    return geometry.normalised(found)
+    return geometry.normalised(result)

@@ -11,8 +11,8 @@ from agalign.cli.terminal import (
     LogJson,
     Quiet,
     RngSeed,
+    Terminal,
     Verbose,
-    Voice,
     examples,
     exits,
     of_alignment,
@@ -22,7 +22,7 @@ from agalign.cli.terminal import (
 )
 from agalign.errors import ConfigurationError
 from agalign.values.choices import (
-    MOST_PIXELS,
+    MAX_PIXELS,
     BandOrder,
     Compression,
     Crop,
@@ -102,7 +102,7 @@ def align(
     max_pixels: Annotated[
         int,
         of_input(min=1, help="Images that declare more are refused before anything is read."),
-    ] = MOST_PIXELS,
+    ] = MAX_PIXELS,
     seed: Annotated[SeedChoice, of_alignment(help="Start from this kind of coarse alignment only.")] = "auto",
     only_seed: Annotated[
         bool,
@@ -214,8 +214,8 @@ def align(
     log_json: LogJson = False,
 ) -> None:
     """Align every capture below FOLDER."""
-    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice, GOES_ON):
+    terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(terminal, GOES_ON):
         from agalign.batch import RunOptions
         from agalign.cameras.discover import DiscoverOptions
         from agalign.config import (
@@ -253,10 +253,10 @@ def align(
         if stac:
             need_stac()
         load_ahead()
-        flight = find_captures(folder, options, voice)
+        flight = find_captures(folder, options, terminal)
         how = RunOptions(overwrite, jobs, align_panels, retry_failed=retry_failed, timeout_s=timeout)
-        outcome = run(flight, target, settings, voice, how, dask=dask, model=model)
-        raise typer.Exit(conclude(outcome, target, voice))
+        totals = run(flight, target, settings, terminal, how, dask=dask, model=model)
+        raise typer.Exit(conclude(totals, target, terminal))
 
 
 def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
@@ -264,7 +264,7 @@ def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
 
     Raises ConfigurationError.
     """
-    found = []
+    result = []
     for part in band_names(text):
         name, _, number = part.rpartition("=")
         try:
@@ -273,8 +273,8 @@ def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
             value = 0.0
         if not 0 < value <= 1:
             raise ConfigurationError(f"--panel-albedo {text}: '{part}' is no reflectance between 0 and 1")
-        found.append((name.strip().lower(), value))
-    return tuple(found)
+        result.append((name.strip().lower(), value))
+    return tuple(result)
 
 
 def band_names(text: str | None) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import typer
 from rich.table import Table
 
 from agalign._version import __version__
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, Voice, exits, shown
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, Terminal, exits, shown
 
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless", "rasterio", "tifffile", "scikit-image", "pydantic")
 EXTRAS = {
@@ -36,18 +36,18 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
     """Say what this machine has: versions, devices, threads, memory, disk, and what extras would add."""
-    voice = Voice(quiet=False, verbose=False, log_json=False)
-    with exits(voice):
+    terminal = Terminal(quiet=False, verbose=False, log_json=False)
+    with exits(terminal):
         facts = {"machine": _machine(), "disk": _disk(folder), "devices": _devices(), "extras": _extras()}
         problems = _problems(facts)
         if as_json:
             typer.echo(json.dumps(facts | {"problems": problems}, indent=1))
         else:
-            _show(facts, voice)
+            _show(facts, terminal)
             for text in problems:
-                voice.problem(text)
+                terminal.problem(text)
             if not problems:
-                voice.result("nothing is in the way")
+                terminal.result("nothing is in the way")
         raise typer.Exit(EXIT_NOTHING if problems else EXIT_OK)
 
 
@@ -96,11 +96,11 @@ def _devices() -> list[dict[str, Any]]:
 
 def _extras() -> list[dict[str, Any]]:
     """Of each extra what it adds, and which of its libraries are missing."""
-    found = []
+    result = []
     for name, adds in EXTRAS.items():
         missing = [d for d in _needs(name) if _version(d) is None]
-        found.append({"extra": name, "adds": adds, "missing": missing})
-    return found
+        result.append({"extra": name, "adds": adds, "missing": missing})
+    return result
 
 
 def _needs(extra: str) -> list[str]:
@@ -122,7 +122,7 @@ def _problems(facts: dict[str, Any]) -> list[str]:
     return problems
 
 
-def _show(facts: dict[str, Any], voice: Voice) -> None:
+def _show(facts: dict[str, Any], terminal: Terminal) -> None:
     machine, disk = facts["machine"], facts["disk"]
     table = Table("This machine", "", show_lines=False)
     for name, value in machine.items():
@@ -132,9 +132,9 @@ def _show(facts: dict[str, Any], voice: Voice) -> None:
     for device in facts["devices"]:
         threads = f", {device['threads']} threads" if device["threads"] else ""
         table.add_row(f"device {device['device']}", shown(device["problem"] or device["what"] + threads))
-    voice.result(table)
+    terminal.result(table)
     table = Table("Extra", "What it adds", "")
     for row in facts["extras"]:
         how = f"pip install 'agalign[{row['extra']}]'" if row["missing"] else "there"
         table.add_row(row["extra"], row["adds"], shown(how))
-    voice.result(table)
+    terminal.result(table)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from agalign.cli.terminal import LogJson, Quiet, RngSeed, Verbose, Voice, exits
+from agalign.cli.terminal import LogJson, Quiet, RngSeed, Terminal, Verbose, exits
 from agalign.errors import ConfigurationError
 
 Pairs = Annotated[
@@ -50,8 +50,8 @@ def evaluate(
     log_json: LogJson = False,
 ) -> None:
     """Descriptors and homographies on pairs whose truth is known: the paper's protocol."""
-    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice):
+    terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(terminal):
         from agalign.evaluation.image_pairs import find_pairs
         from agalign.evaluation.methods import method_named
         from agalign.evaluation.run import Starts, as_csv, error_table, evaluate, precision_table
@@ -65,13 +65,13 @@ def evaluate(
             for result in evaluate(find_pairs(pairs), named, starts, device, rng_seed):
                 results.append(result)
                 line = f"{result.pair}, {result.method}: mAP {result.average_precision:.3f}, {result.error_px:.3f} px"
-                voice.event("result", line if verbose else "", **vars(result))
+                terminal.event("result", line if verbose else "", **vars(result))
         finally:
             if out is not None and results:
                 write_text(out, as_csv(results))
         for title, rows in (("Mean average precision", precision_table(results)), ("Homography", error_table(results))):
             if len(rows) > 1:
-                voice.result(_table(title, rows))
+                terminal.result(_table(title, rows))
 
 
 def surface(
@@ -88,8 +88,8 @@ def surface(
     log_json: LogJson = False,
 ) -> None:
     """The training loss over misalignments of a pair (the paper's Fig. 2), as a picture."""
-    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice):
+    terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(terminal):
         import numpy as np
 
         from agalign.config import JointSettings, PaperRecipe
@@ -109,11 +109,11 @@ def surface(
         assert pair.fixed_to_moving is not None
 
         def progress(share: float) -> None:
-            voice.event("surface", f"{share:.0%}" if verbose else "", share=round(share, 3))
+            terminal.event("surface", f"{share:.0%}" if verbose else "", share=round(share, 3))
 
-        found = loss_surface(*images, pair.fixed_to_moving, offsets, settings, progress=progress)
-        draw_surface(found, offsets, out)
-        voice.event("surface", f"{out}: {pair.name}", file=str(out))
+        result = loss_surface(*images, pair.fixed_to_moving, offsets, settings, progress=progress)
+        draw_surface(result, offsets, out)
+        terminal.event("surface", f"{out}: {pair.name}", file=str(out))
 
 
 def learn(
@@ -128,8 +128,8 @@ def learn(
     log_json: LogJson = False,
 ) -> None:
     """Learn one descriptor from pairs without labels: those that can be aligned teach it."""
-    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice):
+    terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(terminal):
         from pydantic import ValidationError
 
         from agalign.config import JointSettings, Settings
@@ -146,13 +146,13 @@ def learn(
             nonlocal aligned
             aligned += lesson.status == "aligned"
             text = f"{lesson.name}: {lesson.status}" + (f" ({lesson.reason})" if lesson.reason else "")
-            voice.event("pair", text if verbose or lesson.status != "aligned" else "", **vars(lesson))
+            terminal.event("pair", text if verbose or lesson.status != "aligned" else "", **vars(lesson))
 
         settings = Settings(joint=joint)
-        found = read_rough_pairs(pairs, settings)
-        model = learn_descriptor(found, settings, steps_a_pair=steps, on_pair=on_pair)
+        result = read_rough_pairs(pairs, settings)
+        model = learn_descriptor(result, settings, steps_a_pair=steps, on_pair=on_pair)
         save_model(model, out)
-        voice.event("learnt", f"{out}: learnt from {aligned} of {len(found)} pairs", file=str(out))
+        terminal.event("learnt", f"{out}: learnt from {aligned} of {len(result)} pairs", file=str(out))
 
 
 def _shares(text: str) -> tuple[float, ...]:

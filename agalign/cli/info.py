@@ -17,7 +17,7 @@ from agalign.cli.align import (
     band_names,
 )
 from agalign.cli.run import find_captures
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Voice, exits, in_json, shown
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, exits, in_json, shown
 
 if TYPE_CHECKING:
     from agalign.values.capture import Capture
@@ -46,16 +46,16 @@ def info(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
     """Show what was found: cameras, captures, bands, seeds, and what is missing; of a model, the rig that it knows."""
-    voice = Voice(quiet=False, verbose=False, log_json=False)
-    with exits(voice):
+    terminal = Terminal(quiet=False, verbose=False, log_json=False)
+    with exits(terminal):
         if folder.is_file() and folder.suffix == _MODEL_SUFFIX:
-            _show_model(folder, voice, as_json=as_json)
+            _show_model(folder, terminal, as_json=as_json)
             raise typer.Exit(EXIT_OK)
         from agalign.cameras.discover import DiscoverOptions
         from agalign.flight.panels import with_panels
 
         options = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
-        flight = find_captures(folder, options, voice, silent=as_json)
+        flight = find_captures(folder, options, terminal, silent=as_json)
         rows = [_facts(c) for c in with_panels(flight.captures)]
         if as_json:
             problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
@@ -67,16 +67,18 @@ def info(
                 size = "{width} x {height}".format(**row["bands"][0])
                 cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
                 table.add_row(*(shown(c) for c in cells), shown(", ".join(row["missing_bands"])))
-            voice.result(table)
+            terminal.result(table)
             panels = [row for row in rows if row["panel"] is not None]
             for row in panels:
-                voice.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip()))
-            found = f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {len(flight.problems)} problems"
-            voice.result(found)
+                terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip()))
+            result = (
+                f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {len(flight.problems)} problems"
+            )
+            terminal.result(result)
         raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
 
 
-def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
+def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     """What a model knows of its camera. Raises InputError where it is none."""
     from agalign.flight.model import load_model
     from agalign.flight.rig_file import rig_rows
@@ -90,9 +92,9 @@ def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
         facts = {"model": str(path), "camera": model.camera, "bands": list(model.bands), "rig": rig}
         typer.echo(json.dumps(facts, indent=1))
         return
-    voice.result(shown(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}"))
+    terminal.result(shown(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}"))
     if not rows:
-        voice.result("no rig: too few captures said something of it")
+        terminal.result("no rig: too few captures said something of it")
         return
     table = Table("Band", title="The rig: where each band lies, and how far off it is where only predicted (rms, px)")
     for name in ("Offset of the middle", "Baseline", "By bands", "By neighbours", "By the flight", "Lens field up to"):
@@ -102,9 +104,9 @@ def _show_model(path: Path, voice: Voice, *, as_json: bool) -> None:
         errors = (f"{row[k]:.2f}" for k in ("from_bands_px", "from_neighbours_px", "from_flight_px"))
         field = "none" if row["field_px"] is None else f"{row['field_px']:.2f}"
         table.add_row(shown(row["band"]), f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field)
-    voice.result(table)
+    terminal.result(table)
     shared = ", ".join(factors) or "nothing"
-    voice.result(f"rig learnt on {captures} captures; what the bands of a capture share: {shared}")
+    terminal.result(f"rig learnt on {captures} captures; what the bands of a capture share: {shared}")
 
 
 def _facts(capture: "Capture") -> dict[str, Any]:

@@ -17,9 +17,9 @@ from agalign.cli import doctor as cli_doctor
 from agalign.cli import evaluate as cli_evaluate
 from agalign.cli import info as cli_info
 from agalign.cli.align import Jobs
+from agalign.cli.failures import explain
 from agalign.cli.onto import onto
 from agalign.cli.run import GOES_ON, conclude, find_captures, run
-from agalign.cli.shortfalls import explain
 from agalign.cli.terminal import (
     EXIT_NOTHING,
     EXIT_OK,
@@ -28,8 +28,8 @@ from agalign.cli.terminal import (
     LogJson,
     Quiet,
     RngSeed,
+    Terminal,
     Verbose,
-    Voice,
     examples,
     exits,
     of_running,
@@ -77,8 +77,8 @@ def demo(
     log_json: LogJson = False,
 ) -> None:
     """Make a synthetic flight, align it, and compare the result with the known truth."""
-    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice, GOES_ON):
+    terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(terminal, GOES_ON):
         from agalign.batch import CaptureReport, RunOptions, prepare_output
         from agalign.cameras.discover import DiscoverOptions
         from agalign.config import JointSettings, Settings
@@ -86,23 +86,23 @@ def demo(
 
         source, target = out / "flight", out / "aligned"
         prepare_output(source)
-        voice.event(
+        terminal.event(
             "make", f"Painting a field and photographing it: {captures} captures of 5 bands …", captures=captures
         )
         truth = make_flight(source, captures, rng_seed=rng_seed)
-        flight = find_captures(source, DiscoverOptions(), voice)
+        flight = find_captures(source, DiscoverOptions(), terminal)
         settings = Settings(joint=JointSettings(device=device, rng_seed=rng_seed))
         reports: list[CaptureReport] = []
         how = RunOptions(overwrite=True, jobs=jobs)
-        outcome = run(flight, target, settings, voice, how, each=reports.append)
+        totals = run(flight, target, settings, terminal, how, each=reports.append)
         reports.sort(key=lambda r: r.label)
         table = Table("Capture", "Band", "Status", title="Error against the truth, px")
         for name in ("before", "median", "95 %"):
             table.add_column(name, justify="right")
         for s in score_against_truth(reports, truth):
             table.add_row(s.capture, s.band, s.status, f"{s.before_px:.1f}", f"{s.median_px:.3f}", f"{s.p95_px:.3f}")
-        voice.result(table)
-        raise typer.Exit(conclude(outcome, target, voice))
+        terminal.result(table)
+        raise typer.Exit(conclude(totals, target, terminal))
 
 
 cli_info.register(app)
@@ -113,8 +113,8 @@ def report(
     out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.", show_default=False)],
 ) -> None:
     """Rebuild the report and the summary from the sidecars."""
-    voice = Voice(quiet=False, verbose=False, log_json=False)
-    with exits(voice):
+    terminal = Terminal(quiet=False, verbose=False, log_json=False)
+    with exits(terminal):
         from agalign.errors import InputError
         from agalign.products.report import write_pages
         from agalign.products.sidecar import find_sidecars
@@ -124,14 +124,14 @@ def report(
         unreadable: list[str] = []
         pages = write_pages(out, unreadable.append)
         for text in unreadable:
-            voice.problem(text)
-        explain(pages.shortfalls, voice)
+            terminal.problem(text)
+        explain(pages.failures, terminal)
         table = Table("Slowest", "Seconds")
         for label, seconds in pages.slowest:
             table.add_row(shown(label), f"{seconds:.1f}")
-        voice.result(table)
+        terminal.result(table)
         for path in (pages.report, pages.summary):
-            voice.result(shown(str(path)))
+            terminal.result(shown(str(path)))
         raise typer.Exit(EXIT_PARTIAL if unreadable else EXIT_OK)
 
 
@@ -146,8 +146,8 @@ def ndvi(
     log_json: LogJson = False,
 ) -> None:
     """Vegetation indices of aligned captures: a raster and a picture each."""
-    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice):
+    terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(terminal):
         from statistics import median
 
         from agalign.products.index_rasters import IndexReport, write_indices
@@ -155,16 +155,16 @@ def ndvi(
 
         chosen = [index_named(name) for name in index.split(",")]
         reports: list[IndexReport] = []
-        for found in write_indices(out, chosen):
-            reports.append(found)
-            if found.problem:
-                voice.problem(f"{found.capture}: {found.problem}", capture=found.capture, index=found.index)
+        for result in write_indices(out, chosen):
+            reports.append(result)
+            if result.problem:
+                terminal.problem(f"{result.capture}: {result.problem}", capture=result.capture, index=result.index)
             else:
-                text = f"{found.capture} {found.index}: median {found.median:.3f}"
-                voice.event("index", text if verbose else "", **vars(found))
+                text = f"{result.capture} {result.index}: median {result.median:.3f}"
+                terminal.event("index", text if verbose else "", **vars(result))
         written = [r for r in reports if r.path is not None]
         if any(r.raw_numbers for r in written):
-            voice.problem(
+            terminal.problem(
                 "the bands are raw numbers, not reflectance: their indices compare places within a capture, not "
                 "captures or cameras; align with --radiometry where the camera's tags allow it"
             )
@@ -177,8 +177,8 @@ def ndvi(
                 numbers = (f"{v:.3f}" for v in (median(values), min(values), max(values)))
                 table.add_row(one.name, str(len(values)), *numbers)
         if written:
-            voice.result(table)
-            voice.result(shown(f"Rasters and pictures beside each capture: {written[0].path}, …"))
+            terminal.result(table)
+            terminal.result(shown(f"Rasters and pictures beside each capture: {written[0].path}, …"))
         raise typer.Exit(EXIT_NOTHING if not written else EXIT_OK if len(written) == len(reports) else EXIT_PARTIAL)
 
 
@@ -210,8 +210,8 @@ def _refuse_misspelt(first: str) -> None:
     """A word that is nearly a command is no folder that is missing. Raises SystemExit."""
     meant = get_close_matches(first, _COMMANDS, 1, cutoff=0.7)
     if meant and not Path(first).exists():
-        voice = Voice(quiet=False, verbose=False, log_json=False)
-        voice.problem(f"'{first}' is no command and no folder; did you mean '{meant[0]}'?")
+        terminal = Terminal(quiet=False, verbose=False, log_json=False)
+        terminal.problem(f"'{first}' is no command and no folder; did you mean '{meant[0]}'?")
         raise SystemExit(EXIT_USAGE)
 
 

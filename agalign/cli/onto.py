@@ -11,15 +11,15 @@ from agalign.cli.terminal import (
     LogJson,
     Quiet,
     RngSeed,
+    Terminal,
     Verbose,
-    Voice,
     exits,
     of_alignment,
     of_input,
     of_output,
     of_running,
 )
-from agalign.values.choices import MOST_MOSAIC_PIXELS, Compression, Interpolation, LocalUse, RasterFormat
+from agalign.values.choices import MAX_MOSAIC_PIXELS, Compression, Interpolation, LocalUse, RasterFormat
 
 
 def onto(
@@ -44,7 +44,7 @@ def onto(
     overwrite: Annotated[bool, of_running("--overwrite", help="Do again what an earlier run finished.")] = False,
     max_pixels: Annotated[
         int, of_input(min=1, help="Mosaics that declare more are refused before anything is read.")
-    ] = MOST_MOSAIC_PIXELS,
+    ] = MAX_MOSAIC_PIXELS,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
@@ -54,10 +54,10 @@ def onto(
     Grids, resolutions and coordinate reference systems may differ. Written are, for each MOVING, a raster on the
     reference's pixels that holds the band it was compared with and the moving mosaic's bands, and a sidecar.
     """
-    voice = Voice(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(voice):
+    terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
+    with exits(terminal):
         from agalign.batch import RunOptions
-        from agalign.cameras.discover import Flight, captures_onto
+        from agalign.cameras.discover import FolderScan, captures_onto
         from agalign.config import FlightSettings, JointSettings, LocalSettings, Settings, WriteSettings
 
         target = out or reference.absolute().parent / f"{reference.stem}-aligned"
@@ -67,6 +67,6 @@ def onto(
             local=LocalSettings(use=local),
             write=WriteSettings(interpolation=interpolation, crop="none", format=format, compression=compression),
         )
-        flight = Flight(reference.parent, tuple(captures_onto(reference, moving, band, max_pixels)), ())
-        outcome = run(flight, target, settings, voice, RunOptions(overwrite, jobs=jobs, align_panels=True))
-        raise typer.Exit(conclude(outcome, target, voice))
+        flight = FolderScan(reference.parent, tuple(captures_onto(reference, moving, band, max_pixels)), ())
+        totals = run(flight, target, settings, terminal, RunOptions(overwrite, jobs=jobs, align_panels=True))
+        raise typer.Exit(conclude(totals, target, terminal))

@@ -13,21 +13,23 @@ from typing import TYPE_CHECKING
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
-from agalign.cli.shortfalls import explain
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Voice, shown
+from agalign.cli.failures import explain
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, shown
 from agalign.errors import NoSuchBandError, OutputError
 
 if TYPE_CHECKING:
     from agalign.batch import CaptureReport, RunOptions
-    from agalign.cameras.discover import DiscoverOptions, Flight
+    from agalign.cameras.discover import DiscoverOptions, FolderScan
     from agalign.config import Settings
-    from agalign.products.shortfalls import Shortfalls
+    from agalign.products.failures import FailureGroups
     from agalign.values.capture import Capture
 
 GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
 
 
-def find_captures(folder: Path, options: "DiscoverOptions", voice: Voice, *, silent: bool = False) -> "Flight":
+def find_captures(
+    folder: Path, options: "DiscoverOptions", terminal: Terminal, *, silent: bool = False
+) -> "FolderScan":
     """The captures below a folder; what is wrong with its files is said. Raises where there is none."""
     from agalign.cameras.discover import discover
     from agalign.errors import InputError
@@ -35,7 +37,7 @@ def find_captures(folder: Path, options: "DiscoverOptions", voice: Voice, *, sil
     flight = discover(folder, options)
     if not silent:
         for problem in flight.problems:
-            voice.problem(problem.text, file=problem.path)
+            terminal.problem(problem.text, file=problem.path)
     if not flight.captures:
         if any(isinstance(p.error, NoSuchBandError) for p in flight.problems):
             raise NoSuchBandError(f"{folder}: no capture has a band '{options.reference}'")
@@ -44,7 +46,7 @@ def find_captures(folder: Path, options: "DiscoverOptions", voice: Voice, *, sil
         )
     bands = sum(len(c.bands) for c in flight.captures)
     if not silent:
-        voice.event(
+        terminal.event(
             "found",
             f"{len(flight.captures)} captures, {bands} bands in {folder}",
             captures=len(flight.captures),
@@ -63,10 +65,10 @@ def load_ahead() -> None:
     threading.Thread(target=load, daemon=True).start()
 
 
-def _no_shortfalls() -> "Shortfalls":
-    from agalign.products.shortfalls import Shortfalls
+def _no_failures() -> "FailureGroups":
+    from agalign.products.failures import FailureGroups
 
-    return Shortfalls()
+    return FailureGroups()
 
 
 @dataclass
@@ -80,7 +82,7 @@ class BandTotals:
 
 
 @dataclass
-class Outcome:
+class RunTotals:
     """What a run has come to so far: sums, so that a season needs no more memory than a capture."""
 
     states: Counter[str] = field(default_factory=Counter)
@@ -91,7 +93,7 @@ class Outcome:
     """Nothing is left to be wished for, of captures, of files that were found and of the report."""
     radiometry: Counter[str] = field(default_factory=Counter)
     """What was made of raw numbers, and in how many captures."""
-    shortfalls: "Shortfalls" = field(default_factory=_no_shortfalls)
+    failures: "FailureGroups" = field(default_factory=_no_failures)
 
     def add(self, report: "CaptureReport") -> None:
         """One capture more."""
@@ -100,7 +102,7 @@ class Outcome:
         self.good &= report.good
         if report.result is None:
             return
-        self.shortfalls.add(report.label, report.result)
+        self.failures.add(report.label, report.result)
         if report.result.output is not None and report.result.output.radiometry is not None:
             self.radiometry[report.result.output.radiometry] += 1
         for band in report.result.bands:
@@ -115,81 +117,81 @@ class Outcome:
 
 
 def run(
-    flight: "Flight", out: Path, settings: "Settings", voice: Voice, how: "RunOptions", *,
+    flight: "FolderScan", out: Path, settings: "Settings", terminal: Terminal, how: "RunOptions", *,
     dask: str | None = None, model: Path | None = None, each: "Callable[[CaptureReport], None]" = lambda _: None,
-) -> Outcome:  # fmt: skip
+) -> RunTotals:  # fmt: skip
     """Align the captures, saying how far it has come. Raises OutputError where nothing could be written."""
     from agalign.batch import Listener, run_flight
     from agalign.batch.workers import dask_executor
 
-    outcome = Outcome(good=not flight.problems)
+    totals = RunTotals(good=not flight.problems)
     started = time.monotonic()
     cluster = nullcontext() if dask is None else dask_executor(dask, how.jobs, how.timeout_s)
-    with cluster as executor, _progress(voice, len(flight.captures)) as show:
+    with cluster as executor, _progress(terminal, len(flight.captures)) as show:
         options = replace(how, executor=executor)
         current: Capture | None = None
 
         def on_start(capture: "Capture") -> None:
             nonlocal current
-            voice.check()
+            terminal.check()
             current = capture
 
         def on_learning(camera: str, share: float) -> None:
-            voice.check()
-            show(outcome, 0.0, f"learning from {camera}: {share:.0%} at most")
+            terminal.check()
+            show(totals, 0.0, f"learning from {camera}: {share:.0%} at most")
 
         def on_learnt(camera: str, seconds: float) -> None:
-            voice.event("learnt", camera=camera, seconds=round(seconds, 2))
+            terminal.event("learnt", camera=camera, seconds=round(seconds, 2))
 
         def on_pair(band: str, stage: str, share: float) -> None:
-            voice.check()
+            terminal.check()
             assert current is not None
             names = [b.name for b in current.moving]
             place = names.index(band) if band in names else len(names)
             behind = place + (0.85 * share if stage in ("learning", "refining") else 0.0)
-            show(outcome, behind / max(len(names), 1), f"{current.label} {band}: {stage}")
+            show(totals, behind / max(len(names), 1), f"{current.label} {band}: {stage}")
 
         try:
             listener = Listener(on_start, on_pair, on_learning, on_learnt)
             for report in run_flight(flight, out, settings, options, listener, model):
-                voice.check()
-                outcome.add(report)
+                terminal.check()
+                totals.add(report)
                 each(report)
-                show(outcome, 0.0, report.label)
-                _tell(report, voice, outcome.states.total(), len(flight.captures))
+                show(totals, 0.0, report.label)
+                _print_report(report, terminal, totals.states.total(), len(flight.captures))
         except OutputError as error:
-            if not outcome.states:
+            if not totals.states:
                 raise
-            voice.problem(str(error))
-            outcome.good = False
+            terminal.problem(str(error))
+            totals.good = False
         finally:
             # Also after an interruption: what is finished is reported.
-            if outcome.states:
-                outcome.good &= _write_pages(out, voice, changed=set(outcome.states) != {"kept"})
+            if totals.states:
+                totals.good &= _write_pages(out, terminal, changed=set(totals.states) != {"kept"})
     seconds = time.monotonic() - started
-    voice.event("finished", seconds=round(seconds, 1), captures=outcome.states.total(), **outcome.states)
-    return outcome
+    terminal.event("finished", seconds=round(seconds, 1), captures=totals.states.total(), **totals.states)
+    return totals
 
 
-def _write_pages(out: Path, voice: Voice, *, changed: bool) -> bool:
+def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
     """False where they could not be written."""
-    from agalign.products.report import pages_stand, write_pages
+    from agalign.products.report import pages_exist, write_pages
 
     try:
-        if changed or not pages_stand(out):
-            write_pages(out, voice.problem)
+        if changed or not pages_exist(out):
+            write_pages(out, terminal.problem)
     except OutputError as error:
-        voice.problem(str(error))
+        terminal.problem(str(error))
         return False
     return True
 
 
 @contextmanager
-def _progress(voice: Voice, captures: int) -> Iterator[Callable[[Outcome, float, str], None]]:
+def _progress(terminal: Terminal, captures: int) -> Iterator[Callable[[RunTotals, float, str], None]]:
     """One line for the whole flight on a terminal, nothing elsewhere: there each capture prints a plain line. It is
     told what is done, the share of the capture that is worked on, and what is done to which.
     """
-    if voice.quiet or voice.log_json or not voice.err.is_terminal:
+    if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
         yield lambda _outcome, _share, _text: None
         return
     columns = (
@@ -197,14 +199,14 @@ def _progress(voice: Voice, captures: int) -> Iterator[Callable[[Outcome, float,
         TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
         TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis")),
     )  # fmt: skip
-    with Progress(*columns, console=voice.err, transient=True) as progress:
+    with Progress(*columns, console=terminal.err, transient=True) as progress:
         task = progress.add_task("starting", total=captures, done=0, rate="")
         pace = _Pace()
 
-        def show(outcome: Outcome, share: float, text: str) -> None:
-            done = outcome.states.total()
+        def show(totals: RunTotals, share: float, text: str) -> None:
+            done = totals.states.total()
             progress.update(
-                task, completed=done + share, done=done, rate=pace.of(outcome.states), description=shown(text)
+                task, completed=done + share, done=done, rate=pace.of(totals.states), description=shown(text)
             )
 
         yield show
@@ -230,17 +232,17 @@ class _Pace:
         return f"{60 * (done - self.before) / seconds:.0f} a minute" if done > self.before else ""
 
 
-def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> None:
+def _print_report(report: "CaptureReport", terminal: Terminal, number: int, count: int) -> None:
     if report.panel is not None:
         text = f"[{number}/{count}] {report.label}: {report.panel}"
-        voice.event("panel", text, capture=report.label, panel=report.panel)
+        terminal.event("panel", text, capture=report.label, panel=report.panel)
         return
     for text in report.problems:
-        voice.problem(f"{report.label}: {text}", capture=report.label)
-    for (name, stage), seconds in report.stages.items() if voice.log_json else ():
-        voice.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(seconds, 4))
+        terminal.problem(f"{report.label}: {text}", capture=report.label)
+    for (name, stage), seconds in report.stages.items() if terminal.log_json else ():
+        terminal.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(seconds, 4))
     if report.result is None:
-        voice.event("capture", capture=report.label, state=report.state, seconds=round(report.seconds, 3))
+        terminal.event("capture", capture=report.label, state=report.state, seconds=round(report.seconds, 3))
         return
     pairs = [b for b in report.result.bands if b.status != "reference"]
     aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
@@ -248,8 +250,8 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
     kept = ", kept from an earlier run" if report.state == "kept" else ""
     seconds = sum(b.seconds for b in pairs)
     text = f"[{number}/{count}] {report.label}: {aligned} of {len(pairs)} aligned{also}, {seconds:.1f} s{kept}"
-    if voice.verbose or not voice.err.is_terminal or voice.log_json:
-        voice.event(
+    if terminal.verbose or not terminal.err.is_terminal or terminal.log_json:
+        terminal.event(
             "capture",
             text,
             capture=report.label,
@@ -263,41 +265,41 @@ def _tell(report: "CaptureReport", voice: Voice, number: int, count: int) -> Non
     for band in pairs:
         residual = band.metrics.after.residual_px if band.metrics else None
         shown = "" if residual is None else f", residual {residual:.3f} px"
-        if voice.verbose or voice.log_json:
-            voice.event(
+        if terminal.verbose or terminal.log_json:
+            terminal.event(
                 "pair", f"    {band.band}: {band.status}{shown}, {band.seconds:.1f} s",
                 capture=report.label, band=band.band, status=band.status, reason=band.reason,
                 residual_px=residual, seconds=band.seconds,
             )  # fmt: skip
-        if band.status != "aligned" and (voice.verbose or voice.log_json):
-            voice.problem(
+        if band.status != "aligned" and (terminal.verbose or terminal.log_json):
+            terminal.problem(
                 f"{report.label} {band.band}: {band.status}: {band.reason}", capture=report.label, band=band.band
             )
 
 
-def conclude(outcome: Outcome, out: Path, voice: Voice) -> int:
+def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """The closing table, and the exit code."""
     from statistics import median
 
-    statuses = sum((band.statuses for band in outcome.bands.values()), Counter[str]())
+    statuses = sum((band.statuses for band in totals.bands.values()), Counter[str]())
     table = Table("Band", title=f"{statuses['aligned']} of {statuses.total()} band pairs aligned")
     for name in ("Aligned", "Predicted", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair"):
         table.add_column(name, justify="right")
-    for name, band in outcome.bands.items():
+    for name, band in totals.bands.items():
         counts = [str(band.statuses[s]) for s in ("aligned", "predicted", "seed_only", "failed")]
         known = band.residuals_px
         worst = (f"{median(known):.3f}", f"{max(known):.3f}") if known else ("-", "-")
         table.add_row(shown(name), *counts, *worst, f"{median(band.seconds):.1f}")
-    if outcome.bands:
-        voice.result(table)
-    explain(outcome.shortfalls.groups(), voice)
-    for made, count in outcome.radiometry.items():
-        voice.result(shown(f"Written as {made}: {count} captures"))
-    voice.result(shown(f"Report: {out / 'index.html'}"))
-    if outcome.states and set(outcome.states) == {"panel"}:
-        voice.problem("nothing but calibration panels there; --align-panels aligns them all the same")
+    if totals.bands:
+        terminal.result(table)
+    explain(totals.failures.groups(), terminal)
+    for made, count in totals.radiometry.items():
+        terminal.result(shown(f"Written as {made}: {count} captures"))
+    terminal.result(shown(f"Report: {out / 'index.html'}"))
+    if totals.states and set(totals.states) == {"panel"}:
+        terminal.problem("nothing but calibration panels there; --align-panels aligns them all the same")
         return EXIT_NOTHING
-    if not outcome.useful:
-        voice.problem("no band pair could be aligned" if outcome.bands else "no capture could be done")
-        return EXIT_PARTIAL if outcome.bands else EXIT_NOTHING
-    return EXIT_OK if outcome.good else EXIT_PARTIAL
+    if not totals.useful:
+        terminal.problem("no band pair could be aligned" if totals.bands else "no capture could be done")
+        return EXIT_PARTIAL if totals.bands else EXIT_NOTHING
+    return EXIT_OK if totals.good else EXIT_PARTIAL

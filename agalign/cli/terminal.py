@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from agalign.errors import AgalignError, ConfigurationError, is_want_of_memory
-from agalign.values.choices import MOST_RNG_SEED
+from agalign.values.choices import MAX_RNG_SEED
 from agalign.values.text import harmless
 
 EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL = 0, 1, 2, 3
@@ -48,7 +48,7 @@ def in_json(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-class Voice:
+class Terminal:
     """How the program speaks: results to standard output, progress and complaints to standard error."""
 
     def __init__(self, *, quiet: bool, verbose: bool, log_json: bool) -> None:
@@ -127,7 +127,7 @@ def examples(*lines: tuple[str, str]) -> str:
 
 
 RngSeed = Annotated[
-    int, of_running(min=0, max=MOST_RNG_SEED, help="Seed of all random numbers; the same seed gives the same result.")
+    int, of_running(min=0, max=MAX_RNG_SEED, help="Seed of all random numbers; the same seed gives the same result.")
 ]
 Quiet = Annotated[bool, of_running("--quiet", "-q", help="Print problems only.")]
 Verbose = Annotated[bool, of_running("--verbose", "-v", help="Print a line per band pair.")]
@@ -135,10 +135,10 @@ LogJson = Annotated[bool, of_running("--log-json", help="Print one JSON object a
 
 
 @contextmanager
-def exits(voice: Voice, on_interrupt: str = "interrupted") -> Iterator[None]:
+def exits(terminal: Terminal, on_interrupt: str = "interrupted") -> Iterator[None]:
     """Turns what can go wrong into one line and an exit code."""
     try:
-        with voice.stoppable():
+        with terminal.stoppable():
             yield
     except typer.Exit:
         raise
@@ -147,9 +147,9 @@ def exits(voice: Voice, on_interrupt: str = "interrupted") -> Iterator[None]:
         if code is None:
             raise
         with suppress(OSError):  # of a full disk, the terminal's too
-            if voice.verbose and code == EXIT_NOTHING and not isinstance(error, AgalignError):
-                voice.err.print(escape(traceback.format_exc()))
-            voice.problem(text)
+            if terminal.verbose and code == EXIT_NOTHING and not isinstance(error, AgalignError):
+                terminal.err.print(escape(traceback.format_exc()))
+            terminal.problem(text)
         raise typer.Exit(code) from None
 
 

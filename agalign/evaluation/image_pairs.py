@@ -45,14 +45,14 @@ def find_pairs(source: Path) -> list[PairFiles]:
     Raises InputError, naming the file, where there are none or a homography cannot be read.
     """
     if source.is_file():
-        found = list(_from_csv(source))
+        result = list(_from_csv(source))
     elif source.is_dir():
-        found = [pair for folder in sorted({source, *source.rglob("*/")}) for pair in _from_folder(folder)]
+        result = [pair for folder in sorted({source, *source.rglob("*/")}) for pair in _from_folder(folder)]
     else:
         raise InputError(f"{source}: does not exist")
-    if not found:
+    if not result:
         raise InputError(f"{source}: no pairs; give a CSV file, or a folder in the HPatches or Oxford layout")
-    return found
+    return result
 
 
 def _from_folder(folder: Path) -> Iterator[PairFiles]:

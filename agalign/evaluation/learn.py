@@ -25,11 +25,11 @@ from agalign.method.device import one_memory_error, one_thread
 from agalign.method.levels import Level
 from agalign.method.patches import Keypoints, far_apart, patch_positions
 from agalign.method.refine import MovingBand
-from agalign.method.state import JointState, Subject
+from agalign.method.state import ImageGroup, JointState
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 
-_LEAST_KEYPOINTS = 2
+_MIN_KEYPOINTS = 2
 _MOVING_BAND = "moving"
 
 
@@ -64,11 +64,11 @@ def learn_descriptor(
     examples = []
     with one_thread(), one_memory_error():
         for pair in pairs:
-            found = align_pairs([pair], settings, lambda *_: None)[pair.name]
-            on_pair(Lesson(pair.name, found.status, found.reason or ""))
-            if found.status == "aligned":
+            result = align_pairs([pair], settings, lambda *_: None)[pair.name]
+            on_pair(Lesson(pair.name, result.status, result.reason or ""))
+            if result.status == "aligned":
                 with suppress(NoContrastError, NotEnoughTextureError):
-                    examples.append(_example(state, pair, found.fixed_to_moving))
+                    examples.append(_example(state, pair, result.fixed_to_moving))
         if not examples:
             raise InputError("no pair could be aligned, so there is nothing to learn from")
         net = state.fast_descriptor([*channels.pop()])
@@ -78,11 +78,11 @@ def learn_descriptor(
 
 
 def _example(state: JointState, pair: BandPair, fixed_to_moving: Matrix) -> _Example:
-    level = state.level(Subject.of_one(pair.fixed, pair.moving, fixed_to_moving), 1.0, [0])
+    level = state.level(ImageGroup.of_one(pair.fixed, pair.moving, fixed_to_moving), 1.0, [0])
     keypoints = sift_keypoints(pair.fixed)
     keypoints = visible_in_both(keypoints, fixed_to_moving, pair.fixed, pair.moving)
-    if len(keypoints) < _LEAST_KEYPOINTS:
-        raise NotEnoughTextureError(len(keypoints), _LEAST_KEYPOINTS)
+    if len(keypoints) < _MIN_KEYPOINTS:
+        raise NotEnoughTextureError(len(keypoints), _MIN_KEYPOINTS)
     return _Example(level, level.homography(fixed_to_moving, 0), keypoints.to(state.device))
 
 
@@ -102,7 +102,7 @@ def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, ste
         moving = MovingBand(net, example.level, 0, 1)
         patches = [example.level.fixed.patches(patch_positions(k)), moving.patches(k, example.homography)]
         f, f_prime = net.describe(patches, [REFERENCE, moving.side])
-        loss = losses.in_batch(f, f_prime, far_apart(k, recipe.least_negative_px), recipe.temperature)
+        loss = losses.in_batch(f, f_prime, far_apart(k, recipe.min_negative_px), recipe.temperature)
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()
@@ -113,11 +113,11 @@ def read_rough_pairs(source: Path, settings: Settings) -> list[BandPair]:
     """The pairs of a CSV file or folder, as `find_pairs` has them, their homographies taken as rough ones; without one
     the images are laid on each other. Raises InputError.
     """
-    found = []
+    result = []
     for files in find_pairs(source):
         fixed, moving = read_image(files.fixed), read_image(files.moving)
         start = files.fixed_to_moving
         if start is None:
             start = geometry.overlay(fixed.size_px, moving.size_px)
-        found.append(BandPair.of_images(files.name, fixed, moving, {"user": start}, settings))
-    return found
+        result.append(BandPair.of_images(files.name, fixed, moving, {"user": start}, settings))
+    return result

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.seeding import best_seed, subjects_of
+from agalign.capture.seeding import best_seed, image_groups
 from agalign.config import JointSettings, Settings
 from agalign.errors import ConfigurationError, GeometryError, InputError, NoContrastError, NotEnoughTextureError
 from agalign.evaluation.protocol import grey_patches
@@ -32,7 +32,7 @@ from agalign.method.match import matching_network
 from agalign.method.paper import align_by_paper
 from agalign.method.patches import Keypoints, patch_positions, transform
 from agalign.method.refine import MovingBand, describe_fixed, refine
-from agalign.method.state import JointState, Subject
+from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.resample import single, warped
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
@@ -43,7 +43,7 @@ from agalign.values.mapping import PixelMapping
 
 
 @dataclass(frozen=True)
-class Task:
+class PairTask:
     """Two images and where alignment starts."""
 
     fixed: Raster
@@ -69,7 +69,7 @@ class Outcome:
     fixed_to_moving: Matrix | None = None
 
 
-Method = Callable[[Task], Outcome]
+Method = Callable[[PairTask], Outcome]
 
 
 def method_named(name: str) -> Method:
@@ -111,7 +111,7 @@ _MODULES = {"elastix": "itk"}
 # ---- this program's
 
 
-def _learnt_on_the_pair(task: Task, settings: JointSettings, *, colour: bool) -> Outcome:
+def _learnt_on_the_pair(task: PairTask, settings: JointSettings, *, colour: bool) -> Outcome:
     """Recipe fast or paper from the task's start."""
     fixed, moving = task.fixed, task.moving
     if not colour or (settings.sharing == "siamese" and fixed.channels != moving.channels):
@@ -121,17 +121,17 @@ def _learnt_on_the_pair(task: Task, settings: JointSettings, *, colour: bool) ->
     pair = BandPair.of_images("moving", fixed, moving, {"user": task.start}, Settings())
     if task.seeding:
         seed = best_seed(pair, pair.candidates)
-    state, [(_, subject)] = JointState(settings, lambda *_: None), subjects_of([pair], [seed])
+    state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([pair], [seed])
     try:
         if settings.recipe == "paper":
-            net, found = align_by_paper(state, subject)
+            net, result = align_by_paper(state, group)
         else:
             net = state.fast_descriptor([fixed.channels, moving.channels])
-            learn(state, [subject], net)
-            found = refine(state, net, subject)[0]
+            learn(state, [group], net)
+            result = refine(state, net, group)[0]
     except (NotEnoughTextureError, NoContrastError, GeometryError):
         return Outcome(None, seed.fixed_to_moving)
-    mapping = found.fixed_to_moving if isinstance(found, JointResult) else subject.mappings[0]
+    mapping = result.fixed_to_moving if isinstance(result, JointResult) else group.mappings[0]
     return Outcome(_by_network(net, state, fixed, moving), mapping)
 
 
@@ -142,7 +142,7 @@ def _without_colour(raster: Raster) -> Raster:
 def _by_network(net: Descriptor, state: JointState, one: Raster, other: Raster) -> Describe:
     @torch.no_grad()
     def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
-        level = state.level(Subject.of_one(one, other, fixed_to_moving), 1.0, [0])
+        level = state.level(ImageGroup.of_one(one, other, fixed_to_moving), 1.0, [0])
         h, keypoints = level.homography(fixed_to_moving, 0), keypoints.to(state.device)
         return describe_fixed(net, level, keypoints), MovingBand(net, level, 0, 1).describe(keypoints, h)
 
@@ -153,7 +153,7 @@ def _saved_network(path: Path) -> Method:
     """A network of `agalign learn` or of an earlier run; images of other channels than it learnt are made grey."""
     model = load_model(path, lambda: torch.device("cpu"))
 
-    def method(task: Task) -> Outcome:
+    def method(task: PairTask) -> Outcome:
         fixed, moving = (
             r if r.channels == channels else _without_colour(r)
             for r, channels in zip((task.fixed, task.moving), model.net.channels, strict=False)
@@ -168,7 +168,7 @@ def _saved_network(path: Path) -> Method:
 # ---- others'
 
 
-def _from_patches(task: Task, side: int, describe_patches: Callable[[Tensor], Tensor]) -> Outcome:
+def _from_patches(task: PairTask, side: int, describe_patches: Callable[[Tensor], Tensor]) -> Outcome:
     """A descriptor of (N, 1, side, side) patches in [0, 1]."""
 
     def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
@@ -184,11 +184,11 @@ _MARGIN_SHARE = 8
 """SIFT's outer cells reach an eighth of a patch beyond its edge."""
 
 
-def _sift(task: Task) -> Outcome:
+def _sift(task: PairTask) -> Outcome:
     return _from_patches(task, _HAND_MADE_SIDE, sift_of_patches)
 
 
-def _daisy(task: Task) -> Outcome:
+def _daisy(task: PairTask) -> Outcome:
     return _from_patches(task, _HAND_MADE_SIDE, daisy_of_patches)
 
 
@@ -212,8 +212,8 @@ def sift_of_patches(patches: Tensor) -> Tensor:
     rows_columns = (divmod(i, columns) for i in range(len(patches)))
     centres = ((c * side + (side - 1) / 2, r * side + (side - 1) / 2) for r, c in rows_columns)
     keypoints = [cv2.KeyPoint(x, y, patches.shape[-1] / 6, 0.0, 1.0, 0) for x, y in centres]
-    _, found = cv2.SIFT.create().compute(np.asarray((image * 255).round(), np.uint8), keypoints)
-    return torch.from_numpy(np.asarray(found, np.float32).reshape(len(patches), -1))
+    _, result = cv2.SIFT.create().compute(np.asarray((image * 255).round(), np.uint8), keypoints)
+    return torch.from_numpy(np.asarray(result, np.float32).reshape(len(patches), -1))
 
 
 def daisy_of_patches(patches: Tensor) -> Tensor:
@@ -223,8 +223,8 @@ def daisy_of_patches(patches: Tensor) -> Tensor:
     image, columns, side = _mosaic(patches)
     radius = patches.shape[-1] * 3 // 8  # with the outer ring's own width it reaches the patch's edge
     first = side // 2 - radius
-    found = daisy(image[first:, first:], step=side, radius=radius, rings=3, histograms=8, orientations=8)
-    return torch.from_numpy(found[:, :columns].reshape(-1, found.shape[-1])[: len(patches)].astype(np.float32))
+    result = daisy(image[first:, first:], step=side, radius=radius, rings=3, histograms=8, orientations=8)
+    return torch.from_numpy(result[:, :columns].reshape(-1, result.shape[-1])[: len(patches)].astype(np.float32))
 
 
 def _torchscript(path: Path, side: int) -> Method:
@@ -243,13 +243,13 @@ def _torchscript(path: Path, side: int) -> Method:
     return lambda task: _from_patches(task, side, describe)
 
 
-def _elastix(task: Task) -> Outcome:
+def _elastix(task: PairTask) -> Outcome:
     """On the pyramid of recipe paper; its own default parameters otherwise."""
     laid = warped(single(task.moving), PixelMapping(task.start), task.fixed.size_px)
     coarsest = Settings().joint.paper.coarsest_px
     levels = 1 + max(0, round(math.log2(max(task.fixed.size_px) / coarsest)))
-    found = elastix_affinity(single(task.fixed), laid, levels)
-    return Outcome(None, task.start if found is None else geometry.compose(task.start, found))
+    result = elastix_affinity(single(task.fixed), laid, levels)
+    return Outcome(None, task.start if result is None else geometry.compose(task.start, result))
 
 
 def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -> Matrix | None:
@@ -265,10 +265,10 @@ def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -
     parameters.AddParameterMap(chosen)
     images = [itk.GetImageFromArray(np.ascontiguousarray(r.pixels)) for r in (fixed, moving)]
     try:
-        _, found = itk.elastix_registration_method(*images, parameter_object=parameters, log_to_console=False)
+        _, result = itk.elastix_registration_method(*images, parameter_object=parameters, log_to_console=False)
     except RuntimeError:
         return None
-    table = found.GetParameterMap(0)
+    table = result.GetParameterMap(0)
     a, b, c, d, tx, ty = (float(v) for v in table["TransformParameters"])
     centre = np.array([float(v) for v in table["CenterOfRotationPoint"]])
     linear = np.array([[a, b], [c, d]])

@@ -30,6 +30,6 @@ def average_precision(f: Tensor, f_prime: Tensor) -> float:
     return float((nearest == torch.arange(len(f), device=f.device)).float().mean())
 
 
-def homography_error_px(found: Matrix, truth: Matrix, points: NDArray[np.float64]) -> float:
+def homography_error_px(result: Matrix, truth: Matrix, points: NDArray[np.float64]) -> float:
     """Mean distance between where two homographies send the true matches (N, 2), px of the second image."""
-    return float(np.linalg.norm(geometry.apply(found, points) - geometry.apply(truth, points), axis=1).mean())
+    return float(np.linalg.norm(geometry.apply(result, points) - geometry.apply(truth, points), axis=1).mean())

@@ -11,7 +11,7 @@ import numpy as np
 
 from agalign.errors import InputError
 from agalign.evaluation.image_pairs import PairFiles, read_image
-from agalign.evaluation.methods import Method, Task
+from agalign.evaluation.methods import Method, PairTask
 from agalign.evaluation.protocol import average_precision, homography_error_px
 from agalign.method.detect import sift_keypoints, visible_in_both
 from agalign.method.device import one_memory_error, one_thread
@@ -80,7 +80,7 @@ def evaluate(
             for shift, start in starts.of(truth, max(fixed.size_px), rng):
                 began = time.perf_counter()
                 with one_thread(), one_memory_error():
-                    outcome = method(Task(fixed, moving, start, device, rng_seed, starts.seeding))
+                    outcome = method(PairTask(fixed, moving, start, device, rng_seed, starts.seeding))
                 seconds = time.perf_counter() - began
                 precision = error = math.nan
                 if outcome.describe is not None and len(keypoints):

@@ -12,7 +12,7 @@ from agalign.config import JointSettings
 from agalign.errors import NoContrastError, NotEnoughTextureError
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.paper import descend
-from agalign.method.state import JointState, Subject
+from agalign.method.state import ImageGroup, JointState
 from agalign.products.drawing import with_text, write_png
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
@@ -29,18 +29,18 @@ def loss_surface(
     paper, at the resolution whose longer side is at most `longer_side_px`. Offsets are px of the full resolution.
     """
     scale = min(1.0, longer_side_px / max(fixed.size_px))
-    found = np.full((len(offsets_px), len(offsets_px)), np.nan)
+    result = np.full((len(offsets_px), len(offsets_px)), np.nan)
     for row, dy in enumerate(offsets_px):
         for column, dx in enumerate(offsets_px):
             start = geometry.compose(truth, geometry.translation(float(dx), float(dy)))
             state = JointState(settings, lambda *_: None)
             with suppress(NotEnoughTextureError, NoContrastError), one_thread(), one_memory_error():
-                level = state.level(Subject.of_one(fixed, moving, start), scale, [0])
+                level = state.level(ImageGroup.of_one(fixed, moving, start), scale, [0])
                 net = state.paper_descriptor([fixed.channels, moving.channels])
                 pool = level.trainable
-                found[row, column] = descend(state, net, level, pool, start, lambda _: None, move=False).loss
+                result[row, column] = descend(state, net, level, pool, start, lambda _: None, move=False).loss
         progress((row + 1) / len(offsets_px))
-    return found
+    return result
 
 
 def draw_surface(surface: NDArray[np.float64], offsets_px: NDArray[np.float64], path: Path) -> None:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.flight.rig import (
-    LEAST_CAPTURES,
-    LEAST_STD_PX,
+    MIN_CAPTURES,
+    MIN_STD_PX,
     Factor,
     Observation,
     Rig,
@@ -36,7 +36,7 @@ _SETS_IN_MOTION: tuple[tuple[Factor, ...], ...] = (
 _LAYOUT_STD = 0.015
 """Of a camera model's known layout of lenses, in lengths of all baselines together."""
 _ROUNDS = 20
-_MOST_FOLDS = 12
+_MAX_FOLDS = 12
 _PLAINLY_BETTER = 0.9
 """Further factors must leave at most this share of the error that captures left out show without them."""
 
@@ -49,12 +49,12 @@ def learn_rig(
     `layout` is what is known of where each band's lens stands, in any unit; empty where nothing is.
     """
     counts = {b: sum(b in c.mappings for c in captures) for b in dict.fromkeys(b for c in captures for b in c.mappings)}
-    bands = tuple(b for b, count in counts.items() if count >= LEAST_CAPTURES)
+    bands = tuple(b for b, count in counts.items() if count >= MIN_CAPTURES)
     if not bands:
         return None
     captures = [c for c in captures if any(b in c.mappings for b in bands)]
     table = _Table.of(captures, bands, size_px, _normalised_layout(layout, bands))
-    sets = _SETS_IN_MOTION if sum(c.motion is not None for c in captures) >= LEAST_CAPTURES else _SETS
+    sets = _SETS_IN_MOTION if sum(c.motion is not None for c in captures) >= MIN_CAPTURES else _SETS
     errors = {factors: table.errors_left_out(factors) for factors in sets}
     best = sets[0]
     for more in sets[1:]:
@@ -129,14 +129,14 @@ class _Table:
         pull = 0.0 if self.prior is None else 1 / _LAYOUT_STD**2
         for _ in range(_ROUNDS):
             designs = np.stack([design(a, d) for a, d in zip(t, delay, strict=True)])
-            found, _ = solve_factors(self.there - offset, designs, weights, counts)
+            result, _ = solve_factors(self.there - offset, designs, weights, counts)
             # Of a flight that was low here and there, what is typical.
-            found -= np.median(found[kept > 0], axis=0)
+            result -= np.median(result[kept > 0], axis=0)
             # What lies far from typical factors is off by errors of the baselines: it tells less of the means.
-            vote = 1 / (1 + (_LAYOUT_STD / LEAST_STD_PX) ** 2 * (found[:, :3] ** 2).sum(axis=1))
+            vote = 1 / (1 + (_LAYOUT_STD / MIN_STD_PX) ** 2 * (result[:, :3] ** 2).sum(axis=1))
             towards = t if self.prior is None else self._beside(self.prior, delay, counts)
             each = [
-                _band(self.there[:, j], weights[:, j] * vote, found, towards[j], delay[j], pull)
+                _band(self.there[:, j], weights[:, j] * vote, result, towards[j], delay[j], pull)
                 for j in range(len(self.bands))
             ]
             offset = np.stack([o for o, _, _ in each])
@@ -144,16 +144,16 @@ class _Table:
                 delay = _unit(np.array([d for _, _, d in each]))
             t = self._beside(np.stack([v for _, v, _ in each]), delay, counts)
         total = np.maximum(weights.sum(axis=0), 1e-12)
-        centre = np.einsum("ij,ik->jk", weights, found) / total[:, None]
-        information = np.einsum("ij,ijk->j", weights, (found[:, None, :3] - centre[None, :, :3]) ** 2)
+        centre = np.einsum("ij,ik->jk", weights, result) / total[:, None]
+        information = np.einsum("ij,ijk->j", weights, (result[:, None, :3] - centre[None, :, :3]) ** 2)
         # What a baseline is unsure by, relative to the length of all of them, which is 1.
         t_std = np.minimum(1 / np.sqrt(np.maximum(information + pull, 1e-9)), 1.0)
-        return _Fit(offset, t, delay, t_std, found, centre)
+        return _Fit(offset, t, delay, t_std, result, centre)
 
     def errors_left_out(self, factors: Sequence[Factor]) -> dict[str, float]:
         """Root mean square error by band, px, of captures that are predicted from rigs learnt on the others."""
         count, counts = len(self.there), used(factors)
-        folds = min(count, _MOST_FOLDS)
+        folds = min(count, _MAX_FOLDS)
         squares: dict[str, list[float]] = {b: [] for b in self.bands}
         for fold in range(folds):
             out = np.arange(count) % folds == fold
@@ -165,8 +165,8 @@ class _Table:
             for j, band in enumerate(self.bands):
                 others = self.weights[out].copy()
                 others[:, j] = 0.0
-                found, _ = solve_factors(left, designs, others, counts)
-                error = left[:, j] - np.einsum("akf,cf->cak", designs[j] * counts, found)
+                result, _ = solve_factors(left, designs, others, counts)
+                error = left[:, j] - np.einsum("akf,cf->cak", designs[j] * counts, result)
                 squares[band] += (error**2).sum(axis=(1, 2))[self.weights[out, j] > 0].tolist()
         # The rig is learnt on one capture more than those that tell its errors.
         seen = (self.weights > 0).sum(axis=0)
@@ -192,8 +192,8 @@ class _Table:
             return self._beside(self.prior, delay, counts), delay
         if counts[3] > 0:
             designs = np.stack([design(np.zeros(2), d) for d in delay])
-            found, _ = solve_factors(left, designs, weights, used(("motion",)))
-            left = left - np.einsum("bakf,cf->cbak", designs, found)
+            result, _ = solve_factors(left, designs, weights, used(("motion",)))
+            left = left - np.einsum("bakf,cf->cbak", designs, result)
         along = (left * scale).transpose(1, 2, 0, 3).reshape(2 * len(self.bands), -1)
         t = np.asarray(np.linalg.svd(along, full_matrices=False)[0][:, 0].reshape(-1, 2))
         return self._beside(t, delay, counts), delay
@@ -215,8 +215,8 @@ def _band(
     ridge = np.array([1e-9] * 6 + [pull + 1e-6] * 2 + [1e-6])
     normal = np.einsum("c,cif,cig->fg", weights, x, x) + np.diag(ridge)
     wanted = np.einsum("c,cif,ci->f", weights, x, there.reshape(count, 6)) + ridge * np.array([0.0] * 6 + [*t, delay])
-    found = np.linalg.solve(normal, wanted)
-    return found[:6].reshape(2, 3), found[6:8], float(found[8])
+    result = np.linalg.solve(normal, wanted)
+    return result[:6].reshape(2, 3), result[6:8], float(result[8])
 
 
 def _unit(vectors: Array) -> Array:
@@ -226,8 +226,8 @@ def _unit(vectors: Array) -> Array:
 def _normalised_layout(layout: Mapping[str, tuple[float, float]], bands: Sequence[str]) -> Array | None:
     if not all(b in layout for b in bands):
         return None
-    found = np.array([layout[b] for b in bands], dtype=np.float64)
-    return _unit(found) if np.linalg.norm(found) > 0 else None
+    result = np.array([layout[b] for b in bands], dtype=np.float64)
+    return _unit(result) if np.linalg.norm(result) > 0 else None
 
 
 def _root_mean(squares: Mapping[str, Sequence[float]]) -> dict[str, float]:
@@ -235,5 +235,5 @@ def _root_mean(squares: Mapping[str, Sequence[float]]) -> dict[str, float]:
 
 
 def _rms(values: Iterable[float]) -> float:
-    found = np.array([v for v in values if np.isfinite(v)])
-    return float(np.sqrt((found**2).mean())) if len(found) else float("inf")
+    result = np.array([v for v in values if np.isfinite(v)])
+    return float(np.sqrt((result**2).mean())) if len(result) else float("inf")

@@ -25,7 +25,7 @@ from agalign.values.geometry import Matrix, normalised
 
 _FORMAT = "agalign-model/1"
 _LONGEST_BYTES = 1 << 28
-_MOST_SIDES = 512
+_MAX_SIDES = 512
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def _read_model(path: Path) -> FlightModel:
     if not all(torch.isfinite(t).all() for t in tensors.values()):
         raise ValueError("its numbers are none")
     channels = [int(c) for c in json.loads(facts["channels"])]
-    if not 1 < len(channels) <= _MOST_SIDES or not all(0 < c <= _MOST_SIDES for c in channels):
+    if not 1 < len(channels) <= _MAX_SIDES or not all(0 < c <= _MAX_SIDES for c in channels):
         raise ValueError(f"a network for images of {channels[:8]} channels")
     net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
     net.load_state_dict({k.removeprefix("theta."): v for k, v in tensors.items() if k.startswith("theta.")})
@@ -113,11 +113,11 @@ def _read_model(path: Path) -> FlightModel:
 
 def _digest(tensors: Mapping[str, torch.Tensor], facts: Mapping[str, str]) -> str:
     """Of the contents: a flipped bit in a weight is no fault that anything else would see."""
-    found = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    result = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
-        found.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
-        found.update(tensor.contiguous().numpy().tobytes())
-    return found.hexdigest()
+        result.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
+        result.update(tensor.contiguous().numpy().tobytes())
+    return result.hexdigest()
 
 
 def _with_sorted_header(contents: bytes) -> bytes:

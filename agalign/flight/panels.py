@@ -21,8 +21,8 @@ _READERS = 4
 _LOOK_PX = 1600
 _SAME_OUTING_S = 6 * 3600.0
 """A panel tells nothing of another day's light."""
-_MOST_SATURATED = 0.01
-_PANEL_HEIGHT_M, _LEAST_HEIGHT_M = 1.0, 3.0
+_MAX_SATURATED = 0.01
+_PANEL_HEIGHT_M, _MIN_HEIGHT_M = 1.0, 3.0
 """At which the camera is held over a panel; and what errors of altitudes come to."""
 
 
@@ -66,7 +66,7 @@ def with_panels(captures: Sequence[Capture], *, by_look: bool = False) -> list[C
     """
     ends = [end for flight in flights_of(captures) for end in _from_either_end(flight)]
     with without_warnings(), ThreadPoolExecutor(_READERS) as pool:
-        seen = {c.label: c for found in pool.map(lambda end: _panels_at(end, by_look), ends) for c in found}
+        seen = {c.label: c for result in pool.map(lambda end: _panels_at(end, by_look), ends) for c in result}
     return [seen.get(c.label, c) for c in captures]
 
 
@@ -75,7 +75,7 @@ def read_panel(capture: Capture, albedos: Albedos) -> PanelReading:
     return PanelReading(capture, tuple(_read(b, albedos) for b in capture.bands))
 
 
-def factors_for(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, float]:
+def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, float]:
     """By band, what a capture's radiance is to be multiplied by for reflectance: the light is linear in time between
     the panels of its camera, and as the nearest one has it before the first and after the last.
     """
@@ -84,12 +84,12 @@ def factors_for(capture: Capture, readings: Iterable[PanelReading]) -> dict[str,
         if camera_key(r.capture) == camera_key(capture)
         and abs(r.capture.seconds - capture.seconds) <= _SAME_OUTING_S
     ]  # fmt: skip
-    found: dict[str, list[tuple[float, float]]] = {}
+    result: dict[str, list[tuple[float, float]]] = {}
     for reading in mine:
         for band in reading.bands:
             if band.factor is not None:
-                found.setdefault(band.band.name, []).append((reading.capture.seconds, 1 / band.factor))
-    return {name: 1 / _at(capture.seconds, known) for name, known in found.items()}
+                result.setdefault(band.band.name, []).append((reading.capture.seconds, 1 / band.factor))
+    return {name: 1 / _at(capture.seconds, known) for name, known in result.items()}
 
 
 def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
@@ -105,7 +105,7 @@ def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
         and r.capture.position is not None and r.capture.position.altitude_m is not None
     ]  # fmt: skip
     height_m = position.altitude_m - min(panels) + _PANEL_HEIGHT_M if panels else 0.0
-    return replace(capture, pose=replace(pose, height_m=height_m)) if height_m > _LEAST_HEIGHT_M else capture
+    return replace(capture, pose=replace(pose, height_m=height_m)) if height_m > _MIN_HEIGHT_M else capture
 
 
 def _at(seconds: float, known: list[tuple[float, float]]) -> float:
@@ -122,17 +122,17 @@ def _from_either_end(flight: Sequence[Capture]) -> tuple[list[Capture], list[Cap
 
 def _panels_at(end: Sequence[Capture], by_look: bool) -> list[Capture]:
     """Those that show a panel, looked for until a few in a row show none."""
-    found: list[Capture] = []
+    result: list[Capture] = []
     without = 0
     for capture in end:
         # Mosaics show none, and are long to read.
         told = capture.panel is not None or capture.reference.georeference is not None
         seen = capture if told else _looked_at(capture, by_look)
-        found += [] if seen.panel is None else [seen]
+        result += [] if seen.panel is None else [seen]
         without = 0 if seen.panel is not None else without + 1
         if without == _AT_EITHER_END:
             break
-    return found
+    return result
 
 
 def _looked_at(capture: Capture, by_look: bool) -> Capture:
@@ -158,11 +158,11 @@ def _seen(band: Band, *, without_code: bool) -> PanelSight | None:
         image = read_for_alignment(band, _LOOK_PX)
     except AgalignError:
         return None
-    found = find_panel(replace(image, lens=None), without_code=without_code)
-    if found is None:
+    result = find_panel(replace(image, lens=None), without_code=without_code)
+    if result is None:
         return None
     scale = image.size_px[0] / band.width_px
-    return replace(found, area_px=tuple(((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5) for x, y in found.area_px))
+    return replace(result, area_px=tuple(((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5) for x, y in result.area_px))
 
 
 def _read(band: Band, albedos: Albedos) -> BandReading:
@@ -179,7 +179,7 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
         radiance, saturated = _radiance(band, panel)
     except AgalignError as error:
         return BandReading(band, albedo, None, str(error))
-    if saturated > _MOST_SATURATED:
+    if saturated > _MAX_SATURATED:
         return BandReading(band, albedo, radiance, f"{saturated:.0%} of it is saturated")
     if radiance is not None and not radiance > 0:
         return BandReading(band, albedo, radiance, "it is black")

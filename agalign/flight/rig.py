@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.values import geometry
-from agalign.values.alignment import LocalField, Prediction
+from agalign.values.alignment import DisplacementField, Prediction
 from agalign.values.geometry import Matrix, Points
 
 Array = NDArray[np.float64]
@@ -37,16 +37,16 @@ FACTORS = 5
 NO_FACTORS: tuple[float, ...] = (0.0,) * FACTORS
 FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
 """How far from the mean a capture may be before its own bands are doubted: wide, for heights that nobody has seen."""
-LEAST_CAPTURES = 3
-LEAST_STD_PX = 0.05
+MIN_CAPTURES = 3
+MIN_STD_PX = 0.05
 """Of a mapping: what its own uncertainty does not know."""
 _COLUMNS: dict[Factor, tuple[int, ...]] = {"distance": (0,), "tilt": (1, 2), "motion": (3, 4), "reference": (3, 4)}
 _LATTICE = 7, 5
 _CLIMB_STD_PX_PER_M = 1.5
 """What a metre of climb may do to the factor of the ground's distance: 0.03 m of baseline 20 m above it."""
-_LEAST_CLIMB_SPREAD_PX = 0.5
+_MIN_CLIMB_SPREAD_PX = 0.5
 _OUTLIER_PX = 0.3
-_UNLIKE, _LEAST_UNLIKE_PX = 6.0, 3.0
+_UNLIKE, _MIN_UNLIKE_PX = 6.0, 3.0
 """A capture whose factors are so many times as far from the typical one's as most are does not set the crop."""
 
 
@@ -120,7 +120,7 @@ class Rig:
     """Root mean square error of each band as the other bands of captures left out predict it. Of a band all is in px
     of its own file.
     """
-    fields: Mapping[str, LocalField] = field(default_factory=dict)
+    fields: Mapping[str, DisplacementField] = field(default_factory=dict)
     """What no homography explains and all captures have in common, raw px of the reference's file, by band."""
 
     def as_json(self) -> str:
@@ -141,7 +141,7 @@ class Rig:
             baselines={b: (x, y) for b, (x, y) in facts.pop("baselines").items()},
             centres={b: tuple(c) for b, c in facts.pop("centres").items()}, factors=tuple(facts.pop("factors")),
             seen=tuple(_seen(s) for s in facts.pop("seen")),
-            fields={b: LocalField(steps[b], values) for b, values in fields.items()}, **facts,
+            fields={b: DisplacementField(steps[b], values) for b, values in fields.items()}, **facts,
         )  # fmt: skip
 
     def predict(self, band: str, known: Observation) -> Prediction:
@@ -152,7 +152,7 @@ class Rig:
         mean, here = self.mean[band], self._design(band)
         others = [b for b in known.mappings if b != band and b in self.mean]
         if others:
-            found, covariance, off = self._factors_of(known, others)
+            result, covariance, off = self._factors_of(known, others)
             if not self.factors:
                 return Prediction(mean, "flight", float(np.hypot(self.from_bands_px[band], off)))
             # What bands missed in captures left out, where all others were known; what these factors are known less,
@@ -160,11 +160,11 @@ class Rig:
             # all others shows there.
             spread = float(np.einsum("akf,fg,akg->", here, covariance - self._usual_covariance(band), here))
             spread = max(0.0, spread)
-            beyond = 2 * self.baseline_std[band] ** 2 * self._beyond(band, found)
+            beyond = 2 * self.baseline_std[band] ** 2 * self._beyond(band, result)
             error = float(np.sqrt(self.from_bands_px[band] ** 2 + spread + beyond + off**2))
-            return Prediction(moved(mean, here @ found, self.size_px), "bands", error)
+            return Prediction(moved(mean, here @ result, self.size_px), "bands", error)
         like = Seen(known.seconds, known.altitude_m, known.motion, NO_FACTORS)
-        guesses = _GUESSES if len(self.seen) >= _LEAST_FOR_A_CHOICE else _GUESSES[:2]
+        guesses = _GUESSES if len(self.seen) >= _MIN_FOR_A_CHOICE else _GUESSES[:2]
         guess, error_px = min((self._told(g, like, band) for g in guesses), key=lambda told: told[1])
         if not self.factors or guess is None:
             return Prediction(mean, "flight", error_px)
@@ -187,8 +187,8 @@ class Rig:
         guess misses of captures that lie as far from the others as this one does, or what those around it differ by.
         """
         here = self._design(band)
-        found = _TYPICAL if guess is None else guess(like, self.seen)
-        if found is None:
+        result = _TYPICAL if guess is None else guess(like, self.seen)
+        if result is None:
             return None, np.inf
         missed: list[tuple[float, float]] = []
         for i, seen in enumerate(self.seen):
@@ -196,14 +196,14 @@ class Rig:
             if other is not None:
                 missed.append((other.gap, float(((here @ (np.array(seen.factors) - other.factors)) ** 2).sum())))
         missed.sort()
-        alike = [m for gap, m in missed if gap <= _AS_FAR * found.gap]
-        enough = alike if len(alike) >= LEAST_CAPTURES else [m for _, m in missed[:LEAST_CAPTURES]]
+        alike = [m for gap, m in missed if gap <= _AS_FAR * result.gap]
+        enough = alike if len(alike) >= MIN_CAPTURES else [m for _, m in missed[:MIN_CAPTURES]]
         climb_px = self._unknown_climb_px(like.altitude_m) * float(np.linalg.norm(self.baselines[band]))
         # Of few captures the mean square may be small by chance.
         few = (len(enough) + 1) / max(len(enough) - 1, 1)
-        between = float(((here @ found.std) ** 2).sum())
+        between = float(((here @ result.std) ** 2).sum())
         square = max(few * float(np.mean(enough or [0.0])), between) + self.from_bands_px[band] ** 2 + climb_px**2
-        return None if guess is None else found.factors, float(np.sqrt(square))
+        return None if guess is None else result.factors, float(np.sqrt(square))
 
     def expectation(self, band: str, fixed_to_moving: Matrix) -> Expectation:
         """Where a band should lie beside a mapping close to it, whatever the factors of its capture.
@@ -220,7 +220,7 @@ class Rig:
         by_factor = np.einsum("xa,akf,nk->nxf", turn, self._design(band), coordinates(self.size_px, corners))
         over = geometry.over_corners(points, *self.size_px).reshape(-1, 8)
         square = over.T @ over / len(points)
-        std_px = max(self.from_bands_px[band], LEAST_STD_PX) * float(np.sqrt(abs(np.linalg.det(turn))))
+        std_px = max(self.from_bands_px[band], MIN_STD_PX) * float(np.sqrt(abs(np.linalg.det(turn))))
         corners_px = (geometry.apply(back, geometry.apply(self.mean[band], corners)) - corners).reshape(8)
         covariance = np.asarray(std_px**2 / 8 * np.linalg.inv(square))
         return Expectation(corners_px, np.asarray(by_factor.reshape(8, FACTORS)), covariance)
@@ -233,7 +233,7 @@ class Rig:
             return [self.mean[band]]
         factors = np.array([s.factors for s in self.seen])
         spread = np.median(np.abs(factors), axis=0)
-        factors = factors[(np.abs(factors) <= _UNLIKE * np.maximum(spread, _LEAST_UNLIKE_PX)).all(axis=1)]
+        factors = factors[(np.abs(factors) <= _UNLIKE * np.maximum(spread, _MIN_UNLIKE_PX)).all(axis=1)]
         ends = {int(pick) for column in factors.T for pick in (column.argmin(), column.argmax())}
         return [moved(self.mean[band], self._design(band) @ factors[i], self.size_px) for i in sorted(ends)]
 
@@ -241,21 +241,21 @@ class Rig:
         """(2, 3, 5): what each factor that counts does to a band, in terms of g."""
         return design(np.array(self.baselines[band]), self.delays[band]) * used(self.factors)
 
-    def _beyond(self, band: str, found: Array) -> float:
+    def _beyond(self, band: str, result: Array) -> float:
         """By how much factors lie farther from where a band is known than those seen, squared px."""
         seen = np.array([s.factors for s in self.seen]) - self.centres[band]
-        return max(0.0, float(((found - self.centres[band]) ** 2).sum() - (seen**2).sum(axis=1).mean()))
+        return max(0.0, float(((result - self.centres[band]) ** 2).sum() - (seen**2).sum(axis=1).mean()))
 
     def _unknown_climb_px(self, altitude_m: float | None) -> float:
         """Standard deviation of the distance's factor at an altitude that the captures it is taken from do not have:
         how much it changes with a metre is known as well as they have shown it.
         """
         seen = [(s.altitude_m, s.factors[0]) for s in self.seen if s.altitude_m is not None]
-        if altitude_m is None or len(seen) < LEAST_CAPTURES:
+        if altitude_m is None or len(seen) < MIN_CAPTURES:
             return 0.0
         altitudes, nu = (np.array(v) for v in zip(*seen, strict=True))
         slope, offset = np.polyfit(altitudes, nu, 1) if np.ptp(altitudes) > 0 else (0.0, float(nu.mean()))
-        spread = max(float((nu - slope * altitudes - offset).std()), _LEAST_CLIMB_SPREAD_PX)
+        spread = max(float((nu - slope * altitudes - offset).std()), _MIN_CLIMB_SPREAD_PX)
         information = 1 / _CLIMB_STD_PX_PER_M**2 + float(((altitudes - altitudes.mean()) ** 2).sum()) / spread**2
         nearest = float(np.abs(altitudes - altitude_m).min())
         return nearest / float(np.sqrt(information)) + abs(float(slope)) * nearest
@@ -264,7 +264,7 @@ class Rig:
         """(5, 5) of the factors where all other bands of a capture are known well."""
         bands = [b for b in self.mean if b != band]
         designs = np.stack([self._design(b) for b in bands]) if bands else np.zeros((0, 2, 3, FACTORS))
-        weights = np.array([[weight(LEAST_STD_PX, self.from_bands_px[b]) for b in bands]])
+        weights = np.array([[weight(MIN_STD_PX, self.from_bands_px[b]) for b in bands]])
         _, covariance = solve_factors(np.zeros((1, len(bands), 2, 3)), designs, weights, used(self.factors))
         return np.asarray(covariance[0])
 
@@ -275,10 +275,10 @@ class Rig:
         there = np.stack([affine(self.mean[b], known.mappings[b], self.size_px) for b in bands])
         designs = np.stack([self._design(b) for b in bands])
         weights = np.array([weight(known.std_px[b], self.from_bands_px[b]) for b in bands])
-        found, covariance = solve_factors(there[None], designs, weights[None], used(self.factors))
-        off = np.linalg.norm(there - designs @ found[0], axis=(1, 2))
+        result, covariance = solve_factors(there[None], designs, weights[None], used(self.factors))
+        off = np.linalg.norm(there - designs @ result[0], axis=(1, 2))
         usual = np.array([self.from_bands_px[b] for b in bands])
-        return found[0], covariance[0], float(np.sqrt(max(0.0, float(np.median(off**2 - usual**2)))))
+        return result[0], covariance[0], float(np.sqrt(max(0.0, float(np.median(off**2 - usual**2)))))
 
 
 def _seen(facts: Mapping[str, Any]) -> Seen:
@@ -294,18 +294,18 @@ def _seen(facts: Mapping[str, Any]) -> Seen:
 
 def used(factors: Sequence[Factor]) -> Array:
     """(5,): 1 where a column of the factors counts."""
-    found = np.zeros(FACTORS)
+    result = np.zeros(FACTORS)
     for factor in factors:
-        found[list(_COLUMNS[factor])] = 1.0
-    return found
+        result[list(_COLUMNS[factor])] = 1.0
+    return result
 
 
 def design(t: Array, delay: float) -> Array:
     """(2, 3, 5): what each factor does to a band with a baseline t (2,) and a delay, in terms of g."""
-    found = np.zeros((2, 3, FACTORS))
-    found[:, range(3), range(3)] = t[:, None]
-    found[(0, 1), 0, (3, 4)] = delay
-    return found
+    result = np.zeros((2, 3, FACTORS))
+    result[:, range(3), range(3)] = t[:, None]
+    result[(0, 1), 0, (3, 4)] = delay
+    return result
 
 
 def solve_factors(there: Array, designs: Array, weights: Array, counts: Array) -> tuple[Array, Array]:
@@ -319,10 +319,10 @@ def solve_factors(there: Array, designs: Array, weights: Array, counts: Array) -
     for _ in range(6):
         w = weights * vote
         covariance = np.linalg.inv(np.einsum("cb,bif,big->cfg", w, x, x) + prior)
-        found = np.einsum("cfg,cg->cf", covariance, np.einsum("cbi,big->cg", w[:, :, None] * y, x))
-        off2 = ((y - np.einsum("bif,cf->cbi", x, found)) ** 2).sum(axis=2)
+        result = np.einsum("cfg,cg->cf", covariance, np.einsum("cbi,big->cg", w[:, :, None] * y, x))
+        off2 = ((y - np.einsum("bif,cf->cbi", x, result)) ** 2).sum(axis=2)
         vote = 1 / (1 + off2 / _OUTLIER_PX**2)
-    return found, covariance * np.outer(counts, counts)
+    return result, covariance * np.outer(counts, counts)
 
 
 @dataclass(frozen=True)
@@ -349,7 +349,7 @@ def around_in_time(like: Seen, seen: Sequence[Seen]) -> Guessed:
 def around_in_height(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
     """The distance between those of the captures below and above, the rest in time; None where no height is known."""
     known = [s for s in seen if s.altitude_m is not None]
-    if like.altitude_m is None or len(known) < LEAST_CAPTURES:
+    if like.altitude_m is None or len(known) < MIN_CAPTURES:
         return None
     by_height = _between([s.altitude_m or 0.0 for s in known], like.altitude_m, known)
     in_time = around_in_time(like, seen)
@@ -361,7 +361,7 @@ def around_in_height(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
 def by_motion(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
     """W as a linear function of the ground's motion, the rest in time; None where no motion is known."""
     known = [s for s in seen if s.motion is not None]
-    if like.motion is None or len(known) < LEAST_CAPTURES:
+    if like.motion is None or len(known) < MIN_CAPTURES:
         return None
     x = np.array([(1.0, *s.motion) for s in known if s.motion is not None])
     # Where all flew alike nothing is said of other motions: the least slope that fits.
@@ -375,20 +375,20 @@ def by_motion(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
 
 _GUESSES: tuple[_Guess | None, ...] = (None, around_in_time, around_in_height, by_motion)
 _AS_FAR = 2.0
-_LEAST_FOR_A_CHOICE = 6
+_MIN_FOR_A_CHOICE = 6
 """With fewer captures the best of several guesses is best by chance."""
 
 
 def _between(places: Sequence[float], place: float, seen: Sequence[Seen]) -> Guessed:
     order = np.argsort(places, kind="stable")
     at, factors = np.array(places)[order], np.array([s.factors for s in seen])[order]
-    found = np.array([np.interp(place, at, column) for column in factors.T])
+    result = np.array([np.interp(place, at, column) for column in factors.T])
     after = int(np.searchsorted(at, place))
     std = np.zeros(FACTORS)
     if 0 < after < len(at) and at[after] > at[after - 1]:
         share = (place - at[after - 1]) / (at[after] - at[after - 1])
         std = np.abs(factors[after] - factors[after - 1]) * np.sqrt(share * (1 - share))
-    return Guessed(found, float(np.abs(at - place).min()), std)
+    return Guessed(result, float(np.abs(at - place).min()), std)
 
 
 # ---- mappings as numbers
@@ -415,8 +415,8 @@ def affine(mean: Matrix, mapping: Matrix, size_px: tuple[int, int]) -> Array:
 def moved(mean: Matrix, shift: Array, size_px: tuple[int, int]) -> Matrix:
     """The mean with (2, 3) in terms of g added."""
     points = geometry.lattice(*size_px, *_LATTICE)
-    found, _ = cv2.findHomography(points, geometry.apply(mean, points) + coordinates(size_px) @ shift.T, 0)
-    return geometry.normalised(found)
+    result, _ = cv2.findHomography(points, geometry.apply(mean, points) + coordinates(size_px) @ shift.T, 0)
+    return geometry.normalised(result)
 
 
 def distance_px(one: Matrix, other: Matrix, size_px: tuple[int, int]) -> float:
@@ -432,10 +432,10 @@ def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matr
         return matrices[0]
     points = geometry.lattice(*size_px, *_LATTICE)
     there = np.median([geometry.apply(m, points) for m in matrices], axis=0)
-    found, _ = cv2.findHomography(points, there, 0)
-    return geometry.normalised(found)
+    result, _ = cv2.findHomography(points, there, 0)
+    return geometry.normalised(result)
 
 
 def weight(std_px: float, left_px: float = 0.0) -> float:
     """Of a mapping that is known so well, in a model that leaves so much."""
-    return 1 / (std_px**2 + left_px**2 + LEAST_STD_PX**2)
+    return 1 / (std_px**2 + left_px**2 + MIN_STD_PX**2)

@@ -85,7 +85,7 @@ class Descriptor(nn.Module):
         responses = [self.first[min(side, len(self.first) - 1)](x) for x, side in zip(patches, sides, strict=True)]
         if len(self.trunk) == 1:
             whole: Tensor = self.trunk[0](torch.cat(responses))
-            found = list(torch.split(whole, [len(x) for x in patches]))
+            result = list(torch.split(whole, [len(x) for x in patches]))
         else:
-            found = [self.trunk[side](x) for x, side in zip(responses, sides, strict=True)]
-        return [nn.functional.normalize(f, dim=1) for f in found] if self.unit_length else found
+            result = [self.trunk[side](x) for x, side in zip(responses, sides, strict=True)]
+        return [nn.functional.normalize(f, dim=1) for f in result] if self.unit_length else result

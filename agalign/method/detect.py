@@ -13,7 +13,7 @@ from agalign.pixels.landmarks import eight_bit
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Raster
 
-MOST_KEYPOINTS = 2000
+MAX_KEYPOINTS = 2000
 _SPACING_PER_SIZE = 6 / PATCH_PX
 """SIFT describes an area 6 times its keypoint's size wide; so do the patches."""
 
@@ -32,14 +32,14 @@ def to_8_bit(raster: Raster) -> NDArray[np.uint8]:
     return eight_bit(grey(raster.pixels), raster.valid)
 
 
-def sift_keypoints(raster: Raster, most: int = MOST_KEYPOINTS) -> Keypoints:
+def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:
     """The `most` strongest SIFT keypoints of an image, raw px."""
-    found = cv2.SIFT.create(nfeatures=most).detect(to_8_bit(raster), raster.valid.astype(np.uint8))
-    found = sorted(found, key=lambda k: -k.response)[:most]
+    result = cv2.SIFT.create(nfeatures=maximum).detect(to_8_bit(raster), raster.valid.astype(np.uint8))
+    result = sorted(result, key=lambda k: -k.response)[:maximum]
     return Keypoints(
-        torch.tensor([k.pt for k in found], dtype=torch.float32).reshape(-1, 2),
-        torch.tensor([math.radians(k.angle) for k in found], dtype=torch.float32),
-        torch.tensor([k.size * _SPACING_PER_SIZE for k in found], dtype=torch.float32),
+        torch.tensor([k.pt for k in result], dtype=torch.float32).reshape(-1, 2),
+        torch.tensor([math.radians(k.angle) for k in result], dtype=torch.float32),
+        torch.tensor([k.size * _SPACING_PER_SIZE for k in result], dtype=torch.float32),
     )
 
 

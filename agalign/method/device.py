@@ -44,14 +44,14 @@ class Device:
 
 def devices() -> list[Device]:
     """The CPU and every GPU, each tried."""
-    found = [Device("cpu", platform.machine(), torch.get_num_threads(), _trial("cpu"))]
+    result = [Device("cpu", platform.machine(), torch.get_num_threads(), _trial("cpu"))]
     for i in range(torch.cuda.device_count()):
         facts = torch.cuda.get_device_properties(i)
         what = f"{facts.name}, {facts.total_memory / 1e9:.0f} GB"
-        found.append(Device(f"cuda:{i}", what, 0, _trial(f"cuda:{i}")))
+        result.append(Device(f"cuda:{i}", what, 0, _trial(f"cuda:{i}")))
     if torch.backends.mps.is_available():
-        found.append(Device("mps", "Apple GPU", 0, _trial("mps")))
-    return found
+        result.append(Device("mps", "Apple GPU", 0, _trial("mps")))
+    return result
 
 
 def _trial(name: str) -> str:
@@ -77,7 +77,7 @@ def limit_threads(count: int) -> None:
     cv2.setNumThreads(count)
 
 
-_LARGEST_KEPT_BYTES, _MOST_KEPT_BYTES = 32 << 20, 256 << 20
+_LARGEST_KEPT_BYTES, _MAX_KEPT_BYTES = 32 << 20, 256 << 20
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
@@ -89,7 +89,7 @@ def keep_freed_memory() -> None:
     with suppress(OSError, AttributeError, TypeError):
         allocator = ctypes.CDLL(None)
         allocator.mallopt(_M_MMAP_THRESHOLD, _LARGEST_KEPT_BYTES)
-        allocator.mallopt(_M_TRIM_THRESHOLD, _MOST_KEPT_BYTES)
+        allocator.mallopt(_M_TRIM_THRESHOLD, _MAX_KEPT_BYTES)
 
 
 _lock = threading.Lock()

@@ -19,35 +19,35 @@ from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.levels import Level
 from agalign.method.patches import far_apart, patch_positions, translation
 from agalign.method.refine import (
-    LEAST_KEYPOINTS,
+    MIN_KEYPOINTS,
     MovingBand,
     Solver,
     best_shift,
     describe_fixed,
-    make_anchors,
+    describe_reference,
     moved,
     retrieval,
 )
-from agalign.method.state import JointState, Subject
+from agalign.method.state import ImageGroup, JointState
 
 
-def learn(state: JointState, subjects: Sequence[Subject], net: Descriptor, at_once: int = 1) -> tuple[int, float]:
+def learn(state: JointState, groups: Sequence[ImageGroup], net: Descriptor, at_once: int = 1) -> tuple[int, float]:
     """Theta and every psi of all subjects, coarse to fine; theta is carried from level to level.
 
     The psi of so many subjects move at a time, each in a thread; on how many, nothing depends. Returns the steps taken
     and the last loss. Raises NoContrastError.
     """
-    scales = learn_scales(state, max(max(s.fixed.size_px) for s in subjects))
+    scales = learn_scales(state, max(max(s.fixed.size_px) for s in groups))
     steps, loss = 0, float("nan")
     # Random numbers of its own each: what is drawn for one does not depend on the others.
-    states = [JointState(state.settings, state.progress) for _ in subjects]
+    states = [JointState(state.settings, state.progress) for _ in groups]
     with ThreadPoolExecutor(at_once) as pool:
         for number, scale in enumerate(scales):
             last = number == len(scales) - 1
-            wanted = [[b for b in s.hopeful if last or not s.trusted[b]] for s in subjects]
+            wanted = [[b for b in s.hopeful if last or not s.trusted[b]] for s in groups]
             at_level = [
                 _AtLevel(own, net, s, bands, own.level(s, scale, bands))
-                for own, s, bands in zip(states, subjects, wanted, strict=True) if bands
+                for own, s, bands in zip(states, groups, wanted, strict=True) if bands
             ]  # fmt: skip
             if number == 0 and net.learnt:
                 list(pool.map(_search, at_level))
@@ -75,7 +75,7 @@ class _AtLevel:
     state: JointState
     """The subject's own."""
     net: Descriptor
-    subject: Subject
+    group: ImageGroup
     which: Sequence[int]
     """Of the subject's moving images."""
     level: Level
@@ -90,11 +90,11 @@ class _AtLevel:
     def __post_init__(self) -> None:
         self.settled, self.told_apart = ([False] * len(self.which) for _ in range(2))
         self.retrieved = [0.0] * len(self.which)
-        self.h = [self.level.homography(self.subject.mappings[b], i) for i, b in enumerate(self.which)]
+        self.h = [self.level.homography(self.group.mappings[b], i) for i, b in enumerate(self.which)]
 
     @property
     def bands(self) -> list[MovingBand]:
-        return [MovingBand(self.net, self.level, i, self.subject.sides[b]) for i, b in enumerate(self.which)]
+        return [MovingBand(self.net, self.level, i, self.group.sides[b]) for i, b in enumerate(self.which)]
 
     @property
     def is_on_its_way(self) -> bool:
@@ -104,10 +104,10 @@ class _AtLevel:
 
     def hand_on(self) -> None:
         """Give what was found to the subject; a homography that cannot be inverted is not handed on."""
-        self.subject.given_up |= {b: self.retrieved[i] for i, b in enumerate(self.which) if not self.told_apart[i]}
+        self.group.given_up |= {b: self.retrieved[i] for i, b in enumerate(self.which) if not self.told_apart[i]}
         for i, b in enumerate(self.which):
             with suppress(GeometryError):
-                self.subject.mappings[b] = self.level.full_matrix(self.h[i], i)
+                self.group.mappings[b] = self.level.full_matrix(self.h[i], i)
 
 
 @torch.no_grad()
@@ -120,11 +120,11 @@ def _search(at: _AtLevel) -> None:
     recipe = state.settings.fast
     p, _ = state.sampler.draw(level, level.anywhere, at.h, recipe.search_patches, recipe.octaves)
     for i, band in enumerate(at.bands):
-        if at.subject.trusted[at.which[i]]:
+        if at.group.trusted[at.which[i]]:
             continue
         reach = recipe.search_share * max(level.fixed.size_px)
-        if at.subject.reach_px:
-            reach = min(reach, at.subject.reach_px[at.which[i]] * level.fixed.scale[0])
+        if at.group.reach_px:
+            reach = min(reach, at.group.reach_px[at.which[i]] * level.fixed.scale[0])
         shift = best_shift(band, at.h[i], p, reach, recipe.search_step_px)
         at.h[i] = at.h[i] @ translation(shift).to(at.h[i])
 
@@ -139,7 +139,7 @@ def _learn_level(
     """
     recipe = state.settings.fast
     loss_value = float("nan")
-    most_steps = recipe.most_steps * len(at_level)
+    max_steps = recipe.max_steps * len(at_level)
     between = recipe.steps_between_updates * len(at_level)
     warm_up = 0 if net.learnt else recipe.warm_up_steps
     if net.learnt:
@@ -151,14 +151,14 @@ def _learn_level(
             if update >= recipe.first_updates - 1 and not all(a.is_on_its_way for a in restless):
                 break
     optimiser = Adam(net.parameters(), recipe.learning_rate)
-    for step in range(1, most_steps + 1):
+    for step in range(1, max_steps + 1):
         loss = _loss(at_level[step % len(at_level)])
         if loss is not None:
             optimiser.step(loss)
             loss_value = float(loss.detach())
         if step < warm_up or step % between:
             continue
-        state.progress("learning", step / most_steps)
+        state.progress("learning", step / max_steps)
         if all(move_psi(at_level)):
             break
         hopeless = step >= warm_up + recipe.hopeless_steps * len(at_level)
@@ -174,13 +174,13 @@ def _loss(at: _AtLevel) -> Tensor | None:
     recipe = state.settings.fast
     p, inside = state.sampler.draw(level, level.trainable, at.h, recipe.batch, recipe.octaves)
     rows = [inside[:, i].nonzero()[:, 0] for i in range(len(at.h))]
-    taking_part = [band for band in at.bands if len(rows[band.index]) >= LEAST_KEYPOINTS]
+    taking_part = [band for band in at.bands if len(rows[band.index]) >= MIN_KEYPOINTS]
     if not taking_part:
         return None
     patches = [level.fixed.patches(patch_positions(p))]
     patches += [band.patches(p[rows[band.index]], at.h[band.index]) for band in taking_part]
     f, *f_primes = at.net.describe(patches, [REFERENCE, *(band.side for band in taking_part)])
-    apart = far_apart(p, recipe.least_negative_px)
+    apart = far_apart(p, recipe.min_negative_px)
     terms = []
     for band, f_prime in zip(taking_part, f_primes, strict=True):
         mine = rows[band.index]
@@ -195,19 +195,19 @@ def _move_psi(at: _AtLevel) -> bool:
     recipe = state.settings.fast
     test, _ = state.sampler.draw(level, level.held_out, at.h, recipe.test_keypoints, recipe.octaves)
     p, _ = state.sampler.draw(level, level.anywhere, at.h, recipe.learn_patches, recipe.octaves)
-    if len(p) < LEAST_KEYPOINTS:
+    if len(p) < MIN_KEYPOINTS:
         return True
     f_test = describe_fixed(at.net, level, test)
-    anchors = make_anchors(at.net, level, p, recipe.difference_px)
+    reference_patches = describe_reference(at.net, level, p, recipe.difference_px)
     solver = Solver(state.family, recipe)
     for i, band in enumerate(at.bands):
-        retrieved, _ = retrieval(band, at.h[i], test, f_test, recipe.least_negative_px)
+        retrieved, _ = retrieval(band, at.h[i], test, f_test, recipe.min_negative_px)
         at.retrieved[i] = retrieved
         if retrieved < recipe.step_gate:
             continue
         at.told_apart[i] = True
         with suppress(NotEnoughTextureError):
-            step = solver.step(band, at.h[i], anchors)
+            step = solver.step(band, at.h[i], reference_patches)
             at.h[i] = moved(at.h[i], step)
             at.settled[i] |= retrieved > recipe.enough_retrieval and step.length_px < recipe.rest_px
     return all(at.settled)

@@ -101,12 +101,12 @@ class PatchEquations:
 def solve(equations: PatchEquations, family: ModelFamily | None, recipe: FastRecipe) -> Step:
     """The step that the patches agree on.
 
-    With `family` None the richest family is taken whose corners are known to `recipe.most_corner_std_px`.
+    With `family` None the richest family is taken whose corners are known to `recipe.max_corner_std_px`.
     """
     families = FAMILIES if family is None else (family,)
     step = richest = _solve_family(equations, families[0], recipe.longest_step_px)
     for simpler in families[1:]:
-        if step.corner_std_px <= recipe.most_corner_std_px:
+        if step.corner_std_px <= recipe.max_corner_std_px:
             break
         step = _solve_family(equations, simpler, recipe.longest_step_px)
     return replace(step, corner_covariance_px2=richest.corner_covariance_px2)

@@ -21,44 +21,44 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.fast import learn
 from agalign.method.paper import align_by_paper
 from agalign.method.refine import refine
-from agalign.method.state import JointState, Progress, Subject
+from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.values.alignment import JointResult
-from agalign.values.doubts import Doubt
+from agalign.values.issues import Issue
 
-Results = list[JointResult | Doubt]
+Results = list[JointResult | Issue]
 """For each moving image of a subject what was found, or why nothing was."""
 
 
-def align_from_scratch(subject: Subject, settings: JointSettings, progress: Progress) -> Results:
+def align_from_scratch(group: ImageGroup, settings: JointSettings, progress: Progress) -> Results:
     """Theta and every psi of one capture by itself. Raises ConfigurationError where there is no such device."""
     state = JointState(settings, progress)
     if settings.recipe == "paper":
-        return [_by_paper(state, subject, b) for b in range(len(subject.moving))]
-    net = state.fast_descriptor([r.channels for r in (subject.fixed, *subject.moving)])
+        return [_by_paper(state, group, b) for b in range(len(group.moving))]
+    net = state.fast_descriptor([r.channels for r in (group.fixed, *group.moving)])
     try:
-        steps, loss = learn(state, [subject], net)
-        results = refine(state, net, subject)
+        steps, loss = learn(state, [group], net)
+        results = refine(state, net, group)
     except NoContrastError:
-        return [Doubt("no_contrast")] * len(subject.moving)
-    return [r if isinstance(r, Doubt) else replace(r, loss=loss, iterations=steps) for r in results]
+        return [Issue("no_contrast")] * len(group.moving)
+    return [r if isinstance(r, Issue) else replace(r, loss=loss, iterations=steps) for r in results]
 
 
-def refine_with(net: Descriptor, subject: Subject, settings: JointSettings, progress: Progress) -> Results:
+def refine_with(net: Descriptor, group: ImageGroup, settings: JointSettings, progress: Progress) -> Results:
     """Every psi of a capture with the flight's theta frozen."""
     try:
-        results = refine(JointState(settings, progress), net, subject)
+        results = refine(JointState(settings, progress), net, group)
     except NoContrastError:
-        return [Doubt("no_contrast")] * len(subject.moving)
-    return [r if isinstance(r, Doubt) else replace(r, recipe="flight") for r in results]
+        return [Issue("no_contrast")] * len(group.moving)
+    return [r if isinstance(r, Issue) else replace(r, recipe="flight") for r in results]
 
 
-def _by_paper(state: JointState, subject: Subject, band: int) -> JointResult | Doubt:
-    one = Subject.of_one(subject.fixed, subject.moving[band], subject.mappings[band])
+def _by_paper(state: JointState, group: ImageGroup, band: int) -> JointResult | Issue:
+    one = ImageGroup.of_one(group.fixed, group.moving[band], group.mappings[band])
     try:
         return align_by_paper(state, one)[1]
     except NotEnoughTextureError as why_not:
-        return Doubt("few_keypoints", why_not.keypoints, why_not.least)
+        return Issue("few_keypoints", why_not.keypoints, why_not.minimum)
     except NoContrastError:
-        return Doubt("no_contrast")
+        return Issue("no_contrast")
     except GeometryError:
-        return Doubt("not_invertible")
+        return Issue("not_invertible")

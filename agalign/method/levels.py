@@ -16,7 +16,7 @@ from agalign.method.patches import FOOTPRINT_PX, Keypoints, bilinear, footprint_
 from agalign.pixels.resample import shrink
 from agalign.pixels.structure import gradient_magnitude
 from agalign.values import geometry, lens
-from agalign.values.alignment import LocalField
+from agalign.values.alignment import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.lens import Lens
@@ -24,7 +24,7 @@ from agalign.values.lens import Lens
 _HELD_OUT_CELLS = 8
 """Cells along the longer side; every fifth cell, in a diagonal pattern, is kept from training."""
 _FIELD_COLUMNS = 65
-_LEAST_CELL_PX = 4 * FOOTPRINT_PX
+_MIN_CELL_PX = 4 * FOOTPRINT_PX
 """Less than this across, a cell has no room for the patches of recipe fast, twice the smallest one's size."""
 _POOL = 16_384
 """Positions kept of each kind: enough for any run, and each is undistorted only once."""
@@ -33,7 +33,7 @@ _TRIES = 4
 
 
 @dataclass(frozen=True)
-class View:
+class LevelImage:
     """One image at one level, standardised. Positions are given undistorted: the image is sampled through its lens."""
 
     image: Tensor
@@ -85,8 +85,8 @@ class Pool:
 class Level:
     """I and one or more I' at one resolution, and where in I keypoints may lie."""
 
-    fixed: View
-    moving: tuple[View, ...]
+    fixed: LevelImage
+    moving: tuple[LevelImage, ...]
     trainable: Pool
     """Positions with contrast enough from which theta is learnt."""
     held_out: Pool
@@ -99,14 +99,14 @@ class Level:
     on a lattice from corner to corner of I; empty where none is.
     """
 
-    def bent_by(self, fields: "Sequence[LocalField | None]") -> "Level":
+    def with_fields(self, fields: "Sequence[DisplacementField | None]") -> "Level":
         """The same level with displacements, px of the image that I was reduced from."""
         width, height = self.fixed.size_px
         nodes = geometry.lattice(width, height, _FIELD_COLUMNS, round(_FIELD_COLUMNS * height / width) + 1)
         scale = np.array(self.fixed.scale)
         shape = (-1, _FIELD_COLUMNS, 2)
 
-        def on_lattice(field: LocalField) -> Tensor:
+        def on_lattice(field: DisplacementField) -> Tensor:
             shift = field((nodes + 0.5) / scale - 0.5) * scale
             values = np.moveaxis(shift.reshape(shape), -1, 0)[None].astype(np.float32)
             return torch.from_numpy(np.ascontiguousarray(values)).to(self.fixed.image.device)
@@ -120,8 +120,8 @@ class Level:
             return None
         size = xy.new_tensor(self.fixed.size_px) - 1
         at = (2 * self.fixed.raw(xy) / size - 1)[None, :, None]
-        found = functional.grid_sample(field, at, padding_mode="border", align_corners=True)
-        return found[0, :, :, 0].T
+        result = functional.grid_sample(field, at, padding_mode="border", align_corners=True)
+        return result[0, :, :, 0].T
 
     def homography(self, matrix: Matrix, band: int) -> Tensor:
         """A full-resolution fixed_to_moving matrix of a moving image as one between the level's, (3, 3) float32."""
@@ -134,7 +134,7 @@ class Level:
         return geometry.rescale(homography.cpu().double().numpy(), up[0], up[1])
 
 
-def make_view(raster: Raster, scale: float, device: torch.device) -> View:
+def make_level_image(raster: Raster, scale: float, device: torch.device) -> LevelImage:
     """A raster as the networks see it, reduced by `scale` (1 is its own resolution)."""
     width, height = raster.size_px
     small = shrink(raster, (max(1, round(width * scale)), max(1, round(height * scale))))
@@ -147,23 +147,23 @@ def make_view(raster: Raster, scale: float, device: torch.device) -> View:
         standard[~small.valid] = 0
     relative = small.size_px[0] / width, small.size_px[1] / height
     room = torch.from_numpy(_room_px(small.valid)).to(device)
-    return View(torch.from_numpy(image).to(device), room, relative, small.lens)
+    return LevelImage(torch.from_numpy(image).to(device), room, relative, small.lens)
 
 
 def make_level(
-    fixed: Raster, moving: Sequence[Raster], mappings: Sequence[Matrix], scale: float, least_gradient: float,
+    fixed: Raster, moving: Sequence[Raster], mappings: Sequence[Matrix], scale: float, min_gradient: float,
     generator: torch.Generator, device: torch.device,
 ) -> Level:  # fmt: skip
     """The images reduced by `scale`, a moving one so that its mapping's magnification becomes 1 where it is larger."""
-    fixed_view = make_view(fixed, scale, device)
+    fixed_view = make_level_image(fixed, scale, device)
     views = []
     for raster, matrix in zip(moving, mappings, strict=True):
         magnification = float(np.median(np.abs(geometry.local_scale(matrix, *fixed.size_px))))
         usable = np.isfinite(magnification) and magnification > 0
-        views.append(make_view(raster, min(1.0, scale / magnification) if usable else scale, device))
+        views.append(make_level_image(raster, min(1.0, scale / magnification) if usable else scale, device))
     gradient = _gradient_magnitude(fixed_view.image.cpu().numpy())
     room = fixed_view.room_px.cpu().numpy()
-    usable_px = (gradient > least_gradient) & (room > FOOTPRINT_PX)
+    usable_px = (gradient > min_gradient) & (room > FOOTPRINT_PX)
     trainable, held_out = (
         _pool(usable_px, reach_px, fixed_view.lens, generator, device)
         for reach_px in _reach_within_cells(*fixed_view.size_px)
@@ -233,7 +233,7 @@ def _gradient_magnitude(planes: FloatImage) -> FloatImage:
 
 
 def _reserved_cells(width_px: int, height_px: int) -> Mask:
-    cell = max(max(width_px, height_px) / _HELD_OUT_CELLS, _LEAST_CELL_PX)
+    cell = max(max(width_px, height_px) / _HELD_OUT_CELLS, _MIN_CELL_PX)
     column, row = (np.arange(n) // cell % 5 for n in (width_px, height_px))
     # Within a row of cells, those of one column in five.
     return np.asarray(column[None, :] == (-2 * row % 5)[:, None])
@@ -256,9 +256,9 @@ def _pool(
     usable: Mask, reach_px: NDArray[np.float32], model: Lens | None, generator: torch.Generator, device: torch.device
 ) -> Pool:
     """Up to _POOL of the usable pixels from which the smallest patch, and some more, can reach so far."""
-    found = np.flatnonzero(usable & (reach_px > FOOTPRINT_PX + 1))
-    if len(found) > _POOL:
-        found = found[torch.randint(len(found), (_POOL,), generator=generator).numpy()]
-    row, column = np.divmod(found, usable.shape[1])
+    result = np.flatnonzero(usable & (reach_px > FOOTPRINT_PX + 1))
+    if len(result) > _POOL:
+        result = result[torch.randint(len(result), (_POOL,), generator=generator).numpy()]
+    row, column = np.divmod(result, usable.shape[1])
     xy = lens.undistort(model, np.stack([column, row], axis=1)).astype(np.float32)
     return Pool(torch.from_numpy(xy).to(device), torch.from_numpy(reach_px[row, column].astype(np.float32)).to(device))

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from agalign.errors import GeometryError
 from agalign.method.descriptor import REFERENCE, Descriptor
-from agalign.method.detect import MOST_KEYPOINTS, sift_keypoints
-from agalign.method.levels import View, make_view
+from agalign.method.detect import MAX_KEYPOINTS, sift_keypoints
+from agalign.method.levels import LevelImage, make_level_image
 from agalign.method.patches import Keypoints, footprint_radius, patch_positions
 from agalign.method.starter import start_from, start_from_starter
 from agalign.pixels.resample import shrink
@@ -22,7 +22,7 @@ from agalign.values.image import Raster
 _LONGEST_SIDE_PX = 1024
 """Larger images are reduced to this: a seed need not be exact."""
 _WITHIN_PX = 4.0
-_LEAST_MATCHES = 12
+_MIN_MATCHES = 12
 """Of one homography: unrelated images reach 7."""
 
 
@@ -42,42 +42,42 @@ def starter_for_matching(channels: tuple[int, int]) -> Descriptor:
 
 
 @torch.no_grad()
-def match_seed(net: Descriptor, fixed: Raster, moving: Raster, most: int = MOST_KEYPOINTS) -> Matrix | None:
+def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MAX_KEYPOINTS) -> Matrix | None:
     """fixed_to_moving between undistorted px, from matches of a `matching_network`'s descriptors.
 
     So many keypoints of each image are tried. None where fewer than twelve mutual nearest neighbours agree on one
     homography.
     """
     device = next(net.parameters()).device
-    here, there = (_keypoints(raster, device, most) for raster in (fixed, moving))
-    if min(len(here[1]), len(there[1])) < _LEAST_MATCHES:
+    here, there = (_keypoints(raster, device, maximum) for raster in (fixed, moving))
+    if min(len(here[1]), len(there[1])) < _MIN_MATCHES:
         return None
     f = net(here[0].patches(patch_positions(here[1])), REFERENCE)
     # Where contrast is reversed the gradient points the other way, and so does the keypoint.
     both_ways = [_turned(there[1], angle) for angle in (0.0, torch.pi)]
     f_prime = torch.cat([net(there[0].patches(patch_positions(k)), 1) for k in both_ways])
     rows, columns = _mutual_nearest(f, f_prime, len(there[1]))
-    if len(rows) < _LEAST_MATCHES:
+    if len(rows) < _MIN_MATCHES:
         return None
     xy = (here[1].xy[rows].cpu().numpy().astype(np.float64), there[1].xy[columns].cpu().numpy().astype(np.float64))
-    found, inliers = cv2.findHomography(*xy, cv2.USAC_MAGSAC, _WITHIN_PX, maxIters=20_000, confidence=0.9999)
-    if found is None or int(inliers.sum()) < _LEAST_MATCHES:
+    result, inliers = cv2.findHomography(*xy, cv2.USAC_MAGSAC, _WITHIN_PX, maxIters=20_000, confidence=0.9999)
+    if result is None or int(inliers.sum()) < _MIN_MATCHES:
         return None
     up = [(1 / view.scale[0], 1 / view.scale[1]) for view, _ in (here, there)]
     try:
-        return geometry.rescale(geometry.normalised(found), up[0], up[1])
+        return geometry.rescale(geometry.normalised(result), up[0], up[1])
     except GeometryError:
         return None
 
 
-def _keypoints(raster: Raster, device: torch.device, most: int) -> tuple[View, Keypoints]:
+def _keypoints(raster: Raster, device: torch.device, maximum: int) -> tuple[LevelImage, Keypoints]:
     """An image at the resolution at which it is matched, and its keypoints as undistorted positions."""
     scale = min(1.0, _LONGEST_SIDE_PX / max(raster.size_px))
-    view = make_view(raster, scale, device)
+    view = make_level_image(raster, scale, device)
     small = shrink(raster, view.size_px)
-    found = sift_keypoints(small, most)
-    xy = torch.from_numpy(lens.undistort(view.lens, found.xy.numpy()).astype(np.float32))
-    straight = Keypoints(xy, found.angle, found.scale).to(device)
+    result = sift_keypoints(small, maximum)
+    xy = torch.from_numpy(lens.undistort(view.lens, result.xy.numpy()).astype(np.float32))
+    straight = Keypoints(xy, result.angle, result.scale).to(device)
     rows = (view.room_at(straight.xy) > footprint_radius(straight.scale)).nonzero()[:, 0]
     return view, straight[rows]
 

@@ -27,28 +27,28 @@ from agalign.method.patches import (
     warp_keypoints,
 )
 from agalign.method.refine import refine
-from agalign.method.state import JointState, Subject
+from agalign.method.state import ImageGroup, JointState
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
-from agalign.values.doubts import Doubt
 from agalign.values.geometry import Matrix
+from agalign.values.issues import Issue
 
 _MOVING = 1
 
 
-def align_by_paper(state: JointState, subject: Subject) -> tuple[Descriptor, JointResult | Doubt]:
+def align_by_paper(state: JointState, group: ImageGroup) -> tuple[Descriptor, JointResult | Issue]:
     """The network and what it found for a subject of one moving image.
 
     Coarse to fine: theta starts anew at each level, psi is handed on. Raises NotEnoughTextureError, NoContrastError,
     and GeometryError where psi ends in no homography.
     """
     recipe = state.settings.paper
-    channels = subject.fixed.channels, subject.moving[0].channels
-    halvings = max(0, round(math.log2(max(subject.fixed.size_px) / recipe.coarsest_px)))
+    channels = group.fixed.channels, group.moving[0].channels
+    halvings = max(0, round(math.log2(max(group.fixed.size_px) / recipe.coarsest_px)))
     scales = tuple(0.5**k for k in range(halvings, -1, -1))
     steps = 0
     for number, scale in enumerate(scales):
-        level = state.level(subject, scale, [0])
+        level = state.level(group, scale, [0])
         # Retrieval is measured with the last level's theta, from which its patches are kept.
         pool = level.trainable if scale == 1.0 else level.anywhere
         net = state.paper_descriptor(channels)
@@ -56,14 +56,14 @@ def align_by_paper(state: JointState, subject: Subject) -> tuple[Descriptor, Joi
         def report(share: float, number: int = number) -> None:
             state.progress("learning", (number + share) / len(scales))
 
-        descent = descend(state, net, level, pool, subject.mappings[0], report)
-        subject.mappings[0] = descent.fixed_to_moving
+        descent = descend(state, net, level, pool, group.mappings[0], report)
+        group.mappings[0] = descent.fixed_to_moving
         steps += descent.steps
-    found = refine(state, net, subject, move=False)[0]
-    if isinstance(found, Doubt):
-        return net, found
+    result = refine(state, net, group, move=False)[0]
+    if isinstance(result, Issue):
+        return net, result
     return net, replace(
-        found, fixed_to_moving=descent.fixed_to_moving, loss=descent.loss, iterations=steps, levels=scales,
+        result, fixed_to_moving=descent.fixed_to_moving, loss=descent.loss, iterations=steps, levels=scales,
         recipe="paper", last_step_px=descent.last_step_px,
     )  # fmt: skip
 
@@ -144,7 +144,7 @@ def _draw(state: JointState, level: Level, pool: Pool, h: Tensor) -> _Drawn:
         raise NotEnoughTextureError(len(x), recipe.batch)
     order = torch.randperm(len(x), generator=state.sampler.generator).to(state.device)
     x_false = warp_keypoints(x[order], h)
-    is_negative = (x_false.xy - transform(h, x.xy)).norm(dim=1) >= recipe.least_negative_px
+    is_negative = (x_false.xy - transform(h, x.xy)).norm(dim=1) >= recipe.min_negative_px
     return _Drawn(x, x_false, is_negative)
 
 

@@ -139,6 +139,6 @@ def footprint_radius(scale: Tensor) -> Tensor:
     return scale * FOOTPRINT_PX
 
 
-def far_apart(keypoints: Keypoints, least_px: float) -> Tensor:
-    """(N, N) True where two keypoints are at least `least_px` from each other."""
-    return torch.cdist(keypoints.xy, keypoints.xy) >= least_px
+def far_apart(keypoints: Keypoints, min_px: float) -> Tensor:
+    """(N, N) True where two keypoints are at least `min_px` from each other."""
+    return torch.cdist(keypoints.xy, keypoints.xy) >= min_px

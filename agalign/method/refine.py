@@ -21,14 +21,14 @@ from agalign.method.device import exact
 from agalign.method.gauss_newton import PatchEquations, Step, shift_gradient, solve
 from agalign.method.levels import Level, footprints_inside, footprints_inside_moving
 from agalign.method.patches import Keypoints, far_apart, patch_positions, transform
-from agalign.method.state import JointState, Subject
+from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import JointResult
 from agalign.values.choices import ModelFamily
-from agalign.values.doubts import Doubt
+from agalign.values.issues import Issue
 
-LEAST_KEYPOINTS = 16
+MIN_KEYPOINTS = 16
 _FIRST_PATCHES, _LIKELY_SHIFTS, _AT_ONCE = 24, 64, 16
-_MOST_RATIO = 0.6
+_MAX_RATIO = 0.6
 """Of one step to the one before, for what follows to be believed a geometric series."""
 _PLAIN_GAIN = 3.0
 """Standard errors by which a loss must be less to count."""
@@ -63,7 +63,7 @@ class MovingBand:
 
 
 @dataclass(frozen=True)
-class Anchors:
+class ReferencePatches:
     """Patches of the reference as the network describes them."""
 
     keypoints: Keypoints
@@ -72,10 +72,10 @@ class Anchors:
     gradient: Tensor
     """(N, 256, 2) their derivative over a shift, per px."""
 
-    def head(self, count: int) -> "Anchors":
+    def head(self, count: int) -> "ReferencePatches":
         """The first `count` of them."""
         rows = torch.arange(min(count, len(self.f)), device=self.f.device)
-        return Anchors(self.keypoints[rows], self.f[rows], self.gradient[rows])
+        return ReferencePatches(self.keypoints[rows], self.f[rows], self.gradient[rows])
 
 
 def describe_fixed(net: Descriptor, level: Level, keypoints: Keypoints) -> Tensor:
@@ -85,13 +85,13 @@ def describe_fixed(net: Descriptor, level: Level, keypoints: Keypoints) -> Tenso
 
 
 @torch.no_grad()
-def make_anchors(net: Descriptor, level: Level, keypoints: Keypoints, difference_px: float) -> Anchors:
+def describe_reference(net: Descriptor, level: Level, keypoints: Keypoints, difference_px: float) -> ReferencePatches:
     """Descriptors and gradient of the reference's patches."""
 
     def describe(k: Keypoints) -> Tensor:
         return describe_fixed(net, level, k)
 
-    return Anchors(keypoints, describe(keypoints), shift_gradient(describe, keypoints, difference_px))
+    return ReferencePatches(keypoints, describe(keypoints), shift_gradient(describe, keypoints, difference_px))
 
 
 @dataclass(frozen=True)
@@ -102,32 +102,32 @@ class Solver:
     recipe: FastRecipe
 
     @torch.no_grad()
-    def step(self, band: MovingBand, homography: Tensor, anchors: Anchors) -> Step:
+    def step(self, band: MovingBand, homography: Tensor, reference_patches: ReferencePatches) -> Step:
         """One Gauss-Newton step. Raises NotEnoughTextureError where too few patches lie in both images."""
-        rows = band.sees(anchors.keypoints, homography)
-        if len(rows) < LEAST_KEYPOINTS:
-            raise NotEnoughTextureError(len(rows), LEAST_KEYPOINTS)
-        p = anchors.keypoints[rows]
-        residual = anchors.f[rows] - band.describe(p, homography)
-        equations = PatchEquations.of(p, residual, anchors.gradient[rows], band.level.fixed.size_px)
+        rows = band.sees(reference_patches.keypoints, homography)
+        if len(rows) < MIN_KEYPOINTS:
+            raise NotEnoughTextureError(len(rows), MIN_KEYPOINTS)
+        p = reference_patches.keypoints[rows]
+        residual = reference_patches.f[rows] - band.describe(p, homography)
+        equations = PatchEquations.of(p, residual, reference_patches.gradient[rows], band.level.fixed.size_px)
         return solve(equations, self.family, self.recipe)
 
-    def converge(self, band: MovingBand, start: Tensor, anchors: Anchors) -> tuple[Tensor, Step]:
+    def converge(self, band: MovingBand, start: Tensor, reference_patches: ReferencePatches) -> tuple[Tensor, Step]:
         """Steps from `start` until one moves no corner by more than `final_rest_px`.
 
         While the steps are long, a part of the anchors tells where to go. Steps of all of them become shorter by a
         constant ratio, so that every second one is lengthened by what those to come would add (Aitken 1926).
         """
-        h, some, before = start, anchors.head(self.recipe.first_patches), math.inf
+        h, some, before = start, reference_patches.head(self.recipe.first_patches), math.inf
         for _ in range(self.recipe.final_steps):
             step = self.step(band, h, some)
-            ratio = min(step.length_px / before, _MOST_RATIO)
+            ratio = min(step.length_px / before, _MAX_RATIO)
             h = moved(h, step, 1 / (1 - ratio))
-            if step.length_px < self.recipe.final_rest_px and some is anchors:
+            if step.length_px < self.recipe.final_rest_px and some is reference_patches:
                 break
-            before = step.length_px if some is anchors and ratio == 0 else math.inf
+            before = step.length_px if some is reference_patches and ratio == 0 else math.inf
             if step.length_px < self.recipe.rest_px:
-                some = anchors
+                some = reference_patches
         return h, step
 
 
@@ -139,17 +139,17 @@ def moved(homography: Tensor, step: Step, times: float = 1.0) -> Tensor:
 
 @torch.no_grad()
 def retrieval(
-    band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor, least_negative_px: float
+    band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor, min_negative_px: float
 ) -> tuple[float, float]:
     """How often the nearest descriptor in I' is the right one among the keypoints that lie in both images, and what
     guessing would give. `f` (N, 256) are the reference's descriptors.
     """
     rows = band.sees(keypoints, homography)
-    if len(rows) < LEAST_KEYPOINTS:
+    if len(rows) < MIN_KEYPOINTS:
         return 0.0, 1.0
     p = keypoints[rows]
     f_prime = band.describe(p, homography)
-    return losses.retrieval(f[rows], f_prime, far_apart(p, least_negative_px)), 1 / len(rows)
+    return losses.retrieval(f[rows], f_prime, far_apart(p, min_negative_px)), 1 / len(rows)
 
 
 @torch.no_grad()
@@ -157,7 +157,7 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach
     """The translation (2,) of the fixed side, up to `reach_px` long, at which the mean L0 of the patches that lie in
     both images is least; none where that is not plainly less than without, for the patches that both have.
     """
-    if len(keypoints) < LEAST_KEYPOINTS:
+    if len(keypoints) < MIN_KEYPOINTS:
         return homography.new_zeros(2)
     f = describe_fixed(band.net, band.level, keypoints)
     count = int(reach_px / step_px)
@@ -170,7 +170,7 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach
         """(losses (shifts, count) of the first keypoints, nan where a patch leaves an image; their means)."""
         p = keypoints[torch.arange(min(count, len(keypoints)), device=homography.device)]
         table = torch.cat([_losses_moved(band, homography, p, f[: len(p)], s) for s in torch.split(some, _AT_ONCE)])
-        enough = table.isfinite().sum(dim=1) >= LEAST_KEYPOINTS
+        enough = table.isfinite().sum(dim=1) >= MIN_KEYPOINTS
         return table, table.nanmean(dim=1).masked_fill(~enough, float("inf"))
 
     # A part of the patches tells which shifts are worth all of them.
@@ -180,7 +180,7 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach
     best = int(means.argmin())
     gain = table[0] - table[best]
     gain = gain[gain.isfinite()]
-    if not bool(means[best].isfinite()) or len(gain) < LEAST_KEYPOINTS:
+    if not bool(means[best].isfinite()) or len(gain) < MIN_KEYPOINTS:
         return homography.new_zeros(2)
     plain = float(gain.mean()) > _PLAIN_GAIN * float(gain.std()) / math.sqrt(len(gain))
     return likely[best - 1] if plain and best > 0 else homography.new_zeros(2)
@@ -197,45 +197,49 @@ def _losses_moved(band: MovingBand, homography: Tensor, keypoints: Keypoints, f:
 
 
 @torch.no_grad()
-def refine(state: JointState, net: Descriptor, subject: Subject, *, move: bool = True) -> list[JointResult | Doubt]:
+def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool = True) -> list[JointResult | Issue]:
     """Every psi of a capture at full resolution with theta frozen; a doubt says why a pair has none.
 
     Without `move` psi stays where it is, and what is said of it is how sure it is.
     Raises NoContrastError.
     """
     recipe = state.settings.fast
-    level = state.level(subject, 1.0, range(len(subject.moving)))
-    h = [level.homography(matrix, b) for b, matrix in enumerate(subject.mappings)]
+    level = state.level(group, 1.0, range(len(group.moving)))
+    h = [level.homography(matrix, b) for b, matrix in enumerate(group.mappings)]
     p, _ = state.sampler.draw(level, level.anywhere, h, recipe.final_patches, recipe.final_octaves)
     test, _ = state.sampler.draw(level, level.held_out, h, recipe.test_keypoints, recipe.final_octaves)
-    if len(p) < LEAST_KEYPOINTS:
-        return [Doubt("few_keypoints", len(p), LEAST_KEYPOINTS)] * len(h)
-    anchors = make_anchors(net, level, p, recipe.difference_px)
+    if len(p) < MIN_KEYPOINTS:
+        return [Issue("few_keypoints", len(p), MIN_KEYPOINTS)] * len(h)
+    reference_patches = describe_reference(net, level, p, recipe.difference_px)
     f_test = describe_fixed(net, level, test)
     solver = Solver(state.family, recipe)
 
-    def result(band: MovingBand, start: Tensor) -> JointResult | Doubt:
+    def result(band: MovingBand, start: Tensor) -> JointResult | Issue:
         try:
-            found, step = solver.converge(band, start, anchors) if move else (start, solver.step(band, start, anchors))
-            matrix = level.full_matrix(found, band.index)
+            results, step = (
+                solver.converge(band, start, reference_patches)
+                if move
+                else (start, solver.step(band, start, reference_patches))
+            )
+            matrix = level.full_matrix(results, band.index)
         except NotEnoughTextureError as why_not:
-            return Doubt("few_keypoints", why_not.keypoints, why_not.least)
+            return Issue("few_keypoints", why_not.keypoints, why_not.minimum)
         except GeometryError:
-            return Doubt("not_invertible")
+            return Issue("not_invertible")
         std = _complete_std(step, recipe)
         if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
-            return Doubt("corners_unknown")
-        held_out, chance = retrieval(band, found, test, f_test, recipe.least_negative_px)
+            return Issue("corners_unknown")
+        held_out, chance = retrieval(band, results, test, f_test, recipe.min_negative_px)
         return JointResult(
             matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
             _complete_covariance(step, recipe),
         )  # fmt: skip
 
     return [
-        Doubt("retrieval", subject.given_up[b], recipe.step_gate)
-        if b in subject.given_up
+        Issue("retrieval", group.given_up[b], recipe.step_gate)
+        if b in group.given_up
         else result(MovingBand(net, level, b, side), h[b])
-        for b, side in enumerate(subject.sides)
+        for b, side in enumerate(group.sides)
     ]
 
 

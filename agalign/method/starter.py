@@ -49,5 +49,5 @@ def save_starter(net: Descriptor, path: Path) -> None:
 
 @cache
 def _weights() -> dict[str, Tensor]:
-    found: dict[str, Tensor] = load(resources.files("agalign.method").joinpath(_FILE).read_bytes())
-    return {name: value.to(torch.float32) for name, value in found.items()}
+    result: dict[str, Tensor] = load(resources.files("agalign.method").joinpath(_FILE).read_bytes())
+    return {name: value.to(torch.float32) for name, value in result.items()}

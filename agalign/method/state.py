@@ -11,7 +11,7 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.device import choose_device
 from agalign.method.levels import Level, Sampler, make_level
 from agalign.method.starter import start_from_starter
-from agalign.values.alignment import LocalField
+from agalign.values.alignment import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
@@ -20,7 +20,7 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass
-class Subject:
+class ImageGroup:
     """The images of one capture and where their alignment stands."""
 
     fixed: Raster
@@ -36,7 +36,7 @@ class Subject:
     given_up: dict[int, float] = field(default_factory=dict)
     """Moving images whose patches could not be told apart at some level, and the retrieval there: nothing is learnt or
     refined for them."""
-    fields: Sequence[LocalField | None] = ()
+    fields: Sequence[DisplacementField | None] = ()
     """Displacements of the reference's positions before each homography, px of `fixed`; empty for none at all."""
 
     @property
@@ -45,7 +45,7 @@ class Subject:
         return [b for b in range(len(self.moving)) if b not in self.given_up]
 
     @classmethod
-    def of_one(cls, fixed: Raster, moving: Raster, fixed_to_moving: Matrix, *, trusted: bool = False) -> "Subject":
+    def of_one(cls, fixed: Raster, moving: Raster, fixed_to_moving: Matrix, *, trusted: bool = False) -> "ImageGroup":
         """A single pair, described by the network's first two sides."""
         return cls(fixed, [moving], [fixed_to_moving], [1], [trusted])
 
@@ -60,14 +60,14 @@ class JointState:
         self.sampler = Sampler(torch.Generator().manual_seed(settings.rng_seed))
         self.family = None if settings.model_family == "auto" else settings.model_family
 
-    def level(self, subject: Subject, scale: float, bands: Sequence[int]) -> Level:
+    def level(self, group: ImageGroup, scale: float, bands: Sequence[int]) -> Level:
         """The subject's reference and some of its moving images at a resolution. Raises NoContrastError."""
         level = make_level(
-            subject.fixed, [subject.moving[b] for b in bands], [subject.mappings[b] for b in bands], scale,
-            self.settings.paper.least_gradient, self.sampler.generator, self.device,
+            group.fixed, [group.moving[b] for b in bands], [group.mappings[b] for b in bands], scale,
+            self.settings.paper.min_gradient, self.sampler.generator, self.device,
         )  # fmt: skip
-        if subject.fields:
-            level = level.bent_by([subject.fields[b] for b in bands])
+        if group.fields:
+            level = level.with_fields([group.fields[b] for b in bands])
         if len(level.trainable) == 0:
             raise NoContrastError
         return level

@@ -17,8 +17,8 @@ from agalign.values.geometry import Matrix, Points
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.lens import Lens
 
-View = Literal["edges", "image"]
-VIEWS: tuple[View, ...] = ("edges", "image")
+LandmarkInput = Literal["edges", "image"]
+LANDMARK_INPUTS: tuple[LandmarkInput, ...] = ("edges", "image")
 """What is looked at: the strength of the edges, which a reversed contrast leaves as it is, or the image itself."""
 
 _LONGEST_SIDE_PX = 640
@@ -27,7 +27,7 @@ _MOST = 3000
 _RATIO = 0.9
 """Nearest over second nearest distance, from which a match is ambiguous."""
 _WITHIN_PX = 3.0
-_LEAST_AGREED = 10
+_MIN_AGREED = 10
 """Unrelated images reach 8."""
 _EDGES_SMOOTHED_PX, _BESIDE_INVALID_PX = 1.0, 7
 
@@ -46,7 +46,7 @@ class Landmarks:
         return Landmarks(lens.undistort(model, self.xy), self.descriptors)
 
 
-def landmarks(raster: Raster, view: View) -> Landmarks:
+def landmarks(raster: Raster, view: LandmarkInput) -> Landmarks:
     """The strongest ones of an image, whatever its channels."""
     width, height = raster.size_px
     scale = min(1.0, _LONGEST_SIDE_PX / max(width, height))
@@ -57,10 +57,10 @@ def landmarks(raster: Raster, view: View) -> Landmarks:
         looked_at = np.sqrt(gradient_magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))))
         beside = np.ones((_BESIDE_INVALID_PX, _BESIDE_INVALID_PX), np.uint8)
         valid = cv2.erode(valid.astype(np.uint8), beside, borderValue=1) > 0
-    found, described = cv2.SIFT.create(nfeatures=_MOST).detectAndCompute(eight_bit(looked_at, valid), valid.view("u1"))
+    result, described = cv2.SIFT.create(nfeatures=_MOST).detectAndCompute(eight_bit(looked_at, valid), valid.view("u1"))
     if described is None:
         return Landmarks(np.empty((0, 2)), np.empty((0, 128), np.float32))
-    there = np.array([k.pt for k in found], np.float64)
+    there = np.array([k.pt for k in result], np.float64)
     up = width / small.size_px[0], height / small.size_px[1]
     root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-12))
     return Landmarks((there + 0.5) * up - 0.5, np.asarray(root, np.float32))
@@ -68,22 +68,22 @@ def landmarks(raster: Raster, view: View) -> Landmarks:
 
 def agreed_homography(fixed: Landmarks, moving: Landmarks, size_px: tuple[int, int]) -> Matrix | None:
     """fixed_to_moving that ten or more unambiguous matches agree on, for a fixed image (width, height), or None."""
-    if min(len(fixed.xy), len(moving.xy)) < _LEAST_AGREED:
+    if min(len(fixed.xy), len(moving.xy)) < _MIN_AGREED:
         return None
     alike = fixed.descriptors @ moving.descriptors.T
     best, back = alike.argmax(axis=1), alike.argmax(axis=0)
     second, first = np.sqrt(np.maximum(2 - 2 * np.partition(alike, -2, axis=1)[:, -2:], 0)).T
     rows = np.flatnonzero((first < _RATIO * second) & (back[best] == np.arange(len(best))))
-    if len(rows) < _LEAST_AGREED:
+    if len(rows) < _MIN_AGREED:
         return None
     within_px = _WITHIN_PX * max(1.0, max(size_px) / _LONGEST_SIDE_PX)
-    found, agrees = cv2.findHomography(
+    result, agrees = cv2.findHomography(
         fixed.xy[rows], moving.xy[best[rows]], cv2.USAC_MAGSAC, within_px, maxIters=20_000, confidence=0.9999
     )
-    if found is None or int(agrees.sum()) < _LEAST_AGREED:
+    if result is None or int(agrees.sum()) < _MIN_AGREED:
         return None
     try:
-        return geometry.normalised(found)
+        return geometry.normalised(result)
     except GeometryError:
         return None
 

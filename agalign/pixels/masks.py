@@ -7,14 +7,14 @@ from numpy.typing import ArrayLike, NDArray
 from agalign.errors import InputError
 from agalign.values.image import Mask, Raster
 
-_LEAST_SIDE_PX = 48
-_MOST_CHANNELS = 16
+_MIN_SIDE_PX = 48
+_MAX_CHANNELS = 16
 _USUAL_FILLS = (-9999.0, -99999.0, -32767.0, -32768.0)
 _LARGEST_MEASURED = 1e15
 """No sensor's unit reaches this; the fills of netCDF, GIS and C programs (1e20, 9.97e36, 3.4e38) do."""
-_LEAST_FILL_SHARE = 0.002
+_MIN_FILL_SHARE = 0.002
 """A constant patch at the border smaller than this share of the image is content, not fill."""
-_LEAST_SATURATED_PX = 7
+_MIN_SATURATED_PX = 7
 """Saturated spots narrower than this are content: half a patch still shows their surroundings."""
 
 
@@ -45,7 +45,7 @@ def undeclared_fill(pixels: ArrayLike) -> Mask:
             continue
         _, labels, stats, _ = cv2.connectedComponentsWithStats(same, connectivity=4)
         touching = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-        large = [k for k in touching if k and stats[k, cv2.CC_STAT_AREA] >= _LEAST_FILL_SHARE * values.size]
+        large = [k for k in touching if k and stats[k, cv2.CC_STAT_AREA] >= _MIN_FILL_SHARE * values.size]
         fill |= np.isin(labels, large)
     return fill
 
@@ -60,7 +60,7 @@ def learnable(valid: Mask, pixels: ArrayLike, saturation_value: float | None) ->
     saturated = (np.asarray(pixels) >= saturation_value).astype(np.uint8)
     if not saturated.any():
         return valid
-    areas = cv2.morphologyEx(saturated, cv2.MORPH_OPEN, np.ones((_LEAST_SATURATED_PX,) * 2, np.uint8))
+    areas = cv2.morphologyEx(saturated, cv2.MORPH_OPEN, np.ones((_MIN_SATURATED_PX,) * 2, np.uint8))
     grown = cv2.dilate(areas, np.ones((3, 3), np.uint8)) > 0
     return np.asarray(valid & ~grown)
 
@@ -74,12 +74,12 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
         raise InputError(
             f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"
         )
-    if array.ndim == 3 and array.shape[-1] <= _MOST_CHANNELS < array.shape[0]:
+    if array.ndim == 3 and array.shape[-1] <= _MAX_CHANNELS < array.shape[0]:
         array = np.moveaxis(array, -1, 0)
     planes = array if array.ndim == 3 else array[None]
-    if len(planes) > _MOST_CHANNELS or min(planes.shape[1:]) < _LEAST_SIDE_PX:
+    if len(planes) > _MAX_CHANNELS or min(planes.shape[1:]) < _MIN_SIDE_PX:
         raise InputError(
-            f"{name} is {array.shape}: images need {_LEAST_SIDE_PX} px a side and at most {_MOST_CHANNELS} channels"
+            f"{name} is {array.shape}: images need {_MIN_SIDE_PX} px a side and at most {_MAX_CHANNELS} channels"
         )
     saturation = float(np.iinfo(array.dtype).max) if array.dtype.kind in "ui" and array.dtype.itemsize <= 2 else None
     mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)

@@ -24,11 +24,11 @@ _CODE_REACH = 3.0
 """How far their middles lie apart at most, in sides of the code."""
 _SHARE_OF_IMAGE = 0.004, 0.3
 """Of a panel without a code."""
-_MOST_SPREAD = 0.06
+_MAX_SPREAD = 0.06
 """Standard deviation within the area, beside its mean."""
-_LEAST_CONTRAST = 1.5
+_MIN_CONTRAST = 1.5
 """How much brighter it is than what lies around it."""
-_MOST_SLANT, _MOST_TAPER = 1.4, 1.15
+_MAX_SLANT, _MAX_TAPER = 1.4, 1.15
 """Longest side over shortest, and either side over the one across."""
 _ALBEDO_IN_CODE = re.compile(r"_(\d{4})(\d{3})(\d{4})(\d{3})$")
 
@@ -70,10 +70,10 @@ def albedo_of(code: str, wavelength_nm: float | None) -> float | None:
     """What a panel's code says of its reflectance, 0 to 1: RP04-…_04005111000507 is 51.1 % at 400 nm and 50.7 % at
     1000 nm, with a straight line between them, as the cameras' firmware takes it too.
     """
-    found = _ALBEDO_IN_CODE.search(code)
-    if found is None or wavelength_nm is None:
+    result = _ALBEDO_IN_CODE.search(code)
+    if result is None or wavelength_nm is None:
         return None
-    first_nm, first, last_nm, last = (float(n) for n in found.groups())
+    first_nm, first, last_nm, last = (float(n) for n in result.groups())
     if not first_nm <= wavelength_nm <= last_nm or last_nm == first_nm:
         return None
     return (first + (last - first) * (wavelength_nm - first_nm) / (last_nm - first_nm)) / 1000
@@ -106,20 +106,20 @@ def _code(shown: NDArray[np.uint8]) -> tuple[str, Corners | None]:
     return (text, np.asarray(at, np.float64).reshape(4, 2)) if text else ("", None)
 
 
-def _outlines(shown: NDArray[np.uint8], least: float, most: float) -> list[Corners]:
+def _outlines(shown: NDArray[np.uint8], minimum: float, maximum: float) -> list[Corners]:
     """Convex quadrilaterals that some brightness outlines, of areas between two."""
-    found = []
+    result = []
     low, high = (float(v) for v in np.percentile(shown, (5, 99.5)))
     for level in np.linspace(low, high, _LEVELS + 2)[1:-1]:
         contours, _ = cv2.findContours((shown > level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
-        for contour in (c for c in contours if least <= cv2.contourArea(c) <= most):
+        for contour in (c for c in contours if minimum <= cv2.contourArea(c) <= maximum):
             four = cv2.approxPolyDP(contour, 0.04 * cv2.arcLength(contour, closed=True), closed=True).reshape(-1, 2)
             if len(four) == 4 and cv2.isContourConvex(four):
                 sides = np.linalg.norm(four - np.roll(four, 1, axis=0), axis=1)
                 longer, shorter = np.maximum(sides[:2], sides[2:]), np.minimum(sides[:2], sides[2:])
-                if sides.max() <= _MOST_SLANT * sides.min() and (longer <= _MOST_TAPER * shorter).all():
-                    found.append(four.astype(np.float64))
-    return found
+                if sides.max() <= _MAX_SLANT * sides.min() and (longer <= _MAX_TAPER * shorter).all():
+                    result.append(four.astype(np.float64))
+    return result
 
 
 def _is_panel(shown: NDArray[np.uint8], square: Corners) -> bool:
@@ -128,8 +128,8 @@ def _is_panel(shown: NDArray[np.uint8], square: Corners) -> bool:
     within, around = shown[inner].astype(np.float64), shown[outer & ~edge]
     if not len(within) or not len(around):
         return False
-    bright = within.mean() >= _LEAST_CONTRAST * np.median(around)
-    return bool(bright and within.std() <= _MOST_SPREAD * within.mean())
+    bright = within.mean() >= _MIN_CONTRAST * np.median(around)
+    return bool(bright and within.std() <= _MAX_SPREAD * within.mean())
 
 
 def _is_beside(square: Corners, code: Corners) -> bool:

@@ -19,10 +19,10 @@ from agalign.values.capture import Capture, Quantity, Radiometry, RadiometrySour
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage
 
-_MOST_FALLOFF = 1000.0
-_MOST_LOG_FALLOFF = np.log(_MOST_FALLOFF)
-_MOST_RAW = 65535.0
-_MOST_VALUE = 1e12
+_MAX_FALLOFF = 1000.0
+_MAX_LOG_FALLOFF = np.log(_MAX_FALLOFF)
+_MAX_RAW = 65535.0
+_MAX_VALUE = 1e12
 """Float32 holds more; no light does."""
 
 
@@ -43,10 +43,10 @@ def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
         falloff = np.polynomial.polynomial.polyval(r, (1.0, *radiometry.vignetting))
         along = 1.0 + radiometry.row_gradient * np.array([0.0, height])
-        largest = radiometry.gain / radiometry.full_scale * factor * _MOST_RAW
+        largest = radiometry.gain / radiometry.full_scale * factor * _MAX_RAW
     return bool(
-        (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < _MOST_LOG_FALLOFF).all()
-        and (along > 1 / _MOST_FALLOFF).all() and largest < _MOST_VALUE
+        (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < _MAX_LOG_FALLOFF).all()
+        and (along > 1 / _MAX_FALLOFF).all() and largest < _MAX_VALUE
     )  # fmt: skip
 
 
@@ -61,10 +61,10 @@ def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mappin
         return capture
     in_turn: Sequence[RadiometryChoice] = ("panel", "sun", "camera") if choice == "auto" else (choice,)
     for one in in_turn:
-        found = {b.name: _chosen(b.radiometry, one, by_panel.get(b.name)) for b in capture.bands}
-        if all(found[b.name] is not None for b in capture.bands if not b.companion):
+        result = {b.name: _chosen(b.radiometry, one, by_panel.get(b.name)) for b in capture.bands}
+        if all(result[b.name] is not None for b in capture.bands if not b.companion):
             break
-    return replace(capture, bands=tuple(replace(b, radiometry=found[b.name]) for b in capture.bands))
+    return replace(capture, bands=tuple(replace(b, radiometry=result[b.name]) for b in capture.bands))
 
 
 def _chosen(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: float | None) -> Radiometry | None:
@@ -76,8 +76,8 @@ def _chosen(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: fl
     if told is None:
         return None
     factor, quantity = told
-    told_by: RadiometrySource = "panel" if choice == "panel" else "light sensor"
-    return replace(of_camera, gain=of_camera.gain * factor, quantity=quantity, told_by=told_by, by_sun=None)
+    source: RadiometrySource = "panel" if choice == "panel" else "light sensor"
+    return replace(of_camera, gain=of_camera.gain * factor, quantity=quantity, source=source, by_sun=None)
 
 
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:

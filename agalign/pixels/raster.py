@@ -21,7 +21,7 @@ from agalign.errors import GeometryError, UnreadableFileError
 from agalign.pixels.masks import data_mask, learnable, undeclared_fill
 from agalign.values import lens
 from agalign.values.capture import Band, Georeference
-from agalign.values.choices import MOST_PIXELS
+from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster
 
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
@@ -40,7 +40,7 @@ _DRIVERS = {
     b"II*\0": "GTiff", b"MM\0*": "GTiff", b"II+\0": "GTiff", b"MM\0+": "GTiff", b"\xff\xd8\xff": "JPEG",
 }  # fmt: skip
 """By how a file begins. GDAL has drivers that execute, or ask other computers, for whatever name a file has."""
-_MOST_BANDS = 512
+_MAX_BANDS = 512
 
 
 @dataclass(frozen=True)
@@ -118,12 +118,12 @@ def _driver_of(path: Path) -> str:
     raise UnreadableFileError(f"{path}: {what}; copy it from the card again")
 
 
-def probe(path: Path, most_pixels: int = MOST_PIXELS) -> RasterInfo:
+def probe(path: Path, max_pixels: int = MAX_PIXELS) -> RasterInfo:
     """What a raster file holds, without reading its pixels. Raises UnreadableFileError, also where it declares more
     than so many pixels a band.
     """
     try:
-        return _probe(path, most_pixels)
+        return _probe(path, max_pixels)
     except UnreadableFileError:
         raise
     except Exception as error:  # a damaged file makes a reader fail in any way
@@ -131,15 +131,15 @@ def probe(path: Path, most_pixels: int = MOST_PIXELS) -> RasterInfo:
         raise UnreadableFileError(f"{path}: cannot be read ({said}); copy it from the card again") from None
 
 
-def _probe(path: Path, most_pixels: int) -> RasterInfo:
+def _probe(path: Path, max_pixels: int) -> RasterInfo:
     with open_raster(path) as dataset:
         width, height, count = dataset.width, dataset.height, dataset.count
-        if width * height > most_pixels:
+        if width * height > max_pixels:
             raise UnreadableFileError(
-                f"{path}: declares {width} x {height} pixels, more than the {most_pixels:,} that --max-pixels allows"
+                f"{path}: declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
             )
-        if count > _MOST_BANDS:
-            raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MOST_BANDS} can take part")
+        if count > _MAX_BANDS:
+            raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
         wavelengths = tuple(_wavelength_nm(dataset.tags(index)) for index in dataset.indexes)
         alpha = [i for i, c in enumerate(dataset.colorinterp, start=1) if c == ColorInterp.alpha]
         georeference = None
@@ -170,9 +170,9 @@ def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
         valid &= ~undeclared_fill(pixels)
     valid = learnable(valid, pixels, band.saturation_value)
     scale = shape[1] / band.width_px, shape[0] / band.height_px
-    found = pixels.astype(np.float32)
-    found[~valid] = 0
-    return Raster(found, valid, lens.rescaled(band.lens, scale))
+    result = pixels.astype(np.float32)
+    result[~valid] = 0
+    return Raster(result, valid, lens.rescaled(band.lens, scale))
 
 
 def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]) -> NDArray[np.generic]:

@@ -94,9 +94,9 @@ def resample(
     return _as_type(sampled, pixels.dtype), np.asarray(inside)
 
 
-def _between(positions: Points, least: Points, most: Points) -> Mask:
+def _between(positions: Points, minimum: Points, maximum: Points) -> Mask:
     """(H, W) True where positions (H, W, 2) lie within a rectangle, its border included."""
-    return np.asarray(cv2.inRange(positions, tuple(map(float, least)), tuple(map(float, most))) != 0)
+    return np.asarray(cv2.inRange(positions, tuple(map(float, minimum)), tuple(map(float, maximum))) != 0)
 
 
 def _for_remap(pixels: NDArray[np.generic], interpolation: Interpolation) -> NDArray[np.generic]:
@@ -135,7 +135,7 @@ def warped(
 
     `mapping` is between the raw pixels of the two images at their full size.
     """
-    unmoved = not mapping.bends and np.array_equal(mapping.fixed_to_moving, np.eye(3))
+    unmoved = not mapping.is_curved and np.array_equal(mapping.fixed_to_moving, np.eye(3))
     if unmoved and size_px == moving.size_px and fixed_scale == (1.0, 1.0):
         return moving
     full = round(size_px[0] / fixed_scale[0]), round(size_px[1] / fixed_scale[1])
@@ -161,9 +161,9 @@ def single(raster: Raster) -> Raster:
     return Raster(np.asarray(raster.pixels.mean(axis=0), np.float32), raster.valid, raster.lens)
 
 
-def textured(raster: Raster, least_share: float = 0.02) -> bool:
+def textured(raster: Raster, min_share: float = 0.02) -> bool:
     """False where the valid pixels are (nearly) all alike or too few for a structure to exist."""
-    if np.count_nonzero(raster.valid) <= least_share * raster.valid.size:
+    if np.count_nonzero(raster.valid) <= min_share * raster.valid.size:
         return False
     planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
     mask = raster.valid.astype(np.uint8)

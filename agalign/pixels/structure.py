@@ -81,10 +81,10 @@ def windowed_spectra(fields: Field) -> Field:
 
 def correlation_surfaces(fixed: Field, moving: Field) -> NDArray[np.float32]:
     """`correlation_surface` of fields given by their `windowed_spectra`, (..., height, width)."""
-    return np.asarray(fft.ifft2(half_whitened(fixed, moving), overwrite_x=True).real)
+    return np.asarray(fft.ifft2(whitened_cross_spectra(fixed, moving), overwrite_x=True).real)
 
 
-def half_whitened(fixed: Field, moving: Field) -> Field:
+def whitened_cross_spectra(fixed: Field, moving: Field) -> Field:
     """The cross spectrum of which `correlation_surfaces` are the inverse transform."""
     cross = np.conj(fixed)
     cross *= moving
@@ -95,21 +95,21 @@ def half_whitened(fixed: Field, moving: Field) -> Field:
     return cross
 
 
-def tops(cross: Field, near_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The highest points (n, 2) of the surfaces of `half_whitened` spectra (n, height, width), each near the given one.
+def peak_positions(cross: Field, near_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The highest points (n, 2) of the surfaces of cross spectra (n, height, width), each near the given one.
 
     A surface is a trigonometric polynomial, evaluated between its samples on finer and finer lattices of 3 x 3: a
     paraboloid through the samples themselves takes a shift of a fifth of a px for an eighth.
     """
     height, width = cross.shape[-2:]
-    found = near_px.copy()
+    result = near_px.copy()
     offset = np.array([-1.0, 0.0, 1.0])
     for step in _LATTICE_STEPS_PX:
-        at_x, at_y = (found[:, axis, None] + step * offset for axis in (0, 1))
+        at_x, at_y = (result[:, axis, None] + step * offset for axis in (0, 1))
         rows = _waves(at_y, height) @ cross
         patches = (rows @ _waves(at_x, width).transpose(0, 2, 1)).real
-        found += step * paraboloid_tops(patches.astype(np.float64))
-    return found
+        result += step * paraboloid_peaks(patches.astype(np.float64))
+    return result
 
 
 _LATTICE_STEPS_PX = (0.5, 0.25)
@@ -121,7 +121,7 @@ def _waves(at_px: NDArray[np.float64], length: int) -> Field:
     return np.asarray(np.exp(2j * np.pi * at_px[..., None] * frequencies), np.complex64)
 
 
-def paraboloid_tops(patches: NDArray[np.float64]) -> NDArray[np.float64]:
+def paraboloid_peaks(patches: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n, 2): (x, y) of the tops of the quadratic surfaces fitted to (n, 3, 3) samples, each within one of the centre;
     0 where a surface has none.
     """

@@ -82,15 +82,15 @@ def import_xarray() -> Any:
 def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset":
     xr = import_xarray()
     files: dict[str, xarray.DataArray] = {}
-    found = {}
+    result = {}
     for band in sidecar.bands:
         if band.place is None:
             continue
         name = band.place.file
         if name not in files:
             files[name] = _opened(folder, name, masked=masked)
-        found[band.band] = _variable(files[name], band, band.place.band_index, name)
-    dataset: xarray.Dataset = xr.Dataset(found)
+        result[band.band] = _variable(files[name], band, band.place.band_index, name)
+    dataset: xarray.Dataset = xr.Dataset(result)
     dataset.attrs = {
         "capture": sidecar.capture, "capture_id": sidecar.capture_id, "flight_id": sidecar.flight_id,
         "captured_at": sidecar.captured_at, "camera": f"{sidecar.camera.make} {sidecar.camera.model}".strip(),

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
 from agalign.errors import OutputError
-from agalign.judge.expected_error import expected_error_px
 from agalign.pixels.raster import GDAL_ENVIRONMENT, why, without_warnings
 from agalign.products.write import georeferenced, verify
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid
+from agalign.verify.expected_error import expected_error_px
 
 _LATTICE_PX = 16
 _STEP_PX = 0.001
@@ -65,5 +65,5 @@ def _map_of(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) ->
     nodes = error_lattice_px(alignment, size_px, grid)
     rows, columns = nodes.shape
     at_x, at_y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in ((columns, grid.width), (rows, grid.height)))
-    found = cv2.remap(nodes, *np.meshgrid(at_x, at_y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(np.round(found / _STEP_PX) * _STEP_PX, np.float32)
+    result = cv2.remap(nodes, *np.meshgrid(at_x, at_y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(np.round(result / _STEP_PX) * _STEP_PX, np.float32)

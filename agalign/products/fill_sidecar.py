@@ -13,10 +13,10 @@ from agalign.flight.fingerprint import fingerprint
 from agalign.products.sidecar import (
     BandPart,
     CameraPart,
-    DoubtPart,
     FilePart,
     GridPart,
     HomographyPart,
+    IssuePart,
     JointPart,
     LocalPart,
     Matrix3x3,
@@ -34,7 +34,7 @@ from agalign.products.sidecar import (
 )
 from agalign.products.write import Written
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, LocalResult, Prediction, Residual
+from agalign.values.alignment import Alignment, DisplacementResult, JointResult, Prediction, Residual
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Matrix
@@ -43,7 +43,7 @@ from agalign.values.mapping import PixelMapping, mapping_of
 _GRID = 17, 13
 _FINE_GRID = 65, 49
 """Local displacements need more points, and so does a lens that the reference's own does not nearly undo."""
-_MOST_BENT_PX = 0.2
+_MAX_BENT_PX = 0.2
 
 
 def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:
@@ -131,7 +131,7 @@ def _output_part(capture: Capture, written: Written, settings: WriteSettings) ->
 
 
 def _radiometry(capture: Capture) -> str | None:
-    made = dict.fromkeys(f"{b.radiometry.quantity} by {b.radiometry.told_by}" for b in capture.bands if b.radiometry)
+    made = dict.fromkeys(f"{b.radiometry.quantity} by {b.radiometry.source}" for b in capture.bands if b.radiometry)
     return " and ".join(made) or None
 
 
@@ -152,7 +152,7 @@ def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
     joint, residual = alignment.joint, alignment.residual
     local = alignment.local
     mapping = mapping_of(reference, band, alignment)
-    bent = alignment.field is not None or _bends(mapping, reference.size_px)
+    bent = alignment.field is not None or _is_curved(mapping, reference.size_px)
     grid_px = geometry.lattice(*reference.size_px, *(_FINE_GRID if bent else _GRID))
     there_px = mapping(grid_px)
     after = dict(alignment.after)
@@ -167,7 +167,7 @@ def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
         band_index=band.band_index,
         status=alignment.status,
         reason=alignment.reason,
-        doubts=[DoubtPart(kind=d.kind, value=_finite(d.value), limit=_finite(d.limit)) for d in alignment.doubts],
+        doubts=[IssuePart(kind=d.kind, value=_finite(d.value), limit=_finite(d.limit)) for d in alignment.issues],
         homography=HomographyPart(fixed_to_moving=_rows(alignment.fixed_to_moving), space=alignment.space),
         seed=SeedPart(
             kind=alignment.seed.kind,
@@ -186,12 +186,12 @@ def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
     )
 
 
-def _bends(mapping: PixelMapping, size_px: tuple[int, int]) -> bool:
+def _is_curved(mapping: PixelMapping, size_px: tuple[int, int]) -> bool:
     """True where the middles between the points of a coarse grid lie aside from the straight lines between them."""
     points = geometry.lattice(*size_px, *_GRID).reshape(_GRID[1], _GRID[0], 2)
     there = mapping(points)
     straight = mapping(0.5 * (points[:, 1:] + points[:, :-1])) - 0.5 * (there[:, 1:] + there[:, :-1])
-    return bool(np.abs(straight).max() > _MOST_BENT_PX)
+    return bool(np.abs(straight).max() > _MAX_BENT_PX)
 
 
 def _prediction_part(prediction: Prediction) -> PredictionPart:
@@ -203,7 +203,7 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def _local_part(local: LocalResult) -> LocalPart:
+def _local_part(local: DisplacementResult) -> LocalPart:
     before, after = _finite(local.before_p95_px), _finite(local.after_p95_px)
     return LocalPart(applied=local.field is not None, before_p95_px=before, after_p95_px=after)
 

@@ -34,9 +34,9 @@ _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 1
 """Water, soil, and the greens, red green blue, over an index's span."""
 _NODATA_COLOUR = (225, 225, 225)
 _RAW = "raw numbers"
-_MOST_PREDICTED_PX = 1.0
+_MAX_PREDICTED_PX = 1.0
 """A band that the rig predicts no better than this is left out of indices."""
-_MOST_REFLECTANCE = 2.0
+_MAX_REFLECTANCE = 2.0
 """Glints and specular leaves exceed 1; raw numbers of any sensor exceed this."""
 _SAMPLE_PX = 512
 """Longer side of the sample by which unnamed numbers are told apart."""
@@ -85,10 +85,8 @@ def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> 
     parts = sidecar.bands
     chosen = [parts[i] for i in bands_for(index, [p.band for p in parts], [p.wavelength_nm for p in parts])]
     for part in chosen:
-        if not is_delivered(part, _MOST_PREDICTED_PX) or part.place is None:
-            known = (
-                "" if part.prediction is None else f" to {part.prediction.std_px:.1f} px, not {_MOST_PREDICTED_PX:g}"
-            )
+        if not is_delivered(part, _MAX_PREDICTED_PX) or part.place is None:
+            known = "" if part.prediction is None else f" to {part.prediction.std_px:.1f} px, not {_MAX_PREDICTED_PX:g}"
             raise InputError(f"{index.name} is left out: {part.band} is {part.status}{known} ({part.reason})")
     target = path.with_name(f"{path.stem}_{index.name}.tif")
     counts, edges = np.zeros(_BINS, np.int64), np.linspace(*index.span, _BINS + 1)
@@ -137,7 +135,7 @@ def _units_of(source: rasterio.DatasetReader, index: int) -> list[str]:
     values = _physical(source, index, some, shape)
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 0.0)
-    return ["reflectance"] if low >= -_MOST_REFLECTANCE and high <= _MOST_REFLECTANCE else [_RAW]
+    return ["reflectance"] if low >= -_MAX_REFLECTANCE and high <= _MAX_REFLECTANCE else [_RAW]
 
 
 def _write_values(
@@ -224,6 +222,6 @@ def _coloured(values: NDArray[np.floating[Any]], index: Index) -> NDArray[np.uin
     """(H, W) values as (H, W, 3) red, green, blue."""
     share = np.clip((values - index.span[0]) / (index.span[1] - index.span[0]), 0, 1)
     stops = np.linspace(0, 1, len(_COLOURS))
-    found = np.stack([np.interp(np.nan_to_num(share), stops, channel) for channel in _COLOURS.T], axis=-1)
-    found[~np.isfinite(values)] = _NODATA_COLOUR
-    return np.asarray(found.round(), np.uint8)
+    result = np.stack([np.interp(np.nan_to_num(share), stops, channel) for channel in _COLOURS.T], axis=-1)
+    result[~np.isfinite(values)] = _NODATA_COLOUR
+    return np.asarray(result.round(), np.uint8)

@@ -78,7 +78,7 @@ def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float
 
     Raises InputError that says which is missing.
     """
-    found = []
+    result = []
     narrow = [not name.lower().startswith(_NOT_NARROW) for name in names]
     for role in index.roles:
         shortest, nominal, longest = _NOMINAL_NM[role]
@@ -90,8 +90,8 @@ def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float
         named = [i for i, n in enumerate(names) if wavelengths_nm[i] is None and n.lower() in _NAMES[role]]
         if not near and not named:
             raise InputError(f"{index.name} needs a {role} band; there are {', '.join(names)}")
-        found.append(min(near)[1] if near else named[0])
-    return found
+        result.append(min(near)[1] if near else named[0])
+    return result
 
 
 def role_of(name: str, wavelength_nm: float | None) -> Role | None:

@@ -43,7 +43,7 @@ class Layer:
         return self.mapping is None and self.is_reference
 
 
-def lay_out(
+def output_layers(
     capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings, rig: Rig | None = None
 ) -> tuple[list[Layer], OutputGrid]:
     """The layers of a capture, whose usable moving bands have these alignments, and the grid they are written on.
@@ -79,8 +79,8 @@ def lay_out(
         given = [(on_grid(mapping), band) for mapping, band in whole]
         # The reference's own border takes part where it is resampled too.
         given += [(m, b) for m, b in moved if b is reference]
-        found = common_area(given if whole else moved, *size_px)
-        crop = crop if found is None else _inset(found, _FLIGHT_MARGIN_PX if whole else 0)
+        result = common_area(given if whole else moved, *size_px)
+        crop = crop if result is None else _inset(result, _FLIGHT_MARGIN_PX if whole else 0)
     grid = OutputGrid(crop.x0, crop.y0, crop.width, crop.height, scales, undistorted, not _covers(moved, crop))
     return layers, grid
 
@@ -136,10 +136,10 @@ def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height
             inside &= (there >= 0).all(axis=-1) & (there <= np.subtract(band.size_px, 1)).all(axis=-1)
     # A cell counts where its four corners do: between them the mapping is all but straight.
     cells = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:] & inside[1:, 1:]
-    found = _largest_rectangle(cells, np.diff(x), np.diff(y))
-    if found is None:
+    result = _largest_rectangle(cells, np.diff(x), np.diff(y))
+    if result is None:
         return None
-    top, bottom, left, right = found
+    top, bottom, left, right = result
     x0, y0 = int(x[left]), int(y[top])
     return Tile(x0, y0, int(x[right]) - x0 + 1, int(y[bottom]) - y0 + 1)
 

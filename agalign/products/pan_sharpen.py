@@ -27,7 +27,7 @@ from agalign.flight.rig import Rig
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, why, without_warnings
 from agalign.pixels.resample import tiles
-from agalign.products.layout import lay_out
+from agalign.products.layout import output_layers
 from agalign.products.write import marked, verify, write_raster
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
@@ -39,7 +39,7 @@ _BROAD_NM = 200.0
 _COLOUR_NM = 400.0, 700.0
 """What a colour photograph sees."""
 _SAMPLE_PX = 1024
-_MOST_RATIO = 5.0
+_MAX_RATIO = 5.0
 """Between noise and noise any ratio may come out."""
 _WORK_PX = 1024
 
@@ -74,7 +74,7 @@ def write_pan_sharpened(
     if not pan or not all(b.name in there for b in pan):
         return None
     fine = settings.model_copy(update={"resolution": "finest", "format": "gtiff", "compression": "none"})
-    layers, grid = lay_out(capture, {n: a for n, a in alignments.items() if n in there}, fine, rig)
+    layers, grid = output_layers(capture, {n: a for n, a in alignments.items() if n in there}, fine, rig)
     narrow = [
         layer for layer in layers
         if layer.band not in pan and not layer.band.companion and not is_thermal(layer.band) and not layer.is_gap
@@ -105,8 +105,8 @@ def weights_of(bands: Sequence[FloatImage], pan: FloatImage, scale: float) -> ND
     known = np.isfinite(pan) & np.logical_and.reduce([np.isfinite(b) for b in bands])
     if not known.any():
         return np.full(len(bands), 1 / len(bands))
-    found, _ = nnls(np.stack([b[known] for b in bands], axis=-1).astype(np.float64), blurred[known].astype(np.float64))
-    return np.asarray(found) if found.any() else np.full(len(bands), 1 / len(bands))
+    result, _ = nnls(np.stack([b[known] for b in bands], axis=-1).astype(np.float64), blurred[known].astype(np.float64))
+    return np.asarray(result) if result.any() else np.full(len(bands), 1 / len(bands))
 
 
 def brovey_ratio(bands: Sequence[FloatImage], pan: FloatImage, weights: NDArray[np.float64]) -> FloatImage:
@@ -114,7 +114,7 @@ def brovey_ratio(bands: Sequence[FloatImage], pan: FloatImage, weights: NDArray[
     made = np.tensordot(weights, np.stack(bands), axes=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(made > 0, pan / made, 1.0)
-    return np.asarray(np.clip(np.nan_to_num(ratio, nan=1.0), 1 / _MOST_RATIO, _MOST_RATIO), np.float32)
+    return np.asarray(np.clip(np.nan_to_num(ratio, nan=1.0), 1 / _MAX_RATIO, _MAX_RATIO), np.float32)
 
 
 def _sharpen(
@@ -173,8 +173,8 @@ def _as(values: FloatImage, valid: Mask, dtype: str, nodata: float | None) -> ND
     if kind.kind != "f":
         limits = np.iinfo(str(kind))
         values = np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max)
-    found = values.astype(kind)
-    return found if nodata is None else marked(found, valid, nodata)
+    result = values.astype(kind)
+    return result if nodata is None else marked(result, valid, nodata)
 
 
 def _describe(

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from agalign.products.drawing import Picture, with_text, write_png
-from agalign.products.views import Grey, Views
+from agalign.products.reduced_bands import Grey, ReducedBands
 from agalign.values.capture import Band
 
 _OVERVIEW_PX = 480
@@ -27,7 +27,7 @@ def choose_bands(bands: list[Band], reference: Band) -> list[Band]:
     return [red, between, reference]
 
 
-def write_picture(views: Views, names: Sequence[str], path: Path) -> None:
+def write_picture(views: ReducedBands, names: Sequence[str], path: Path) -> None:
     """Write the picture of three bands as red, green and blue. Raises OutputError."""
     before, after = (np.stack([of[name] for name in names], axis=-1) for of in (views.before, views.after))
     sheet = _sheet(before, after, f"before: {', '.join(names)} as red, green, blue", "after")

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from agalign.errors import OutputError
 from agalign.products.picture import busiest_window
+from agalign.products.reduced_bands import Grey, ReducedBands
 from agalign.products.sidecar import PreviewPart
-from agalign.products.views import Grey, Views
 from agalign.values.files import complete_file
 from agalign.values.image import Tile
 
@@ -29,19 +29,19 @@ _WIDEST_PX, _NARROWEST_PX, _DETAIL_SHARE = 640, 96, 0.35
 """Of a tile, and how wide a detail is beside it."""
 _QUALITY, _BLOCK_PX = 35, 8
 """Of the JPEG: pictures that share no block do not show in each other."""
-_MOST_BYTES_EACH, _MOST_BYTES_IN_ALL = 600_000, 44_000_000
+_MAX_BYTES_EACH, _MAX_BYTES_IN_ALL = 600_000, 44_000_000
 """A season's report can still be sent to somebody."""
 
 
 def preview_bytes(captures: int) -> int:
     """How large the preview of one capture of so many may be."""
-    return min(_MOST_BYTES_EACH, _MOST_BYTES_IN_ALL // max(captures, 1))
+    return min(_MAX_BYTES_EACH, _MAX_BYTES_IN_ALL // max(captures, 1))
 
 
 def write_preview(
-    views: Views, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], path: Path, most_bytes: int
+    views: ReducedBands, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], path: Path, max_bytes: int
 ) -> PreviewPart:
-    """Write the sheet, about as large as `most_bytes` allows, with a detail where the first of the bands has most to
+    """Write the sheet, about as large as `max_bytes` allows, with a detail where the first of the bands has most to
     show; `errors_px` has a coarse map (rows, columns) by band, or none. Raises OutputError.
     """
     longest = max(views.size_px)
@@ -51,16 +51,16 @@ def write_preview(
         encoded, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         if not encoded:
             raise OutputError(f"{path}: cannot be made")
-        if len(data) <= most_bytes or widest <= _NARROWEST_PX:
+        if len(data) <= max_bytes or widest <= _NARROWEST_PX:
             break
-        widest = max(_NARROWEST_PX, int(widest * 0.97 * (most_bytes / len(data)) ** 0.5))
+        widest = max(_NARROWEST_PX, int(widest * 0.97 * (max_bytes / len(data)) ** 0.5))
     with complete_file(path) as partial:
         partial.write_bytes(data.tobytes())
     return part
 
 
 def _sheet(
-    views: Views, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], scale: float, name: str
+    views: ReducedBands, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], scale: float, name: str
 ) -> tuple[PreviewPart, Grey]:
     width, height = views.size_px
     tile_px = _blocks(width * scale, width), _blocks(height * scale, height)
@@ -86,8 +86,8 @@ def _sheet(
     return part, np.asarray(sheet, np.uint8)
 
 
-def _blocks(length_px: float, most_px: int) -> int:
-    return min(most_px, max(_BLOCK_PX, int(length_px / _BLOCK_PX) * _BLOCK_PX))
+def _blocks(length_px: float, max_px: int) -> int:
+    return min(max_px, max(_BLOCK_PX, int(length_px / _BLOCK_PX) * _BLOCK_PX))
 
 
 def _small(image: Grey | None, size_px: tuple[int, int]) -> Grey:

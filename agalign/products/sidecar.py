@@ -13,8 +13,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from agalign.errors import SidecarError
 from agalign.values.choices import CaptureStatus, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
-from agalign.values.doubts import DoubtKind
-from agalign.values.files import lies_within, write_text
+from agalign.values.files import is_inside, write_text
+from agalign.values.issues import IssueKind
 
 SCHEMA = "agalign/1"
 
@@ -26,7 +26,7 @@ _LONGEST_QUOTED = 60
 
 
 def _beside(name: str) -> str:
-    if not lies_within(name):
+    if not is_inside(name):
         raise ValueError("names a file outside its folder")
     return name
 
@@ -96,10 +96,10 @@ class GridPart(_Part):
     moving_px: list[PointPx]
 
 
-class DoubtPart(_Part):
+class IssuePart(_Part):
     """One thing that speaks against an alignment: what was measured, and what it should have been."""
 
-    kind: DoubtKind
+    kind: IssueKind
     value: float | None
     limit: float | None
 
@@ -195,7 +195,7 @@ class BandResult(_Result):
     band_index: int
     status: PairStatus
     reason: str | None
-    doubts: list[DoubtPart] = []
+    issues: list[IssuePart] = Field(default=[], alias="doubts")
     """Everything that speaks against it; the first is the one that `reason` tells."""
     homography: HomographyPart | None = None
     seed: SeedPart | None = None
@@ -333,8 +333,8 @@ def _read(path: Path, model: type[Model]) -> Model:
         if not where:
             raise SidecarError(f"{path}: is no sidecar of schema {SCHEMA!r}; delete it and run again") from None
         if "schema" in problems:
-            found = _shortened(problems["schema"]["input"] if problems["schema"]["type"] != "missing" else None)
-            raise SidecarError(f"{path}: schema is {found}, not {SCHEMA!r}; run again with --overwrite") from None
+            result = _shortened(problems["schema"]["input"] if problems["schema"]["type"] != "missing" else None)
+            raise SidecarError(f"{path}: schema is {result}, not {SCHEMA!r}; run again with --overwrite") from None
         raise SidecarError(f"{path}: {where}: {first['msg']}; run again with --overwrite") from None
 
 
@@ -345,7 +345,7 @@ def _shortened(value: object) -> str:
 
 def find_sidecars(folder: Path) -> list[Path]:
     """The sidecars below an output folder, sorted; other JSON files are passed over, but not what cannot be read."""
-    found = []
+    result = []
     for path in sorted(folder.rglob("*.json")):
         try:
             if not path.is_file():
@@ -353,8 +353,8 @@ def find_sidecars(folder: Path) -> list[Path]:
             with path.open("rb") as file:
                 head = file.read(200)
         except OSError:
-            found.append(path)
+            result.append(path)
             continue
         if b'"agalign/' in head:
-            found.append(path)
-    return found
+            result.append(path)
+    return result

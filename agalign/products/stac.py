@@ -35,7 +35,7 @@ _ITEM_SUFFIX = ".stac.json"
 _COLLECTION_SUFFIX = ".collection.json"
 _GEOJSON = "application/geo+json"
 _COMMON_NAMES = {"blue": "blue", "green": "green", "red": "red", "red edge": "rededge", "nir": "nir"}
-_MOST_TILT_DEG = 45.0
+_MAX_TILT_DEG = 45.0
 """A camera that looks farther aside, or is said to, has no footprint."""
 
 
@@ -169,8 +169,8 @@ def _describe(
         name, nm, width = _common_name(band, capture), band.wavelength_nm, band.bandwidth_nm
         middle, across = (None if v is None else round(v / 1000, 6) for v in (nm, width))
         eo.append(EoBand.create(band.name, name, None, middle, across))
-        found = RasterBand.create(data_type=DataType(dtype), nodata=missing, unit=unit, scale=scale, offset=offset)
-        raster.append(found)
+        result = RasterBand.create(data_type=DataType(dtype), nodata=missing, unit=unit, scale=scale, offset=offset)
+        raster.append(result)
         facts = {
             "name": band.name, "data_type": dtype, "nodata": missing, "unit": unit, "eo:common_name": name,
             "eo:center_wavelength": middle, "eo:full_width_half_max": across,
@@ -222,7 +222,7 @@ def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.flo
     pose = capture.pose
     if pose is None or pose.height_m is None or pose.focal_length_px is None:
         return None
-    if math.hypot(pose.pitch_deg, pose.roll_deg) > _MOST_TILT_DEG:
+    if math.hypot(pose.pitch_deg, pose.roll_deg) > _MAX_TILT_DEG:
         return None
     middle = (np.array(capture.reference.size_px) - 1) / 2
     right, down = ((points_px - middle) / pose.focal_length_px).T

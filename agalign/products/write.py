@@ -20,8 +20,8 @@ from rasterio.shutil import copy as copy_dataset
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from agalign.cameras.carried_tags import CarriedTags, band_tags, capture_tags
 from agalign.cameras.pix4d import FromSource
+from agalign.cameras.tag_transfer import TransferredTags, band_tags, capture_tags
 from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
@@ -43,7 +43,7 @@ UNITS: Mapping[Quantity, str] = {
 """In the words of UDUNITS."""
 _FOUND_PX = 0.1
 _TILE_PX = 2048
-_MOST_VALUES_TRIED = 1 << 16
+_MAX_VALUES_TRIED = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def write_capture(
     contents: dict[Path, tuple[str, ...]] = {}
     nodata: dict[Path, float | None] = {}
 
-    def write(path: Path, some: Sequence[Layer], tags: CarriedTags) -> None:
+    def write(path: Path, some: Sequence[Layer], tags: TransferredTags) -> None:
         nodata[path] = write_raster(capture, some, grid, path, settings, tags)
         contents[path] = tuple(layer.band.name for layer in some)
 
@@ -137,7 +137,7 @@ def _in_file_name(text: str) -> str:
 
 def write_raster(
     capture: Capture, layers: Sequence[Layer], grid: OutputGrid, path: Path, settings: WriteSettings,
-    tags: CarriedTags | None = None,
+    tags: TransferredTags | None = None,
 ) -> float | None:  # fmt: skip
     """Write layers as the bands of one file, complete or not at all; returns its nodata value.
 
@@ -257,15 +257,15 @@ def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any
     copied = [layer.band for layer in layers if layer.mapping is None and not layer.is_gap]
     held = [_values_in(band, grid.tile) for band in copied]
     limits = np.iinfo(str(dtype))
-    wanted = itertools.chain([0, limits.max], range(1, min(limits.max, _MOST_VALUES_TRIED)))
+    wanted = itertools.chain([0, limits.max], range(1, min(limits.max, _MAX_VALUES_TRIED)))
     return float(next((v for v in wanted if not any((values == v).any() for values in held)), 0))
 
 
 def _values_in(band: Band, tile: Tile) -> Pixels:
     """All different values of a band on a rectangle."""
     with open_raster(band.path) as source:
-        found = [np.unique(read_window(source, band, t.x0, t.y0, t.width, t.height)[0]) for t in tiles(tile, _TILE_PX)]
-    return np.unique(np.concatenate(found))
+        result = [np.unique(read_window(source, band, t.x0, t.y0, t.width, t.height)[0]) for t in tiles(tile, _TILE_PX)]
+    return np.unique(np.concatenate(result))
 
 
 def _fits(value: float, dtype: np.dtype[Any]) -> bool:
@@ -337,7 +337,7 @@ def _describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings:
     raw = settings.radiometry == "off"
     quantities = [None if raw or layer.band.radiometry is None else layer.band.radiometry.quantity for layer in layers]
     facts["RADIOMETRY"] = " and ".join(dict.fromkeys(q for q in quantities if q is not None))
-    sources = [] if raw else [b.radiometry.told_by for layer in layers if (b := layer.band).radiometry is not None]
+    sources = [] if raw else [b.radiometry.source for layer in layers if (b := layer.band).radiometry is not None]
     facts["RADIOMETRY_SOURCE"] = " and ".join(dict.fromkeys(sources))
     dataset.update_tags(**{k: v for k, v in facts.items() if v})
     if any(quantities):

@@ -138,7 +138,7 @@ def _truth(shot: Shot, number: int, camera: CameraSpec, size_px: tuple[int, int]
     }
 
 
-def lay_out_flight(
+def plan_flight(
     captures: int,
     size_px: tuple[int, int],
     rng_seed: int = 0,

@@ -16,7 +16,7 @@ from agalign.values.geometry import Points
 Field = NDArray[np.float32]
 
 _TERRACE_M = 8.0
-_FINE_GRAINS_M, _LEAST_GRAIN_PX = (0.02, 0.005), 3.0
+_FINE_GRAINS_M, _MIN_GRAIN_PX = (0.02, 0.005), 3.0
 """Clods and leaves, where the camera is low enough to see them."""
 _RAY_STEPS = 40
 """A ray falls on relief by repeated intersection with the height below its last place."""
@@ -71,7 +71,7 @@ def paint_ground(
     brightness = 1 + 0.22 * _noise(rng, side, 2.5 * metre) + 0.16 * _noise(rng, side, 0.08 * metre)
     vigour = 0.5 * _noise(rng, side, 3 * metre) + 0.45 * _noise(rng, side, 0.12 * metre)
     for grain_m in _FINE_GRAINS_M:
-        if grain_m * metre >= _LEAST_GRAIN_PX:
+        if grain_m * metre >= _MIN_GRAIN_PX:
             brightness = brightness + 0.12 * _noise(rng, side, grain_m * metre)
             vigour = vigour + 0.3 * _noise(rng, side, grain_m * metre)
     brightness = np.clip(brightness + 0.25 * (edge < 0.35 * metre) - 0.3 * ruts, 0.3, 2.2)
@@ -91,10 +91,10 @@ def reflectance(ground: Ground, band: BandSpec) -> Field:
     crop = band.crop * (1 + 0.35 * bright * ground.vigour)
     soil = band.soil * ground.brightness
     bare = 1 - ground.crop - ground.tree
-    found = soil * bare + crop * ground.crop + band.tree * (1 + 0.5 * ground.vigour) * ground.tree
+    result = soil * bare + crop * ground.crop + band.tree * (1 + 0.5 * ground.vigour) * ground.tree
     if ground.laid_out is not None:
-        found = np.where(np.isnan(ground.laid_out), found, ground.laid_out)
-    return np.asarray(found, np.float32)
+        result = np.where(np.isnan(ground.laid_out), result, ground.laid_out)
+    return np.asarray(result, np.float32)
 
 
 def on_ground(ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], raw_px: Points) -> Points:

@@ -11,8 +11,8 @@ from scipy.ndimage import map_coordinates
 
 from agalign.values import geometry
 from agalign.values.choices import ModelFamily, PairStatus, PredictionSource, SeedKind, Space
-from agalign.values.doubts import Doubt, explanation, sentence
 from agalign.values.geometry import Matrix
+from agalign.values.issues import Issue, explanation, sentence
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Residual:
 
 
 @dataclass(frozen=True)
-class LocalField:
+class DisplacementField:
     """A smooth field of displacements on an image, px, by its values on a lattice."""
 
     step_px: float
@@ -126,37 +126,37 @@ class LocalField:
         points = np.asarray(points_px)
         at = points.reshape(-1, 2)[:, ::-1].T / self.step_px
         planes = np.moveaxis(self.displacements_px, -1, 0)
-        found = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
-        return np.stack(found, axis=-1).reshape(points.shape)
+        result = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
+        return np.stack(result, axis=-1).reshape(points.shape)
 
-    def rescaled(self, scale: tuple[float, float]) -> "LocalField":
+    def rescaled(self, scale: tuple[float, float]) -> "DisplacementField":
         """The same on an image that is larger by these factors (x, y), which are all but equal."""
         # The lattice's first node lies at the centre of a pixel; half a pixel is nothing to a smooth field.
-        return LocalField(self.step_px * scale[0], self.displacements_px * scale)
+        return DisplacementField(self.step_px * scale[0], self.displacements_px * scale)
 
-    def on_lattice(self, step_px: float, size_px: tuple[int, int]) -> "LocalField":
+    def on_lattice(self, step_px: float, size_px: tuple[int, int]) -> "DisplacementField":
         """The same by its values on another lattice, which covers an image (width, height)."""
         columns, rows = (math.ceil(n / step_px) + 1 for n in size_px)
         nodes = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64) * step_px
-        return LocalField(float(step_px), self(nodes))
+        return DisplacementField(float(step_px), self(nodes))
 
-    def plus(self, other: "LocalField") -> "LocalField":
+    def plus(self, other: "DisplacementField") -> "DisplacementField":
         """X -> x + d(x) with this field, measured again under it: d(x) + other(x)."""
-        return LocalField(self.step_px, self.displacements_px + other.displacements_px)
+        return DisplacementField(self.step_px, self.displacements_px + other.displacements_px)
 
 
 @dataclass(frozen=True)
-class LocalResult:
+class DisplacementResult:
     """A field of displacements, where it gains something, and what it gains on windows it was not fitted to."""
 
-    field: LocalField | None
+    field: DisplacementField | None
     before_p95_px: float
     after_p95_px: float
 
-    def enlarged(self, up: tuple[float, float]) -> "LocalResult":
+    def enlarged(self, up: tuple[float, float]) -> "DisplacementResult":
         """The same on an image that is larger by these factors (x, y)."""
         larger = None if self.field is None else self.field.rescaled(up)
-        return LocalResult(larger, self.before_p95_px * up[0], self.after_p95_px * up[0])
+        return DisplacementResult(larger, self.before_p95_px * up[0], self.after_p95_px * up[0])
 
 
 _SOURCES: dict[PredictionSource, str] = {
@@ -185,7 +185,7 @@ class Alignment:
     """Between undistorted pixels where both lenses are known, else between raw pixels."""
     space: Space
     status: PairStatus
-    doubts: tuple[Doubt, ...]
+    issues: tuple[Issue, ...]
     """What speaks against it, the plainest first; none where it is `aligned`."""
     seed: Seed
     joint: JointResult | None
@@ -193,9 +193,9 @@ class Alignment:
     seconds: float
     before: Mapping[str, float] = dataclasses.field(default_factory=dict)
     after: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    local: LocalResult | None = None
+    local: DisplacementResult | None = None
     """What a field of displacements of this capture's own gains; None where it was not asked for."""
-    field: LocalField | None = None
+    field: DisplacementField | None = None
     """All displacements in raw px of the reference, before the homography: the rig's and the capture's own."""
     prediction: Prediction | None = None
     """What the flight's rig says of it; None without a rig."""
@@ -218,7 +218,7 @@ class Alignment:
     @property
     def reason(self) -> str | None:
         """Why it is not aligned, in words; None where it is."""
-        told = explanation(self.doubts)
+        told = explanation(self.issues)
         if told is None or self.status == "aligned":
             return None
         if self.status == "predicted" and self.prediction is not None:
@@ -226,6 +226,6 @@ class Alignment:
             return f"{told}; the rig of the flight says where it lies, {known}"
         if self.status == "seed_only":
             return f"{told}; the {self.seed.kind} seed is used as it is"
-        if self.doubts[-1].kind == "seed_does_not_fit":
-            return f"{told}; the {self.seed.kind} seed is used as it is, {sentence(self.doubts[-1])}"
+        if self.issues[-1].kind == "seed_does_not_fit":
+            return f"{told}; the {self.seed.kind} seed is used as it is, {sentence(self.issues[-1])}"
         return told

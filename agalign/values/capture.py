@@ -45,7 +45,7 @@ class Radiometry:
     """Share of the signal that each row has more than the one above it."""
     by_sun: tuple[float, Quantity] | None = None
     """What radiance is to be multiplied by for reflectance, by the light sensor, and which kind of it that gives."""
-    told_by: RadiometrySource = "camera calibration"
+    source: RadiometrySource = "camera calibration"
     """What made reflectance of radiance, if anything did."""
 
     @property

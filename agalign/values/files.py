@@ -62,7 +62,7 @@ def remove_partial_files(folder: Path) -> None:
                     Path(parent, name).unlink()
 
 
-def lies_within(name: str) -> bool:
+def is_inside(name: str) -> bool:
     """True for the relative path of a file that no reading of it puts outside the folder it is relative to."""
     posix, windows = PurePosixPath(name), PureWindowsPath(name)
     anchored = posix.is_absolute() or bool(windows.drive or windows.root)

@@ -10,15 +10,15 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from agalign.values import geometry, lens
-from agalign.values.alignment import Alignment, LocalField
+from agalign.values.alignment import Alignment, DisplacementField
 from agalign.values.capture import Band
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Tile
 from agalign.values.lens import Lens
 
-_LATTICE_STEP_PX = 32
+_KNOT_STEP_PX = 32
 """Curved mappings are evaluated this far apart and splined between: with real lenses below 0.0001 px of error."""
-_LOCAL_LATTICE_STEP_PX = 12
+_FIELD_KNOT_STEP_PX = 12
 """The same where displacements change from place to place."""
 
 
@@ -31,7 +31,7 @@ class PixelMapping:
     moving_lens: Lens | None = None
     pre_distortion: Lens | None = None
     """Lens through which the given pixels go first, where they are undistorted ones of the reference."""
-    local: LocalField | None = None
+    local: DisplacementField | None = None
     """Displacements of raw reference px before anything else; `local_scale` is px of its image for one of these."""
     local_scale: tuple[float, float] = (1.0, 1.0)
 
@@ -61,7 +61,7 @@ class PixelMapping:
         )
 
     @property
-    def bends(self) -> bool:
+    def is_curved(self) -> bool:
         """True where the mapping is not just a homography: a lens model or a local field takes part."""
         return self.local is not None or any(
             map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion))
@@ -73,16 +73,16 @@ class PixelMapping:
 
     def at_crossings(self, x_px: Points, y_px: Points, dtype: DTypeLike = np.float64) -> Points:
         """The same for pixels of the columns x (n,) and the rows y (m,), in ascending order: (m, n, 2)."""
-        if self.bends:
-            step = _LATTICE_STEP_PX if self.local is None else _LOCAL_LATTICE_STEP_PX
+        if self.is_curved:
+            step = _KNOT_STEP_PX if self.local is None else _FIELD_KNOT_STEP_PX
             return splined(self, x_px, y_px, step, dtype)
         h = self.fixed_to_moving
-        found = np.empty((len(y_px), len(x_px), 2), dtype)
+        result = np.empty((len(y_px), len(x_px), 2), dtype)
         denominator = (h[2, 0] * x_px)[None, :] + (h[2, 1] * y_px + h[2, 2])[:, None]
         for k in (0, 1):
             with np.errstate(divide="ignore", invalid="ignore"):
-                found[..., k] = ((h[k, 0] * x_px)[None, :] + (h[k, 1] * y_px + h[k, 2])[:, None]) / denominator
-        return found
+                result[..., k] = ((h[k, 0] * x_px)[None, :] + (h[k, 1] * y_px + h[k, 2])[:, None]) / denominator
+        return result
 
 
 def _along(start: int, length: int) -> Points:
@@ -98,7 +98,7 @@ def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> PixelMapp
 
 
 def splined(
-    mapping: Callable[[Points], Points], x_px: Points, y_px: Points, step_px: int = _LATTICE_STEP_PX,
+    mapping: Callable[[Points], Points], x_px: Points, y_px: Points, step_px: int = _KNOT_STEP_PX,
     dtype: DTypeLike = np.float64,
 ) -> Points:  # fmt: skip
     """A smooth mapping of points (..., 2) at all crossings of columns x (n,) and rows y (m,): (m, n, 2).
@@ -111,10 +111,10 @@ def splined(
     )
     values = mapping(np.stack(np.meshgrid(knots_x, knots_y), axis=-1))
     across = np.ascontiguousarray(weights_x.T, dtype)
-    found = np.empty((len(y_px), len(x_px), 2), dtype)
+    result = np.empty((len(y_px), len(x_px), 2), dtype)
     for k in (0, 1):
-        found[..., k] = (weights_y @ values[..., k]).astype(dtype, copy=False) @ across
-    return found
+        result[..., k] = (weights_y @ values[..., k]).astype(dtype, copy=False) @ across
+    return result
 
 
 @lru_cache(maxsize=32)

@@ -60,9 +60,9 @@ def _replace_pixels(path: Path, pixels: Image) -> None:
 
 def _sidecars(out: Path) -> Iterator[dict[str, Any]]:
     for path in sorted(out.rglob("*.json")):
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if str(found.get("schema", "")).startswith("agalign/"):
-            yield found
+        result = json.loads(path.read_text(encoding="utf-8"))
+        if str(result.get("schema", "")).startswith("agalign/"):
+            yield result
 
 
 def _row(band: Mapping[str, Any] | None, seconds: float) -> Row:

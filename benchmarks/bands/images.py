@@ -48,12 +48,12 @@ def locate(folder: Path, sets: Mapping[str, Mapping[str, Any]]) -> Located:
     paths: dict[str, dict[str, Path]] = {}
     missing: dict[str, list[str]] = {}
     for name, description in sets.items():
-        found = {f: by_sum.get(entry["sha256"]) for f, entry in description["files"].items()}
-        absent = [f for f, path in found.items() if path is None]
+        result = {f: by_sum.get(entry["sha256"]) for f, entry in description["files"].items()}
+        absent = [f for f, path in result.items() if path is None]
         if absent:
             missing[name] = absent
         else:
-            paths[name] = {f: path for f, path in found.items() if path is not None}
+            paths[name] = {f: path for f, path in result.items() if path is not None}
     return Located(paths, missing)
 
 

@@ -124,10 +124,10 @@ def ecc(fixed: Image, moving: Image) -> Matrix | None:
         small = [cv2.resize(e, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for e in edges]
         start = geometry.rescale(matrix, (scale, scale), (scale, scale)).astype(np.float32)
         try:
-            _, found = cv2.findTransformECC(small[0], small[1], start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
+            _, result = cv2.findTransformECC(small[0], small[1], start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
         except cv2.error:
             return None
-        matrix = geometry.rescale(found.astype(float), (1 / scale, 1 / scale), (1 / scale, 1 / scale))
+        matrix = geometry.rescale(result.astype(float), (1 / scale, 1 / scale), (1 / scale, 1 / scale))
     return matrix
 
 
@@ -143,11 +143,11 @@ def kornia_registrator(fixed: Image, moving: Image) -> Matrix | None:
 
     images = [grey_8_bit(image) for image in (fixed, moving)]
     one, other = (torch.from_numpy(image).float()[None, None] / 255 for image in images)
-    found = ImageRegistrator("homography").register(other, one)[0].detach().double().numpy()
+    result = ImageRegistrator("homography").register(other, one)[0].detach().double().numpy()
     to_unit = [
         np.array([[2 / w, 0, 1 / w - 1], [0, 2 / h, 1 / h - 1], [0, 0, 1.0]]) for h, w in (i.shape for i in images)
     ]
-    return geometry.compose(geometry.invert(to_unit[1]), found, to_unit[0])
+    return geometry.compose(geometry.invert(to_unit[1]), result, to_unit[0])
 
 
 # ---- this program, and what can be put together of its parts
@@ -164,11 +164,11 @@ def structure_ties(fixed: Image, moving: Image) -> Matrix | None:
     f, m = grey_raster(fixed), grey_raster(moving)
     seed = structure_seed(f, m)
     windows = Reference(f, Settings(check=CheckSettings(tile_px=64))).windows
-    found = windows.residuals(warped(m, PixelMapping(seed), f.size_px))
-    some = np.isfinite(found.shifts_px[:, 0])
+    result = windows.residuals(warped(m, PixelMapping(seed), f.size_px))
+    some = np.isfinite(result.shifts_px[:, 0])
     if some.sum() < 8:
         return None
-    here, there = found.centres_px[some], found.centres_px[some] + found.shifts_px[some]
+    here, there = result.centres_px[some], result.centres_px[some] + result.shifts_px[some]
     return by_ransac(here, geometry.apply(seed, there), cv2.USAC_MAGSAC, 0.5)
 
 
@@ -176,17 +176,17 @@ def elastix_seeded(fixed: Image, moving: Image) -> Matrix | None:
     """Elastix from the structure seed, over five levels."""
     f, m = grey_raster(fixed), grey_raster(moving)
     seed = structure_seed(f, m)
-    found = elastix_affinity(f, warped(m, PixelMapping(seed), f.size_px), levels=5)
-    return None if found is None else geometry.compose(seed, found)
+    result = elastix_affinity(f, warped(m, PixelMapping(seed), f.size_px), levels=5)
+    return None if result is None else geometry.compose(seed, result)
 
 
 def agalign_pair(fixed: Image, moving: Image) -> Matrix | None:
     """`agalign.align` with its defaults; it claims what it calls aligned."""
     try:
-        found = agalign.align(fixed, moving)
+        result = agalign.align(fixed, moving)
     except AgalignError:
         return None
-    return found.fixed_to_moving if found.status == "aligned" else None
+    return result.fixed_to_moving if result.status == "aligned" else None
 
 
 # ---- networks that others have learnt, where their weights are to be had
@@ -199,8 +199,8 @@ def _loftr() -> Align:
     def align(fixed: Image, moving: Image) -> Matrix | None:
         one, other, scales = _as_tensors(torch, fixed, moving, 840)
         with torch.inference_mode():
-            found = net({"image0": one, "image1": other})
-        here, there = found["keypoints0"].numpy(), found["keypoints1"].numpy()
+            result = net({"image0": one, "image1": other})
+        here, there = result["keypoints0"].numpy(), result["keypoints1"].numpy()
         return _at_full_size(by_ransac(here, there, cv2.USAC_MAGSAC, 1.0), *scales)
 
     return align

@@ -154,13 +154,13 @@ def main() -> None:
     names = options.methods.split(";") if options.methods else [m for m in METHODS if m not in SLOW]
     arguments = [str(options.data), "--sets", ",".join(located.paths), "--variants", ",".join(variants)]
     with ThreadPoolExecutor(options.jobs) as pool:
-        found = dict(zip(names, pool.map(lambda name: child(name, arguments), names), strict=True))
-    rows = [row for some, _ in found.values() for row in some]
+        result = dict(zip(names, pool.map(lambda name: child(name, arguments), names), strict=True))
+    rows = [row for some, _ in result.values() for row in some]
     if options.said:
         write_said(rows, options.said)
     scored = score_pairs(rows, sets)
     write_csv(summary(scored), options.output)
-    text = tables(scored, {name: gigabytes for name, (some, gigabytes) in found.items() if some})
+    text = tables(scored, {name: gigabytes for name, (some, gigabytes) in result.items() if some})
     options.output.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
     if options.plot:

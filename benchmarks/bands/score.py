@@ -162,10 +162,10 @@ def movement(variant: str, size_px: tuple[int, int]) -> Matrix:
     """Where a variant puts the pixels of a moving file (width, height): `turn DEGREES` (clockwise as seen) and `scale
     FACTOR` about its centre and within its frame; all others leave them in their places.
     """
-    found = re.fullmatch(r"(turn|scale) ([\d.]+)", variant)
+    result = re.fullmatch(r"(turn|scale) ([\d.]+)", variant)
     matrix = np.eye(3)
-    if found:
-        angle, scale = (np.radians(float(found[2])), 1.0) if found[1] == "turn" else (0.0, float(found[2]))
+    if result:
+        angle, scale = (np.radians(float(result[2])), 1.0) if result[1] == "turn" else (0.0, float(result[2]))
         cos, sin = scale * np.cos(angle), scale * np.sin(angle)
         matrix[:2, :2] = [[cos, -sin], [sin, cos]]
         centre = (np.array(size_px) - 1) / 2

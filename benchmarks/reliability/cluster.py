@@ -80,7 +80,7 @@ def main() -> None:
         finally:
             for process in (*nannies, scheduler):
                 process.terminate()
-        found = differences(out, {name: contents(path) for name, path in files(alone).items()})
+        result = differences(out, {name: contents(path) for name, path in files(alone).items()})
         section.say(
             f"{asked.captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} on a scheduler and two worker processes; one, "
             f"with its nanny, killed by SIGKILL when {killed_at} captures were done: exit code {run.returncode}, "
@@ -88,7 +88,7 @@ def main() -> None:
             f"a cluster: {alone_s:.0f} s)."
         )
         kinds = ("missing", "left over", "corrupt", "different")
-        section.table([("beside the run without a cluster", "files"), *((k, str(found[k])) for k in kinds)])
+        section.table([("beside the run without a cluster", "files"), *((k, str(result[k])) for k in kinds)])
 
 
 if __name__ == "__main__":

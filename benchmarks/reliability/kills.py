@@ -61,36 +61,36 @@ def files(out: Path) -> dict[str, Path]:
 
 def differences(out: Path, expected: dict[str, object]) -> Counter[str]:
     """How many files are missing, left over, unreadable, different."""
-    found: Counter[str] = Counter()
+    result: Counter[str] = Counter()
     here = files(out)
-    found["missing"] = len(expected.keys() - here.keys())
-    found["left over"] = len(here.keys() - expected.keys())
+    result["missing"] = len(expected.keys() - here.keys())
+    result["left over"] = len(here.keys() - expected.keys())
     for name in expected.keys() & here.keys():
         try:
             if contents(here[name]) != expected[name]:
-                found["different"] += 1
+                result["different"] += 1
                 print("different:", name)
         except Exception as error:
             print(name, error)
-            found["corrupt"] += 1
-    return found
+            result["corrupt"] += 1
+    return result
 
 
 def whole_sidecars(out: Path) -> Counter[str]:
     """Right after a kill: a sidecar that is there must be readable, and its files must be as it says."""
-    found: Counter[str] = Counter()
+    result: Counter[str] = Counter()
     for path in find_sidecars(out) if out.is_dir() else []:
         try:
             output = json.loads(path.read_text())["output"]
         except ValueError:
-            found["torn sidecars"] += 1
+            result["torn sidecars"] += 1
             continue
         named = [*output["band_files"], {"file": output["file"], "bytes": output["bytes"]}]
-        found["torn captures"] += any(
+        result["torn captures"] += any(
             not (path.parent / f["file"]).is_file() or (path.parent / f["file"]).stat().st_size != f["bytes"]
             for f in named
         )
-    return found
+    return result
 
 
 def kill_after(seconds: float, argv: list[str], *, workers_too: bool) -> bool:
@@ -127,7 +127,7 @@ def main() -> None:
         subprocess.run(command(flight, whole), check=True)
         seconds = time.monotonic() - began
         expected = {name: contents(path) for name, path in files(whole).items()}
-        found: Counter[str] = Counter()
+        result: Counter[str] = Counter()
         hit, kept = 0, []
         for number in range(asked.kills):
             shutil.rmtree(out, ignore_errors=True)
@@ -142,14 +142,14 @@ def main() -> None:
             print(
                 f"{number + 1}: killed after {at:.1f} s, {kept[-1]} captures kept, {dict(here) or 'equal'}", flush=True
             )
-            found += here
+            result += here
         section.say(
             f"{asked.kills} kills of a run of {seconds:.0f} s over {CAPTURES} captures ({hit} while it was running; "
             f"between {min(kept)} and {max(kept)} captures were finished by then), each followed by the same command: "
-            f"{asked.kills - found['bad exit codes']} exit codes 0."
+            f"{asked.kills - result['bad exit codes']} exit codes 0."
         )
         kinds = ("torn sidecars", "torn captures", "missing", "left over", "corrupt", "different")
-        section.table([("after the kill / after going on", "files"), *((k, str(found[k])) for k in kinds)])
+        section.table([("after the kill / after going on", "files"), *((k, str(result[k])) for k in kinds)])
 
 
 if __name__ == "__main__":

@@ -35,9 +35,9 @@ def cpu() -> torch.device:
 @pytest.fixture(scope="module")
 def model(flight: Path) -> FlightModel:
     captures = flights_of(discover(flight).captures)[0]
-    found = learn_flight(captures, SETTINGS, lambda *_: None)
-    assert found is not None
-    return found
+    result = learn_flight(captures, SETTINGS, lambda *_: None)
+    assert result is not None
+    return result
 
 
 def test_a_frozen_network_aligns_a_capture_that_it_has_never_seen(flight: Path, tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_what_is_no_model_is_named(tmp_path: Path) -> None:
 def test_a_model_is_used_again_and_refused_for_another_camera(flight: Path, model: FlightModel, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     save_model(model, path)
-    steps = FastRecipe(start="random", most_steps=1)  # nothing could be learnt in one step
+    steps = FastRecipe(start="random", max_steps=1)  # nothing could be learnt in one step
     settings = Settings(joint=JointSettings(fast=steps), flight=FlightSettings(captures=1))
     reports = list(run_flight(discover(flight), tmp_path / "out", settings, model=path))
     assert all(r.good for r in reports)
@@ -90,14 +90,14 @@ def test_a_model_is_used_again_and_refused_for_another_camera(flight: Path, mode
 
 
 def test_several_processes_give_the_same_numbers(flight: Path, tmp_path: Path) -> None:
-    found = []
+    result = []
     for jobs in (1, 2):
         out = tmp_path / str(jobs)
         agalign.align_folder(flight, out, settings=SETTINGS, run=RunOptions(jobs=jobs))
         sidecars = [read_sidecar(p) for p in find_sidecars(out)]
-        found.append([(b.grid, b.metrics, b.joint) for s in sidecars for b in s.bands])
-    assert len(found[0]) == 10
-    assert found[0] == found[1]
+        result.append([(b.grid, b.metrics, b.joint) for s in sidecars for b in s.bands])
+    assert len(result[0]) == 10
+    assert result[0] == result[1]
 
 
 def test_a_second_run_learns_nothing_anew(flight: Path, tmp_path: Path) -> None:

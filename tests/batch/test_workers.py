@@ -27,13 +27,13 @@ def test_a_dask_cluster_does_the_captures(flight: Path, tmp_path: Path, monkeypa
         reports = run_flight(discover(flight), tmp_path / "out", SETTINGS, RunOptions(executor=executor))
         workers_ = [p for p in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
         assert len(workers_) == 2
-        found = []
+        result = []
         for number, report in enumerate(reports):
-            found.append(report)
+            result.append(report)
             if number == 0:
                 workers_[0].kill()
-    assert all(r.good for r in found)
-    assert {r.label: r.result and without_seconds(r.result) for r in found} == {
+    assert all(r.good for r in result)
+    assert {r.label: r.result and without_seconds(r.result) for r in result} == {
         r.label: r.result and without_seconds(r.result) for r in alone
     }
 

@@ -44,9 +44,9 @@ def row(file: str, **said: Any) -> dict[str, Any]:
 
 def test_the_error_of_a_known_homography_is_exact(sets: dict[str, Any]) -> None:
     rows = [row("1_r.png", homography=shifted(0.3, 0.4).tolist()), row("1_n.png", homography=TRUE.tolist())]
-    found = score.score_pairs(rows, sets)
-    assert [s.median_px for s in found[:2]] == pytest.approx([0.5, 0.0], abs=1e-9)
-    assert [s.p95_px for s in found[:2]] == pytest.approx([0.5, 0.0], abs=1e-9)
+    result = score.score_pairs(rows, sets)
+    assert [s.median_px for s in result[:2]] == pytest.approx([0.5, 0.0], abs=1e-9)
+    assert [s.p95_px for s in result[:2]] == pytest.approx([0.5, 0.0], abs=1e-9)
 
 
 def test_a_grid_says_what_its_homography_says(sets: dict[str, Any]) -> None:
@@ -70,17 +70,17 @@ def test_wrong_claims_refusals_and_estimates_without_a_claim_are_counted_apart(s
         row("1_r.png", homography=shifted(0.1, 0).tolist()), row("1_n.png", homography=shifted(7, 0).tolist()),
         row("2_r.png"), row("2_n.png", homography=shifted(9, 0).tolist(), claimed="no"),
     ]  # fmt: skip
-    (found,) = score.summary(score.score_pairs(rows, sets))
-    assert (found.pairs, found.claimed, found.wrong_claims, found.refused, found.unclaimed) == (4, 2, 1, 1, 1)
-    assert (found.under_half_px, found.under_1_px) == (0.25, 0.25)
-    assert (found.median_px, found.worst_px, found.unclaimed_median_px) == pytest.approx((3.55, 7.0, 9.0))
-    assert "| m | 4 | 2 | **1** | 1 | 1 (9.00 px) | 25% |" in score.markdown([found])
+    (result,) = score.summary(score.score_pairs(rows, sets))
+    assert (result.pairs, result.claimed, result.wrong_claims, result.refused, result.unclaimed) == (4, 2, 1, 1, 1)
+    assert (result.under_half_px, result.under_1_px) == (0.25, 0.25)
+    assert (result.median_px, result.worst_px, result.unclaimed_median_px) == pytest.approx((3.55, 7.0, 9.0))
+    assert "| m | 4 | 2 | **1** | 1 | 1 (9.00 px) | 25% |" in score.markdown([result])
 
 
 def test_what_is_left_out_is_refused_and_what_is_not_asked_raises(sets: dict[str, Any]) -> None:
     one = row("1_r.png", homography=TRUE.tolist())
-    (found,) = score.summary(score.score_pairs([one], sets))
-    assert (found.claimed, found.refused) == (1, 3)
+    (result,) = score.summary(score.score_pairs([one], sets))
+    assert (result.claimed, result.refused) == (1, 3)
     for rows, problem in (
         ([one, one], "two rows"), ([row("1_x.png")], "no such pair"), ([{**one, "set": "moon"}], "no set"),
         ([row("1_r.png", homography="1 2 3")], "no mapping"),
@@ -119,8 +119,8 @@ def test_an_image_moves_as_its_truth_does(sets: dict[str, Any], variant: str) ->
     pair = score.pairs_of(sets["field"])[0]
     y, x = np.mgrid[:480, :640]
     image = (60000 * np.exp(-((x - 400.0) ** 2 + (y - 150.0) ** 2) / 50)).astype(np.uint16)
-    found = spoilt(image, pair, variant).astype(float)
-    centre = np.array([(found * x).sum(), (found * y).sum()]) / found.sum()
+    result = spoilt(image, pair, variant).astype(float)
+    centre = np.array([(result * x).sum(), (result * y).sum()]) / result.sum()
     (there,) = score.apply(score.movement(variant, (640, 480)), np.array([[400.0, 150.0]]))
     assert centre == pytest.approx(there, abs=0.02)
 

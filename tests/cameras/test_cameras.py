@@ -27,12 +27,12 @@ def micasense_bands(flight: Path) -> dict[str, Band]:
 def test_micasense_lens_is_the_generators(flight: Path) -> None:
     bands = micasense_bands(flight)
     for spec in cameras.BANDS:
-        expected, found = spec.lens(480, 360), bands[spec.name].lens
-        assert found is not None
+        expected, result = spec.lens(480, 360), bands[spec.name].lens
+        assert result is not None
         np.testing.assert_allclose(
-            [found.fx_px, found.cx_px, found.cy_px], [expected.fx_px, expected.cx_px, expected.cy_px], atol=1e-4
+            [result.fx_px, result.cx_px, result.cy_px], [expected.fx_px, expected.cx_px, expected.cy_px], atol=1e-4
         )
-        np.testing.assert_allclose(found.distortion, expected.distortion)
+        np.testing.assert_allclose(result.distortion, expected.distortion)
 
 
 def test_rig_seed_is_the_truth_at_infinity(flight: Path) -> None:
@@ -65,8 +65,8 @@ def tags(**camera: str) -> Tags:
 def test_focal_length_of_old_firmware_is_in_pixels() -> None:
     old = tags(PerspectiveFocalLength="1451.8", PrincipalPoint="2.4,1.8")
     new = tags(PerspectiveFocalLength="5.45", PrincipalPoint="2.4,1.8", PerspectiveFocalLengthUnits="mm")
-    for found, expected in ((old, 1451.8), (new, 5.45 * 266.666667)):
-        (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), found, INFO)
+    for result, expected in ((old, 1451.8), (new, 5.45 * 266.666667)):
+        (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), result, INFO)
         assert band.lens is not None
         assert band.lens.fx_px == pytest.approx(expected)
 

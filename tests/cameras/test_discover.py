@@ -28,10 +28,10 @@ def labels(folder: Path, **options: object) -> list[str]:
 
 
 def test_a_micasense_flight(flight: Path) -> None:
-    found = discover(flight)
-    assert [c.label for c in found.captures] == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
-    assert found.problems == ()
-    first = found.captures[0]
+    result = discover(flight)
+    assert [c.label for c in result.captures] == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
+    assert result.problems == ()
+    first = result.captures[0]
     assert [b.name for b in first.bands] == ["Blue", "Green", "Red", "NIR", "Red edge"]
     assert first.reference.name == "Green"
     assert first.capture_id == "synthetic00000000001"
@@ -39,18 +39,18 @@ def test_a_micasense_flight(flight: Path) -> None:
 
 
 def test_ignoring_metadata_keeps_the_captures_but_not_the_lenses(flight: Path) -> None:
-    found = discover(flight, DiscoverOptions(ignore_metadata=True))
-    assert len(found.captures) == 2
-    assert all(b.lens is None and b.to_rig is None for c in found.captures for b in c.bands)
+    result = discover(flight, DiscoverOptions(ignore_metadata=True))
+    assert len(result.captures) == 2
+    assert all(b.lens is None and b.to_rig is None for c in result.captures for b in c.bands)
 
 
 def test_names_that_repeat_in_sub_folders_are_different_captures(flight: Path, tmp_path: Path) -> None:
     for name in ("0000SET", "0001SET mit Größe"):
         shutil.copytree(flight / "0000SET" / "000", tmp_path / name / "000")
-    found = discover(tmp_path)
-    assert len(found.captures) == 4
-    assert len({c.label for c in found.captures}) == 4
-    assert all(len(c.bands) == 5 for c in found.captures)
+    result = discover(tmp_path)
+    assert len(result.captures) == 4
+    assert len({c.label for c in result.captures}) == 4
+    assert all(len(c.bands) == 5 for c in result.captures)
 
 
 def test_missing_bands_and_unreadable_files_are_told(flight: Path, tmp_path: Path) -> None:
@@ -58,18 +58,18 @@ def test_missing_bands_and_unreadable_files_are_told(flight: Path, tmp_path: Pat
     images = tmp_path / "f" / "0000SET" / "000"
     (images / "IMG_0002_3.tif").unlink()
     (images / "IMG_0002_5.tif").write_bytes(b"II*\0 cut short")
-    found = discover(tmp_path)
-    assert found.captures[0].missing_bands == ()
-    assert set(found.captures[1].missing_bands) == {"Red", "Red edge"}
-    assert [p.path.name for p in found.problems] == ["IMG_0002_5.tif"]
-    assert "IMG_0002_5.tif" in found.problems[0].text
+    result = discover(tmp_path)
+    assert result.captures[0].missing_bands == ()
+    assert set(result.captures[1].missing_bands) == {"Red", "Red edge"}
+    assert [p.path.name for p in result.problems] == ["IMG_0002_5.tif"]
+    assert "IMG_0002_5.tif" in result.problems[0].text
 
 
 def test_one_file_a_band(tmp_path: Path) -> None:
     for name in ("north_red", "north_nir", "north_green", "south_red", "south_nir"):
         write(tmp_path / f"{name}.tif")
-    found = discover(tmp_path)
-    assert [(c.name, c.reference.name, len(c.bands)) for c in found.captures] == [
+    result = discover(tmp_path)
+    assert [(c.name, c.reference.name, len(c.bands)) for c in result.captures] == [
         ("north", "green", 3),
         ("south", "nir", 2),
     ]
@@ -97,10 +97,10 @@ def test_pattern(tmp_path: Path) -> None:
 
 def test_a_band_without_companions_is_a_problem_not_a_capture(tmp_path: Path) -> None:
     write(tmp_path / "lonely_red.tif")
-    found = discover(tmp_path)
-    assert found.captures == ()
-    assert "lonely_red.tif" in found.problems[0].text
-    assert "--pattern" in found.problems[0].text
+    result = discover(tmp_path)
+    assert result.captures == ()
+    assert "lonely_red.tif" in result.problems[0].text
+    assert "--pattern" in result.problems[0].text
 
 
 def test_two_captures_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
@@ -112,9 +112,9 @@ def test_two_captures_of_one_name_do_not_overwrite_each_other(tmp_path: Path) ->
 
 def test_reference_by_name(flight: Path) -> None:
     assert discover(flight, DiscoverOptions(reference="nir")).captures[0].reference.name == "NIR"
-    found = discover(flight, DiscoverOptions(reference="swir"))
-    assert found.captures == ()
-    assert "swir" in found.problems[0].text
+    result = discover(flight, DiscoverOptions(reference="swir"))
+    assert result.captures == ()
+    assert "swir" in result.problems[0].text
 
 
 def test_output_folders_are_not_looked_into(flight: Path, tmp_path: Path) -> None:
@@ -151,33 +151,33 @@ def test_a_panel_of_another_flight_is_a_capture_of_its_own(flight: Path, tmp_pat
     for path in (tmp_path / "other" / "0000SET" / "000").iterdir():
         shutil.copy(path, tmp_path / "f" / "0000SET" / "000" / path.name.replace("IMG_0001", "IMG_0000"))
     # Same CaptureId as IMG_0001 in this folder: real cameras never repeat one, so files are told apart by name.
-    found = discover(tmp_path / "f")
-    assert sum(len(c.bands) for c in found.captures) == 15
+    result = discover(tmp_path / "f")
+    assert sum(len(c.bands) for c in result.captures) == 15
 
 
 def test_a_pattern_splits_names_where_the_band_begins(tmp_path: Path) -> None:
     for name in ("IMG_0007_1", "IMG_0007_2", "IMG_0009_1", "IMG_0009_2", "north_red_edge", "north_red"):
         write(tmp_path / f"{name}.tif")
-    found = discover(tmp_path, DiscoverOptions(pattern="{capture}_{band}.tif"))
-    bands = {c.name: [b.name for b in c.bands] for c in found.captures}
+    result = discover(tmp_path, DiscoverOptions(pattern="{capture}_{band}.tif"))
+    bands = {c.name: [b.name for b in c.bands] for c in result.captures}
     assert bands == {"IMG_0007": ["1", "2"], "IMG_0009": ["1", "2"], "north": ["red", "red_edge"]}
-    assert found.problems == ()
+    assert result.problems == ()
 
 
 def test_a_pattern_that_makes_one_band_of_two_files_is_told(tmp_path: Path) -> None:
     for name in ("a_1_red", "a_2_red", "a_1_nir"):
         write(tmp_path / f"{name}.tif")
-    found = discover(tmp_path, DiscoverOptions(pattern="{capture}_*_{band}.tif"))
-    (problem,) = found.problems
+    result = discover(tmp_path, DiscoverOptions(pattern="{capture}_*_{band}.tif"))
+    (problem,) = result.problems
     assert "a_2_red.tif: is band 'red' of one capture with a_1_red.tif" in problem.text
 
 
 def test_the_day_of_a_date_is_no_band(tmp_path: Path) -> None:
     for name in ("field_2023-05-12", "field_2023-06-03"):
         write(tmp_path / f"{name}.tif")
-    found = discover(tmp_path)
-    assert not found.captures
-    assert all("no companion" in p.text for p in found.problems)
+    result = discover(tmp_path)
+    assert not result.captures
+    assert all("no companion" in p.text for p in result.problems)
     write(tmp_path / "field_2023-05-12_red.tif")
     write(tmp_path / "field_2023-05-12_nir.tif")
     assert [c.name for c in discover(tmp_path).captures] == ["field_2023-05-12"]
@@ -202,18 +202,18 @@ def test_a_capture_lies_where_its_reference_says(flight: Path, tmp_path: Path) -
 
 
 def test_a_reference_that_no_capture_has_is_an_error_of_its_own_class(flight: Path) -> None:
-    found = discover(flight, DiscoverOptions(reference="SWIR"))
-    assert not found.captures
-    assert {type(p.error) for p in found.problems} == {NoSuchBandError}
+    result = discover(flight, DiscoverOptions(reference="SWIR"))
+    assert not result.captures
+    assert {type(p.error) for p in result.problems} == {NoSuchBandError}
 
 
 def test_positions_that_cannot_be_are_none(tmp_path: Path) -> None:
     def gps(latitude: float, longitude: float) -> dict[str, object]:
         return {"GPSLatitude": (latitude, 0.0, 0.0), "GPSLongitude": (longitude, 0.0, 0.0), "GPSAltitude": 1e9}
 
-    found = metadata._position(gps(47.0, 9.0))
-    assert found is not None
-    assert found.altitude_m is None
+    result = metadata._position(gps(47.0, 9.0))
+    assert result is not None
+    assert result.altitude_m is None
     assert metadata._position(gps(4e9, 9.0)) is None
     assert metadata._position(gps(47.0, 181.0)) is None
 

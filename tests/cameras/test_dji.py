@@ -87,5 +87,5 @@ def test_a_mavic_s_gimbal_is_turned_either_way(roll: str, yaw: str) -> None:
 
 def test_pixels_that_are_dewarped_have_no_distortion(tmp_path: Path) -> None:
     bent = "2022-09-08;2170,2170,0,0,-0.1,0.05,0,0,0"
-    found = [mavic_band(tmp_path, mavic_tags(DewarpData=bent, DewarpFlag=flag)).lens for flag in "01"]
-    assert [lens.is_distorting(one) for one in found] == [True, False]
+    result = [mavic_band(tmp_path, mavic_tags(DewarpData=bent, DewarpFlag=flag)).lens for flag in "01"]
+    assert [lens.is_distorting(one) for one in result] == [True, False]

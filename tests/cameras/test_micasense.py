@@ -30,9 +30,9 @@ def test_thermal_bands_count_in_hundredths_of_a_kelvin(tmp_path: Path) -> None:
     ],
 )
 def test_panels_as_firmware_writes_them(values: dict[str, str], albedo: float | None, corners: int) -> None:
-    found = panel_in(Tags(xmp={(CAMERA, k): (v,) for k, v in values.items()}), (64, 48))
-    assert found is not None
-    assert (found.albedo, len(found.corners_px)) == (albedo, corners)
+    result = panel_in(Tags(xmp={(CAMERA, k): (v,) for k, v in values.items()}), (64, 48))
+    assert result is not None
+    assert (result.albedo, len(result.corners_px)) == (albedo, corners)
 
 
 @pytest.mark.parametrize(

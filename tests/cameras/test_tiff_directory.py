@@ -44,9 +44,9 @@ def test_what_is_added_is_read_by_others_and_the_pixels_stay(tmp_path: Path, ord
     if not big:
         with Image.open(path) as image:
             assert image.getexif().get_ifd(GPS)[4] == (5.0, 0.0, 1.25)
-    found = read_directories(path)
-    assert found[GPS] == PLACE
-    assert {tag: found[0][tag] for tag in FIRST} == FIRST
+    result = read_directories(path)
+    assert result[GPS] == PLACE
+    assert {tag: result[0][tag] for tag in FIRST} == FIRST
 
 
 def test_directories_that_follow_are_kept(tmp_path: Path) -> None:
@@ -65,10 +65,10 @@ def test_a_jpegs_exif_is_read(tmp_path: Path) -> None:
     exif[271] = "Maker"
     exif.get_ifd(GPS)[1] = "S"
     Image.fromarray(np.zeros((20, 20, 3), np.uint8)).save(tmp_path / "x.jpg", exif=exif, xmp=b"packet")
-    found = read_directories(tmp_path / "x.jpg")
-    assert found[0][271].data == b"Maker\0"
-    assert found[GPS][1].data == b"S\0"
-    assert found[0][700].data == b"packet"
+    result = read_directories(tmp_path / "x.jpg")
+    assert result[0][271].data == b"Maker\0"
+    assert result[GPS][1].data == b"S\0"
+    assert result[0][700].data == b"packet"
 
 
 @pytest.mark.parametrize("content", [b"", b"II*\0", b"no tiff at all", struct.pack("<2sHI", b"II", 42, 10**6)])

@@ -138,9 +138,9 @@ def write_capture(folder: Path, vendor: Vendor, dialect: str = "attributes", dam
 
 
 def only_capture(folder: Path, options: DiscoverOptions | None = None) -> Capture:
-    found = discover(folder, options)
-    assert not found.problems
-    (capture,) = found.captures
+    result = discover(folder, options)
+    assert not result.problems
+    (capture,) = result.captures
     return capture
 
 
@@ -166,8 +166,8 @@ def test_damaged_tags_leave_the_names_of_the_files(tmp_path: Path, name: str, da
     vendor = VENDORS[name]
     write_capture(tmp_path, vendor, damage=damage)
     capture = only_capture(tmp_path)
-    found = {b.name for b in capture.bands}
-    assert found == (
+    result = {b.name for b in capture.bands}
+    assert result == (
         {band for band, _, _ in vendor.files.values()} if damage == "no numbers" else set(vendor.names_without_xmp)
     )
     assert all(b.lens is None or np.isfinite(b.lens.matrix).all() for b in capture.bands)
@@ -204,9 +204,9 @@ def test_mavic_3_goes_through_the_common_plane(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["Mavic 3"])
     bands = {b.name: b for b in only_capture(tmp_path).bands}
     np.testing.assert_allclose(rig_seed(bands["Green"], bands["NIR"]), geometry.translation(-3, 0), atol=1e-9)
-    found = bands["NIR"].lens
-    assert found is not None
-    assert (found.fx_px, found.cx_px, found.cy_px, found.distortion[0]) == (170, 81.5, 57.5, -0.1)
+    result = bands["NIR"].lens
+    assert result is not None
+    assert (result.fx_px, result.cx_px, result.cy_px, result.distortion[0]) == (170, 81.5, 57.5, -0.1)
 
 
 def test_sequoia_fisheye_is_the_vendors_formula(tmp_path: Path) -> None:
@@ -306,9 +306,9 @@ def test_three_bands_of_one_lens_are_no_capture(tmp_path: Path) -> None:
     path = tmp_path / "survey.tif"
     tifffile.imwrite(path, np.zeros((120, 160, 3), np.uint8), photometric="rgb", metadata=None)
     add_directories(path, {271: text("MAPIR"), 272: text("Survey3W_RGN")}, {}, {})
-    found = discover(tmp_path)
-    assert not found.captures
-    assert "one lens" in found.problems[0].text
+    result = discover(tmp_path)
+    assert not result.captures
+    assert "one lens" in result.problems[0].text
 
 
 def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
@@ -345,9 +345,9 @@ def test_a_stack_with_a_vendors_make_is_a_stack(tmp_path: Path) -> None:
         pixels = np.zeros((5, 120, 160), np.uint16)
         tifffile.imwrite(path, pixels, photometric="minisblack", planarconfig="separate", metadata=None)
         add_directories(path, {271: text(make)}, {}, {})
-    found = discover(tmp_path)
-    assert not found.problems
-    assert [len(c.bands) for c in found.captures] == [5] * 5
+    result = discover(tmp_path)
+    assert not result.problems
+    assert [len(c.bands) for c in result.captures] == [5] * 5
 
 
 @pytest.mark.parametrize("folder", ["NDVI 2024", "NDVI"])

@@ -24,8 +24,8 @@ def test_values_are_changed_in_the_form_they_have(dialect: str) -> None:
 def test_taking_anothers_values(dialect: str, theirs: str) -> None:
     mine = Packet.parse(packet(VALUES, dialect))
     mine.take(Packet.parse(packet(OTHER, theirs)), [(CAMERA, "PrincipalPoint"), (CAMERA, "RigRelatives")])
-    found = Packet.parse(mine.serialised()).values()
-    values = {k: ",".join(v).replace(" ", "") for k, v in found.items() if k[0] == CAMERA}
+    result = Packet.parse(mine.serialised()).values()
+    values = {k: ",".join(v).replace(" ", "") for k, v in result.items() if k[0] == CAMERA}
     assert values == {
         (CAMERA, "PrincipalPoint"): "9,8", (CAMERA, "RigRelatives"): "1,2,3", (CAMERA, "BandName"): "Red",
     }  # fmt: skip

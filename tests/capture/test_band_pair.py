@@ -26,9 +26,9 @@ pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreference
 def test_a_seed_that_tags_do_not_give_is_not_replaced_by_another(flight: Path, kind: str) -> None:
     capture = discover(flight, DiscoverOptions(ignore_metadata=True)).captures[0]
     settings = Settings(seed=SeedSettings(force=kind))
-    found = align_capture_bands(capture, settings, None, lambda *_: None)
-    assert {a.status for a in found.values()} == {"failed"}
-    assert {a.reason for a in found.values()} == {f"there is no {kind} seed for it; leave --seed out"}
+    result = align_capture_bands(capture, settings, None, lambda *_: None)
+    assert {a.status for a in result.values()} == {"failed"}
+    assert {a.reason for a in result.values()} == {f"there is no {kind} seed for it; leave --seed out"}
 
 
 def test_the_reference_is_worked_out_once_for_all_bands(flight: Path) -> None:

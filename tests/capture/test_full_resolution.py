@@ -24,11 +24,11 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 def error_px(capture: Capture, longest_side_px: int) -> float:
     settings = Settings(joint=JointSettings(longest_side_px=longest_side_px, device="cpu"))
-    found = align_capture_bands(capture, settings, None, lambda *_: None)["nir"]
-    assert found.status == "aligned"
-    assert found.residual is not None
-    assert found.residual.centres_px.max() > 1000  # px of the file
-    return geometry.corner_error_px(found.fixed_to_moving, TRUTH, *SIZE)
+    result = align_capture_bands(capture, settings, None, lambda *_: None)["nir"]
+    assert result.status == "aligned"
+    assert result.residual is not None
+    assert result.residual.centres_px.max() > 1000  # px of the file
+    return geometry.corner_error_px(result.fixed_to_moving, TRUTH, *SIZE)
 
 
 def test_what_was_found_on_reduced_images_is_sharpened_on_the_files(

@@ -37,9 +37,9 @@ def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def model(five: Path) -> FlightModel:
-    found = learn_flight(discover(five).captures, Settings(), lambda *_: None)
-    assert found is not None
-    return found
+    result = learn_flight(discover(five).captures, Settings(), lambda *_: None)
+    assert result is not None
+    return result
 
 
 def error_px(five: Path, capture: str, file: str, matrix: np.ndarray) -> float:
@@ -70,17 +70,17 @@ def test_a_model_that_still_holds_is_kept_and_one_that_does_not_is_learnt_anew(f
 
 def test_a_lost_band_is_predicted_with_an_error_bar_and_never_called_aligned(five: Path, model: FlightModel) -> None:
     capture = discover(five).captures[2]
-    found = align_capture_bands(capture, Settings(), model, lambda *_: None)
-    assert {b: a.status for b, a in found.items()} == {
+    result = align_capture_bands(capture, Settings(), model, lambda *_: None)
+    assert {b: a.status for b, a in result.items()} == {
         "Blue": "aligned", "Red": "aligned", "NIR": "predicted", "Red edge": "aligned",
     }  # fmt: skip
-    nir = found["NIR"]
+    nir = result["NIR"]
     assert nir.prediction is not None
     assert nir.prediction.source == "bands"
     assert error_px(five, "IMG_0003", "IMG_0003_4.tif", nir.fixed_to_moving) < 3 * nir.prediction.std_px
     assert "from the capture's other bands" in (nir.reason or "")
-    assert found["Red"].prediction is not None
-    assert found["Red"].prediction.off_px is not None
+    assert result["Red"].prediction is not None
+    assert result["Red"].prediction.off_px is not None
 
 
 def test_a_capture_over_water_costs_little_and_is_written(five: Path, tmp_path: Path) -> None:
@@ -112,11 +112,11 @@ def test_an_alignment_where_the_rig_cannot_be_is_not_believed(five: Path, model:
         b: geometry.compose(geometry.translation(25, 0), m) if b == "NIR" else m for b, m in model.rig.mean.items()
     }
     wrong = replace(model, rig=replace(model.rig, mean=moved))
-    found = align_capture_bands(discover(five).captures[0], Settings(), wrong, lambda *_: None)
-    assert found["NIR"].status == "predicted"
-    assert found["NIR"].doubts[0].kind == "unexpected_px"
-    assert found["NIR"].doubts[0].value == pytest.approx(25, abs=3)
-    assert found["Red"].status == "aligned"
+    result = align_capture_bands(discover(five).captures[0], Settings(), wrong, lambda *_: None)
+    assert result["NIR"].status == "predicted"
+    assert result["NIR"].issues[0].kind == "unexpected_px"
+    assert result["NIR"].issues[0].value == pytest.approx(25, abs=3)
+    assert result["Red"].status == "aligned"
 
 
 def test_a_band_that_shows_itself_turned_is_not_placed_by_the_rig(
@@ -131,7 +131,7 @@ def test_a_band_that_shows_itself_turned_is_not_placed_by_the_rig(
         image = cv2.warpAffine(dataset.read(1), about, (400, 300), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         dataset.write(image, 1)
     capture = next(c for c in discover(copy).captures if c.name == "IMG_0001")
-    found = align_capture_bands(capture, Settings(), model, lambda *_: None)
-    assert found["Red"].status == "failed"
-    assert found["Red"].doubts[0].kind == "unexpected_px"
-    assert found["NIR"].status == "aligned"
+    result = align_capture_bands(capture, Settings(), model, lambda *_: None)
+    assert result["Red"].status == "failed"
+    assert result["Red"].issues[0].kind == "unexpected_px"
+    assert result["NIR"].status == "aligned"

@@ -3,12 +3,12 @@ import numpy as np
 import pytest
 
 from agalign.capture.band_pair import BandPair, Candidates
-from agalign.capture.evidence import Look
-from agalign.capture.seeding import best_seed, find_seed, found_turned
+from agalign.capture.seeding import best_seed, find_rotated, find_seed
 from agalign.capture.tag_seeds import geo_seed
+from agalign.capture.verification import WarpedPair
 from agalign.config import SeedSettings, Settings
 from agalign.errors import GeometryError
-from agalign.pixels.landmarks import VIEWS, agreed_homography, landmarks
+from agalign.pixels.landmarks import LANDMARK_INPUTS, agreed_homography, landmarks
 from agalign.values import geometry
 from agalign.values.alignment import Seed
 from agalign.values.capture import Band, Georeference
@@ -137,10 +137,10 @@ def test_tags_that_are_wrong_by_a_turn_are_found_out() -> None:
     first = best_seed(pair, told)
     assert first.trusted, "by the peak alone it looks right"
     assert pair.is_expected(first.fixed_to_moving)
-    found = find_seed(pair)
-    assert isinstance(found, Seed)
-    assert found.kind == "match"
-    assert mean_error_px(found.fixed_to_moving, truth, 640, 480) < 2
+    result = find_seed(pair)
+    assert isinstance(result, Seed)
+    assert result.kind == "match"
+    assert mean_error_px(result.fixed_to_moving, truth, 640, 480) < 2
 
 
 def test_a_turn_that_no_rig_has_is_told_from_a_shift() -> None:
@@ -148,11 +148,11 @@ def test_a_turn_that_no_rig_has_is_told_from_a_shift() -> None:
     pair = pair_turned(4.0, {"identity": np.eye(3)})
 
     def turned_beside(mapping: np.ndarray) -> np.ndarray | None:
-        return found_turned(pair, mapping, Look.at(pair, pair.mapping(mapping)).residual)
+        return find_rotated(pair, mapping, WarpedPair.at(pair, pair.mapping(mapping)).residual)
 
-    found = turned_beside(np.eye(3))
-    assert found is not None
-    assert mean_error_px(found, truth, 640, 480) < 2
+    result = turned_beside(np.eye(3))
+    assert result is not None
+    assert mean_error_px(result, truth, 640, 480) < 2
     assert turned_beside(truth) is None, "where it fits there is nothing to be found"
     shifted = geometry.compose(truth, geometry.translation(60, 25))
     assert turned_beside(shifted) is None, "a scene that repeats looks so too"
@@ -173,7 +173,7 @@ def test_what_a_user_knows_is_not_left_for_landmarks() -> None:
 def test_unrelated_images_have_no_landmarks_in_common() -> None:
     valid = np.ones((320, 400), bool)
     one, other = (Raster(textured_image(400, 320, s), valid) for s in (5, 6))
-    for view in VIEWS:
+    for view in LANDMARK_INPUTS:
         assert agreed_homography(landmarks(one, view), landmarks(other, view), (400, 320)) is None
 
 

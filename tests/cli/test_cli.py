@@ -379,8 +379,8 @@ def test_info_is_json_whatever_the_nodata(tmp_path: Path) -> None:
     def no_constant(name: str) -> None:
         raise ValueError(f"{name} is no JSON")
 
-    found = json.loads(agalign("info", tmp_path / "in", "--json").stdout, parse_constant=no_constant)
-    assert [b["nodata"] for b in found["captures"][0]["bands"]] == ["nan", "nan"]
+    result = json.loads(agalign("info", tmp_path / "in", "--json").stdout, parse_constant=no_constant)
+    assert [b["nodata"] for b in result["captures"][0]["bands"]] == ["nan", "nan"]
 
 
 def test_a_seed_that_there_is_not_is_told(tmp_path: Path) -> None:

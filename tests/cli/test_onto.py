@@ -45,8 +45,8 @@ def test_a_mosaic_is_laid_on_the_grid_of_another(mosaics: Path, tmp_path: Path) 
     sidecar = json.loads((tmp_path / "out" / "summer.json").read_text())
     assert [b["band"] for b in sidecar["bands"]] == ["spring band_1", "band_1", "band_2"]
     assert [b["status"] for b in sidecar["bands"]] == ["reference", "aligned", "aligned"]
-    found = np.array(sidecar["bands"][1]["homography"]["fixed_to_moving"])
-    assert geometry.corner_error_px(found, TRUTH, 640, 520) < 0.3
+    result = np.array(sidecar["bands"][1]["homography"]["fixed_to_moving"])
+    assert geometry.corner_error_px(result, TRUTH, 640, 520) < 0.3
     with rasterio.open(tmp_path / "out" / "summer.tif") as out, rasterio.open(mosaics / "spring.tif") as reference:
         assert (out.shape, out.transform, out.crs) == (reference.shape, reference.transform, reference.crs)
         np.testing.assert_array_equal(out.read(1), reference.read(1))

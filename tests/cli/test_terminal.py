@@ -3,7 +3,7 @@
 import pytest
 import typer
 
-from agalign.cli.terminal import Voice, exits, shown
+from agalign.cli.terminal import Terminal, exits, shown
 from agalign.errors import ConfigurationError, InputError
 
 
@@ -20,7 +20,7 @@ from agalign.errors import ConfigurationError, InputError
 def test_every_end_is_a_line_and_a_code(
     error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(typer.Exit) as ended, exits(Voice(quiet=False, verbose=False, log_json=False)):
+    with pytest.raises(typer.Exit) as ended, exits(Terminal(quiet=False, verbose=False, log_json=False)):
         raise error
     assert ended.value.exit_code == code
     (line,) = capsys.readouterr().err.splitlines()

@@ -93,12 +93,12 @@ def test_links_lead_somewhere(page: Path) -> None:
         if re.match(r"[a-z]+:", target):
             continue
         path, _, anchor = target.partition("#")
-        found = (page.parent / path) if path else page
-        if not found.suffix and not found.exists():
-            found = found.with_suffix(".md")
-        assert found.exists(), target
+        result = (page.parent / path) if path else page
+        if not result.suffix and not result.exists():
+            result = result.with_suffix(".md")
+        assert result.exists(), target
         if anchor:
-            heads = re.findall(r"^#+ (.+)$", found.read_text(encoding="utf-8"), re.MULTILINE)
+            heads = re.findall(r"^#+ (.+)$", result.read_text(encoding="utf-8"), re.MULTILINE)
             assert anchor in {re.sub(r"[^\w -]", "", h).strip().lower().replace(" ", "-") for h in heads}, target
 
 
@@ -116,7 +116,7 @@ def test_options_that_are_spoken_of_exist() -> None:
 
 def test_the_table_of_doubts_is_the_programs() -> None:
     done = subprocess.run(
-        [sys.executable, "tools/doubts.py", "--check"], cwd=ROOT, capture_output=True, text=True, check=False,
+        [sys.executable, "tools/issues.py", "--check"], cwd=ROOT, capture_output=True, text=True, check=False,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

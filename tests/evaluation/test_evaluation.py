@@ -16,7 +16,7 @@ from agalign.config import FastRecipe, JointSettings, PaperRecipe, SeedSettings,
 from agalign.errors import ConfigurationError, InputError
 from agalign.evaluation.image_pairs import PairFiles
 from agalign.evaluation.learn import Lesson, learn_descriptor
-from agalign.evaluation.methods import Task, daisy_of_patches, method_named, sift_of_patches
+from agalign.evaluation.methods import PairTask, daisy_of_patches, method_named, sift_of_patches
 from agalign.evaluation.protocol import average_precision, grey_patches, homography_error_px
 from agalign.evaluation.run import Starts, as_csv, error_table, evaluate, precision_table
 from agalign.evaluation.surface import draw_surface, loss_surface
@@ -26,8 +26,8 @@ from agalign.method.detect import sift_keypoints, visible_in_both
 from agalign.method.match import match_seed, matching_network, starter_for_matching
 from agalign.method.patches import patch_positions
 from agalign.values import geometry
-from agalign.values.doubts import Doubt
 from agalign.values.image import Raster
+from agalign.values.issues import Issue
 
 from ..conftest import textured_image, textured_pair
 
@@ -76,21 +76,21 @@ def test_keypoints_whose_patch_leaves_an_image_do_not_count() -> None:
 
 def test_sift_and_daisy_of_a_mosaic_are_those_of_single_patches() -> None:
     fixed = raster(textured_image(400, 320))
-    keypoints = sift_keypoints(fixed, most=30)
+    keypoints = sift_keypoints(fixed, maximum=30)
     patches = grey_patches(fixed, patch_positions(keypoints, 64))
     alone = torch.cat([sift_of_patches(p[None]) for p in patches])
     together = sift_of_patches(patches)
     assert torch.cosine_similarity(alone, together).min() > 0.98
-    found = daisy_of_patches(patches)
-    assert torch.cosine_similarity(found[7], daisy_of_patches(patches[7:8])[0], dim=0) > 0.99
+    result = daisy_of_patches(patches)
+    assert torch.cosine_similarity(result[7], daisy_of_patches(patches[7:8])[0], dim=0) > 0.99
 
 
 @pytest.mark.parametrize("name", ["sift", "daisy"])
 def test_hand_made_descriptors_find_copies_and_nothing_in_unrelated_images(name: str) -> None:
     fixed, other = raster(textured_image(400, 320)), raster(textured_image(400, 320, 5))
-    keypoints = visible_in_both(sift_keypoints(fixed, most=200), np.eye(3), fixed, fixed)
+    keypoints = visible_in_both(sift_keypoints(fixed, maximum=200), np.eye(3), fixed, fixed)
     for moving, low, high in ((fixed, 0.99, 1.0), (other, 0.0, 0.05)):
-        describe = method_named(name)(Task(fixed, moving, np.eye(3))).describe
+        describe = method_named(name)(PairTask(fixed, moving, np.eye(3))).describe
         assert describe is not None
         assert low <= average_precision(*describe(keypoints, np.eye(3))) <= high
 
@@ -120,8 +120,8 @@ def test_a_torchscript_file_takes_part(tmp_path: Path) -> None:
         flat = torch.nn.Sequential(torch.nn.AvgPool2d(4), torch.nn.Flatten(), torch.nn.LayerNorm(64))
         torch.jit.trace(flat, torch.zeros(2, 1, 32, 32)).save(str(path))
     fixed = raster(textured_image(400, 320))
-    keypoints = visible_in_both(sift_keypoints(fixed, most=200), np.eye(3), fixed, fixed)
-    describe = method_named(f"{path}@32")(Task(fixed, fixed, np.eye(3))).describe
+    keypoints = visible_in_both(sift_keypoints(fixed, maximum=200), np.eye(3), fixed, fixed)
+    describe = method_named(f"{path}@32")(PairTask(fixed, fixed, np.eye(3))).describe
     assert describe is not None
     assert average_precision(*describe(keypoints, np.eye(3))) > 0.95
     with pytest.raises(InputError, match="64 x 64"):
@@ -209,18 +209,18 @@ def test_matching_finds_what_is_turned_and_far_away(learnt: Path) -> None:
     fixed, moving = rasters(truth, 4)
     model = load_model(learnt, lambda: torch.device("cpu"))
     for net in (starter_for_matching((1, 1)), matching_network(model.net, 1, (1, 1))):
-        found = match_seed(net, fixed, moving)
-        assert found is not None
+        result = match_seed(net, fixed, moving)
+        assert result is not None
         points = geometry.lattice(400, 320, 8, 8)[20:44]
-        assert np.median(np.linalg.norm(geometry.apply(found, points) - geometry.apply(truth, points), axis=1)) < 2
+        assert np.median(np.linalg.norm(geometry.apply(result, points) - geometry.apply(truth, points), axis=1)) < 2
 
 
 def test_matching_finds_nothing_in_unrelated_images() -> None:
     pair = raster(textured_image(400, 320, 70)), raster(textured_image(400, 320, 71))
     assert match_seed(starter_for_matching((1, 1)), *pair) is None
     asked = Settings(seed=SeedSettings(force="match"))
-    found = find_seed(BandPair.of_images("moving", *pair, {"identity": np.eye(3)}, asked))
-    assert found == Doubt("no_such_seed", detail="match")
+    result = find_seed(BandPair.of_images("moving", *pair, {"identity": np.eye(3)}, asked))
+    assert result == Issue("no_such_seed", detail="match")
 
 
 # ---- the commands

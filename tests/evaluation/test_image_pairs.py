@@ -24,14 +24,14 @@ def test_hpatches_layout(tmp_path: Path) -> None:
             write_image(tmp_path / name / f"{k}.ppm", channels=3)
         for k in range(2, 7):
             np.savetxt(tmp_path / name / f"H_1_{k}", H)
-    found = find_pairs(tmp_path)
-    assert len(found) == 10
-    assert [p.group for p in found if p.name.startswith("i_sun")] == [
+    result = find_pairs(tmp_path)
+    assert len(result) == 10
+    assert [p.group for p in result if p.name.startswith("i_sun")] == [
         "illumination, easy", "illumination, easy", "illumination, hard", "illumination, hard", "illumination, tough",
     ]  # fmt: skip
-    assert found[-1].name == "v_wall 1-6"
-    assert found[-1].moving.name == "6.ppm"
-    np.testing.assert_allclose(found[0].fixed_to_moving, H)
+    assert result[-1].name == "v_wall 1-6"
+    assert result[-1].moving.name == "6.ppm"
+    np.testing.assert_allclose(result[0].fixed_to_moving, H)
 
 
 def test_oxford_layout(tmp_path: Path) -> None:

@@ -24,9 +24,9 @@ def test_what_a_result_depends_on_changes_it(flight: object) -> None:
         dataclasses.replace(capture, bands=(dataclasses.replace(band, lens=None), *capture.bands[1:])),
         dataclasses.replace(capture, reference_index=0),
     ]
-    found = {fingerprint(c, Settings()) for c in captures}
-    found.add(fingerprint(capture, Settings(seed=SeedSettings(only=True))))
-    assert len(found) == 5
+    result = {fingerprint(c, Settings()) for c in captures}
+    result.add(fingerprint(capture, Settings(seed=SeedSettings(only=True))))
+    assert len(result) == 5
 
 
 def test_facts_are_told_apart() -> None:

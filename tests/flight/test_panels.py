@@ -6,7 +6,7 @@ import pytest
 import tifffile
 
 from agalign.cameras.discover import discover
-from agalign.flight.panels import BandReading, PanelReading, factors_for, read_panel, with_height, with_panels
+from agalign.flight.panels import BandReading, PanelReading, read_panel, reflectance_factors, with_height, with_panels
 from agalign.synthetic.panel import make_flight_between_panels
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Radiometry
 
@@ -33,9 +33,9 @@ def reading(moment: str, factor: float, band: Band | None = None) -> PanelReadin
 
 
 def test_what_a_panel_reflects_is_what_its_radiance_is_worth(tmp_path: Path) -> None:
-    (found,) = read_panel(capture(panel_file(tmp_path / "a.tif")), {}).bands
-    assert found.radiance == pytest.approx(1.0)
-    assert (found.albedo, found.factor) == (0.4, pytest.approx(0.4))
+    (result,) = read_panel(capture(panel_file(tmp_path / "a.tif")), {}).bands
+    assert result.radiance == pytest.approx(1.0)
+    assert (result.albedo, result.factor) == (0.4, pytest.approx(0.4))
 
 
 def test_a_user_s_reflectance_goes_before_the_tags(tmp_path: Path) -> None:
@@ -47,9 +47,9 @@ def test_a_user_s_reflectance_goes_before_the_tags(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("level", "problem"), [(65535, "saturated"), (900, "black")])
 def test_a_panel_that_cannot_be_measured_tells_nothing(tmp_path: Path, level: int, problem: str) -> None:
-    (found,) = read_panel(capture(panel_file(tmp_path / "a.tif", level)), {}).bands
-    assert problem in found.problem
-    assert found.factor is None
+    (result,) = read_panel(capture(panel_file(tmp_path / "a.tif", level)), {}).bands
+    assert problem in result.problem
+    assert result.factor is None
 
 
 def test_between_panels_the_light_is_linear_in_time_and_beyond_them_as_the_nearest_has_it() -> None:
@@ -57,22 +57,22 @@ def test_between_panels_the_light_is_linear_in_time_and_beyond_them_as_the_neare
     of = panels[0].capture.bands[0]
 
     def at(moment: str) -> dict[str, float]:
-        return factors_for(capture(of, f"2026-06-21T{moment}"), panels)
+        return reflectance_factors(capture(of, f"2026-06-21T{moment}"), panels)
 
     assert at("09:00:00") == {"Green": pytest.approx(2.0)}
     assert at("10:30:00") == {"Green": pytest.approx(1 / 0.375)}
     assert at("12:00:00") == {"Green": pytest.approx(4.0)}
-    assert factors_for(capture(of, "2026-06-23T10:30:00"), panels) == {}
-    assert factors_for(replace(capture(of), camera=CameraIdentity("a", "b", "2")), panels) == {}
+    assert reflectance_factors(capture(of, "2026-06-23T10:30:00"), panels) == {}
+    assert reflectance_factors(replace(capture(of), camera=CameraIdentity("a", "b", "2")), panels) == {}
 
 
 def test_a_panel_on_the_ground_tells_how_high_the_others_are() -> None:
     band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
     ground = PanelReading(capture(band, position=Position(52.0, 5.0, 93.0)), ())
     high = capture(band, position=Position(52.0, 5.0, 112.0), pose=Pose(30.0))
-    found = with_height(high, [ground])
-    assert found.pose is not None
-    assert found.pose.height_m == pytest.approx(20.0)
+    result = with_height(high, [ground])
+    assert result.pose is not None
+    assert result.pose.height_m == pytest.approx(20.0)
     assert with_height(high, []) == high
     told = replace(high, pose=Pose(30.0, height_m=25.0))
     assert with_height(told, [ground]) == told
@@ -84,14 +84,14 @@ def test_the_ends_of_a_flight_are_looked_at_until_three_in_a_row_show_none(monke
     flight = [replace(capture(band, f"2026-06-21T10:00:{k:02d}"), name=f"{k}") for k in range(20)]
     looked: list[str] = []
 
-    def look(one: Capture, _by_look: bool) -> Capture:
+    def warped_pair(one: Capture, _by_look: bool) -> Capture:
         looked.append(one.name)
         shown = one.name in ("0", "1", "2", "3", "5", "18")
         return replace(one, bands=(replace(band, panel=Panel("look") if shown else None),))
 
-    monkeypatch.setattr("agalign.flight.panels._looked_at", look)
-    found = with_panels(flight)
-    assert [c.name for c in found if c.panel] == ["0", "1", "2", "3", "5", "18"]
+    monkeypatch.setattr("agalign.flight.panels._looked_at", warped_pair)
+    result = with_panels(flight)
+    assert [c.name for c in result if c.panel] == ["0", "1", "2", "3", "5", "18"]
     assert sorted(map(int, looked)) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 15, 16, 17, 18, 19]
     looked.clear()
     with_panels(flight[7:8])
@@ -103,8 +103,8 @@ def test_the_ends_of_a_flight_are_looked_at_until_three_in_a_row_show_none(monke
 
 def test_the_first_and_last_captures_are_looked_at(tmp_path: Path) -> None:
     make_flight_between_panels(tmp_path, 7, (640, 480))
-    found = with_panels(discover(tmp_path).captures)
-    assert [c.panel is not None for c in found] == [True, *[False] * 7, True]
-    assert all(b.panel is not None and b.panel.corners_px and b.panel.albedo for b in found[0].bands)
-    (shown,) = {b.panel.serial for b in found[-1].bands if b.panel is not None}
+    result = with_panels(discover(tmp_path).captures)
+    assert [c.panel is not None for c in result] == [True, *[False] * 7, True]
+    assert all(b.panel is not None and b.panel.corners_px and b.panel.albedo for b in result[0].bands)
+    (shown,) = {b.panel.serial for b in result[-1].bands if b.panel is not None}
     assert shown == "RP04-0000001-SY"

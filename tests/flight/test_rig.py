@@ -7,7 +7,7 @@ import pytest
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig, distance_px, median_mapping
 from agalign.values import geometry
-from agalign.values.alignment import LocalField
+from agalign.values.alignment import DisplacementField
 
 SIZE = 1280, 960
 BASELINES = {"Blue": (0.9, 0.0), "Red": (0.0, 0.65), "NIR": (0.9, 0.7), "Red edge": (0.4, 0.35)}
@@ -17,14 +17,14 @@ BASELINES = {"Blue": (0.9, 0.0), "Red": (0.0, 0.65), "NIR": (0.9, 0.7), "Red edg
 def mappings(distance_px: float, tilt: tuple[float, float] = (0.0, 0.0), noise: float = 0.0, seed: int = 0) -> dict:
     """Homographies of a rig over a plane: A_b + e_b nu^T, the baselines in px at the image's middle."""
     rng = np.random.default_rng(seed)
-    found = {}
+    result = {}
     for k, (name, (bx, by)) in enumerate(BASELINES.items()):
         own = np.array([[1.001, 0.002 * k, 20.0 + k], [-0.002 * k, 0.999, -8.0 * k], [1e-6, -2e-6, 1.0]])
         nu = np.array([tilt[0] / SIZE[0], tilt[1] / SIZE[1], distance_px - sum(tilt) / 2])
         moved = own + np.outer([bx, by, 0.0], nu)
         moved[:2, 2] += noise * rng.normal(size=2)
-        found[name] = geometry.normalised(moved)
-    return found
+        result[name] = geometry.normalised(moved)
+    return result
 
 
 def observation(seconds: float, *plane: object, without: tuple[str, ...] = (), **options: object) -> Observation:
@@ -46,10 +46,10 @@ def test_the_baselines_are_found_up_to_a_factor() -> None:
     rig = learn_rig(flight(), SIZE, {})
     assert rig is not None
     assert rig.factors == ("distance",)
-    found, wanted = (np.array([b[name] for name in BASELINES]) for b in (rig.baselines, BASELINES))
+    result, wanted = (np.array([b[name] for name in BASELINES]) for b in (rig.baselines, BASELINES))
     wanted = wanted / np.linalg.norm(wanted)
-    assert abs((found * wanted).sum()) > 0.995
-    assert np.linalg.norm(found) == pytest.approx(1)
+    assert abs((result * wanted).sum()) > 0.995
+    assert np.linalg.norm(result) == pytest.approx(1)
 
 
 def test_a_band_without_evidence_is_where_the_others_say() -> None:
@@ -126,7 +126,7 @@ def test_few_captures_are_no_rig() -> None:
 def test_written_and_read_it_is_the_same(tmp_path: Path) -> None:
     rig = learn_rig(flight(), SIZE, {})
     assert rig is not None
-    field = LocalField(32.0, np.random.default_rng(0).normal(size=(31, 41, 2)))
+    field = DisplacementField(32.0, np.random.default_rng(0).normal(size=(31, 41, 2)))
     rig = replace(rig, fields={"Red": field})
     again = Rig.from_json(rig.as_json(), {"Red": field.displacements_px})
     np.testing.assert_array_equal(again.mean["NIR"], rig.mean["NIR"])
@@ -152,8 +152,8 @@ def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:
     good = geometry.translation(10, 5)
     wrong = geometry.translation(-80, 90)
     near = geometry.translation(10.1, 5.1)
-    found = median_mapping([good, wrong, near], (400, 300))
-    assert geometry.corner_error_px(found, good, 400, 300) < 0.2
+    result = median_mapping([good, wrong, near], (400, 300))
+    assert geometry.corner_error_px(result, good, 400, 300) < 0.2
 
 
 def test_the_error_bar_holds_what_captures_left_out_missed() -> None:
@@ -178,8 +178,8 @@ DELAYS = {"Blue": 0.0, "Red": 0.4, "NIR": 1.0, "Red edge": 0.7}
 
 def passing(seconds: float, motion: tuple[float, float], distance_px: float = 0.0, seed: int = 0) -> Observation:
     """A capture of a rig that exposes its bands one after another, while the ground passes."""
-    found = mappings(distance_px, noise=0.03, seed=seed)
-    moved = {b: geometry.compose(geometry.translation(*(DELAYS[b] * np.array(motion))), m) for b, m in found.items()}
+    result = mappings(distance_px, noise=0.03, seed=seed)
+    moved = {b: geometry.compose(geometry.translation(*(DELAYS[b] * np.array(motion))), m) for b, m in result.items()}
     return Observation(seconds, moved, dict.fromkeys(moved, 0.05), motion=(motion[0] / 50, motion[1] / 50))
 
 
@@ -195,8 +195,8 @@ def test_delays_are_told_from_baselines(layout: dict) -> None:
     rig = learn_rig(two_headings(), SIZE, layout)
     assert rig is not None
     assert "motion" in rig.factors
-    found, wanted = (np.array([d[name] for name in DELAYS]) for d in (rig.delays, DELAYS))
-    assert abs(found @ wanted) / np.linalg.norm(wanted) > 0.99
+    result, wanted = (np.array([d[name] for name in DELAYS]) for d in (rig.delays, DELAYS))
+    assert abs(result @ wanted) / np.linalg.norm(wanted) > 0.99
     truth = passing(20.0, (0.3, 15.0), 1.5, seed=99)
     known = replace(truth, mappings={b: m for b, m in truth.mappings.items() if b != "NIR"})
     assert error_px(rig, "NIR", known, truth.mappings["NIR"])[0] < 0.3

@@ -10,12 +10,12 @@ PATCHES = torch.randn(12, 1, 16, 16, generator=torch.Generator().manual_seed(0))
 
 def parameters_of(net: Descriptor) -> dict[str, set[int]]:
     """Which parameters a side's descriptor depends on, by their gradients."""
-    found = {}
+    result = {}
     for name, side in (("fixed", 0), ("moving", 1)):
         net.zero_grad()
         net(PATCHES, side).sum().backward()
-        found[name] = {id(p) for p in net.parameters() if p.grad is not None and bool((p.grad != 0).any())}
-    return found
+        result[name] = {id(p) for p in net.parameters() if p.grad is not None and bool((p.grad != 0).any())}
+    return result
 
 
 @pytest.mark.parametrize(("sharing", "shared"), [("siamese", 6), ("pseudo-siamese", 4), ("unshared", 0)])
@@ -58,5 +58,5 @@ def test_channels_may_differ_between_the_sides() -> None:
 def test_several_sides_at_once_are_the_sides_one_by_one(sharing: str) -> None:
     net = Descriptor(sharing, (1, 1, 1), unit_length=True)
     together = net.describe([PATCHES, PATCHES[:5], PATCHES[3:]], [0, 1, 2])
-    for found, (patches, side) in zip(together, ((PATCHES, 0), (PATCHES[:5], 1), (PATCHES[3:], 2)), strict=True):
-        torch.testing.assert_close(found, net(patches, side), atol=1e-6, rtol=1e-5)
+    for result, (patches, side) in zip(together, ((PATCHES, 0), (PATCHES[:5], 1), (PATCHES[3:], 2)), strict=True):
+        torch.testing.assert_close(result, net(patches, side), atol=1e-6, rtol=1e-5)

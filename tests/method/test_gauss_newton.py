@@ -11,9 +11,9 @@ WIDTH, HEIGHT = 300, 200
 
 
 def solve(
-    p: Keypoints, residual: torch.Tensor, gradient: torch.Tensor, family: str | None, most_std: float, longest: float
+    p: Keypoints, residual: torch.Tensor, gradient: torch.Tensor, family: str | None, max_std: float, longest: float
 ) -> Step:
-    recipe = FastRecipe(most_corner_std_px=most_std, longest_step_px=longest)
+    recipe = FastRecipe(max_corner_std_px=max_std, longest_step_px=longest)
     return solve_equations(PatchEquations.of(p, residual, gradient, (WIDTH, HEIGHT)), family, recipe)
 
 

@@ -8,11 +8,11 @@ from agalign.config import FastRecipe, JointSettings, PaperRecipe
 from agalign.method.fast import learn, learn_scales
 from agalign.method.joint import align_from_scratch
 from agalign.method.refine import refine
-from agalign.method.state import JointState, Subject
+from agalign.method.state import ImageGroup, JointState
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
-from agalign.values.doubts import Doubt
 from agalign.values.image import Raster
+from agalign.values.issues import Issue
 
 from ..conftest import mean_error_px, textured_image, textured_pair
 
@@ -26,8 +26,8 @@ def rasters(matrix: np.ndarray, seed: int = 0) -> tuple[Raster, Raster]:
     return Raster(fixed, valid), Raster(moving, valid)
 
 
-def scratch(fixed: Raster, moving: Raster, seed: np.ndarray, settings: JointSettings) -> JointResult | Doubt:
-    return align_from_scratch(Subject.of_one(fixed, moving, seed, trusted=True), settings, lambda *_: None)[0]
+def scratch(fixed: Raster, moving: Raster, seed: np.ndarray, settings: JointSettings) -> JointResult | Issue:
+    return align_from_scratch(ImageGroup.of_one(fixed, moving, seed, trusted=True), settings, lambda *_: None)[0]
 
 
 def run(settings: JointSettings, seed: np.ndarray = NEAR, **kwargs: int) -> JointResult:
@@ -46,7 +46,7 @@ def test_fast_recovers_a_homography_through_reversed_contrast(start: Literal["ra
 
 
 def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> None:
-    short = FastRecipe(start="random", most_steps=50, final_steps=1)
+    short = FastRecipe(start="random", max_steps=50, final_steps=1)
     one, same = (run(JointSettings(fast=short, rng_seed=4)) for _ in range(2))
     other = run(JointSettings(fast=short, rng_seed=5))
     np.testing.assert_array_equal(one.fixed_to_moving, same.fixed_to_moving)
@@ -57,7 +57,7 @@ def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> 
 def test_the_global_random_state_is_left_alone() -> None:
     torch.manual_seed(1)
     before = torch.get_rng_state()
-    run(JointSettings(fast=FastRecipe(start="random", most_steps=50, final_steps=1)))
+    run(JointSettings(fast=FastRecipe(start="random", max_steps=50, final_steps=1)))
     assert torch.equal(before, torch.get_rng_state())
 
 
@@ -76,7 +76,7 @@ def test_unrelated_images_are_not_told_apart() -> None:
     valid = np.ones((320, 400), bool)
     pair = [Raster(textured_image(400, 320, s), valid) for s in (8, 9)]
     result = scratch(*pair, np.eye(3), JointSettings())
-    assert isinstance(result, Doubt)
+    assert isinstance(result, Issue)
     assert result.kind == "retrieval"
     assert result.value is not None
     assert result.value < 0.1
@@ -93,23 +93,23 @@ def test_rgb_against_a_single_band() -> None:
 def test_nothing_to_learn_from() -> None:
     fixed, moving = rasters(TRUTH)
     flat = Raster(np.zeros_like(fixed.pixels), fixed.valid)
-    assert scratch(flat, moving, NEAR, JointSettings()) == Doubt("no_contrast")
+    assert scratch(flat, moving, NEAR, JointSettings()) == Issue("no_contrast")
     apart = geometry.translation(390, 0)
-    found = scratch(fixed, moving, apart, JointSettings())
-    assert isinstance(found, Doubt)
-    assert found.kind == "few_keypoints"
+    result = scratch(fixed, moving, apart, JointSettings())
+    assert isinstance(result, Issue)
+    assert result.kind == "few_keypoints"
 
 
 def test_one_network_for_two_bands_and_one_that_does_not_belong() -> None:
     fixed, moving = rasters(TRUTH)
     stranger = Raster(textured_image(400, 320, 9), fixed.valid)
     other = Raster(np.tanh(fixed.pixels), fixed.valid)
-    subject = Subject(fixed, [moving, stranger, other], [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
-    found = align_from_scratch(subject, JointSettings(), lambda *_: None)
-    assert [type(r) for r in found] == [JointResult, Doubt, JointResult]
-    assert mean_error_px(found[0].fixed_to_moving, TRUTH, 400, 320) < 0.1
-    assert found[1].kind == "retrieval"
-    assert mean_error_px(found[2].fixed_to_moving, np.eye(3), 400, 320) < 0.1
+    group = ImageGroup(fixed, [moving, stranger, other], [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
+    result = align_from_scratch(group, JointSettings(), lambda *_: None)
+    assert [type(r) for r in result] == [JointResult, Issue, JointResult]
+    assert mean_error_px(result[0].fixed_to_moving, TRUTH, 400, 320) < 0.1
+    assert result[1].kind == "retrieval"
+    assert mean_error_px(result[2].fixed_to_moving, np.eye(3), 400, 320) < 0.1
 
 
 @pytest.mark.parametrize(("sharing", "left"), [("siamese", 0.35), ("pseudo-siamese", 0.35), ("unshared", 0.9)])
@@ -138,8 +138,8 @@ def test_a_start_far_off_is_searched_for_along_the_loss() -> None:
     fixed, moving = rasters(truth)
     state = JointState(JointSettings(device="cpu"), lambda *_: None)
     net = state.fast_descriptor([1, 1])
-    subject = Subject.of_one(fixed, moving, geometry.translation(46.0, 26.0))
-    learn(state, [subject], net)
-    found = refine(state, net, subject)[0]
-    assert isinstance(found, JointResult)
-    assert np.abs(geometry.apply(found.fixed_to_moving, [[200.0, 160.0]]) - [206.0, 156.0]).max() < 0.2
+    group = ImageGroup.of_one(fixed, moving, geometry.translation(46.0, 26.0))
+    learn(state, [group], net)
+    result = refine(state, net, group)[0]
+    assert isinstance(result, JointResult)
+    assert np.abs(geometry.apply(result.fixed_to_moving, [[200.0, 160.0]]) - [206.0, 156.0]).max() < 0.2

@@ -1,10 +1,10 @@
 import numpy as np
 import torch
 
-from agalign.method.levels import Level, Sampler, footprints_inside, make_level, make_view
+from agalign.method.levels import Level, Sampler, footprints_inside, make_level, make_level_image
 from agalign.method.patches import Keypoints, patch_positions, transform
 from agalign.values import lens
-from agalign.values.alignment import LocalField
+from agalign.values.alignment import DisplacementField
 from agalign.values.image import Raster
 from agalign.values.lens import Lens
 
@@ -101,11 +101,11 @@ def test_patches_are_sampled_through_the_lens() -> None:
     x, y = np.meshgrid(np.arange(320.0), np.arange(240.0))
     raw = lens.undistort(model, np.stack([x, y], axis=-1))[..., 0].astype(np.float32)
     valid = np.ones(raw.shape, bool)
-    view = make_view(Raster(raw, valid, model), 1.0, CPU)
+    view = make_level_image(Raster(raw, valid, model), 1.0, CPU)
     xy = torch.tensor([[60.0, 50.0], [200.0, 180.0]])
     positions = patch_positions(Keypoints(xy, torch.tensor([0.3, 2.0]), torch.ones(2)))
-    found = view.patches(positions)[:, 0] * float(raw.std()) + float(raw.mean())
-    torch.testing.assert_close(found, positions[..., 0], atol=0.02, rtol=0)
+    result = view.patches(positions)[:, 0] * float(raw.std()) + float(raw.mean())
+    torch.testing.assert_close(result, positions[..., 0], atol=0.02, rtol=0)
 
 
 def test_level_matrices_go_to_full_resolution_and_back() -> None:
@@ -119,10 +119,10 @@ def test_positions_are_displaced_by_the_field_of_their_place() -> None:
     """The rig's own field lies on the full image: at half the resolution it is half as long."""
     fixed, moving = rasters()
     nodes = np.stack(np.meshgrid(np.arange(12) * 32.0, np.arange(9) * 32.0), axis=-1)
-    field = LocalField(32.0, np.stack([0.01 * nodes[..., 0], -0.02 * nodes[..., 1]], axis=-1))
+    field = DisplacementField(32.0, np.stack([0.01 * nodes[..., 0], -0.02 * nodes[..., 1]], axis=-1))
     level = make_level(fixed, [moving], [np.eye(3)], 0.5, 0.05, torch.Generator().manual_seed(0), CPU)
     assert level.displacement(0, torch.zeros(1, 2)) is None
     xy = torch.tensor([[40.0, 30.0], [100.0, 90.0]])
-    found = level.bent_by([field]).displacement(0, xy)
+    result = level.with_fields([field]).displacement(0, xy)
     full = (xy + 0.5) * 2 - 0.5
-    torch.testing.assert_close(found, full * torch.tensor([0.005, -0.01]), atol=0.01, rtol=0)
+    torch.testing.assert_close(result, full * torch.tensor([0.005, -0.01]), atol=0.01, rtol=0)

@@ -29,10 +29,10 @@ def raster(pixels: np.ndarray) -> Raster:
 
 
 def test_a_panel_is_found_by_its_code_and_its_grey_is_inside_the_area(panel: np.ndarray) -> None:
-    found = find_panel(raster(panel))
-    assert found is not None
-    assert found.code == PANEL_CODE
-    within = panel[inside(found.area_px, panel.shape)]
+    result = find_panel(raster(panel))
+    assert result is not None
+    assert result.code == PANEL_CODE
+    within = panel[inside(result.area_px, panel.shape)]
     assert len(within) > 1000
     assert within.mean() == pytest.approx(0.51, abs=0.005)
     assert within.std() < 0.01
@@ -41,10 +41,10 @@ def test_a_panel_is_found_by_its_code_and_its_grey_is_inside_the_area(panel: np.
 def test_a_square_without_a_code_counts_only_where_asked_for(panel: np.ndarray) -> None:
     bare = np.where(panel > 0.6, 0.05, panel)  # no label
     assert find_panel(raster(bare)) is None
-    found = find_panel(raster(bare), without_code=True)
-    assert found is not None
-    assert found.code == ""
-    assert panel[inside(found.area_px, panel.shape)].mean() == pytest.approx(0.51, abs=0.005)
+    result = find_panel(raster(bare), without_code=True)
+    assert result is not None
+    assert result.code == ""
+    assert panel[inside(result.area_px, panel.shape)].mean() == pytest.approx(0.51, abs=0.005)
 
 
 @pytest.mark.parametrize("without_code", [False, True])

@@ -20,11 +20,11 @@ from agalign.values.choices import RadiometryChoice
 def test_every_term_has_its_place() -> None:
     radiometry = Radiometry("radiance", 1000.0, 65536.0, 2.0, (3.0, 4.0), (0.1, 0, 0, 0, 0, 0), True, 0.01)
     raw = np.full((10, 12), 3000, np.uint16)
-    found = calibrated(raw, radiometry, 0, 0)
+    result = calibrated(raw, radiometry, 0, 0)
     signal = 2.0 * 2000 / 65536
-    assert found[4, 3] == pytest.approx(signal / 1.04, rel=1e-6)
-    assert found[4, 8] == pytest.approx(signal / 1.5 / 1.04, rel=1e-6)
-    assert found[9, 3] == pytest.approx(signal / 1.5 / 1.09, rel=1e-6)
+    assert result[4, 3] == pytest.approx(signal / 1.04, rel=1e-6)
+    assert result[4, 8] == pytest.approx(signal / 1.5 / 1.04, rel=1e-6)
+    assert result[9, 3] == pytest.approx(signal / 1.5 / 1.09, rel=1e-6)
     times = calibrated(raw, replace(radiometry, vignetting_divides=False), 0, 0)
     assert times[4, 8] == pytest.approx(signal * 1.5 / 1.04, rel=1e-6)
 
@@ -48,10 +48,10 @@ def test_reflectance_of_the_synthetic_flight_is_the_truth(tmp_path: Path) -> Non
         assert band.radiometry.quantity == "reflectance"
         bright = np.full_like(ground.crop, 0.3 * max(spec.soil, spec.crop))
         raw = synthetic.render(bright, ground, spec, pose, (320, 240), rng)
-        found = calibrated(raw, band.radiometry, 0, 0)
-        np.testing.assert_allclose(np.median(found), bright[0, 0], rtol=0.01)
+        result = calibrated(raw, band.radiometry, 0, 0)
+        np.testing.assert_allclose(np.median(result), bright[0, 0], rtol=0.01)
         # Vignetting is gone: the corners are as bright as the middle.
-        assert np.median(found[:40, :40]) == pytest.approx(np.median(found[100:140, 140:180]), rel=0.02)
+        assert np.median(result[:40, :40]) == pytest.approx(np.median(result[100:140, 140:180]), rel=0.02)
 
 
 @pytest.mark.parametrize("missing", ["RadiometricCalibration", "ExposureTime", "ISOSpeed", "black"])
@@ -82,11 +82,11 @@ def test_radiometry_is_what_was_chosen(tmp_path: Path) -> None:
     assert sun is not None
     assert raw == camera
     assert (camera.quantity, sun.quantity) == ("radiance", "reflectance")
-    assert (camera.told_by, sun.told_by) == ("camera calibration", "light sensor")
+    assert (camera.source, sun.source) == ("camera calibration", "light sensor")
     assert sun.gain == pytest.approx(camera.gain * np.pi / 0.8)
     panel = by(path, "panel", {"Blue": 2.5}).radiometry
     assert panel is not None
-    assert panel.told_by == "panel"
+    assert panel.source == "panel"
     assert (panel.quantity, panel.gain) == ("reflectance", pytest.approx(2.5 * camera.gain))
     assert by(path, "panel", {"Green": 2.5}).radiometry is None
     assert by(path, "auto", {"Blue": 2.5}).radiometry == panel
@@ -105,8 +105,8 @@ def test_temperatures_stay_temperatures_whatever_is_chosen() -> None:
     kelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)
     band = Band("LWIR", Path("IMG_0001_6.tif"), 1, 160, 120, "uint16", radiometry=kelvin)
     for choice in ("auto", "camera", "sun", "panel"):
-        (found,) = with_radiometry(Capture("IMG_0001", Path(), (band,), 0), choice, {}).bands
-        assert found.radiometry == kelvin
+        (result,) = with_radiometry(Capture("IMG_0001", Path(), (band,), 0), choice, {}).bands
+        assert result.radiometry == kelvin
     assert calibrated(np.full((2, 2), 30115, np.uint16), kelvin, 0, 0) == pytest.approx(28.0)
 
 

@@ -33,8 +33,8 @@ def test_a_photograph_is_averaged_down(tmp_path: Path) -> None:
 def test_codes_of_coordinate_systems() -> None:
     assert crs_code(rasterio.CRS.from_epsg(32631).to_wkt()) == "EPSG:32631"
     assert crs_code(rasterio.CRS.from_string("+proj=aeqd +lat_0=52 +lon_0=5 +datum=WGS84").to_wkt()) is None
-    found = transformed(np.array([[0.0, 1000.0]]), "+proj=aeqd +lat_0=52 +lon_0=5 +datum=WGS84", "EPSG:4326")
-    np.testing.assert_allclose(found, [[5.0, 52.00899]], atol=1e-4)
+    result = transformed(np.array([[0.0, 1000.0]]), "+proj=aeqd +lat_0=52 +lon_0=5 +datum=WGS84", "EPSG:4326")
+    np.testing.assert_allclose(result, [[5.0, 52.00899]], atol=1e-4)
     with pytest.raises(GeometryError, match="cannot be transformed"):
         transformed(np.zeros((1, 2)), "EPSG:0", "EPSG:4326")
 

@@ -139,11 +139,11 @@ def test_largest_rectangle_is_the_largest(cells: np.ndarray) -> None:
         ),
         default=0,
     )  # fmt: skip
-    found = _largest_rectangle(cells, np.ones(columns, int), np.ones(rows, int))
-    if found is None:
+    result = _largest_rectangle(cells, np.ones(columns, int), np.ones(rows, int))
+    if result is None:
         assert best == 0
     else:
-        top, bottom, left, right = found
+        top, bottom, left, right = result
         assert cells[top:bottom, left:right].all()
         assert (bottom - top) * (right - left) == best
 
@@ -195,6 +195,6 @@ def test_booleans_stay_booleans() -> None:
     mask[20:40, 30:60] = True
     positions = PixelMapping(geometry.translation(3, 2)).positions(Tile(0, 0, 80, 60))
     for interpolation in get_args(Interpolation):
-        found, valid = resample(mask, np.ones_like(mask), positions, (80, 60), (0, 0), interpolation)
-        assert found.dtype == bool
-        np.testing.assert_array_equal(found[:58, :77][valid[:58, :77]], mask[2:, 3:][valid[:58, :77]])
+        result, valid = resample(mask, np.ones_like(mask), positions, (80, 60), (0, 0), interpolation)
+        assert result.dtype == bool
+        np.testing.assert_array_equal(result[:58, :77][valid[:58, :77]], mask[2:, 3:][valid[:58, :77]])

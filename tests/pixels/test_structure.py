@@ -76,6 +76,6 @@ def at_offset(image: np.ndarray, offset: int) -> np.ndarray:
 
 def test_the_magnitude_does_not_depend_on_where_the_image_lies_in_memory() -> None:
     gx, gy = textured_image(471, 353, 1), textured_image(471, 353, 2)
-    found = {gradient_magnitude(at_offset(gx, k), at_offset(gy, (5 * k) % 128)).tobytes() for k in range(0, 128, 4)}
-    assert len(found) == 1
+    result = {gradient_magnitude(at_offset(gx, k), at_offset(gy, (5 * k) % 128)).tobytes() for k in range(0, 128, 4)}
+    assert len(result) == 1
     np.testing.assert_allclose(gradient_magnitude(gx, gy), cv2.magnitude(gx, gy), atol=1e-5)

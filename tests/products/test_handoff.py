@@ -42,17 +42,17 @@ def bands_of(folder: Path) -> list[Path]:
 
 def exif_of(path: Path) -> dict[str, Any]:
     with path.open("rb") as file:
-        found: dict[str, Any] = exifread.process_file(file, details=True, extract_thumbnail=False)
-    return found
+        result: dict[str, Any] = exifread.process_file(file, details=True, extract_thumbnail=False)
+    return result
 
 
 def xmp_of(path: Path) -> dict[str, Any]:
     """Keys with the prefixes that cameras write, attributes with an @, as OpenDroneMap looks them up."""
     data = path.read_bytes()
     packet = data[data.index(b"<x:xmpmeta") : data.index(b"</x:xmpmeta>") + len(b"</x:xmpmeta>")]
-    found = xmltodict.parse(packet)["x:xmpmeta"]["rdf:RDF"]["rdf:Description"]
+    result = xmltodict.parse(packet)["x:xmpmeta"]["rdf:RDF"]["rdf:Description"]
     merged: dict[str, Any] = {}
-    for description in found if isinstance(found, list) else [found]:
+    for description in result if isinstance(result, list) else [result]:
         merged |= description
     return merged
 

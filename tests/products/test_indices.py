@@ -32,9 +32,9 @@ def test_an_unknown_index_is_a_usage_error() -> None:
 
 def test_values_and_nodata() -> None:
     nir, red = np.float32([[0.5, 0.0, np.nan, 0.3]]), np.float32([[0.1, 0.0, 0.2, -0.3]])
-    found = compute(INDICES["ndvi"], [nir, red])
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, [[0.4 / 0.6, np.nan, np.nan, np.nan]], rtol=1e-6)
+    result = compute(INDICES["ndvi"], [nir, red])
+    assert result.dtype == np.float32
+    np.testing.assert_allclose(result, [[0.4 / 0.6, np.nan, np.nan, np.nan]], rtol=1e-6)
     blue = np.float32([[0.05] * 4])
     np.testing.assert_allclose(
         compute(INDICES["evi"], [nir, red, blue])[0, 0], 2.5 * 0.4 / (0.5 + 0.6 - 0.375 + 1), rtol=1e-6

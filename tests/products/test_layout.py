@@ -7,7 +7,7 @@ import rasterio
 
 from agalign.config import WriteSettings
 from agalign.flight.rig import NO_FACTORS, Rig, Seen
-from agalign.products.layout import lay_out
+from agalign.products.layout import output_layers
 from agalign.products.write import write_raster
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
@@ -36,7 +36,7 @@ def aligned_by(shift_px: float) -> Alignment:
 @pytest.mark.parametrize("undistort", [False, True])
 def test_without_a_common_area_what_no_band_shows_is_nodata(tmp_path: Path, undistort: bool) -> None:
     capture, settings = capture_of(tmp_path), WriteSettings(undistort=undistort)
-    layers, grid = lay_out(capture, {"nir": aligned_by(200.0)}, settings)
+    layers, grid = output_layers(capture, {"nir": aligned_by(200.0)}, settings)
     assert (grid.width, grid.height, grid.has_gaps) == (120, 90, True)
     write_raster(capture, layers, grid, tmp_path / "out.tif", settings)
     with rasterio.open(tmp_path / "out.tif") as written:
@@ -46,12 +46,12 @@ def test_without_a_common_area_what_no_band_shows_is_nodata(tmp_path: Path, undi
 def test_where_all_bands_show_everything_no_nodata_is_declared(tmp_path: Path) -> None:
     capture = capture_of(tmp_path)
     for crop in ("common", "none"):
-        _, grid = lay_out(capture, {"nir": aligned_by(0.0)}, WriteSettings(crop=crop))
+        _, grid = output_layers(capture, {"nir": aligned_by(0.0)}, WriteSettings(crop=crop))
         assert not grid.has_gaps
-    moved, cut = lay_out(capture, {"nir": aligned_by(9.0)}, WriteSettings())
+    moved, cut = output_layers(capture, {"nir": aligned_by(9.0)}, WriteSettings())
     assert not cut.has_gaps
     assert cut.width < 120
-    _, whole = lay_out(capture, {"nir": aligned_by(9.0)}, WriteSettings(crop="none"))
+    _, whole = output_layers(capture, {"nir": aligned_by(9.0)}, WriteSettings(crop="none"))
     assert whole.has_gaps
     assert write_raster(capture, moved, cut, tmp_path / "out.tif", WriteSettings()) is None
 
@@ -70,13 +70,14 @@ def rig_between(low_px: float, high_px: float) -> Rig:
 
 def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
     capture, rig = capture_of(tmp_path), rig_between(2.0, 12.0)
-    grids = [lay_out(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig)[1] for shift in (2.0, 7.0, 12.0)]
+    grids = [output_layers(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig)[1] for shift in (2.0, 7.0, 12.0)]
     assert len(set(grids)) == 1
     assert not grids[0].has_gaps
     # The farthest band leaves 12 px at the right; two more are left for captures that the rig has not seen.
     assert 120 - (grids[0].x0 + grids[0].width) in range(13, 17)
     alone = [
-        lay_out(capture, {"nir": aligned_by(shift)}, WriteSettings(crop="common"), rig)[1] for shift in (2.0, 12.0)
+        output_layers(capture, {"nir": aligned_by(shift)}, WriteSettings(crop="common"), rig)[1]
+        for shift in (2.0, 12.0)
     ]
     assert alone[0].width > alone[1].width
 
@@ -84,7 +85,7 @@ def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
 def test_a_capture_beyond_its_flight_keeps_the_geometry_and_declares_nodata(tmp_path: Path) -> None:
     capture, rig = capture_of(tmp_path), rig_between(2.0, 12.0)
     (_, within), (_, beyond) = (
-        lay_out(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig) for shift in (5.0, 30.0)
+        output_layers(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig) for shift in (5.0, 30.0)
     )
     assert replace(beyond, has_gaps=False) == within
     assert beyond.has_gaps

@@ -17,7 +17,7 @@ from agalign.config import JointSettings, LocalSettings, SeedSettings, Settings,
 from agalign.errors import ConfigurationError, InputError
 from agalign.products.index_rasters import write_indices
 from agalign.products.indices import INDICES
-from agalign.products.layout import lay_out
+from agalign.products.layout import output_layers
 from agalign.products.write import band_file_names
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
@@ -58,9 +58,9 @@ def test_bands_can_be_chosen_and_ordered(aligned_capture: Path) -> None:
     assert names(order="name") == ["green", "nir", "pan", "red"]
     with pytest.raises(ConfigurationError, match="no capture has a band 'swir'"):
         discover(aligned_capture, DiscoverOptions(bands=("nir", "swir")))
-    found = discover(aligned_capture, DiscoverOptions(bands=("nir",)))
-    assert not found.captures
-    assert "leaves nir" in found.problems[0].text
+    result = discover(aligned_capture, DiscoverOptions(bands=("nir",)))
+    assert not result.captures
+    assert "leaves nir" in result.problems[0].text
 
 
 def test_order_by_wavelength_keeps_the_reference(flight: Path) -> None:
@@ -93,7 +93,7 @@ def test_a_finer_grid_has_the_same_outline_on_the_map() -> None:
     seed = Seed("identity", geometry.resolution_change(2, 2), 0.0)
     alignment = Alignment(seed.fixed_to_moving, "pixel", "aligned", (), seed, None, None, 0.0)
     capture = Capture("c", Path(), (one, pan), 0)
-    layers, grid = lay_out(capture, {"pan": alignment}, WriteSettings(resolution="finest", crop="none"))
+    layers, grid = output_layers(capture, {"pan": alignment}, WriteSettings(resolution="finest", crop="none"))
     assert (grid.width, grid.height, grid.scale) == (200, 160, 2.0)
     assert layers[1].mapping is not None
     np.testing.assert_allclose(layers[1].mapping(np.array([[10.0, 7.0]])), [[10.0, 7.0]], atol=1e-9)
@@ -141,11 +141,11 @@ def test_ndvi_of_the_synthetic_flight_is_its_truth(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path / "in", 1, (480, 360), rng_seed=3)
     out = tmp_path / "out"
     agalign.align_folder(tmp_path / "in", out, settings=Settings(write=WriteSettings(radiometry="auto")))
-    (found,) = write_indices(out, [INDICES["ndvi"]])
-    assert not found.problem
-    assert not found.raw_numbers
-    assert found.path is not None
-    with rasterio.open(found.path) as dataset:
+    (result,) = write_indices(out, [INDICES["ndvi"]])
+    assert not result.problem
+    assert not result.raw_numbers
+    assert result.path is not None
+    with rasterio.open(result.path) as dataset:
         value = dataset.read(1)
         assert dataset.dtypes == ("float32",)
         assert np.isnan(dataset.nodata)
@@ -157,13 +157,13 @@ def test_ndvi_of_the_synthetic_flight_is_its_truth(tmp_path: Path) -> None:
     low, high = np.nanpercentile(value, (5, 95))
     assert low == pytest.approx(bare, abs=0.12)
     assert high == pytest.approx(crop, abs=0.1)
-    assert found.path.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
+    assert result.path.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_an_index_of_bands_that_are_not_aligned_is_left_out(aligned_capture: Path, tmp_path: Path) -> None:
     agalign.align_folder(aligned_capture, tmp_path / "out", settings=ONLY_SEED)
-    (found,) = write_indices(tmp_path / "out", [INDICES["ndvi"]])
-    assert "nir is seed_only" in found.problem
+    (result,) = write_indices(tmp_path / "out", [INDICES["ndvi"]])
+    assert "nir is seed_only" in result.problem
     assert not list((tmp_path / "out").glob("*ndvi*"))
     with pytest.raises(InputError, match="no sidecars"):
         list(write_indices(tmp_path, [INDICES["ndvi"]])) if not list(tmp_path.rglob("*.json")) else list(

@@ -116,10 +116,10 @@ def test_gaps_keep_the_nodata_value_and_what_is_not_seen_is_not_sharpened(
         tmp_path / "layers.tif", tmp_path / "out.tif", bands, [panchro], [True, False], [0.0] * 3, 2.0, nodata
     )  # fmt: skip
     with rasterio.open(tmp_path / "out.tif") as file:
-        found = file.read()
-    assert (found[:, :20] == nodata).all()
-    assert found[0, 30:].std() > 100
-    assert (found[1, 20:] == 2000).all()
+        result = file.read()
+    assert (result[:, :20] == nodata).all()
+    assert result[0, 30:].std() > 100
+    assert (result[1, 20:] == 2000).all()
 
 
 def test_a_photograph_sharpens_no_infra_red_alone(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from agalign.products.preview import preview_bytes, write_preview
-from agalign.products.views import Views
+from agalign.products.reduced_bands import ReducedBands
 
 from ..conftest import textured_image
 
@@ -17,21 +17,21 @@ def grey(seed: int, width: int = 640, height: int = 480) -> np.ndarray:
 
 
 @pytest.fixture
-def views() -> Views:
+def views() -> ReducedBands:
     """Green and NIR, of which only Green was written."""
-    return Views({"Green": grey(1), "NIR": grey(2)}, {"Green": grey(3)}, (640, 480))
+    return ReducedBands({"Green": grey(1), "NIR": grey(2)}, {"Green": grey(3)}, (640, 480))
 
 
-def test_every_picture_lies_where_the_sidecar_says(views: Views, tmp_path: Path) -> None:
+def test_every_picture_lies_where_the_sidecar_says(views: ReducedBands, tmp_path: Path) -> None:
     errors = {"NIR": np.full((4, 5), 0.25, np.float32)}
     part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1))
     sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)
     (w, h), (dw, dh) = part.tile_px, part.detail_px
     assert sheet.shape == (3 * h + 2 * dh, 2 * w)
 
-    def like(found: np.ndarray, image: np.ndarray) -> float:
-        there = cv2.resize(image, found.shape[::-1], interpolation=cv2.INTER_AREA)
-        return float(np.corrcoef(found.ravel(), there.ravel())[0, 1])
+    def like(result: np.ndarray, image: np.ndarray) -> float:
+        there = cv2.resize(image, result.shape[::-1], interpolation=cv2.INTER_AREA)
+        return float(np.corrcoef(result.ravel(), there.ravel())[0, 1])
 
     assert like(sheet[:h, :w], views.before["Green"]) > 0.98
     assert like(sheet[:h, w:], views.before["NIR"]) > 0.98
@@ -44,7 +44,7 @@ def test_every_picture_lies_where_the_sidecar_says(views: Views, tmp_path: Path)
 
 
 @pytest.mark.parametrize("captures", [1, 200, 1000])
-def test_all_previews_of_a_flight_have_a_limit(views: Views, tmp_path: Path, captures: int) -> None:
+def test_all_previews_of_a_flight_have_a_limit(views: ReducedBands, tmp_path: Path, captures: int) -> None:
     path = tmp_path / "a.preview.jpg"
     write_preview(views, ["Green", "NIR"], {}, path, preview_bytes(captures))
     assert path.stat().st_size <= preview_bytes(captures)
@@ -53,7 +53,7 @@ def test_all_previews_of_a_flight_have_a_limit(views: Views, tmp_path: Path, cap
 
 def test_images_smaller_than_a_tile_are_shown_as_they_are(tmp_path: Path) -> None:
     tiny = {"Green": grey(1, 60, 41), "NIR": grey(2, 60, 41)}
-    part = write_preview(Views(tiny, tiny, (60, 41)), ["Green", "NIR"], {}, tmp_path / "a.preview.jpg", 10_000)
+    part = write_preview(ReducedBands(tiny, tiny, (60, 41)), ["Green", "NIR"], {}, tmp_path / "a.preview.jpg", 10_000)
     assert part.tile_px == (56, 40)
     assert part.detail[2] <= 1
     assert part.detail[3] <= 1

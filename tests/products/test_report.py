@@ -12,8 +12,8 @@ import pytest
 import agalign
 from agalign.errors import InputError
 from agalign.flight.rig_file import read_rig
-from agalign.products.report import pages_stand, write_pages
-from agalign.products.report.facts import Told
+from agalign.products.report import pages_exist, write_pages
+from agalign.products.report.facts import CaptureEntry
 from agalign.products.report.rigs import CHART_HEIGHT, drifts_of, rig_views
 from agalign.synthetic import flight as synthetic
 
@@ -29,9 +29,9 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def facts_of(page: str) -> dict[str, object]:
-    found = re.search(r'<script type="application/json" id="facts">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
-    return json.loads(found.group(1))  # type: ignore[no-any-return]
+    result = re.search(r'<script type="application/json" id="facts">(.*?)</script>', page, re.DOTALL)
+    assert result is not None
+    return json.loads(result.group(1))  # type: ignore[no-any-return]
 
 
 def test_the_page_has_the_facts_of_every_capture(out: Path) -> None:
@@ -79,12 +79,12 @@ def test_the_page_asks_nobody_for_anything(out: Path) -> None:
 
 
 def test_pages_stand_until_a_sidecar_is_newer(out: Path) -> None:
-    assert pages_stand(out)
+    assert pages_exist(out)
     path = out / "0000SET" / "000" / "IMG_0001.json"
     path.write_bytes(path.read_bytes())
-    assert not pages_stand(out)
+    assert not pages_exist(out)
     write_pages(out, pytest.fail)
-    assert pages_stand(out)
+    assert pages_exist(out)
 
 
 def test_the_rig_is_read_without_its_network(out: Path, tmp_path: Path) -> None:
@@ -104,8 +104,8 @@ def test_the_rig_is_read_without_its_network(out: Path, tmp_path: Path) -> None:
     assert len(said) == 1
 
 
-def told(label: str, offsets: dict[str, tuple[float, float]]) -> Told:
-    return Told(label, f"2026-06-21T10:00:{label}", "ok", "camera", None, 1.0, offsets)
+def told(label: str, offsets: dict[str, tuple[float, float]]) -> CaptureEntry:
+    return CaptureEntry(label, f"2026-06-21T10:00:{label}", "ok", "camera", None, 1.0, offsets)
 
 
 def test_drift_is_drawn_along_the_direction_of_change_and_breaks_where_nothing_is_known() -> None:

@@ -14,8 +14,8 @@ from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.sidecar import (
     BandPart,
     CameraPart,
-    DoubtPart,
     GridPart,
+    IssuePart,
     OutputPart,
     ReferencePart,
     Sidecar,
@@ -27,7 +27,7 @@ from agalign.products.sidecar import (
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.capture import Band, Capture
-from agalign.values.doubts import Doubt
+from agalign.values.issues import Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 
@@ -103,18 +103,18 @@ def test_a_rejected_solution_says_so() -> None:
     seed = Seed("rig", geometry.translation(3, 4), 30.0)
     bands = tuple(Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("green", "nir"))
     capture = Capture("c", Path(), bands, 0)
-    doubts = (Doubt("retrieval", 0.1, 0.2), Doubt("coverage", math.nan, 0.6))
-    for status, doubt in (("seed_only", doubts), ("aligned", ())):
-        alignment = Alignment(seed.fixed_to_moving, "pixel", status, doubt, seed, joint, residual, 0.0)
+    issues = (Issue("retrieval", 0.1, 0.2), Issue("coverage", math.nan, 0.6))
+    for status, issue in (("seed_only", issues), ("aligned", ())):
+        alignment = Alignment(seed.fixed_to_moving, "pixel", status, issue, seed, joint, residual, 0.0)
         part = sidecar_of(capture, {"nir": alignment}, None, Settings()).bands[1]
         assert part.joint is not None
         assert part.joint.accepted == (status == "aligned")
-        assert [d.kind for d in part.doubts] == [d.kind for d in doubt]
+        assert [d.kind for d in part.issues] == [d.kind for d in issue]
     assert "retrieval" in (alignment.reason or "retrieval")
 
 
 def test_a_doubt_that_could_not_be_measured_is_null_in_json() -> None:
-    part = DoubtPart(kind="retrieval", value=None, limit=0.2)
+    part = IssuePart(kind="retrieval", value=None, limit=0.2)
     assert json.loads(part.model_dump_json()) == {"kind": "retrieval", "value": None, "limit": 0.2}
 
 
@@ -127,18 +127,18 @@ def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
         Band("rgb", Path("c.jpg"), 1, 2112, 1582, "uint8", lens=wide),
         Band("red", Path("r.tif"), 1, 1037, 777, "uint16", lens=plain),
     )
-    found = {
+    result = {
         "rgb": geometry.compose(wide.matrix, geometry.invert(plain.matrix)), "red": geometry.translation(5.0, 2.0),
     }  # fmt: skip
     seed = Seed("rig", np.eye(3), 30.0)
-    alignments = {b: Alignment(m, "undistorted", "aligned", (), seed, None, None, 0.0) for b, m in found.items()}
+    alignments = {b: Alignment(m, "undistorted", "aligned", (), seed, None, None, 0.0) for b, m in result.items()}
     _, colour, red = sidecar_of(Capture("c", Path(), bands, 0), alignments, None, Settings()).bands
     assert colour.grid is not None
     assert red.grid is not None
     assert (len(colour.grid.reference_px), len(red.grid.reference_px)) == (65 * 49, 17 * 13)
     at = np.random.default_rng(0).uniform((0, 0), (1036, 776), (500, 2))
     there = CloughTocher2DInterpolator(colour.grid.reference_px, colour.grid.moving_px)(at)
-    exact = PixelMapping(found["rgb"], plain, wide)(at)
+    exact = PixelMapping(result["rgb"], plain, wide)(at)
     assert np.abs(there - exact).max() < 0.02
 
 

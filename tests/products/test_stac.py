@@ -60,9 +60,9 @@ def test_items_and_collection_are_valid_and_find_each_other(run: Path) -> None:
     for item in items:
         item.validate()
         assert item.collection_id == collection.id == "syntheticflight00001"
-        found = item.get_collection()
-        assert found is not None
-        assert found.id == collection.id
+        result = item.get_collection()
+        assert result is not None
+        assert result.id == collection.id
         for asset in item.assets.values():
             assert Path(asset.get_absolute_href() or "").is_file(), asset.href
     box = collection.extent.spatial.bboxes[0]
@@ -129,9 +129,9 @@ def test_where_a_pixel_lies_on_the_ground(
     pose: Pose, point_px: tuple[float, float], expected_m: tuple[float, float]
 ) -> None:
     band = Band("Green", Path("x.tif"), 1, 640, 480, "uint16")
-    found = ground_m(Capture("a", Path(), (band,), 0, pose=pose), np.array([point_px]))
-    assert found is not None
-    np.testing.assert_allclose(found[0], expected_m, atol=0.01)
+    result = ground_m(Capture("a", Path(), (band,), 0, pose=pose), np.array([point_px]))
+    assert result is not None
+    np.testing.assert_allclose(result[0], expected_m, atol=0.01)
 
 
 @pytest.mark.parametrize("pose", [None, Pose(0.0), Pose(0.0, 60.0, 0.0, 100.0, 1000.0), Pose(0.0, height_m=10.0)])

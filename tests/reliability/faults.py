@@ -134,19 +134,19 @@ def run_fault(fault: Fault, folder: Path) -> Seen:
 
 def aligned(out: Path) -> list[str]:
     """Captures all of whose bands are aligned."""
-    found = []
+    result = []
     for path in find_sidecars(out) if out.is_dir() else []:
         with contextlib.suppress(SidecarError):
             sidecar = read_sidecar(path)
-            found += [sidecar.capture] if sidecar.status == "ok" else []
-    return found
+            result += [sidecar.capture] if sidecar.status == "ok" else []
+    return result
 
 
 def run_inside(arguments: list[str], scene: Scene) -> tuple[int, str]:
     """In this process, which has loaded everything: (exit code, standard error)."""
     said, real = io.StringIO(), cli_run.find_captures
 
-    def found(*given: Any, **named: Any) -> Any:
+    def result(*given: Any, **named: Any) -> Any:
         flight = real(*given, **named)
         if scene.during is not None:
             scene.during()
@@ -156,7 +156,7 @@ def run_inside(arguments: list[str], scene: Scene) -> tuple[int, str]:
     sys.argv = ["agalign", *arguments]
     homes = [module for module in list(sys.modules.values()) if getattr(module, "find_captures", None) is real]
     for home in homes:
-        home.find_captures = found  # type: ignore[attr-defined]
+        home.find_captures = result  # type: ignore[attr-defined]
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
             cli.main()

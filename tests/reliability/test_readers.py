@@ -15,10 +15,10 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agalign.cameras.carried_tags import capture_tags
 from agalign.cameras.discover import discover
 from agalign.cameras.known import known_cameras
 from agalign.cameras.metadata import Tags, read_tags
+from agalign.cameras.tag_transfer import capture_tags
 from agalign.cameras.xmp import Packet
 from agalign.cli.align import albedos
 from agalign.errors import AgalignError, InputError, SidecarError
@@ -132,10 +132,10 @@ def test_any_names(tmp_path_factory: pytest.TempPathFactory, images: list[bytes]
     if said is not None:
         assert str(folder) in said
         return
-    found = discover(folder)
-    labels = [c.label.lower() for c in found.captures]
+    result = discover(folder)
+    labels = [c.label.lower() for c in result.captures]
     assert len(labels) == len(set(labels))
-    assert all(c.name and not c.name.startswith("/") for c in found.captures)
+    assert all(c.name and not c.name.startswith("/") for c in result.captures)
 
 
 @ANY_FILE

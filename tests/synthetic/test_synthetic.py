@@ -90,8 +90,8 @@ def test_the_same_seed_gives_the_same_flight(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("band", cameras.BANDS, ids=lambda b: b.name)
 def test_bands_are_well_exposed(flight: Path, band: rig.BandSpec) -> None:
-    (found,) = [b for b in discover(flight).captures[0].bands if b.name == band.name]
-    raster = read_for_alignment(found, 4096)
+    (result,) = [b for b in discover(flight).captures[0].bands if b.name == band.name]
+    raster = read_for_alignment(result, 4096)
     assert raster.valid.mean() > 0.95
     assert raster.pixels[raster.valid].std() > 1000
 

@@ -23,11 +23,11 @@ def test_every_trouble_is_in_the_flight_and_in_its_truth(tmp_path: Path) -> None
     troubles = [t["trouble"] for t in truth.values()]
     assert {"panel", "take-off", "a lake", "fog", "planted grid", "terraces", "no NIR", ""} < set(troubles)
     assert troubles[0] == troubles[-1] == "panel"
-    found = {c.name: c for c in discover(tmp_path).captures}
-    assert len(found) == 32
+    result = {c.name: c for c in discover(tmp_path).captures}
+    assert len(result) == 32
     for name, known in truth.items():
-        assert {b.path.name for b in found[name].moving} == set(known["bands"])
-        assert len(found[name].moving) == (3 if known["trouble"] == "no NIR" else 4)
+        assert {b.path.name for b in result[name].moving} == set(known["bands"])
+        assert len(result[name].moving) == (3 if known["trouble"] == "no NIR" else 4)
 
 
 def test_half_of_the_pixels_are_saturated(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from agalign.errors import OutputError
-from agalign.values.files import complete_file, lies_within, remove_partial_files, scratch_file, write_text
+from agalign.values.files import complete_file, is_inside, remove_partial_files, scratch_file, write_text
 
 
 def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_what_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.tif", "red/a.tif", "..a.tif", "with space é.tif"])
 def test_names_that_lie_within(name: str) -> None:
-    assert lies_within(name)
+    assert is_inside(name)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_names_that_lie_within(name: str) -> None:
     ["", "../a", "a/../../b", "/etc/passwd", "/vsicurl/http://x/y", "C:\\a", "\\\\host\\a", "a\\..\\..\\b", "a\0b"],
 )
 def test_names_that_do_not(name: str) -> None:
-    assert not lies_within(name)
+    assert not is_inside(name)
 
 
 def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
 """What tells of a run as a whole, from the sidecars below its output folder: the page and the summary."""
 
-from agalign.products.report.pages import REPORT_FILE, SUMMARY_FILE, Pages, pages_stand, write_pages
+from agalign.products.report.pages import REPORT_FILE, SUMMARY_FILE, Pages, pages_exist, write_pages
 
-__all__ = ["REPORT_FILE", "SUMMARY_FILE", "Pages", "pages_stand", "write_pages"]
+__all__ = ["REPORT_FILE", "SUMMARY_FILE", "Pages", "pages_exist", "write_pages"]

@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from agalign.products.shortfalls import Shortfalls
+from agalign.products.failures import FailureGroups
 from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, Sidecar, SimilarityPart
 
 SCHEMA = "agalign-report/1"
@@ -20,7 +20,7 @@ _LIKE_SCALES = 0.1
 
 
 @dataclass(frozen=True)
-class Told:
+class CaptureEntry:
     """A capture, without what only its picture needs."""
 
     label: str
@@ -55,10 +55,10 @@ class Facts:
     """What is told of the captures below an output folder, as they are added."""
 
     out: Path
-    told: list[Told] = field(default_factory=list)
+    entries: list[CaptureEntry] = field(default_factory=list)
     bands: list[BandResult] = field(default_factory=list)
     """All moving bands of all captures."""
-    shortfalls: Shortfalls = field(default_factory=Shortfalls)
+    failures: FailureGroups = field(default_factory=FailureGroups)
     _captures: list[dict[str, Any]] = field(default_factory=list)
     _apart_px: dict[str, list[float]] = field(default_factory=dict)
     _lattices: dict[tuple[float, ...], int] = field(default_factory=dict)
@@ -71,10 +71,10 @@ class Facts:
         pairs = [self._pair(b, sidecar) for b in sidecar.bands]
         moving = [b for b in result.bands if b.status != "reference"]
         self.bands += moving
-        self.shortfalls.add(label, result)
+        self.failures.add(label, result)
         delivered = {"aligned", "predicted"}
         position = sidecar.position
-        told = Told(
+        entry = CaptureEntry(
             label, sidecar.captured_at, sidecar.status, _camera(result),
             None if position is None else (position.latitude, position.longitude), sum(b.seconds for b in moving),
             {p["band"]: p["offset_px"] for p in pairs if p["status"] in delivered and p["offset_px"] is not None},
@@ -82,8 +82,8 @@ class Facts:
         for pair in pairs:
             if pair["apart_px"] is not None:
                 self._apart_px.setdefault(pair["band"], []).append(pair["apart_px"])
-        self.told.append(told)
-        self._captures.append(self._capture(base, sidecar, told, pairs))
+        self.entries.append(entry)
+        self._captures.append(self._capture(base, sidecar, entry, pairs))
 
     @property
     def residuals_px(self) -> list[float]:
@@ -112,14 +112,16 @@ class Facts:
             "lattices": [list(centres) for centres in self._lattices],
         }  # fmt: skip
 
-    def _capture(self, base: str, sidecar: Sidecar, told: Told, pairs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def _capture(
+        self, base: str, sidecar: Sidecar, entry: CaptureEntry, pairs: Sequence[dict[str, Any]]
+    ) -> dict[str, Any]:
         output, preview, reference = sidecar.output, sidecar.preview, sidecar.reference
         crop = (0, 0, reference.width, reference.height) if output is None else output.crop
         picture = f"{base}{sidecar.capture}.png"
         return {
-            "label": told.label, "captured_at": told.captured_at, "camera": told.camera, "status": told.status,
-            "position": told.position, "altitude_m": None if sidecar.position is None else sidecar.position.altitude_m,
-            "missing": sidecar.missing_bands, "reference": reference.band, "seconds": round(told.seconds, 2),
+            "label": entry.label, "captured_at": entry.captured_at, "camera": entry.camera, "status": entry.status,
+            "position": entry.position, "altitude_m": None if sidecar.position is None else sidecar.position.altitude_m,
+            "missing": sidecar.missing_bands, "reference": reference.band, "seconds": round(entry.seconds, 2),
             "crop": crop, "scale": (1.0, 1.0) if output is None else output.scale,
             "radiometry": None if output is None else output.radiometry,
             "stack": quote(f"{base}{output.file}") if output is not None and output.file else None,

@@ -15,11 +15,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 
 from agalign._version import __version__
 from agalign.errors import SidecarError
+from agalign.products.failures import FailureGroup
 from agalign.products.panels import PANELS_FILE, PanelPart, read_panels
 from agalign.products.report.facts import Facts
 from agalign.products.report.rigs import drifts_of, rig_views
 from agalign.products.run_record import RunPart, read_run_record
-from agalign.products.shortfalls import Shortfall
 from agalign.products.sidecar import find_sidecars, read_sidecar
 from agalign.products.summary import panel_rows, summary_rows, write_summary
 from agalign.values.files import write_text
@@ -34,7 +34,7 @@ class Pages:
 
     report: Path
     summary: Path
-    shortfalls: Sequence[Shortfall]
+    failures: Sequence[FailureGroup]
     slowest: tuple[tuple[str, float], ...]
     """Labels of the captures that took longest, with their seconds."""
 
@@ -63,18 +63,18 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         on_problem(str(error))
     rows += [row for panel in panels for row in panel_rows(panel)]
     write_summary(rows, out / SUMMARY_FILE)
-    shortfalls = facts.shortfalls.groups()
-    slowest = sorted(((c.label, c.seconds) for c in facts.told), key=lambda c: -c[1])[:_SLOWEST]
+    failures = facts.failures.groups()
+    slowest = sorted(((c.label, c.seconds) for c in facts.entries), key=lambda c: -c[1])[:_SLOWEST]
     write_text(out / REPORT_FILE, _page(out, facts, panels, run, on_problem))
-    return Pages(out / REPORT_FILE, out / SUMMARY_FILE, shortfalls, tuple(slowest))
+    return Pages(out / REPORT_FILE, out / SUMMARY_FILE, failures, tuple(slowest))
 
 
-def pages_stand(out: Path) -> bool:
+def pages_exist(out: Path) -> bool:
     """True where the pages of an earlier run are newer than all that they tell of."""
     try:
         written = min((out / name).stat().st_mtime_ns for name in (REPORT_FILE, SUMMARY_FILE))
-        told = [*find_sidecars(out), *([out / PANELS_FILE] if (out / PANELS_FILE).exists() else [])]
-        return all(path.stat().st_mtime_ns < written for path in told)
+        entries = [*find_sidecars(out), *([out / PANELS_FILE] if (out / PANELS_FILE).exists() else [])]
+        return all(path.stat().st_mtime_ns < written for path in entries)
     except OSError:
         return False
 
@@ -96,21 +96,21 @@ def _page(
         script=script,
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         facts=_in_a_page(facts.as_json()),
-        captures=facts.told,
-        counts=Counter(c.status for c in facts.told),
+        captures=facts.entries,
+        counts=Counter(c.status for c in facts.entries),
         statuses=Counter(b.status for b in facts.bands),
         pairs=len(facts.bands),
-        cameras=Counter(c.camera for c in facts.told),
+        cameras=Counter(c.camera for c in facts.entries),
         residuals_px=facts.residuals_px,
         seconds=_Seconds.of(facts, run),
-        shortfalls=facts.shortfalls.groups(),
+        failures=facts.failures.groups(),
         problems=[] if run is None else run.problems,
         unfinished=run is not None and run.state == "interrupted",
         bands=facts.by_band(),
         rigs=rig_views(out, on_problem),
-        drifts=drifts_of(facts.told),
+        drifts=drifts_of(facts.entries),
         panels=panels,
-        mapped=sum(c.position is not None for c in facts.told),
+        mapped=sum(c.position is not None for c in facts.entries),
     )
 
 
@@ -135,8 +135,8 @@ class _Seconds:
 
     @classmethod
     def of(cls, facts: Facts, run: RunPart | None) -> "_Seconds":
-        at_once = run is not None and run.captures.get("done") == len(facts.told)
+        at_once = run is not None and run.captures.get("done") == len(facts.entries)
         return cls(
-            median(c.seconds for c in facts.told) if facts.told else None,
+            median(c.seconds for c in facts.entries) if facts.entries else None,
             run.seconds if run is not None and at_once else None,
         )

@@ -12,15 +12,15 @@ import numpy as np
 from agalign.errors import InputError
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import read_rig, rig_rows
-from agalign.products.report.facts import Told
+from agalign.products.report.facts import CaptureEntry
 from agalign.values import geometry
 
 PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
 _FIELD_REACH = 11.0
 """Of the longest arrow of a lens field."""
 _FIELD_COLUMNS, _FIELD_ROWS = 13, 10
-_LEAST_SPREAD_PX = 0.2
-_MOST_POINTS = 400
+_MIN_SPREAD_PX = 0.2
+_MAX_POINTS = 400
 
 
 @dataclass(frozen=True)
@@ -118,25 +118,25 @@ def hue_of(number: int, count: int) -> float:
     return round(205 + 360 * number / max(count, 1)) % 360
 
 
-def drifts_of(captures: Sequence[Told]) -> list[Drift]:
+def drifts_of(captures: Sequence[CaptureEntry]) -> list[Drift]:
     """A chart for each camera that took three captures or more, in the order in which they were taken."""
-    found = []
+    result = []
     for camera in dict.fromkeys(c.camera for c in captures):
         mine = sorted((c for c in captures if c.camera == camera), key=lambda c: (c.captured_at, c.label))
         names = list(dict.fromkeys(name for c in mine for name in c.offsets_px))
         if len(mine) >= 3 and names:
-            found.append(_drift(camera, mine, names))
-    return found
+            result.append(_drift(camera, mine, names))
+    return result
 
 
-def _drift(camera: str, captures: Sequence[Told], names: Sequence[str]) -> Drift:
+def _drift(camera: str, captures: Sequence[CaptureEntry], names: Sequence[str]) -> Drift:
     along = {name: _along([c.offsets_px.get(name) for c in captures]) for name in names}
     # Which end of a direction is up is nobody's: all as the first band goes.
     first = along[names[0]]
     along = {name: values if _together(first, values) else [None if v is None else -v for v in values]
              for name, values in along.items()}  # fmt: skip
-    full = max([_LEAST_SPREAD_PX, *(abs(v) for values in along.values() for v in values if v is not None)])
-    step = max(1, math.ceil(len(captures) / _MOST_POINTS))
+    full = max([_MIN_SPREAD_PX, *(abs(v) for values in along.values() for v in values if v is not None)])
+    step = max(1, math.ceil(len(captures) / _MAX_POINTS))
     lines = tuple(
         Line(name, hue_of(number, len(names)), _runs(along[name], full, step)) for number, name in enumerate(names)
     )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from agalign.config import CheckSettings
-from agalign.pixels.structure import Field, half_whitened, structure_field, tops, windowed_spectra
+from agalign.pixels.structure import Field, peak_positions, structure_field, whitened_cross_spectra, windowed_spectra
 from agalign.values.alignment import Residual
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
@@ -31,7 +31,7 @@ class FixedWindows:
         self.origins, windows = self._strong(structure, origins if min(width, height) >= self.side else [])
         self.spectra = windowed_spectra(windows)
 
-    def residuals(self, moving: Raster, least_valid: float = 0.9) -> Residual:
+    def residuals(self, moving: Raster, min_valid: float = 0.9) -> Residual:
         """The shift of each window's content; a window counts as measured where its peak stands out.
 
         It is looked at where this share of it is valid in both. What is not valid holds no structure, but its outline
@@ -39,15 +39,15 @@ class FixedWindows:
         """
         both = self.valid & moving.valid
         field = structure_field(moving, self.settings.smoothing_px)
-        least = least_valid * self.side**2
-        valid = [o for o in self.origins if np.count_nonzero(self._cut(both, o)) >= least]
+        minimum = min_valid * self.side**2
+        valid = [o for o in self.origins if np.count_nonzero(self._cut(both, o)) >= minimum]
         origins, windows = self._strong(field, valid)
         rows = {o: i for i, o in enumerate(self.origins)}
         tried = self.spectra if len(origins) == len(rows) else self.spectra[[rows[o] for o in origins]]
-        cross = half_whitened(tried, windowed_spectra(windows))
-        found, sigma = _peaks(cross, self.settings.least_peak_sigma)
+        cross = whitened_cross_spectra(tried, windowed_spectra(windows))
+        result, sigma = _peaks(cross, self.settings.min_peak_sigma)
         centres_px = np.array(origins, dtype=np.float64).reshape(-1, 2) + (self.side - 1) / 2
-        return Residual.of(centres_px, found, sigma)
+        return Residual.of(centres_px, result, sigma)
 
     def _cut(self, image: NDArray[Any], origin: _Origin) -> NDArray[Any]:
         x, y = origin
@@ -60,14 +60,14 @@ class FixedWindows:
         cut = np.empty((len(origins), self.side, self.side), np.complex64)
         for window, origin in zip(cut, origins, strict=True):
             window[:] = self._cut(field, origin)
-        strong = np.abs(cut[:, ::2, ::2]).mean(axis=(1, 2)) >= self.settings.least_strength
+        strong = np.abs(cut[:, ::2, ::2]).mean(axis=(1, 2)) >= self.settings.min_strength
         if not strong.all():
             cut = cut[strong]
         cut -= cut.mean(axis=(1, 2), keepdims=True)
         return [o for o, s in zip(origins, strong, strict=True) if s], cut
 
 
-def moved(residual: Residual, before: PixelMapping, after: PixelMapping) -> Residual:
+def residual_under(residual: Residual, before: PixelMapping, after: PixelMapping) -> Residual:
     """The shifts of windows that were looked at under one mapping, as another one that is all but equal leaves them.
 
     What lies at p + s of the fixed image under the one lies at p + s - d under the other, with before(p + s) =
@@ -85,7 +85,7 @@ def _starts(length: int, side: int, step: int | None) -> list[int]:
     return [round(v) for v in np.linspace(0, max(0, length - side), count)]
 
 
-def _peaks(cross: Field, least_sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _peaks(cross: Field, min_sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """((n, 2) shifts, nan where no peak stands out; (n,) heights in standard deviations) of cross spectra."""
     count, height, width = cross.shape
     surfaces = fft.ifft2(cross).real.reshape(count, height * width)
@@ -96,7 +96,7 @@ def _peaks(cross: Field, least_sigma: float) -> tuple[NDArray[np.float64], NDArr
     row, column = np.divmod(highest, width)
     # Shifts are circular: beyond half a window they are negative.
     at = np.stack([(column + width // 2) % width - width // 2, (row + height // 2) % height - height // 2], axis=1)
-    found = np.full((count, 2), np.nan)
-    plain = sigma >= least_sigma
-    found[plain] = tops(cross[plain], at[plain].astype(np.float64))
-    return found, sigma.astype(np.float64)
+    result = np.full((count, 2), np.nan)
+    plain = sigma >= min_sigma
+    result[plain] = peak_positions(cross[plain], at[plain].astype(np.float64))
+    return result, sigma.astype(np.float64)

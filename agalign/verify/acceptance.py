@@ -11,66 +11,66 @@ from agalign.config import CheckSettings
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.choices import PairStatus
-from agalign.values.doubts import Doubt
 from agalign.values.geometry import Matrix, Points
+from agalign.values.issues import Issue
 
 _NEIGHBOUR = 1.6
 """Diagonal neighbours count, in distances between windows."""
-_MOST_STRETCH = 4.0
+_MAX_STRETCH = 4.0
 """Largest over smallest magnification within an image."""
 
 
-def doubts_of(
+def issues_of(
     joint: JointResult, residual: Residual, size_px: tuple[int, int], settings: CheckSettings
-) -> tuple[Doubt, ...]:
+) -> tuple[Issue, ...]:
     """Everything that speaks against a result on an image (width, height), the plainest first."""
     return (*_of_the_result(joint, size_px, settings), *_of_the_windows(residual, settings))
 
 
-def status_of(doubts: tuple[Doubt, ...], residual: Residual, settings: CheckSettings, *, seed: bool) -> PairStatus:
+def status_of(issues: tuple[Issue, ...], residual: Residual, settings: CheckSettings, *, seed: bool) -> PairStatus:
     """`aligned` where nothing speaks against it; else `seed_only`, where the `seed` is usable and what it leaves is not
     too much, or `failed`.
     """
-    if not doubts:
+    if not issues:
         return "aligned"
     return "seed_only" if seed and seed_fits(residual, settings) else "failed"
 
 
 def seed_fits(residual: Residual, settings: CheckSettings) -> bool:
     """True where what a seed leaves is little enough for it to be used as it is."""
-    return residual.coverage >= settings.least_seed_coverage and residual.median_px <= settings.most_seed_residual_px
+    return residual.coverage >= settings.min_seed_coverage and residual.median_px <= settings.max_seed_residual_px
 
 
-def _of_the_result(joint: JointResult, size_px: tuple[int, int], settings: CheckSettings) -> Iterator[Doubt]:
+def _of_the_result(joint: JointResult, size_px: tuple[int, int], settings: CheckSettings) -> Iterator[Issue]:
     # Each is written so that nan passes nowhere.
     scale = geometry.local_scale(joint.fixed_to_moving, *size_px)
-    if not (scale.min() > 0 and scale.max() <= _MOST_STRETCH * scale.min()):
-        yield Doubt("folds", float(scale.max() / scale.min()), _MOST_STRETCH)
-    least = max(settings.least_retrieval, settings.least_times_chance * joint.chance)
-    if not joint.retrieval >= least:
-        yield Doubt("retrieval", joint.retrieval, least)
-    if not joint.corner_std_px <= settings.most_corner_std_px:
-        yield Doubt("corner_std_px", joint.corner_std_px, settings.most_corner_std_px)
+    if not (scale.min() > 0 and scale.max() <= _MAX_STRETCH * scale.min()):
+        yield Issue("folds", float(scale.max() / scale.min()), _MAX_STRETCH)
+    minimum = max(settings.min_retrieval, settings.min_times_chance * joint.chance)
+    if not joint.retrieval >= minimum:
+        yield Issue("retrieval", joint.retrieval, minimum)
+    if not joint.corner_std_px <= settings.max_corner_std_px:
+        yield Issue("corner_std_px", joint.corner_std_px, settings.max_corner_std_px)
 
 
-def _of_the_windows(residual: Residual, settings: CheckSettings) -> Iterator[Doubt]:
-    if len(residual.centres_px) < settings.least_windows:
-        yield Doubt("few_windows", len(residual.centres_px), settings.least_windows)
+def _of_the_windows(residual: Residual, settings: CheckSettings) -> Iterator[Issue]:
+    if len(residual.centres_px) < settings.min_windows:
+        yield Issue("few_windows", len(residual.centres_px), settings.min_windows)
         return
-    if not residual.coverage >= settings.least_coverage:
-        yield Doubt("coverage", residual.coverage, settings.least_coverage)
+    if not residual.coverage >= settings.min_coverage:
+        yield Issue("coverage", residual.coverage, settings.min_coverage)
     measured = np.isfinite(residual.shifts_px[:, 0])
-    off = measured & (np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > settings.most_residual_px)
+    off = measured & (np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > settings.max_residual_px)
     close = 1 - float(off.sum()) / max(int(measured.sum()), 1)
-    if not close >= settings.least_close:
-        within = f"{settings.most_residual_px:g} px"
-        yield Doubt("close_windows", close, settings.least_close, within)
+    if not close >= settings.min_close:
+        within = f"{settings.max_residual_px:g} px"
+        yield Issue("close_windows", close, settings.min_close, within)
     together = _largest_cluster(residual.centres_px[off], residual.centres_px)
-    most = max(settings.least_cluster, round(settings.most_cluster * int(measured.sum())))
-    if not together < most:
-        yield Doubt("cluster", together / max(int(measured.sum()), 1), most / max(int(measured.sum()), 1))
-    if not residual.median_px <= settings.most_residual_px:
-        yield Doubt("residual_px", residual.median_px, settings.most_residual_px)
+    maximum = max(settings.min_cluster, round(settings.max_cluster * int(measured.sum())))
+    if not together < maximum:
+        yield Issue("cluster", together / max(int(measured.sum()), 1), maximum / max(int(measured.sum()), 1))
+    if not residual.median_px <= settings.max_residual_px:
+        yield Issue("residual_px", residual.median_px, settings.max_residual_px)
 
 
 def _largest_cluster(off_px: Points, all_px: Points) -> int:
@@ -93,4 +93,4 @@ def is_as_it_was(
     `scale` is the size of the image relative to its file, in whose pixels the limit is.
     """
     moved_px = geometry.corner_error_px(joint.fixed_to_moving, given, *size_px)
-    return moved_px <= min(settings.most_snap_px * scale, 3 * joint.corner_std_px)
+    return moved_px <= min(settings.max_snap_px * scale, 3 * joint.corner_std_px)

@@ -19,7 +19,7 @@ _LONGEST_PX = 2048
 
 
 @dataclass(frozen=True)
-class Views:
+class ReducedBands:
     """The bands of a capture on the grid of its aligned files, reduced where that is larger than a screen."""
 
     before: Mapping[str, Grey]
@@ -30,7 +30,7 @@ class Views:
     """(width, height) of all of them."""
 
 
-def read_views(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> Views:
+def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> ReducedBands:
     """Views of a capture whose bands were written to `places` on a grid. Raises UnreadableFileError."""
     size_px = _reduced(grid.width, grid.height)
     whole = 0, 0, grid.width, grid.height
@@ -39,7 +39,7 @@ def read_views(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: O
         with suppress(UnreadableFileError):  # its pair has failed, and says so
             before[band.name] = _grey(_before(band, capture.reference, grid, size_px))
     after = {name: _grey(read_preview(*place, whole, size_px)) for name, place in places.items()}
-    return Views(before, after, size_px)
+    return ReducedBands(before, after, size_px)
 
 
 def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, int]) -> NDArray[np.float32]:

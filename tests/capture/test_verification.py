@@ -4,14 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.capture import evidence
+from agalign.capture import verification
 from agalign.capture.band_pair import BandPair
-from agalign.capture.evidence import Look, judged, with_metrics
+from agalign.capture.verification import WarpedPair, verified, with_metrics
 from agalign.config import LocalSettings, Settings
 from agalign.values import geometry
-from agalign.values.alignment import JointResult, LocalField, LocalResult, Residual, Seed
-from agalign.values.doubts import Doubt
+from agalign.values.alignment import DisplacementField, DisplacementResult, JointResult, Residual, Seed
 from agalign.values.image import Raster
+from agalign.values.issues import Issue
 
 from ..conftest import textured_image, textured_pair
 
@@ -34,59 +34,61 @@ def pair() -> BandPair:
 
 
 def test_what_passes_is_aligned_and_measured(pair: BandPair) -> None:
-    found = judged(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
-    assert (found.status, found.doubts, found.reason) == ("aligned", (), None)
-    assert found.residual.median_px < 0.1
-    measured = with_metrics(found, pair)
+    results = verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
+    assert (results.status, results.issues, results.reason) == ("aligned", (), None)
+    assert results.residual.median_px < 0.1
+    measured = with_metrics(results, pair)
     assert measured.after["overlap"] > 0.9
     assert measured.after["mattes_mi"] < measured.before["mattes_mi"]
 
 
 def test_a_look_under_a_mapping_that_is_all_but_equal_is_what_looking_again_shows(pair: BandPair) -> None:
-    look = Look.at(pair, pair.mapping(geometry.translation(5.95, -3.95)))
+    warped_pair = WarpedPair.at(pair, pair.mapping(geometry.translation(5.95, -3.95)))
     mapping = pair.mapping(np.array([[1.0001, 0, 6.0], [0, 0.9999, -4.0], [0, 0, 1.0]]))
-    near, again = look.under(mapping), Look.at(pair, mapping)
-    assert near.there is look.there
+    near, again = warped_pair.under(mapping), WarpedPair.at(pair, mapping)
+    assert near.warped is warped_pair.warped
     np.testing.assert_allclose(near.residual.shifts_px, again.residual.shifts_px, atol=0.04)
     assert near.residual.median_px == pytest.approx(again.residual.median_px, abs=0.04)
     far = pair.mapping(geometry.translation(9, -4))
-    assert look.under(far).there is not look.there
+    assert warped_pair.under(far).warped is not warped_pair.warped
 
 
 def test_a_doubted_result_leaves_the_seed_and_its_windows(pair: BandPair) -> None:
-    found = judged(pair, SEED, result(geometry.translation(6, -4), retrieval=0.01), SETTINGS)
-    assert found.status == "seed_only"
-    assert found.doubts[0].kind == "retrieval"
-    np.testing.assert_array_equal(found.fixed_to_moving, SEED.fixed_to_moving)
-    assert found.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.15)
+    results = verified(pair, SEED, result(geometry.translation(6, -4), retrieval=0.01), SETTINGS)
+    assert results.status == "seed_only"
+    assert results.issues[0].kind == "retrieval"
+    np.testing.assert_array_equal(results.fixed_to_moving, SEED.fixed_to_moving)
+    assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.15)
 
 
 def test_no_result_at_all_is_told_in_its_own_words(pair: BandPair) -> None:
-    found = judged(pair, SEED, Doubt("few_keypoints", 3, 16), SETTINGS)
-    assert found.status == "seed_only"
-    assert found.reason == "only 3 keypoints lie on the common valid area; the rig seed is used as it is"
+    result = verified(pair, SEED, Issue("few_keypoints", 3, 16), SETTINGS)
+    assert result.status == "seed_only"
+    assert result.reason == "only 3 keypoints lie on the common valid area; the rig seed is used as it is"
 
 
 def test_an_unrelated_image_is_failed_seed_or_not() -> None:
-    found = judged(
+    results = verified(
         pair_of(textured_image(400, 320), textured_image(400, 320, 9)), SEED, result(np.eye(3), 0.01), SETTINGS
     )
-    assert found.status == "failed"
-    assert found.reason is not None
-    assert found.reason.endswith("but it does not fit either")
+    assert results.status == "failed"
+    assert results.reason is not None
+    assert results.reason.endswith("but it does not fit either")
 
 
 def test_the_verdict_is_asked_again_under_a_local_field(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
     """A field that is kept though the windows then lie apart must not be written."""
     wild = np.zeros((11, 14, 2))
     wild[..., 0] = 3.0
-    monkeypatch.setattr(pair.reference.local, "refine", lambda *_: LocalResult(LocalField(32.0, wild), 1.0, 0.5))
-    found = judged(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
-    assert found.status == "aligned"
-    assert found.local == LocalResult(None, 1.0, 0.5)
-    assert found.residual.median_px < 0.1
-    monkeypatch.setattr(evidence, "doubts_of", lambda *_: ())
-    assert judged(pair, SEED, result(geometry.translation(6, -4)), SETTINGS).local.field is not None
+    monkeypatch.setattr(
+        pair.reference.local, "refine", lambda *_: DisplacementResult(DisplacementField(32.0, wild), 1.0, 0.5)
+    )
+    results = verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
+    assert results.status == "aligned"
+    assert results.local == DisplacementResult(None, 1.0, 0.5)
+    assert results.residual.median_px < 0.1
+    monkeypatch.setattr(verification, "issues_of", lambda *_: ())
+    assert verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS).local.field is not None
 
 
 def test_residuals_of_a_reduced_image_are_given_in_px_of_the_file() -> None:
@@ -117,19 +119,19 @@ def bent_pair(height_px: float, apart_px: float | None = None) -> BandPair:
 def test_a_field_starts_by_itself_where_a_part_of_the_image_lies_apart(use: str, status: str) -> None:
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     settings = Settings(local=LocalSettings(use=use))
-    found = judged(bent_pair(4.0), seed, result(np.eye(3)), settings)
-    assert found.status == status
-    assert (found.field is not None) == (status == "aligned")
+    results = verified(bent_pair(4.0), seed, result(np.eye(3)), settings)
+    assert results.status == status
+    assert (results.field is not None) == (status == "aligned")
 
 
 def test_what_changes_from_plant_to_plant_is_followed_by_a_finer_field() -> None:
     """Waves of 170 px: the first field's windows show half of them each."""
     pair, seed = bent_pair(2.5, apart_px=170.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
-    found = judged(pair, seed, result(np.eye(3)), Settings())
-    assert found.status == "aligned"
-    assert found.field is not None
-    assert found.field.step_px == Settings().local.finer_scale.lattice_px
-    assert found.residual.median_px < 0.1
+    results = verified(pair, seed, result(np.eye(3)), Settings())
+    assert results.status == "aligned"
+    assert results.field is not None
+    assert results.field.step_px == Settings().local.finer_scale.lattice_px
+    assert results.residual.median_px < 0.1
     assert pair.reference.local.refine(pair.moving_image, pair.mapping(np.eye(3))).field is None
 
 
@@ -138,7 +140,7 @@ def test_what_needs_no_field_gets_none_and_with_a_rig_none_is_tried(rig_known: b
     pair = bent_pair(0.0)
     pair = replace(pair, known_to_px={"model": 1.0} if rig_known else {})
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
-    plain = judged(pair, seed, result(np.eye(3)), Settings())
+    plain = verified(pair, seed, result(np.eye(3)), Settings())
     assert (plain.status, plain.local is not None, plain.field) == ("aligned", tried, None)
 
 
@@ -147,7 +149,7 @@ def test_what_a_field_cannot_mend_is_named(pair: BandPair) -> None:
     fixed, moving = textured_pair(geometry.translation(6, -4))
     torn = moving.copy()
     torn[:, 270:] = np.roll(moving, 15, axis=0)[:, 270:]
-    found = judged(pair_of(fixed, torn), SEED, result(geometry.translation(6, -4)), Settings())
-    assert found.status != "aligned"
-    assert {"close_windows", "cluster"} & {d.kind for d in found.doubts}
-    assert "of the windows" in (found.reason or "")
+    results = verified(pair_of(fixed, torn), SEED, result(geometry.translation(6, -4)), Settings())
+    assert results.status != "aligned"
+    assert {"close_windows", "cluster"} & {d.kind for d in results.issues}
+    assert "of the windows" in (results.reason or "")

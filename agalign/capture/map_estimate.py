@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 _WINDOWS_STD_PX = 0.01
 """What all windows have in common, along x and y, beside what they disagree by."""
-_LEAST_WINDOWS = 16
+_MIN_WINDOWS = 16
 _FARTHEST_PX = 1.0
 """Windows that would move a corner farther do not correct a mapping: they contradict it."""
 _REWEIGHTINGS = 6
@@ -38,7 +38,7 @@ _FREEDOM = 4.0
 
 
 @dataclass(frozen=True)
-class Witness:
+class InformationForm:
     """Gaussian knowledge of delta (8,), px of the reference's image."""
 
     information: Array
@@ -46,32 +46,32 @@ class Witness:
     pull: Array
     """(8,) information times mean."""
 
-    def __add__(self, other: "Witness") -> "Witness":
-        return Witness(self.information + other.information, self.pull + other.pull)
+    def __add__(self, other: "InformationForm") -> "InformationForm":
+        return InformationForm(self.information + other.information, self.pull + other.pull)
 
     @classmethod
-    def of(cls, mean: Array, covariance: Array) -> "Witness":
+    def of(cls, mean: Array, covariance: Array) -> "InformationForm":
         information = np.asarray(np.linalg.inv(covariance))
         return cls(information, information @ mean)
 
 
-def most_probable(
-    pairs: Sequence[BandPair], found: Mapping[str, JointResult], residuals: Mapping[str, Residual], rig: Rig | None
+def map_estimate(
+    pairs: Sequence[BandPair], results: Mapping[str, JointResult], residuals: Mapping[str, Residual], rig: Rig | None
 ) -> dict[str, JointResult]:
     """Each result, by band, moved to the maximum a posteriori of all, with what is known of its corners then.
 
     `residuals` are what the windows show under the results.
     """
-    known = [p for p in pairs if p.name in found and found[p.name].corner_covariance_px2 is not None]
-    own = [_of_descriptors(found[p.name]) for p in known]
+    known = [p for p in pairs if p.name in results and results[p.name].corner_covariance_px2 is not None]
+    own = [_of_descriptors(results[p.name]) for p in known]
     for k, pair in enumerate(known):
         shown = _of_windows(pair, residuals[pair.name])
         if shown is not None:
             own[k] = own[k] + shown
-    priors = [_expectation(pair, found[pair.name], rig) for pair in known]
-    moved = dict(found)
+    priors = [_expectation(pair, results[pair.name], rig) for pair in known]
+    moved = dict(results)
     for pair, (delta, covariance) in zip(known, _solve(own, priors), strict=True):
-        result, size = found[pair.name], pair.fixed.size_px
+        result, size = results[pair.name], pair.fixed.size_px
         std = np.sqrt(np.diag(covariance)).reshape(4, 2)
         moved[pair.name] = replace(
             result,
@@ -81,7 +81,7 @@ def most_probable(
     return moved
 
 
-def _solve(own: Sequence[Witness], priors: Sequence[Expectation | None]) -> list[tuple[Array, Array]]:
+def _solve(own: Sequence[InformationForm], priors: Sequence[Expectation | None]) -> list[tuple[Array, Array]]:
     """(delta (8,), its covariance (8, 8)) of each band, all together."""
     factors = 8 * len(own) + np.arange(len(FACTOR_STD_PX))
     weights = np.ones(len(own))
@@ -89,10 +89,10 @@ def _solve(own: Sequence[Witness], priors: Sequence[Expectation | None]) -> list
         normal = np.zeros((factors[-1] + 1, factors[-1] + 1))
         pull = np.zeros(len(normal))
         normal[factors, factors] = 1 / np.square(FACTOR_STD_PX)
-        for b, (witness, prior) in enumerate(zip(own, priors, strict=True)):
+        for b, (information, prior) in enumerate(zip(own, priors, strict=True)):
             band = 8 * b + np.arange(8)
-            normal[np.ix_(band, band)] += witness.information
-            pull[band] += witness.pull
+            normal[np.ix_(band, band)] += information.information
+            pull[band] += information.pull
             if prior is not None:
                 rows = np.concatenate([band, factors])
                 design = np.hstack([np.eye(8), -prior.by_factor])
@@ -111,21 +111,21 @@ def _solve(own: Sequence[Witness], priors: Sequence[Expectation | None]) -> list
     return [(np.round(solution[s], 6), np.round(covariance[s, s], 12)) for s in blocks]
 
 
-def _of_descriptors(result: JointResult) -> Witness:
+def _of_descriptors(result: JointResult) -> InformationForm:
     assert result.corner_covariance_px2 is not None
-    return Witness.of(np.zeros(8), result.corner_covariance_px2)
+    return InformationForm.of(np.zeros(8), result.corner_covariance_px2)
 
 
-def _of_windows(pair: BandPair, residual: Residual) -> Witness | None:
+def _of_windows(pair: BandPair, residual: Residual) -> InformationForm | None:
     """What the windows' shifts say of the corners; None where they are few or far off."""
     some = np.isfinite(residual.shifts_px[:, 0])
-    if some.sum() < _LEAST_WINDOWS:
+    if some.sum() < _MIN_WINDOWS:
         return None
     at, there = (_undistorted(pair, p) for p in (residual.centres_px, residual.centres_px + residual.shifts_px))
     fit = fit_corners(at[some], (there - at)[some], residual.peaks_sigma[some], pair.fixed.size_px)
     if not np.abs(fit.mean_px).max() <= _FARTHEST_PX:
         return None
-    return Witness.of(fit.mean_px, fit.covariance_px2 + _WINDOWS_STD_PX**2 * np.eye(8))
+    return InformationForm.of(fit.mean_px, fit.covariance_px2 + _WINDOWS_STD_PX**2 * np.eye(8))
 
 
 def _undistorted(pair: BandPair, raw_px: Array) -> Array:

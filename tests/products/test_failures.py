@@ -2,15 +2,15 @@
 
 from typing import get_args
 
-from agalign.products.shortfalls import Shortfalls
-from agalign.products.sidecar import BandResult, CameraPart, CaptureResult, DoubtPart, ReferencePart
-from agalign.values.doubts import DoubtKind, remedy
+from agalign.products.failures import FailureGroups
+from agalign.products.sidecar import BandResult, CameraPart, CaptureResult, IssuePart, ReferencePart
+from agalign.values.issues import IssueKind, remedy
 
 
 def band(name: str, status: str, kind: str | None = None) -> BandResult:
-    doubts = [] if kind is None else [DoubtPart(kind=kind, value=None, limit=None)]  # type: ignore[arg-type]
+    issues = [] if kind is None else [IssuePart(kind=kind, value=None, limit=None)]  # type: ignore[arg-type]
     return BandResult(
-        band=name, wavelength_nm=None, file="a.tif", band_index=1, status=status, reason=f"{kind}", doubts=doubts,
+        band=name, wavelength_nm=None, file="a.tif", band_index=1, status=status, reason=f"{kind}", doubts=issues,
         seconds=0.1,
     )  # type: ignore[arg-type]  # fmt: skip
 
@@ -24,15 +24,15 @@ def capture(*bands: BandResult, missing: tuple[str, ...] = ()) -> CaptureResult:
 
 
 def test_bands_of_one_cause_and_status_are_one_group_and_the_gravest_comes_first() -> None:
-    found = Shortfalls()
-    found.add(
+    result = FailureGroups()
+    result.add(
         "one", capture(band("Green", "reference"), band("Blue", "aligned"), band("NIR", "predicted", "retrieval"))
     )
-    found.add(
+    result.add(
         "two", capture(band("NIR", "predicted", "few_windows"), band("Red", "failed", "unreadable"), missing=("X",))
     )
-    found.add("three", capture(band("NIR", "seed_only", "repeats")))
-    groups = found.groups()
+    result.add("three", capture(band("NIR", "seed_only", "repeats")))
+    groups = result.groups()
     assert [g.status for g in groups] == ["failed", "seed_only", "missing", "predicted"]
     assert [b.capture for b in groups[-1].bands] == ["one", "two"]
     assert groups[-1].captures == 2
@@ -41,12 +41,12 @@ def test_bands_of_one_cause_and_status_are_one_group_and_the_gravest_comes_first
 
 
 def test_a_band_without_a_reason_is_told_too() -> None:
-    found = Shortfalls()
-    found.add("one", capture(band("NIR", "seed_only")))
-    assert "no reason" in found.groups()[0].remedy.cause
+    result = FailureGroups()
+    result.add("one", capture(band("NIR", "seed_only")))
+    assert "no reason" in result.groups()[0].remedy.cause
 
 
 def test_every_doubt_has_a_remedy() -> None:
-    for kind in get_args(DoubtKind):
+    for kind in get_args(IssueKind):
         assert remedy(kind).cause
         assert remedy(kind).advice

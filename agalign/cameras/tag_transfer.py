@@ -42,7 +42,7 @@ _EXIF_OF_THE_CAPTURE = _GEOMETRIC_EXIF | {36864, 36867, 36868, 36880, 36881, 368
 
 
 @dataclass(frozen=True)
-class CarriedTags:
+class TransferredTags:
     """Entries for an aligned file."""
 
     first: Directory
@@ -50,16 +50,16 @@ class CarriedTags:
     gps: Directory
 
 
-def capture_tags(reference: Band, grid: OutputGrid) -> CarriedTags:
+def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
     """For a stack: what is true of all bands of a capture."""
     source = _directories(reference.path)
     first = _some(source[0], _OF_THE_CAPTURE | {_ORIENTATION})
-    return CarriedTags(first, _on_grid(_some(source[EXIF], _EXIF_OF_THE_CAPTURE), source[EXIF], grid), source[GPS])
+    return TransferredTags(first, _on_grid(_some(source[EXIF], _EXIF_OF_THE_CAPTURE), source[EXIF], grid), source[GPS])
 
 
 def band_tags(
     source: Path, reference: Band, grid: OutputGrid, from_source: FromSource, *, radiometry: bool = False
-) -> CarriedTags:
+) -> TransferredTags:
     """For a file whose aligned bands came from `source`.
 
     With `radiometry` black level, vignetting and exposure have been taken out of the pixels.
@@ -72,13 +72,13 @@ def band_tags(
     with suppress(UnreadableFileError):
         theirs_packet = Packet.parse(theirs[0][XMP].data if XMP in theirs[0] else b"")
         of_reference = read_tags(reference.path)
-        camera_of(of_reference).carrying.put_geometry(packet, theirs_packet, reference, of_reference, grid)
+        camera_of(of_reference).tag_transfer.put_geometry(packet, theirs_packet, reference, of_reference, grid)
         of_source = read_tags(source)
-        carrying = camera_of(of_source).carrying
-        carrying.put_vignetting(packet, of_source, grid, from_source, radiometry=radiometry)
+        tag_transfer = camera_of(of_source).tag_transfer
+        tag_transfer.put_vignetting(packet, of_source, grid, from_source, radiometry=radiometry)
         if serialised := packet.serialised():
             first[XMP] = byte_string(serialised)
-    return CarriedTags(first, _on_grid(exif, theirs[EXIF], grid), own[GPS])
+    return TransferredTags(first, _on_grid(exif, theirs[EXIF], grid), own[GPS])
 
 
 def _directories(path: Path) -> dict[int, Directory]:
@@ -95,11 +95,11 @@ def _some(directory: Directory, tags: Iterable[int]) -> Directory:
 
 def _on_grid(exif: Directory, reference: Directory, grid: OutputGrid) -> Directory:
     """With the reference's focal length and pixel density, and the size that is written."""
-    found = exif | _some(reference, _GEOMETRIC_EXIF)
-    for tag in _DENSITIES & found.keys() if grid.scale != 1 else ():
-        density = number(found[tag])
+    result = exif | _some(reference, _GEOMETRIC_EXIF)
+    for tag in _DENSITIES & result.keys() if grid.scale != 1 else ():
+        density = number(result[tag])
         if density is not None and density > 0:
             with suppress(ValueError):  # a density that no camera has
-                found[tag] = rational(grid.scale * density)
+                result[tag] = rational(grid.scale * density)
     sizes = zip(_EXIF_SIZES, (grid.width, grid.height), strict=True)
-    return found | {tag: long(size) for tag, size in sizes if tag in found}
+    return result | {tag: long(size) for tag, size in sizes if tag in result}

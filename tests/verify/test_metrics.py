@@ -5,7 +5,9 @@ from skimage.metrics import normalized_mutual_information, structural_similarity
 
 from agalign.capture.reference import Reference
 from agalign.config import CheckSettings, Settings
-from agalign.judge.metrics import (
+from agalign.values.alignment import Residual
+from agalign.values.image import Raster
+from agalign.verify.metrics import (
     FixedSimilarity,
     cubic_spline,
     fixed_bins,
@@ -13,8 +15,6 @@ from agalign.judge.metrics import (
     mutual_information,
     normalised_mutual_information,
 )
-from agalign.values.alignment import Residual
-from agalign.values.image import Raster
 
 from ..conftest import textured_image, textured_pair
 
@@ -164,13 +164,13 @@ def test_tiles_without_structure_are_not_tried() -> None:
 def test_windows_that_are_nowhere_valid_say_nothing() -> None:
     one, other = textured_pair(np.eye(3))
     nowhere = Raster(other, np.zeros(other.shape, bool))
-    found = tile_residuals(Raster(one, np.ones(one.shape, bool)), nowhere, CheckSettings())
-    assert len(found.centres_px) == 0
-    assert (found.median_px, found.coverage) == (np.inf, 0.0)
+    result = tile_residuals(Raster(one, np.ones(one.shape, bool)), nowhere, CheckSettings())
+    assert len(result.centres_px) == 0
+    assert (result.median_px, result.coverage) == (np.inf, 0.0)
 
 
 def test_normalised_mutual_information_is_scikit_image_s() -> None:
     one, other = textured_pair(np.eye(3), 320, 240)
     joint, _, _ = np.histogram2d(one.ravel(), other.ravel(), 32)
-    found = normalised_mutual_information(joint / joint.sum())
-    assert found == pytest.approx(normalized_mutual_information(one, other, bins=32), abs=1e-6)
+    result = normalised_mutual_information(joint / joint.sum())
+    assert result == pytest.approx(normalized_mutual_information(one, other, bins=32), abs=1e-6)

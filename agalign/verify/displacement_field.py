@@ -14,16 +14,16 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from agalign.config import CheckSettings, LocalScale, LocalSettings
-from agalign.judge.residuals import FixedWindows
 from agalign.pixels.resample import warped
 from agalign.pixels.structure import Field
-from agalign.values.alignment import LocalField, LocalResult, Residual
+from agalign.values.alignment import DisplacementField, DisplacementResult, Residual
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
+from agalign.verify.residuals import FixedWindows
 
 
-class LocalRefiner:
+class DisplacementEstimator:
     """The reference cut into small, overlapping windows, ready for any number of moving bands."""
 
     def __init__(
@@ -31,11 +31,11 @@ class LocalRefiner:
     ) -> None:
         """`valid` and `structure` (height, width) are the reference's."""
         self.settings, self.size_px, self.lattice_px = settings, (valid.shape[1], valid.shape[0]), scale.lattice_px
-        step = max(scale.window_px // 2, round((valid.size / settings.most_windows) ** 0.5))
+        step = max(scale.window_px // 2, round((valid.size / settings.max_windows) ** 0.5))
         small = check.model_copy(update={"tile_px": scale.window_px})
         self.windows = FixedWindows(valid, structure, small, step)
 
-    def refine(self, moving: Raster, mapping: PixelMapping) -> LocalResult:
+    def refine(self, moving: Raster, mapping: PixelMapping) -> DisplacementResult:
         """The field over a mapping, with the displacements that it has already, and what it gains on windows that it
         was not fitted to.
 
@@ -49,55 +49,55 @@ class LocalRefiner:
         # Windows that lie farther from those of the fit may know a smoother field only.
         for smoothness in (s for s in self.settings.smoothness if s >= finest):
             gain = self._held_out_gain(first, smoothness, _ALL_FOLDS, apart_px=self.windows.side)
-            if gain.is_plain(self.settings.least_gain_sigma):
+            if gain.is_plain(self.settings.min_gain_sigma):
                 break
         else:
-            return LocalResult(None, gain.before_p95_px, gain.after_p95_px)
+            return DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
         field = before
-        for number in range(self.settings.most_rounds):
-            found = first if number == 0 else self._measure(moving, replace(mapping, local=field))
-            more = self._field(Shifts.of(found), gain.smoothness)
+        for number in range(self.settings.max_rounds):
+            result = first if number == 0 else self._measure(moving, replace(mapping, local=field))
+            more = self._field(Shifts.of(result), gain.smoothness)
             total = more if field is None else field.plus(more)
             if not _is_one_to_one(total, self.size_px):
                 break
             field = total
-            if number + 1 >= self.settings.rounds and found.median_px <= self.settings.settled_px:
+            if number + 1 >= self.settings.rounds and result.median_px <= self.settings.settled_px:
                 break
-        return LocalResult(None if field is before else field, gain.before_p95_px, gain.after_p95_px)
+        return DisplacementResult(None if field is before else field, gain.before_p95_px, gain.after_p95_px)
 
     def _held_out_gain(self, residual: Residual, smoothness: float, folds: Iterable[int], apart_px: float) -> "_Gain":
         """Windows are left out in turn, and with them from the fit all nearer than `apart_px` to one of them."""
-        found = Shifts.of(residual)
-        if len(found) < self.settings.least_windows:
+        result = Shifts.of(residual)
+        if len(result) < self.settings.min_windows:
             return _Gain(smoothness)
-        fold = _folds(found.centres_px)
-        left = np.full(len(found), np.nan)
+        fold = _folds(result.centres_px)
+        left = np.full(len(result), np.nan)
         for k in folds:
             out = fold == k
-            kept = ~out & ~_near(found.centres_px, found.centres_px[out], apart_px)
-            if kept.sum() >= self.settings.least_windows // 2:
-                field = self._field(found.some(kept), smoothness)
-                left[out] = np.linalg.norm(found.shifts_px[out] - field(found.centres_px[out]), axis=1)
-        return _gain_of(found, left, smoothness)
+            kept = ~out & ~_near(result.centres_px, result.centres_px[out], apart_px)
+            if kept.sum() >= self.settings.min_windows // 2:
+                field = self._field(result.some(kept), smoothness)
+                left[out] = np.linalg.norm(result.shifts_px[out] - field(result.centres_px[out]), axis=1)
+        return _gain_of(result, left, smoothness)
 
-    def _field(self, found: "Shifts", smoothness: float) -> LocalField:
-        return fitted_field(found, smoothness, self.settings, self.lattice_px, self.size_px)
+    def _field(self, result: "Shifts", smoothness: float) -> DisplacementField:
+        return fitted_field(result, smoothness, self.settings, self.lattice_px, self.size_px)
 
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Residual:
-        return self.windows.residuals(warped(moving, mapping, self.size_px), least_valid=1.0)
+        return self.windows.residuals(warped(moving, mapping, self.size_px), min_valid=1.0)
 
 
 _FAR_PX = 0.1
-_LEAST_CAPTURES = 3
+_MIN_CAPTURES = 3
 _COMMON_FOLDS = 4
 _COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
 """Of what is the lenses' own, beside one window of each capture."""
-_LEAST_COMMON_GAIN_SIGMA, _NO_WORSE = 2.5, 1.05
+_MIN_COMMON_GAIN_SIGMA, _NO_WORSE = 2.5, 1.05
 """Less than of one capture's windows: whole captures that are left out share nothing but their lenses."""
 _ALL_FOLDS = range(16)
 _SOME_FOLDS = (0, 2, 8, 10)
 """Far enough apart to say how smooth a field should be."""
-_LEAST_TRUST = 0.1
+_MIN_TRUST = 0.1
 """Of windows that are asked what a field explains; parallax within a window lowers its peak too."""
 
 
@@ -146,23 +146,23 @@ class _Gain:
     sigma: float = 0.0
     """Mean fall of the squared shifts, in standard errors of that mean."""
 
-    def is_plain(self, least_sigma: float) -> bool:
+    def is_plain(self, min_sigma: float) -> bool:
         """True where a field helps on the whole and makes the worst windows no worse."""
-        return self.sigma >= least_sigma and self.after_p95_px <= self.before_p95_px
+        return self.sigma >= min_sigma and self.after_p95_px <= self.before_p95_px
 
 
-def _gain_of(found: Shifts, left: NDArray[np.float64], smoothness: float) -> _Gain:
+def _gain_of(result: Shifts, left: NDArray[np.float64], smoothness: float) -> _Gain:
     """From what is `left` (n,) of the shifts, px, nan for windows that were not left out."""
     # What is measured badly says little of a field.
-    tried = np.isfinite(left) & (found.trust >= _LEAST_TRUST)
+    tried = np.isfinite(left) & (result.trust >= _MIN_TRUST)
     if not tried.any():
         return _Gain(smoothness)
-    before, after = np.linalg.norm(found.shifts_px[tried], axis=1), left[tried]
+    before, after = np.linalg.norm(result.shifts_px[tried], axis=1), left[tried]
     # Wrong peaks must not decide: what lies far out counts no more than twice the 95th percentile.
-    most = 2 * np.percentile(before, 95)
-    fall = np.minimum(before, most) ** 2 - np.minimum(after, most) ** 2
+    maximum = 2 * np.percentile(before, 95)
+    fall = np.minimum(before, maximum) ** 2 - np.minimum(after, maximum) ** 2
     sigma = fall.mean() / max(fall.std() / math.sqrt(len(fall)), 1e-12)
-    what_is_left = float(np.average(np.log1p((after / _FAR_PX) ** 2), weights=found.trust[tried]))
+    what_is_left = float(np.average(np.log1p((after / _FAR_PX) ** 2), weights=result.trust[tried]))
     before_p95, after_p95 = (float(np.percentile(shifts, 95)) for shifts in (before, after))
     return _Gain(smoothness, before_p95, after_p95, what_is_left, float(sigma))
 
@@ -185,13 +185,15 @@ def _near(centres_px: Points, others_px: Points, apart_px: float) -> NDArray[np.
     return np.asarray(nearest < apart_px)
 
 
-def common_field(residuals: Sequence[Residual], settings: LocalSettings, size_px: tuple[int, int]) -> LocalField | None:
+def common_field(
+    residuals: Sequence[Residual], settings: LocalSettings, size_px: tuple[int, int]
+) -> DisplacementField | None:
     """The smooth field that the windows of several captures have in common, on an image (width, height).
 
     None where it does not explain captures that are left out of its fit: what is the lenses' is the same in all.
     """
     captures = [s for s in map(Shifts.of, residuals) if len(s)]
-    if len(captures) < _LEAST_CAPTURES:
+    if len(captures) < _MIN_CAPTURES:
         return None
     lattice_px = settings.scale.lattice_px
     folds = [captures[k :: min(len(captures), _COMMON_FOLDS)] for k in range(min(len(captures), _COMMON_FOLDS))]
@@ -206,15 +208,15 @@ def common_field(residuals: Sequence[Residual], settings: LocalSettings, size_px
         return _gain_of(out, np.concatenate(left), smoothness)
 
     best = min(map(gain, _COMMON_SMOOTHNESS), key=lambda g: g.left)
-    if best.sigma < _LEAST_COMMON_GAIN_SIGMA or best.after_p95_px > _NO_WORSE * best.before_p95_px:
+    if best.sigma < _MIN_COMMON_GAIN_SIGMA or best.after_p95_px > _NO_WORSE * best.before_p95_px:
         return None
     field = fitted_field(out, best.smoothness * len(captures), settings, lattice_px, size_px)
     return field if _is_one_to_one(field, size_px) else None
 
 
 def fitted_field(
-    found: Shifts, smoothness: float, settings: LocalSettings, lattice_px: int, size_px: tuple[int, int]
-) -> LocalField:
+    result: Shifts, smoothness: float, settings: LocalSettings, lattice_px: int, size_px: tuple[int, int]
+) -> DisplacementField:
     """The smooth field d through shifts s at centres x: on a lattice,
 
         min sum_i t_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + pull |d|^2
@@ -224,17 +226,17 @@ def fitted_field(
     """
     step = lattice_px
     columns, rows = (int(np.ceil(n / step)) + 1 for n in size_px)
-    design = _interpolation(found.centres_px / step, columns, rows)
+    design = _interpolation(result.centres_px / step, columns, rows)
     penalty = smoothness * _bending(columns, rows) + settings.pull * identity(rows * columns)
-    weight = np.ones(len(found))
+    weight = np.ones(len(result))
     nodes = np.zeros((rows * columns, 2))
     for _ in range(settings.reweightings):
-        weighted = design.T @ diags(found.trust * weight)
-        nodes = splu((weighted @ design + penalty).tocsc()).solve(weighted @ found.shifts_px)
-        off = np.linalg.norm(found.shifts_px - design @ nodes, axis=1)
-        spread = max(1.4826 * float(np.median(off)), settings.least_spread_px)
+        weighted = design.T @ diags(result.trust * weight)
+        nodes = splu((weighted @ design + penalty).tocsc()).solve(weighted @ result.shifts_px)
+        off = np.linalg.norm(result.shifts_px - design @ nodes, axis=1)
+        spread = max(1.4826 * float(np.median(off)), settings.min_spread_px)
         weight = 1 / (1 + (off / (settings.outlier_spreads * spread)) ** 2)
-    return LocalField(float(step), nodes.reshape(rows, columns, 2))
+    return DisplacementField(float(step), nodes.reshape(rows, columns, 2))
 
 
 def _interpolation(at: Points, columns: int, rows: int) -> csr_matrix:
@@ -263,7 +265,7 @@ def _second_differences(count: int) -> dia_matrix:
     return diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
 
 
-def _is_one_to_one(field: LocalField, size_px: tuple[int, int]) -> bool:
+def _is_one_to_one(field: DisplacementField, size_px: tuple[int, int]) -> bool:
     """True where x + d(x) folds nowhere: its Jacobian is positive at four points a step of the lattice."""
     x = np.arange(0.0, size_px[0], field.step_px / 4)
     y = np.arange(0.0, size_px[1], field.step_px / 4)

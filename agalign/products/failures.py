@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from agalign.products.sidecar import BandResult, CaptureResult
-from agalign.values.doubts import MISSING_BAND, Remedy, remedy
+from agalign.values.issues import MISSING_BAND, Remedy, remedy
 
 _GRAVITY = {"failed": 0, "seed_only": 1, "missing": 2, "predicted": 3}
 """The worse comes first."""
@@ -11,7 +11,7 @@ _UNTOLD = Remedy("no reason is on record", "run again with --overwrite")
 
 
 @dataclass(frozen=True)
-class Short:
+class UnalignedBand:
     """One band of one capture that is not aligned."""
 
     capture: str
@@ -22,12 +22,12 @@ class Short:
 
 
 @dataclass
-class Shortfall:
+class FailureGroup:
     """The bands of a run that fell short by one cause to one status."""
 
     status: str
     remedy: Remedy
-    bands: list[Short] = field(default_factory=list)
+    bands: list[UnalignedBand] = field(default_factory=list)
 
     @property
     def advice(self) -> str:
@@ -44,27 +44,27 @@ class Shortfall:
 
 
 @dataclass
-class Shortfalls:
+class FailureGroups:
     """All of a run, as its captures are added."""
 
-    _by_cause: dict[tuple[str, Remedy], Shortfall] = field(default_factory=dict)
+    _by_cause: dict[tuple[str, Remedy], FailureGroup] = field(default_factory=dict)
 
     def add(self, label: str, result: CaptureResult) -> None:
         """One capture more."""
         for band in result.bands:
             if band.status not in ("reference", "aligned"):
-                self._put(Short(label, band.band, band.status, band.reason or ""), _remedy_of(band))
+                self._put(UnalignedBand(label, band.band, band.status, band.reason or ""), _remedy_of(band))
         for name in result.missing_bands:
-            self._put(Short(label, name, "missing", MISSING_BAND.cause), MISSING_BAND)
+            self._put(UnalignedBand(label, name, "missing", MISSING_BAND.cause), MISSING_BAND)
 
-    def groups(self) -> list[Shortfall]:
+    def groups(self) -> list[FailureGroup]:
         """The gravest first, and of those the most frequent."""
         return sorted(self._by_cause.values(), key=lambda s: (_GRAVITY[s.status], -len(s.bands), s.remedy.cause))
 
-    def _put(self, short: Short, cause: Remedy) -> None:
-        self._by_cause.setdefault((short.status, cause), Shortfall(short.status, cause)).bands.append(short)
+    def _put(self, short: UnalignedBand, cause: Remedy) -> None:
+        self._by_cause.setdefault((short.status, cause), FailureGroup(short.status, cause)).bands.append(short)
 
 
 def _remedy_of(band: BandResult) -> Remedy:
     """The first doubt is the one that the reason tells."""
-    return remedy(band.doubts[0].kind) if band.doubts else _UNTOLD
+    return remedy(band.issues[0].kind) if band.issues else _UNTOLD

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from agalign.judge.expected_error import expected_error_px
 from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed
+from agalign.verify.expected_error import expected_error_px
 
 SIZE = 640, 480
 LEFT, RIGHT = np.array([[60.0, 240.0]]), np.array([[620.0, 240.0]])
@@ -27,8 +27,8 @@ def windows(columns: int, shift_px: float) -> Residual:
 
 
 def test_the_corners_covariance_is_what_the_corners_show() -> None:
-    found = expected_error_px(alignment([0.1, 0.5, 0.5, 0.1], None), SIZE, np.array([[0.0, 0.0], [639.0, 0.0]]))
-    np.testing.assert_allclose(found, np.sqrt(2) * np.array([0.1, 0.5]), rtol=1e-6)
+    result = expected_error_px(alignment([0.1, 0.5, 0.5, 0.1], None), SIZE, np.array([[0.0, 0.0], [639.0, 0.0]]))
+    np.testing.assert_allclose(result, np.sqrt(2) * np.array([0.1, 0.5]), rtol=1e-6)
 
 
 def test_windows_tell_of_their_places_and_far_from_all_of_them_the_worst_is_to_be_expected() -> None:

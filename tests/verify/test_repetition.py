@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign.judge.repeats import rival_of
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.image import Raster
+from agalign.verify.repetition import alias_peak
 
 from ..conftest import textured_image
 
@@ -27,7 +27,7 @@ def spectrum(image: np.ndarray) -> np.ndarray:
 
 
 def test_a_rival_lies_a_period_away() -> None:
-    rival = rival_of(spectrum(planted((0, 0), 1)), spectrum(planted((0, 0), 2, -1.0)))
+    rival = alias_peak(spectrum(planted((0, 0), 1)), spectrum(planted((0, 0), 2, -1.0)))
     assert rival.share > 0.8
     periods = np.array(rival.shift_px) / PERIOD
     assert np.abs(periods - periods.round()).max() < 0.1
@@ -37,22 +37,22 @@ def test_a_rival_lies_a_period_away() -> None:
 def test_what_is_like_nothing_else_has_no_rival() -> None:
     image = textured_image(400, 300)
     other = cv2.GaussianBlur(-image, (0, 0), 0.7)
-    assert rival_of(spectrum(image), spectrum(other)).share < 0.4
+    assert alias_peak(spectrum(image), spectrum(other)).share < 0.4
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0), (2.0, 1.0), (PERIOD, 0.0)])
 def test_a_scene_that_repeats_is_not_aligned_where_nothing_says_which_place(off: tuple[float, float]) -> None:
     truth = geometry.translation(9.0, -6.0)
     images = planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7)
-    found = agalign.align(*images, seed=geometry.compose(truth, geometry.translation(*off)))
-    assert found.status != "aligned"
-    assert found.doubts[0].kind == "repeats"
-    assert "px away it fits nearly as well" in (found.reason or "")
+    result = agalign.align(*images, seed=geometry.compose(truth, geometry.translation(*off)))
+    assert result.status != "aligned"
+    assert result.issues[0].kind == "repeats"
+    assert "px away it fits nearly as well" in (result.reason or "")
 
 
 def test_a_seed_that_is_known_to_less_than_half_a_period_decides() -> None:
     truth = geometry.translation(9.0, -6.0)
     near = geometry.compose(truth, geometry.translation(3.0, 2.0))
-    found = agalign.align(planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7), seed=near, seed_std_px=3.0)
-    assert found.status == "aligned"
-    assert geometry.corner_error_px(found.fixed_to_moving, truth, 400, 300) < 1.0
+    result = agalign.align(planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7), seed=near, seed_std_px=3.0)
+    assert result.status == "aligned"
+    assert geometry.corner_error_px(result.fixed_to_moving, truth, 400, 300) < 1.0

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from agalign.config import CheckSettings
-from agalign.judge.verdict import doubts_of, is_as_it_was, status_of
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
-from agalign.values.doubts import Doubt, sentence
+from agalign.values.issues import Issue, sentence
+from agalign.verify.acceptance import is_as_it_was, issues_of, status_of
 
 SEED = Seed("rig", np.eye(3), 100.0, 100.0, 5.0)
 GOOD_JOINT = JointResult(np.eye(3), 0.1, 0.95, 0.004, 75, (0.5, 1.0), "fast", "homography", 0.05, ((0.07, 0.07),) * 4)
@@ -17,7 +17,7 @@ SIZE = (1280, 960)
 
 
 def kinds(joint: JointResult = GOOD_JOINT, residual: Residual = GOOD_RESIDUAL) -> list[str]:
-    return [d.kind for d in doubts_of(joint, residual, SIZE, CheckSettings())]
+    return [d.kind for d in issues_of(joint, residual, SIZE, CheckSettings())]
 
 
 def test_all_well() -> None:
@@ -52,23 +52,23 @@ NAN = float("nan")
 )
 def test_any_doubt_is_enough_and_each_is_named(joint: JointResult, residual: Residual, expected: list[str]) -> None:
     assert kinds(joint, residual) == expected
-    doubts = doubts_of(joint, residual, SIZE, CheckSettings())
-    assert status_of(doubts, GOOD_RESIDUAL, CheckSettings(), seed=True) == "seed_only"
-    assert status_of(doubts, GOOD_RESIDUAL, CheckSettings(), seed=False) == "failed"
-    assert all(sentence(d) for d in doubts)
+    issues = issues_of(joint, residual, SIZE, CheckSettings())
+    assert status_of(issues, GOOD_RESIDUAL, CheckSettings(), seed=True) == "seed_only"
+    assert status_of(issues, GOOD_RESIDUAL, CheckSettings(), seed=False) == "failed"
+    assert all(sentence(d) for d in issues)
 
 
 def test_a_doubt_has_its_value_and_limit() -> None:
-    (doubt,) = doubts_of(replace(GOOD_JOINT, retrieval=0.1), GOOD_RESIDUAL, SIZE, CheckSettings())
-    assert doubt == Doubt("retrieval", 0.1, 0.2)
-    assert "0.10" in sentence(doubt)
+    (issue,) = issues_of(replace(GOOD_JOINT, retrieval=0.1), GOOD_RESIDUAL, SIZE, CheckSettings())
+    assert issue == Issue("retrieval", 0.1, 0.2)
+    assert "0.10" in sentence(issue)
 
 
 def test_a_seed_that_does_not_fit_is_not_used() -> None:
-    doubts = (Doubt("retrieval", 0.1, 0.2),)
+    issues = (Issue("retrieval", 0.1, 0.2),)
     off = replace(GOOD_RESIDUAL, median_px=9.0)
-    assert status_of(doubts, off, CheckSettings(), seed=True) == "failed"
-    failed = Alignment(np.eye(3), "pixel", "failed", (*doubts, Doubt("seed_does_not_fit")), SEED, None, off, 0.0)
+    assert status_of(issues, off, CheckSettings(), seed=True) == "failed"
+    failed = Alignment(np.eye(3), "pixel", "failed", (*issues, Issue("seed_does_not_fit")), SEED, None, off, 0.0)
     assert failed.reason is not None
     assert "rig seed is used as it is, but it does not fit either" in failed.reason
 

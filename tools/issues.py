@@ -1,8 +1,8 @@
 """Write the table of what may be said of a band pair into docs/troubleshooting.md, or check that it stands there.
 
-    python tools/doubts.py [--check]
+    python tools/issues.py [--check]
 
-The sentences are the program's own (agalign/values/doubts.py).
+The sentences are the program's own (agalign/values/issues.py).
 """
 
 import re
@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import get_args
 
-from agalign.values.doubts import Doubt, DoubtKind, remedy, sentence
+from agalign.values.issues import Issue, IssueKind, remedy, sentence
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "troubleshooting.md"
 _BEGIN, _END = "<!-- doubts -->\n", "<!-- end of doubts -->"
@@ -19,9 +19,9 @@ _BEGIN, _END = "<!-- doubts -->\n", "<!-- end of doubts -->"
 def table() -> str:
     """Markdown; numbers and details are dots."""
     rows = {}
-    for kind in get_args(DoubtKind):
+    for kind in get_args(IssueKind):
         detail = "FILE: cannot be read (\0)" if kind == "unreadable" else "\0"
-        said = sentence(Doubt(kind, 0.0, 0.0, detail))
+        said = sentence(Issue(kind, 0.0, 0.0, detail))
         said = re.sub(r"\d+(\.\d+)?", "…", said.replace("\0", "…"))
         rows.setdefault(remedy(kind), []).append(f"`{said}`")
     lines = ["| said of a pair | mostly | try |", "|---|---|---|"]
@@ -37,7 +37,7 @@ def main() -> None:
     if page == text:
         return
     if "--check" in sys.argv[1:]:
-        sys.exit(f"{PAGE.name}: its table of doubts is old; run python tools/doubts.py")
+        sys.exit(f"{PAGE.name}: its table of doubts is old; run python tools/issues.py")
     PAGE.write_text(page, encoding="utf-8", newline="\n")
 
 

@@ -3,11 +3,11 @@ import pytest
 
 from agalign.capture.reference import Reference
 from agalign.config import LocalSettings, Settings
-from agalign.judge.local import Shifts, _folds, _Gain, _is_one_to_one, _near, common_field, fitted_field
 from agalign.values import geometry
-from agalign.values.alignment import LocalField, Residual
+from agalign.values.alignment import DisplacementField, Residual
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping
+from agalign.verify.displacement_field import Shifts, _folds, _Gain, _is_one_to_one, _near, common_field, fitted_field
 
 from ..conftest import textured_pair
 
@@ -49,10 +49,10 @@ def test_far_from_all_measurements_the_field_goes_to_nothing() -> None:
 
 def test_folding_is_seen() -> None:
     flat = np.zeros((16, 21, 2))
-    assert _is_one_to_one(LocalField(32.0, flat), SIZE)
+    assert _is_one_to_one(DisplacementField(32.0, flat), SIZE)
     steep = flat.copy()
     steep[:, 10, 0] = -60
-    assert not _is_one_to_one(LocalField(32.0, steep), SIZE)
+    assert not _is_one_to_one(DisplacementField(32.0, steep), SIZE)
 
 
 def bent_pair(height: float) -> tuple[Raster, Raster]:
@@ -70,18 +70,18 @@ def bent_pair(height: float) -> tuple[Raster, Raster]:
 
 def test_displacements_between_bands_are_followed() -> None:
     fixed, moving = bent_pair(1.5)
-    found = Reference(fixed, Settings()).local.refine(moving, PixelMapping(geometry.identity()))
-    assert found.field is not None
+    result = Reference(fixed, Settings()).local.refine(moving, PixelMapping(geometry.identity()))
+    assert result.field is not None
     at = geometry.lattice(*SIZE, 17, 13)
-    before, after = (np.linalg.norm(d, axis=1) for d in (bump(at), found.field(at) - bump(at)))
+    before, after = (np.linalg.norm(d, axis=1) for d in (bump(at), result.field(at) - bump(at)))
     assert np.percentile(after, 95) < 0.35 * np.percentile(before, 95)
-    assert found.after_p95_px < found.before_p95_px
+    assert result.after_p95_px < result.before_p95_px
 
 
 def test_where_a_homography_is_enough_nothing_is_added() -> None:
     fixed, moving = bent_pair(0.0)
-    found = Reference(fixed, Settings()).local.refine(moving, PixelMapping(geometry.identity()))
-    assert found.field is None or np.abs(found.field(geometry.lattice(*SIZE, 17, 13))).max() < 0.05
+    result = Reference(fixed, Settings()).local.refine(moving, PixelMapping(geometry.identity()))
+    assert result.field is None or np.abs(result.field(geometry.lattice(*SIZE, 17, 13))).max() < 0.05
 
 
 def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:

@@ -11,7 +11,7 @@ _SAME_PX = 3
 
 
 @dataclass(frozen=True)
-class Rival:
+class AliasPeak:
     """The best of all other places."""
 
     shift_px: tuple[float, float]
@@ -20,7 +20,7 @@ class Rival:
     """Height of its correlation peak over that of the place found."""
 
 
-def rival_of(fixed: Field, moving: Field) -> Rival:
+def alias_peak(fixed: Field, moving: Field) -> AliasPeak:
     """The highest peak away from no shift of two windowed spectra (height, width) of images laid on each other."""
     surface = np.fft.fftshift(correlation_surfaces(fixed, moving))
     height, width = surface.shape
@@ -31,4 +31,4 @@ def rival_of(fixed: Field, moving: Field) -> Rival:
     there = int(surface.argmax())
     shift_px = float(there % width - column), float(there // width - row)
     best = float(surface.flat[there])
-    return Rival(shift_px, best / here if here > 0 else float("inf"))
+    return AliasPeak(shift_px, best / here if here > 0 else float("inf"))

@@ -12,11 +12,11 @@ from PIL import Image
 
 import agalign
 from agalign.cameras import rig_seed
-from agalign.cameras.carried_tags import band_tags
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import CAMERA
+from agalign.cameras.tag_transfer import band_tags
 from agalign.cameras.tiff_directory import (
     EXIF,
     GPS,
@@ -48,11 +48,11 @@ def both(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def bands_in(folder: Path) -> dict[str, Band]:
-    found = {}
+    result = {}
     for path in sorted(folder.glob("IMG_0001_*.tif")):
         (band,) = MicaSense().bands(path, read_tags(path), probe(path))
-        found[band.name] = band
-    return found
+        result[band.name] = band
+    return result
 
 
 def test_aligned_bands_look_like_one_camera(flight: Path, both: Path) -> None:
@@ -80,9 +80,9 @@ def test_vignetting_lies_where_the_band_was_moved_to(flight: Path, both: Path) -
         geometry.invert(np.array(truth["fixed_to_moving"])), lens.undistort(bands["NIR"].lens, centre)
     )
     expected = lens.distort(bands["Green"].lens, back) - data["output"]["crop"][:2]
-    found = read_tags(both / "IMG_0001_4.tif").numbers(CAMERA, "VignettingCenter")
-    np.testing.assert_allclose(found, expected, atol=0.2)
-    assert np.linalg.norm(np.array(found) - centre) > 3
+    result = read_tags(both / "IMG_0001_4.tif").numbers(CAMERA, "VignettingCenter")
+    np.testing.assert_allclose(result, expected, atol=0.2)
+    assert np.linalg.norm(np.array(result) - centre) > 3
 
 
 def test_three_readers_agree_on_place_time_and_band(flight: Path, both: Path) -> None:
@@ -108,12 +108,12 @@ def test_three_readers_agree_on_place_time_and_band(flight: Path, both: Path) ->
 
 
 def test_the_stack_says_what_is_true_of_all_its_bands(both: Path) -> None:
-    found = read_directories(both / "IMG_0001.tif")
-    assert found[GPS][1].data == b"N\0"
-    assert 36867 in found[EXIF]
-    assert 33434 not in found[EXIF]  # each band was exposed for a time of its own
-    assert 700 not in found[0]
-    assert found[0][272].data == b"RedEdge-M\0"
+    result = read_directories(both / "IMG_0001.tif")
+    assert result[GPS][1].data == b"N\0"
+    assert 36867 in result[EXIF]
+    assert 33434 not in result[EXIF]  # each band was exposed for a time of its own
+    assert 700 not in result[0]
+    assert result[0][272].data == b"RedEdge-M\0"
 
 
 def test_the_bands_pixels_are_the_stacks(both: Path) -> None:
@@ -140,28 +140,28 @@ def carried(tmp_path: Path, vendor: str, file: str, reference: str, grid: Output
 def test_djis_geometry_is_the_references(tmp_path: Path) -> None:
     grid = OutputGrid(20, 10, 200, 180, scale_xy=(2.0, 2.0))
     prefix = "DJI_20230607112233_0001_MS_"
-    found = carried(tmp_path, "Mavic 3", f"{prefix}NIR.TIF", f"{prefix}G.TIF", grid)
-    assert found.text(CAMERA, "BandName") == "NIR"
-    assert found.number(DJI, "CalibratedOpticalCenterX") == 2 * 80.5 - 0.5 - 20
-    assert found.number(DJI, "CalibratedOpticalCenterY") == 2 * 60.5 - 0.5 - 10
-    assert found.text(DJI, "DewarpData") == "2022-09-08;340,340,3,-5,-0.1,0.05,0,0,0"
-    assert found.numbers(DJI, "CalibratedHMatrix")[2] == 0.5
+    result = carried(tmp_path, "Mavic 3", f"{prefix}NIR.TIF", f"{prefix}G.TIF", grid)
+    assert result.text(CAMERA, "BandName") == "NIR"
+    assert result.number(DJI, "CalibratedOpticalCenterX") == 2 * 80.5 - 0.5 - 20
+    assert result.number(DJI, "CalibratedOpticalCenterY") == 2 * 60.5 - 0.5 - 10
+    assert result.text(DJI, "DewarpData") == "2022-09-08;340,340,3,-5,-0.1,0.05,0,0,0"
+    assert result.numbers(DJI, "CalibratedHMatrix")[2] == 0.5
 
 
 def test_an_upside_down_principal_point_counts_from_the_other_end(tmp_path: Path) -> None:
     files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
-    found = carried(tmp_path, "Sequoia", *files, OutputGrid(30, 20, 120, 90))
+    result = carried(tmp_path, "Sequoia", *files, OutputGrid(30, 20, 120, 90))
     # Stored: (160 - 80, 120 - 58.67) - (30, 20); seen upright it counts from 120, 90.
-    x, y = (v * 266.67 for v in found.numbers(CAMERA, "PrincipalPoint"))
+    x, y = (v * 266.67 for v in result.numbers(CAMERA, "PrincipalPoint"))
     assert (x, y) == pytest.approx((120 - (160 - 80.0 - 30), 90 - (120 - 58.667 - 20)), abs=0.01)
-    assert found.orientation == 3
+    assert result.orientation == 3
 
 
 def test_undistorted_pixels_have_no_distortion(tmp_path: Path) -> None:
-    found = carried(
+    result = carried(
         tmp_path, "RedEdge", "IMG_0007_4.tif", "IMG_0007_2.tif", OutputGrid(0, 0, 160, 120, undistorted=True)
     )
-    assert found.numbers(CAMERA, "PerspectiveDistortion") == (0.0,) * 5
+    assert result.numbers(CAMERA, "PerspectiveDistortion") == (0.0,) * 5
 
 
 def test_radiometry_takes_what_it_used(tmp_path: Path) -> None:
@@ -172,10 +172,10 @@ def test_radiometry_takes_what_it_used(tmp_path: Path) -> None:
         tmp_path / "IMG_0007_4.tif", {XMP: byte_string(packet(values, "sequences")), 50714: short(5)}, {}, {}
     )
     for radiometry in (False, True):
-        found = carried_from(tmp_path, radiometry=radiometry)
-        assert ((CAMERA, "VignettingCenter") in found.xmp) != radiometry
-        assert ((MICASENSE, "RadiometricCalibration") in found.xmp) != radiometry
-        assert (found.black_level is None) == radiometry
+        result = carried_from(tmp_path, radiometry=radiometry)
+        assert ((CAMERA, "VignettingCenter") in result.xmp) != radiometry
+        assert ((MICASENSE, "RadiometricCalibration") in result.xmp) != radiometry
+        assert (result.black_level is None) == radiometry
 
 
 def carried_from(folder: Path, *, radiometry: bool) -> Tags:
@@ -204,12 +204,12 @@ def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
     out = tmp_path / "out_GRE.TIF"
     tifffile.imwrite(out, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
     add_directories(out, tags.first, tags.exif, tags.gps)
-    (found,) = Sequoia().bands(out, read_tags(out), probe(out))
-    assert found.lens is not None
+    (result,) = Sequoia().bands(out, read_tags(out), probe(out))
+    assert result.lens is not None
     assert reference.lens is not None
-    assert not any(found.lens.distortion)
-    assert found.lens.fx_px == pytest.approx(reference.lens.fx_px, rel=1e-6)
-    assert found.lens.cx_px == pytest.approx(reference.lens.cx_px, abs=1e-3)
+    assert not any(result.lens.distortion)
+    assert result.lens.fx_px == pytest.approx(reference.lens.fx_px, rel=1e-6)
+    assert result.lens.cx_px == pytest.approx(reference.lens.cx_px, abs=1e-3)
 
 
 def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ def test_a_turned_principal_point_stays_on_its_pixel_at_any_resolution(tmp_path:
     """The centre of a pixel is at whole numbers: turned by 180 degrees, pixel p is size - 1 - p."""
     files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
     density, seen = 266.67, (80.0, 58.667)
-    found = carried(tmp_path, "Sequoia", *files, OutputGrid(0, 0, 320, 240, scale_xy=(2.0, 2.0)))
-    x, y = (v * 2 * density for v in found.numbers(CAMERA, "PrincipalPoint"))
+    result = carried(tmp_path, "Sequoia", *files, OutputGrid(0, 0, 320, 240, scale_xy=(2.0, 2.0)))
+    x, y = (v * 2 * density for v in result.numbers(CAMERA, "PrincipalPoint"))
     # Of an image of twice as many pixels: 2 (p + 0.5) - 0.5, whichever way it is seen.
     assert (x, y) == pytest.approx((2 * (seen[0] + 0.5) - 0.5, 2 * (seen[1] + 0.5) - 0.5), abs=0.02)

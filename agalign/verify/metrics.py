@@ -19,9 +19,9 @@ _BINS = 32
 _RANGE_MARGIN = 0.01
 _FINE = 64
 """Moving values are counted in 64ths of a bin before the spline is applied: exact to 1/128 bin."""
-_LEAST_PIXELS = 256
+_MIN_PIXELS = 256
 _ENOUGH_PIXELS = 250_000
-_LEAST_DEVIATION = 1e-9
+_MIN_DEVIATION = 1e-9
 _SSIM_WINDOW_PX = 11
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
 """Of SSIM, for a range of 1."""
@@ -48,7 +48,7 @@ class FixedSimilarity:
         both = self.fixed.valid & moving.valid
         overlap = float(both.mean())
         valid = both[self.lattice]
-        if np.count_nonzero(valid) < _LEAST_PIXELS:
+        if np.count_nonzero(valid) < _MIN_PIXELS:
             return {"overlap": overlap}
         one, other = (r.pixels[self.lattice][valid] for r in (self.fixed, moving))
         joint = joint_histogram(self.bins[valid], other, _range(moving.pixels, both))
@@ -184,7 +184,7 @@ def _ssim(one: _Gradient, other: _Gradient, valid: Mask, inside: Mask) -> float:
 def _standard(values: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
     """(mean, 1 / standard deviation); 0 for one that is none."""
     mean, deviation = values.mean(dtype=np.float64), values.std(dtype=np.float64)
-    return np.float32(mean), np.float32(1 / deviation if deviation > _LEAST_DEVIATION else 0.0)
+    return np.float32(mean), np.float32(1 / deviation if deviation > _MIN_DEVIATION else 0.0)
 
 
 def _blur(image: FloatImage) -> FloatImage:

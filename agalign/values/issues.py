@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-DoubtKind = Literal[
+IssueKind = Literal[
     "unreadable", "blank_reference", "blank_moving", "no_such_seed", "seed_asked_for",
     "no_contrast", "few_keypoints", "not_invertible", "corners_unknown",
     "folds", "retrieval", "corner_std_px", "few_windows", "coverage", "close_windows", "cluster", "residual_px",
@@ -13,10 +13,10 @@ DoubtKind = Literal[
 
 
 @dataclass(frozen=True)
-class Doubt:
+class Issue:
     """One thing that speaks against an alignment."""
 
-    kind: DoubtKind
+    kind: IssueKind
     value: float | None = None
     """What was measured, in the unit of the kind: px, a share, a count."""
     limit: float | None = None
@@ -25,7 +25,7 @@ class Doubt:
     """A file's own fault, the seed that was asked for, or what the share is of."""
 
 
-_SENTENCES: dict[DoubtKind, str] = {
+_SENTENCES: dict[IssueKind, str] = {
     "unreadable": "{detail}",
     "blank_reference": "the reference band is constant or all invalid",
     "blank_moving": "the moving band is constant or all invalid",
@@ -49,14 +49,14 @@ _SENTENCES: dict[DoubtKind, str] = {
 }
 
 
-def sentence(doubt: Doubt) -> str:
+def sentence(issue: Issue) -> str:
     """A doubt in words, without a full stop."""
-    return _SENTENCES[doubt.kind].format(value=doubt.value, limit=doubt.limit, detail=doubt.detail)
+    return _SENTENCES[issue.kind].format(value=issue.value, limit=issue.limit, detail=issue.detail)
 
 
-def explanation(doubts: Sequence[Doubt]) -> str | None:
+def explanation(issues: Sequence[Issue]) -> str | None:
     """The first of some doubts, which is what to look at, in words; None where there is none."""
-    return sentence(doubts[0]) if doubts else None
+    return sentence(issues[0]) if issues else None
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ _ELSEWHERE = Remedy(
     "if a lens was knocked or changed, align without --model; else look at the picture",
 )
 MISSING_BAND = Remedy("a band is missing that other captures of this camera have", "copy the files from the card again")
-_REMEDIES: dict[DoubtKind, Remedy] = {
+_REMEDIES: dict[IssueKind, Remedy] = {
     "unreadable": _UNREADABLE,
     "blank_reference": _BLANK, "blank_moving": _BLANK,
     "no_such_seed": _ASKED, "seed_asked_for": _ASKED,
@@ -108,6 +108,6 @@ _REMEDIES: dict[DoubtKind, Remedy] = {
 }  # fmt: skip
 
 
-def remedy(kind: DoubtKind) -> Remedy:
+def remedy(kind: IssueKind) -> Remedy:
     """What a doubt of this kind mostly comes of, and what to try."""
     return _REMEDIES[kind]

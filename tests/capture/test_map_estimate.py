@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.evidence import Look
-from agalign.capture.whole import most_probable
+from agalign.capture.map_estimate import map_estimate
+from agalign.capture.verification import WarpedPair
 from agalign.config import Settings
 from agalign.flight.rig import NO_FACTORS, Rig
 from agalign.values import geometry
@@ -42,14 +42,14 @@ def result(corners_px: np.ndarray, std_px: np.ndarray) -> JointResult:
     return JointResult(moved, 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, std, covariance)
 
 
-def corners_beside_the_mean(found: JointResult) -> np.ndarray:
+def corners_beside_the_mean(result: JointResult) -> np.ndarray:
     points = geometry.corners(*SIZE)
-    return np.asarray(geometry.apply(found.fixed_to_moving, points) - geometry.apply(MEAN, points))
+    return np.asarray(geometry.apply(result.fixed_to_moving, points) - geometry.apply(MEAN, points))
 
 
 def found_together(red: JointResult, nir: JointResult, the_rig: Rig | None) -> dict[str, JointResult]:
-    found = {"red": red, "nir": nir}
-    return most_probable(pairs(), found, dict.fromkeys(found, NOTHING), the_rig)
+    result = {"red": red, "nir": nir}
+    return map_estimate(pairs(), result, dict.fromkeys(result, NOTHING), the_rig)
 
 
 def test_corners_without_evidence_lie_where_the_rig_has_them_and_say_how_well() -> None:
@@ -92,12 +92,12 @@ def test_windows_mend_what_the_descriptors_left() -> None:
     fixed, moving = textured_pair(truth, *SIZE)
     images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, moving))
     pair = BandPair.of_images("nir", *images, {"identity": np.eye(3)}, Settings())
-    found = result(np.zeros((4, 2)), np.full((4, 2), 0.2))
+    results = result(np.zeros((4, 2)), np.full((4, 2), 0.2))
     left_px = np.array([0.2, -0.15, 0.1, 0.2, -0.2, 0.1, 0.15, -0.1])
     off = geometry.compose(truth, geometry.moving_corners(left_px, *SIZE))
-    before = replace(found, fixed_to_moving=off)
-    after = most_probable(
-        [pair], {"nir": before}, {"nir": Look.at(pair, pair.mapping(before.fixed_to_moving)).residual}, None
+    before = replace(results, fixed_to_moving=off)
+    after = map_estimate(
+        [pair], {"nir": before}, {"nir": WarpedPair.at(pair, pair.mapping(before.fixed_to_moving)).residual}, None
     )["nir"]
     assert geometry.corner_error_px(off, truth, *SIZE) > 0.2
     assert geometry.corner_error_px(after.fixed_to_moving, truth, *SIZE) < 0.08
@@ -111,7 +111,7 @@ def test_windows_in_a_line_say_nothing_of_what_lies_beside_it() -> None:
     shifts = np.array([0.3, 0.0]) + 0.02 * rng.normal(size=(20, 2))
     shown = Residual(centres, shifts, 0.3, 0.35, 1.0, np.full(20, 20.0))
     unsure = result(np.zeros((4, 2)), np.full((4, 2), 2.0))
-    found = most_probable(pairs()[:1], {"red": unsure}, {"red": shown}, None)["red"]
-    middle = geometry.apply(found.fixed_to_moving, [320.0, 240.0]) - geometry.apply(MEAN, [320.0, 240.0])
+    results = map_estimate(pairs()[:1], {"red": unsure}, {"red": shown}, None)["red"]
+    middle = geometry.apply(results.fixed_to_moving, [320.0, 240.0]) - geometry.apply(MEAN, [320.0, 240.0])
     np.testing.assert_allclose(middle, [0.3, 0.0], atol=0.05)
-    assert found.corner_std_px > 0.5
+    assert results.corner_std_px > 0.5
