@@ -28,13 +28,14 @@ TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 _READ_WHOLE_PX = 1 << 26
 """Images up to this are decoded at once where they are to be averaged."""
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
+_BLOCK_CACHE_BYTES = 256 * 2**20
+"""rasterio takes an integer as bytes. GDAL's default is 5 % of the machine's memory, which every worker would take."""
 GDAL_ENVIRONMENT = {
     "GDAL_PAM_ENABLED": "NO", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_NUM_THREADS": "ALL_CPUS",
-    "GDAL_CACHEMAX": 256,
+    "GDAL_CACHEMAX": _BLOCK_CACHE_BYTES,
 }  # fmt: skip
-"""No files beside the user's, and none of his taken for a part of an image: x.tif.ovr may hold anything, such as a
-description of other files or of a server. And megabytes of blocks that are kept, of which GDAL takes a twentieth of the
-machine's.
+"""GDAL neither writes files next to the user's nor reads any as part of an image: x.tif.ovr may hold anything, such as
+a description of other files or of a server.
 """
 _DRIVERS = {
     b"II*\0": "GTiff", b"MM\0*": "GTiff", b"II+\0": "GTiff", b"MM\0+": "GTiff", b"\xff\xd8\xff": "JPEG",

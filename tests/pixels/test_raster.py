@@ -5,9 +5,10 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from rasterio._env import get_gdal_config
 
 from agalign.errors import GeometryError
-from agalign.pixels.raster import crs_code, probe, read_for_alignment, transformed
+from agalign.pixels.raster import crs_code, open_raster, probe, read_for_alignment, transformed
 from agalign.values.capture import Band
 
 from ..conftest import textured_image
@@ -49,3 +50,11 @@ def test_a_file_says_what_it_holds(tmp_path: Path) -> None:
     assert info.descriptions == ("red", None)
     assert info.wavelengths_nm == (None, 840.0)
     assert info.georeference is None
+
+
+def test_gdal_caches_megabytes_of_blocks_while_a_raster_is_open(tmp_path: Path) -> None:
+    """GDAL_CACHEMAX as an integer is bytes: with 256 bytes GDAL decodes a block again for each line."""
+    with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", width=8, height=6, count=1, dtype="uint16"):
+        pass
+    with open_raster(tmp_path / "a.tif"):
+        assert get_gdal_config("GDAL_CACHEMAX") == 256 * 2**20
