@@ -6,6 +6,7 @@ import pytest
 from agalign.cameras import default_reference, known_cameras, rig_seed
 from agalign.cameras.base import rotation
 from agalign.cameras.generic import Generic
+from agalign.cameras.mapir import Mapir
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.pix4d import CAMERA
@@ -149,3 +150,9 @@ def test_default_reference() -> None:
     # Thermal is never it, also where no other band's wavelength is known.
     assert default_reference([band("LWIR", 11000), band("a"), band("b")]) == 1
     assert default_reference([band("band_1", 11000), band("band_2")]) == 1
+
+
+def test_an_alpha_band_that_is_not_the_last_shifts_no_index(tmp_path: Path) -> None:
+    info = RasterInfo(80, 64, ("uint8",) * 4, (None,) * 4, (None,) * 4, (None,) * 4, 2, None)
+    result = Mapir().bands(tmp_path / "survey.tif", Tags(make="MAPIR", model="Survey3"), info)
+    assert [(b.name, b.band_index) for b in result] == [("band_1", 1), ("band_3", 3), ("band_4", 4)]
