@@ -143,7 +143,8 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     it, signal SensorGainAdjustment / Irradiance is reflectance up to a factor that all bands share.
     """
     gain, exposure_us = tags.number(_DJI, "SensorGain"), tags.number(_DJI, "ExposureTime")
-    black = tags.number(_DJI, "BlackLevel") or tags.number(CAMERA, "BlackCurrent") or tags.black_level
+    black_levels = tags.number(_DJI, "BlackLevel"), tags.number(CAMERA, "BlackCurrent"), tags.black_level
+    black = next((level for level in black_levels if level is not None), None)
     if not gain or not exposure_us or black is None:
         return None
     irradiance = tags.number(_DJI, "Irradiance") or 0.0

@@ -1,5 +1,6 @@
 """What one real Mavic 3 Multispectral writes, and what it means."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -89,3 +90,19 @@ def test_pixels_that_are_dewarped_have_no_distortion(tmp_path: Path) -> None:
     bent = "2022-09-08;2170,2170,0,0,-0.1,0.05,0,0,0"
     result = [mavic_band(tmp_path, mavic_tags(DewarpData=bent, DewarpFlag=flag)).lens for flag in "01"]
     assert [lens.is_distorting(one) for one in result] == [True, False]
+
+
+@pytest.mark.parametrize("black", ["0", "4096"])
+def test_a_black_level_of_0_is_a_black_level(tmp_path: Path, black: str) -> None:
+    tags = mavic_tags(SensorGain="1", ExposureTime="2000", BlackLevel=black)
+    band = mavic_band(tmp_path, replace(tags, black_level=3200.0))
+    assert band.radiometry is not None
+    assert band.radiometry.black_level == float(black)
+
+
+def test_without_a_black_level_there_is_no_radiometry(tmp_path: Path) -> None:
+    tags = mavic_tags(SensorGain="1", ExposureTime="2000")
+    assert mavic_band(tmp_path, tags).radiometry is None
+    by_tiff_tag = mavic_band(tmp_path, replace(tags, black_level=0.0)).radiometry
+    assert by_tiff_tag is not None
+    assert by_tiff_tag.black_level == 0.0
