@@ -59,7 +59,8 @@ def resample_tile(
     x0, y0 = np.maximum(low, 0)
     x1, y1 = np.minimum(high, band.size_px)
     if x1 - x0 < 1 or y1 - y0 < 1:
-        return np.zeros(shape, dtype=band.dtype), np.zeros(shape, dtype=bool)
+        dtype = np.dtype(band.dtype if radiometry is None else np.float32)
+        return np.zeros(shape, dtype), np.zeros(shape, dtype=bool)
     with open_raster(band.path) as dataset:
         pixels, valid = read_window(dataset, band, int(x0), int(y0), int(x1 - x0), int(y1 - y0))
     if radiometry is not None:

@@ -14,7 +14,7 @@ from agalign.pixels.resample import resample, resample_tile, tiles, warped
 from agalign.products.layout import _largest_rectangle, common_area
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
-from agalign.values.capture import Band
+from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import Interpolation
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping
@@ -198,3 +198,12 @@ def test_booleans_stay_booleans() -> None:
         result, valid = resample(mask, np.ones_like(mask), positions, (80, 60), (0, 0), interpolation)
         assert result.dtype == bool
         np.testing.assert_array_equal(result[:58, :77][valid[:58, :77]], mask[2:, 3:][valid[:58, :77]])
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 500.0])
+def test_calibrated_pixels_are_float32_inside_and_outside_the_moving_image(tmp_path: Path, shift_px: float) -> None:
+    band = write_band(tmp_path / "b.tif", np.ones((100, 140), np.uint16))
+    mapping, tile = PixelMapping(geometry.translation(shift_px, 0)), Tile(0, 0, 30, 20)
+    assert resample_tile(band, mapping, tile, "cubic")[0].dtype == np.uint16
+    radiometry = Radiometry("radiance", 0.0, 65536.0, 1.0)
+    assert resample_tile(band, mapping, tile, "cubic", radiometry)[0].dtype == np.float32
