@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field, replace
+from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
 from types import MappingProxyType
@@ -386,11 +387,17 @@ def _ordered(bands: Sequence[Band], order: BandOrder) -> list[Band]:
 
 
 def _with_unique_band_names(bands: Sequence[Band]) -> list[Band]:
-    seen: dict[str, int] = defaultdict(int)
+    """The bands, renamed where a name repeats: the first band keeps it, the others get the next free number."""
+    taken = {b.name for b in bands}
+    kept: set[str] = set()
     unique = []
     for band in bands:
-        seen[band.name] += 1
-        unique.append(band if seen[band.name] == 1 else replace(band, name=f"{band.name}-{seen[band.name]}"))
+        name = band.name
+        if name in kept:
+            name = next(n for k in count(2) if (n := f"{band.name}-{k}") not in taken)
+        taken.add(name)
+        kept.add(name)
+        unique.append(replace(band, name=name))
     return unique
 
 
