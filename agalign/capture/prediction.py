@@ -21,7 +21,7 @@ def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment], capture
     """The mappings of a capture that are aligned, as the rig takes them."""
     good = {p.name: (p, a) for p in pairs if (a := result[p.name]).status == "aligned" and a.joint is not None}
     return Observation(
-        capture.seconds,
+        capture.time_s,
         {name: pair.in_file_px(a.fixed_to_moving) for name, (pair, a) in good.items()},
         {name: _std_there_px(pair, a) for name, (pair, a) in good.items()},
         None if capture.position is None else capture.position.altitude_m,

@@ -77,45 +77,52 @@ def read_panel(capture: Capture, albedos: Albedos) -> PanelReading:
 
 def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, float]:
     """By band, what a capture's radiance is to be multiplied by for reflectance: the light is linear in time between
-    the panels of its camera, and as the nearest one has it before the first and after the last.
+    the panels of its camera, and as the nearest one has it before the first and after the last. None where the time of
+    the capture or of all panels is unknown.
     """
-    mine = [
-        r for r in readings
-        if camera_key(r.capture) == camera_key(capture)
-        and abs(r.capture.seconds - capture.seconds) <= _SAME_OUTING_S
-    ]  # fmt: skip
+    time_s = capture.time_s
+    if time_s is None:
+        return {}
     result: dict[str, list[tuple[float, float]]] = {}
-    for reading in mine:
-        for band in reading.bands:
+    for panel_time_s, reading in _of_the_same_outing(readings, time_s):
+        for band in reading.bands if camera_key(reading.capture) == camera_key(capture) else ():
             if band.factor is not None:
-                result.setdefault(band.band.name, []).append((reading.capture.seconds, 1 / band.factor))
-    return {name: 1 / _at(capture.seconds, known) for name, known in result.items()}
+                result.setdefault(band.band.name, []).append((panel_time_s, 1 / band.factor))
+    return {name: 1 / _at(time_s, known) for name, known in result.items()}
 
 
 def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
     """The capture with its height above the ground, where its tags have only an altitude and a panel of the same hours
     was held on the ground.
     """
-    pose, position = capture.pose, capture.position
-    if pose is None or pose.height_m is not None or position is None or position.altitude_m is None:
+    pose, position, time_s = capture.pose, capture.position, capture.time_s
+    if pose is None or pose.height_m is not None or position is None or position.altitude_m is None or time_s is None:
         return capture
     panels = [
-        r.capture.position.altitude_m for r in readings
-        if abs(r.capture.seconds - capture.seconds) <= _SAME_OUTING_S
-        and r.capture.position is not None and r.capture.position.altitude_m is not None
+        r.capture.position.altitude_m for _, r in _of_the_same_outing(readings, time_s)
+        if r.capture.position is not None and r.capture.position.altitude_m is not None
     ]  # fmt: skip
     height_m = position.altitude_m - min(panels) + _PANEL_HEIGHT_M if panels else 0.0
     return replace(capture, pose=replace(pose, height_m=height_m)) if height_m > _MIN_HEIGHT_M else capture
 
 
-def _at(seconds: float, known: list[tuple[float, float]]) -> float:
+def _of_the_same_outing(readings: Iterable[PanelReading], time_s: float) -> list[tuple[float, PanelReading]]:
+    """(time, reading) of the panels that were taken within hours of a time; none whose own time is unknown."""
+    return [
+        (panel_time_s, r) for r in readings
+        if (panel_time_s := r.capture.time_s) is not None and abs(panel_time_s - time_s) <= _SAME_OUTING_S
+    ]  # fmt: skip
+
+
+def _at(time_s: float, known: list[tuple[float, float]]) -> float:
     times = sorted({t for t, _ in known})
-    return float(np.interp(seconds, times, [np.mean([v for t, v in known if t == time]) for time in times]))
+    return float(np.interp(time_s, times, [np.mean([v for t, v in known if t == time]) for time in times]))
 
 
 def _from_either_end(flight: Sequence[Capture]) -> tuple[list[Capture], list[Capture]]:
-    """The first half of a flight, and the second from its end."""
-    in_time = sorted(flight, key=lambda c: c.seconds)
+    """The first half of a flight, and the second from its end: in time, or as given where a time is unknown."""
+    times = [t for c in flight if (t := c.time_s) is not None]
+    in_time = [flight[i] for i in np.argsort(times, kind="stable")] if len(times) == len(flight) else list(flight)
     middle = (len(in_time) + 1) // 2
     return in_time[:middle], in_time[middle:][::-1]
 

@@ -54,8 +54,8 @@ _UNLIKE, _MIN_UNLIKE_PX = 6.0, 3.0
 class Observation:
     """The mappings of one capture, as they were found."""
 
-    seconds: float
-    """When it was taken, from any beginning."""
+    seconds: float | None
+    """When it was taken, from any beginning; None where that is unknown."""
     mappings: Mapping[str, Matrix]
     """fixed_to_moving by band, undistorted px of the files."""
     std_px: Mapping[str, float]
@@ -70,7 +70,7 @@ class Observation:
 class Seen:
     """A capture that a rig was learnt on."""
 
-    seconds: float
+    seconds: float | None
     altitude_m: float | None
     motion: tuple[float, float] | None
     factors: tuple[float, ...]
@@ -195,6 +195,8 @@ class Rig:
             other = _TYPICAL if guess is None else guess(seen, [*self.seen[:i], *self.seen[i + 1 :]])
             if other is not None:
                 missed.append((other.gap, float(((here @ (np.array(seen.factors) - other.factors)) ** 2).sum())))
+        if guess is not None and not missed:
+            return None, np.inf  # its error cannot be measured
         missed.sort()
         alike = [m for gap, m in missed if gap <= _AS_FAR * result.gap]
         enough = alike if len(alike) >= MIN_CAPTURES else [m for _, m in missed[:MIN_CAPTURES]]
@@ -341,9 +343,12 @@ _Guess = Callable[[Seen, Sequence[Seen]], Guessed | None]
 _TYPICAL = Guessed(np.zeros(FACTORS), 0.0)
 
 
-def around_in_time(like: Seen, seen: Sequence[Seen]) -> Guessed:
-    """Factors between those of the captures before and after."""
-    return _between([s.seconds for s in seen], like.seconds, seen)
+def around_in_time(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
+    """Factors between those of the captures before and after; None where no time is known."""
+    known = [s for s in seen if s.seconds is not None]
+    if like.seconds is None or not known:
+        return None
+    return _between([s.seconds or 0.0 for s in known], like.seconds, known)
 
 
 def around_in_height(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
@@ -352,7 +357,7 @@ def around_in_height(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
     if like.altitude_m is None or len(known) < MIN_CAPTURES:
         return None
     by_height = _between([s.altitude_m or 0.0 for s in known], like.altitude_m, known)
-    in_time = around_in_time(like, seen)
+    in_time = around_in_time(like, seen) or Guessed(np.zeros(FACTORS), 0.0)
     factors, std = in_time.factors, in_time.std
     factors[0], std[0] = by_height.factors[0], by_height.std[0]
     return Guessed(factors, by_height.gap, std)
@@ -367,7 +372,7 @@ def by_motion(like: Seen, seen: Sequence[Seen]) -> Guessed | None:
     # Where all flew alike nothing is said of other motions: the least slope that fits.
     scale = np.maximum(np.abs(x).max(axis=0), 1e-12)
     slope = np.linalg.lstsq(x / scale, np.array([s.factors[3:] for s in known]), rcond=1e-3)[0]
-    in_time = around_in_time(like, seen)
+    in_time = around_in_time(like, seen) or Guessed(np.zeros(FACTORS), 0.0)
     factors, std = in_time.factors, in_time.std
     factors[3:], std[3:] = (np.array([1.0, *like.motion]) / scale) @ slope, 0.0
     return Guessed(factors, float(np.linalg.norm(x[:, 1:] - like.motion, axis=1).min()), std)

@@ -205,12 +205,12 @@ class Capture:
         return next((b.panel for b in self.bands if b.panel is not None), None)
 
     @property
-    def seconds(self) -> float:
-        """When it was taken, seconds since 1970, UTC where no zone is named; 0 where that is not known."""
+    def time_s(self) -> float | None:
+        """Seconds from 1970 to the capture, UTC where `captured_at` names no time zone; None where it is unknown."""
         with suppress(ValueError):
             moment = datetime.fromisoformat(self.captured_at)
             return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-        return 0.0
+        return None
 
     @property
     def label(self) -> str:

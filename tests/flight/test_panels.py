@@ -108,3 +108,33 @@ def test_the_first_and_last_captures_are_looked_at(tmp_path: Path) -> None:
     assert all(b.panel is not None and b.panel.corners_px and b.panel.albedo for b in result[0].bands)
     (shown,) = {b.panel.serial for b in result[-1].bands if b.panel is not None}
     assert shown == "RP04-0000001-SY"
+
+
+def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
+    """A camera without a fix starts its clock at 1970: its panel is not of the hours of captures without a time."""
+    undated, of_1970 = reading("", 2.0), reading("1970-01-01T01:00:00", 2.0)
+    of = undated.capture.bands[0]
+    assert (undated.capture.time_s, of_1970.capture.time_s) == (None, 3600.0)
+    assert reflectance_factors(capture(of, ""), [of_1970]) == {}
+    assert reflectance_factors(of_1970.capture, [undated]) == {}
+    assert reflectance_factors(undated.capture, [undated]) == {}
+    assert reflectance_factors(of_1970.capture, [undated, of_1970]) == {"Green": pytest.approx(2.0)}
+
+
+def test_without_a_time_no_panel_is_at_the_height_of_the_ground() -> None:
+    band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
+    ground = PanelReading(capture(band, "1970-01-01T01:00:00", position=Position(52.0, 5.0, 93.0)), ())
+    high = capture(band, "", position=Position(52.0, 5.0, 112.0), pose=Pose(30.0))
+    assert with_height(high, [ground]) == high
+    undated = replace(ground, capture=replace(ground.capture, captured_at=""))
+    assert with_height(replace(high, captured_at="1970-01-01T01:00:00"), [undated]).pose == high.pose
+
+
+def test_one_unknown_time_leaves_the_captures_of_a_flight_in_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
+    moments = ["" if k == 10 else f"2026-06-21T10:00:{k:02d}" for k in range(20)]
+    flight = [replace(capture(band, moment), name=f"{k}") for k, moment in enumerate(moments)]
+    looked: list[str] = []
+    monkeypatch.setattr("agalign.flight.panels._looked_at", lambda one, _by_look: looked.append(one.name) or one)
+    with_panels(flight)
+    assert sorted(map(int, looked)) == [0, 1, 2, 17, 18, 19]

@@ -27,9 +27,12 @@ def mappings(distance_px: float, tilt: tuple[float, float] = (0.0, 0.0), noise: 
     return result
 
 
-def observation(seconds: float, *plane: object, without: tuple[str, ...] = (), **options: object) -> Observation:
+def observation(
+    seconds: float | None, *plane: object, without: tuple[str, ...] = (), altitude_m: float | None = None,
+    **options: object,
+) -> Observation:  # fmt: skip
     known = {b: m for b, m in mappings(*plane, **options).items() if b not in without}
-    return Observation(seconds, known, dict.fromkeys(known, 0.05))
+    return Observation(seconds, known, dict.fromkeys(known, 0.05), altitude_m)
 
 
 def flight(count: int = 8, spread_px: float = 1.0, noise: float = 0.03) -> list[Observation]:
@@ -239,3 +242,32 @@ def test_what_is_expected_of_a_band_of_large_pixels_is_told_in_px_of_the_referen
     one, other = (r.expectation("NIR", r.mean["NIR"]) for r in (rig, coarse))
     np.testing.assert_allclose(other.covariance, 100 * one.covariance, rtol=1e-6)
     np.testing.assert_allclose(other.by_factor, 10 * one.by_factor, rtol=1e-6, atol=1e-9)
+
+
+def test_a_capture_without_a_time_is_not_between_captures_in_time() -> None:
+    """The drone sinks from the mean: time 0 would be its first capture, which is far from a capture of unknown time."""
+    sinking = [observation(10.0 * k, 0.5 * k) for k in range(9)]
+    rig = learn_rig(sinking, SIZE, {})
+    assert rig is not None
+    prediction = rig.predict("NIR", Observation(None, {}, {}))
+    assert prediction.source == "flight"
+    np.testing.assert_array_equal(prediction.fixed_to_moving, rig.mean["NIR"])
+    by_height = rig.predict("NIR", Observation(None, {}, {}, altitude_m=100.0))
+    assert by_height.source == "flight"
+
+
+@pytest.mark.parametrize("known_times", [0, 1, 2])
+def test_too_few_known_times_say_nothing_of_a_capture_between_them(known_times: int) -> None:
+    sinking = [observation(10.0 * k if k < known_times else None, 0.5 * k, altitude_m=90.0 - k) for k in range(9)]
+    rig = learn_rig(sinking, SIZE, {})
+    assert rig is not None
+    again = Rig.from_json(rig.as_json(), {})
+    assert [s.seconds for s in again.seen] == [s.seconds for s in rig.seen] == [c.seconds for c in sinking]
+    for band in BASELINES:
+        unseen = rig.predict(band, Observation(35.0, {}, {}))
+        # Without the times the error is the typical one of the flight, not what few captures happen to show.
+        assert unseen.std_px > 0.5 * rig.missed_px(band, by_neighbours=False)
+    # The height is known without the time, and predicts the capture.
+    by_height = rig.predict("NIR", Observation(None, {}, {}, altitude_m=86.5))
+    assert by_height.source == "neighbours"
+    assert distance_px(by_height.fixed_to_moving, mappings(1.75)["NIR"], SIZE) < 0.3
