@@ -57,13 +57,22 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
     import atheris
 
     with atheris.instrument_imports(include=["agalign.cameras", "agalign.values", "tifffile", "defusedxml", "xml"]):
-        from agalign.cameras import carried_tags, discover, known, metadata, pix4d, tiff_directory, xmp
+        from agalign.cameras import (
+            discover,
+            known_cameras,
+            metadata,
+            pix4d,
+            read_files,
+            tag_transfer,
+            tiff_directory,
+            xmp,
+        )
     from agalign.errors import AgalignError
     from agalign.pixels.raster import RasterInfo
 
     for library in ("tifffile", "rasterio", "PIL"):
         logging.getLogger(library).setLevel(logging.CRITICAL + 1)
-    cameras = known.known_cameras(None)
+    cameras = known_cameras()
     info = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
     scratch = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     file = scratch / "IMG_0001_1.tif"
@@ -76,7 +85,7 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
             tags = metadata.Tags(make=make, model="x", xmp=packet.values())
             camera = next(c for c in cameras if c.recognises(tags))
             bands = camera.bands(file, tags, info)
-            camera.placed(bands, [tags] * len(bands))
+            camera.with_shared_rig(bands, [tags] * len(bands))
             camera.pose(tags)
             camera.motion(tags)
             pix4d.panel_in(tags, (1280, 960))
@@ -86,10 +95,10 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
     def on_tags(data: bytes) -> None:
         file.write_bytes(data)
         with contextlib.suppress(AgalignError):
-            discover._examine(file, cameras, discover.DiscoverOptions())
+            read_files.read_file(file, cameras, discover.DiscoverOptions())
         with contextlib.suppress(AgalignError):
             metadata.read_tags(file)
-        carried_tags._directories(file)
+        tag_transfer._directories(file)
         with contextlib.suppress(ValueError):
             tiff_directory.check_directories(file)
 

@@ -1,6 +1,27 @@
-"""What the files of a folder say: tags, one module a vendor, and captures found by them."""
+"""What camera files contain: tags, one module per vendor, and the captures of a folder.
+
+The first camera that recognises a file reads it; `generic` reads the rest.
+"""
 
 from agalign.cameras.base import Camera, default_reference, other_rig_seed, rig_seed
-from agalign.cameras.known import camera_of, known_cameras
+from agalign.cameras.dji import Dji
+from agalign.cameras.generic import Generic
+from agalign.cameras.mapir import Mapir
+from agalign.cameras.metadata import Tags
+from agalign.cameras.micasense import MicaSense
+from agalign.cameras.parrot import Sequoia
+from agalign.cameras.sentera import Sentera
 
 __all__ = ["Camera", "camera_of", "default_reference", "known_cameras", "other_rig_seed", "rig_seed"]
+
+
+def known_cameras(pattern: str | None = None) -> tuple[Camera, ...]:
+    """The cameras in the order in which they are tried, `generic` last. With a `pattern` only `generic`, which reads
+    file names instead of tags.
+    """
+    return (Generic(pattern),) if pattern else (MicaSense(), Dji(), Sequoia(), Sentera(), Mapir(), Generic())
+
+
+def camera_of(tags: Tags) -> Camera:
+    """The camera that wrote a file's tags."""
+    return next(camera for camera in known_cameras() if camera.recognises(tags))

@@ -1,6 +1,6 @@
-"""What agalign asks of a camera, and what all of them have in common.
+"""The interface of a camera, and the functions that the cameras share.
 
-A new camera is one module with one subclass of `Camera`, named in `known.py`, and one entry in the test of vendors.
+A new camera is one module with one subclass of `Camera`, listed in `known_cameras`, and one entry in the vendors' test.
 """
 
 import re
@@ -14,7 +14,7 @@ import numpy as np
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import TagTransfer
 from agalign.cameras.xmp import Name
-from agalign.errors import GeometryError
+from agalign.errors import GeometryError, NoSuchBandError
 from agalign.pixels.raster import RasterInfo
 from agalign.values import geometry
 from agalign.values.capture import Band, Pose
@@ -22,19 +22,21 @@ from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 
 _PREFERRED_REFERENCES = ("green", "gre", "g")
+_GREEN_NM = 550.0
 _THERMAL = ("lwir", "thermal")
-_SHORTEST_THERMAL_NM = 3000.0
+_MIN_THERMAL_NM = 3000.0
+"""Below, cameras see reflected sunlight."""
 _COLOURS = ("Red", "Green", "Blue")
 
 
 class Camera(ABC):
-    """How one family of cameras groups and names its bands, and what its tags say of lenses and rig."""
+    """How one family of cameras groups and names its bands, and how its tags describe lenses and rig."""
 
     name: str
     capture_ids: tuple[Name, ...] = ()
-    """Where an id stands that the bands of a capture share."""
+    """The XMP values that identify a capture, tried in turn."""
     flight_ids: tuple[Name, ...] = ()
-    """Where one stands that a flight shares."""
+    """The XMP values that identify a flight, tried in turn."""
     tag_transfer: TagTransfer = TagTransfer()
     """What becomes of its tags when a band is written on the reference's grid."""
 
@@ -54,17 +56,17 @@ class Camera(ABC):
         """Files with the same key (and the same camera and folder) are one capture."""
         return tags.first_text(self.capture_ids) or self.capture_name(path)
 
-    def placed(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
-        """The bands of a capture, those among them that only the tags of its other files place, too."""
+    def with_shared_rig(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
+        """The bands of a capture, with `to_rig` where only the tags of another of its files hold it."""
         return list(bands)
 
     def pose(self, tags: Tags) -> Pose | None:
-        """How it hung; None where the tags do not tell."""
+        """The camera's orientation and height; None where the tags do not hold them."""
         return None
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
-        """How fast the ground passes through the image, right and down, in focal lengths a second; None where the tags
-        do not tell.
+        """Speed of the ground through the image, right and down, in focal lengths per second; None where the tags do
+        not hold it.
         """
         return None
 
@@ -74,28 +76,46 @@ class Camera(ABC):
 
 
 def default_reference(bands: Sequence[Band]) -> int:
-    """Index of the green band; else of the one nearest to 550 nm; else the first. Never a thermal one."""
-    seeing = [i for i, b in enumerate(bands) if not is_thermal(b)]
-    for index in seeing:
+    """Index of the green band; else of the one nearest to 550 nm; else the first. A thermal one only if all are."""
+    reflective = [i for i, b in enumerate(bands) if not is_thermal(b)]
+    for index in reflective:
         if re.split(r"[-_ ]", bands[index].name.lower())[0] in _PREFERRED_REFERENCES:
             return index
-    known = [(abs(nm - 550), i) for i in seeing if (nm := bands[i].wavelength_nm) is not None]
-    return min(known)[1] if known else next(iter(seeing), 0)
+    known = [(abs(nm - _GREEN_NM), i) for i in reflective if (nm := bands[i].wavelength_nm) is not None]
+    return min(known)[1] if known else next(iter(reflective), 0)
+
+
+def reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> int:
+    """Index of the band with the name `wanted`, in any case; of the default where that is None or 'auto'.
+
+    Raises NoSuchBandError, with `path`, where no band has the name.
+    """
+    if wanted is None or wanted.lower() == "auto":
+        return default_reference(bands)
+    for index, band in enumerate(bands):
+        if band.name.lower() == wanted.lower():
+            return index
+    raise NoSuchBandError(f"{path}: no band '{wanted}' for the reference; this capture has {listed(bands)}")
+
+
+def listed(bands: Sequence[Band]) -> str:
+    """The names of some bands, for a message."""
+    return ", ".join(b.name for b in bands)
 
 
 def is_thermal(band: Band) -> bool:
-    """True for a band that sees how warm things are."""
-    long = band.wavelength_nm is not None and band.wavelength_nm >= _SHORTEST_THERMAL_NM
+    """True for a band of the thermal infrared."""
+    long = band.wavelength_nm is not None and band.wavelength_nm >= _MIN_THERMAL_NM
     return long or band.name.lower().startswith(_THERMAL)
 
 
 def rig_seed(reference: Band, moving: Band) -> Matrix | None:
-    """fixed_to_moving between undistorted pixels from metadata alone; None where it does not tell."""
+    """fixed_to_moving between undistorted pixels from metadata alone; None where the tags do not hold it."""
     return _through_rig(reference.to_rig, moving.to_rig)
 
 
 def other_rig_seed(reference: Band, moving: Band) -> Matrix | None:
-    """The same by the other tags that some makers write."""
+    """The same by the second set of tags that some makers write; None where both bands lack it."""
     if reference.other_to_rig is None and moving.other_to_rig is None:
         return None
     return _through_rig(*(b.to_rig if b.other_to_rig is None else b.other_to_rig for b in (reference, moving)))
@@ -111,7 +131,7 @@ def _through_rig(reference: Matrix | None, moving: Matrix | None) -> Matrix | No
 
 
 def band_of(path: Path, info: RasterInfo, name: str, index: int = 1) -> Band:
-    """A band with what its file's raster says."""
+    """A band with the properties of its raster."""
     return Band(
         name=name,
         path=path,
@@ -131,7 +151,7 @@ def band_of(path: Path, info: RasterInfo, name: str, index: int = 1) -> Band:
 def colour_bands(
     path: Path, info: RasterInfo, lens: Lens | None = None, to_rig: Matrix | None = None
 ) -> tuple[Band, ...]:
-    """The bands of the colour photograph that a camera takes beside its narrow ones."""
+    """The bands of the colour photograph that a camera takes with its multispectral bands."""
     names = [f"RGB {colour}" for colour in _COLOURS] if len(info.dtypes) >= 3 else ["RGB"]
     return tuple(
         replace(band_of(path, info, name, i), lens=lens, to_rig=to_rig, one_lens=True, companion=True)
@@ -154,7 +174,7 @@ def rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
 
 
 def rays_to_rig(lens: Lens | None, camera_to_rig: Matrix) -> Matrix | None:
-    """to_rig of a band whose camera is turned by R: R K^-1; None where the tags make no camera."""
+    """to_rig of a band whose camera is rotated by R: R K^-1; None without a lens or where K is singular."""
     try:
         return None if lens is None else np.asarray(camera_to_rig @ geometry.invert(lens.matrix))
     except GeometryError:

@@ -99,7 +99,7 @@ class Dji(Camera):
             replace(band, lens=lens, to_rig=calibrated, other_to_rig=by_centres, radiometry=_radiometry(tags)),
         )  # fmt: skip
 
-    def placed(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
+    def with_shared_rig(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
         to_colour = next((m for t in tags if _is_mavic_3(t) and (m := _matrix(t, _TO_COLOUR)) is not None), None)
         if to_colour is None:
             return list(bands)

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from agalign.cameras.known import camera_of
+from agalign.cameras import camera_of
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.pix4d import FromSource
 from agalign.cameras.tiff_directory import (

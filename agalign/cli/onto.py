@@ -57,7 +57,8 @@ def onto(
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
         from agalign.batch import RunOptions
-        from agalign.cameras.discover import FolderScan, captures_onto
+        from agalign.cameras.discover import FolderScan
+        from agalign.cameras.mosaics import captures_onto
         from agalign.config import FlightSettings, JointSettings, LocalSettings, Settings, WriteSettings
 
         target = out or reference.absolute().parent / f"{reference.stem}-aligned"

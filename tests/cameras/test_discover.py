@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agalign.cameras import metadata
-from agalign.cameras.discover import DiscoverOptions, _with_unique_band_names, discover
+from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import read_tags
+from agalign.cameras.naming import with_unique_band_names
 from agalign.cameras.tiff_directory import EXIF, add_directories, rational, read_directories, text
 from agalign.errors import InputError, NoSuchBandError
 from agalign.synthetic import flight as synthetic
@@ -257,7 +258,7 @@ def test_several_processes_find_what_one_finds(tmp_path: Path) -> None:
 @given(st.lists(st.sampled_from(["a", "a-2", "a-3", "a-2-2", "b"]), max_size=8))
 def test_band_names_of_a_capture_are_unique(names: list[str]) -> None:
     bands = [Band(name, Path("x.tif"), 1, 8, 8, "uint16") for name in names]
-    unique = [b.name for b in _with_unique_band_names(bands)]
+    unique = [b.name for b in with_unique_band_names(bands)]
     assert len(set(unique)) == len(names)
     # The first band of each name keeps it.
     assert {name: unique[names.index(name)] for name in names} == {name: name for name in names}
@@ -270,4 +271,4 @@ def test_band_names_of_a_capture_are_unique(names: list[str]) -> None:
 )
 def test_repeated_band_names_are_numbered_past_names_in_use(names: str, expected: str) -> None:
     bands = [Band(name, Path("x.tif"), 1, 8, 8, "uint16") for name in names.split()]
-    assert [b.name for b in _with_unique_band_names(bands)] == expected.split()
+    assert [b.name for b in with_unique_band_names(bands)] == expected.split()

@@ -65,13 +65,13 @@ def test_the_mavic_s_colour_photograph_goes_through_the_designed_frame(tmp_path:
     nir = mavic_band(tmp_path, mavic_tags(RelativeOpticalCenterX="0", RelativeOpticalCenterY="0"))
     rgb = Dji().bands(photo, colour, probe(photo))
     assert all(b.to_rig is None for b in rgb)
-    placed = {b.name: b for b in Dji().placed([nir, *rgb], [mavic_tags(), colour])}
+    placed = {b.name: b for b in Dji().with_shared_rig([nir, *rgb], [mavic_tags(), colour])}
     seed = rig_seed(nir, placed["RGB Red"])
     np.testing.assert_allclose(geometry.apply(seed, np.array([[1296.0, 972.0]])), [[2639.9, 1978.0]], atol=0.01)
     assert geometry.local_scale(seed, 2592, 1944)[-1] == pytest.approx(1.7162)
     # The Phantom's matrix of that name is none such.
     phantom = Tags(**{**vars(mavic_tags()), "model": "FC6360"})
-    assert Dji().placed([nir, *rgb], [phantom, colour])[1].to_rig is None
+    assert Dji().with_shared_rig([nir, *rgb], [phantom, colour])[1].to_rig is None
 
 
 @pytest.mark.parametrize(("roll", "yaw"), [("0.00", "30"), ("+180.00", "-150")])

@@ -15,8 +15,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
-from agalign.cameras.known import known_cameras
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.tag_transfer import capture_tags
 from agalign.cameras.xmp import Packet
@@ -110,7 +110,7 @@ def test_any_packet(values: dict[str, str], make: str) -> None:
     tags = Tags(make=make, model="x", xmp=packet.values())
     camera = next(c for c in known_cameras(None) if c.recognises(tags))
     bands = camera.bands(Path("IMG_0001_1.tif"), tags, INFO)
-    camera.placed(bands, [tags])
+    camera.with_shared_rig(bands, [tags])
     camera.pose(tags)
     camera.motion(tags)
     assert Packet.parse(packet.serialised()).values() == packet.values()

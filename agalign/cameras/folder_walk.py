@@ -1,0 +1,70 @@
+"""The image files below a folder, in natural order, without those of earlier outputs."""
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from agalign.cameras.scan import Problem
+from agalign.errors import InputError
+from agalign.pixels.raster import JPEG_SUFFIXES, TIFF_SUFFIXES
+from agalign.values.files import RUN_FILE
+
+_SUFFIXES = TIFF_SUFFIXES | JPEG_SUFFIXES
+_SYSTEM_FOLDERS = {"lost+found", "System Volume Information", "$RECYCLE.BIN"}
+"""Operating systems create these on a memory card."""
+
+
+def check_folder(folder: Path) -> None:
+    """Raises InputError where `folder` is not a folder that can be listed."""
+    if folder.as_posix().startswith("/vsi"):
+        raise InputError(f"{folder}: is one of GDAL's virtual paths; mount or unpack it, and give the folder")
+    try:
+        if folder.is_dir():
+            return
+        what = "is a file; give the folder it is in" if folder.exists() else "does not exist"
+    except OSError as error:
+        what = f"cannot be looked into ({error.strerror or error})"
+    raise InputError(f"{folder}: {what}")
+
+
+def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Problem]]:
+    """(the image files below a folder, the folders that cannot be listed)."""
+    skipped = {p.resolve() for p in skip}
+    result: list[Path] = []
+    problems: list[Problem] = []
+
+    def refuse(error: OSError) -> None:
+        path = Path(error.filename)
+        problems.append(Problem(path, InputError(f"{path}: cannot be looked into ({error.strerror}); left out")))
+
+    for parent, folders, names in os.walk(folder, onerror=refuse):
+        here = Path(parent)
+        folders[:] = sorted(d for d in folders if _is_input_folder(here / d, skipped))
+        images = [n for n in names if Path(n).suffix.lower() in _SUFFIXES and not n.startswith(".")]
+        result.extend(here / n for n in sorted(images, key=natural_order))
+    return result, problems
+
+
+def natural_order(name: str) -> list[tuple[bool, int, str]]:
+    """Sort key that puts `_2` before `_10`."""
+    parts = re.split(r"(\d+)", name)
+    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part.lower()) for part in parts]
+
+
+def _is_input_folder(folder: Path, skipped: set[Path]) -> bool:
+    if folder.name.startswith(".") or folder.name in _SYSTEM_FOLDERS or folder.resolve() in skipped:
+        return False
+    return not _is_output_folder(folder)
+
+
+def _is_output_folder(folder: Path) -> bool:
+    """True for the output of an earlier run inside the input folder: its stacks are not captures.
+
+    A run writes RUN_FILE before anything else, so the output of a killed run is recognised too.
+    """
+    try:
+        entries = {entry.name for entry in os.scandir(folder)}
+    except OSError:
+        return False
+    return RUN_FILE in entries or {"summary.csv", "index.html"} <= entries

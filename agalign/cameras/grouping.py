@@ -1,0 +1,157 @@
+"""From image files to captures: which files belong to one capture, its reference, and the bands it lacks."""
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from agalign.cameras import camera_of
+from agalign.cameras.base import listed, reference_index
+from agalign.cameras.folder_walk import natural_order
+from agalign.cameras.metadata import Tags
+from agalign.cameras.naming import with_unique_band_names
+from agalign.cameras.read_files import ImageFile
+from agalign.cameras.scan import DiscoverOptions, Problem
+from agalign.errors import InputError
+from agalign.values.capture import Band, CameraIdentity, Capture
+from agalign.values.choices import BandOrder
+
+_NAMELESS = "capture"
+"""Name of a capture where the names of its files leave none, such as `_1.tif`."""
+
+_GroupKey = tuple[str, str, str]
+"""(camera, folder of the capture, the camera's capture key)."""
+_CameraModel = tuple[str, ...]
+
+
+def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
+    """The files of each capture: same camera, folder and key. Files of colour photographs come last."""
+    groups: dict[_GroupKey, list[ImageFile]] = defaultdict(list)
+    for file in files:
+        key = file.path.name if file.is_whole_capture else file.camera.capture_key(file.path, file.tags)
+        groups[file.camera.name, str(file.camera.capture_folder(file.path)), key].append(file)
+    _add_files_without_id(groups)
+    return [sorted(group, key=lambda f: f.bands[0].companion) for group in groups.values()]
+
+
+def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
+    """Add files whose damaged tags lost the capture's id to the group that has the id and the same file name."""
+    by_name: dict[_GroupKey, _GroupKey] = {}
+    for key, group in groups.items():
+        names = {f.camera.capture_name(f.path) for f in group}
+        if len(names) == 1 and not group[0].is_whole_capture and names != {key[-1]}:
+            by_name.setdefault((key[0], key[1], next(iter(names))), key)
+    for key in list(groups):
+        with_id = by_name.get(key)
+        if with_id is not None and not groups[key][0].is_whole_capture:
+            groups[with_id].extend(groups.pop(key))
+            groups[with_id].sort(key=lambda f: natural_order(f.path.name))
+
+
+def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
+    """Files of one capture that a pattern takes for the same band: it splits their names in the wrong place."""
+    first: dict[str, Path] = {}
+    result = []
+    for file in files:
+        for name in {b.name for b in file.bands}:
+            if first.setdefault(name, file.path) != file.path:
+                text = (
+                    f"{file.path}: is band '{name}' of one capture with {first[name].name} by the pattern "
+                    f"'{pattern}'; give one that tells them apart"
+                )
+                result.append(Problem(file.path, InputError(text)))
+    return result
+
+
+def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOptions) -> Capture:
+    """The capture of a group of files below the input `folder`.
+
+    Raises InputError where fewer than two bands are left to align, NoSuchBandError where it lacks the reference band.
+    """
+    first = files[0]
+    bands = with_unique_band_names(_bands_to_align(files, options.bands))
+    bands = first.camera.with_shared_rig(bands, [f.tags for f in files])
+    if options.ignore_metadata:
+        bands = [replace(b, lens=None, to_rig=None, other_to_rig=None) for b in bands]
+    reference = bands[reference_index(bands, options.reference, first.path)]
+    bands = _in_order(bands, options.order)
+    # The reference's tags are the capture's; a damaged file has none.
+    tags = next((f.tags for f in files if f.path == reference.path and f.tags != Tags()), first.tags)
+    camera = camera_of(tags)
+    serials = sorted({f.tags.serial for f in files if f.tags.serial})
+    return Capture(
+        name=(first.path.stem if len(files) == 1 else first.camera.capture_name(first.path)) or _NAMELESS,
+        folder=_relative_folder(first.camera.capture_folder(first.path), folder),
+        bands=tuple(bands),
+        reference_index=next(i for i, b in enumerate(bands) if b is reference),
+        camera=CameraIdentity(tags.make, tags.model, "+".join(serials)),
+        capture_id=tags.first_text(camera.capture_ids),
+        flight_id=tags.first_text(camera.flight_ids),
+        captured_at=tags.captured_at,
+        position=tags.position,
+        pose=camera.pose(tags),
+        motion=camera.motion(tags),
+    )
+
+
+def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Band]:
+    """The bands of these names (all if there are none). Raises InputError where there is nothing to align."""
+    first = files[0]
+    bands = [b for file in files for b in file.bands]
+    if names:
+        wanted = {name.lower() for name in names}
+        bands = [b for b in bands if b.name.lower() in wanted]
+        if len(bands) < 2:
+            raise InputError(f"{first.path}: of this capture, --bands leaves {listed(bands) or 'nothing'}")
+    if len(bands) < 2:
+        raise InputError(f"{first.path}: a band with no companion; name files '<capture>_<band>.tif' or give --pattern")
+    if len(files) == 1 and first.bands[0].one_lens:
+        raise InputError(f"{first.path}: its bands come through one lens; there is nothing to align")
+    return bands
+
+
+def _in_order(bands: Sequence[Band], order: BandOrder) -> list[Band]:
+    if order == "wavelength":
+        return sorted(bands, key=lambda b: math.inf if b.wavelength_nm is None else b.wavelength_nm)
+    return sorted(bands, key=lambda b: natural_order(b.name)) if order == "name" else list(bands)
+
+
+def _relative_folder(capture_folder: Path, folder: Path) -> Path:
+    """Relative to the input folder, never above it: the input may be one of several folders of a capture's bands."""
+    return capture_folder.relative_to(folder) if capture_folder.is_relative_to(folder) else Path()
+
+
+def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
+    """The captures, each with the names of the bands that at least half of its camera model's captures have and it
+    lacks. A multiband file is complete.
+    """
+    usual = _usual_bands([c for c in captures if _has_a_file_per_band(c)])
+    result = []
+    for capture in captures:
+        own = {b.name for b in capture.bands}
+        expected = usual[_camera_model(capture)] if _has_a_file_per_band(capture) else ()
+        missing = tuple(name for name in expected if name not in own)
+        result.append(replace(capture, missing_bands=missing) if missing else capture)
+    return result
+
+
+def _usual_bands(captures: Sequence[Capture]) -> Mapping[_CameraModel, list[str]]:
+    """Names of the bands that at least half of a model's captures have: rarer ones come from damaged tags."""
+    members = Counter(map(_camera_model, captures))
+    counts: dict[_CameraModel, Counter[str]] = defaultdict(Counter)
+    for capture in captures:
+        counts[_camera_model(capture)].update(b.name for b in capture.bands)
+    return {m: [name for name, n in names.items() if 2 * n >= members[m]] for m, names in counts.items()}
+
+
+def _has_a_file_per_band(capture: Capture) -> bool:
+    return len({b.path for b in capture.bands}) > 1
+
+
+def _camera_model(capture: Capture) -> _CameraModel:
+    """Make and model, or the folder where no tag names a model. Not the serial numbers: a dual camera that lost all
+    bands of one half lacks one of them.
+    """
+    camera = capture.camera
+    return (camera.make, camera.model) if camera.model else (capture.folder.as_posix(),)

@@ -1,0 +1,116 @@
+"""The tags and bands of many image files, read by one process or by several."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+from pebble import ProcessExpired, ProcessPool
+
+from agalign.cameras import known_cameras
+from agalign.cameras.base import Camera
+from agalign.cameras.metadata import Tags, read_tags
+from agalign.cameras.pix4d import panel_in
+from agalign.cameras.scan import DiscoverOptions, Problem
+from agalign.errors import UnreadableFileError
+from agalign.pixels.radiometry import is_physical
+from agalign.pixels.raster import TIFF_SUFFIXES, RasterInfo, probe
+from agalign.values.capture import Band
+from agalign.values.processes import follow_parent, without_interrupt_key
+
+_FILES_PER_TASK = 100
+"""A file that kills its process takes the others of its task with it; smaller tasks cost more per file."""
+_MIN_FILES_FOR_PROCESSES = 1000
+"""Reading fewer takes less time than starting the processes."""
+_PHOTOGRAPH_CHANNELS = (3, 4)
+"""RGB, or RGB with alpha."""
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """One image file with what its camera's tags say."""
+
+    path: Path
+    camera: Camera
+    tags: Tags
+    bands: tuple[Band, ...]
+    """Empty where the file holds no band that was asked for."""
+
+    @property
+    def is_whole_capture(self) -> bool:
+        """True for a file of several bands that each came through a lens of their own."""
+        return len(self.bands) > 1 and not self.bands[0].one_lens
+
+
+def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[ImageFile | Problem]:
+    """Each file with its bands, or why it cannot be used, in the order of `paths`."""
+    tasks = [paths[i : i + _FILES_PER_TASK] for i in range(0, len(paths), _FILES_PER_TASK)]
+    processes = min(options.jobs, len(tasks))
+    if processes > 1 and len(paths) >= _MIN_FILES_FOR_PROCESSES:
+        yield from _read_in_processes(tasks, options, processes)
+        return
+    for task in tasks:
+        yield from _read_task(task, options)
+
+
+def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> ImageFile:
+    """One file with its bands. Raises UnreadableFileError."""
+    info = probe(path, options.max_pixels)
+    tags = read_tags(path)
+    # Cameras write one band per file, or photographs: a stack is a product, whatever make its tags still name.
+    *_, generic = cameras
+    camera = generic if _is_stack(path, info) else next(c for c in cameras if c.recognises(tags))
+    panel = panel_in(tags, (info.width_px, info.height_px))
+    bands = (replace(b, panel=panel) for b in camera.bands(path, tags, info) if options.with_rgb or not b.companion)
+    return ImageFile(path, camera, tags, tuple(_without_impossible_values(b) for b in bands))
+
+
+def _read_in_processes(
+    tasks: Sequence[Sequence[Path]], options: DiscoverOptions, processes: int
+) -> Iterator[ImageFile | Problem]:
+    # Spawned, not forked: a fork would copy the locks that threads of the calling program hold.
+    pool = ProcessPool(processes, context=get_context("spawn"), initializer=follow_parent)
+    try:
+        with without_interrupt_key():
+            futures = [pool.schedule(_read_task, args=(task, options)) for task in tasks]
+        for task, future in zip(tasks, futures, strict=True):
+            try:
+                yield from future.result()
+            except BrokenExecutor:  # all processes were killed, and not by a file
+                yield from _read_task(task, options)
+            except ProcessExpired:
+                yield from (Problem(path, _killed(path)) for path in task)
+        pool.close()
+    except BaseException:
+        pool.stop()
+        raise
+    finally:
+        pool.join()
+
+
+def _killed(path: Path) -> UnreadableFileError:
+    what = "reading it, or a file read together with it, killed the process"
+    return UnreadableFileError(f"{path}: {what}; take it out of the folder")
+
+
+def _read_task(paths: Sequence[Path], options: DiscoverOptions) -> list[ImageFile | Problem]:
+    cameras = known_cameras(options.pattern)
+    result: list[ImageFile | Problem] = []
+    for path in paths:
+        try:
+            result.append(read_file(path, cameras, options))
+        except UnreadableFileError as error:
+            result.append(Problem(path, error))
+    return result
+
+
+def _without_impossible_values(band: Band) -> Band:
+    """The band without a radiometric calibration that no camera has: its tags are damaged."""
+    possible = band.radiometry is None or is_physical(band.radiometry, band.size_px)
+    return band if possible else replace(band, radiometry=None)
+
+
+def _is_stack(path: Path, info: RasterInfo) -> bool:
+    photograph = info.dtypes[0] == "uint8" and len(info.dtypes) in _PHOTOGRAPH_CHANNELS
+    return path.suffix.lower() in TIFF_SUFFIXES and len(info.dtypes) > 1 and not photograph

@@ -1,0 +1,54 @@
+"""The options and the result of a search for captures below a folder."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from agalign.errors import AgalignError
+from agalign.values.capture import Capture
+from agalign.values.choices import MAX_PIXELS, BandOrder
+
+
+@dataclass(frozen=True)
+class DiscoverOptions:
+    """What to look for."""
+
+    pattern: str | None = None
+    """File names as '{capture}_{band}.tif', for files whose names follow no known scheme."""
+    reference: str | None = None
+    """Name of the reference band; None is the camera's default."""
+    ignore_metadata: bool = False
+    """Ignore lens and rig tags."""
+    with_rgb: bool = False
+    """Include the colour photographs that some cameras take with each multispectral capture, as three bands."""
+    bands: tuple[str, ...] = ()
+    """Names of the bands to include; empty for all."""
+    order: BandOrder = "index"
+    """Order of the bands in the stacks: as the camera counts them, by wavelength, or by name."""
+    skip: tuple[Path, ...] = field(default=())
+    """Folders to leave out, such as the output's."""
+    max_pixels: int = MAX_PIXELS
+    """Larger images are refused before their pixels are read."""
+    jobs: int = 1
+    """Processes that read the files' tags where there are many files; the calling script must be importable then."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A file or capture that is left out, and why."""
+
+    path: Path
+    error: AgalignError
+
+    @property
+    def text(self) -> str:
+        """One line that names the file and says what to do."""
+        return str(self.error)
+
+
+@dataclass(frozen=True)
+class FolderScan:
+    """The captures and the problems below a folder."""
+
+    folder: Path
+    captures: tuple[Capture, ...]
+    problems: tuple[Problem, ...]
