@@ -41,14 +41,13 @@ class Generic(Camera):
         if path.suffix.lower() in JPEG_SUFFIXES:
             return colour_bands(path, info)
         own_name = tags.text(*BAND_NAME) or self.split(path)[1]
-        indexes = [i for i in range(1, len(info.dtypes) + 1) if i != info.alpha_index]
+        indexes = info.band_indexes
+        file_wavelength_nm = tags.number(CAMERA, "CentralWavelength") or _wavelength_in(own_name)
         result = []
         for i in indexes:
             name = info.descriptions[i - 1] or (own_name if len(indexes) == 1 else "") or f"band_{i}"
-            wavelength = (
-                info.wavelengths_nm[i - 1] or tags.number(CAMERA, "CentralWavelength") or _wavelength_in(own_name)
-            )
-            result.append(replace(band_of(path, info, name, i), wavelength_nm=wavelength))
+            wavelength_nm = info.wavelengths_nm[i - 1] or file_wavelength_nm
+            result.append(replace(band_of(path, info, name, i), wavelength_nm=wavelength_nm))
         return tuple(result)
 
     def capture_key(self, path: Path, tags: Tags) -> str:

@@ -29,8 +29,7 @@ class Mapir(Camera):
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
         if len(info.dtypes) > 1:
-            indexes = (i for i in range(1, len(info.dtypes) + 1) if i != info.alpha_index)
-            return tuple(replace(band_of(path, info, f"band_{i}", i), one_lens=True) for i in indexes)
+            return tuple(replace(band_of(path, info, f"band_{i}", i), one_lens=True) for i in info.band_indexes)
         result = _FILTER.search(tags.model)
         if not result:
             file = _FILE.match(path.stem)

@@ -8,7 +8,11 @@ from agalign.errors import InputError
 from agalign.values.image import Mask, Raster
 
 _MIN_SIDE_PX = 48
+"""Smaller images hold too few patches to learn from."""
 _MAX_CHANNELS = 16
+"""Tells (H, W, C) from (C, H, W): images have more rows than this."""
+_MAX_SENSOR_BYTES = 2
+"""Sensors count in 8 or 16 bits; the largest value of a wider type is not saturation."""
 _USUAL_FILLS = (-9999.0, -99999.0, -32767.0, -32768.0)
 _LARGEST_MEASURED = 1e15
 """No sensor's unit reaches this; the fills of netCDF, GIS and C programs (1e20, 9.97e36, 3.4e38) do."""
@@ -69,7 +73,23 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     """An array (H, W), (H, W, C) or (C, H, W) as the estimation sees it: without constant fill at its border, and for
     integers without saturated areas. Raises InputError, with `name`, for what is no image.
     """
-    array = np.asarray(image)
+    planes = _planes(np.asarray(image), name)
+    measured = planes.dtype.kind in "ui" and planes.dtype.itemsize <= _MAX_SENSOR_BYTES
+    saturation = float(np.iinfo(str(planes.dtype)).max) if measured else None
+    mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
+    if mask.shape != planes.shape[1:]:
+        raise InputError(f"{name}_valid is {mask.shape}, the image {planes.shape[1:]}")
+    for plane in planes:
+        mask &= data_mask(plane, None)
+    mask &= ~np.logical_and.reduce([undeclared_fill(plane) for plane in planes])
+    for plane in planes:
+        mask = learnable(mask, plane, saturation)
+    pixels = np.where(mask, planes, 0).astype(np.float32)
+    return Raster(pixels if len(planes) > 1 else pixels[0], mask)
+
+
+def _planes(array: NDArray[np.generic], name: str) -> NDArray[np.generic]:
+    """(C, H, W) from (H, W), (H, W, C) or (C, H, W). Raises InputError, with `name`, where the array is no image."""
     if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
         raise InputError(
             f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"
@@ -81,14 +101,4 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
         raise InputError(
             f"{name} is {array.shape}: images need {_MIN_SIDE_PX} px a side and at most {_MAX_CHANNELS} channels"
         )
-    saturation = float(np.iinfo(array.dtype).max) if array.dtype.kind in "ui" and array.dtype.itemsize <= 2 else None
-    mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
-    if mask.shape != planes.shape[1:]:
-        raise InputError(f"{name}_valid is {mask.shape}, the image {planes.shape[1:]}")
-    for plane in planes:
-        mask &= data_mask(plane, None)
-    mask &= ~np.logical_and.reduce([undeclared_fill(plane) for plane in planes])
-    for plane in planes:
-        mask = learnable(mask, plane, saturation)
-    pixels = np.where(mask, planes, 0).astype(np.float32)
-    return Raster(pixels if len(planes) > 1 else pixels[0], mask)
+    return planes

@@ -13,7 +13,11 @@ _LONGEST_PX = 1600
 _SHOWN_PERCENTILES = 1.0, 99.5
 _SMOOTHING_PX = 2.0
 _LEVELS = 12
-"""Brightnesses at which outlines are looked for."""
+"""Brightnesses at which outlines are looked for,"""
+_LEVEL_PERCENTILES = 5.0, 99.5
+"""between these of the image."""
+_CORNER_TOLERANCE = 0.04
+"""Distance from a quadrilateral at which a contour counts as one, as a share of its length."""
 _INNER = 0.5
 """Side of the area that is measured beside the panel's,"""
 _RING = 1.15, 1.4
@@ -55,15 +59,20 @@ def find_panel(image: Raster, *, without_code: bool = False) -> PanelSight | Non
     code, at = _code(shown)
     if not code and not without_code:
         return None
-    limits = _SHARE_OF_IMAGE if at is None else tuple(share * _area(at) / shown.size for share in _CODE_AREAS)
     shown = np.asarray(cv2.GaussianBlur(shown, (0, 0), _SMOOTHING_PX), np.uint8)  # a dark panel's noise is no structure
-    squares = _outlines(shown, limits[0] * shown.size, limits[1] * shown.size)
-    squares = [s for s in squares if (at is None or _is_beside(s, at)) and _is_panel(shown, s)]
-    if not squares:
+    largest = _largest_panel(shown, at)
+    if largest is None:
         return PanelSight(code, ()) if code else None
-    largest = max(squares, key=_area)
     area = (_shrunk(largest) + 0.5) / scale - 0.5
     return PanelSight(code, tuple((float(x), float(y)) for x, y in area))
+
+
+def _largest_panel(shown: NDArray[np.uint8], code: Corners | None) -> Corners | None:
+    """The largest square that looks like a panel, near the code where there is one; None where there is none."""
+    limits = _SHARE_OF_IMAGE if code is None else tuple(share * _area(code) / shown.size for share in _CODE_AREAS)
+    squares = _outlines(shown, limits[0] * shown.size, limits[1] * shown.size)
+    squares = [s for s in squares if (code is None or _is_beside(s, code)) and _is_panel(shown, s)]
+    return max(squares, key=_area, default=None)
 
 
 def albedo_of(code: str, wavelength_nm: float | None) -> float | None:
@@ -109,11 +118,12 @@ def _code(shown: NDArray[np.uint8]) -> tuple[str, Corners | None]:
 def _outlines(shown: NDArray[np.uint8], minimum: float, maximum: float) -> list[Corners]:
     """Convex quadrilaterals that some brightness outlines, of areas between two."""
     result = []
-    low, high = (float(v) for v in np.percentile(shown, (5, 99.5)))
+    low, high = (float(v) for v in np.percentile(shown, _LEVEL_PERCENTILES))
     for level in np.linspace(low, high, _LEVELS + 2)[1:-1]:
         contours, _ = cv2.findContours((shown > level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
         for contour in (c for c in contours if minimum <= cv2.contourArea(c) <= maximum):
-            four = cv2.approxPolyDP(contour, 0.04 * cv2.arcLength(contour, closed=True), closed=True).reshape(-1, 2)
+            tolerance_px = _CORNER_TOLERANCE * cv2.arcLength(contour, closed=True)
+            four = cv2.approxPolyDP(contour, tolerance_px, closed=True).reshape(-1, 2)
             if len(four) == 4 and cv2.isContourConvex(four):
                 sides = np.linalg.norm(four - np.roll(four, 1, axis=0), axis=1)
                 longer, shorter = np.maximum(sides[:2], sides[2:]), np.minimum(sides[:2], sides[2:])

@@ -42,6 +42,11 @@ _DRIVERS = {
 }  # fmt: skip
 """By how a file begins. GDAL has drivers that execute, or ask other computers, for whatever name a file has."""
 _MAX_BANDS = 512
+"""More than any imager has; a damaged file may declare 65,535."""
+_PREVIEW_SIDE_PX = 2048
+"""Longest side of a preview whose size is not given: more than a page shows."""
+_MAX_MICROMETRES = 20.0
+"""Wavelengths below this without a unit are in micrometres: thermal bands end at 14 um, and none is below 100 nm."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +60,17 @@ class RasterInfo:
     descriptions: tuple[str | None, ...]
     wavelengths_nm: tuple[float | None, ...]
     alpha_index: int | None
-    """Index from 1 of an alpha band, which is no band of the scene."""
+    """Index from 1 of an alpha band, which does not show the scene."""
     georeference: Georeference | None
     has_mask: bool = False
     scales_offsets: tuple[tuple[float, float], ...] = ()
-    """A pair a band; none where the file says nothing of the kind."""
+    """A pair per band, or empty."""
     overviews: tuple[int, ...] = ()
+
+    @property
+    def band_indexes(self) -> tuple[int, ...]:
+        """Indexes from 1 of the bands that show the scene: all but the alpha band."""
+        return tuple(i for i in range(1, len(self.dtypes) + 1) if i != self.alpha_index)
 
 
 @contextmanager
@@ -121,7 +131,7 @@ def _driver_of(path: Path) -> str:
 
 def probe(path: Path, max_pixels: int = MAX_PIXELS) -> RasterInfo:
     """What a raster file holds, without reading its pixels. Raises UnreadableFileError, also where it declares more
-    than so many pixels a band.
+    than `max_pixels` per band.
     """
     try:
         return _probe(path, max_pixels)
@@ -143,15 +153,11 @@ def _probe(path: Path, max_pixels: int) -> RasterInfo:
             raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
         wavelengths = tuple(_wavelength_nm(dataset.tags(index)) for index in dataset.indexes)
         alpha = [i for i, c in enumerate(dataset.colorinterp, start=1) if c == ColorInterp.alpha]
-        georeference = None
-        transform = np.array(dataset.transform, float).reshape(3, 3)
-        if dataset.crs is not None and not dataset.transform.is_identity and _places_pixels(transform):
-            georeference = Georeference(transform, dataset.crs.to_wkt())
         if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
             raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
         return RasterInfo(
             width, height, tuple(dataset.dtypes), tuple(dataset.nodatavals),
-            tuple(dataset.descriptions), wavelengths, alpha[0] if alpha else None, georeference,
+            tuple(dataset.descriptions), wavelengths, alpha[0] if alpha else None, _georeference(dataset),
             MaskFlags.per_dataset in dataset.mask_flag_enums[0],
             tuple(zip(dataset.scales, dataset.offsets, strict=True)), tuple(dataset.overviews(1)),
         )  # fmt: skip
@@ -202,7 +208,7 @@ def read_preview(
 ) -> NDArray[np.float32]:
     """A window (x0, y0, width, height) of a band as (height, width) float32, perhaps resized; nodata as nan."""
     x0, y0, width, height = window_px
-    reduction = max(1.0, max(width, height) / 2048)
+    reduction = max(1.0, max(width, height) / _PREVIEW_SIDE_PX)
     out = size_px or (round(width / reduction), round(height / reduction))
     with open_raster(path) as dataset:
         window = Window(x0, y0, width, height)
@@ -245,8 +251,14 @@ def _dataset_mask(dataset: rasterio.DatasetReader, index: int, shape: tuple[int,
     return np.asarray(mask > 0)
 
 
-def _places_pixels(transform: NDArray[np.float64]) -> bool:
-    return bool(np.isfinite(transform).all() and np.linalg.det(transform[:2, :2]) != 0)
+def _georeference(dataset: rasterio.DatasetReader) -> Georeference | None:
+    """None also where the transform is the identity, which files without a georeference have, or is singular."""
+    if dataset.crs is None or dataset.transform.is_identity:
+        return None
+    transform = np.array(dataset.transform, float).reshape(3, 3)
+    if not np.isfinite(transform).all() or np.linalg.det(transform[:2, :2]) == 0:
+        return None
+    return Georeference(transform, dataset.crs.to_wkt())
 
 
 def _wavelength_nm(tags: dict[str, str]) -> float | None:
@@ -258,6 +270,6 @@ def _wavelength_nm(tags: dict[str, str]) -> float | None:
             continue
         if not 0 < value < math.inf:
             continue
-        micrometres = value < 20 or "micro" in tags.get("wavelength_units", "").lower()
+        micrometres = value < _MAX_MICROMETRES or "micro" in tags.get("wavelength_units", "").lower()
         return value * 1000 if micrometres else value
     return None

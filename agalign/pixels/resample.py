@@ -28,8 +28,13 @@ _FLAGS: dict[str, int] = {
 _SUPPORT_PX = 4
 """Half width of the widest interpolation kernel."""
 _SAMPLE_PX = 16
+"""Spacing of the positions that the extent of a tile is taken from."""
+_MIN_WHOLE_WEIGHT = 0.999
+"""Share of valid pixels in a resampled pixel that is valid: float32 weights do not add up to exactly 1."""
+_MIN_SIDE_PX = 8
+"""A moving image is not reduced below this side, whatever the homography's scale."""
 _NOWHERE = -1e6
-"""Where points on the horizon of a homography are taken to lie."""
+"""Position, px, of points on the horizon of a homography: outside any image."""
 
 
 def tiles(area: Tile, side_px: int) -> Iterator[Tile]:
@@ -44,14 +49,14 @@ def tiles(area: Tile, side_px: int) -> Iterator[Tile]:
 def resample_tile(
     band: Band, mapping: PixelMapping, tile: Tile, interpolation: Interpolation, radiometry: Radiometry | None = None
 ) -> tuple[NDArray[np.generic], Mask]:
-    """The moving band on a tile of the reference grid, in its own type (integers rounded and clipped) or, calibrated
-    with `radiometry`, as float32, and its mask.
+    """The moving band on a tile of the reference grid, (height, width), and its mask. The type is the band's own,
+    integers rounded and clipped; calibrated with `radiometry` it is float32.
 
-    A pixel is valid where it lies inside the moving image and no invalid pixel has a part in it.
+    A pixel is valid where it is inside the moving image and no invalid pixel contributes to it.
     """
     positions = mapping.positions(tile)
     shape = tile.height, tile.width
-    # The mapping is smooth: a coarse sample of it, edges included, tells its extent to a pixel.
+    # The mapping is smooth: a coarse sample of it, edges included, gives its extent to a pixel.
     rows, columns = (np.append(np.arange(0, n, _SAMPLE_PX), n - 1) for n in shape)
     some = positions[np.ix_(rows, columns)]
     low = np.floor(np.nanmin(some, axis=(0, 1))).astype(int) - _SUPPORT_PX - 1
@@ -91,7 +96,7 @@ def resample(
     if not everything:
         flag = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
         weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)
-        inside &= weight > 0.999
+        inside &= weight > _MIN_WHOLE_WEIGHT
     return _as_type(sampled, pixels.dtype), np.asarray(inside)
 
 
@@ -141,8 +146,9 @@ def warped(
         return moving
     full = round(size_px[0] / fixed_scale[0]), round(size_px[1] / fixed_scale[1])
     magnification = float(np.median(np.abs(geometry.local_scale(mapping.fixed_to_moving, *full))))
-    reduce = float(np.clip(fixed_scale[0] / magnification, 8 / min(moving.size_px), 1.0))
-    moving_size = max(8, round(moving.size_px[0] * reduce)), max(8, round(moving.size_px[1] * reduce))
+    reduce = float(np.clip(fixed_scale[0] / magnification, _MIN_SIDE_PX / min(moving.size_px), 1.0))
+    width, height = (max(_MIN_SIDE_PX, round(side * reduce)) for side in moving.size_px)
+    moving_size = width, height
     moving_scale = moving_size[0] / moving.size_px[0], moving_size[1] / moving.size_px[1]
     small = shrink(moving, moving_size)
     positions = mapping.rescaled(fixed_scale, moving_scale).positions(Tile(0, 0, *size_px), np.float32)
@@ -180,5 +186,5 @@ def shrink(raster: Raster, size_px: tuple[int, int]) -> Raster:
     planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
     shrunk = np.stack([cv2.resize(np.where(raster.valid, p, 0), size_px, interpolation=cv2.INTER_AREA) for p in planes])
     shrunk = (shrunk / np.maximum(weight, 1e-6)).astype(np.float32)
-    valid: Mask = weight > 0.999
+    valid: Mask = weight > _MIN_WHOLE_WEIGHT
     return Raster(shrunk if raster.pixels.ndim == 3 else shrunk[0], valid, lens.rescaled(raster.lens, scale))
