@@ -43,6 +43,10 @@ _CENTRE: tuple[Name, Name] = ((_DJI, "CalibratedOpticalCenterX"), (_DJI, "Calibr
 _RELATIVE_CENTRE: tuple[Name, Name] = ((_DJI, "RelativeOpticalCenterX"), (_DJI, "RelativeOpticalCenterY"))
 _FOCAL_LENGTH_PX: Name = (_DJI, "CalibratedFocalLength")
 _H_MATRIX: Name = (_DJI, "CalibratedHMatrix")
+_MAX_UPRIGHT_ROLL_DEG = 90.0
+"""Gimbals write a roll near 0 or near 180 degrees."""
+_FULL_SCALE = 65536.0
+"""Bands are stored as 16 bits."""
 _SPEED = "FlightXSpeed", "FlightYSpeed", "GimbalYawDegree", "RelativeAltitude"
 _VIGNETTING: Name = (_DJI, "VignettingData")
 _TO_COLOUR: Name = (_DJI, "DewarpHMatrix")
@@ -134,27 +138,31 @@ class Dji(Camera):
 
 
 def _heading_deg(tags: Tags, yaw_deg: float) -> float:
-    """A gimbal that looks down and is said to be rolled by 180 degrees is turned: units write either."""
-    return yaw_deg + (180 if abs(tags.number(_DJI, "GimbalRollDegree") or 0.0) > 90 else 0)
+    """Some units write a gimbal that looks down as rolled by 180 degrees: its yaw is then the opposite one."""
+    return yaw_deg + (180 if abs(tags.number(_DJI, "GimbalRollDegree") or 0.0) > _MAX_UPRIGHT_ROLL_DEG else 0)
 
 
 def _radiometry(tags: Tags) -> Radiometry | None:
     """The signal is (raw - black) / 65536 (1 + k1 r + ... + k6 r^6) / (gain exposure), and as DJI's guide has
     it, signal SensorGainAdjustment / Irradiance is reflectance up to a factor that all bands share.
     """
-    gain, exposure_us = tags.number(_DJI, "SensorGain"), tags.number(_DJI, "ExposureTime")
-    black_levels = tags.number(_DJI, "BlackLevel"), tags.number(CAMERA, "BlackCurrent"), tags.black_level
-    black = next((level for level in black_levels if level is not None), None)
+    gain, exposure_us, black = tags.number(_DJI, "SensorGain"), tags.number(_DJI, "ExposureTime"), _black_level(tags)
     if not gain or not exposure_us or black is None:
         return None
     irradiance = tags.number(_DJI, "Irradiance") or 0.0
     adjusted = tags.number(_DJI, "SensorGainAdjustment") or 1.0
     centre, k = _pair(tags, _CENTRE), tags.numbers(*_VIGNETTING)
     return Radiometry(
-        "relative radiance", black, 65536.0, adjusted / (gain * exposure_us / 1e6), centre or (0.0, 0.0),
+        "relative radiance", black, _FULL_SCALE, adjusted / (gain * exposure_us / 1e6), centre or (0.0, 0.0),
         k if centre else (), vignetting_divides=False,
         by_sun=(1 / irradiance, "relative reflectance") if irradiance > 0 else None,
     )  # fmt: skip
+
+
+def _black_level(tags: Tags) -> float | None:
+    """The first that the tags hold; 0 is a black level."""
+    levels = tags.number(_DJI, "BlackLevel"), tags.number(CAMERA, "BlackCurrent"), tags.black_level
+    return next((level for level in levels if level is not None), None)
 
 
 def _is_mavic_3(tags: Tags) -> bool:

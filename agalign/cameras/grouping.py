@@ -17,6 +17,8 @@ from agalign.errors import InputError
 from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.choices import BandOrder
 
+_MIN_BANDS = 2
+"""The reference and a band to align to it."""
 _NAMELESS = "capture"
 """Name of a capture where the names of its files leave none, such as `_1.tif`."""
 
@@ -76,8 +78,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         bands = [replace(b, lens=None, to_rig=None, other_to_rig=None) for b in bands]
     reference = bands[reference_index(bands, options.reference, first.path)]
     bands = _in_order(bands, options.order)
-    # The reference's tags are the capture's; a damaged file has none.
-    tags = next((f.tags for f in files if f.path == reference.path and f.tags != Tags()), first.tags)
+    tags = _tags_of(reference, files)
     camera = camera_of(tags)
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
     return Capture(
@@ -95,20 +96,28 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
     )
 
 
+def _tags_of(reference: Band, files: Sequence[ImageFile]) -> Tags:
+    """The tags that describe the capture: the reference's, else the first file's where the reference's are damaged."""
+    return next((f.tags for f in files if f.path == reference.path and f.tags != Tags()), files[0].tags)
+
+
 def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Band]:
     """The bands of these names (all if there are none). Raises InputError where there is nothing to align."""
     first = files[0]
-    bands = [b for file in files for b in file.bands]
-    if names:
-        wanted = {name.lower() for name in names}
-        bands = [b for b in bands if b.name.lower() in wanted]
-        if len(bands) < 2:
-            raise InputError(f"{first.path}: of this capture, --bands leaves {listed(bands) or 'nothing'}")
-    if len(bands) < 2:
+    bands = _with_names([b for file in files for b in file.bands], names)
+    if len(bands) < _MIN_BANDS and names:
+        raise InputError(f"{first.path}: of this capture, --bands leaves {listed(bands) or 'nothing'}")
+    if len(bands) < _MIN_BANDS:
         raise InputError(f"{first.path}: a band with no companion; name files '<capture>_<band>.tif' or give --pattern")
     if len(files) == 1 and first.bands[0].one_lens:
         raise InputError(f"{first.path}: its bands come through one lens; there is nothing to align")
     return bands
+
+
+def _with_names(bands: list[Band], names: Sequence[str]) -> list[Band]:
+    """The bands of these names, in any case; all where no name is given."""
+    wanted = {name.lower() for name in names}
+    return [b for b in bands if b.name.lower() in wanted] if wanted else bands
 
 
 def _in_order(bands: Sequence[Band], order: BandOrder) -> list[Band]:

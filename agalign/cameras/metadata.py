@@ -10,7 +10,7 @@ from typing import Any
 import tifffile
 from PIL import ExifTags, Image
 
-from agalign.cameras.tiff_directory import check_directories
+from agalign.cameras.tiff_directory import EXIF, GPS, XMP, check_directories
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
 from agalign.values.capture import Position
@@ -19,11 +19,15 @@ from agalign.values.text import without_controls
 _RATIONAL_TYPES = (5, 10)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
-_READ = {271, 272, 274, 306, 700, 34665, 34853, 50714}
-"""What is read of a TIFF: what else there is may be as long as it likes."""
-_LATITUDE_DEG, _LONGITUDE_DEG, _ALTITUDE_M = 90.0, 180.0, 20_000.0
-"""Positions beyond these are none."""
-_LONGEST_TEXT = 200
+_MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _BLACK_LEVEL = 271, 272, 274, 306, 50714
+_TAGS = {_MAKE, _MODEL, _ORIENTATION, _DATE_TIME, XMP, EXIF, GPS, _BLACK_LEVEL}
+"""The TIFF tags that are read: the values of others may be of any length."""
+_MAX_LATITUDE_DEG, _MAX_LONGITUDE_DEG, _MAX_ALTITUDE_M = 90.0, 180.0, 20_000.0
+"""Positions beyond these come from damaged tags."""
+_BELOW_SEA_LEVEL = (1, b"\x01")
+"""EXIF GPSAltitudeRef of an altitude below sea level, as readers return a BYTE."""
+_MAX_TEXT_LENGTH = 200
+"""Makes, models and serial numbers are shorter; a damaged tag may hold megabytes."""
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -94,18 +98,18 @@ def read_tags(path: Path) -> Tags:
         raise UnreadableFileError(
             f"{path}: not a readable {kind} ({error or 'empty'}); copy it from the card again"
         ) from None
-    exif = values.get(34665)
+    exif = values.get(EXIF)
     exif = exif if isinstance(exif, dict) else {}
-    orientation = values.get(274, 1)
+    orientation = values.get(_ORIENTATION, 1)
     return Tags(
-        make=_text(values.get(271)),
-        model=_text(values.get(272)),
+        make=_text(values.get(_MAKE)),
+        model=_text(values.get(_MODEL)),
         serial=_text(exif.get("BodySerialNumber")),
-        position=_position(values.get(34853)),
-        captured_at=_iso_time(exif, values.get(306)),
+        position=_position(values.get(GPS)),
+        captured_at=_iso_time(exif, values.get(_DATE_TIME)),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
-        black_level=_mean(values.get(50714)),
-        xmp=Packet.parse(values.get(700, b"")).values(),
+        black_level=_mean(values.get(_BLACK_LEVEL)),
+        xmp=Packet.parse(values.get(XMP, b"")).values(),
         exif=exif,
     )
 
@@ -113,7 +117,7 @@ def read_tags(path: Path) -> Tags:
 def _tiff_values(path: Path) -> dict[int, Any]:
     check_directories(path)
     with tifffile.TiffFile(path) as tiff:
-        tags = [tag for tag in tiff.pages[0].tags.values() if tag.code in _READ]  # type: ignore[union-attr]
+        tags = [tag for tag in tiff.pages[0].tags.values() if tag.code in _TAGS]  # type: ignore[union-attr]
         return {tag.code: _fractions(tag.value) if tag.dtype in _RATIONAL_TYPES else tag.value for tag in tags}
 
 
@@ -125,29 +129,36 @@ def _fractions(value: tuple[int, ...]) -> tuple[float, ...]:
 def _jpeg_values(path: Path) -> dict[int, Any]:
     with Image.open(path, formats=("JPEG",)) as image:
         exif = image.getexif()
-        named = {ExifTags.TAGS.get(code, str(code)): value for code, value in exif.get_ifd(34665).items()}
-        place = {ExifTags.GPSTAGS.get(code, str(code)): value for code, value in exif.get_ifd(34853).items()}
-        return {**exif, 34665: named, 34853: place, 700: image.info.get("xmp", b"")}
+        named = {ExifTags.TAGS.get(code, str(code)): value for code, value in exif.get_ifd(EXIF).items()}
+        place = {ExifTags.GPSTAGS.get(code, str(code)): value for code, value in exif.get_ifd(GPS).items()}
+        return {**exif, EXIF: named, GPS: place, XMP: image.info.get("xmp", b"")}
 
 
 def _position(gps: Any) -> Position | None:
     """From a GPS directory; cameras without a fix write an empty one."""
     if not isinstance(gps, dict):
         return None
-    latitude, longitude = (_degrees(gps.get(f"GPS{axis}")) for axis in ("Latitude", "Longitude"))
-    if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
+    latitude_deg = _signed_degrees(gps, "Latitude", "S", _MAX_LATITUDE_DEG)
+    longitude_deg = _signed_degrees(gps, "Longitude", "W", _MAX_LONGITUDE_DEG)
+    if latitude_deg is None or longitude_deg is None or latitude_deg == longitude_deg == 0:
         return None
-    south, west = (_text(gps.get(f"GPS{axis}Ref")) for axis in ("Latitude", "Longitude"))
-    if abs(latitude) > _LATITUDE_DEG or abs(longitude) > _LONGITUDE_DEG:
+    return Position(latitude_deg, longitude_deg, _altitude_m(gps))
+
+
+def _signed_degrees(gps: Mapping[str, Any], axis: str, negative: str, max_deg: float) -> float | None:
+    """A coordinate, negative where its reference is `negative`; None where it is missing or beyond `max_deg`."""
+    degrees = _degrees(gps.get(f"GPS{axis}"))
+    if degrees is None or abs(degrees) > max_deg:
         return None
-    altitude = rational(gps.get("GPSAltitude"))
-    if altitude is not None and abs(altitude) > _ALTITUDE_M:
-        altitude = None
-    below = gps.get("GPSAltitudeRef") in (1, b"\x01")
-    return Position(
-        -latitude if south.upper() == "S" else latitude, -longitude if west.upper() == "W" else longitude,
-        -altitude if altitude is not None and below else altitude,
-    )  # fmt: skip
+    return -degrees if _text(gps.get(f"GPS{axis}Ref")).upper() == negative else degrees
+
+
+def _altitude_m(gps: Mapping[str, Any]) -> float | None:
+    """Above sea level; None where it is missing or beyond any that a drone reaches."""
+    altitude_m = rational(gps.get("GPSAltitude"))
+    if altitude_m is None or abs(altitude_m) > _MAX_ALTITUDE_M:
+        return None
+    return -altitude_m if gps.get("GPSAltitudeRef") in _BELOW_SEA_LEVEL else altitude_m
 
 
 def _degrees(value: Any) -> float | None:
@@ -172,7 +183,7 @@ def _mean(value: Any) -> float | None:
 def _text(value: Any) -> str:
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
-    return without_controls(str(value)).strip()[:_LONGEST_TEXT] if isinstance(value, (str, int)) else ""
+    return without_controls(str(value)).strip()[:_MAX_TEXT_LENGTH] if isinstance(value, (str, int)) else ""
 
 
 def _iso_time(exif: Mapping[str, Any], fallback: Any) -> str:

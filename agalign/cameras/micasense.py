@@ -29,6 +29,10 @@ from agalign.cameras.xmp import Name
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose, Radiometry
 
+_FULL_SCALE = 65536.0
+"""Bands are stored as 16 bits."""
+_HORIZONTAL_IRRADIANCE_UNIT = 0.01
+"""W / m^2 / nm, where no tag gives the scale."""
 _TWELVE_BIT_TOP = 65520.0
 """RedEdge cameras store 12 bits in the upper bits of uint16."""
 
@@ -89,20 +93,24 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     reflectance = pi L / E with the light sensor's irradiance E on a horizontal plane.
     """
     a = tags.numbers(*_CALIBRATION)
-    exposure_s = rational(tags.exif.get("ExposureTime"))
-    sensitivity = next(
-        (tags.exif[n] for n in ("ISOSpeed", "ISOSpeedRatings", "PhotographicSensitivity") if n in tags.exif), None
-    )
-    if len(a) != 3 or not exposure_s or tags.black_level is None or not isinstance(sensitivity, int) or not sensitivity:
+    exposure_s, iso = rational(tags.exif.get("ExposureTime")), _iso(tags)
+    if len(a) != 3 or not exposure_s or tags.black_level is None or not iso:
         return None
     irradiance = _irradiance(tags)
     centre, k = tags.numbers(*VIGNETTING_CENTRE), tags.numbers(*VIGNETTING_POLYNOMIAL)
     known = len(centre) == 2
     return Radiometry(
-        "radiance", tags.black_level, 65536.0, a[0] / (sensitivity / 100) / exposure_s,
+        "radiance", tags.black_level, _FULL_SCALE, a[0] / (iso / 100) / exposure_s,
         (centre[0], centre[1]) if known else (0.0, 0.0), k if known else (), True, a[1] / exposure_s - a[2],
         (math.pi / irradiance, "reflectance") if irradiance else None,
     )  # fmt: skip
+
+
+def _iso(tags: Tags) -> int | None:
+    """The sensitivity, under any of the names that EXIF has had for it."""
+    values = (tags.exif[n] for n in ("ISOSpeed", "ISOSpeedRatings", "PhotographicSensitivity") if n in tags.exif)
+    value = next(values, None)
+    return value if isinstance(value, int) else None
 
 
 def _irradiance(tags: Tags) -> float | None:
@@ -111,7 +119,7 @@ def _irradiance(tags: Tags) -> float | None:
     """
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
     result = [
-        (tags.number(_DLS, "HorizontalIrradiance"), scale or 0.01),
+        (tags.number(_DLS, "HorizontalIrradiance"), scale or _HORIZONTAL_IRRADIANCE_UNIT),
         (tags.number(_DLS, "SpectralIrradiance"), scale or 1.0),
         (tags.number(CAMERA, "Irradiance"), scale or 1.0),
     ]

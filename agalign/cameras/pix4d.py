@@ -31,7 +31,9 @@ VIGNETTING_POLYNOMIAL: Name = (CAMERA, "VignettingPolynomial")
 
 _PANEL_SERIALS: tuple[Name, ...] = (("micasense.com/MicaSense", "PanelSerial"), (CAMERA, "PanelSerial"))
 _AREA_NUMBERS = 8
-_LONGEST_FOCAL_LENGTH_MM = 100.0
+"""x and y of four corners."""
+_MAX_FOCAL_LENGTH_MM = 100.0
+"""Larger numbers are px: lenses of drone cameras have 2 to 50 mm, or 300 px and more."""
 _MAX_MAGNIFICATION = 1.02
 """Beyond this a polynomial of vignetting in the band's own pixels is dropped."""
 
@@ -69,7 +71,7 @@ def pixels_per_mm(tags: Tags) -> float | None:
 def focal_length_is_in_px(tags: Tags) -> bool:
     """True where Camera:PerspectiveFocalLength is in px: old firmware gives them without saying so."""
     units, length = tags.text(*FOCAL_LENGTH_UNITS).lower(), tags.number(*FOCAL_LENGTH)
-    return "px" in units or "pixel" in units or (length is not None and length > _LONGEST_FOCAL_LENGTH_MM)
+    return "px" in units or "pixel" in units or (length is not None and length > _MAX_FOCAL_LENGTH_MM)
 
 
 def focal_length_px(tags: Tags) -> float | None:
@@ -115,15 +117,22 @@ def panel_in(tags: Tags, size_px: tuple[int, int]) -> Panel | None:
     """The calibration panel that the firmware saw in an image (width, height): CalibrationPicture, Albedo, ReflectArea
     (x, y of four corners, px) and PanelSerial; None where it saw none.
     """
-    area, is_picture = tags.numbers(CAMERA, "ReflectArea"), tags.number(CAMERA, "CalibrationPicture")
-    corners = tuple(zip(area[::2], area[1::2], strict=True)) if len(area) == _AREA_NUMBERS else ()
-    inside = all(0 <= x < size_px[0] and 0 <= y < size_px[1] for x, y in corners)
-    corners = corners if inside and len(set(corners)) == _AREA_NUMBERS // 2 else ()
+    corners, is_picture = _panel_corners(tags, size_px), tags.number(CAMERA, "CalibrationPicture")
     if is_picture == 0 or (is_picture is None and not corners):
         return None
     albedo = tags.number(CAMERA, "Albedo")
     known = albedo if albedo is not None and 0 < albedo <= 1 else None
     return Panel("tags", tags.first_text(_PANEL_SERIALS), known, corners)
+
+
+def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, float], ...]:
+    """(x, y) of the four corners of ReflectArea; none where they are not four points of the image."""
+    area = tags.numbers(CAMERA, "ReflectArea")
+    if len(area) != _AREA_NUMBERS:
+        return ()
+    corners = tuple(zip(area[::2], area[1::2], strict=True))
+    inside = all(0 <= x < size_px[0] and 0 <= y < size_px[1] for x, y in corners)
+    return corners if inside and len(set(corners)) == len(corners) else ()
 
 
 # ---- what becomes of them
@@ -157,20 +166,24 @@ class TagTransfer:
         packet.remove(self.of_the_sensor)
         for name in (RIG_RELATIVES, RIG_TRANSLATIONS):
             packet.put(name, ["0", "0", "0"])
-        point_px, density = principal_point_px(tags), self.pixels_per_mm(tags)
-        if point_px is not None and density is not None:
-            if self.is_turned(tags):
-                stored = turned(point_px, reference.size_px)
-                point_px = turned(grid.px(*stored), (grid.width, grid.height))
-            else:
-                point_px = grid.px(*point_px)
-            packet.put(PRINCIPAL_POINT, [number_text(v / (density * grid.scale)) for v in point_px])
+        self._put_principal_point(packet, reference, tags, grid)
         for name in (*self.in_px, *([FOCAL_LENGTH] if focal_length_is_in_px(tags) else [])):
             values = tags.numbers(*name)
             if values and grid.scale != 1:
                 packet.put(name, [number_text(v * grid.scale) for v in values])
         if grid.undistorted:
             packet.put(DISTORTION, ["0"] * len(tags.numbers(*DISTORTION)))
+
+    def _put_principal_point(self, packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
+        point_px, density = principal_point_px(tags), self.pixels_per_mm(tags)
+        if point_px is None or density is None:
+            return
+        if self.is_turned(tags):
+            stored = turned(point_px, reference.size_px)
+            point_px = turned(grid.px(*stored), (grid.width, grid.height))
+        else:
+            point_px = grid.px(*point_px)
+        packet.put(PRINCIPAL_POINT, [number_text(v / (density * grid.scale)) for v in point_px])
 
     def put_vignetting(
         self, packet: Packet, tags: Tags, grid: OutputGrid, from_source: FromSource, *, radiometry: bool

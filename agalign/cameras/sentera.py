@@ -40,21 +40,10 @@ class Sentera(Camera):
         return "sentera" in tags.make.lower() or any(namespace == _SENTERA for namespace, _ in tags.xmp)
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+        if len(info.dtypes) > 1:
+            return _listed_bands(path, tags, info) or _channel_bands(path, tags, info)
         matrix = tags.numbers(_SENTERA, "AlignMatrix")
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
-        if len(info.dtypes) > 1:
-            listed = _listed_bands(path, tags, info)
-            if listed:
-                return listed
-            kind = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), "")
-            if not kind:
-                # The Double 4K's colour camera is one of its two: no mere companion.
-                return tuple(replace(b, companion="6X" in tags.model.upper()) for b in colour_bands(path, info))
-            return tuple(
-                replace(band_of(path, info, name, index), wavelength_nm=wavelength, one_lens=True)
-                for index, (name, wavelength) in _CHANNELS[kind].items()
-                if index <= len(info.dtypes)
-            )
         folder = _BAND_FOLDER.match(path.parent.name)
         name = tags.text(*BAND_NAME) or (folder["name"] if folder else path.stem)
         band = spectral(band_of(path, info, name), tags)
@@ -71,6 +60,19 @@ class Sentera(Camera):
 
     def capture_name(self, path: Path) -> str:
         return re.sub(r"_\d{3}_\d{2,3}$", "", path.stem)
+
+
+def _channel_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+    """The bands of a photograph whose folder or model names the filter of its lens, else red, green and blue."""
+    kind = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), None)
+    if kind is None:
+        # The Double 4K's colour camera is one of its two, not a companion that is left out by default.
+        return tuple(replace(b, companion="6X" in tags.model.upper()) for b in colour_bands(path, info))
+    return tuple(
+        replace(band_of(path, info, name, index), wavelength_nm=wavelength, one_lens=True)
+        for index, (name, wavelength) in _CHANNELS[kind].items()
+        if index <= len(info.dtypes)
+    )
 
 
 def _listed_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:

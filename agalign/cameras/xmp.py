@@ -93,14 +93,7 @@ class Packet:
             for tag in [t for t in description.attrib if _is_one_of(t, [name])]:
                 description.attrib[tag] = ",".join(values)
             for child in [c for c in description if _is_one_of(c.tag, [name])]:
-                items = list(child.iter(f"{_RDF}li"))
-                if not items:
-                    child.text = ",".join(values)
-                elif len(items) == len(values):
-                    for item, value in zip(items, values, strict=True):
-                        item.text = value
-                else:
-                    items[0].text = ",".join(values)
+                _put_texts(child, values)
 
     def add(self, name: Name, value: str) -> None:
         """Give it a value that it does not have, in a namespace in which it has others."""
@@ -152,6 +145,16 @@ def _is_deeper(root: Element, deepest: int) -> bool:
 def _texts(element: Element) -> tuple[str, ...]:
     items = [item.text or "" for item in element.iter(f"{_RDF}li")]
     return tuple(items) if items else (element.text or "",)
+
+
+def _put_texts(element: Element, values: Sequence[str]) -> None:
+    """Into an element's items where it has as many, else joined by commas into one text."""
+    items = list(element.iter(f"{_RDF}li"))
+    if items and len(items) == len(values):
+        for item, value in zip(items, values, strict=True):
+            item.text = value
+    else:
+        (items[0] if items else element).text = ",".join(values)
 
 
 @lru_cache(maxsize=4096)  # a thousand captures of one camera have the same few tags
