@@ -120,15 +120,6 @@ class JointSettings(Stage):
     rng_seed: Annotated[int, Field(ge=0, le=MAX_RNG_SEED)] = 0
     fast: FastRecipe = FastRecipe()
     paper: PaperRecipe = PaperRecipe()
-    longest_side_px: Positive = 4096
-    """Larger images are reduced to this for estimation."""
-    coarse_ratio: float = 0.4
-    """A moving band that has fewer pixels beside the reference's, along a line of the ground, is coarse: the reference
-    is reduced for it"""
-    coarse_oversampling: float = 2.0
-    """to so many along one of the band's,"""
-    coarse_min_px: Positive = 128
-    """but to no fewer along its longer side."""
 
 
 class FlightSettings(Stage):

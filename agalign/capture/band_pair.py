@@ -8,7 +8,7 @@ import numpy as np
 
 from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import seed_candidates
-from agalign.config import JointSettings, Settings
+from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.pixels.raster import read_for_alignment
@@ -29,6 +29,15 @@ _TAGS_STD_PX = 5.0
 """Rig tags are off by 2 px in the median and 12 at most on five cameras (docs/cameras.md)."""
 _MIN_MODEL_STD_PX = 1.0
 _PLAINLY_REDUCED = 0.7
+_LONGEST_SIDE_PX = 4096
+"""Larger images are reduced to this for estimation: it bounds memory and time; `full_resolution` refines the result."""
+_COARSE_RATIO = 0.4
+"""A moving band with fewer pixels than this for each pixel of the reference, along a line of the ground, is coarse: the
+reference is reduced for it."""
+_COARSE_OVERSAMPLING = 2.0
+"""Pixels of the reduced reference for each pixel of a coarse band: more of them add no detail that both images show."""
+_COARSE_MIN_PX = 128
+"""Longer side of a reference that is reduced for a coarse band, at least: fewer pixels leave no room for windows."""
 _NOT_REDUCED = (1.0, 1.0), (1.0, 1.0)
 
 
@@ -136,7 +145,7 @@ def read_pairs(
     What a flight's `model` knows is tried before what the tags say.
     Raises UnreadableFileError where the reference cannot be read.
     """
-    longest = settings.joint.longest_side_px
+    longest = _LONGEST_SIDE_PX
     references = {longest: Reference(read_for_alignment(capture.reference, longest), settings)}
     pairs: list[BandPair] = []
     left_out: dict[str, Issue] = {}
@@ -154,7 +163,7 @@ def read_pairs(
         except AgalignError as error:
             left_out |= dict.fromkeys((b.name for b in bands), Issue("unreadable", detail=str(error)))
             continue
-        maximum = longest_for(capture.reference, next(iter(candidates.values())), settings.joint)
+        maximum = longest_for(capture.reference, next(iter(candidates.values())))
         if maximum not in references:
             references[maximum] = Reference(read_for_alignment(capture.reference, maximum), settings)
         reference, is_coarse = references[maximum], maximum < min(longest, max(capture.reference.size_px))
@@ -167,15 +176,15 @@ def read_pairs(
     return pairs, left_out
 
 
-def longest_for(reference: Band, fixed_to_moving: Matrix, settings: JointSettings) -> int:
+def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
     """Longer side that the reference's image is to have beside a moving band: its own, but where the band's pixels are
     much larger, a thermal camera's, so many that a few of them make one of the band's.
     """
     ratio = abs(float(geometry.local_scale(fixed_to_moving, *reference.size_px)[-1]))
-    if not 0 < ratio < settings.coarse_ratio:
-        return settings.longest_side_px
-    side = round(settings.coarse_oversampling * ratio * max(reference.size_px))
-    return min(settings.longest_side_px, max(side, settings.coarse_min_px))
+    if not 0 < ratio < _COARSE_RATIO:
+        return _LONGEST_SIDE_PX
+    side = round(_COARSE_OVERSAMPLING * ratio * max(reference.size_px))
+    return min(_LONGEST_SIDE_PX, max(side, _COARSE_MIN_PX))
 
 
 def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float]) -> dict[SeedKind, float]:

@@ -10,7 +10,7 @@ from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.align import align_capture_bands
 from agalign.capture.band_pair import _known_to_px, longest_for, read_pairs
 from agalign.capture.prediction import observed
-from agalign.config import JointSettings, SeedSettings, Settings
+from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
 from agalign.synthetic.cameras import ALTUM
@@ -61,7 +61,7 @@ def test_without_one_lens_neither_is_corrected(flight: Path) -> None:
 def test_for_a_band_of_few_pixels_the_reference_is_reduced(ratio: float, longest: int) -> None:
     band = Band("Green", Path("x.tif"), 1, 1280, 960, "uint16")
     mapping = np.diag([abs(ratio), ratio, 1.0])
-    assert longest_for(band, mapping, JointSettings()) == longest
+    assert longest_for(band, mapping) == longest
 
 
 def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path) -> None:

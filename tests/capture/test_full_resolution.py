@@ -3,6 +3,7 @@ import pytest
 import tifffile
 
 from agalign.cameras.discover import discover
+from agalign.capture import band_pair
 from agalign.capture.align import align_capture_bands
 from agalign.config import JointSettings, Settings
 from agalign.values import geometry
@@ -22,8 +23,8 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return discover(folder).captures[0]
 
 
-def error_px(capture: Capture, longest_side_px: int) -> float:
-    settings = Settings(joint=JointSettings(longest_side_px=longest_side_px, device="cpu"))
+def error_px(capture: Capture) -> float:
+    settings = Settings(joint=JointSettings(device="cpu"))
     result = align_capture_bands(capture, settings, None, lambda *_: None)["nir"]
     assert result.status == "aligned"
     assert result.residual is not None
@@ -34,8 +35,9 @@ def error_px(capture: Capture, longest_side_px: int) -> float:
 def test_what_was_found_on_reduced_images_is_sharpened_on_the_files(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sharpened = error_px(capture, 400)
+    monkeypatch.setattr(band_pair, "_LONGEST_SIDE_PX", 400)
+    sharpened = error_px(capture)
     monkeypatch.setattr("agalign.capture.align.at_full_resolution", lambda _r, _m, alignment, _c: alignment)
-    reduced = error_px(capture, 400)
+    reduced = error_px(capture)
     assert sharpened < 0.05
     assert sharpened < 0.5 * reduced
