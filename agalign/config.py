@@ -55,8 +55,6 @@ class FastRecipe(Stage):
     steps_between_updates: Positive = 10
     hopeless_steps: Positive = 30
     """Steps after which a level is given up where no held-out patches could be told apart."""
-    step_gate: float = 0.2
-    """Held-out retrieval below which psi does not move."""
     enough_retrieval: float = 0.6
     """Held-out retrieval at which learning may stop once psi is at rest."""
     rest_px: float = 0.5

@@ -25,7 +25,7 @@ from agalign.method.joint import Results, refine_with
 from agalign.method.starter import start_from
 from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.pixels.raster import without_warnings
-from agalign.values.alignment import JointResult, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.verify.displacement_field import common_field
@@ -70,7 +70,7 @@ def learn_flight(
     outcome: dict[str, list[Matrix]] = {}
     for one, of_capture in zip(loaded, results, strict=True):
         for pair, result in zip(one.pairs, of_capture, strict=True):
-            if isinstance(result, JointResult) and result.retrieval >= settings.joint.fast.step_gate:
+            if isinstance(result, JointResult) and result.retrieval >= MIN_RETRIEVAL:
                 outcome.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
     if not outcome:
         return None

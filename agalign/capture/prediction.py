@@ -9,12 +9,9 @@ from agalign.capture.verification import as_predicted
 from agalign.config import CheckSettings
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Prediction
+from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Prediction
 from agalign.values.capture import Capture
 from agalign.values.issues import Issue
-
-_PLAINLY_MORE = 5.0
-"""Times what guessing tells of held-out patches: there is something in common."""
 
 
 def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment], capture: Capture) -> Observation:
@@ -94,7 +91,7 @@ def worth_learning(
 
 def _shows_something(alignment: Alignment) -> bool:
     joint = alignment.joint
-    return alignment.seed.trusted or (joint is not None and joint.retrieval >= _PLAINLY_MORE * joint.chance)
+    return alignment.seed.trusted or (joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance)
 
 
 def _in_image_px(prediction: Prediction, pair: BandPair) -> Prediction:

@@ -29,6 +29,7 @@ from agalign.method.refine import (
     retrieval,
 )
 from agalign.method.state import ImageGroup, JointState
+from agalign.values.alignment import MIN_RETRIEVAL
 
 
 def learn(state: JointState, groups: Sequence[ImageGroup], net: Descriptor, at_once: int = 1) -> tuple[int, float]:
@@ -203,7 +204,7 @@ def _move_psi(at: _AtLevel) -> bool:
     for i, band in enumerate(at.bands):
         retrieved, _ = retrieval(band, at.h[i], test, f_test, recipe.min_negative_px)
         at.retrieved[i] = retrieved
-        if retrieved < recipe.step_gate:
+        if retrieved < MIN_RETRIEVAL:
             continue
         at.told_apart[i] = True
         with suppress(NotEnoughTextureError):

@@ -22,7 +22,7 @@ from agalign.method.gauss_newton import PatchEquations, Step, shift_gradient, so
 from agalign.method.levels import Level, footprints_inside, footprints_inside_moving
 from agalign.method.patches import Keypoints, far_apart, patch_positions, transform
 from agalign.method.state import ImageGroup, JointState
-from agalign.values.alignment import JointResult
+from agalign.values.alignment import MIN_RETRIEVAL, JointResult
 from agalign.values.choices import ModelFamily
 from agalign.values.issues import Issue
 
@@ -236,7 +236,7 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
         )  # fmt: skip
 
     return [
-        Issue("retrieval", group.given_up[b], recipe.step_gate)
+        Issue("retrieval", group.given_up[b], MIN_RETRIEVAL)
         if b in group.given_up
         else result(MovingBand(net, level, b, side), h[b])
         for b, side in enumerate(group.sides)
