@@ -113,14 +113,17 @@ class Solver:
         return solve(equations, self.family, self.recipe)
 
     def converge(self, band: MovingBand, start: Tensor, reference_patches: ReferencePatches) -> tuple[Tensor, Step]:
-        """Steps from `start` until one moves no corner by more than `final_rest_px`.
+        """Steps from `start` until one moves no corner by more than `final_rest_px`; returns (homography, last step).
 
-        While the steps are long, a part of the anchors tells where to go. Steps of all of them become shorter by a
-        constant ratio, so that every second one is lengthened by what those to come would add (Aitken 1926).
+        While the steps are long, some of the patches are enough. Steps of all patches become shorter by a constant
+        ratio, so every second one is lengthened by what the steps to come would add (Aitken 1926). A step of infinite
+        length moves nothing and is the last: the patches do not determine where the corners are mapped to.
         """
         h, some, before = start, reference_patches.head(self.recipe.first_patches), math.inf
         for _ in range(self.recipe.final_steps):
             step = self.step(band, h, some)
+            if not math.isfinite(step.length_px):
+                break
             ratio = min(step.length_px / before, _MAX_RATIO)
             h = moved(h, step, 1 / (1 - ratio))
             if step.length_px < self.recipe.final_rest_px and some is reference_patches:

@@ -1,9 +1,18 @@
+import math
+
+import numpy as np
+import pytest
 import torch
 
-from agalign.config import FastRecipe
+from agalign.config import FastRecipe, JointSettings
 from agalign.method.gauss_newton import Step
 from agalign.method.patches import Keypoints
-from agalign.method.refine import ReferencePatches, Solver
+from agalign.method.refine import ReferencePatches, Solver, refine
+from agalign.method.state import ImageGroup, JointState
+from agalign.values.image import Raster
+from agalign.values.issues import Issue
+
+from ..conftest import textured_pair
 
 
 class Halving(Solver):
@@ -22,3 +31,37 @@ def test_steps_that_fall_by_a_constant_ratio_are_summed_to_their_end() -> None:
     result, last = Halving("homography", FastRecipe()).converge(None, torch.eye(3), reference_patches)  # type: ignore[arg-type]
     assert last.length_px < FastRecipe().final_rest_px
     assert abs(float(result[0, 2]) - 1.0) < 1e-3
+
+
+class Unbounded(Solver):
+    """After some regular steps, one that sends a corner to infinity, as `gauss_newton.solve` reports it."""
+
+    regular_steps = 0
+
+    def step(self, _band: object, homography: torch.Tensor, _anchors: ReferencePatches) -> Step:  # type: ignore[override]
+        change = torch.eye(3, dtype=torch.float64)
+        length_px = 0.4 if float(homography[0, 2]) < 0.4 * self.regular_steps - 1e-3 else math.inf
+        if math.isfinite(length_px):
+            change[0, 2] = length_px
+        return Step(change, length_px, ((0.1, 0.1),) * 4, "homography", torch.zeros(8, 8, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("regular_steps", [0, 1, 2])
+def test_a_step_of_infinite_length_ends_with_a_finite_homography(
+    regular_steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Unbounded, "regular_steps", regular_steps)
+    points = Keypoints(torch.zeros(4, 2), torch.zeros(4), torch.ones(4))
+    reference_patches = ReferencePatches(points, torch.zeros(4, 256), torch.zeros(4, 256, 2))
+    result, last = Unbounded("homography", FastRecipe()).converge(None, torch.eye(3), reference_patches)  # type: ignore[arg-type]
+    assert torch.isfinite(result).all()
+    assert last.length_px == math.inf
+
+
+def test_a_pair_whose_last_step_is_infinite_has_unknown_corners(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("agalign.method.gauss_newton.transform", lambda _h, points: points * math.nan)
+    fixed, moving = textured_pair(np.eye(3))
+    valid = np.ones(fixed.shape, bool)
+    state = JointState(JointSettings(device="cpu"), lambda *_: None)
+    group = ImageGroup.of_one(Raster(fixed, valid), Raster(moving, valid), np.eye(3))
+    assert refine(state, state.fast_descriptor([1, 1]), group) == [Issue("corners_unknown")]
