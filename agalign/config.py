@@ -1,6 +1,10 @@
-"""Settings, one frozen object a stage. Every number that decides something has its name and its reason here."""
+"""What a user chooses: one frozen, validated object for each stage.
 
-from typing import Annotated, Literal
+An unknown name or an impossible value raises pydantic's ValidationError. docs/options.md lists all settings. Other
+numbers that decide something are constants in the module that uses them, with their reasons.
+"""
+
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -30,94 +34,20 @@ class Stage(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class FastRecipe(Stage):
-    """In-batch negatives, Adam on theta, Gauss-Newton on psi. See docs/method.md for what each choice gained."""
-
-    learn_px: Positive = 640
-    """Longer side of the images on which theta is learnt, but at least half of the full resolution."""
-    coarsest_px: Positive = 200
-    """The coarsest level, where an untrusted seed starts, is between this and twice this on its longer side."""
-    search_share: float = 0.22
-    """How far around an untrusted seed the loss is searched at the coarsest level, in longer sides."""
-    search_step_px: float = 3.0
-    """Between neighbouring translations that are tried, px of that level."""
-    search_patches: Positive = 64
-    start: Literal["starter", "random"] = "starter"
-    """Where theta starts: from the network that comes with the package, or from random weights."""
-    batch: Positive = 128
-    temperature: float = 0.07
-    learning_rate: float = 2e-3
-    max_steps: Positive = 150
-    warm_up_steps: int = 50
-    """Steps on random weights before psi may move."""
-    first_updates: Positive = 5
-    """Steps on psi before the first on weights that are not random; twice as many where those suffice."""
-    steps_between_updates: Positive = 10
-    hopeless_steps: Positive = 30
-    """Steps after which a level is given up where no held-out patches could be told apart."""
-    enough_retrieval: float = 0.6
-    """Held-out retrieval at which learning may stop once psi is at rest."""
-    rest_px: float = 0.5
-    """psi is at rest when a step moves no corner by more than this, in px of the level."""
-    min_negative_px: float = 8.0
-    """Keypoints closer than this are not negatives of each other."""
-    test_keypoints: Positive = 256
-    """Held-out keypoints among which retrieval is measured."""
-    octaves: float = 1.0
-    """Patch scales are drawn from [1, 2**octaves] px between samples while learning."""
-    learn_patches: Positive = 300
-    """Patches in a Gauss-Newton step while learning."""
-    final_patches: Positive = 400
-    """Patches in a Gauss-Newton step at full resolution."""
-    final_octaves: float = 0.3
-    """Their range of scales: small patches place themselves more exactly."""
-    first_patches: Positive = 200
-    """Patches at full resolution while psi is not at rest."""
-    final_steps: Positive = 10
-    final_rest_px: float = 0.03
-    """psi has converged when a step moves no corner by more than this."""
-    systematic_std_px: float = 0.035
-    """Added in quadrature to the standard deviations along x and y: what the curvature cannot see, such as a bias
-    between two modalities. Measured on synthetic flights."""
-    longest_step_px: float = 4.0
-    difference_px: float = 0.75
-    """Half width of the central differences that give a descriptor's gradient."""
-    max_corner_std_px: float = 0.5
-    """A model family is rich enough only while its corners are known this well, px of the level."""
-
-
-class PaperRecipe(Stage):
-    """The hyperparameters of Dong et al. 2018, Sec. 5.3, and, said so, what the paper leaves open."""
-
-    keypoints: Positive = 4000
-    min_gradient: float = 0.05
-    octaves: float = 4.0
-    """log2 s is uniform in [0, octaves]."""
-    spacing_px: float = 0.25
-    """Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. The paper does not say."""
-    margin: float = 1.0
-    min_negative_px: float = 16.0
-    """tau: least distance of a negative from the true position. The paper does not say."""
-    batch: Positive = 64
-    momentum: float = 0.9
-    learning_rate: float = 1e-4
-    """Annealed by a cosine to 0 within each level."""
-    coarsest_px: Positive = 80
-    """Longer side of the coarsest level."""
-    epochs: Positive = 8
-    """Passes over the keypoints a level. The paper does not say."""
-
-
 class JointSettings(Stage):
-    """The joint aligner."""
+    """Joint optimisation of the descriptor and the homographies."""
 
     recipe: Recipe = "fast"
+    """`paper` follows the published algorithm step by step; `fast` reaches the same result sooner."""
     sharing: Sharing = "pseudo-siamese"
+    """Layers that the descriptors of the reference and of a moving band share: all (siamese), all but the first
+    (pseudo-siamese), or none (unshared)."""
     model_family: FamilyChoice = "auto"
+    """Mappings to fit; `auto` takes the richest one that the images determine."""
     device: str = "auto"
+    """Of torch: cpu, cuda, cuda:1 and so on; `auto` is CUDA where it is available."""
     rng_seed: Annotated[int, Field(ge=0, le=MAX_RNG_SEED)] = 0
-    fast: FastRecipe = FastRecipe()
-    paper: PaperRecipe = PaperRecipe()
+    """The same seed gives the same result, bit by bit."""
 
 
 class FlightSettings(Stage):

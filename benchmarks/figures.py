@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import agalign
-from agalign.config import JointSettings, PaperRecipe
+from agalign.config import JointSettings
 from agalign.evaluation.image_pairs import read_image
 from agalign.evaluation.methods import Task, method_named
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.method.detect import sift_keypoints, to_8_bit, visible_in_both
+from agalign.method.paper import Training
 from agalign.products.drawing import with_text
 from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
@@ -96,8 +97,8 @@ def main(out: Path) -> None:
         cv2.imwrite(str(out / "matches.jpg"), drawn, [cv2.IMWRITE_JPEG_QUALITY, 40])
         cv2.imwrite(str(out / "aligned.jpg"), before_and_after(folder), [cv2.IMWRITE_JPEG_QUALITY, 65])
         offsets = np.linspace(-100, 100, 17)
-        settings = JointSettings(recipe="paper", paper=PaperRecipe(epochs=2))
-        surface = loss_surface(fixed, moving, truth, offsets, settings)
+        settings = JointSettings(recipe="paper")
+        surface = loss_surface(fixed, moving, truth, offsets, settings, Training(epochs=2))
         draw_surface(surface, offsets, out / "loss-surface.png")
 
 

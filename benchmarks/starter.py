@@ -9,7 +9,9 @@ their homography in a text file, which start 5 % of the image away from the trut
 import sys
 import time
 from collections.abc import Iterator
+from functools import partialmethod
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -19,7 +21,8 @@ from agalign.batch.capture import quiet
 from agalign.capture.align import align_pairs
 from agalign.capture.band_pair import BandPair
 from agalign.capture.reference import Reference
-from agalign.config import FastRecipe, JointSettings, Settings
+from agalign.config import Settings
+from agalign.method.state import JointState
 from agalign.values import geometry
 from agalign.values.image import Raster
 
@@ -65,13 +68,15 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     for folder in map(Path, sys.argv[1:]):
         for start in ("random", "starter"):
-            settings = Settings(joint=JointSettings(fast=FastRecipe(start=start)))
+            settings = Settings()
             errors, seconds, pairs = [], [], 0
             for _, images, ties in groups(folder):
                 began = time.perf_counter()
                 reference = Reference(images[0][1], settings)
                 pairs_here = [BandPair(name, reference, moving, starts) for name, _, moving, starts in images]
-                result = align_pairs(pairs_here, settings, quiet)
+                descriptor = partialmethod(JointState.fast_descriptor, start=start)
+                with patch.object(JointState, "fast_descriptor", descriptor):
+                    result = align_pairs(pairs_here, settings, quiet)
                 seconds += [(time.perf_counter() - began) / len(images)] * len(images)
                 pairs += len(images)
                 for name, alignment in result.items():

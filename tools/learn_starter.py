@@ -16,8 +16,8 @@ import torch
 import agalign
 from agalign.batch.learn import read_subject
 from agalign.cameras.discover import discover
-from agalign.config import FastRecipe, JointSettings, Settings
-from agalign.method.fast import learn
+from agalign.config import JointSettings, Settings
+from agalign.method.fast import Schedule, learn
 from agalign.method.starter import save_starter
 from agalign.method.state import JointState
 from agalign.synthetic.flight import make_flight
@@ -39,12 +39,12 @@ def main() -> None:
         groups = [read_subject(c, Settings())[0] for c in captures]
     for rate, steps in SCHEDULE:
         # psi may move as always, but nothing is ever learnt well enough to stop.
-        recipe = FastRecipe(start="random", learning_rate=rate, max_steps=steps, enough_retrieval=1.0)
-        settings = JointSettings(sharing="siamese", fast=recipe)
+        schedule = Schedule(learning_rate=rate, max_steps=steps, enough_retrieval=1.0)
+        settings = JointSettings(sharing="siamese")
         state = JointState(settings, lambda _, share, rate=rate: print(f"rate {rate:g}: {share:.0%}", flush=True))
         if net is None:
-            net = state.fast_descriptor([1] * (1 + len(groups[0].moving)))
-        learn(state, groups, net)
+            net = state.fast_descriptor([1] * (1 + len(groups[0].moving)), "random")
+        learn(state, groups, net, schedule=schedule)
     save_starter(net, Path(agalign.__file__).parent / "method" / "starter.safetensors")
 
 

@@ -92,9 +92,10 @@ def surface(
     with exits(terminal):
         import numpy as np
 
-        from agalign.config import JointSettings, PaperRecipe
+        from agalign.config import JointSettings
         from agalign.evaluation.image_pairs import find_pairs, read_image
         from agalign.evaluation.surface import draw_surface, loss_surface
+        from agalign.method.paper import Training
 
         if out.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
             raise ConfigurationError(f"{out}: is no name of a picture, such as loss-surface.png")
@@ -103,15 +104,15 @@ def surface(
             raise ConfigurationError(f"{pairs}: has {len(known)} pairs with a homography, not {number}")
         pair = known[number - 1]
         offsets = np.linspace(-reach, reach, points)
-        recipe = PaperRecipe(epochs=epochs)
-        settings = JointSettings(recipe="paper", paper=recipe, device=device, rng_seed=rng_seed)
+        settings = JointSettings(recipe="paper", device=device, rng_seed=rng_seed)
         images = read_image(pair.fixed), read_image(pair.moving)
         assert pair.fixed_to_moving is not None
 
         def progress(share: float) -> None:
             terminal.event("surface", f"{share:.0%}" if verbose else "", share=round(share, 3))
 
-        result = loss_surface(*images, pair.fixed_to_moving, offsets, settings, progress=progress)
+        training = Training(epochs=epochs)
+        result = loss_surface(*images, pair.fixed_to_moving, offsets, settings, training, progress=progress)
         draw_surface(result, offsets, out)
         terminal.event("surface", f"{out}: {pair.name}", file=str(out))
 

@@ -22,6 +22,7 @@ from agalign.method import losses
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.detect import sift_keypoints, visible_in_both
 from agalign.method.device import one_memory_error, one_thread
+from agalign.method.fast import BATCH, LEARNING_RATE, TEMPERATURE
 from agalign.method.levels import Level
 from agalign.method.patches import Keypoints, far_apart, patch_positions
 from agalign.method.refine import MovingBand
@@ -88,12 +89,12 @@ def _example(state: JointState, pair: BandPair, fixed_to_moving: Matrix) -> _Exa
 
 def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, steps: int) -> None:
     """Theta by Adam with psi known, a pair at a time; the rate falls to nothing along a cosine."""
-    recipe, generator = state.settings.fast, state.sampler.generator
-    optimiser = torch.optim.Adam(net.parameters(), recipe.learning_rate)
+    generator = state.sampler.generator
+    optimiser = torch.optim.Adam(net.parameters(), LEARNING_RATE)
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for step in range(steps):
         example = examples[step % len(examples)]
-        rows = torch.randint(len(example.keypoints), (recipe.batch,), generator=generator)
+        rows = torch.randint(len(example.keypoints), (BATCH,), generator=generator)
         k = example.keypoints[rows.to(state.device)]
         # SIFT's own scale and orientation are one of many that a patch may have: the network is to know all.
         turn = 2 * math.pi * torch.rand(len(k), generator=generator)
@@ -102,7 +103,7 @@ def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, ste
         moving = MovingBand(net, example.level, 0, 1)
         patches = [example.level.fixed.patches(patch_positions(k)), moving.patches(k, example.homography)]
         f, f_prime = net.describe(patches, [REFERENCE, moving.side])
-        loss = losses.in_batch(f, f_prime, far_apart(k, recipe.min_negative_px), recipe.temperature)
+        loss = losses.in_batch(f, f_prime, far_apart(k), TEMPERATURE)
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()

@@ -29,10 +29,10 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.detect import grey
 from agalign.method.fast import learn
 from agalign.method.match import matching_network
-from agalign.method.paper import align_by_paper
+from agalign.method.paper import align_by_paper, pyramid
 from agalign.method.patches import Keypoints, patch_positions, transform
 from agalign.method.refine import MovingBand, describe_fixed, refine
-from agalign.method.state import ImageGroup, JointState
+from agalign.method.state import ImageGroup, JointState, ThetaStart
 from agalign.pixels.resample import single, warped
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
@@ -90,11 +90,9 @@ def method_named(name: str) -> Method:
         return fixed_names[name]
     learnt = re.fullmatch(r"(fast|paper):([a-z-]+)(:grey)?(:random)?", name)
     if learnt and learnt[2] in get_args(Sharing):
-        start = "random" if learnt[4] else "starter"
-        settings = JointSettings.model_validate(
-            {"recipe": learnt[1], "sharing": learnt[2], "fast": {"start": start}},
-        )
-        return lambda task: _learnt_on_the_pair(task, settings, colour=learnt[3] is None)
+        start: ThetaStart = "random" if learnt[4] else "starter"
+        settings = JointSettings.model_validate({"recipe": learnt[1], "sharing": learnt[2]})
+        return lambda task: _learnt_on_the_pair(task, settings, start, colour=learnt[3] is None)
     if ".safetensors" in name:
         return _saved_network(Path(name))
     if ".pt" in name:
@@ -111,7 +109,7 @@ _MODULES = {"elastix": "itk"}
 # ---- this program's
 
 
-def _learnt_on_the_pair(task: PairTask, settings: JointSettings, *, colour: bool) -> Outcome:
+def _learnt_on_the_pair(task: PairTask, settings: JointSettings, start: ThetaStart, *, colour: bool) -> Outcome:
     """Recipe fast or paper from the task's start."""
     fixed, moving = task.fixed, task.moving
     if not colour or (settings.sharing == "siamese" and fixed.channels != moving.channels):
@@ -126,7 +124,7 @@ def _learnt_on_the_pair(task: PairTask, settings: JointSettings, *, colour: bool
         if settings.recipe == "paper":
             net, result = align_by_paper(state, group)
         else:
-            net = state.fast_descriptor([fixed.channels, moving.channels])
+            net = state.fast_descriptor([fixed.channels, moving.channels], start)
             learn(state, [group], net)
             result = refine(state, net, group)[0]
     except (NotEnoughTextureError, NoContrastError, GeometryError):
@@ -246,8 +244,7 @@ def _torchscript(path: Path, side: int) -> Method:
 def _elastix(task: PairTask) -> Outcome:
     """On the pyramid of recipe paper; its own default parameters otherwise."""
     laid = warped(single(task.moving), PixelMapping(task.start), task.fixed.size_px)
-    coarsest = Settings().joint.paper.coarsest_px
-    levels = 1 + max(0, round(math.log2(max(task.fixed.size_px) / coarsest)))
+    levels = len(pyramid(max(task.fixed.size_px)))
     result = elastix_affinity(single(task.fixed), laid, levels)
     return Outcome(None, task.start if result is None else geometry.compose(task.start, result))
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from agalign.config import JointSettings
 from agalign.errors import NoContrastError, NotEnoughTextureError
 from agalign.method.device import one_memory_error, one_thread
-from agalign.method.paper import descend
+from agalign.method.paper import DEFAULT_TRAINING, Training, descend
 from agalign.method.state import ImageGroup, JointState
 from agalign.products.drawing import with_text, write_png
 from agalign.values import geometry
@@ -21,7 +21,8 @@ from agalign.values.image import Raster
 
 def loss_surface(
     fixed: Raster, moving: Raster, truth: Matrix, offsets_px: NDArray[np.float64], settings: JointSettings,
-    longer_side_px: int = 512, progress: Callable[[float], None] = lambda _: None,
+    training: Training = DEFAULT_TRAINING, longer_side_px: int = 512,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> NDArray[np.float64]:  # fmt: skip
     """Mean loss a keypoint at the end of training with psi held at the truth moved by (x, y), for all pairs of offsets.
 
@@ -38,7 +39,7 @@ def loss_surface(
                 level = state.level(ImageGroup.of_one(fixed, moving, start), scale, [0])
                 net = state.paper_descriptor([fixed.channels, moving.channels])
                 pool = level.trainable
-                result[row, column] = descend(state, net, level, pool, start, lambda _: None, move=False).loss
+                result[row, column] = descend(state, net, level, pool, start, training, move=False).loss
         progress((row + 1) / len(offsets_px))
     return result
 

@@ -20,6 +20,8 @@ from agalign.method.levels import Level
 from agalign.method.patches import far_apart, patch_positions, translation
 from agalign.method.refine import (
     MIN_KEYPOINTS,
+    REST_PX,
+    TEST_KEYPOINTS,
     MovingBand,
     Solver,
     best_shift,
@@ -31,14 +33,61 @@ from agalign.method.refine import (
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL
 
+BATCH = 128
+"""Keypoints of a step on theta, all negatives of each other."""
+LEARNING_RATE = 2e-3
+TEMPERATURE = 0.07
+"""Of the in-batch loss (He et al. 2020, Sec. 3.3)."""
+_LEARN_PX = 640
+"""Longer side of the images on which theta is learnt, but at least half of the full resolution: what is learnt at this
+scale holds at full resolution, at a quarter of the cost."""
+_COARSEST_PX = 200
+"""The coarsest level, where an untrusted seed starts, is between this and twice this on its longer side."""
+_SEARCH_SHARE = 0.22
+"""How far around an untrusted seed the loss is searched at the coarsest level, in longer sides."""
+_SEARCH_STEP_PX = 3.0
+"""Between neighbouring translations that are tried, px of that level: within reach of a Gauss-Newton step."""
+_SEARCH_PATCHES = 64
+_OCTAVES = 1.0
+"""Patch scales are drawn from [1, 2**octaves] px between samples."""
+_WARM_UP_STEPS = 50
+"""Steps on random weights before psi may move."""
+_FIRST_UPDATES = 5
+"""Steps on psi before the first on weights that are not random; twice as many where those suffice."""
+_STEPS_BETWEEN_UPDATES = 10
+_HOPELESS_STEPS = 30
+"""Steps after which a level is given up where no held-out patches could be told apart."""
+_PATCHES = 300
+"""Patches in a Gauss-Newton step: the cost of a step grows with them, its error falls with their square root."""
 
-def learn(state: JointState, groups: Sequence[ImageGroup], net: Descriptor, at_once: int = 1) -> tuple[int, float]:
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long theta is learnt at each level."""
+
+    learning_rate: float = LEARNING_RATE
+    max_steps: int = 150
+    """Of each capture."""
+    enough_retrieval: float = 0.6
+    """Held-out retrieval at which learning may stop once psi is at rest."""
+
+
+DEFAULT_SCHEDULE = Schedule()
+
+
+def learn(
+    state: JointState,
+    groups: Sequence[ImageGroup],
+    net: Descriptor,
+    at_once: int = 1,
+    schedule: Schedule = DEFAULT_SCHEDULE,
+) -> tuple[int, float]:
     """Theta and every psi of all subjects, coarse to fine; theta is carried from level to level.
 
     The psi of so many subjects move at a time, each in a thread; on how many, nothing depends. Returns the steps taken
     and the last loss. Raises NoContrastError.
     """
-    scales = learn_scales(state, max(max(s.fixed.size_px) for s in groups))
+    scales = learn_scales(max(max(s.fixed.size_px) for s in groups))
     steps, loss = 0, float("nan")
     # Random numbers of its own each: what is drawn for one does not depend on the others.
     states = [JointState(state.settings, state.progress) for _ in groups]
@@ -47,24 +96,23 @@ def learn(state: JointState, groups: Sequence[ImageGroup], net: Descriptor, at_o
             last = number == len(scales) - 1
             wanted = [[b for b in s.hopeful if last or not s.trusted[b]] for s in groups]
             at_level = [
-                _AtLevel(own, net, s, bands, own.level(s, scale, bands))
+                _AtLevel(own, net, s, bands, own.level(s, scale, bands), schedule)
                 for own, s, bands in zip(states, groups, wanted, strict=True) if bands
             ]  # fmt: skip
             if number == 0 and net.learnt:
                 list(pool.map(_search, at_level))
             if at_level:
-                taken, loss = _learn_level(state, net, at_level, lambda some: list(pool.map(_move_psi, some)))
+                taken, loss = _learn_level(state, net, at_level, schedule, lambda some: list(pool.map(_move_psi, some)))
                 steps += taken
             for a in at_level:
                 a.hand_on()
     return steps, loss
 
 
-def learn_scales(state: JointState, longer_side_px: int) -> list[float]:
+def learn_scales(longer_side_px: int) -> list[float]:
     """Resolutions at which theta is learnt, coarse to fine."""
-    recipe = state.settings.fast
-    scales = [min(1.0, max(0.5, recipe.learn_px / longer_side_px))]
-    while scales[0] * longer_side_px >= 2 * recipe.coarsest_px:
+    scales = [min(1.0, max(0.5, _LEARN_PX / longer_side_px))]
+    while scales[0] * longer_side_px >= 2 * _COARSEST_PX:
         scales.insert(0, scales[0] / 2)
     return scales
 
@@ -80,6 +128,7 @@ class _AtLevel:
     which: Sequence[int]
     """Of the subject's moving images."""
     level: Level
+    schedule: Schedule
     h: list[Tensor] = field(init=False)
     settled: list[bool] = field(init=False)
     """Those whose psi has been at rest once; it is moved on all the same."""
@@ -100,7 +149,7 @@ class _AtLevel:
     @property
     def is_on_its_way(self) -> bool:
         """True where the patches of all psi that are not at rest are told apart well: more steps are all they need."""
-        enough = self.state.settings.fast.enough_retrieval
+        enough = self.schedule.enough_retrieval
         return all(r > enough for r, settled in zip(self.retrieved, self.settled, strict=True) if not settled)
 
     def hand_on(self) -> None:
@@ -118,40 +167,38 @@ def _search(at: _AtLevel) -> None:
     Around the truth the loss is a funnel (paper, Fig. 2) that is wider than what one Gauss-Newton step sees.
     """
     state, level = at.state, at.level
-    recipe = state.settings.fast
-    p, _ = state.sampler.draw(level, level.anywhere, at.h, recipe.search_patches, recipe.octaves)
+    p, _ = state.sampler.draw(level, level.anywhere, at.h, _SEARCH_PATCHES, _OCTAVES)
     for i, band in enumerate(at.bands):
         if at.group.trusted[at.which[i]]:
             continue
-        reach = recipe.search_share * max(level.fixed.size_px)
+        reach = _SEARCH_SHARE * max(level.fixed.size_px)
         if at.group.reach_px:
             reach = min(reach, at.group.reach_px[at.which[i]] * level.fixed.scale[0])
-        shift = best_shift(band, at.h[i], p, reach, recipe.search_step_px)
+        shift = best_shift(band, at.h[i], p, reach, _SEARCH_STEP_PX)
         at.h[i] = at.h[i] @ translation(shift).to(at.h[i])
 
 
 def _learn_level(
-    state: JointState, net: Descriptor, at_level: Sequence[_AtLevel],
+    state: JointState, net: Descriptor, at_level: Sequence[_AtLevel], schedule: Schedule,
     move_psi: Callable[[Sequence[_AtLevel]], list[bool]],
 ) -> tuple[int, float]:  # fmt: skip
     """Theta by Adam, a capture at a time; each psi by Gauss-Newton once held-out patches are told apart.
 
     A network that is learnt already needs no step where its first ones on psi are enough.
     """
-    recipe = state.settings.fast
     loss_value = float("nan")
-    max_steps = recipe.max_steps * len(at_level)
-    between = recipe.steps_between_updates * len(at_level)
-    warm_up = 0 if net.learnt else recipe.warm_up_steps
+    max_steps = schedule.max_steps * len(at_level)
+    between = _STEPS_BETWEEN_UPDATES * len(at_level)
+    warm_up = 0 if net.learnt else _WARM_UP_STEPS
     if net.learnt:
         restless = at_level
-        for update in range(2 * recipe.first_updates):
+        for update in range(2 * _FIRST_UPDATES):
             restless = [a for a, settled in zip(restless, move_psi(restless), strict=True) if not settled]
             if not restless:
                 return 0, loss_value
-            if update >= recipe.first_updates - 1 and not all(a.is_on_its_way for a in restless):
+            if update >= _FIRST_UPDATES - 1 and not all(a.is_on_its_way for a in restless):
                 break
-    optimiser = Adam(net.parameters(), recipe.learning_rate)
+    optimiser = Adam(net.parameters(), schedule.learning_rate)
     for step in range(1, max_steps + 1):
         loss = _loss(at_level[step % len(at_level)])
         if loss is not None:
@@ -162,7 +209,7 @@ def _learn_level(
         state.progress("learning", step / max_steps)
         if all(move_psi(at_level)):
             break
-        hopeless = step >= warm_up + recipe.hopeless_steps * len(at_level)
+        hopeless = step >= warm_up + _HOPELESS_STEPS * len(at_level)
         if hopeless and not any(any(a.told_apart) for a in at_level):
             break
     net.learnt = True
@@ -172,8 +219,7 @@ def _learn_level(
 def _loss(at: _AtLevel) -> Tensor | None:
     """The in-batch loss of one capture's pairs on keypoints that are drawn anew; None where none can be drawn."""
     state, level = at.state, at.level
-    recipe = state.settings.fast
-    p, inside = state.sampler.draw(level, level.trainable, at.h, recipe.batch, recipe.octaves)
+    p, inside = state.sampler.draw(level, level.trainable, at.h, BATCH, _OCTAVES)
     rows = [inside[:, i].nonzero()[:, 0] for i in range(len(at.h))]
     taking_part = [band for band in at.bands if len(rows[band.index]) >= MIN_KEYPOINTS]
     if not taking_part:
@@ -181,11 +227,11 @@ def _loss(at: _AtLevel) -> Tensor | None:
     patches = [level.fixed.patches(patch_positions(p))]
     patches += [band.patches(p[rows[band.index]], at.h[band.index]) for band in taking_part]
     f, *f_primes = at.net.describe(patches, [REFERENCE, *(band.side for band in taking_part)])
-    apart = far_apart(p, recipe.min_negative_px)
+    apart = far_apart(p)
     terms = []
     for band, f_prime in zip(taking_part, f_primes, strict=True):
         mine = rows[band.index]
-        terms.append(losses.in_batch(f[mine], f_prime, apart[mine][:, mine], recipe.temperature))
+        terms.append(losses.in_batch(f[mine], f_prime, apart[mine][:, mine], TEMPERATURE))
     return torch.stack(terms).mean()
 
 
@@ -193,16 +239,15 @@ def _loss(at: _AtLevel) -> Tensor | None:
 def _move_psi(at: _AtLevel) -> bool:
     """One step on each psi of a capture whose held-out patches are retrieved; True where all have settled."""
     state, level = at.state, at.level
-    recipe = state.settings.fast
-    test, _ = state.sampler.draw(level, level.held_out, at.h, recipe.test_keypoints, recipe.octaves)
-    p, _ = state.sampler.draw(level, level.anywhere, at.h, recipe.learn_patches, recipe.octaves)
+    test, _ = state.sampler.draw(level, level.held_out, at.h, TEST_KEYPOINTS, _OCTAVES)
+    p, _ = state.sampler.draw(level, level.anywhere, at.h, _PATCHES, _OCTAVES)
     if len(p) < MIN_KEYPOINTS:
         return True
     f_test = describe_fixed(at.net, level, test)
-    reference_patches = describe_reference(at.net, level, p, recipe.difference_px)
-    solver = Solver(state.family, recipe)
+    reference_patches = describe_reference(at.net, level, p)
+    solver = Solver(state.family)
     for i, band in enumerate(at.bands):
-        retrieved, _ = retrieval(band, at.h[i], test, f_test, recipe.min_negative_px)
+        retrieved, _ = retrieval(band, at.h[i], test, f_test)
         at.retrieved[i] = retrieved
         if retrieved < MIN_RETRIEVAL:
             continue
@@ -210,5 +255,5 @@ def _move_psi(at: _AtLevel) -> bool:
         with suppress(NotEnoughTextureError):
             step = solver.step(band, at.h[i], reference_patches)
             at.h[i] = moved(at.h[i], step)
-            at.settled[i] |= retrieved > recipe.enough_retrieval and step.length_px < recipe.rest_px
+            at.settled[i] |= retrieved > at.schedule.enough_retrieval and step.length_px < REST_PX
     return all(at.settled)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from agalign.config import FastRecipe
 from agalign.method.device import exact
 from agalign.method.patches import ALPHA, FAMILY_PARAMETERS, Keypoints, homography_from_psi, transform
 from agalign.values import geometry
@@ -21,6 +20,11 @@ _REWEIGHTINGS = 4
 _DAMPING = 1e-4
 _CELL_PX = 48
 """Patches whose centres share a cell of this side count as one witness of the uncertainty."""
+_RICH_ENOUGH_STD_PX = 0.5
+"""A model family is rich enough while its least certain corner is known this well, px of the level: beyond it a simpler
+family has the smaller error."""
+_MAX_STEP_PX = 4.0
+"""Longest step, px of the level: the descriptors are linear in a shift over about this distance."""
 FAMILIES: tuple[ModelFamily, ...] = ("homography", "affine", "translation")
 
 
@@ -98,21 +102,24 @@ class PatchEquations:
         return row * (self.size_px[0] // _CELL_PX + 2) + column
 
 
-def solve(equations: PatchEquations, family: ModelFamily | None, recipe: FastRecipe) -> Step:
-    """The step that the patches agree on.
+def solve(
+    equations: PatchEquations, family: ModelFamily | None, *, rich_enough_std_px: float = _RICH_ENOUGH_STD_PX,
+    max_step_px: float = _MAX_STEP_PX,
+) -> Step:  # fmt: skip
+    """The step that the patches agree on, cut to `max_step_px`.
 
-    With `family` None the richest family is taken whose corners are known to `recipe.max_corner_std_px`.
+    With `family` None the richest family is taken whose corners have a standard error of at most `rich_enough_std_px`.
     """
     families = FAMILIES if family is None else (family,)
-    step = richest = _solve_family(equations, families[0], recipe.longest_step_px)
+    step = richest = _solve_family(equations, families[0], max_step_px)
     for simpler in families[1:]:
-        if step.corner_std_px <= recipe.max_corner_std_px:
+        if step.corner_std_px <= rich_enough_std_px:
             break
-        step = _solve_family(equations, simpler, recipe.longest_step_px)
+        step = _solve_family(equations, simpler, max_step_px)
     return replace(step, corner_covariance_px2=richest.corner_covariance_px2)
 
 
-def _solve_family(equations: PatchEquations, family: ModelFamily, longest_step_px: float) -> Step:
+def _solve_family(equations: PatchEquations, family: ModelFamily, max_step_px: float) -> Step:
     pull, stiffness, size_px = equations.pull, equations.stiffness, equations.size_px
     parameters = list(FAMILY_PARAMETERS[family])
     j = shift_over_psi(equations.xy, *size_px)[:, :, parameters]
@@ -141,8 +148,8 @@ def _solve_family(equations: PatchEquations, family: ModelFamily, longest_step_p
     length_px = float((transform(change, corner_points) - corner_points).norm(dim=1).max())
     if not math.isfinite(length_px):
         change, length_px = torch.eye(3, dtype=torch.float64, device=psi.device), math.inf
-    elif length_px > longest_step_px:
-        change = homography_from_psi(psi * (longest_step_px / length_px), *size_px)
+    elif length_px > max_step_px:
+        change = homography_from_psi(psi * (max_step_px / length_px), *size_px)
     return Step(change, length_px, std_xy, family, of_corners)
 
 

@@ -18,10 +18,10 @@ from dataclasses import replace
 from agalign.config import JointSettings
 from agalign.errors import GeometryError, NoContrastError, NotEnoughTextureError
 from agalign.method.descriptor import Descriptor
-from agalign.method.fast import learn
-from agalign.method.paper import align_by_paper
+from agalign.method.fast import DEFAULT_SCHEDULE, Schedule, learn
+from agalign.method.paper import DEFAULT_TRAINING, Training, align_by_paper
 from agalign.method.refine import refine
-from agalign.method.state import ImageGroup, JointState, Progress
+from agalign.method.state import ImageGroup, JointState, Progress, ThetaStart
 from agalign.values.alignment import JointResult
 from agalign.values.issues import Issue
 
@@ -29,14 +29,21 @@ Results = list[JointResult | Issue]
 """For each moving image of a subject what was found, or why nothing was."""
 
 
-def align_from_scratch(group: ImageGroup, settings: JointSettings, progress: Progress) -> Results:
-    """Theta and every psi of one capture by itself. Raises ConfigurationError where there is no such device."""
+def align_from_scratch(
+    group: ImageGroup, settings: JointSettings, progress: Progress, *, start: ThetaStart = "starter",
+    schedule: Schedule = DEFAULT_SCHEDULE, training: Training = DEFAULT_TRAINING,
+) -> Results:  # fmt: skip
+    """Theta and every psi of one capture by itself.
+
+    `start` and `schedule` are recipe fast's, `training` is recipe paper's. Raises ConfigurationError where there is no
+    such device.
+    """
     state = JointState(settings, progress)
     if settings.recipe == "paper":
-        return [_by_paper(state, group, b) for b in range(len(group.moving))]
-    net = state.fast_descriptor([r.channels for r in (group.fixed, *group.moving)])
+        return [_by_paper(state, group, b, training) for b in range(len(group.moving))]
+    net = state.fast_descriptor([r.channels for r in (group.fixed, *group.moving)], start)
     try:
-        steps, loss = learn(state, [group], net)
+        steps, loss = learn(state, [group], net, schedule=schedule)
         results = refine(state, net, group)
     except NoContrastError:
         return [Issue("no_contrast")] * len(group.moving)
@@ -52,10 +59,10 @@ def refine_with(net: Descriptor, group: ImageGroup, settings: JointSettings, pro
     return [r if isinstance(r, Issue) else replace(r, recipe="flight") for r in results]
 
 
-def _by_paper(state: JointState, group: ImageGroup, band: int) -> JointResult | Issue:
+def _by_paper(state: JointState, group: ImageGroup, band: int, training: Training) -> JointResult | Issue:
     one = ImageGroup.of_one(group.fixed, group.moving[band], group.mappings[band])
     try:
-        return align_by_paper(state, one)[1]
+        return align_by_paper(state, one, training)[1]
     except NotEnoughTextureError as why_not:
         return Issue("few_keypoints", why_not.keypoints, why_not.minimum)
     except NoContrastError:

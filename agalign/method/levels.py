@@ -24,6 +24,8 @@ from agalign.values.lens import Lens
 _HELD_OUT_CELLS = 8
 """Cells along the longer side; every fifth cell, in a diagonal pattern, is kept from training."""
 _FIELD_COLUMNS = 65
+_MIN_GRADIENT = 0.05
+"""Keypoints are drawn where the gradient of the standardised image is larger than this, per px (paper, Sec. 5.3)."""
 _MIN_CELL_PX = 4 * FOOTPRINT_PX
 """Less than this across, a cell has no room for the patches of recipe fast, twice the smallest one's size."""
 _POOL = 16_384
@@ -151,7 +153,7 @@ def make_level_image(raster: Raster, scale: float, device: torch.device) -> Leve
 
 
 def make_level(
-    fixed: Raster, moving: Sequence[Raster], mappings: Sequence[Matrix], scale: float, min_gradient: float,
+    fixed: Raster, moving: Sequence[Raster], mappings: Sequence[Matrix], scale: float,
     generator: torch.Generator, device: torch.device,
 ) -> Level:  # fmt: skip
     """The images reduced by `scale`, a moving one so that its mapping's magnification becomes 1 where it is larger."""
@@ -163,7 +165,7 @@ def make_level(
         views.append(make_level_image(raster, min(1.0, scale / magnification) if usable else scale, device))
     gradient = _gradient_magnitude(fixed_view.image.cpu().numpy())
     room = fixed_view.room_px.cpu().numpy()
-    usable_px = (gradient > min_gradient) & (room > FOOTPRINT_PX)
+    usable_px = (gradient > _MIN_GRADIENT) & (room > FOOTPRINT_PX)
     trainable, held_out = (
         _pool(usable_px, reach_px, fixed_view.lens, generator, device)
         for reach_px in _reach_within_cells(*fixed_view.size_px)

@@ -1,7 +1,7 @@
 """Recipe paper: SGD on theta and psi through one loss, level by level, as published (paper, Sec. 4 and 5).
 
 Names follow the paper: I and I' are `fixed` and `moving`, f the descriptor, theta the network's weights, psi the
-parameters of a homography, L0 and L1 the losses. What the paper leaves open is chosen in `config.PaperRecipe`.
+parameters of a homography, L0 and L1 the losses. The constants are those of Sec. 5.3 unless they say otherwise.
 """
 
 import math
@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from agalign.config import PaperRecipe
 from agalign.errors import NotEnoughTextureError
 from agalign.method import losses
 from agalign.method.descriptor import REFERENCE, Descriptor
@@ -34,18 +33,49 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
 
 _MOVING = 1
+_COARSEST_PX = 80
+"""Longer side of the coarsest level."""
+_OCTAVES = 4.0
+"""log2 s is uniform in [0, octaves]."""
+_SPACING_PX = 0.25
+"""Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. The paper does not say."""
+_MARGIN = 1.0
+_MIN_NEGATIVE_PX = 16.0
+"""tau: least distance of a negative from the true position. The paper does not say."""
+_BATCH = 64
+_MOMENTUM = 0.9
+_LEARNING_RATE = 1e-4
+"""Annealed by a cosine to 0 within each level."""
 
 
-def align_by_paper(state: JointState, group: ImageGroup) -> tuple[Descriptor, JointResult | Issue]:
+@dataclass(frozen=True)
+class Training:
+    """How long recipe paper trains at each level."""
+
+    keypoints: int = 4000
+    epochs: int = 8
+    """Passes over the keypoints. The paper does not say."""
+
+
+DEFAULT_TRAINING = Training()
+
+
+def pyramid(longer_side_px: int) -> tuple[float, ...]:
+    """Scales of the levels, each half of the next, coarse to fine; 1 is full resolution."""
+    halvings = max(0, round(math.log2(longer_side_px / _COARSEST_PX)))
+    return tuple(0.5**k for k in range(halvings, -1, -1))
+
+
+def align_by_paper(
+    state: JointState, group: ImageGroup, training: Training = DEFAULT_TRAINING
+) -> tuple[Descriptor, JointResult | Issue]:
     """The network and what it found for a subject of one moving image.
 
     Coarse to fine: theta starts anew at each level, psi is handed on. Raises NotEnoughTextureError, NoContrastError,
     and GeometryError where psi ends in no homography.
     """
-    recipe = state.settings.paper
     channels = group.fixed.channels, group.moving[0].channels
-    halvings = max(0, round(math.log2(max(group.fixed.size_px) / recipe.coarsest_px)))
-    scales = tuple(0.5**k for k in range(halvings, -1, -1))
+    scales = pyramid(max(group.fixed.size_px))
     steps = 0
     for number, scale in enumerate(scales):
         level = state.level(group, scale, [0])
@@ -56,7 +86,7 @@ def align_by_paper(state: JointState, group: ImageGroup) -> tuple[Descriptor, Jo
         def report(share: float, number: int = number) -> None:
             state.progress("learning", (number + share) / len(scales))
 
-        descent = descend(state, net, level, pool, group.mappings[0], report)
+        descent = descend(state, net, level, pool, group.mappings[0], training, report=report)
         group.mappings[0] = descent.fixed_to_moving
         steps += descent.steps
     result = refine(state, net, group, move=False)[0]
@@ -81,32 +111,31 @@ class Descent:
 
 
 def descend(
-    state: JointState, net: Descriptor, level: Level, pool: Pool, start: Matrix, report: Callable[[float], None], *,
-    move: bool = True,
+    state: JointState, net: Descriptor, level: Level, pool: Pool, start: Matrix,
+    training: Training = DEFAULT_TRAINING, *, report: Callable[[float], None] = lambda _: None, move: bool = True,
 ) -> Descent:  # fmt: skip
     """Argmin over theta and psi of sum L0(x; psi, theta) + sum L1(x, x'; theta) (paper, Eq. 5).
 
     Keypoints x are drawn from `pool`. Without `move` over theta alone, with psi known (paper, Eq. 3). Raises
     NotEnoughTextureError.
     """
-    recipe = state.settings.paper
     size_px = level.fixed.size_px
     psi = psi_from_homography(exact(level.homography(start, 0)), *size_px).to(level.fixed.image).requires_grad_()
     movable = torch.zeros_like(psi)
     if move:
         movable[list(FAMILY_PARAMETERS[state.family or "homography"])] = 1.0
-    keypoints = _draw(state, level, pool, homography_from_psi(psi.detach(), *size_px))
+    keypoints = _draw(state, level, pool, homography_from_psi(psi.detach(), *size_px), training.keypoints)
 
-    batches = len(keypoints.x) // recipe.batch
-    steps = recipe.epochs * batches
-    optimiser = torch.optim.SGD([*net.parameters(), psi], recipe.learning_rate, recipe.momentum)
+    batches = len(keypoints.x) // _BATCH
+    steps = training.epochs * batches
+    optimiser = torch.optim.SGD([*net.parameters(), psi], _LEARNING_RATE, _MOMENTUM)
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     loss_value, before = float("nan"), psi.detach().clone()
-    for _ in range(recipe.epochs):
+    for _ in range(training.epochs):
         shuffled = torch.randperm(len(keypoints.x), generator=state.sampler.generator).to(state.device)
         pass_loss = 0.0
-        for rows in torch.split(shuffled[: batches * recipe.batch], recipe.batch):
-            loss = _loss(net, level, keypoints.of(rows), homography_from_psi(psi, *size_px), recipe)
+        for rows in torch.split(shuffled[: batches * _BATCH], _BATCH):
+            loss = _loss(net, level, keypoints.of(rows), homography_from_psi(psi, *size_px))
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             assert psi.grad is not None
@@ -115,7 +144,7 @@ def descend(
             optimiser.step()
             annealing.step()
             pass_loss += float(loss.detach())
-        loss_value = pass_loss / (batches * recipe.batch)
+        loss_value = pass_loss / (batches * _BATCH)
         report(annealing.last_epoch / steps)
     h, h_before = (homography_from_psi(q, *size_px).detach() for q in (psi, before))
     corners = torch.tensor(geometry.corners(*size_px)).to(h)
@@ -136,23 +165,22 @@ class _Drawn:
         return _Drawn(self.x[rows], self.x_false[rows], self.is_negative[rows])
 
 
-def _draw(state: JointState, level: Level, pool: Pool, h: Tensor) -> _Drawn:
+def _draw(state: JointState, level: Level, pool: Pool, h: Tensor, count: int) -> _Drawn:
     """The negatives are drawn once: each keypoint of I with a random other one's place in I'."""
-    recipe = state.settings.paper
-    x, _ = state.sampler.draw(level, pool, [h], recipe.keypoints, recipe.octaves, recipe.spacing_px)
-    if len(x) < recipe.batch:
-        raise NotEnoughTextureError(len(x), recipe.batch)
+    x, _ = state.sampler.draw(level, pool, [h], count, _OCTAVES, _SPACING_PX)
+    if len(x) < _BATCH:
+        raise NotEnoughTextureError(len(x), _BATCH)
     order = torch.randperm(len(x), generator=state.sampler.generator).to(state.device)
     x_false = warp_keypoints(x[order], h)
-    is_negative = (x_false.xy - transform(h, x.xy)).norm(dim=1) >= recipe.min_negative_px
+    is_negative = (x_false.xy - transform(h, x.xy)).norm(dim=1) >= _MIN_NEGATIVE_PX
     return _Drawn(x, x_false, is_negative)
 
 
-def _loss(net: Descriptor, level: Level, batch: _Drawn, h: Tensor, recipe: PaperRecipe) -> Tensor:
+def _loss(net: Descriptor, level: Level, batch: _Drawn, h: Tensor) -> Tensor:
     """Sum of L0(x, w_k(x; psi)) and of L1(x, x') (paper, Eq. 4)."""
     fixed, moving = level.fixed, level.moving[0]
     f = net(fixed.patches(patch_positions(batch.x)), REFERENCE)
     f_true = net(moving.patches(patch_positions(warp_keypoints(batch.x, h))), _MOVING)
     f_false = net(moving.patches(patch_positions(batch.x_false)), _MOVING)
     apart = losses.distance(f, f_false)[batch.is_negative]
-    return losses.contrastive(losses.distance(f, f_true), apart, recipe.margin)
+    return losses.contrastive(losses.distance(f, f_true), apart, _MARGIN)

@@ -19,6 +19,9 @@ ALPHA = 64.0
 FOOTPRINT_PX = (PATCH_PX - 1) / 2 * math.sqrt(2.0)
 """Distance from a keypoint to the farthest sample of its patch where the samples are 1 px apart."""
 
+_MIN_NEGATIVE_PX = 8.0
+"""Recipe fast: keypoints closer than half a patch show much the same and are not negatives of each other."""
+
 FAMILY_PARAMETERS: dict[ModelFamily, tuple[int, ...]] = {
     "homography": (0, 1, 2, 3, 4, 5, 6, 7),
     "affine": (0, 1, 2, 3, 4, 5),
@@ -139,6 +142,6 @@ def footprint_radius(scale: Tensor) -> Tensor:
     return scale * FOOTPRINT_PX
 
 
-def far_apart(keypoints: Keypoints, min_px: float) -> Tensor:
-    """(N, N) True where two keypoints are at least `min_px` from each other."""
-    return torch.cdist(keypoints.xy, keypoints.xy) >= min_px
+def far_apart(keypoints: Keypoints) -> Tensor:
+    """(N, N) True where two keypoints are so far from each other that they count as negatives."""
+    return torch.cdist(keypoints.xy, keypoints.xy) >= _MIN_NEGATIVE_PX

@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agalign.config import FastRecipe
 from agalign.errors import GeometryError, NotEnoughTextureError
 from agalign.method import losses
 from agalign.method.descriptor import REFERENCE, Descriptor
@@ -27,6 +26,22 @@ from agalign.values.choices import ModelFamily
 from agalign.values.issues import Issue
 
 MIN_KEYPOINTS = 16
+TEST_KEYPOINTS = 256
+"""Held-out keypoints among which retrieval is measured: chance is then 0.004, and a share is known to 0.03."""
+REST_PX = 0.5
+"""psi is at rest when a step moves no corner by more than this, px of the level."""
+_FINAL_PATCHES, _FIRST_PATCHES_AT_FULL = 400, 200
+"""Patches in a Gauss-Newton step at full resolution, and while psi is not at rest."""
+_FINAL_OCTAVES = 0.3
+"""Range of their scales: small patches place themselves more exactly."""
+_FINAL_STEPS = 10
+_FINAL_REST_PX = 0.03
+"""psi has converged when a step moves no corner by more than this, px: less than the systematic error."""
+_SYSTEMATIC_STD_PX = 0.035
+"""Added in quadrature to the standard deviations along x and y: what the curvature cannot see, such as a bias between
+two modalities. Measured on synthetic flights."""
+_DIFFERENCE_PX = 0.75
+"""Half width of the central differences that give a descriptor's gradient."""
 _FIRST_PATCHES, _LIKELY_SHIFTS, _AT_ONCE = 24, 64, 16
 _MAX_RATIO = 0.6
 """Of one step to the one before, for what follows to be believed a geometric series."""
@@ -85,21 +100,20 @@ def describe_fixed(net: Descriptor, level: Level, keypoints: Keypoints) -> Tenso
 
 
 @torch.no_grad()
-def describe_reference(net: Descriptor, level: Level, keypoints: Keypoints, difference_px: float) -> ReferencePatches:
+def describe_reference(net: Descriptor, level: Level, keypoints: Keypoints) -> ReferencePatches:
     """Descriptors and gradient of the reference's patches."""
 
     def describe(k: Keypoints) -> Tensor:
         return describe_fixed(net, level, k)
 
-    return ReferencePatches(keypoints, describe(keypoints), shift_gradient(describe, keypoints, difference_px))
+    return ReferencePatches(keypoints, describe(keypoints), shift_gradient(describe, keypoints, _DIFFERENCE_PX))
 
 
 @dataclass(frozen=True)
 class Solver:
-    """How psi is moved: by which family of mappings (None for as rich a one as the patches allow) and recipe."""
+    """How psi is moved: by which family of mappings (None for as rich a one as the patches allow)."""
 
     family: ModelFamily | None
-    recipe: FastRecipe
 
     @torch.no_grad()
     def step(self, band: MovingBand, homography: Tensor, reference_patches: ReferencePatches) -> Step:
@@ -110,26 +124,26 @@ class Solver:
         p = reference_patches.keypoints[rows]
         residual = reference_patches.f[rows] - band.describe(p, homography)
         equations = PatchEquations.of(p, residual, reference_patches.gradient[rows], band.level.fixed.size_px)
-        return solve(equations, self.family, self.recipe)
+        return solve(equations, self.family)
 
     def converge(self, band: MovingBand, start: Tensor, reference_patches: ReferencePatches) -> tuple[Tensor, Step]:
-        """Steps from `start` until one moves no corner by more than `final_rest_px`; returns (homography, last step).
+        """Steps from `start` until one moves no corner by more than `_FINAL_REST_PX`; returns (homography, last step).
 
         While the steps are long, some of the patches are enough. Steps of all patches become shorter by a constant
         ratio, so every second one is lengthened by what the steps to come would add (Aitken 1926). A step of infinite
         length moves nothing and is the last: the patches do not determine where the corners are mapped to.
         """
-        h, some, before = start, reference_patches.head(self.recipe.first_patches), math.inf
-        for _ in range(self.recipe.final_steps):
+        h, some, before = start, reference_patches.head(_FIRST_PATCHES_AT_FULL), math.inf
+        for _ in range(_FINAL_STEPS):
             step = self.step(band, h, some)
             if not math.isfinite(step.length_px):
                 break
             ratio = min(step.length_px / before, _MAX_RATIO)
             h = moved(h, step, 1 / (1 - ratio))
-            if step.length_px < self.recipe.final_rest_px and some is reference_patches:
+            if step.length_px < _FINAL_REST_PX and some is reference_patches:
                 break
             before = step.length_px if some is reference_patches and ratio == 0 else math.inf
-            if step.length_px < self.recipe.rest_px:
+            if step.length_px < REST_PX:
                 some = reference_patches
         return h, step
 
@@ -141,9 +155,7 @@ def moved(homography: Tensor, step: Step, times: float = 1.0) -> Tensor:
 
 
 @torch.no_grad()
-def retrieval(
-    band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor, min_negative_px: float
-) -> tuple[float, float]:
+def retrieval(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor) -> tuple[float, float]:
     """How often the nearest descriptor in I' is the right one among the keypoints that lie in both images, and what
     guessing would give. `f` (N, 256) are the reference's descriptors.
     """
@@ -152,7 +164,7 @@ def retrieval(
         return 0.0, 1.0
     p = keypoints[rows]
     f_prime = band.describe(p, homography)
-    return losses.retrieval(f[rows], f_prime, far_apart(p, min_negative_px)), 1 / len(rows)
+    return losses.retrieval(f[rows], f_prime, far_apart(p)), 1 / len(rows)
 
 
 @torch.no_grad()
@@ -206,16 +218,15 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
     Without `move` psi stays where it is, and what is said of it is how sure it is.
     Raises NoContrastError.
     """
-    recipe = state.settings.fast
     level = state.level(group, 1.0, range(len(group.moving)))
     h = [level.homography(matrix, b) for b, matrix in enumerate(group.mappings)]
-    p, _ = state.sampler.draw(level, level.anywhere, h, recipe.final_patches, recipe.final_octaves)
-    test, _ = state.sampler.draw(level, level.held_out, h, recipe.test_keypoints, recipe.final_octaves)
+    p, _ = state.sampler.draw(level, level.anywhere, h, _FINAL_PATCHES, _FINAL_OCTAVES)
+    test, _ = state.sampler.draw(level, level.held_out, h, TEST_KEYPOINTS, _FINAL_OCTAVES)
     if len(p) < MIN_KEYPOINTS:
         return [Issue("few_keypoints", len(p), MIN_KEYPOINTS)] * len(h)
-    reference_patches = describe_reference(net, level, p, recipe.difference_px)
+    reference_patches = describe_reference(net, level, p)
     f_test = describe_fixed(net, level, test)
-    solver = Solver(state.family, recipe)
+    solver = Solver(state.family)
 
     def result(band: MovingBand, start: Tensor) -> JointResult | Issue:
         try:
@@ -229,13 +240,13 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
             return Issue("few_keypoints", why_not.keypoints, why_not.minimum)
         except GeometryError:
             return Issue("not_invertible")
-        std = _complete_std(step, recipe)
+        std = _complete_std(step)
         if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
             return Issue("corners_unknown")
-        held_out, chance = retrieval(band, results, test, f_test, recipe.min_negative_px)
+        held_out, chance = retrieval(band, results, test, f_test)
         return JointResult(
             matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
-            _complete_covariance(step, recipe),
+            _complete_covariance(step),
         )  # fmt: skip
 
     return [
@@ -246,13 +257,13 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
     ]
 
 
-def _complete_std(step: Step, recipe: FastRecipe) -> tuple[tuple[float, float], ...]:
+def _complete_std(step: Step) -> tuple[tuple[float, float], ...]:
     """Random and systematic parts together."""
-    systematic = recipe.systematic_std_px
-    return tuple((math.hypot(x, systematic), math.hypot(y, systematic)) for x, y in step.corner_std_xy_px)
+    s = _SYSTEMATIC_STD_PX
+    return tuple((math.hypot(x, s), math.hypot(y, s)) for x, y in step.corner_std_xy_px)
 
 
-def _complete_covariance(step: Step, recipe: FastRecipe) -> NDArray[np.float64] | None:
+def _complete_covariance(step: Step) -> NDArray[np.float64] | None:
     """The same of all corners together; None where it is not finite."""
     random = step.corner_covariance_px2.cpu().numpy()
-    return random + recipe.systematic_std_px**2 * np.eye(8) if np.isfinite(random).all() else None
+    return random + _SYSTEMATIC_STD_PX**2 * np.eye(8) if np.isfinite(random).all() else None

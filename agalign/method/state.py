@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 
@@ -17,6 +18,7 @@ from agalign.values.image import Raster
 
 Progress = Callable[[str, float], None]
 """Called with the name of what is being done and the share of it that is behind, 0 to 1."""
+ThetaStart = Literal["starter", "random"]
 
 
 @dataclass
@@ -64,7 +66,7 @@ class JointState:
         """The subject's reference and some of its moving images at a resolution. Raises NoContrastError."""
         level = make_level(
             group.fixed, [group.moving[b] for b in bands], [group.mappings[b] for b in bands], scale,
-            self.settings.paper.min_gradient, self.sampler.generator, self.device,
+            self.sampler.generator, self.device,
         )  # fmt: skip
         if group.fields:
             level = level.with_fields([group.fields[b] for b in bands])
@@ -76,10 +78,10 @@ class JointState:
         """F of recipe paper with random weights; `channels` of each side, the reference's first."""
         return self._random_descriptor(channels, half_rectified=False, unit_length=False)
 
-    def fast_descriptor(self, channels: Sequence[int]) -> Descriptor:
-        """F of recipe fast where theta starts."""
+    def fast_descriptor(self, channels: Sequence[int], start: ThetaStart = "starter") -> Descriptor:
+        """F of recipe fast where theta starts: with the network that comes with the package, or with random weights."""
         net = self._random_descriptor(channels, half_rectified=True, unit_length=True)
-        if self.settings.fast.start == "starter":
+        if start == "starter":
             start_from_starter(net)
         return net
 

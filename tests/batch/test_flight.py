@@ -3,6 +3,7 @@ import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial, partialmethod
 from pathlib import Path
 
 import cv2
@@ -16,10 +17,13 @@ from agalign.batch import capture as batch_capture
 from agalign.batch import learn as batch_learn
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.cameras.discover import discover
-from agalign.config import FastRecipe, FlightSettings, JointSettings, Settings
+from agalign.config import FlightSettings, Settings
 from agalign.errors import ConfigurationError, GeometryError, InputError, OutputError
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.method import joint as method_joint
+from agalign.method.fast import Schedule, learn
+from agalign.method.state import JointState
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar import find_sidecars, read_sidecar
 from agalign.synthetic.score import score_against_truth
@@ -77,16 +81,20 @@ def test_what_is_no_model_is_named(tmp_path: Path) -> None:
         load_model(path, cpu)
 
 
-def test_a_model_is_used_again_and_refused_for_another_camera(flight: Path, model: FlightModel, tmp_path: Path) -> None:
+def test_a_model_is_used_again_and_refused_for_another_camera(
+    flight: Path, model: FlightModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "m.safetensors"
     save_model(model, path)
-    steps = FastRecipe(start="random", max_steps=1)  # nothing could be learnt in one step
-    settings = Settings(joint=JointSettings(fast=steps), flight=FlightSettings(captures=1))
-    reports = list(run_flight(discover(flight), tmp_path / "out", settings, model=path))
+    # From random weights, nothing could be learnt in one step.
+    monkeypatch.setattr(JointState, "fast_descriptor", partialmethod(JointState.fast_descriptor, start="random"))
+    for module in (batch_learn, method_joint):
+        monkeypatch.setattr(module, "learn", partial(learn, schedule=Schedule(max_steps=1)))
+    reports = list(run_flight(discover(flight), tmp_path / "out", SETTINGS, model=path))
     assert all(r.good for r in reports)
     save_model(replace(model, camera="Another 1 [Green 10x10]"), path)
     with pytest.raises(ConfigurationError, match=r"m\.safetensors: was learnt for Another 1"):
-        list(run_flight(discover(flight), tmp_path / "out2", settings, model=path))
+        list(run_flight(discover(flight), tmp_path / "out2", SETTINGS, model=path))
 
 
 def test_several_processes_give_the_same_numbers(flight: Path, tmp_path: Path) -> None:

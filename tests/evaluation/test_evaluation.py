@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import find_seed
 from agalign.cli.main import app
-from agalign.config import FastRecipe, JointSettings, PaperRecipe, SeedSettings, Settings
+from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError, InputError
 from agalign.evaluation.image_pairs import PairFiles
 from agalign.evaluation.learn import Lesson, learn_descriptor
@@ -24,6 +24,7 @@ from agalign.flight.model import load_model, save_model
 from agalign.method.descriptor import Descriptor
 from agalign.method.detect import sift_keypoints, visible_in_both
 from agalign.method.match import match_seed, matching_network, starter_for_matching
+from agalign.method.paper import Training
 from agalign.method.patches import patch_positions
 from agalign.values import geometry
 from agalign.values.image import Raster
@@ -145,10 +146,9 @@ def test_what_is_learnt_on_a_pair_beats_sift_where_contrast_is_reversed(tmp_path
 
 def test_the_loss_is_least_at_the_truth(tmp_path: Path) -> None:
     fixed, moving = rasters(TRUTH)
-    recipe = PaperRecipe(epochs=1, keypoints=800)
-    settings = JointSettings(recipe="paper", device="cpu", paper=recipe)
+    settings = JointSettings(recipe="paper", device="cpu")
     offsets = np.array([-40.0, 0.0, 40.0])
-    surface = loss_surface(fixed, moving, TRUTH, offsets, settings)
+    surface = loss_surface(fixed, moving, TRUTH, offsets, settings, Training(keypoints=800, epochs=1))
     assert np.unravel_index(np.nanargmin(surface), surface.shape) == (1, 1)
     draw_surface(surface, offsets, tmp_path / "surface.png")
     assert cv2.imread(str(tmp_path / "surface.png")).shape == (552, 552, 3)
@@ -185,7 +185,7 @@ def test_a_descriptor_learnt_on_pairs_serves_one_that_it_has_not_seen(learnt: Pa
 
 
 def test_nothing_aligned_is_nothing_to_learn_from() -> None:
-    settings = Settings(joint=JointSettings(device="cpu", fast=FastRecipe(hopeless_steps=5)))
+    settings = Settings(joint=JointSettings(device="cpu"))
     one, other = (raster(textured_image(400, 320, seed)) for seed in (70, 71))
     unrelated = rough_pair("u", one, other, settings)
     with pytest.raises(InputError, match="no pair could be aligned"):

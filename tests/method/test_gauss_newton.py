@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-from agalign.config import FastRecipe
 from agalign.method.gauss_newton import PatchEquations, Step, shift_gradient, shift_over_psi
 from agalign.method.gauss_newton import solve as solve_equations
 from agalign.method.patches import Keypoints, homography_from_psi, transform
@@ -13,8 +12,8 @@ WIDTH, HEIGHT = 300, 200
 def solve(
     p: Keypoints, residual: torch.Tensor, gradient: torch.Tensor, family: str | None, max_std: float, longest: float
 ) -> Step:
-    recipe = FastRecipe(max_corner_std_px=max_std, longest_step_px=longest)
-    return solve_equations(PatchEquations.of(p, residual, gradient, (WIDTH, HEIGHT)), family, recipe)
+    equations = PatchEquations.of(p, residual, gradient, (WIDTH, HEIGHT))
+    return solve_equations(equations, family, rich_enough_std_px=max_std, max_step_px=longest)
 
 
 def scattered(count: int, seed: int = 0) -> Keypoints:

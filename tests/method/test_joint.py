@@ -1,14 +1,15 @@
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from agalign.config import FastRecipe, JointSettings, PaperRecipe
-from agalign.method.fast import learn, learn_scales
+from agalign.config import JointSettings
+from agalign.method.fast import Schedule, learn, learn_scales
 from agalign.method.joint import align_from_scratch
+from agalign.method.paper import Training
 from agalign.method.refine import refine
-from agalign.method.state import ImageGroup, JointState
+from agalign.method.state import ImageGroup, JointState, ThetaStart
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.image import Raster
@@ -26,19 +27,22 @@ def rasters(matrix: np.ndarray, seed: int = 0) -> tuple[Raster, Raster]:
     return Raster(fixed, valid), Raster(moving, valid)
 
 
-def scratch(fixed: Raster, moving: Raster, seed: np.ndarray, settings: JointSettings) -> JointResult | Issue:
-    return align_from_scratch(ImageGroup.of_one(fixed, moving, seed, trusted=True), settings, lambda *_: None)[0]
+def scratch(
+    fixed: Raster, moving: Raster, seed: np.ndarray, settings: JointSettings, **how: Any
+) -> JointResult | Issue:
+    group = ImageGroup.of_one(fixed, moving, seed, trusted=True)
+    return align_from_scratch(group, settings, lambda *_: None, **how)[0]
 
 
-def run(settings: JointSettings, seed: np.ndarray = NEAR, **kwargs: int) -> JointResult:
-    result = scratch(*rasters(TRUTH, **kwargs), seed, settings)
+def run(settings: JointSettings, **how: Any) -> JointResult:
+    result = scratch(*rasters(TRUTH), NEAR, settings, **how)
     assert isinstance(result, JointResult)
     return result
 
 
 @pytest.mark.parametrize("start", ["random", "starter"])
-def test_fast_recovers_a_homography_through_reversed_contrast(start: Literal["random", "starter"]) -> None:
-    result = run(JointSettings(fast=FastRecipe(start=start)))
+def test_fast_recovers_a_homography_through_reversed_contrast(start: ThetaStart) -> None:
+    result = run(JointSettings(), start=start)
     assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.08
     assert result.retrieval > 0.8
     assert result.chance < 0.01
@@ -46,9 +50,9 @@ def test_fast_recovers_a_homography_through_reversed_contrast(start: Literal["ra
 
 
 def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> None:
-    short = FastRecipe(start="random", max_steps=50, final_steps=1)
-    one, same = (run(JointSettings(fast=short, rng_seed=4)) for _ in range(2))
-    other = run(JointSettings(fast=short, rng_seed=5))
+    short: dict[str, Any] = {"start": "random", "schedule": Schedule(max_steps=50)}
+    one, same = (run(JointSettings(rng_seed=4), **short) for _ in range(2))
+    other = run(JointSettings(rng_seed=5), **short)
     np.testing.assert_array_equal(one.fixed_to_moving, same.fixed_to_moving)
     assert one.retrieval == same.retrieval
     assert not np.array_equal(one.fixed_to_moving, other.fixed_to_moving)
@@ -57,7 +61,7 @@ def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> 
 def test_the_global_random_state_is_left_alone() -> None:
     torch.manual_seed(1)
     before = torch.get_rng_state()
-    run(JointSettings(fast=FastRecipe(start="random", max_steps=50, final_steps=1)))
+    run(JointSettings(), start="random", schedule=Schedule(max_steps=50))
     assert torch.equal(before, torch.get_rng_state())
 
 
@@ -115,12 +119,12 @@ def test_one_network_for_two_bands_and_one_that_does_not_belong() -> None:
 @pytest.mark.parametrize(("sharing", "left"), [("siamese", 0.35), ("pseudo-siamese", 0.35), ("unshared", 0.9)])
 def test_paper_recipe_lowers_the_error(sharing: str, left: float) -> None:
     # Fully unshared networks learn slowest, as the paper expects; three epochs are few.
-    settings = JointSettings(recipe="paper", sharing=sharing, paper=PaperRecipe(epochs=3, keypoints=2000))
+    settings = JointSettings(recipe="paper", sharing=sharing)
     fixed, moving = textured_pair(TRUTH)
     # The paper's siamese network is for one modality: give it the same contrast.
     valid = np.ones(fixed.shape, bool)
     moving = -moving if sharing == "siamese" else moving
-    result = scratch(Raster(fixed, valid), Raster(moving, valid), NEAR, settings)
+    result = scratch(Raster(fixed, valid), Raster(moving, valid), NEAR, settings, training=Training(2000, 3))
     assert isinstance(result, JointResult)
     assert result.recipe == "paper"
     assert result.levels == (0.25, 0.5, 1.0)
@@ -129,7 +133,7 @@ def test_paper_recipe_lowers_the_error(sharing: str, left: float) -> None:
 
 
 def test_levels_halve_down_to_the_coarsest() -> None:
-    assert learn_scales(JointState(JointSettings(), lambda *_: None), 1280) == [0.25, 0.5]
+    assert learn_scales(1280) == [0.25, 0.5]
 
 
 def test_a_start_far_off_is_searched_for_along_the_loss() -> None:

@@ -22,7 +22,7 @@ def rasters() -> tuple[Raster, Raster]:
 
 
 def level_of(fixed: Raster, *moving: Raster) -> Level:
-    return make_level(fixed, moving, [np.eye(3)] * len(moving), 1.0, 0.05, torch.Generator().manual_seed(0), CPU)
+    return make_level(fixed, moving, [np.eye(3)] * len(moving), 1.0, torch.Generator().manual_seed(0), CPU)
 
 
 def test_images_are_standardised_over_their_valid_pixels_only() -> None:
@@ -111,7 +111,7 @@ def test_patches_are_sampled_through_the_lens() -> None:
 def test_level_matrices_go_to_full_resolution_and_back() -> None:
     matrix = np.array([[1.01, 0.02, 5.0], [-0.01, 0.99, -3.0], [1e-5, -2e-5, 1.0]])
     fixed, moving = rasters()
-    level = make_level(fixed, [moving], [matrix], 0.5, 0.05, torch.Generator().manual_seed(0), CPU)
+    level = make_level(fixed, [moving], [matrix], 0.5, torch.Generator().manual_seed(0), CPU)
     np.testing.assert_allclose(level.full_matrix(level.homography(matrix, 0), 0), matrix, atol=1e-4)
 
 
@@ -120,7 +120,7 @@ def test_positions_are_displaced_by_the_field_of_their_place() -> None:
     fixed, moving = rasters()
     nodes = np.stack(np.meshgrid(np.arange(12) * 32.0, np.arange(9) * 32.0), axis=-1)
     field = DisplacementField(32.0, np.stack([0.01 * nodes[..., 0], -0.02 * nodes[..., 1]], axis=-1))
-    level = make_level(fixed, [moving], [np.eye(3)], 0.5, 0.05, torch.Generator().manual_seed(0), CPU)
+    level = make_level(fixed, [moving], [np.eye(3)], 0.5, torch.Generator().manual_seed(0), CPU)
     assert level.displacement(0, torch.zeros(1, 2)) is None
     xy = torch.tensor([[40.0, 30.0], [100.0, 90.0]])
     result = level.with_fields([field]).displacement(0, xy)

@@ -3,10 +3,10 @@ from typing import get_args
 import pytest
 import torch
 
-from agalign.config import FastRecipe, JointSettings
+from agalign.config import JointSettings
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.starter import start_from, start_from_starter
-from agalign.method.state import JointState
+from agalign.method.state import JointState, ThetaStart
 from agalign.values.choices import Sharing
 
 PATCHES = torch.randn(8, 1, 16, 16, generator=torch.Generator().manual_seed(1))
@@ -39,13 +39,13 @@ def test_patches_are_told_apart_and_contrast_does_not_matter_much() -> None:
     assert (f - reversed_f).norm(dim=1).median() < d.min(dim=1).values.median()
 
 
-def test_the_recipe_starts_from_it_unless_told_otherwise() -> None:
-    def first(start: str) -> torch.Tensor:
-        settings = JointSettings(device="cpu", fast=FastRecipe.model_validate({"start": start}))
-        return JointState(settings, lambda *_: None).fast_descriptor([1, 1])(PATCHES, 1)
+def test_the_recipe_starts_from_it_by_default() -> None:
+    def first(*start: ThetaStart) -> torch.Tensor:
+        state = JointState(JointSettings(device="cpu"), lambda *_: None)
+        return state.fast_descriptor([1, 1], *start)(PATCHES, 1)
 
-    torch.testing.assert_close(first("starter"), started("pseudo-siamese", (1, 1))(PATCHES, 1))
-    assert (first("starter") - first("random")).abs().max() > 0.1
+    torch.testing.assert_close(first(), started("pseudo-siamese", (1, 1))(PATCHES, 1))
+    assert (first() - first("random")).abs().max() > 0.1
 
 
 def test_each_side_takes_the_side_it_is_told() -> None:
