@@ -18,11 +18,10 @@ from agalign.errors import InputError, NoContrastError, NotEnoughTextureError
 from agalign.evaluation.image_pairs import find_pairs, read_image
 from agalign.flight.fingerprint import hashed
 from agalign.flight.model import FlightModel
-from agalign.method import losses
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.detect import sift_keypoints, visible_in_both
 from agalign.method.device import one_memory_error, one_thread
-from agalign.method.fast import BATCH, LEARNING_RATE, TEMPERATURE
+from agalign.method.fast import BATCH, LEARNING_RATE, in_batch_loss
 from agalign.method.levels import Level
 from agalign.method.patches import Keypoints, far_apart, patch_positions
 from agalign.method.refine import MovingBand
@@ -103,7 +102,7 @@ def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, ste
         moving = MovingBand(net, example.level, 0, 1)
         patches = [example.level.fixed.patches(patch_positions(k)), moving.patches(k, example.homography)]
         f, f_prime = net.describe(patches, [REFERENCE, moving.side])
-        loss = losses.in_batch(f, f_prime, far_apart(k), TEMPERATURE)
+        loss = in_batch_loss(f, f_prime, far_apart(k))
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()

@@ -1,4 +1,5 @@
-"""The descriptor f(x; theta): a shallow CNN with one first layer a band (paper, Sec. 4.4 and 5.3).
+"""The descriptor f(x; theta), a shallow CNN with one first layer for each band, and how descriptors are compared
+(paper, Sec. 4.4 and 5.3).
 
 Conv(C, 32, 5) - Tanh - MaxPool(2) - Conv(32, 64, 3) - Tanh - FC(256) on 16 x 16 patches.
 """
@@ -42,6 +43,24 @@ class _FirstLayer(nn.Module):
 
 def _trunk() -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(32, 64, 3), nn.Tanh(), nn.Flatten(), nn.Linear(64 * 4 * 4, DIMENSION))
+
+
+def distance(f: Tensor, f_prime: Tensor) -> Tensor:
+    """L0 of the paper: ||f(x) - f(x')||_2 row by row, (N, D) x (N, D) -> (N,). Its gradient at 0 is 0, not nan."""
+    return (f - f_prime).square().sum(dim=1).clamp_min(1e-12).sqrt()
+
+
+def retrieval(f: Tensor, f_prime: Tensor, allowed: Tensor) -> float:
+    """Share of rows of `f` (N, D) whose nearest row of `f_prime` (N, D) is their own, averaged over both directions.
+
+    Pairs that are not `allowed` (N, N) do not compete; the diagonal always does. Chance is about 1 / N.
+    """
+    d = torch.cdist(f, f_prime)
+    keep = allowed | torch.eye(len(f), dtype=torch.bool, device=f.device)
+    d = d.masked_fill(~keep, float("inf"))
+    target = torch.arange(len(f), device=f.device)
+    hits = (d.argmin(dim=1) == target).float().mean() + (d.argmin(dim=0) == target).float().mean()
+    return float(0.5 * hits)
 
 
 class Descriptor(nn.Module):

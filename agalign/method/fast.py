@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from agalign.errors import GeometryError, NotEnoughTextureError
-from agalign.method import losses
 from agalign.method.adam import Adam
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.levels import Level
@@ -27,8 +27,8 @@ from agalign.method.refine import (
     best_shift,
     describe_fixed,
     describe_reference,
+    held_out_retrieval,
     moved,
-    retrieval,
 )
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL
@@ -36,7 +36,7 @@ from agalign.values.alignment import MIN_RETRIEVAL
 BATCH = 128
 """Keypoints of a step on theta, all negatives of each other."""
 LEARNING_RATE = 2e-3
-TEMPERATURE = 0.07
+_TEMPERATURE = 0.07
 """Of the in-batch loss (He et al. 2020, Sec. 3.3)."""
 _LEARN_PX = 640
 """Longer side of the images on which theta is learnt, but at least half of the full resolution: what is learnt at this
@@ -231,8 +231,22 @@ def _loss(at: _AtLevel) -> Tensor | None:
     terms = []
     for band, f_prime in zip(taking_part, f_primes, strict=True):
         mine = rows[band.index]
-        terms.append(losses.in_batch(f[mine], f_prime, apart[mine][:, mine], TEMPERATURE))
+        terms.append(in_batch_loss(f[mine], f_prime, apart[mine][:, mine]))
     return torch.stack(terms).mean()
+
+
+def in_batch_loss(f: Tensor, f_prime: Tensor, allowed: Tensor) -> Tensor:
+    """InfoNCE in both directions with the other rows of the batch as negatives, a scalar.
+
+    `f` and `f_prime` are (N, D) of unit length, row i of one matching row i of the other; `allowed` (N, N) is False
+    where two keypoints are too close to count as negatives of each other (its diagonal does not matter).
+    van den Oord et al. 2018, Eq. 4, symmetrised.
+    """
+    logits = f @ f_prime.T / _TEMPERATURE
+    keep = allowed | torch.eye(len(f), dtype=torch.bool, device=f.device)
+    logits = logits.masked_fill(~keep, float("-inf"))
+    target = torch.arange(len(f), device=f.device)
+    return 0.5 * (functional.cross_entropy(logits, target) + functional.cross_entropy(logits.T, target))
 
 
 @torch.no_grad()
@@ -247,7 +261,7 @@ def _move_psi(at: _AtLevel) -> bool:
     reference_patches = describe_reference(at.net, level, p)
     solver = Solver(state.family)
     for i, band in enumerate(at.bands):
-        retrieved, _ = retrieval(band, at.h[i], test, f_test)
+        retrieved, _ = held_out_retrieval(band, at.h[i], test, f_test)
         at.retrieved[i] = retrieved
         if retrieved < MIN_RETRIEVAL:
             continue

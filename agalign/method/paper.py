@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from agalign.errors import NotEnoughTextureError
-from agalign.method import losses
-from agalign.method.descriptor import REFERENCE, Descriptor
+from agalign.method.descriptor import REFERENCE, Descriptor, distance
 from agalign.method.device import exact
 from agalign.method.levels import Level, Pool
 from agalign.method.patches import (
@@ -182,5 +182,12 @@ def _loss(net: Descriptor, level: Level, batch: _Drawn, h: Tensor) -> Tensor:
     f = net(fixed.patches(patch_positions(batch.x)), REFERENCE)
     f_true = net(moving.patches(patch_positions(warp_keypoints(batch.x, h))), _MOVING)
     f_false = net(moving.patches(patch_positions(batch.x_false)), _MOVING)
-    apart = losses.distance(f, f_false)[batch.is_negative]
-    return losses.contrastive(losses.distance(f, f_true), apart, _MARGIN)
+    apart = distance(f, f_false)[batch.is_negative]
+    return contrastive_loss(distance(f, f_true), apart)
+
+
+def contrastive_loss(positive: Tensor, negative: Tensor) -> Tensor:
+    """The paper's loss (its Eq. 2), a scalar: the sum of L0 over positive and of L1 = max(0, margin - L0) over
+    negative pairs. Both arguments are distances, (P,) and (N,).
+    """
+    return positive.sum() + functional.relu(_MARGIN - negative).sum()

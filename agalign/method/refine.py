@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agalign.errors import GeometryError, NotEnoughTextureError
-from agalign.method import losses
-from agalign.method.descriptor import REFERENCE, Descriptor
+from agalign.method.descriptor import REFERENCE, Descriptor, distance, retrieval
 from agalign.method.device import exact
 from agalign.method.gauss_newton import PatchEquations, Step, shift_gradient, solve
 from agalign.method.levels import Level, footprints_inside, footprints_inside_moving
@@ -155,7 +154,7 @@ def moved(homography: Tensor, step: Step, times: float = 1.0) -> Tensor:
 
 
 @torch.no_grad()
-def retrieval(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor) -> tuple[float, float]:
+def held_out_retrieval(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor) -> tuple[float, float]:
     """How often the nearest descriptor in I' is the right one among the keypoints that lie in both images, and what
     guessing would give. `f` (N, 256) are the reference's descriptors.
     """
@@ -164,7 +163,7 @@ def retrieval(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Ten
         return 0.0, 1.0
     p = keypoints[rows]
     f_prime = band.describe(p, homography)
-    return losses.retrieval(f[rows], f_prime, far_apart(p)), 1 / len(rows)
+    return retrieval(f[rows], f_prime, far_apart(p)), 1 / len(rows)
 
 
 @torch.no_grad()
@@ -206,7 +205,7 @@ def _losses_moved(band: MovingBand, homography: Tensor, keypoints: Keypoints, f:
     count = len(shifts)
     xy = (keypoints.xy + shifts[:, None]).reshape(-1, 2)
     shifted = Keypoints(xy, keypoints.angle.repeat(count), keypoints.scale.repeat(count))
-    apart = losses.distance(f.repeat(count, 1), band.describe(shifted, homography))
+    apart = distance(f.repeat(count, 1), band.describe(shifted, homography))
     inside = footprints_inside_moving(band.level, band.index, shifted, homography)
     return apart.masked_fill(~inside, float("nan")).reshape(count, -1)
 
@@ -243,7 +242,7 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
         std = _complete_std(step)
         if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
             return Issue("corners_unknown")
-        held_out, chance = retrieval(band, results, test, f_test)
+        held_out, chance = held_out_retrieval(band, results, test, f_test)
         return JointResult(
             matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
             _complete_covariance(step),
