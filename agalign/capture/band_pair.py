@@ -1,7 +1,7 @@
 """A moving image beside the reference, as the estimation sees the two, with the mappings that its tags offer."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.pixels.raster import read_for_alignment
 from agalign.pixels.resample import single, warped
+from agalign.pixels.stripes import without_common_stripes
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementField
 from agalign.values.capture import Band, Capture
@@ -173,7 +174,19 @@ def read_pairs(
         field = None if field is None else field.rescaled(scales[0])
         known = _known_to_px(name, model, scales[0])
         pairs.append(BandPair(name, reference, moving, down, bands, scales, known, is_coarse, field))
-    return pairs, left_out
+    return _without_stripes(pairs, references[longest]), left_out
+
+
+def _without_stripes(pairs: Sequence[BandPair], reference: Reference) -> list[BandPair]:
+    """The pairs; those with this reference, without the pattern of rows and columns that their sensors share."""
+    moving = [pair.moving_image for pair in pairs if pair.reference is reference]
+    fixed, *cleaned = without_common_stripes([reference.image, *moving])
+    same = reference if fixed is reference.image else Reference(fixed, reference.settings)
+    images = iter(cleaned)
+    return [
+        replace(pair, reference=same, moving_image=next(images)) if pair.reference is reference else pair
+        for pair in pairs
+    ]
 
 
 def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:

@@ -1,0 +1,124 @@
+import logging
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import pytest
+
+from agalign.pixels.stripes import without_common_stripes
+from agalign.pixels.structure import Peak, correlation_surface, find_peak, structure_field
+from agalign.values.image import Raster
+
+from ..conftest import textured_image
+
+WIDTH, HEIGHT = 400, 320
+EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
+OFFSETS = ((0, 0), (13, -8), (-21, 5), (9, 17))
+"""Of what each of four bands sees, px."""
+REGISTERED = ((0, 0),) * len(OFFSETS)
+
+
+def bands(offsets: Sequence[tuple[int, int]] = OFFSETS, scene: np.ndarray | None = None) -> list[Raster]:
+    """Views of one scene, every second one contrast-reversed, each with its own brightness and noise."""
+    scene = textured_image(WIDTH + 80, HEIGHT + 80) if scene is None else scene
+    rng = np.random.default_rng(1)
+    result = []
+    for k, (x, y) in enumerate(offsets):
+        seen = scene[40 - y : 40 - y + HEIGHT, 40 - x : 40 - x + WIDTH] * (-1) ** k
+        noisy = (1000 + 100 * (k + 1) * (seen + 0.05 * rng.normal(size=seen.shape))).astype(np.float32)
+        result.append(Raster(noisy, EVERYWHERE))
+    return result
+
+
+def pattern(axis: int, share: float = 0.2, seed: int = 5) -> np.ndarray:
+    """White stripes along columns (axis 0) or rows, peak to peak a share of the range that `bands` has per unit."""
+    length = WIDTH if axis == 0 else HEIGHT
+    one = share * 5 * np.random.default_rng(seed).uniform(-0.5, 0.5, length).astype(np.float32)
+    return np.broadcast_to(one[None] if axis == 0 else one[:, None], (HEIGHT, WIDTH))
+
+
+def striped(images: Sequence[Raster], *patterns: np.ndarray) -> list[Raster]:
+    """With the same pattern, in each image as strong as its contrast."""
+    total = np.sum(patterns, axis=0)
+    return [Raster(i.pixels + 100 * (k + 1) * total, i.valid) for k, i in enumerate(images)]
+
+
+def peak(fixed: Raster, moving: Raster) -> Peak:
+    return find_peak(correlation_surface(structure_field(fixed), structure_field(moving)), 16)
+
+
+def is_same(one: Sequence[Raster], other: Sequence[Raster]) -> bool:
+    return all(a is b for a, b in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("axes", [(0,), (1,), (0, 1)])
+def test_bands_peak_at_their_offset_once_the_common_pattern_is_removed(
+    axes: tuple[int, ...], caplog: pytest.LogCaptureFixture
+) -> None:
+    images = striped(bands(), *(pattern(axis, share=2.0) for axis in axes))
+    shifts = np.array([peak(images[0], image).shift_px for image in images[1:]])
+    assert np.linalg.norm(shifts - OFFSETS[1:], axis=1).min() > 0.5, "the pattern hides the offsets"
+    with caplog.at_level(logging.DEBUG):
+        fixed, *moving = without_common_stripes(images)
+    for image, offset in zip(moving, OFFSETS[1:], strict=True):
+        np.testing.assert_allclose(peak(fixed, image).shift_px, offset, atol=0.1)
+    assert all((word in caplog.text) == (axis in axes) for axis, word in enumerate(("columns", "rows")))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_of_a_pattern_a_tenth_remains(axis: int) -> None:
+    clean = bands()
+    result = without_common_stripes(striped(clean, pattern(axis)))
+    for k, (before, after) in enumerate(zip(clean, result, strict=True)):
+        scale = 100 * (k + 1)
+        left = np.diff(cv2.GaussianBlur((after.pixels - before.pixels) / scale, (0, 0), 1.0), axis=1 - axis)
+        there = np.diff(cv2.GaussianBlur(np.ascontiguousarray(pattern(axis)), (0, 0), 1.0), axis=1 - axis)
+        assert left.std() < 0.2 * there.std()
+
+
+def test_without_a_common_pattern_the_images_are_the_same_objects() -> None:
+    images = bands()
+    assert is_same(without_common_stripes(images), images)
+    one_only = [*images[:2], *striped(images[2:3], pattern(0)), images[3]]
+    assert is_same(without_common_stripes(one_only), one_only)
+    own = [striped([image], pattern(0, seed=k))[0] for k, image in enumerate(images)]
+    assert is_same(without_common_stripes(own), own)
+
+
+@pytest.mark.parametrize("offsets", [OFFSETS, REGISTERED])
+def test_crop_rows_along_the_columns_are_not_removed(
+    offsets: Sequence[tuple[int, int]], caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = 2 * np.sin(2 * np.pi * np.arange(WIDTH + 80) / 17).astype(np.float32)
+    images = bands(offsets, textured_image(WIDTH + 80, HEIGHT + 80) + rows)
+    images = [image if k % 2 == 0 else Raster(2000 - image.pixels, image.valid) for k, image in enumerate(images)]
+    with caplog.at_level(logging.DEBUG):
+        assert is_same(without_common_stripes(images), images)
+    assert ("co-registered" in caplog.text) == (offsets is REGISTERED)
+
+
+def test_invalid_pixels_stay_out_of_the_estimate_and_at_0() -> None:
+    clean = bands()
+    valid = EVERYWHERE.copy()
+    valid[:, 100:160] = valid[200:230] = False
+    images = [Raster(np.where(valid, i.pixels, np.float32(0)), valid) for i in striped(clean, pattern(0))]
+    for before, after in zip(images, without_common_stripes(images), strict=True):
+        assert (after.pixels[~valid] == 0).all()
+        assert after.valid is before.valid
+        assert not np.array_equal(after.pixels[valid], before.pixels[valid])
+    fixed, moving, *_ = without_common_stripes(images)
+    np.testing.assert_allclose(peak(fixed, moving).shift_px, OFFSETS[1], atol=0.1)
+
+
+def test_images_of_another_size_or_of_several_channels_are_not_compared() -> None:
+    images = striped(bands(), pattern(0))
+    colour = Raster(np.stack([images[0].pixels] * 3), EVERYWHERE)
+    small = Raster(images[1].pixels[:100, :100], EVERYWHERE[:100, :100])
+    alone = [images[0], colour, small]
+    assert is_same(without_common_stripes(alone), alone)
+    first, second, third, *others = without_common_stripes([images[0], colour, small, *images[1:]])
+    assert second is colour
+    assert third is small
+    expected = without_common_stripes(images)
+    for one, other in zip([first, *others], expected, strict=True):
+        np.testing.assert_array_equal(one.pixels, other.pixels)
