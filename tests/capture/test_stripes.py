@@ -1,0 +1,30 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import agalign
+from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic.flight import Shot, plan_flight, write_shots
+from agalign.synthetic.ground import Field
+from agalign.synthetic.score import score_against_truth
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+SIZE_PX = (480, 360)
+
+
+def stripes(light: Field, _rng: np.random.Generator) -> Field:
+    """White column stripes, the same in all bands, of 20 % of the light's range up and down."""
+    low, high = np.percentile(light, (1, 99))
+    pattern = np.random.default_rng(5).uniform(-0.2, 0.2, light.shape[1]).astype(np.float32)
+    return np.asarray(light + (high - low) * pattern, np.float32)
+
+
+def test_a_capture_whose_bands_share_stripes_is_aligned(tmp_path: Path) -> None:
+    poses, ground, rng = plan_flight(1, SIZE_PX, rng_seed=3)
+    truth = write_shots(tmp_path, [Shot(poses[0], ground, stripes)], SIZE_PX, REDEDGE, rng)
+    reports = agalign.align_folder(tmp_path, tmp_path / "out")
+    scores = score_against_truth(reports, truth)
+    assert [score.status for score in scores] == ["aligned"] * 4
+    assert max(score.median_px for score in scores) < 0.3
