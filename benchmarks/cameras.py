@@ -12,13 +12,13 @@ from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
+from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_6X
+from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.discover import DiscoverOptions
-from agalign.synthetic.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_6X
 from agalign.synthetic.rig import CameraSpec
 from agalign.synthetic.score import Score, score_against_truth
-from agalign.synthetic.troubles import make_two_headings
 
 CAMERAS: dict[str, tuple[CameraSpec, tuple[int, int]]] = {
     "mavic": (MAVIC, (1280, 960)),

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
+from synthetic_flights.troubles import make_troubled_flight, make_two_headings
 
 from agalign.products.sidecar import find_sidecars
 from agalign.synthetic import make_flight
-from agalign.synthetic.troubles import make_troubled_flight, make_two_headings
 
 WRONG_PX = 1.0
 

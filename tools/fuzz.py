@@ -32,14 +32,17 @@ SIZE_PX = 32, 24
 def seeds(folder: Path) -> None:
     """Files for each target to begin from."""
     from agalign.cameras.tiff_directory import XMP, read_directories
-    from agalign.synthetic import cameras, flight
+    from agalign.synthetic.cameras import REDEDGE
+    from agalign.synthetic.flight import make_flight
+
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+    from synthetic_flights.cameras import ALTUM, MAVIC, MAVIC_3M, SENTERA_6X
 
     for target in SHARES:
         (folder / target).mkdir(parents=True)
-    known = (cameras.REDEDGE, cameras.MAVIC, cameras.MAVIC_3M, cameras.ALTUM, cameras.SENTERA_6X)
-    for camera in known:
+    for camera in (REDEDGE, MAVIC, MAVIC_3M, ALTUM, SENTERA_6X):
         made = folder / "made" / camera.model.replace(" ", "_")
-        flight.make_flight(made, 1, SIZE_PX, camera=camera)
+        make_flight(made, 1, SIZE_PX, camera=camera)
         names = []
         for path in sorted(p for p in made.rglob("*") if p.suffix.lower() in (".tif", ".jpg")):
             names.append(path.name)

@@ -16,16 +16,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.synthetic import tags
 from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.ground import Field, Ground, map_px, on_ground, paint_ground, reflectance
 from agalign.synthetic.rig import (
     BandSpec,
     CameraSpec,
+    Exposure,
     Pose,
     place_and_rays,
     true_homography,
 )
+from agalign.synthetic.tags import BLACK_LEVEL, WHITE_LEVEL
 from agalign.values import geometry, lens
 from agalign.values.geometry import Points
 from agalign.values.mapping import splined
@@ -106,12 +107,12 @@ def _write(
             light = painted[1] if band.sees == "heat" else painted[1] * np.float32(shot.sun * shot.shutter)
             pixels = render(light, shot.ground, band, shot.pose, size_px, rng, spoil)
             if band.name not in shot.without:
-                path = images / tags.file_name(camera, band, number)
+                path = images / camera.file_name(band, number)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 there = replace(shot.pose, north_m=shot.pose.north_m + before)
-                tags.write_band(path, pixels, camera, band, there, number, _VIGNETTING, size_px, shot.shutter)
+                camera.write_band(path, pixels, band, Exposure(there, number, size_px, _VIGNETTING, shot.shutter))
     return {
-        tags.capture_name(camera, number): _truth(shot, number, camera, size_px)
+        camera.capture_name(number): _truth(shot, number, camera, size_px)
         for number, shot in enumerate(shots, start=before + 1)
     }
 
@@ -125,10 +126,10 @@ def _write_truth(folder: Path, truth: dict[str, Any]) -> Path:
 def _truth(shot: Shot, number: int, camera: CameraSpec, size_px: tuple[int, int]) -> dict[str, Any]:
     reference = camera.bands[camera.reference]
     return {
-        "reference": Path(tags.file_name(camera, reference, number)).name,
+        "reference": Path(camera.file_name(reference, number)).name,
         "trouble": shot.trouble,
         "bands": {
-            Path(tags.file_name(camera, b, number)).name: {
+            Path(camera.file_name(b, number)).name: {
                 "fixed_to_moving": true_homography(reference, b, shot.pose, size_px).tolist(),
                 "ties": true_ties(shot.ground, reference, b, shot.pose, size_px),
             }
@@ -208,7 +209,7 @@ def render(
     signal = np.clip((light if spoil is None else spoil(light, rng)) * vignetting, 0, 1)
     electrons = signal * 4000
     noisy = electrons + rng.normal(size=signal.shape) * np.sqrt(electrons + 60)
-    levels = tags.BLACK_LEVEL + noisy / 4000 * (tags.WHITE_LEVEL - tags.BLACK_LEVEL)
+    levels = BLACK_LEVEL + noisy / 4000 * (WHITE_LEVEL - BLACK_LEVEL)
     return np.asarray((np.clip(np.rint(levels / 16), 0, 4095) * 16).astype(np.uint16))
 
 

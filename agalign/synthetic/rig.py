@@ -1,9 +1,11 @@
 """What a synthetic camera is: the lenses of its bands, their places and angles in the rig, what they are sensitive to,
-and how they see the ground from a pose. `synthetic.cameras` has the cameras.
+and how they see the ground from a pose. `synthetic.cameras` has the camera of the demo.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -72,31 +74,6 @@ class BandSpec:
 
 
 @dataclass(frozen=True)
-class CameraSpec:
-    """A camera, and whose tags it writes."""
-
-    maker: Literal["MicaSense", "DJI", "Sentera"]
-    model: str
-    bands: tuple[BandSpec, ...]
-    reference: int
-    """Index of the band that the others are aligned to."""
-    size_px: tuple[int, int] = (1280, 960)
-    """(width, height) of the reference's images."""
-    calibrated: bool = True
-    """DJI's: its bands' mappings to a plane that all share are in its tags, not only their optical centres."""
-
-    @property
-    def sharpest(self) -> float:
-        """Most pixels an angle that a band has, beside the first camera's."""
-        return max(b.size_ratio[0] / b.view for b in self.bands)
-
-    @property
-    def widest(self) -> float:
-        """Widest field of view, likewise."""
-        return max(b.view for b in self.bands)
-
-
-@dataclass(frozen=True)
 class Pose:
     """Where the rig is at a capture, and its attitude."""
 
@@ -108,6 +85,61 @@ class Pose:
     north_m: float
     velocity_m_s: tuple[float, float] = (0.0, 0.0)
     """East and south."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How one image of a band was taken."""
+
+    pose: Pose
+    number: int
+    """Of the capture, counted from 1."""
+    size_px: tuple[int, int]
+    """(width, height) of the reference's images."""
+    vignetting: float
+    """Share of the light that the corners lack."""
+    shutter: float = 1.0
+    """Exposure time as a multiple of the usual one."""
+
+    @property
+    def moment(self) -> str:
+        """When, as Exif writes it."""
+        return f"2026:06:21 10:{self.number // 60:02d}:{self.number % 60:02d}"
+
+
+@dataclass(frozen=True)
+class CameraSpec(ABC):
+    """A camera; its subclasses write the files of a maker."""
+
+    maker: ClassVar[str]
+    model: str
+    bands: tuple[BandSpec, ...]
+    reference: int
+    """Index of the band that the others are aligned to."""
+    size_px: tuple[int, int] = (1280, 960)
+    """(width, height) of the reference's images."""
+
+    @abstractmethod
+    def capture_name(self, number: int) -> str:
+        """Shared part of the names of a capture's files; captures are counted from 1."""
+
+    @abstractmethod
+    def file_name(self, band: BandSpec, number: int) -> str:
+        """Name of a band's file, with its folder where bands have folders of their own."""
+
+    @abstractmethod
+    def write_band(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
+        """Write (height, width) pixels and their tags."""
+
+    @property
+    def sharpest(self) -> float:
+        """Most pixels an angle that a band has, beside the first camera's."""
+        return max(b.size_ratio[0] / b.view for b in self.bands)
+
+    @property
+    def widest(self) -> float:
+        """Widest field of view, likewise."""
+        return max(b.view for b in self.bands)
 
 
 def true_homography(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:

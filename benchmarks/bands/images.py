@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from synthetic_flights import troubles
 
-from agalign.synthetic import troubles
 from agalign.synthetic.ground import Field
 from bands.score import AS_IT_IS, LOST, Pair, movement
 

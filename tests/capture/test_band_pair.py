@@ -4,6 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from synthetic_flights.cameras import ALTUM
+from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
@@ -13,9 +15,7 @@ from agalign.capture.prediction import observed
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
-from agalign.synthetic.cameras import ALTUM
 from agalign.synthetic.score import score_against_truth
-from agalign.synthetic.troubles import make_two_headings
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Band
 

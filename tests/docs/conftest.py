@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from synthetic_flights.cameras import ALTUM
 
 from agalign.synthetic import flight as synthetic
-from agalign.synthetic.cameras import ALTUM
 
 from ..cli.test_onto import TRUTH, write_mosaic
 from ..conftest import textured_pair

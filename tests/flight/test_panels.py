@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from synthetic_flights.panel import make_flight_between_panels
 
 from agalign.cameras.discover import discover
 from agalign.flight.panels import BandReading, PanelReading, read_panel, reflectance_factors, with_height, with_panels
-from agalign.synthetic.panel import make_flight_between_panels
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Radiometry
 
 AREA = ((20.0, 10.0), (39.0, 10.0), (39.0, 29.0), (20.0, 29.0))

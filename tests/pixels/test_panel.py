@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
+from synthetic_flights.panel import PANEL_CODE, with_panel
 
 from agalign.pixels.panel import albedo_of, find_panel, inside
 from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.flight import view
 from agalign.synthetic.ground import paint_ground, reflectance
-from agalign.synthetic.panel import PANEL_CODE, with_panel
 from agalign.synthetic.rig import Pose
 from agalign.values.image import Raster
 

@@ -10,14 +10,15 @@ import exifread
 import pytest
 import xmltodict
 from PIL import Image
+from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
+from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.discover import DiscoverOptions
 from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.products.sidecar import find_sidecars
-from agalign.synthetic.cameras import MAVIC, MAVIC_3M, REDEDGE, SENTERA_6X
+from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.rig import CameraSpec
-from agalign.synthetic.troubles import make_two_headings
 
 CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
 CAPTURE_TAGS = ("@drone-dji:CaptureUUID", "MicaSense:CaptureId", "@Camera:CaptureUUID", "Camera:CaptureUUID")

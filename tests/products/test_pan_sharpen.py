@@ -4,13 +4,13 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from synthetic_flights.cameras import ALTUM_PT, MAVIC_3M
+from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.discover import DiscoverOptions
 from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.products.pan_sharpen import _is_seen, _sharpen, brovey_ratio, panchromatic, weights_of
-from agalign.synthetic.cameras import ALTUM_PT, MAVIC_3M
-from agalign.synthetic.troubles import make_two_headings
 from agalign.values.capture import Band, Capture
 
 from ..conftest import textured_image

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import Image
+from synthetic_flights.panel import make_flight_between_panels
 
 import agalign
 from agalign.batch import CaptureReport, RunOptions
@@ -15,7 +16,6 @@ from agalign.config import Settings, WriteSettings
 from agalign.errors import SidecarError
 from agalign.products.panels import PANELS_FILE, read_panels
 from agalign.products.report import write_pages
-from agalign.synthetic.panel import make_flight_between_panels
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 SIZE = 640, 480

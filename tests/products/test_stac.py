@@ -13,11 +13,11 @@ from pystac.extensions.projection import ProjectionExtension
 from pystac.extensions.raster import RasterExtension
 from pystac.validation import RegisteredValidator
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
+from synthetic_flights.panel import make_flight_between_panels
 
 import agalign
 from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.products.stac import ground_m
-from agalign.synthetic.panel import make_flight_between_panels
 from agalign.values.capture import Band, Capture, Pose
 
 from ..conftest import textured_image

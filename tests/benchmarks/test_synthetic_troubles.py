@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from synthetic_flights.cameras import MAVIC
+from synthetic_flights.troubles import make_troubled_flight, make_two_headings
 
 from agalign.cameras.base import rig_seed
 from agalign.cameras.discover import discover
-from agalign.synthetic import cameras, rig, tags
+from agalign.synthetic import rig, tags
 from agalign.synthetic.flight import Shot, write_shots
 from agalign.synthetic.ground import paint_ground
-from agalign.synthetic.troubles import make_troubled_flight, make_two_headings
 from agalign.values import geometry
 
 SIZE = 160, 120
@@ -44,12 +45,12 @@ def test_bands_that_come_late_see_another_place(tmp_path: Path) -> None:
     passing = np.array([c.motion for c in captures])
     assert (np.sign(passing[:8, 1]) == -np.sign(passing[8:, 1])).all()
     # Tags tell the speed to 0.1 m/s, and the ground moves as they say: by the delay, times the focal length.
-    focal_px = cameras.MAVIC.bands[3].lens(*SIZE).fx_px
+    focal_px = MAVIC.bands[3].lens(*SIZE).fx_px
     for capture, motion in zip(captures, passing, strict=True):
         ties = np.array(truth[capture.name]["bands"][f"{capture.name}_MS_NIR.TIF"]["ties"])
         later = np.median(ties[:, 2:] - ties[:, :2], axis=0) @ [0, 1]
         assert abs(later) < 20
-        expected = cameras.MAVIC.bands[3].delay_s * focal_px * motion[1]
+        expected = MAVIC.bands[3].delay_s * focal_px * motion[1]
         assert later - expected == pytest.approx(_without_motion(captures[0], truth), abs=1.5)
 
 
@@ -57,17 +58,17 @@ def _without_motion(first: object, truth: dict) -> float:
     """Rows between green and near infra-red where the drone stands still."""
     name = first.name  # type: ignore[attr-defined]
     ties = np.array(truth[name]["bands"][f"{name}_MS_NIR.TIF"]["ties"])
-    focal_px = cameras.MAVIC.bands[3].lens(*SIZE).fx_px
-    moved = cameras.MAVIC.bands[3].delay_s * focal_px * first.motion[1]  # type: ignore[attr-defined]
+    focal_px = MAVIC.bands[3].lens(*SIZE).fx_px
+    moved = MAVIC.bands[3].delay_s * focal_px * first.motion[1]  # type: ignore[attr-defined]
     return float(np.median(ties[:, 2:] - ties[:, :2], axis=0)[1] - moved)
 
 
 def test_the_mavic_s_calibration_is_its_rig(tmp_path: Path) -> None:
     pose = rig.Pose(4000.0, 20.0, 0.0, 0.0, 0.0, 0.0)  # so high that the lenses stand in one place
     ground = paint_ground(np.random.default_rng(0), [rig.Pose(28.0, 20.0, 0.0, 0.0, 0.0, 0.0)], SIZE)
-    write_shots(tmp_path, [Shot(pose, ground)], SIZE, cameras.MAVIC, np.random.default_rng(0))
+    write_shots(tmp_path, [Shot(pose, ground)], SIZE, MAVIC, np.random.default_rng(0))
     (capture,) = discover(tmp_path).captures
     for band in capture.moving:
-        spec = next(b for b in cameras.MAVIC.bands if b.name == band.name)
-        truth = rig.true_homography(cameras.MAVIC.bands[0], spec, pose, SIZE)
+        spec = next(b for b in MAVIC.bands if b.name == band.name)
+        truth = rig.true_homography(MAVIC.bands[0], spec, pose, SIZE)
         assert geometry.corner_error_px(rig_seed(capture.reference, band), truth, *SIZE) < 0.05
