@@ -13,33 +13,86 @@ from agalign._version import __version__
 
 if TYPE_CHECKING:
     from agalign.api import align, align_capture, align_folder, warp_onto
-    from agalign.errors import AgalignError
+    from agalign.batch import CaptureReport, RunOptions
+    from agalign.cameras.discover import DiscoverOptions, FolderScan, discover
+    from agalign.config import (
+        CheckSettings,
+        FlightSettings,
+        JointSettings,
+        LocalSettings,
+        SeedSettings,
+        Settings,
+        WriteSettings,
+    )
+    from agalign.errors import (
+        AgalignError,
+        ConfigurationError,
+        GeometryError,
+        InputError,
+        NoContrastError,
+        NoSuchBandError,
+        NotEnoughTextureError,
+        OutputError,
+        SidecarError,
+        UnreadableFileError,
+    )
     from agalign.products.dataset import open_capture, open_flight
+    from agalign.values.alignment import Alignment, Prediction, Residual, Seed
 
 __all__ = [
     "AgalignError",
+    "Alignment",
+    "CaptureReport",
+    "CheckSettings",
+    "ConfigurationError",
+    "DiscoverOptions",
+    "FlightSettings",
+    "FolderScan",
+    "GeometryError",
+    "InputError",
+    "JointSettings",
+    "LocalSettings",
+    "NoContrastError",
+    "NoSuchBandError",
+    "NotEnoughTextureError",
+    "OutputError",
+    "Prediction",
+    "Residual",
+    "RunOptions",
+    "Seed",
+    "SeedSettings",
+    "Settings",
+    "SidecarError",
+    "UnreadableFileError",
+    "WriteSettings",
     "__version__",
     "align",
     "align_capture",
     "align_folder",
+    "discover",
     "open_capture",
     "open_flight",
     "warp_onto",
 ]
 
-_HOMES = {
-    "align": "agalign.api",
-    "align_capture": "agalign.api",
-    "align_folder": "agalign.api",
-    "warp_onto": "agalign.api",
-    "open_capture": "agalign.products.dataset",
-    "open_flight": "agalign.products.dataset",
-    "AgalignError": "agalign.errors",
+_OTHER_MODULES = {
+    "agalign.api": ("align", "align_capture", "align_folder", "warp_onto"),
+    "agalign.batch": ("CaptureReport", "RunOptions"),
+    "agalign.cameras.discover": ("DiscoverOptions", "FolderScan", "discover"),
+    "agalign.products.dataset": ("open_capture", "open_flight"),
+    "agalign.values.alignment": ("Alignment", "Prediction", "Residual", "Seed"),
 }
+"""Where the public names are defined that are neither settings nor errors."""
 
 
 def __getattr__(name: str) -> Any:
-    """Torch takes seconds to import, so nothing that needs it is imported before it is asked for (PEP 562)."""
-    if name not in _HOMES:
+    """Import what defines a public name when it is first used (PEP 562): importing torch takes seconds."""
+    if name not in __all__:
         raise AttributeError(f"module 'agalign' has no attribute '{name}'")
-    return getattr(import_module(_HOMES[name]), name)
+    rest = "agalign.config" if name.endswith("Settings") else "agalign.errors"
+    module = next((module for module, names in _OTHER_MODULES.items() if name in names), rest)
+    return getattr(import_module(module), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -4,7 +4,8 @@ An unknown name or an impossible value raises pydantic's ValidationError. docs/o
 numbers that decide something are constants in the module that uses them, with their reasons.
 """
 
-from typing import Annotated
+from collections.abc import Iterator
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -32,6 +33,12 @@ class Stage(BaseModel):
     """Base of the settings: immutable, and an unknown name is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """Print only what differs from the defaults."""
+        for name, field in type(self).model_fields.items():
+            if (value := getattr(self, name)) != field.get_default():
+                yield name, value
 
 
 class JointSettings(Stage):

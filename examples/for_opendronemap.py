@@ -8,17 +8,15 @@ import sys
 from pathlib import Path
 
 import agalign
-from agalign.batch import RunOptions
-from agalign.config import Settings, WriteSettings
 
 
 def main() -> None:
     images = Path(sys.argv[2]) / "images"
     images.mkdir(parents=True)
-    settings = Settings(write=WriteSettings(layout="bands"))
+    settings = agalign.Settings(write=agalign.WriteSettings(layout="bands"))
     left_out = []
     for report in agalign.align_folder(sys.argv[1], Path(sys.argv[2]) / "aligned", settings=settings,
-                                       run=RunOptions(jobs=0)):  # fmt: skip
+                                       run=agalign.RunOptions(jobs=0)):  # fmt: skip
         # A reconstruction is better off without a capture than with a band in the wrong place.
         if report.sidecar is None or report.sidecar.status != "ok":
             left_out.append(report.label)

@@ -7,14 +7,13 @@ import sys
 from pathlib import Path
 
 import agalign
-from agalign.batch import RunOptions
 
 
 def main() -> None:
     first, second, out = sys.argv[1], sys.argv[2], Path(sys.argv[3])
-    agalign.align_folder(first, out / "first", run=RunOptions(jobs=0))
+    agalign.align_folder(first, out / "first", run=agalign.RunOptions(jobs=0))
     (model,) = (out / "first" / "models").glob("*.safetensors")
-    for report in agalign.align_folder(second, out / "second", model=model, run=RunOptions(jobs=0)):
+    for report in agalign.align_folder(second, out / "second", model=model, run=agalign.RunOptions(jobs=0)):
         statuses = [band.status for band in report.sidecar.bands]
         print(f"{report.label}: {statuses.count('aligned')} of {len(statuses) - 1} aligned, {report.seconds:.1f} s")
 

@@ -6,9 +6,8 @@ python examples/one_capture.py FLIGHT OUT
 import sys
 
 import agalign
-from agalign.cameras.discover import discover
 
-flight = discover(sys.argv[1])
+flight = agalign.discover(sys.argv[1])
 capture = flight.captures[0]
 print(capture.label, *(band.name for band in capture.bands))
 

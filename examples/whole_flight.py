@@ -6,14 +6,12 @@ python examples/whole_flight.py FLIGHT OUT
 import sys
 
 import agalign
-from agalign.batch import RunOptions
-from agalign.config import Settings, WriteSettings
 
 
 def main() -> None:
-    settings = Settings(write=WriteSettings(format="cog", interpolation="bilinear"))
+    settings = agalign.Settings(write=agalign.WriteSettings(format="cog", interpolation="bilinear"))
     # Two captures at a time. RunOptions(executor=...) takes any concurrent.futures executor instead.
-    for report in agalign.align_folder(sys.argv[1], sys.argv[2], settings=settings, run=RunOptions(jobs=2)):
+    for report in agalign.align_folder(sys.argv[1], sys.argv[2], settings=settings, run=agalign.RunOptions(jobs=2)):
         if report.sidecar is None:
             print(f"{report.label}: {report.error}")
             continue

@@ -235,3 +235,10 @@ class Alignment:
         if self.issues[-1].kind == "seed_does_not_fit":
             return f"{told}; the {self.seed.kind} seed is used as it is, {sentence(self.issues[-1])}"
         return told
+
+    def __repr__(self) -> str:
+        """One line without the arrays."""
+        median_px = None if self.residual is None else round(self.residual.median_px, 3)
+        std_px = None if self.joint is None else round(self.joint.corner_std_px, 3)
+        reason = "" if self.reason is None else f", reason={self.reason!r}"
+        return f"Alignment(status={self.status!r}, residual_median_px={median_px}, corner_std_px={std_px}{reason})"

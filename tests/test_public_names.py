@@ -1,0 +1,77 @@
+"""The names that `import agalign` offers, and what its objects print."""
+
+import subprocess
+import sys
+import typing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import agalign
+from agalign import api, config, errors
+from agalign.values.issues import Issue
+
+FUNCTIONS = {
+    "align", "align_capture", "align_folder", "discover", "open_capture", "open_flight", "warp_onto",
+}  # fmt: skip
+SETTINGS = {
+    "CheckSettings", "FlightSettings", "JointSettings", "LocalSettings", "SeedSettings", "Settings", "WriteSettings",
+}  # fmt: skip
+OPTIONS_AND_RESULTS = {
+    "Alignment", "CaptureReport", "DiscoverOptions", "FolderScan", "Prediction", "Residual", "RunOptions", "Seed",
+}  # fmt: skip
+ERRORS = {
+    "AgalignError", "ConfigurationError", "GeometryError", "InputError", "NoContrastError", "NoSuchBandError",
+    "NotEnoughTextureError", "OutputError", "SidecarError", "UnreadableFileError",
+}  # fmt: skip
+
+
+def test_the_public_names() -> None:
+    names = FUNCTIONS | SETTINGS | OPTIONS_AND_RESULTS | ERRORS | {"__version__"}
+    assert set(agalign.__all__) == set(dir(agalign)) == names
+    assert len(agalign.__all__) == len(names)
+    for name in names:
+        assert getattr(agalign, name) is not None
+    with pytest.raises(AttributeError, match="'nothing'"):
+        agalign.nothing  # noqa: B018
+
+
+def test_all_errors_and_settings_are_public() -> None:
+    raised = {n for n, c in vars(errors).items() if isinstance(c, type) and issubclass(c, Exception)}
+    assert raised == ERRORS
+    stages = {type(getattr(config.Settings(), name)).__name__ for name in config.Settings.model_fields}
+    assert stages | {"Settings"} == SETTINGS
+
+
+@pytest.mark.parametrize("name", ["align", "align_folder"])
+def test_types_in_the_signatures_are_public(name: str) -> None:
+    hints = typing.get_type_hints(getattr(api, name))
+    own = {t for hint in hints.values() for t in (hint, *typing.get_args(hint)) if hasattr(t, "__module__")}
+    ours = {t.__name__ for t in own if t.__module__.startswith("agalign") and hasattr(t, "__name__")}
+    assert ours
+    assert ours <= set(agalign.__all__)
+
+
+def test_importing_loads_no_heavy_library(tmp_path: Path) -> None:
+    heavy = {"cv2", "numpy", "pydantic", "rasterio", "scipy", "torch"}
+    code = f"import agalign, sys; dir(agalign); print({heavy!r} & set(sys.modules))"
+    root = Path(agalign.__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
+    assert done.stdout.strip() == "set()"
+
+
+def test_settings_print_what_differs_from_the_defaults() -> None:
+    assert repr(agalign.Settings()) == "Settings()"
+    changed = agalign.Settings(write=agalign.WriteSettings(layout="both", stac=True))
+    assert repr(changed) == "Settings(write=WriteSettings(layout='both', stac=True))"
+
+
+def test_an_alignment_prints_one_short_line() -> None:
+    seed = agalign.Seed("identity", np.eye(3), 0.0)
+    residual = agalign.Residual(np.zeros((44, 2)), np.zeros((44, 2)), 0.0512, 0.1, 0.9)
+    result = agalign.Alignment(np.eye(3), "pixel", "aligned", (), seed, None, residual, 1.0)
+    assert repr(result) == "Alignment(status='aligned', residual_median_px=0.051, corner_std_px=None)"
+    failed = agalign.Alignment(np.eye(3), "pixel", "failed", (Issue("blank_moving"),), seed, None, None, 1.0)
+    assert repr(failed).startswith("Alignment(status='failed', residual_median_px=None, corner_std_px=None, reason='")
+    assert "array" not in repr(failed)
