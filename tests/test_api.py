@@ -9,6 +9,8 @@ from agalign.values import geometry
 
 from .conftest import mean_error_px, textured_image, textured_pair
 
+pytestmark = pytest.mark.slow
+
 TRUTH = np.array([[1.004, 0.006, 9.0], [-0.005, 0.998, -7.0], [4e-6, -6e-6, 1.0]])
 
 

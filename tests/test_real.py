@@ -22,7 +22,7 @@ from agalign.pixels.raster import open_raster, probe
 from agalign.products.sidecar import find_sidecars
 from agalign.values import geometry
 
-pytestmark = pytest.mark.real
+pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 
 def pair_medians(out: Path, ties_path: Path) -> dict[str, float]:
@@ -39,36 +39,44 @@ def pair_medians(out: Path, ties_path: Path) -> dict[str, float]:
     return medians
 
 
-@pytest.mark.parametrize(
-    ("folder", "pairs", "median", "worst"),
-    [
-        ("captures/rededge_orchard_no_rig", 4, 0.15, 0.25),
-        ("captures/rededge_mx_dual", 9, 0.12, 0.25),
-        ("captures/p4m_forest", 4, 0.20, 0.30),
-    ],
-)
-def test_captures(real_data: Path, tmp_path: Path, folder: str, pairs: int, median: float, worst: float) -> None:
+DOCUMENTED = {
+    "flights/rededge_m_rowcrop": (16, 0.055, 0.09),
+    "flights/rededge_altitudes": (16, 0.05, 0.10),
+    "captures/rededge_mx_dual": (9, 0.055, 0.07),
+    "captures/rededge_orchard_no_rig": (4, 0.06, 0.07),
+    "captures/p4m_forest": (4, 0.068, 0.09),
+}
+"""Pairs, all aligned, and their median and worst error in px: the README's table."""
+TOLERANCE = 1.5
+"""Errors may exceed the documented figures by this factor, on another machine or with other versions of libraries."""
+
+
+@pytest.mark.parametrize("folder", DOCUMENTED)
+def test_errors_are_the_documented_ones(real_data: Path, tmp_path: Path, folder: str) -> None:
+    pairs, median, worst = DOCUMENTED[folder]
     agalign.align_folder(real_data / folder, tmp_path)
     medians = pair_medians(tmp_path, real_data / folder / "ties.json")
     assert len(medians) == pairs
-    assert np.median(list(medians.values())) < median
-    assert max(medians.values()) < worst
+    assert np.median(list(medians.values())) < TOLERANCE * median
+    assert max(medians.values()) < TOLERANCE * worst
 
 
-def test_a_capture_of_the_row_crop_flight(real_data: Path, tmp_path: Path) -> None:
+def test_a_capture_without_its_flight(real_data: Path, tmp_path: Path) -> None:
     flight = discover(real_data / "flights/rededge_m_rowcrop")
     process_capture(flight.captures[2], tmp_path, Settings())
     medians = pair_medians(tmp_path, real_data / "flights/rededge_m_rowcrop/ties.json")
+    _, median, worst = DOCUMENTED["flights/rededge_m_rowcrop"]
     assert len(medians) == 4
-    assert np.median(list(medians.values())) < 0.12
-    assert max(medians.values()) < 0.3
+    assert np.median(list(medians.values())) < TOLERANCE * median
+    assert max(medians.values()) < TOLERANCE * worst
 
 
 def test_without_metadata_and_from_identity_nothing_is_wrongly_aligned(real_data: Path, tmp_path: Path) -> None:
     flight = discover(real_data / "flights/rededge_m_rowcrop", DiscoverOptions(ignore_metadata=True))
     process_capture(flight.captures[0], tmp_path, Settings(seed=SeedSettings(force="identity")))
     medians = pair_medians(tmp_path, real_data / "flights/rededge_m_rowcrop/ties.json")
-    assert all(m < 0.5 for m in medians.values())
+    assert medians
+    assert max(medians.values()) < 0.5
 
 
 @pytest.mark.parametrize("number", [5, 25, 31])
@@ -138,7 +146,9 @@ def test_the_panel_of_the_row_crop_is_recognised_with_and_without_its_tags(real_
 
 def test_temperature_is_what_the_altum_says_itself(real_data: Path) -> None:
     """SceneTemperature, degrees C, is in its tags."""
-    for path in sorted((real_data / "captures/altum_lwir").glob("*.tif")):
+    paths = sorted((real_data / "captures/altum_lwir").glob("*.tif"))
+    assert paths
+    for path in paths:
         tags = read_tags(path)
         (band,) = MicaSense().bands(path, tags, probe(path))
         with open_raster(path) as file:
@@ -160,9 +170,10 @@ def test_a_sentera_s_cameras_are_laid_on_each_other(real_data: Path, tmp_path: P
     captures = discover(real_data / "captures/sentera_d4k").captures
     assert [len(c.bands) for c in captures] == [5, 5]
     sidecar = process_capture(captures[1], tmp_path, Settings()).sidecar
-    for band in sidecar.bands:
-        if band.band in ("Red edge", "NIR"):
-            here, there = np.array(band.grid.reference_px), np.array(band.grid.moving_px)
-            middle = np.argmin(np.linalg.norm(here - here.mean(axis=0), axis=1))
-            assert band.status == "aligned"
-            assert np.linalg.norm(there[middle] - here[middle] - (-533, -85)) < 3
+    second_camera = [b for b in sidecar.bands if b.band in ("Red edge", "NIR")]
+    assert len(second_camera) == 2
+    for band in second_camera:
+        here, there = np.array(band.grid.reference_px), np.array(band.grid.moving_px)
+        middle = np.argmin(np.linalg.norm(here - here.mean(axis=0), axis=1))
+        assert band.status == "aligned"
+        assert np.linalg.norm(there[middle] - here[middle] - (-533, -85)) < 3

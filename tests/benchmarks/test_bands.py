@@ -143,10 +143,13 @@ def test_a_set_is_sound(name: str) -> None:
     description = score.read_sets()[name]
     assert description["set"] == name
     assert {"camera", "difficulty", "published", "convention", "truth", "truth_std_px"} <= set(description)
+    assert description["files"]
     for entry in description["files"].values():
         assert re.fullmatch("[0-9a-f]{64}", entry["sha256"])
         assert entry["bytes"] > 0
-    for pair in score.pairs_of(description):
+    pairs = score.pairs_of(description)
+    assert pairs
+    for pair in pairs:
         assert pair.reference in description["files"]
         assert 30 < len(pair.reference_px) <= 400
         w, h = description["files"][pair.reference]["size_px"]

@@ -16,6 +16,8 @@ from agalign.synthetic.ground import paint_ground
 from agalign.synthetic.rig import CameraSpec, Pose, true_homography
 from agalign.values import geometry
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = {
     "RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "Altum": ALTUM, "Altum-PT": ALTUM_PT,
     "6X": SENTERA_6X,

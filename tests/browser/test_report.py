@@ -17,7 +17,7 @@ from agalign.products.report import write_pages
 from agalign.synthetic import flight as synthetic
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = pytest.mark.filterwarnings("ignore")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 HOSTILE = '<img src=x onerror="window.broken=1">\'</script><script>window.broken=1</script>'
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

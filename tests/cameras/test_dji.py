@@ -64,7 +64,7 @@ def test_the_mavic_s_colour_photograph_goes_through_the_designed_frame(tmp_path:
     cv2.imwrite(str(photo), np.zeros((48, 64, 3), np.uint8))
     nir = mavic_band(tmp_path, mavic_tags(RelativeOpticalCenterX="0", RelativeOpticalCenterY="0"))
     rgb = Dji().bands(photo, colour, probe(photo))
-    assert all(b.to_rig is None for b in rgb)
+    assert [b.to_rig for b in rgb] == [None] * 3
     placed = {b.name: b for b in Dji().with_shared_rig([nir, *rgb], [mavic_tags(), colour])}
     seed = rig_seed(nir, placed["RGB Red"])
     np.testing.assert_allclose(geometry.apply(seed, np.array([[1296.0, 972.0]])), [[2639.9, 1978.0]], atol=0.01)

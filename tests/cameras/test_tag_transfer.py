@@ -55,6 +55,7 @@ def bands_in(folder: Path) -> dict[str, Band]:
     return result
 
 
+@pytest.mark.slow
 def test_aligned_bands_look_like_one_camera(flight: Path, both: Path) -> None:
     before, after = bands_in(flight / "0000SET" / "000"), bands_in(both)
     assert set(after) == {"Blue", "Green", "Red", "NIR", "Red edge"}
@@ -71,6 +72,7 @@ def test_aligned_bands_look_like_one_camera(flight: Path, both: Path) -> None:
         np.testing.assert_allclose(rig_seed(after["Green"], band), geometry.identity(), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_vignetting_lies_where_the_band_was_moved_to(flight: Path, both: Path) -> None:
     data = json.loads((both / "IMG_0001.json").read_text())
     truth = json.loads((flight / "truth.json").read_text())["IMG_0001"]["bands"]["IMG_0001_4.tif"]
@@ -85,6 +87,7 @@ def test_vignetting_lies_where_the_band_was_moved_to(flight: Path, both: Path) -
     assert np.linalg.norm(np.array(result) - centre) > 3
 
 
+@pytest.mark.slow
 def test_three_readers_agree_on_place_time_and_band(flight: Path, both: Path) -> None:
     source, path = flight / "0000SET" / "000" / "IMG_0001_4.tif", both / "IMG_0001_4.tif"
     before, after = read_directories(source), read_directories(path)
@@ -107,6 +110,7 @@ def test_three_readers_agree_on_place_time_and_band(flight: Path, both: Path) ->
         assert dataset.compression.name == "deflate"
 
 
+@pytest.mark.slow
 def test_the_stack_says_what_is_true_of_all_its_bands(both: Path) -> None:
     result = read_directories(both / "IMG_0001.tif")
     assert result[GPS][1].data == b"N\0"
@@ -116,9 +120,11 @@ def test_the_stack_says_what_is_true_of_all_its_bands(both: Path) -> None:
     assert result[0][272].data == b"RedEdge-M\0"
 
 
+@pytest.mark.slow
 def test_the_bands_pixels_are_the_stacks(both: Path) -> None:
     data = json.loads((both / "IMG_0001.json").read_text())
     with rasterio.open(both / "IMG_0001.tif") as stack:
+        assert stack.count == len(data["bands"]) == 5
         for index, band in enumerate(data["bands"], start=1):
             assert band["place"] == {"file": "IMG_0001.tif", "band_index": index}
             with rasterio.open(both / band["file"]) as single:

@@ -11,6 +11,8 @@ from agalign.values.capture import Capture
 
 from ..conftest import textured_pair
 
+pytestmark = pytest.mark.slow
+
 SIZE = 1500, 1200
 TRUTH = np.array([[1.002, 0.004, 12.4], [-0.003, 0.999, -7.7], [1e-6, -1e-6, 1.0]])
 

@@ -19,7 +19,7 @@ from agalign.products.fill_sidecar import capture_status
 from agalign.synthetic import make_flight
 from agalign.values import geometry
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,9 @@ def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_flight(folder, captures=5, size_px=(400, 300), rng_seed=5, altitude_m=(12.0, 30.0))
     rng = np.random.default_rng(0)
     images = folder / "0000SET" / "000"
-    for path in [images / "IMG_0003_4.tif", *images.glob("IMG_0005_*.tif")]:
+    spoilt = [images / "IMG_0003_4.tif", *images.glob("IMG_0005_*.tif")]
+    assert len(spoilt) == 6
+    for path in spoilt:
         with rasterio.open(path, "r+") as dataset:
             dataset.write((20_000 + 1500 * rng.normal(size=(1, 300, 400))).astype(np.uint16))
     return folder

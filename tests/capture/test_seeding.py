@@ -143,6 +143,7 @@ def test_tags_that_are_wrong_by_a_turn_are_found_out() -> None:
     assert mean_error_px(result.fixed_to_moving, truth, 640, 480) < 2
 
 
+@pytest.mark.slow
 def test_a_turn_that_no_rig_has_is_told_from_a_shift() -> None:
     _, _, truth = turned(np.zeros((480, 640), np.float32), 4.0, 1.0)
     pair = pair_turned(4.0, {"identity": np.eye(3)})

@@ -124,6 +124,7 @@ def test_a_field_starts_by_itself_where_a_part_of_the_image_lies_apart(use: str,
     assert (results.field is not None) == (status == "aligned")
 
 
+@pytest.mark.slow
 def test_what_changes_from_plant_to_plant_is_followed_by_a_finer_field() -> None:
     """Waves of 170 px: the first field's windows show half of them each."""
     pair, seed = bent_pair(2.5, apart_px=170.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)

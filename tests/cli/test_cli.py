@@ -27,7 +27,7 @@ from agalign.values.geometry import translation
 
 from ..conftest import textured_image
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 
 
 def agalign(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
@@ -53,6 +53,7 @@ def test_a_flight_is_aligned(flight: Path, aligned: tuple[Path, subprocess.Compl
         jsonschema.validate(data, schema)
         assert data["status"] == "ok"
         assert data["output"]["nodata"] is None
+        assert len(data["bands"]) == 5
         for band in data["bands"]:
             if band["status"] == "reference":
                 assert band["band"] == "Green"

@@ -14,7 +14,7 @@ from .test_cli import agalign
 TRUTH = np.array([[1.001, 0.002, 9.3], [-0.002, 1.001, -14.6], [0, 0, 1.0]])
 
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 
 
 def write_mosaic(path: Path, image: np.ndarray, off_m: tuple[float, float] | None, bands: int = 1) -> None:

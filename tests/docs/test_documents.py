@@ -39,6 +39,7 @@ def run(block: Block, command: list[str], folder: Path) -> None:
     assert done.returncode == 0, f"{block.where}: {shlex.join(command)}\n{done.stdout[-1500:]}{done.stderr[-3000:]}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNABLE, ids=[p.relative_to(ROOT).as_posix() for p in RUNNABLE])
 def test_a_page_does_what_it_says(page: Path, desk: Path, tmp_path: Path) -> None:
     """Read from top to bottom, in a folder with a flight in it."""
@@ -63,9 +64,10 @@ def test_a_page_does_what_it_says(page: Path, desk: Path, tmp_path: Path) -> Non
 
 def test_every_block_says_what_it_is() -> None:
     """One without a kind would be run by nobody."""
-    for page in PAGES:
-        for block in blocks_of(page):
-            assert block.kind in KINDS, block.where
+    blocks = [block for page in PAGES for block in blocks_of(page)]
+    assert blocks
+    for block in blocks:
+        assert block.kind in KINDS, block.where
 
 
 def test_what_is_not_run_here_is_run_elsewhere() -> None:
@@ -81,9 +83,10 @@ def test_what_is_not_run_here_is_run_elsewhere() -> None:
 
 def test_extras_that_are_named_can_be_had() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    for page in PAGES:
-        for names in re.findall(r"agalign\[([\w,]+)\]", page.read_text(encoding="utf-8")):
-            assert set(names.split(",")) <= set(extras), page
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    named = {name for names in re.findall(r"agalign\[([\w,]+)\]", text) for name in names.split(",")}
+    assert named
+    assert named <= set(extras)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[p.relative_to(ROOT).as_posix() for p in PAGES])
@@ -102,16 +105,19 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert anchor in {re.sub(r"[^\w -]", "", h).strip().lower().replace(" ", "-") for h in heads}, target
 
 
-def test_options_that_are_spoken_of_exist() -> None:
-    """Also those in a sentence."""
-    done = subprocess.run(
-        [sys.executable, "-m", "agalign", "align", "--help"], capture_output=True, text=True, check=True,
-        env=os.environ | {"COLUMNS": "300"},
-    )  # fmt: skip
-    known = set(re.findall(r"--[a-z][\w-]+", done.stdout))
-    for page in (ROOT / "README.md", *(ROOT / "docs").glob("quickstart.md"), ROOT / "docs" / "troubleshooting.md"):
-        rows = re.findall(r"^\| `(--[a-z][\w-]+)", page.read_text(encoding="utf-8"), re.MULTILINE)
-        assert set(rows) <= known, page
+def test_options_in_the_documents_exist() -> None:
+    known = set()
+    for command in (["--help"], ["align", "--help"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "agalign", *command], capture_output=True, text=True, check=True,
+            env=os.environ | {"COLUMNS": "300"},
+        )  # fmt: skip
+        known |= set(re.findall(r"--[a-z][\w-]+", done.stdout))
+    names = "README.md", "docs/options.md", "docs/quickstart.md", "docs/troubleshooting.md"
+    for page in (ROOT / name for name in names):
+        named = set(re.findall(r"`(--[a-z][\w-]+)", page.read_text(encoding="utf-8")))
+        assert named, page
+        assert named <= known, page
 
 
 def test_the_table_of_doubts_is_the_programs() -> None:
@@ -122,6 +128,7 @@ def test_the_table_of_doubts_is_the_programs() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_the_site_is_built(tmp_path: Path) -> None:
     """Every page, and what the docstrings say, without a warning."""
     pytest.importorskip("sphinx")

@@ -101,10 +101,12 @@ def test_the_ends_of_a_flight_are_looked_at_until_three_in_a_row_show_none(monke
     assert with_panels([]) == []
 
 
+@pytest.mark.slow
 def test_the_first_and_last_captures_are_looked_at(tmp_path: Path) -> None:
     make_flight_between_panels(tmp_path, 7, (640, 480))
     result = with_panels(discover(tmp_path).captures)
     assert [c.panel is not None for c in result] == [True, *[False] * 7, True]
+    assert len(result[0].bands) == 5
     assert all(b.panel is not None and b.panel.corners_px and b.panel.albedo for b in result[0].bands)
     (shown,) = {b.panel.serial for b in result[-1].bands if b.panel is not None}
     assert shown == "RP04-0000001-SY"

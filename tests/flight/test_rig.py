@@ -66,6 +66,7 @@ def test_a_band_without_evidence_is_where_the_others_say() -> None:
     assert distance_px(rig.mean["NIR"], mappings(4.0)["NIR"], SIZE) > 3
 
 
+@pytest.mark.slow
 def test_tilt_counts_where_the_ground_tilts() -> None:
     rng = np.random.default_rng(3)
     tilted = [observation(float(k), rng.normal(), tuple(2 * rng.normal(size=2))) for k in range(10)]
@@ -99,6 +100,7 @@ def test_a_known_layout_is_enough_for_a_height_that_nobody_has_seen() -> None:
     assert error < 2.5 * std
 
 
+@pytest.mark.slow
 def test_a_band_whole_periods_away_does_not_carry_the_others() -> None:
     rig = learn_rig(flight(), SIZE, {})
     assert rig is not None
@@ -110,6 +112,7 @@ def test_a_band_whole_periods_away_does_not_carry_the_others() -> None:
     assert error_px(rig, "Blue", spoiled, wrong)[0] > 35
 
 
+@pytest.mark.slow
 def test_a_capture_without_evidence_lies_between_its_neighbours() -> None:
     """A drone that sinks steadily: the captures before and after say more than the flight's mean."""
     sinking = [observation(10.0 * k, 0.5 * k) for k in range(9)]
@@ -193,6 +196,7 @@ def two_headings() -> list[Observation]:
     return [passing(float(k), motion, float(rng.normal()), seed=k) for k, motion in enumerate(there)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", [{}, BASELINES])
 def test_delays_are_told_from_baselines(layout: dict) -> None:
     rig = learn_rig(two_headings(), SIZE, layout)
@@ -205,6 +209,7 @@ def test_delays_are_told_from_baselines(layout: dict) -> None:
     assert error_px(rig, "NIR", known, truth.mappings["NIR"])[0] < 0.3
 
 
+@pytest.mark.slow
 def test_a_capture_without_evidence_on_the_other_heading_lies_where_its_speed_says() -> None:
     rig = learn_rig(two_headings(), SIZE, BASELINES)
     assert rig is not None
@@ -218,6 +223,7 @@ def test_a_capture_without_evidence_on_the_other_heading_lies_where_its_speed_sa
         assert error < 2.5 * prediction.std_px
 
 
+@pytest.mark.slow
 def test_between_captures_that_differ_nothing_is_known_for_sure() -> None:
     """A panel a metre below the camera was taken just before: in time it is near, in height it is not."""
     panel = replace(observation(0.0, 100.0), altitude_m=1.0)

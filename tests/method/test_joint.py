@@ -17,6 +17,8 @@ from agalign.values.issues import Issue
 
 from ..conftest import mean_error_px, textured_image, textured_pair
 
+pytestmark = pytest.mark.slow
+
 TRUTH = np.array([[1.004, 0.006, 6.0], [-0.005, 0.998, -4.0], [4e-6, -6e-6, 1.0]])
 NEAR = geometry.translation(7.5, -5.5)
 

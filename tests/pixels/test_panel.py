@@ -47,6 +47,7 @@ def test_a_square_without_a_code_counts_only_where_asked_for(panel: np.ndarray) 
     assert panel[inside(result.area_px, panel.shape)].mean() == pytest.approx(0.51, abs=0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("without_code", [False, True])
 def test_a_field_shows_no_panel(without_code: bool) -> None:
     pose = Pose(28.0, 25.0, 0.0, 0.0, 0.0, 0.0)

@@ -13,7 +13,7 @@ from agalign.synthetic.flight import make_flight
 from ..conftest import textured_image
 from .test_outputs import write_band
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 SEEDED = Settings(seed=SeedSettings(only=True))
 
 

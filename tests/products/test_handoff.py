@@ -20,6 +20,8 @@ from agalign.products.sidecar import find_sidecars
 from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.rig import CameraSpec
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
 CAPTURE_TAGS = ("@drone-dji:CaptureUUID", "MicaSense:CaptureId", "@Camera:CaptureUUID", "Camera:CaptureUUID")
 SIZE = 480, 360
@@ -82,7 +84,9 @@ def test_bands_are_grouped_and_named_as_before(aligned: tuple[CameraSpec, Path, 
 def test_place_time_and_camera_are_as_before(aligned: tuple[CameraSpec, Path, Path]) -> None:
     _, folder, out = aligned
     sources = {p.name: p for p in bands_of(folder)}
-    for path in bands_of(out):
+    paths = bands_of(out)
+    assert {p.name for p in paths} == set(sources)
+    for path in paths:
         before, after = exif_of(sources[path.name]), exif_of(path)
         for tag in (
             "Image Make", "Image Model", "GPS GPSLatitude", "GPS GPSLatitudeRef", "GPS GPSLongitude", "GPS GPSAltitude",
@@ -98,6 +102,7 @@ def test_nobody_aligns_them_once_more(aligned: tuple[CameraSpec, Path, Path]) ->
     """All bands are one camera's now: no angles between them, one principal point, one lens, one homography."""
     camera, _, out = aligned
     packets = [xmp_of(p) for p in bands_of(out)]
+    assert len(packets) > 1
     if camera.maker == "MicaSense":
         for xmp in packets:
             assert numbers(xmp["Camera:RigRelatives"]) == [0, 0, 0]
@@ -135,7 +140,9 @@ def test_undistorted_pixels_say_so(tmp_path: Path) -> None:
     make_two_headings(tmp_path / "in", 1, SIZE, camera=MAVIC, line=1, lakes=False)
     settings = Settings(seed=SeedSettings(only=True), write=WriteSettings(layout="bands", undistort=True))
     agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
-    for path in bands_of(tmp_path / "out"):
+    paths = bands_of(tmp_path / "out")
+    assert len(paths) == 4
+    for path in paths:
         xmp = xmp_of(path)
         assert xmp["@drone-dji:DewarpFlag"] == "1"
         assert numbers(xmp["@drone-dji:DewarpData"].partition(";")[2])[4:] == [0] * 5
@@ -146,7 +153,9 @@ def test_gdalinfo_opens_them(aligned: tuple[CameraSpec, Path, Path]) -> None:
     if gdalinfo is None:
         pytest.skip("gdalinfo is not installed")
     _, _, out = aligned
-    for path in bands_of(out):
+    paths = bands_of(out)
+    assert paths
+    for path in paths:
         done = subprocess.run([gdalinfo, "-json", str(path)], capture_output=True, text=True, check=True)
         assert not done.stderr
         (band,) = json.loads(done.stdout)["bands"]

@@ -27,7 +27,7 @@ from agalign.values.mapping import mapping_of
 
 from ..conftest import textured_image
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 ONLY_SEED = Settings(seed=SeedSettings(only=True, force="identity"), joint=JointSettings())
 
 
@@ -322,6 +322,8 @@ def test_bands_of_other_sizes_are_aligned(tmp_path: Path) -> None:
         write_band(tmp_path / "in" / f"f_{name}.tif", (3000 + 600 * pixels).clip(1).astype(np.uint16))
     (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out")
     assert report.sidecar is not None
+    assert [b.band for b in report.sidecar.bands if b.grid is None] == ["green"]
+    assert len(report.sidecar.bands) == 3
     for band in report.sidecar.bands:
         if band.grid is None:
             continue

@@ -15,7 +15,7 @@ from agalign.values.capture import Band, Capture
 
 from ..conftest import textured_image
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 
 
 def scene() -> tuple[list[np.ndarray], np.ndarray]:
@@ -83,7 +83,7 @@ def test_what_is_sharpened_keeps_its_brightness_and_gains_detail(tmp_path: Path)
 def test_without_a_panchromatic_band_it_is_refused(flight: Path, tmp_path: Path) -> None:
     settings = Settings(write=WriteSettings(pan_sharpen=True))
     reports = agalign.align_folder(flight, tmp_path, settings=settings)
-    assert all(r.error is not None and "--with-rgb" in r.error for r in reports)
+    assert ["--with-rgb" in (r.error or "") for r in reports] == [True, True]
 
 
 def test_what_sees_the_others_light_together() -> None:

@@ -17,7 +17,7 @@ from agalign.errors import SidecarError
 from agalign.products.panels import PANELS_FILE, read_panels
 from agalign.products.report import write_pages
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 SIZE = 640, 480
 SUN = 1.0, 0.6
 
@@ -69,7 +69,7 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: tuple[Path, list[Capt
     assert ((drawn == (255, 64, 32)).all(axis=-1)).sum() > 5 * 50
     data = json.loads((out / PANELS_FILE).read_text())
     assert [p["capture"] for p in data["panels"]] == ["IMG_0001", "IMG_0004"]
-    assert all(b["albedo"] == pytest.approx(0.51) for p in data["panels"] for b in p["bands"])
+    assert [b["albedo"] for p in data["panels"] for b in p["bands"]] == pytest.approx([0.51] * 10)
     table = csv.DictReader((out / "summary.csv").read_text().splitlines())
     rows = [r for r in table if r["status"] == "panel"]
     assert {(r["capture"], r["band"]) for r in rows} >= {("IMG_0001", "NIR"), ("IMG_0004", "Green")}

@@ -17,6 +17,8 @@ from agalign.products.report.facts import CaptureEntry
 from agalign.products.report.rigs import CHART_HEIGHT, drifts_of, rig_views
 from agalign.synthetic import flight as synthetic
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(agalign.__file__).parent / "products" / "report"
 
 

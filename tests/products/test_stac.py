@@ -23,7 +23,7 @@ from agalign.values.capture import Band, Capture, Pose
 from ..conftest import textured_image
 from .test_outputs import write_band
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 SEEDED = Settings(seed=SeedSettings(only=True))
 EXTENSIONS = "https://stac-extensions.github.io/{}/schema.json"
 
@@ -63,6 +63,7 @@ def test_items_and_collection_are_valid_and_find_each_other(run: Path) -> None:
         result = item.get_collection()
         assert result is not None
         assert result.id == collection.id
+        assert item.assets
         for asset in item.assets.values():
             assert Path(asset.get_absolute_href() or "").is_file(), asset.href
     box = collection.extent.spatial.bboxes[0]

@@ -8,7 +8,7 @@ from .faults import FAULTS, Fault, run_fault, what_is_wrong
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=[f.name for f in FAULTS])
