@@ -196,10 +196,6 @@ class WriteSettings(Stage):
     format: RasterFormat = "gtiff"
     compression: Compression = "auto"
     """auto is Zstandard for stacks and Deflate for files of single bands."""
-    tile_px: Positive = 256
-    """Side of the tiles within a TIFF."""
-    work_tile_px: Positive = 2048
-    """Side of the tiles in which moving bands are resampled: it bounds the memory."""
     undistort: bool = False
     """Write the lens-corrected grid of the reference instead of its own."""
     layout: Layout = "stack"

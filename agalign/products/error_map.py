@@ -12,7 +12,7 @@ from rasterio.errors import RasterioError
 
 from agalign.errors import OutputError
 from agalign.pixels.raster import GDAL_ENVIRONMENT, why, without_warnings
-from agalign.products.write import georeferenced, verify
+from agalign.products.raster_file import check_complete, georeferenced
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import complete_file
@@ -43,7 +43,7 @@ def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid:
                     dataset.write(_map_of(alignment, size_px, grid), index)
                     dataset.set_band_description(index, name)
                     dataset.update_tags(index, units="px of the reference", STATUS=alignment.status)
-            verify(partial)
+            check_complete(partial)
     except (RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
 

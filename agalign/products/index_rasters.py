@@ -20,8 +20,8 @@ from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, why, without_wa
 from agalign.products.drawing import with_text, write_png
 from agalign.products.fill_sidecar import is_delivered
 from agalign.products.indices import Index, bands_for, compute
+from agalign.products.raster_file import check_complete
 from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
-from agalign.products.write import verify
 from agalign.values.files import complete_file
 from agalign.values.image import FloatImage
 
@@ -150,7 +150,7 @@ def _write_values(
                 value = compute(index, [_physical(source, i, window) for source, i in sources])
                 counts += np.histogram(value[np.isfinite(value)].clip(*index.span), edges)[0]
                 dataset.write(value, 1, window=window)
-        verify(partial)
+        check_complete(partial)
     except (OSError, RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{target}: cannot be written ({why(error)})") from None
 

@@ -28,7 +28,8 @@ from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, why, without_warnings
 from agalign.pixels.resample import tiles
 from agalign.products.layout import output_layers
-from agalign.products.write import marked, verify, write_raster
+from agalign.products.nodata import with_nodata
+from agalign.products.raster_file import check_complete, write_raster
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.files import complete_file, scratch_file
@@ -91,7 +92,7 @@ def write_pan_sharpened(
             dark = [_dark(layer.band, settings) for layer in sources]
             with complete_file(path) as partial:
                 _sharpen(unsharpened, partial, bands, pan, seen, dark, max(grid.scale_xy), nodata)
-                verify(partial)
+                check_complete(partial)
     except RasterioError as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
     return path
@@ -174,7 +175,7 @@ def _as(values: FloatImage, valid: Mask, dtype: str, nodata: float | None) -> ND
         limits = np.iinfo(str(kind))
         values = np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max)
     result = values.astype(kind)
-    return result if nodata is None else marked(result, valid, nodata)
+    return result if nodata is None else with_nodata(result, valid, nodata)
 
 
 def _describe(

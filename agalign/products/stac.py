@@ -21,7 +21,9 @@ from agalign.flight.groups import camera_key
 from agalign.pixels.raster import crs_code, transformed
 from agalign.products.indices import role_of
 from agalign.products.pan_sharpen import panchromatic
-from agalign.products.write import UNITS, Written, georeferenced
+from agalign.products.raster_file import georeferenced
+from agalign.products.raster_tags import UNITS
+from agalign.products.write import Written
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Position
 from agalign.values.files import write_text

@@ -8,7 +8,7 @@ import rasterio
 from agalign.config import WriteSettings
 from agalign.flight.rig import NO_FACTORS, Rig, Seen
 from agalign.products.layout import output_layers
-from agalign.products.write import write_raster
+from agalign.products.raster_file import write_raster
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, Capture

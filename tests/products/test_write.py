@@ -8,7 +8,8 @@ import rasterio
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.products.layout import Layer
-from agalign.products.write import write_capture, write_raster
+from agalign.products.raster_file import write_raster
+from agalign.products.write import write_capture
 from agalign.values import geometry
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference
 from agalign.values.image import OutputGrid

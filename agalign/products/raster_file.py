@@ -1,0 +1,155 @@
+"""One aligned raster on the reference's pixel grid, a tiled GeoTIFF or COG: written, then checked to be complete."""
+
+import errno
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+import tifffile
+from rasterio.enums import Resampling
+from rasterio.errors import RasterioError
+from rasterio.shutil import copy as copy_dataset
+from rasterio.transform import Affine
+from rasterio.windows import Window
+
+from agalign.cameras.tag_transfer import TransferredTags
+from agalign.cameras.tiff_directory import add_directories
+from agalign.config import WriteSettings
+from agalign.errors import OutputError
+from agalign.pixels.radiometry import calibrated
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_window, why, without_warnings
+from agalign.pixels.resample import resample_tile, tiles
+from agalign.products.layout import Layer
+from agalign.products.nodata import Pixels, nodata_value, with_nodata
+from agalign.products.raster_tags import describe
+from agalign.values import geometry
+from agalign.values.capture import Band, Capture, Georeference
+from agalign.values.files import complete_file
+from agalign.values.image import Mask, OutputGrid, Tile
+
+_TILE_PX = 256
+"""Side of the tiles within a TIFF: GDAL's default, which viewers read quickly."""
+_WORK_TILE_PX = 2048
+"""Side of the tiles in which moving bands are resampled: it bounds the memory."""
+_COG_TILE_PX = 512
+"""GDAL's default for a COG."""
+
+
+def write_raster(
+    capture: Capture, layers: Sequence[Layer], grid: OutputGrid, path: Path, settings: WriteSettings,
+    tags: TransferredTags | None = None,
+) -> float | None:  # fmt: skip
+    """Write layers as the bands of one file, complete or not at all; return its nodata value.
+
+    The type is the layers' where all share it, else the smallest that holds them all; float32 after radiometry. A
+    nodata value is declared only where some pixel needs it; valid moving pixels that happen to equal it change by
+    the smallest step. A COG gets no tags that GDAL does not write: they would break its layout.
+    Raises OutputError, or UnreadableFileError for an input.
+    """
+    raw = settings.radiometry == "off"
+    dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
+    nodata = nodata_value(capture, layers, grid, dtype, settings)
+    compression = _compression(settings, all_bands=len(layers) == len(capture.bands))
+    profile = _profile(capture.reference, len(layers), grid, dtype, nodata, compression)
+    try:
+        with complete_file(path) as partial:
+            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT):
+                with rasterio.open(partial, "w", **profile) as dataset:
+                    describe(dataset, capture, layers, settings)
+                    for index, layer in enumerate(layers, start=1):
+                        _write_layer(dataset, index, layer, grid, nodata, settings)
+                if capture.reference.overviews and settings.format == "gtiff":
+                    with rasterio.open(partial, "r+") as dataset:
+                        dataset.build_overviews(list(capture.reference.overviews), Resampling.average)
+                if tags is not None:
+                    add_directories(partial, tags.first, tags.exif, tags.gps)
+                if settings.format == "cog":
+                    _to_cog(partial, compression)
+            check_complete(partial)
+    except (RasterioError, tifffile.TiffFileError) as error:
+        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
+    return nodata
+
+
+def check_complete(path: Path) -> None:
+    """Raise OSError for a TIFF in which a tile or strip is missing or cut off.
+
+    GDAL flushes when a file is closed, and a failure then (a full disk) raises nothing.
+    """
+    size = path.stat().st_size
+    with tifffile.TiffFile(path) as tiff:
+        segments = [s for page in tiff.pages for s in zip(page.dataoffsets, page.databytecounts, strict=True)]
+    if not segments or any(count == 0 or offset + count > size for offset, count in segments):
+        raise OSError(errno.EIO, "the file came out incomplete; is the disk full?")
+
+
+def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any]:
+    """Return rasterio's `transform` and `crs` of an output grid, given the georeference of the reference's file."""
+    # Only where the source has one: an identity transform would be an invented georeference.
+    # Geotransforms count from corners, where a change of resolution is a mere factor.
+    shrunk = np.diag([1 / grid.scale_xy[0], 1 / grid.scale_xy[1], 1.0])
+    written = georeference.transform @ shrunk @ geometry.translation(grid.x0, grid.y0)
+    return {"transform": Affine(*written[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
+
+
+def _write_layer(
+    dataset: Any, index: int, layer: Layer, grid: OutputGrid, nodata: float | None, settings: WriteSettings
+) -> None:
+    dtype = np.dtype(dataset.dtypes[0])
+    for tile in tiles(grid.tile, _WORK_TILE_PX):
+        pixels, valid = _tile_of(layer, tile, settings)
+        if pixels is None:
+            pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
+        elif nodata is not None and not (valid.all() and layer.is_copied):
+            pixels = with_nodata(pixels.astype(dtype, copy=False), valid, nodata)
+        window = Window(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
+        dataset.write(pixels.astype(dtype, copy=False), index, window=window)
+
+
+def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels | None, Mask]:
+    """A layer's pixels on a tile and their mask; no pixels for a gap."""
+    if layer.is_gap:
+        return None, np.zeros((tile.height, tile.width), dtype=bool)
+    radiometry = None if settings.radiometry == "off" else layer.band.radiometry
+    if layer.mapping is not None:
+        return resample_tile(layer.band, layer.mapping, tile, settings.interpolation, radiometry)
+    with open_raster(layer.band.path) as source:
+        pixels, valid = read_window(source, layer.band, tile.x0, tile.y0, tile.width, tile.height)
+    return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
+
+
+def _profile(
+    reference: Band, count: int, grid: OutputGrid, dtype: np.dtype[Any], nodata: float | None, compression: str
+) -> dict[str, Any]:
+    profile: dict[str, Any] = {
+        "driver": "GTiff", "width": grid.width, "height": grid.height, "count": count, "dtype": dtype.name,
+        "interleave": "band", "photometric": "minisblack", "bigtiff": "if_safer",
+        "tiled": True, "blockxsize": _TILE_PX, "blockysize": _TILE_PX,
+    }  # fmt: skip
+    if nodata is not None:
+        profile["nodata"] = nodata
+    if compression != "none":
+        profile |= {"compress": compression, "predictor": 3 if dtype.kind == "f" else 2}
+        profile |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
+    if reference.georeference is not None:
+        profile |= georeferenced(reference.georeference, grid)
+    return profile
+
+
+def _compression(settings: WriteSettings, *, all_bands: bool) -> str:
+    """Files of single bands often go on to programs without Zstandard."""
+    if settings.compression != "auto":
+        return settings.compression
+    return "zstd" if all_bands and settings.layout != "bands" else "deflate"
+
+
+def _to_cog(path: Path, compression: str) -> None:
+    cog = path.with_name(f"{path.name}.cog")
+    options = {} if compression == "none" else {"compress": compression, "predictor": "yes"}
+    try:
+        copy_dataset(path, cog, driver="COG", blocksize=_COG_TILE_PX, bigtiff="if_safer", **options)
+        cog.replace(path)
+    finally:
+        cog.unlink(missing_ok=True)

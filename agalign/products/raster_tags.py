@@ -1,0 +1,64 @@
+"""What an output file says about itself: band names, wavelengths, units, radiometry, and where it is from."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from agalign.config import WriteSettings
+from agalign.products.layout import Layer
+from agalign.values.capture import Band, Capture, Quantity
+
+UNITS: Mapping[Quantity, str] = {
+    "radiance": "W m-2 sr-1 nm-1", "relative radiance": "", "reflectance": "1", "relative reflectance": "1",
+    "temperature": "degC",
+}  # fmt: skip
+"""As UDUNITS spells them."""
+
+
+def describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings: WriteSettings) -> None:
+    """Set tags, units, scales and descriptions of an open rasterio dataset whose bands are these layers."""
+    raw = settings.radiometry == "off"
+    facts = {
+        "TIFFTAG_SOFTWARE": "agalign",
+        "TIFFTAG_DATETIME": capture.captured_at[:19].replace("-", ":").replace("T", " "),
+        "CAPTURE_ID": capture.capture_id,
+        "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
+        "REFERENCE_BAND": capture.reference.name,
+    } | ({} if raw else _radiometry(layers))
+    dataset.update_tags(**{k: v for k, v in facts.items() if v})
+    if raw:
+        _describe_scales(dataset, layers)
+    else:
+        _describe_quantities(dataset, layers)
+    for index, layer in enumerate(layers, start=1):
+        dataset.set_band_description(index, layer.band.name)
+        _describe_wavelength(dataset, index, layer.band)
+
+
+def _radiometry(layers: Sequence[Layer]) -> dict[str, str]:
+    known = [layer.band.radiometry for layer in layers if layer.band.radiometry is not None]
+    return {
+        "RADIOMETRY": " and ".join(dict.fromkeys(r.quantity for r in known)),
+        "RADIOMETRY_SOURCE": " and ".join(dict.fromkeys(r.source for r in known)),
+    }
+
+
+def _describe_scales(dataset: Any, layers: Sequence[Layer]) -> None:
+    if any(layer.band.scale_offset != (1.0, 0.0) for layer in layers):
+        dataset.scales, dataset.offsets = zip(*(layer.band.scale_offset for layer in layers), strict=True)
+
+
+def _describe_quantities(dataset: Any, layers: Sequence[Layer]) -> None:
+    quantities = [None if layer.band.radiometry is None else layer.band.radiometry.quantity for layer in layers]
+    if not any(quantities):
+        return
+    dataset.units = [UNITS[q] if q is not None else "" for q in quantities]
+    for index, quantity in enumerate(quantities, start=1):
+        dataset.update_tags(index, **({} if quantity is None else {"QUANTITY": quantity}))
+
+
+def _describe_wavelength(dataset: Any, index: int, band: Band) -> None:
+    if band.wavelength_nm is None:
+        return
+    width = {} if band.bandwidth_nm is None else {"fwhm": f"{band.bandwidth_nm:g}"}
+    dataset.update_tags(index, wavelength=f"{band.wavelength_nm:g}", wavelength_units="nm", **width)
+    dataset.update_tags(index, ns="IMAGERY", CENTRAL_WAVELENGTH_UM=f"{band.wavelength_nm / 1000:g}")
