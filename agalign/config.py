@@ -212,7 +212,7 @@ class WriteSettings(Stage):
     """Write float32 instead of raw numbers: radiance as the camera's own calibration has it, reflectance by the light
     sensor, or by a panel; auto is the last of these that every band can be given. Thermal bands are in degrees C then.
     """
-    panel_albedo: tuple[tuple[str, float], ...] = ()
+    panel_albedo: tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...] = ()
     """Reflectance of the calibration panel, 0 to 1, by band in lower case, or for all others by the empty name; before
     what tags or its code say. Where it is given, a panel is also known by its looks."""
 

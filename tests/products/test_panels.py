@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import Image
+from pydantic import ValidationError
 from synthetic_flights.panel import make_flight_between_panels
 
 import agalign
@@ -113,3 +114,10 @@ def test_a_file_that_is_none_of_ours_is_told(tmp_path: Path) -> None:
     (tmp_path / PANELS_FILE).write_text('{"schema": "agalign-panels/1"')
     with pytest.raises(SidecarError, match="run again"):
         read_panels(tmp_path)
+
+
+@pytest.mark.parametrize("albedo", [0.0, -0.5, 1.01, float("nan")])
+def test_a_panel_reflects_between_nothing_and_all(albedo: float) -> None:
+    assert WriteSettings(panel_albedo=(("", 1.0), ("nir", 0.49))).panel_albedo
+    with pytest.raises(ValidationError, match="panel_albedo"):
+        WriteSettings(panel_albedo=(("nir", albedo),))
