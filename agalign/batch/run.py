@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from agalign.batch.capture import discard_outputs, output_paths, paths_written, quiet
+from agalign.batch.capture import discard_outputs, paths_written, quiet
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.batch.output_folder import is_full, locked
 from agalign.batch.workers import (
@@ -37,11 +37,11 @@ from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.panels import write_panels
 from agalign.products.preview import preview_bytes
+from agalign.products.product import CapturePaths
 from agalign.products.run_record import RunState, Tally, begun, problem_of, write_run_record
 from agalign.products.sidecar import CaptureResult, read_result
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
-from agalign.values.choices import Layout
 
 _CAPTURES_WORTH_A_PROCESS = 4
 """To start one takes as long as these."""
@@ -94,7 +94,7 @@ def run_flight(
     or ConfigurationError for `model`.
     """
     options, listener = options or RunOptions(), listener or Listener()
-    _refuse_to_overwrite(flight, out, settings.write.layout)
+    _refuse_to_overwrite(flight, out, settings.write)
     known = None if model is None else _given_model(model, flight, settings)
     if known is not None:
         used = settings.flight.model_copy(update={"start": known.fingerprint})
@@ -150,7 +150,7 @@ def _reports(
 ) -> Iterator[CaptureReport]:
     panels, captures = _panels(flight.captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
-        discard_outputs(*output_paths(reading.capture, out))
+        discard_outputs(reading.capture, out, settings.write)
         yield CaptureReport(reading.capture.label, "panel", panel=part.sentence)
     left: list[tuple[Sequence[Capture], str, list[Capture]]] = []
     groups = flights_of(captures)
@@ -163,7 +163,7 @@ def _reports(
             if earlier is None or (options.retry_failed and earlier.status != "ok"):
                 mine.append(capture)
             else:
-                yield CaptureReport(capture.label, "kept", earlier, output_paths(capture, out)[1])
+                yield CaptureReport(capture.label, "kept", earlier, CapturePaths.of(capture, out).sidecar)
         if mine:
             left.append((group, name, mine))
     with _workers(sum(len(mine) for _, _, mine in left), options, settings) as (submit, maximum):
@@ -271,7 +271,7 @@ def _learn(
     return path
 
 
-def _refuse_to_overwrite(flight: FolderScan, out: Path, layout: Layout) -> None:
+def _refuse_to_overwrite(flight: FolderScan, out: Path, settings: WriteSettings) -> None:
     """Neither an input nor what another capture writes. Raises ConfigurationError."""
     if out.resolve() == flight.folder.resolve():
         raise ConfigurationError(f"{out}: is the folder of the images; choose another output folder with -o")
@@ -279,7 +279,7 @@ def _refuse_to_overwrite(flight: FolderScan, out: Path, layout: Layout) -> None:
     there: dict[Path, Path] = {}
     written: dict[str, Capture] = {}
     for capture in flight.captures:
-        for path in paths_written(capture, out, layout):
+        for path in paths_written(capture, out, settings):
             if path.parent not in there:
                 there[path.parent] = path.parent.resolve()
             if there[path.parent] / path.name in sources:
@@ -293,24 +293,20 @@ def _refuse_to_overwrite(flight: FolderScan, out: Path, layout: Layout) -> None:
 
 def finished_before(capture: Capture, out: Path, settings: Settings) -> CaptureResult | None:
     """What the sidecar says of an earlier run with the same settings and bands whose outputs are still there."""
-    stack, path = output_paths(capture, out)
+    path = CapturePaths.of(capture, out).sidecar
     try:
         sidecar = read_result(path)
     except SidecarError:
         return None
     if sidecar.settings != fingerprint(capture, settings):
         return None
-    return sidecar if _outputs_are_there(sidecar, path.parent, stack) else None
+    return sidecar if _outputs_are_there(sidecar, path.parent) else None
 
 
-def _outputs_are_there(sidecar: CaptureResult, folder: Path, stack: Path) -> bool:
-    output = sidecar.output
-    if output is None:
-        return not stack.is_file()
-    files = [(f.file, f.bytes) for f in output.band_files]
-    files += [] if output.file is None or output.bytes is None else [(output.file, output.bytes)]
+def _outputs_are_there(sidecar: CaptureResult, folder: Path) -> bool:
+    """True where every file that the sidecar lists is there, with its size: checksums would take minutes."""
     try:
-        states = [((folder / name).stat(), size) for name, size in files]
+        states = [((folder / name).stat(), size) for name, size in sidecar.files.items()]
     except OSError:
         return False
     return all(stat.S_ISREG(state.st_mode) and state.st_size == size for state, size in states)

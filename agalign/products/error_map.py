@@ -1,4 +1,4 @@
-"""A raster of the error to be expected at every pixel, a band for each moving band, beside the aligned files."""
+"""A raster of the expected error at every pixel, a band for each moving band, on the grid of the aligned files."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,9 +10,11 @@ import tifffile
 from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
+from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.pixels.raster import GDAL_ENVIRONMENT, why, without_warnings
-from agalign.products.raster_file import check_complete, georeferenced
+from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.raster_file import GEOTIFF, check_complete, georeferenced
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import complete_file
@@ -20,8 +22,26 @@ from agalign.values.image import OutputGrid
 from agalign.verify.expected_error import expected_error_px
 
 _LATTICE_PX = 16
+"""Between the nodes at which the error is calculated: it changes slowly."""
 _STEP_PX = 0.001
-"""Errors are rounded to this: what is known no better compresses better."""
+"""Errors are rounded to this: they are known less well, and compress better."""
+
+
+class ErrorMap(Product):
+    """The expected error of each moving band that is written."""
+
+    kind = "error_map"
+    suffix = ".error.tif"
+
+    def is_enabled(self, settings: WriteSettings) -> bool:
+        """True with `--error-map`."""
+        return settings.error_map
+
+    def write(self, context: ProductContext) -> list[WrittenFile]:
+        """Write <capture>.error.tif."""
+        path = context.paths.file(self.suffix)
+        write_error_map(context.capture, context.usable, context.grid, path)
+        return [WrittenFile(self.kind, path, StacAsset("error", GEOTIFF, ("metadata",)))]
 
 
 def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid: OutputGrid, path: Path) -> None:
@@ -40,7 +60,7 @@ def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid:
                 without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
             ):  # fmt: skip
                 for index, (name, alignment) in enumerate(alignments.items(), start=1):
-                    dataset.write(_map_of(alignment, size_px, grid), index)
+                    dataset.write(_error_px(alignment, size_px, grid), index)
                     dataset.set_band_description(index, name)
                     dataset.update_tags(index, units="px of the reference", STATUS=alignment.status)
             check_complete(partial)
@@ -49,8 +69,8 @@ def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid:
 
 
 def error_lattice_px(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
-    """(rows, columns): the error to be expected on a lattice over a grid, px of the reference (width, height); nan
-    where nothing is known.
+    """Return the expected error (rows, columns) on a lattice over a grid, px of the reference (width, height); nan
+    where it is unknown.
     """
     columns, rows = (max(2, -(-n // _LATTICE_PX)) for n in (grid.width, grid.height))
     x = (grid.x0 + np.linspace(0, grid.width - 1, columns) + 0.5) / grid.scale_xy[0] - 0.5
@@ -60,7 +80,7 @@ def error_lattice_px(alignment: Alignment, size_px: tuple[int, int], grid: Outpu
     return np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
 
 
-def _map_of(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
+def _error_px(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
     """(height, width): linear between the nodes of a lattice."""
     nodes = error_lattice_px(alignment, size_px, grid)
     rows, columns = nodes.shape

@@ -1,15 +1,19 @@
-"""A capture's outcome as its sidecar."""
+"""The sidecar of a capture, filled from its alignments and the files that were written."""
 
+import hashlib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign._version import __version__
-from agalign.config import Settings, WriteSettings
+from agalign.errors import OutputError
 from agalign.flight.fingerprint import fingerprint
+from agalign.products.band_files import BandFiles
+from agalign.products.product import ProductContext, WrittenFile
 from agalign.products.sidecar import (
     BandPart,
     CameraPart,
@@ -25,14 +29,14 @@ from agalign.products.sidecar import (
     PlacePart,
     PositionPart,
     PredictionPart,
-    PreviewPart,
+    ProductPart,
     ReferencePart,
     ResidualTile,
     SeedPart,
     Sidecar,
     SimilarityPart,
 )
-from agalign.products.write import Written
+from agalign.products.stack import Stack
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, DisplacementResult, JointResult, Prediction, Residual
 from agalign.values.capture import Band, Capture
@@ -41,9 +45,11 @@ from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping, mapping_of
 
 _GRID = 17, 13
+"""Columns and rows of the sampled mapping, which is nearly a homography."""
 _FINE_GRID = 65, 49
-"""Local displacements need more points, and so does a lens that the reference's own does not nearly undo."""
-_MAX_BENT_PX = 0.2
+"""The same where local displacements or a lens curve it."""
+_MAX_CURVATURE_PX = 0.2
+"""A coarse grid whose bilinear interpolation is off by more than this is not enough."""
 
 
 def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:
@@ -61,31 +67,11 @@ def is_delivered(band: BandPart, accept_predicted_px: float) -> bool:
     return band.status in ("reference", "aligned")
 
 
-def sidecar_of(
-    capture: Capture, alignments: dict[str, Alignment], written: Written | None, settings: Settings,
-    preview: PreviewPart | None = None,
-) -> Sidecar:  # fmt: skip
-    """The sidecar of a capture whose moving bands have the given alignments, by band name."""
-    reference = capture.reference
-    parts = []
-    for band in capture.bands:
-        if band is reference:
-            parts.append(
-                BandPart(
-                    band=band.name,
-                    wavelength_nm=band.wavelength_nm,
-                    file=band.path.name,
-                    band_index=band.band_index,
-                    status="reference",
-                    reason=None,
-                    seconds=0.0,
-                )
-            )
-        else:
-            parts.append(_band_part(reference, band, alignments[band.name]))
-    if written is not None:
-        parts = [p.model_copy(update={"place": _place(written, p.band)}) for p in parts]
-    status = capture_status(parts, settings.check.accept_predicted_px)
+def sidecar_of(context: ProductContext) -> Sidecar:
+    """Return the sidecar of a capture after all its products were written. Raises OutputError."""
+    capture, reference = context.capture, context.capture.reference
+    bands = [_band_part(context, band) for band in capture.bands]
+    status = capture_status(bands, context.settings.check.accept_predicted_px)
     return Sidecar(
         agalign=__version__,
         capture=capture.name,
@@ -103,31 +89,48 @@ def sidecar_of(
             width=reference.width_px,
             height=reference.height_px,
         ),
-        bands=parts,
-        output=None if written is None else _output_part(capture, written, settings.write),
-        preview=preview,
-        settings=fingerprint(capture, settings),
+        bands=bands,
+        output=_output_part(context) if context.layers else None,
+        preview=next((f.preview for f in context.written if f.preview is not None), None),
+        products=[_product_part(file, context) for file in context.written],
+        settings=fingerprint(capture, context.settings),
     )
 
 
-def _output_part(capture: Capture, written: Written, settings: WriteSettings) -> OutputPart:
-    grid, stack = written.grid, written.stack
-    values = {path: _nodata(value) for path, value in written.nodata.items()}
-    alike = set(values.values() if stack is None else [values[stack]])
+def _output_part(context: ProductContext) -> OutputPart:
+    """The stack and the band files, which readers of before `products` know."""
+    stack = next((_file_part(f, context) for f in context.written if f.kind == Stack.kind), None)
+    band_files = [_file_part(f, context) for f in context.written if f.kind == BandFiles.kind]
+    values = {f.nodata for f in band_files} if stack is None else {stack.nodata}
+    grid = context.grid
     return OutputPart(
-        file=None if stack is None else stack.name,
-        bytes=None if stack is None else stack.stat().st_size,
-        band_files=[
-            FilePart(
-                file=path.relative_to(written.folder).as_posix(), bytes=path.stat().st_size, nodata=values[path],
-            )
-            for path in written.band_files
-        ],
-        radiometry=None if settings.radiometry == "off" else _radiometry(capture),
+        file=None if stack is None else stack.file,
+        bytes=None if stack is None else stack.bytes,
+        band_files=band_files,
+        radiometry=None if context.write_settings.radiometry == "off" else _radiometry(context.capture),
         crop=(grid.x0, grid.y0, grid.width, grid.height),
         scale=grid.scale_xy,
-        nodata=alike.pop() if len(alike) == 1 else None,
-    )  # fmt: skip
+        nodata=values.pop() if len(values) == 1 else None,
+    )
+
+
+def _file_part(file: WrittenFile, context: ProductContext) -> FilePart:
+    return FilePart(file=_name(file.path, context), bytes=file.path.stat().st_size, nodata=_nodata(file.nodata))
+
+
+def _product_part(file: WrittenFile, context: ProductContext) -> ProductPart:
+    """The file was written a moment ago: its bytes come from memory. Raises OutputError."""
+    try:
+        with file.path.open("rb") as opened:
+            digest = hashlib.file_digest(opened, "sha256").hexdigest()
+            size = opened.tell()
+    except OSError as error:
+        raise OutputError(f"{file.path}: cannot be read back ({error.strerror or error})") from None
+    return ProductPart(kind=file.kind, file=_name(file.path, context), bytes=size, sha256=digest)
+
+
+def _name(path: Path, context: ProductContext) -> str:
+    return path.relative_to(context.paths.folder).as_posix()
 
 
 def _radiometry(capture: Capture) -> str | None:
@@ -140,26 +143,29 @@ def _nodata(value: float | None) -> float | str | None:
     return "nan" if value is not None and math.isnan(value) else value
 
 
-def _place(written: Written, band: str) -> PlacePart | None:
-    """Not of a band that is all nodata."""
-    if band not in written.places:
-        return None
-    path, index = written.places[band]
-    return PlacePart(file=path.relative_to(written.folder).as_posix(), band_index=index)
+def _place(context: ProductContext, band: Band) -> PlacePart | None:
+    """None for a band that is all nodata."""
+    place = context.places.get(band.name)
+    return None if place is None else PlacePart(file=_name(place[0], context), band_index=place[1])
 
 
-def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
+def _band_part(context: ProductContext, band: Band) -> BandPart:
+    place = _place(context, band)
+    if band is not context.capture.reference:
+        return _moving_part(context.capture.reference, band, context.alignments[band.name], place)
+    return BandPart(
+        band=band.name, wavelength_nm=band.wavelength_nm, file=band.path.name, band_index=band.band_index,
+        status="reference", reason=None, place=place, seconds=0.0,
+    )  # fmt: skip
+
+
+def _moving_part(reference: Band, band: Band, alignment: Alignment, place: PlacePart | None) -> BandPart:
     joint, residual = alignment.joint, alignment.residual
     local = alignment.local
     mapping = mapping_of(reference, band, alignment)
-    bent = alignment.field is not None or _is_curved(mapping, reference.size_px)
-    grid_px = geometry.lattice(*reference.size_px, *(_FINE_GRID if bent else _GRID))
-    there_px = mapping(grid_px)
-    after = dict(alignment.after)
-    if residual is not None and math.isfinite(residual.median_px):
-        after |= {"residual_px": residual.median_px, "residual_p95_px": residual.p95_px}
-    if residual is not None:
-        after["residual_coverage"] = residual.coverage
+    is_fine = alignment.field is not None or _is_curved(mapping, reference.size_px)
+    grid_px = geometry.lattice(*reference.size_px, *(_FINE_GRID if is_fine else _GRID))
+    after = dict(alignment.after) | _residual_metrics(residual)
     return BandPart(
         band=band.name,
         wavelength_nm=band.wavelength_nm,
@@ -175,23 +181,33 @@ def _band_part(reference: Band, band: Band, alignment: Alignment) -> BandPart:
             peak_sigma=alignment.seed.peak_sigma,
             runner_up_sigma=alignment.seed.runner_up_sigma,
         ),
-        grid=GridPart(reference_px=_points(grid_px), moving_px=_points(there_px)),
+        grid=GridPart(reference_px=_points(grid_px), moving_px=_points(mapping(grid_px))),
         joint=None if joint is None else _joint_part(joint, accepted=alignment.status == "aligned"),
         metrics=MetricsPart(
             before=_similarity_part(alignment.before), after=_similarity_part(after), tiles=_tile_parts(residual)
         ),
         local=None if local is None else _local_part(local),
         prediction=None if alignment.prediction is None else _prediction_part(alignment.prediction),
+        place=place,
         seconds=round(alignment.seconds, 3),
     )
 
 
+def _residual_metrics(residual: Residual | None) -> dict[str, float]:
+    if residual is None:
+        return {}
+    coverage = {"residual_coverage": residual.coverage}
+    if not math.isfinite(residual.median_px):
+        return coverage
+    return {"residual_px": residual.median_px, "residual_p95_px": residual.p95_px} | coverage
+
+
 def _is_curved(mapping: PixelMapping, size_px: tuple[int, int]) -> bool:
-    """True where the middles between the points of a coarse grid lie aside from the straight lines between them."""
+    """True where linear interpolation halfway between the points of a coarse grid misses the mapping."""
     points = geometry.lattice(*size_px, *_GRID).reshape(_GRID[1], _GRID[0], 2)
-    there = mapping(points)
-    straight = mapping(0.5 * (points[:, 1:] + points[:, :-1])) - 0.5 * (there[:, 1:] + there[:, :-1])
-    return bool(np.abs(straight).max() > _MAX_BENT_PX)
+    mapped = mapping(points)
+    error_px = mapping(0.5 * (points[:, 1:] + points[:, :-1])) - 0.5 * (mapped[:, 1:] + mapped[:, :-1])
+    return bool(np.abs(error_px).max() > _MAX_CURVATURE_PX)
 
 
 def _prediction_part(prediction: Prediction) -> PredictionPart:

@@ -9,7 +9,8 @@ is 1 only on the mean. Other bands are resampled and not sharpened: visible ligh
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,26 +24,56 @@ from scipy.optimize import nnls
 from agalign.cameras.base import is_thermal
 from agalign.config import WriteSettings
 from agalign.errors import InputError, OutputError
-from agalign.flight.rig import Rig
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, why, without_warnings
 from agalign.pixels.resample import tiles
-from agalign.products.layout import output_layers
+from agalign.products.layout import Layer, output_layers
 from agalign.products.nodata import with_nodata
-from agalign.products.raster_file import check_complete, write_raster
-from agalign.values.alignment import Alignment
+from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.raster_file import GEOTIFF, check_complete, write_raster
 from agalign.values.capture import Band, Capture
 from agalign.values.files import complete_file, scratch_file
-from agalign.values.image import FloatImage, Mask, Tile
+from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
 
 _BROAD_NM = 200.0
-"""Bands at least so wide are panchromatic."""
+"""Width from which a band is panchromatic."""
 _COLOUR_NM = 400.0, 700.0
-"""What a colour photograph sees."""
+"""The light in a colour photograph."""
 _SAMPLE_PX = 1024
+"""Side of the square in the middle that the weights are fitted on."""
 _MAX_RATIO = 5.0
-"""Between noise and noise any ratio may come out."""
+"""In dark pixels noise is divided by noise."""
 _WORK_PX = 1024
+"""Side of the tiles that are sharpened at a time: it bounds the memory."""
+
+
+class PanSharpened(Product):
+    """The narrow bands, as far as they are aligned, at the panchromatic band's resolution."""
+
+    kind = "pan_sharpened"
+    suffix = ".pan.tif"
+
+    def is_enabled(self, settings: WriteSettings) -> bool:
+        """True with `--pan-sharpen`."""
+        return settings.pan_sharpen
+
+    def check(self, capture: Capture) -> None:
+        """Raise InputError for a capture without a band to sharpen with."""
+        if not panchromatic(capture):
+            raise InputError(
+                f"{capture.reference.path}: no panchromatic band to sharpen with; add --with-rgb where the camera "
+                "takes a colour photograph, or leave --pan-sharpen out"
+            )
+
+    def write(self, context: ProductContext) -> list[WrittenFile]:
+        """Write <capture>.pan.tif; nothing where the panchromatic band is not aligned."""
+        fine = {"resolution": "finest", "format": "gtiff", "compression": "none"}
+        settings, path = context.write_settings.model_copy(update=fine), context.paths.file(self.suffix)
+        sources = _sources(context, settings)
+        if sources is None:
+            return []
+        _write(sources, path, context, settings)
+        return [WrittenFile(self.kind, path, StacAsset("pan", GEOTIFF, ("data",)))]
 
 
 def panchromatic(capture: Capture) -> list[Band]:
@@ -53,49 +84,47 @@ def panchromatic(capture: Capture) -> list[Band]:
     return [b for b in broad if not is_thermal(b)][:1] or [b for b in capture.bands if b.companion]
 
 
-def need_panchromatic(capture: Capture) -> None:
-    """Raises InputError where a capture has nothing that its bands can be sharpened with."""
-    if not panchromatic(capture):
-        raise InputError(
-            f"{capture.reference.path}: no panchromatic band to sharpen with; add --with-rgb where the camera takes a "
-            "colour photograph, or leave --pan-sharpen out"
-        )
+@dataclass(frozen=True)
+class _Sources:
+    """What a sharpened file is made of, all on one grid."""
+
+    narrow: list[Layer]
+    is_seen: list[bool]
+    """For each narrow band: whether the panchromatic band sees its light."""
+    pan: list[Layer]
+    grid: OutputGrid
 
 
-def write_pan_sharpened(
-    capture: Capture, alignments: Mapping[str, Alignment], path: Path, settings: WriteSettings, rig: Rig | None = None
-) -> Path | None:
-    """Write the capture's narrow bands, as far as they have these alignments, at the panchromatic's resolution.
-
-    Returns None, and writes nothing, where the panchromatic band is not aligned or sees the light of none of them.
-    Raises OutputError, or UnreadableFileError for an input.
-    """
-    pan = panchromatic(capture)
-    there = {name for name, a in alignments.items() if a.status in ("aligned", "predicted")} | {capture.reference.name}
-    if not pan or not all(b.name in there for b in pan):
+def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | None:
+    """None where the panchromatic band is not aligned, or sees the light of no narrow band."""
+    capture, pan = context.capture, panchromatic(context.capture)
+    placed = {n: a for n, a in context.usable.items() if a.status in ("aligned", "predicted")}
+    if not pan or not all(b is capture.reference or b.name in placed for b in pan):
         return None
-    fine = settings.model_copy(update={"resolution": "finest", "format": "gtiff", "compression": "none"})
-    layers, grid = output_layers(capture, {n: a for n, a in alignments.items() if n in there}, fine, rig)
-    narrow = [
-        layer for layer in layers
-        if layer.band not in pan and not layer.band.companion and not is_thermal(layer.band) and not layer.is_gap
-    ]  # fmt: skip
-    bands = [layer.band for layer in narrow]
-    seen = [_is_seen(b, pan) for b in bands]
-    if not any(seen):
-        return None
-    sources = [*narrow, *(layer for layer in layers if layer.band in pan)]
+    layers, grid = output_layers(capture, placed, settings, context.rig)
+    narrow = [layer for layer in layers if _is_narrow(layer, pan)]
+    is_seen = [_is_seen(layer.band, pan) for layer in narrow]
+    return _Sources(narrow, is_seen, [la for la in layers if la.band in pan], grid) if any(is_seen) else None
+
+
+def _is_narrow(layer: Layer, pan: Sequence[Band]) -> bool:
+    return not (layer.is_gap or layer.band in pan or layer.band.companion or is_thermal(layer.band))
+
+
+def _write(sources: _Sources, path: Path, context: ProductContext, settings: WriteSettings) -> None:
+    """Write the sharpened bands. Raises OutputError, or UnreadableFileError for an input."""
+    layers, grid = [*sources.narrow, *sources.pan], sources.grid
+    bands, pan = [layer.band for layer in sources.narrow], panchromatic(context.capture)
     try:
         with scratch_file(path) as unsharpened:
-            nodata = write_raster(capture, sources, grid, unsharpened, fine)
+            nodata = write_raster(context.capture, layers, grid, unsharpened, settings)
             # Ratios are of light: what a sensor counts in the dark is none.
-            dark = [_dark(layer.band, settings) for layer in sources]
+            dark = [_dark(layer.band, settings) for layer in layers]
             with complete_file(path) as partial:
-                _sharpen(unsharpened, partial, bands, pan, seen, dark, max(grid.scale_xy), nodata)
+                _sharpen(unsharpened, partial, bands, pan, sources.is_seen, dark, max(grid.scale_xy), nodata)
                 check_complete(partial)
     except RasterioError as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
-    return path
 
 
 def weights_of(bands: Sequence[FloatImage], pan: FloatImage, scale: float) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The small before/after picture beside each stack: three bands as red, green and blue; misalignment is colour."""
+"""The small before/after picture of a capture: three bands as red, green and blue; misalignment is colour."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from agalign.products.drawing import Picture, with_text, write_png
+from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.reduced_bands import Grey, ReducedBands
 from agalign.values.capture import Band
 
@@ -14,17 +15,40 @@ _OVERVIEW_PX = 480
 _ZOOM_SOURCE_PX = 160
 _GAP_PX = 8
 _TITLE_PX = 26
+_RED_NM = 668.0
+"""The middle band of the picture is the one nearest to this."""
+_THERMAL_NM = 1000.0
+"""A band beyond this shows warmth, in which vegetation has few edges."""
 
 
-def choose_bands(bands: list[Band], reference: Band) -> list[Band]:
-    """Three bands for red, green and blue: the longest wavelength, a middle one, and the reference."""
-    others = [b for b in bands if b is not reference]
-    known = sorted((b for b in others if b.wavelength_nm is not None), key=lambda b: b.wavelength_nm or 0.0)
-    others = known if len(known) >= 2 else others
-    red = max(others, key=lambda b: (b.wavelength_nm or 0.0) if (b.wavelength_nm or 0.0) < 1000 else 0.0)
+class BeforeAfterPicture(Product):
+    """Before and after, with a detail of each."""
+
+    kind = "picture"
+    suffix = ".png"
+    is_required = False
+
+    def write(self, context: ProductContext) -> list[WrittenFile]:
+        """Write <capture>.png."""
+        path, reference = context.paths.file(self.suffix), context.capture.reference
+        usable = context.usable
+        chosen = choose_bands([b for b in context.capture.moving if b.name in usable], reference)
+        write_picture(context.reduced_bands, [b.name for b in chosen], path)
+        return [WrittenFile(self.kind, path, StacAsset("picture", "image/png", ("thumbnail",)))]
+
+
+def choose_bands(moving: list[Band], reference: Band) -> list[Band]:
+    """Return three bands for red, green and blue: the longest wavelength, a middle one, and the reference."""
+    known = sorted((b for b in moving if b.wavelength_nm is not None), key=_wavelength_nm)
+    others = known if len(known) >= 2 else moving
+    red = max(others, key=lambda b: _wavelength_nm(b) if _wavelength_nm(b) < _THERMAL_NM else 0.0)
     rest = [b for b in others if b is not red]
-    between = min(rest, key=lambda b: abs((b.wavelength_nm or 668.0) - 668.0)) if rest else reference
+    between = min(rest, key=lambda b: abs((b.wavelength_nm or _RED_NM) - _RED_NM)) if rest else reference
     return [red, between, reference]
+
+
+def _wavelength_nm(band: Band) -> float:
+    return band.wavelength_nm or 0.0
 
 
 def write_picture(views: ReducedBands, names: Sequence[str], path: Path) -> None:

@@ -3,11 +3,11 @@ any three of them.
 
 The sheet has a column for each band of the sidecar, in its order, and these rows:
 
-    0  the raw files laid on the reference's as they are
+    0  the raw files, each resized to the reference's file
     1  what was written; black where nothing was
-    2  a detail of row 0 at the views' own resolution, where there is most to see
+    2  a detail of row 0 at full resolution of the reduced bands, where there are most edges
     3  the same detail of row 1
-    4  where error maps are written: the error to be expected, white for `ERROR_FULL_PX` and more
+    4  where error maps are written: the expected error, white for `ERROR_FULL_PX` and more
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,24 +18,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.errors import OutputError
+from agalign.products.error_map import error_lattice_px
 from agalign.products.picture import busiest_window
+from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.reduced_bands import Grey, ReducedBands
 from agalign.products.sidecar import PreviewPart
 from agalign.values.files import complete_file
 from agalign.values.image import Tile
 
 ERROR_FULL_PX = 0.5
-_WIDEST_PX, _NARROWEST_PX, _DETAIL_SHARE = 640, 96, 0.35
-"""Of a tile, and how wide a detail is beside it."""
+_MAX_TILE_PX, _MIN_TILE_PX, _DETAIL_SHARE = 640, 96, 0.35
+"""Longer side of a tile, and the size of a detail as a share of it."""
 _QUALITY, _BLOCK_PX = 35, 8
 """Of the JPEG: pictures that share no block do not show in each other."""
-_MAX_BYTES_EACH, _MAX_BYTES_IN_ALL = 600_000, 44_000_000
-"""A season's report can still be sent to somebody."""
+_MAX_BYTES_EACH, _MAX_TOTAL_BYTES = 600_000, 44_000_000
+"""The report of a season, which contains them all, stays small enough for an e-mail service."""
 
 
 def preview_bytes(captures: int) -> int:
-    """How large the preview of one capture of so many may be."""
-    return min(_MAX_BYTES_EACH, _MAX_BYTES_IN_ALL // max(captures, 1))
+    """Return the largest size of the preview of one of this many captures, bytes."""
+    return min(_MAX_BYTES_EACH, _MAX_TOTAL_BYTES // max(captures, 1))
+
+
+class Preview(Product):
+    """The sheet from which the report composes its views; that of a failed capture shows why it failed."""
+
+    kind = "preview"
+    suffix = ".preview.jpg"
+    is_required = False
+    needs_layers = False
+
+    def write(self, context: ProductContext) -> list[WrittenFile]:
+        """Write <capture>.preview.jpg."""
+        path, size_px = context.paths.file(self.suffix), context.capture.reference.size_px
+        bands = [b.name for b in context.capture.bands]
+        mapped = context.usable if context.write_settings.error_map else {}
+        errors_px = {name: error_lattice_px(a, size_px, context.grid) for name, a in mapped.items()}
+        part = write_preview(context.reduced_bands, bands, errors_px, path, context.max_preview_bytes)
+        return [WrittenFile(self.kind, path, preview=part)]
 
 
 def write_preview(
@@ -44,16 +64,16 @@ def write_preview(
     """Write the sheet, about as large as `max_bytes` allows, with a detail where the first of the bands has most to
     show; `errors_px` has a coarse map (rows, columns) by band, or none. Raises OutputError.
     """
-    longest = max(views.size_px)
-    widest = min(_WIDEST_PX, longest)
+    longest_px = max(views.size_px)
+    tile_px = min(_MAX_TILE_PX, longest_px)
     for _ in range(6):
-        part, sheet = _sheet(views, bands, errors_px, widest / longest, path.name)
+        part, sheet = _sheet(views, bands, errors_px, tile_px / longest_px, path.name)
         encoded, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         if not encoded:
             raise OutputError(f"{path}: cannot be made")
-        if len(data) <= max_bytes or widest <= _NARROWEST_PX:
+        if len(data) <= max_bytes or tile_px <= _MIN_TILE_PX:
             break
-        widest = max(_NARROWEST_PX, int(widest * 0.97 * (max_bytes / len(data)) ** 0.5))
+        tile_px = max(_MIN_TILE_PX, int(tile_px * 0.97 * (max_bytes / len(data)) ** 0.5))
     with complete_file(path) as partial:
         partial.write_bytes(data.tobytes())
     return part

@@ -29,6 +29,8 @@ from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.files import complete_file
 from agalign.values.image import Mask, OutputGrid, Tile
 
+GEOTIFF = "image/tiff; application=geotiff"
+COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 _TILE_PX = 256
 """Side of the tiles within a TIFF: GDAL's default, which viewers read quickly."""
 _WORK_TILE_PX = 2048
@@ -71,6 +73,11 @@ def write_raster(
     except (RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
     return nodata
+
+
+def media_type(settings: WriteSettings) -> str:
+    """Return the media type of the files that `write_raster` writes."""
+    return COG if settings.format == "cog" else GEOTIFF
 
 
 def check_complete(path: Path) -> None:

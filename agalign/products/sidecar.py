@@ -1,4 +1,4 @@
-"""The sidecar that is written beside each aligned stack: schema `agalign/1`.
+"""The sidecar of a capture, a JSON file next to its aligned stack: schema `agalign/1`.
 
 All pixel coordinates are x right, y down, (0, 0) the centre of the top-left pixel. `fixed_to_moving` maps a pixel of
 the reference to a pixel of the moving band; `grid` samples the complete mapping between the raw pixels of the files.
@@ -21,19 +21,20 @@ SCHEMA = "agalign/1"
 Row = tuple[float, float, float]
 Matrix3x3 = tuple[Row, Row, Row]
 PointPx = tuple[float, float]
-_LONGEST_BYTES = 1 << 26
-_LONGEST_QUOTED = 60
+_MAX_BYTES = 1 << 26
+"""A sidecar of many bands has a tenth of this; reading a larger file would take the memory."""
+_MAX_QUOTED = 60
+"""Characters of a wrong value in a message."""
 
 
-def _beside(name: str) -> str:
+def _inside_folder(name: str) -> str:
     if not is_inside(name):
         raise ValueError("names a file outside its folder")
     return name
 
 
-BesideIt = Annotated[str, AfterValidator(_beside)]
-"""A file in the sidecar's folder or below: a sidecar is a file like any other, and what it names is read and removed.
-"""
+RelativeFile = Annotated[str, AfterValidator(_inside_folder)]
+"""A file in the sidecar's folder or below. Anyone may write a sidecar, and agalign reads and removes what it names."""
 Count = Annotated[int, Field(gt=0)]
 
 
@@ -182,7 +183,7 @@ class PredictionPart(_Part):
 class PlacePart(_Part):
     """A file beside the sidecar that holds a band's aligned pixels, and the band's index there, from 1."""
 
-    file: BesideIt
+    file: RelativeFile
     band_index: Count
 
 
@@ -219,7 +220,7 @@ class BandPart(BandResult):
 class FilePart(_Part):
     """A file beside the sidecar."""
 
-    file: BesideIt
+    file: RelativeFile
     bytes: int
     nodata: float | str | None = None
 
@@ -232,7 +233,7 @@ class OutputPart(_Part):
     its sides as the reference's file.
     """
 
-    file: BesideIt | None
+    file: RelativeFile | None
     bytes: int | None
     band_files: list[FilePart] = []
     radiometry: str | None = None
@@ -242,13 +243,22 @@ class OutputPart(_Part):
     nodata: float | str | None
 
 
+class ProductPart(_Part):
+    """A file that was written for the capture, whatever its kind: `stack`, `band`, `picture`, `error_map` …"""
+
+    kind: str
+    file: RelativeFile
+    bytes: int
+    sha256: str
+
+
 class PreviewPart(_Part):
     """A sheet of small grey pictures of all bands beside the sidecar, which the report composes: a column for each band
     of `bands`, in their order, and rows of the raw files as they lie, of what was written, of a detail of either, and
     of the error to be expected where that was written, white for `error_full_px`.
     """
 
-    file: BesideIt
+    file: RelativeFile
     tile_px: tuple[Count, Count]
     """(width, height) of a picture in rows 0, 1 and 4, and of a detail in rows 2 and 3,"""
     detail_px: tuple[Count, Count]
@@ -264,7 +274,7 @@ class CaptureResult(_Result):
 
     schema_: Annotated[Literal["agalign/1"], Field(alias="schema")] = "agalign/1"
     agalign: str
-    capture: BesideIt
+    capture: RelativeFile
     capture_id: str
     flight_id: str
     captured_at: str
@@ -276,8 +286,20 @@ class CaptureResult(_Result):
     bands: Sequence[BandResult]
     output: OutputPart | None
     preview: PreviewPart | None = None
+    products: list[ProductPart] = []
+    """Every file that was written but the sidecar itself."""
     settings: str
     """Fingerprint of the settings that made this; another run with the same need not do it again."""
+
+    @property
+    def files(self) -> dict[str, int]:
+        """Size in bytes of every file that the sidecar lists, by its path relative to the sidecar's folder."""
+        files = {part.file: part.bytes for part in self.products}
+        if self.output is not None:
+            files |= {part.file: part.bytes for part in self.output.band_files}
+            if self.output.file is not None and self.output.bytes is not None:
+                files[self.output.file] = self.output.bytes
+        return files
 
 
 class Sidecar(CaptureResult):
@@ -320,7 +342,7 @@ Model = TypeVar("Model", bound=CaptureResult)
 def _read(path: Path, model: type[Model]) -> Model:
     try:
         size = path.stat().st_size
-        if size > _LONGEST_BYTES:
+        if size > _MAX_BYTES:
             raise SidecarError(f"{path}: {size >> 20} MB are no sidecar; delete it and run again")
         return model.model_validate_json(path.read_bytes())
     except OSError as error:
@@ -340,7 +362,7 @@ def _read(path: Path, model: type[Model]) -> Model:
 
 def _shortened(value: object) -> str:
     text = repr(value)
-    return text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}…"
+    return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}…"
 
 
 def find_sidecars(folder: Path) -> list[Path]:

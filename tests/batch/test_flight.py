@@ -13,7 +13,6 @@ import torch
 
 import agalign
 from agalign.batch import RunOptions, run_flight, workers
-from agalign.batch import capture as batch_capture
 from agalign.batch import learn as batch_learn
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.cameras.discover import discover
@@ -24,6 +23,7 @@ from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.method import joint as method_joint
 from agalign.method.fast import Schedule, learn
 from agalign.method.state import JointState
+from agalign.products import picture
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar import find_sidecars, read_sidecar
 from agalign.synthetic.score import score_against_truth
@@ -319,7 +319,7 @@ def test_a_picture_that_fails_is_told_and_costs_no_more(
     def fails(*_: object) -> None:
         raise OutputError("a.png: cannot be written")
 
-    monkeypatch.setattr(batch_capture, "write_picture", fails)
+    monkeypatch.setattr(picture, "write_picture", fails)
     reports = list(run_flight(discover(flight), tmp_path, SETTINGS))
     assert [r.shortcomings for r in reports] == [("a.png: cannot be written",)] * 2
     assert not any(r.good for r in reports)

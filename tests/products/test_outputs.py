@@ -15,10 +15,10 @@ from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.tag_seeds import geo_seed
 from agalign.config import JointSettings, LocalSettings, SeedSettings, Settings, WriteSettings
 from agalign.errors import ConfigurationError, InputError
+from agalign.products.band_files import band_file_names
 from agalign.products.index_rasters import write_indices
 from agalign.products.indices import INDICES
 from agalign.products.layout import output_layers
-from agalign.products.write import band_file_names
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed

@@ -11,6 +11,7 @@ import agalign
 from agalign.config import Settings
 from agalign.errors import OutputError, SidecarError
 from agalign.products.fill_sidecar import sidecar_of
+from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.sidecar import (
     BandPart,
     CameraPart,
@@ -27,6 +28,7 @@ from agalign.products.sidecar import (
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.capture import Band, Capture
+from agalign.values.image import OutputGrid
 from agalign.values.issues import Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
@@ -41,6 +43,12 @@ def example() -> Sidecar:
         reference=ReferencePart(band="Green", file="g.tif", band_index=1, width=10, height=8),
         bands=[], output=OutputPart(file="IMG_1.tif", bytes=1, crop=(0, 0, 10, 8), nodata=None), settings="0",
     )  # fmt: skip
+
+
+def context_of(capture: Capture, alignments: dict[str, Alignment]) -> ProductContext:
+    """Of a capture for which nothing was written."""
+    grid = OutputGrid(0, 0, *capture.reference.size_px)
+    return ProductContext(capture, CapturePaths(Path(), capture.name), Settings(), alignments, (), grid, None, 0)
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -106,7 +114,7 @@ def test_a_rejected_solution_says_so() -> None:
     issues = (Issue("retrieval", 0.1, 0.2), Issue("coverage", math.nan, 0.6))
     for status, issue in (("seed_only", issues), ("aligned", ())):
         alignment = Alignment(seed.fixed_to_moving, "pixel", status, issue, seed, joint, residual, 0.0)
-        part = sidecar_of(capture, {"nir": alignment}, None, Settings()).bands[1]
+        part = sidecar_of(context_of(capture, {"nir": alignment})).bands[1]
         assert part.joint is not None
         assert part.joint.accepted == (status == "aligned")
         assert [d.kind for d in part.issues] == [d.kind for d in issue]
@@ -132,7 +140,7 @@ def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
     }  # fmt: skip
     seed = Seed("rig", np.eye(3), 30.0)
     alignments = {b: Alignment(m, "undistorted", "aligned", (), seed, None, None, 0.0) for b, m in result.items()}
-    _, colour, red = sidecar_of(Capture("c", Path(), bands, 0), alignments, None, Settings()).bands
+    _, colour, red = sidecar_of(context_of(Capture("c", Path(), bands, 0), alignments)).bands
     assert colour.grid is not None
     assert red.grid is not None
     assert (len(colour.grid.reference_px), len(red.grid.reference_px)) == (65 * 49, 17 * 13)
@@ -155,6 +163,7 @@ def test_a_sidecar_names_no_file_elsewhere(tmp_path: Path, name: str) -> None:
         lambda d: d["output"].update(file=name), lambda d: d.update(capture=name),
         lambda d: d["output"]["band_files"].append({"file": name, "bytes": 1, "nodata": None}),
         lambda d: d["bands"][0].update(place={"file": name, "band_index": 1}),
+        lambda d: d.update(products=[{"kind": "stack", "file": name, "bytes": 1, "sha256": ""}]),
     ):  # fmt: skip
         changed = json.loads(json.dumps(data))
         change(changed)

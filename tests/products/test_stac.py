@@ -17,7 +17,7 @@ from synthetic_flights.panel import make_flight_between_panels
 
 import agalign
 from agalign.config import SeedSettings, Settings, WriteSettings
-from agalign.products.stac import ground_m
+from agalign.products.footprint import ground_m
 from agalign.values.capture import Band, Capture, Pose
 
 from ..conftest import textured_image

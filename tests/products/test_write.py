@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 import rasterio
 
-from agalign.config import WriteSettings
+from agalign.config import Settings, WriteSettings
 from agalign.errors import OutputError
+from agalign.products.band_files import BandFiles
 from agalign.products.layout import Layer
+from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.raster_file import write_raster
-from agalign.products.write import write_capture
 from agalign.values import geometry
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference
 from agalign.values.image import OutputGrid
@@ -222,8 +223,8 @@ def test_files_of_bands_have_each_their_own_nodata(tmp_path: Path) -> None:
     (tmp_path / "floats").mkdir()
     floats = make_capture(tmp_path / "floats", "float32").bands[2]
     capture = replace(capture, bands=(*capture.bands[:2], floats))
-    grid, settings = OutputGrid(0, 0, 200, 150), WriteSettings(layout="bands")
-    written = write_capture(capture, layers_of(capture), grid, tmp_path / "out" / "c.tif", settings)
-    by_name = {path.name: value for path, value in written.nodata.items()}
+    paths, settings = CapturePaths(tmp_path / "out", "c"), Settings(write=WriteSettings(layout="bands"))
+    context = ProductContext(capture, paths, settings, {}, layers_of(capture), OutputGrid(0, 0, 200, 150), None, 0)
+    by_name = {file.path.name: file.nodata for file in BandFiles().write(context)}
     assert by_name["f_0.tif"] == 0
     assert np.isnan(by_name["f_2.tif"])

@@ -1,0 +1,21 @@
+"""Every product of a capture, in the order in which they are written."""
+
+from agalign.products.band_files import BandFiles
+from agalign.products.error_map import ErrorMap
+from agalign.products.pan_sharpen import PanSharpened
+from agalign.products.picture import BeforeAfterPicture
+from agalign.products.preview import Preview
+from agalign.products.product import Product
+from agalign.products.stac import StacItem
+from agalign.products.stack import Stack
+
+PRODUCTS: tuple[Product, ...] = (
+    BandFiles(),
+    Stack(),
+    PanSharpened(),
+    ErrorMap(),
+    BeforeAfterPicture(),
+    Preview(),
+    # Last: its assets are the files of those before it.
+    StacItem(),
+)
