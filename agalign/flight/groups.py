@@ -16,11 +16,16 @@ def camera_key(capture: Capture) -> str:
     return f"{camera.make} {camera.model} {camera.serial}".strip() + f" [{bands}]"
 
 
+def flight_key(capture: Capture) -> tuple[str, str]:
+    """(camera, flight id): captures with the same key belong to one flight."""
+    return camera_key(capture), capture.flight_id
+
+
 def flights_of(captures: Iterable[Capture]) -> list[list[Capture]]:
     """The captures grouped by camera and flight, in their order."""
     groups: dict[tuple[str, str], list[Capture]] = {}
     for capture in captures:
-        groups.setdefault((camera_key(capture), capture.flight_id), []).append(capture)
+        groups.setdefault(flight_key(capture), []).append(capture)
     return list(groups.values())
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from agalign.cameras.base import is_thermal
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError
-from agalign.flight.groups import camera_key
+from agalign.flight.fingerprint import hashed
+from agalign.flight.groups import camera_key, flight_key, flights_of
 from agalign.pixels.raster import crs_code
 from agalign.products.footprint import footprint
 from agalign.products.indices import role_of
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     import pystac
 
 _COLLECTION_SUFFIX = ".collection.json"
+_MAX_NAME, _CHECKSUM_DIGITS = 60, 8
+"""Characters of a collection's id: file systems allow 255 bytes, and a character takes up to four."""
 _GEOJSON = "application/geo+json"
 _JSON = "application/json"
 _COMMON_NAMES = {"blue": "blue", "green": "green", "red": "red", "red edge": "rededge", "nir": "nir"}
@@ -69,15 +72,11 @@ def need_stac() -> None:
 
 def write_collections(captures: Sequence[Capture], out: Path) -> list[Path]:
     """Write a collection for each flight with items below OUT. Raises OutputError."""
-    flights: dict[str, list[Capture]] = {}
-    for capture in captures:
-        flights.setdefault(_collection_id(capture), []).append(capture)
     written = []
-    for captures_of_flight in flights.values():
-        paths = [CapturePaths.of(c, out).file(StacItem.suffix) for c in captures_of_flight]
-        paths = [path for path in paths if path.is_file()]
+    for flight in flights_of(captures):
+        paths = [path for c in flight if (path := CapturePaths.of(c, out).file(StacItem.suffix)).is_file()]
         if paths:
-            written.append(_write_collection(captures_of_flight[0], paths, out))
+            written.append(_write_collection(flight[0], paths, out))
     return written
 
 
@@ -109,9 +108,13 @@ def _read_item(path: Path) -> "pystac.Item":
 
 
 def _collection_id(capture: Capture) -> str:
-    """Of the flight: its id, or where it has none its camera's model and day."""
-    name = capture.flight_id or f"{capture.camera.model or 'flight'} {capture.captured_at[:10]}".strip()
-    return re.sub(r"[^\w.-]+", "_", name)
+    """Of the capture's flight: its id or camera in words, and a checksum that no other flight has.
+
+    It depends on nothing but the capture: a capture of another run, or alone, finds the same collection.
+    """
+    camera = f"{capture.camera.model} {capture.camera.serial}".strip()
+    name = re.sub(r"[^\w.-]+", "_", capture.flight_id or camera or "flight")
+    return f"{name[:_MAX_NAME]}-{hashed(*flight_key(capture))[:_CHECKSUM_DIGITS]}"
 
 
 def _collection_file(capture: Capture) -> str:

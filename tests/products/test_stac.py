@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,12 @@ from synthetic_flights.panel import make_flight_between_panels
 
 import agalign
 from agalign.config import SeedSettings, Settings, WriteSettings
+from agalign.errors import OutputError
+from agalign.flight.groups import flights_of
 from agalign.products.footprint import ground_m
-from agalign.values.capture import Band, Capture, Pose
+from agalign.products.stac import write_collections
+from agalign.values.capture import Band, CameraIdentity, Capture, Pose
+from agalign.values.files import write_text
 
 from ..conftest import textured_image
 from .test_outputs import write_band
@@ -59,7 +64,8 @@ def test_items_and_collection_are_valid_and_find_each_other(run: Path) -> None:
     assert [i.id for i in items] == ["0000SET/000/IMG_0002", "0000SET/000/IMG_0003"]
     for item in items:
         item.validate()
-        assert item.collection_id == collection.id == "syntheticflight00001"
+        assert item.collection_id == collection.id
+        assert collection.id.startswith("syntheticflight00001-")
         result = item.get_collection()
         assert result is not None
         assert result.id == collection.id
@@ -159,3 +165,34 @@ def test_odc_stac_opens_a_capture_by_its_common_names(tmp_path: Path) -> None:
         for name in ("green", "red"):
             index = dataset.descriptions.index(name) + 1
             np.testing.assert_array_equal(loaded[name].values[0], dataset.read(index))
+
+
+def test_collections_are_the_flights_that_share_a_network(tmp_path: Path) -> None:
+    """Two units of one model on one day are two flights, with or without a flight id."""
+    band = Band("Green", Path("x.tif"), 1, 640, 480, "uint16")
+
+    def capture(name: str, serial: str, day: str, flight_id: str = "") -> Capture:
+        item = pystac.Item(name, None, None, datetime.fromisoformat(f"{day}T10:00:00+00:00"), {})
+        write_text(tmp_path / f"{name}.stac.json", json.dumps(item.to_dict(include_self_link=False)))
+        camera = CameraIdentity("Make", "Model", serial)
+        return Capture(name, Path(), (band,), 0, camera, captured_at=f"{day}T10:00:00", flight_id=flight_id)
+
+    captures = [
+        capture("a", "1", "2026-06-21"), capture("b", "2", "2026-06-21"), capture("c", "1", "2026-06-22"),
+        capture("d", "1", "2026-06-22", "F"), capture("e", "2", "2026-06-22", "F"),
+        capture("f", "1", "2026-06-22", "F"),
+    ]  # fmt: skip
+    members = []
+    for path in write_collections(captures, tmp_path):
+        collection = pystac.Collection.from_file(str(path))
+        members.append([item.id for item in collection.get_items()])
+    assert members == [["a", "c"], ["b"], ["d", "f"], ["e"]]
+    assert members == [[c.name for c in flight] for flight in flights_of(captures)]
+    assert len(list(tmp_path.glob("*.collection.json"))) == 4
+
+
+def test_a_damaged_item_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.stac.json").write_bytes(b"\0\0")
+    band = Band("Green", Path("x.tif"), 1, 640, 480, "uint16")
+    with pytest.raises(OutputError, match=r"a\.stac\.json: cannot be read as a STAC item .* --overwrite"):
+        write_collections([Capture("a", Path(), (band,), 0)], tmp_path)
