@@ -71,7 +71,8 @@ def sidecar_of(context: ProductContext) -> Sidecar:
     """Return the sidecar of a capture after all its products were written. Raises OutputError."""
     capture, reference = context.capture, context.capture.reference
     bands = [_band_part(context, band) for band in capture.bands]
-    status = capture_status(bands, context.settings.check.accept_predicted_px)
+    accept_predicted_px = context.settings.check.accept_predicted_px
+    status = capture_status(bands, accept_predicted_px)
     return Sidecar(
         agalign=__version__,
         capture=capture.name,
@@ -92,6 +93,7 @@ def sidecar_of(context: ProductContext) -> Sidecar:
         bands=bands,
         output=_output_part(context) if context.layers else None,
         preview=next((f.preview for f in context.written if f.preview is not None), None),
+        accept_predicted_px=accept_predicted_px,
         products=[_product_part(file, context) for file in context.written],
         settings=fingerprint(capture, context.settings),
     )

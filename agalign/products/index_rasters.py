@@ -34,8 +34,8 @@ _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 1
 """Water, soil, and the greens, red green blue, over an index's span."""
 _NODATA_COLOUR = (225, 225, 225)
 _RAW = "raw numbers"
-_MAX_PREDICTED_PX = 1.0
-"""A band that the rig predicts no better than this is left out of indices."""
+_OLD_ACCEPT_PREDICTED_PX = 1.0
+"""For sidecars that do not state the limit of their run: the default of `--accept-predicted`."""
 _MAX_REFLECTANCE = 2.0
 """Glints and specular leaves exceed 1; raw numbers of any sensor exceed this."""
 _SAMPLE_PX = 512
@@ -78,16 +78,13 @@ def write_indices(out: Path, indices: Sequence[Index]) -> Iterator[IndexReport]:
 
 
 def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> IndexReport:
-    """Write one index of the capture whose sidecar lies at `path`.
+    """Write one index of the capture whose sidecar is at `path`.
 
     Raises InputError where a band is missing, not aligned, or not in the unit that the index needs; OutputError.
     """
     parts = sidecar.bands
     chosen = [parts[i] for i in bands_for(index, [p.band for p in parts], [p.wavelength_nm for p in parts])]
-    for part in chosen:
-        if not is_delivered(part, _MAX_PREDICTED_PX) or part.place is None:
-            known = "" if part.prediction is None else f" to {part.prediction.std_px:.1f} px, not {_MAX_PREDICTED_PX:g}"
-            raise InputError(f"{index.name} is left out: {part.band} is {part.status}{known} ({part.reason})")
+    _need_delivered(chosen, index, sidecar.accept_predicted_px)
     target = path.with_name(f"{path.stem}_{index.name}.tif")
     counts, edges = np.zeros(_BINS, np.int64), np.linspace(*index.span, _BINS + 1)
     with ExitStack() as stack:
@@ -99,6 +96,15 @@ def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> 
     middle = np.searchsorted(np.cumsum(counts), counts.sum() / 2)
     median = float(edges[middle : middle + 2].mean()) if counts.any() else math.nan
     return IndexReport(label, index.name, target, median, unit == _RAW)
+
+
+def _need_delivered(parts: Sequence[BandPart], index: Index, accept_predicted_px: float | None) -> None:
+    """Raise InputError for a band that the run did not count as delivered, or that has no pixels."""
+    limit_px = _OLD_ACCEPT_PREDICTED_PX if accept_predicted_px is None else accept_predicted_px
+    for part in parts:
+        if not is_delivered(part, limit_px) or part.place is None:
+            known = "" if part.prediction is None else f" to {part.prediction.std_px:.1f} px, not {limit_px:g}"
+            raise InputError(f"{index.name} is left out: {part.band} is {part.status}{known} ({part.reason})")
 
 
 def _open(stack: ExitStack, sidecar: Path, part: BandPart) -> Source:

@@ -286,6 +286,8 @@ class CaptureResult(_Result):
     bands: Sequence[BandResult]
     output: OutputPart | None
     preview: PreviewPart | None = None
+    accept_predicted_px: float | None = None
+    """Standard error up to which `status` counts a predicted band as delivered, px; null in older sidecars."""
     products: list[ProductPart] = []
     """Every file that was written but the sidecar itself."""
     settings: str

@@ -13,7 +13,7 @@ import agalign
 from agalign.batch import RunOptions
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.tag_seeds import geo_seed
-from agalign.config import JointSettings, LocalSettings, SeedSettings, Settings, WriteSettings
+from agalign.config import CheckSettings, JointSettings, LocalSettings, SeedSettings, Settings, WriteSettings
 from agalign.errors import ConfigurationError, InputError
 from agalign.products.band_files import band_file_names
 from agalign.products.index_rasters import write_indices
@@ -405,3 +405,24 @@ def test_the_error_map_lies_on_the_stack_s_grid_and_goes_when_not_asked_for(tmp_
     assert ((values > 0) & (values < 1)).all()
     agalign.align_folder(tmp_path / "in", out)
     assert not list(out.rglob("*.error.tif"))
+
+
+@pytest.mark.parametrize(("accepted_px", "std_px", "written"), [(2.0, 1.5, True), (0.5, 0.8, False), (0.5, 0.4, True)])
+def test_indices_take_the_bands_that_the_run_delivered(
+    tmp_path: Path, accepted_px: float, std_px: float, written: bool
+) -> None:
+    """A band that `--accept-predicted` counts as delivered is good enough for indices, and no other."""
+    for name, gain in (("green", 900), ("red", 500), ("nir", 700)):
+        pixels = (3000 + gain * textured_image(300, 240, 3)).clip(1).astype(np.uint16)
+        write_band(tmp_path / "in" / f"field_{name}.tif", pixels)
+    settings = ONLY_SEED.model_copy(update={"check": CheckSettings(accept_predicted_px=accepted_px)})
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
+    path = tmp_path / "out" / "field.json"
+    sidecar = json.loads(path.read_text())
+    for band in sidecar["bands"]:
+        if band["status"] != "reference":
+            band |= {"status": "predicted", "prediction": {"from": "flight", "std_px": std_px, "off_px": None}}
+    path.write_text(json.dumps(sidecar))
+    (result,) = write_indices(tmp_path / "out", [INDICES["ndvi"]])
+    assert (result.path is not None) == written
+    assert written or f"predicted to {std_px:g} px, not {accepted_px:g}" in result.problem
