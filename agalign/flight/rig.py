@@ -21,7 +21,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -420,8 +419,7 @@ def affine(mean: Matrix, mapping: Matrix, size_px: tuple[int, int]) -> Array:
 def moved(mean: Matrix, shift: Array, size_px: tuple[int, int]) -> Matrix:
     """The mean with (2, 3) in terms of g added."""
     points = geometry.lattice(*size_px, *_LATTICE)
-    result, _ = cv2.findHomography(points, geometry.apply(mean, points) + coordinates(size_px) @ shift.T, 0)
-    return geometry.normalised(result)
+    return geometry.fit_homography(points, geometry.apply(mean, points) + coordinates(size_px) @ shift.T)
 
 
 def distance_px(one: Matrix, other: Matrix, size_px: tuple[int, int]) -> float:
@@ -436,9 +434,7 @@ def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matr
     if len(matrices) == 1:
         return matrices[0]
     points = geometry.lattice(*size_px, *_LATTICE)
-    there = np.median([geometry.apply(m, points) for m in matrices], axis=0)
-    result, _ = cv2.findHomography(points, there, 0)
-    return geometry.normalised(result)
+    return geometry.fit_homography(points, np.median([geometry.apply(m, points) for m in matrices], axis=0))
 
 
 def weight(std_px: float, left_px: float = 0.0) -> float:

@@ -5,6 +5,7 @@ Every matrix is a 3x3 float64 array that maps homogeneous column vectors (x, y, 
 maps a pixel of the fixed (reference) image to a pixel of the moving image.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -99,6 +100,19 @@ def lattice(width_px: int, height_px: int, columns: int, rows: int) -> Points:
     """A regular lattice over an image, (rows * columns, 2), row by row, corner pixels included."""
     x, y = np.meshgrid(np.linspace(0, width_px - 1, columns), np.linspace(0, height_px - 1, rows))
     return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def fit_homography(points_px: ArrayLike, mapped_px: ArrayLike) -> Matrix:
+    """The homography that maps points (n, 2) to mapped points (n, 2) with the least squared error.
+
+    Raises GeometryError where there is none: fewer than four points, points on one line, or values that are not finite.
+    """
+    points, mapped = (np.asarray(p, dtype=np.float64) for p in (points_px, mapped_px))
+    enough = len(points) >= 4 and bool(np.isfinite(points).all() and np.isfinite(mapped).all())
+    result = cv2.findHomography(points, mapped, 0)[0] if enough else None
+    if result is None:
+        raise GeometryError(f"no homography can be fitted to {len(points)} pairs of points that are degenerate")
+    return normalised(result)
 
 
 def corner_error_px(one: Matrix, other: Matrix, width_px: int, height_px: int) -> float:

@@ -91,3 +91,24 @@ def test_corners_move_a_homography_and_all_points_with_them() -> None:
     points = geometry.lattice(1280, 960, 6, 5)
     there = points + geometry.over_corners(points, 1280, 960) @ moved_px
     np.testing.assert_allclose(geometry.apply(change, points), there, atol=1e-3)
+
+
+@given(matrices)
+def test_a_homography_is_fitted_to_the_points_that_it_maps(matrix: np.ndarray) -> None:
+    lattice = geometry.lattice(100, 80, 5, 4)
+    fitted = geometry.fit_homography(lattice, geometry.apply(matrix, lattice))
+    assert_allclose(geometry.apply(fitted, lattice), geometry.apply(matrix, lattice), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "points_px",
+    [
+        np.column_stack([np.arange(6.0), 2 * np.arange(6.0)]),
+        np.where(np.eye(6, 2) > 0, np.nan, points[[0, 1, 2, 3, 0, 1]]),
+        points[:3],
+    ],
+    ids=["on one line", "not finite", "three points"],
+)
+def test_no_homography_is_fitted_to_degenerate_points(points_px: np.ndarray) -> None:
+    with pytest.raises(GeometryError):
+        geometry.fit_homography(points_px, points_px)
