@@ -152,13 +152,9 @@ class _Table:
 
     def errors_left_out(self, factors: Sequence[Factor]) -> dict[str, float]:
         """Root mean square error by band, px, of captures that are predicted from rigs learnt on the others."""
-        count, counts = len(self.there), used(factors)
-        folds = min(count, _MAX_FOLDS)
-        squares: dict[str, list[float]] = {b: [] for b in self.bands}
-        for fold in range(folds):
-            out = np.arange(count) % folds == fold
-            if not (self.weights[~out].sum(axis=0) > 0).all():
-                continue
+        counts = used(factors)
+        errors: dict[str, list[float]] = {b: [] for b in self.bands}
+        for out in self._folds():
             fit = self.fit(1.0 - out, factors or ("distance",))
             designs = np.stack([design(a, d) for a, d in zip(fit.t, fit.delay, strict=True)])
             left = self.there[out] - fit.offset
@@ -167,12 +163,23 @@ class _Table:
                 others[:, j] = 0.0
                 result, _ = solve_factors(left, designs, others, counts)
                 error = left[:, j] - np.einsum("akf,cf->cak", designs[j] * counts, result)
-                squares[band] += (error**2).sum(axis=(1, 2))[self.weights[out, j] > 0].tolist()
+                lengths = np.linalg.norm(error, axis=(1, 2))
+                errors[band] += lengths[self.weights[out, j] > 0].tolist()
         # The rig is learnt on one capture more than those that tell its errors.
         seen = (self.weights > 0).sum(axis=0)
         gained = np.sqrt((1 + 1 / seen) / (1 + 1 / np.maximum(seen - 1, 1)))
-        errors = _root_mean(squares)
-        return {b: errors[b] * float(g) for b, g in zip(self.bands, gained, strict=True)}
+        return {b: _rms(errors[b]) * float(g) for b, g in zip(self.bands, gained, strict=True)}
+
+    def _folds(self) -> list[NDArray[np.bool_]]:
+        """Which captures (captures,) each fold leaves out. The others always show every band, so that each band has an
+        error: where all captures of a band would be in one fold, each capture is a fold of its own.
+        """
+        count = len(self.there)
+        for folds in (min(count, _MAX_FOLDS), count):
+            left_out = [np.arange(count) % folds == fold for fold in range(folds)]
+            if all((self.weights[~out].sum(axis=0) > 0).all() for out in left_out):
+                break
+        return left_out
 
     @staticmethod
     def _beside(t: Array, delay: Array, counts: Array) -> Array:
@@ -230,10 +237,5 @@ def _normalised_layout(layout: Mapping[str, tuple[float, float]], bands: Sequenc
     return _unit(result) if np.linalg.norm(result) > 0 else None
 
 
-def _root_mean(squares: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    return {b: float(np.sqrt(np.mean(s))) if s else float("inf") for b, s in squares.items()}
-
-
 def _rms(values: Iterable[float]) -> float:
-    result = np.array([v for v in values if np.isfinite(v)])
-    return float(np.sqrt((result**2).mean())) if len(result) else float("inf")
+    return float(np.sqrt(np.mean(np.square(list(values)))))

@@ -234,7 +234,9 @@ class Rig:
             return [self.mean[band]]
         factors = np.array([s.factors for s in self.seen])
         spread = np.median(np.abs(factors), axis=0)
-        factors = factors[(np.abs(factors) <= _UNLIKE * np.maximum(spread, _MIN_UNLIKE_PX)).all(axis=1)]
+        unlike = (np.abs(factors) / (_UNLIKE * np.maximum(spread, _MIN_UNLIKE_PX))).max(axis=1)
+        # Where each capture is unlike the others in some factor, the one that is least so stays.
+        factors = factors[unlike <= max(1.0, float(unlike.min()))]
         ends = {int(pick) for column in factors.T for pick in (column.argmin(), column.argmax())}
         return [moved(self.mean[band], self._design(band) @ factors[i], self.size_px) for i in sorted(ends)]
 

@@ -8,7 +8,8 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.verification import WarpedPair
 from agalign.config import Settings
-from agalign.flight.rig import NO_FACTORS, Rig
+from agalign.flight.learn_rig import learn_rig
+from agalign.flight.rig import NO_FACTORS, Observation, Rig
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.image import Raster
@@ -115,3 +116,26 @@ def test_windows_in_a_line_say_nothing_of_what_lies_beside_it() -> None:
     middle = geometry.apply(results.fixed_to_moving, [320.0, 240.0]) - geometry.apply(MEAN, [320.0, 240.0])
     np.testing.assert_allclose(middle, [0.3, 0.0], atol=0.05)
     assert results.corner_std_px > 0.5
+
+
+def test_a_band_that_few_captures_show_does_not_cost_the_others() -> None:
+    """The rig of 25 captures, of which three show near infra-red, twelve captures apart."""
+    rng = np.random.default_rng(2)
+    shown = []
+    for k in range(25):
+        distance_px = rng.normal()
+        at = {
+            "red": geometry.compose(geometry.translation(0.6 * distance_px, 0.0), MEAN),
+            "nir": geometry.compose(geometry.translation(0.0, 0.8 * distance_px), MEAN),
+        }
+        known = at if k % 12 == 0 else {"red": at["red"]}
+        shown.append(Observation(float(k), known, dict.fromkeys(known, 0.05)))
+    few = learn_rig(shown, SIZE, {})
+    assert few is not None
+    assert set(few.mean) == {"red", "nir"}
+    there = result(np.zeros((4, 2)), np.full((4, 2), 0.03))
+    both = found_together(there, replace(there), few)
+    for band in both.values():
+        assert np.isfinite(band.fixed_to_moving).all()
+        assert np.isfinite(band.corner_std_xy_px).all()
+        assert band.corner_std_px < 0.05

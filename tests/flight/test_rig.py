@@ -6,6 +6,7 @@ import pytest
 
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig, distance_px, median_mapping
+from agalign.products.sidecar import PredictionPart
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementField
 
@@ -277,3 +278,39 @@ def test_too_few_known_times_say_nothing_of_a_capture_between_them(known_times: 
     by_height = rig.predict("NIR", Observation(None, {}, {}, altitude_m=86.5))
     assert by_height.source == "neighbours"
     assert distance_px(by_height.fixed_to_moving, mappings(1.75)["NIR"], SIZE) < 0.3
+
+
+def rarely_shown() -> list[Observation]:
+    """25 captures of which three show NIR: twelve apart, as far as the folds of the cross-validation are."""
+    rng = np.random.default_rng(1)
+    return [
+        observation(float(k), float(rng.normal()), noise=0.03, seed=k, without=() if k % 12 == 0 else ("NIR",))
+        for k in range(25)
+    ]
+
+
+def test_a_band_that_few_captures_show_has_a_finite_error() -> None:
+    rig = learn_rig(rarely_shown(), SIZE, {})
+    assert rig is not None
+    assert set(rig.mean) == set(BASELINES)
+    assert all(0 < rig.from_bands_px[band] < 0.3 for band in BASELINES)
+    error, std = error_px(rig, "NIR", observation(30.0, 0.5, without=("NIR",)), mappings(0.5)["NIR"])
+    assert error < 0.3
+    assert error < 3 * std < 1.0
+    # Neither the model's file nor the sidecar holds anything but finite numbers.
+    assert "Infinity" not in rig.as_json()
+    prediction = rig.predict("NIR", observation(30.0, 0.5, without=("NIR",)))
+    part = PredictionPart(source=prediction.source, std_px=prediction.std_px, off_px=prediction.off_px)
+    assert PredictionPart.model_validate_json(part.model_dump_json()) == part
+
+
+def test_the_extremes_of_a_flight_without_a_typical_capture_are_its_most_typical_one() -> None:
+    rig = learn_rig(flight(3), SIZE, {})
+    assert rig is not None
+    outliers = [(90.0, 0.0, 0.0, 0.0, 0.0), (0.0, 50.0, 0.0, 0.0, 0.0), (0.0, 0.0, 70.0, 0.0, 0.0)]
+    seen = tuple(replace(s, factors=f) for s, f in zip(rig.seen, outliers, strict=True))
+    rig = replace(rig, factors=("distance", "tilt"), seen=seen)
+    (extreme,) = rig.extremes("NIR")
+    tilted = np.array(rig.baselines["NIR"]) * 50.0
+    moved_px = geometry.apply(extreme, [1279.0, 479.5]) - geometry.apply(rig.mean["NIR"], [1279.0, 479.5])
+    np.testing.assert_allclose(moved_px, tilted * 1.5, rtol=0.02)
