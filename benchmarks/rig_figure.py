@@ -51,7 +51,7 @@ def main() -> None:
         axis.quiver(*points.T, *(_TIMES * apart.T), length, angles="xy", scale_units="xy", scale=1, cmap="viridis",
                     clim=(0, 0.25), width=0.006)  # fmt: skip
         axis.set_title(f"{band}: up to {length.max():.2f} px")
-    figure.suptitle(f"{len(rig.seen)} captures; arrows of the lens fields {_TIMES} times as long", fontsize=9)
+    figure.suptitle(f"{len(rig.captures)} captures; arrows of the lens fields {_TIMES} times as long", fontsize=9)
     figure.savefig(sys.argv[2], dpi=70)
 
 

@@ -14,11 +14,12 @@ from agalign.capture.prediction import observed, with_predictions
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.config import Settings
 from agalign.errors import AgalignError
+from agalign.flight.factors import median_mapping
 from agalign.flight.fingerprint import fingerprint, hashed
 from agalign.flight.groups import camera_key
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
-from agalign.flight.rig import MIN_CAPTURES, Observation, Rig, median_mapping
+from agalign.flight.rig import MIN_CAPTURES, Observation, Rig
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
 from agalign.method.joint import Results, refine_with

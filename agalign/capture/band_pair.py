@@ -11,6 +11,7 @@ from agalign.capture.tag_seeds import seed_candidates
 from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
+from agalign.flight.rig_prediction import unobserved_error_px
 from agalign.pixels.raster import read_for_alignment
 from agalign.pixels.resample import single, warped
 from agalign.pixels.stripes import without_common_stripes
@@ -207,7 +208,7 @@ def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float
         mean, rig = model.rig.mean[band], model.rig
         # What a rig misses is in px of the band's own file.
         ratio = abs(float(geometry.local_scale(mean, *rig.size_px)[-1]))
-        known["model"] = max(rig.missed_px(band, by_neighbours=False) / ratio, _MIN_MODEL_STD_PX) * scale[0]
+        known["model"] = max(unobserved_error_px(rig, band, by_neighbours=False) / ratio, _MIN_MODEL_STD_PX) * scale[0]
     return known
 
 

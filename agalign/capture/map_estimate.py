@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.corner_fit import fit_corners
-from agalign.flight.rig import FACTOR_STD_PX, Expectation, Rig
+from agalign.flight.factors import FACTOR_STD_PX
+from agalign.flight.rig import Rig
+from agalign.flight.rig_prediction import Expectation, expected_corners
 from agalign.values import geometry, lens
 from agalign.values.alignment import JointResult, Residual
 
@@ -137,4 +139,4 @@ def _undistorted(pair: BandPair, raw_px: Array) -> Array:
 def _expectation(pair: BandPair, result: JointResult, rig: Rig | None) -> Expectation | None:
     if rig is None or pair.name not in rig.mean or not pair.is_the_rigs:
         return None
-    return rig.expectation(pair.name, pair.in_file_px(result.fixed_to_moving)).rescaled(pair.scales[0])
+    return expected_corners(rig, pair.name, pair.in_file_px(result.fixed_to_moving)).rescaled(pair.scales[0])

@@ -7,7 +7,9 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import find_rotated
 from agalign.capture.verification import as_predicted
 from agalign.config import CheckSettings
-from agalign.flight.rig import Observation, Rig, distance_px
+from agalign.flight.factors import distance_px
+from agalign.flight.rig import Observation, Rig
+from agalign.flight.rig_prediction import predict_band
 from agalign.values import geometry
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Prediction
 from agalign.values.capture import Capture
@@ -47,7 +49,7 @@ def with_predictions(
         alignment = checked[pair.name]
         if pair.name not in rig.mean or not pair.is_the_rigs:
             continue
-        prediction = rig.predict(pair.name, known)
+        prediction = predict_band(rig, pair.name, known)
         if pair.name in known.mappings:
             off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
             prediction = replace(prediction, off_px=off_px)
@@ -83,7 +85,7 @@ def worth_learning(
             tried is None
             or pair.name not in rig.mean
             or not pair.is_the_rigs
-            or (rig.predict(pair.name, known).std_px > check.accept_predicted_px and _shows_something(tried))
+            or (predict_band(rig, pair.name, known).std_px > check.accept_predicted_px and _shows_something(tried))
         ):
             worth.add(pair.name)
     return worth

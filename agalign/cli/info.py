@@ -81,12 +81,12 @@ def info(
 def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     """What a model knows of its camera. Raises InputError where it is none."""
     from agalign.flight.model import load_model
-    from agalign.flight.rig_file import rig_rows
+    from agalign.flight.rig_prediction import band_summaries
     from agalign.method.device import choose_device
 
     model = load_model(path, lambda: choose_device("cpu"))
-    rows = [] if model.rig is None else rig_rows(model.rig)
-    captures, factors = (0, ()) if model.rig is None else (len(model.rig.seen), model.rig.factors)
+    rows = [] if model.rig is None else band_summaries(model.rig)
+    captures, factors = (0, ()) if model.rig is None else (len(model.rig.captures), model.rig.factors)
     if as_json:
         rig = {"captures": captures, "factors": factors, "bands": rows} if rows else None
         facts = {"model": str(path), "camera": model.camera, "bands": list(model.bands), "rig": rig}

@@ -18,6 +18,7 @@ from safetensors.torch import save
 from agalign._version import __version__
 from agalign.errors import InputError, is_want_of_memory
 from agalign.flight.rig import Rig
+from agalign.flight.rig_file import rig_from_json, rig_to_json
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import matching_network
 from agalign.values.files import complete_file
@@ -62,7 +63,7 @@ def save_model(model: FlightModel, path: Path) -> None:
     facts = {
         "format": _FORMAT, "agalign": __version__, "camera": model.camera, "bands": json.dumps(model.bands),
         "sharing": model.net.sharing, "channels": json.dumps(model.net.channels), "fingerprint": model.fingerprint,
-        "rig": "" if model.rig is None else model.rig.as_json(),
+        "rig": "" if model.rig is None else rig_to_json(model.rig),
     }  # fmt: skip
     contents = _with_sorted_header(save(tensors, facts | {"digest": _digest(tensors, facts)}))
     with complete_file(path) as partial:
@@ -107,7 +108,7 @@ def _read_model(path: Path) -> FlightModel:
         k.removeprefix("mapping."): normalised(v.numpy()) for k, v in tensors.items() if k.startswith("mapping.")
     }
     bands = tuple(map(str, json.loads(facts["bands"])))
-    rig = Rig.from_json(facts["rig"], fields) if facts.get("rig") else None
+    rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
     return FlightModel(net, facts["camera"], bands, mappings, facts["fingerprint"], rig)
 
 

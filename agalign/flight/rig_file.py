@@ -1,41 +1,58 @@
-"""The rig that a model's file knows, read without its network: what tells of a run needs no torch."""
+"""The rig as JSON, and read from a model's file without its network: reports of a run need no torch."""
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors import safe_open
 
 from agalign.errors import InputError
-from agalign.flight.rig import Rig
-from agalign.values.geometry import apply
+from agalign.flight.rig import CaptureFactors, Rig
+from agalign.values.alignment import DisplacementField
+
+
+def rig_to_json(rig: Rig) -> str:
+    """Everything but the values of the displacement fields."""
+    facts = {k: v for k, v in vars(rig).items() if k not in ("mean", "fields", "captures")}
+    facts["mean"] = {b: m.tolist() for b, m in rig.mean.items()}
+    facts["seen"] = [vars(c) for c in rig.captures]
+    return json.dumps(facts | {"field_steps_px": {b: f.step_px for b, f in rig.fields.items()}})
+
+
+def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
+    """The inverse, with the fields' values (rows, columns, 2) by band. Raises KeyError, TypeError, ValueError."""
+    facts = json.loads(text)
+    steps = facts.pop("field_steps_px")
+    width, height = facts.pop("size_px")
+    return Rig(
+        size_px=(int(width), int(height)), mean={b: np.array(m) for b, m in facts.pop("mean").items()},
+        baselines={b: (x, y) for b, (x, y) in facts.pop("baselines").items()},
+        centres={b: tuple(c) for b, c in facts.pop("centres").items()}, factors=tuple(facts.pop("factors")),
+        captures=tuple(_capture_factors(c) for c in facts.pop("seen")),
+        fields={b: DisplacementField(steps[b], values) for b, values in fields.items()}, **facts,
+    )  # fmt: skip
 
 
 def read_rig(path: Path) -> tuple[str, Rig | None]:
-    """(camera, its rig, None where too few captures said something of it). Raises InputError, naming the file."""
+    """(camera, rig) of a model's file, None where too few captures showed a rig. Raises InputError, naming the file."""
     try:
         with safe_open(path, framework="np") as file:
             facts = dict(file.metadata() or {})
             names = [n for n in file.keys() if n.startswith("field.")]  # noqa: SIM118
             fields = {n.removeprefix("field."): np.asarray(file.get_tensor(n)) for n in names}
-        rig = Rig.from_json(facts["rig"], fields) if facts.get("rig") else None
+        rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
         return str(facts.get("camera", "")), rig
     except Exception as error:  # of a damaged file anything may be wrong
-        said = next(iter(str(error).splitlines()), type(error).__name__)
-        raise InputError(f"{path}: its rig cannot be read ({said})") from None
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise InputError(f"{path}: its rig cannot be read ({reason})") from None
 
 
-def rig_rows(rig: Rig) -> list[dict[str, Any]]:
-    """A band each: where its middle lies in the moving image, how it moves, and how well it is predicted, px."""
-    middle = (np.array(rig.size_px, float) - 1) / 2
-    return [
-        {
-            "band": band, "offset_px": (apply(mean, middle[None])[0] - middle).tolist(),
-            "baseline": rig.baselines[band], "from_bands_px": rig.from_bands_px[band],
-            "from_neighbours_px": rig.missed_px(band, by_neighbours=True),
-            "from_flight_px": rig.missed_px(band, by_neighbours=False),
-            "field_px": float(np.hypot(*np.moveaxis(rig.fields[band].displacements_px, -1, 0)).max())
-            if band in rig.fields else None,
-        }
-        for band, mean in rig.mean.items()
-    ]  # fmt: skip
+def _capture_factors(facts: Mapping[str, Any]) -> CaptureFactors:
+    motion = facts["motion"]
+    return CaptureFactors(
+        facts["seconds"], facts["altitude_m"], None if motion is None else (motion[0], motion[1]),
+        tuple(facts["factors"]),
+    )  # fmt: skip

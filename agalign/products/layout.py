@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from agalign.config import WriteSettings
 from agalign.flight.rig import Rig
+from agalign.flight.rig_prediction import extreme_mappings
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
@@ -92,7 +93,7 @@ def _of_the_flight(capture: Capture, rig: Rig) -> list[tuple[PixelMapping, Band]
         (PixelMapping(matrix, reference.lens, band.lens if reference.lens is not None else None), band)
         for band in capture.moving
         if band.name in rig.mean and (band.lens is None) == (reference.lens is None)
-        for matrix in rig.extremes(band.name)
+        for matrix in extreme_mappings(rig, band.name)
     ]
 
 

@@ -4,8 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agalign.flight.factors import distance_px, median_mapping
 from agalign.flight.learn_rig import learn_rig
-from agalign.flight.rig import Observation, Rig, distance_px, median_mapping
+from agalign.flight.rig import Observation, Rig
+from agalign.flight.rig_file import rig_from_json, rig_to_json
+from agalign.flight.rig_prediction import expected_corners, extreme_mappings, predict_band, unobserved_error_px
 from agalign.products.sidecar import PredictionPart
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementField
@@ -42,7 +45,7 @@ def flight(count: int = 8, spread_px: float = 1.0, noise: float = 0.03) -> list[
 
 
 def error_px(rig: Rig, band: str, known: Observation, truth: np.ndarray) -> tuple[float, float]:
-    prediction = rig.predict(band, known)
+    prediction = predict_band(rig, band, known)
     return distance_px(prediction.fixed_to_moving, truth, SIZE), prediction.std_px
 
 
@@ -63,7 +66,7 @@ def test_a_band_without_evidence_is_where_the_others_say() -> None:
     error, std = error_px(rig, "NIR", low, mappings(4.0)["NIR"])
     assert error < 0.3
     assert error < 2 * std
-    assert rig.predict("NIR", low).source == "bands"
+    assert predict_band(rig, "NIR", low).source == "bands"
     assert distance_px(rig.mean["NIR"], mappings(4.0)["NIR"], SIZE) > 3
 
 
@@ -83,7 +86,7 @@ def test_where_nothing_is_shared_no_factor_is() -> None:
     rig = learn_rig(still, SIZE, {})
     assert rig is not None
     assert rig.factors == ()
-    assert rig.predict("Red", observation(3.5, 0.0, without=("Red",))).source == "flight"
+    assert predict_band(rig, "Red", observation(3.5, 0.0, without=("Red",))).source == "flight"
 
 
 def test_a_known_layout_is_enough_for_a_height_that_nobody_has_seen() -> None:
@@ -120,7 +123,7 @@ def test_a_capture_without_evidence_lies_between_its_neighbours() -> None:
     rig = learn_rig(sinking, SIZE, {})
     assert rig is not None
     nothing = Observation(35.0, {}, {})
-    prediction = rig.predict("NIR", nothing)
+    prediction = predict_band(rig, "NIR", nothing)
     assert prediction.source == "neighbours"
     assert distance_px(prediction.fixed_to_moving, mappings(1.75)["NIR"], SIZE) < 0.3
 
@@ -135,10 +138,10 @@ def test_written_and_read_it_is_the_same(tmp_path: Path) -> None:
     assert rig is not None
     field = DisplacementField(32.0, np.random.default_rng(0).normal(size=(31, 41, 2)))
     rig = replace(rig, fields={"Red": field})
-    again = Rig.from_json(rig.as_json(), {"Red": field.displacements_px})
+    again = rig_from_json(rig_to_json(rig), {"Red": field.displacements_px})
     np.testing.assert_array_equal(again.mean["NIR"], rig.mean["NIR"])
     np.testing.assert_array_equal(again.fields["Red"].displacements_px, field.displacements_px)
-    for name in ("baselines", "baseline_std", "centres", "delays", "factors", "seen", "from_bands_px", "size_px"):
+    for name in ("baselines", "baseline_std", "centres", "delays", "factors", "captures", "from_bands_px", "size_px"):
         assert getattr(again, name) == getattr(rig, name)
 
 
@@ -149,7 +152,7 @@ def test_an_altitude_that_nobody_has_seen_widens_the_error_bar() -> None:
     ]
     rig = learn_rig(level, SIZE, BASELINES)
     assert rig is not None
-    bars = [rig.predict("NIR", Observation(2.5, {}, {}, altitude_m)).std_px for altitude_m in (101.0, 90.0, None)]
+    bars = [predict_band(rig, "NIR", Observation(2.5, {}, {}, altitude_m)).std_px for altitude_m in (101.0, 90.0, None)]
     assert bars[0] < 0.6
     assert bars[1] > 2.0
     assert bars[2] < 0.6
@@ -168,16 +171,16 @@ def test_the_error_bar_holds_what_captures_left_out_missed() -> None:
     assert rig is not None
     worse = replace(rig, from_bands_px={**rig.from_bands_px, "NIR": 2.0})
     known = observation(9.0, 0.5, without=("NIR",))
-    assert rig.predict("NIR", known).std_px < 0.2
-    assert worse.predict("NIR", known).std_px >= 2.0
+    assert predict_band(rig, "NIR", known).std_px < 0.2
+    assert predict_band(worse, "NIR", known).std_px >= 2.0
 
 
 def test_the_error_bar_grows_where_the_other_bands_of_a_capture_disagree() -> None:
     rig = learn_rig(flight(), SIZE, {})
     assert rig is not None
     alike, unlike = (observation(9.0, 0.5, without=("NIR",), noise=noise, seed=3) for noise in (0.0, 3.0))
-    assert rig.predict("NIR", alike).std_px < 0.2
-    assert rig.predict("NIR", unlike).std_px > 1
+    assert predict_band(rig, "NIR", alike).std_px < 0.2
+    assert predict_band(rig, "NIR", unlike).std_px > 1
 
 
 DELAYS = {"Blue": 0.0, "Red": 0.4, "NIR": 1.0, "Red edge": 0.7}
@@ -217,7 +220,7 @@ def test_a_capture_without_evidence_on_the_other_heading_lies_where_its_speed_sa
     for moment, sign in ((7.5, -1), (7.5, 1)):  # at a turn, where the captures before and after disagree
         truth = passing(moment, (0.0, sign * 16.0))
         nothing = Observation(moment, {}, {}, motion=truth.motion)
-        prediction = rig.predict("NIR", nothing)
+        prediction = predict_band(rig, "NIR", nothing)
         assert prediction.source == "neighbours"
         error = distance_px(prediction.fixed_to_moving, truth.mappings["NIR"], SIZE)
         assert error < 1.0
@@ -246,7 +249,7 @@ def test_what_is_expected_of_a_band_of_large_pixels_is_told_in_px_of_the_referen
     assert rig is not None
     mean = rig.mean["NIR"]
     coarse = replace(rig, mean={**rig.mean, "NIR": geometry.compose(np.diag([0.1, 0.1, 1.0]), mean)})
-    one, other = (r.expectation("NIR", r.mean["NIR"]) for r in (rig, coarse))
+    one, other = (expected_corners(r, "NIR", r.mean["NIR"]) for r in (rig, coarse))
     np.testing.assert_allclose(other.covariance, 100 * one.covariance, rtol=1e-6)
     np.testing.assert_allclose(other.by_factor, 10 * one.by_factor, rtol=1e-6, atol=1e-9)
 
@@ -256,10 +259,10 @@ def test_a_capture_without_a_time_is_not_between_captures_in_time() -> None:
     sinking = [observation(10.0 * k, 0.5 * k) for k in range(9)]
     rig = learn_rig(sinking, SIZE, {})
     assert rig is not None
-    prediction = rig.predict("NIR", Observation(None, {}, {}))
+    prediction = predict_band(rig, "NIR", Observation(None, {}, {}))
     assert prediction.source == "flight"
     np.testing.assert_array_equal(prediction.fixed_to_moving, rig.mean["NIR"])
-    by_height = rig.predict("NIR", Observation(None, {}, {}, altitude_m=100.0))
+    by_height = predict_band(rig, "NIR", Observation(None, {}, {}, altitude_m=100.0))
     assert by_height.source == "flight"
 
 
@@ -268,14 +271,14 @@ def test_too_few_known_times_say_nothing_of_a_capture_between_them(known_times: 
     sinking = [observation(10.0 * k if k < known_times else None, 0.5 * k, altitude_m=90.0 - k) for k in range(9)]
     rig = learn_rig(sinking, SIZE, {})
     assert rig is not None
-    again = Rig.from_json(rig.as_json(), {})
-    assert [s.seconds for s in again.seen] == [s.seconds for s in rig.seen] == [c.seconds for c in sinking]
+    again = rig_from_json(rig_to_json(rig), {})
+    assert [s.seconds for s in again.captures] == [s.seconds for s in rig.captures] == [c.seconds for c in sinking]
     for band in BASELINES:
-        unseen = rig.predict(band, Observation(35.0, {}, {}))
+        unseen = predict_band(rig, band, Observation(35.0, {}, {}))
         # Without the times the error is the typical one of the flight, not what few captures happen to show.
-        assert unseen.std_px > 0.5 * rig.missed_px(band, by_neighbours=False)
+        assert unseen.std_px > 0.5 * unobserved_error_px(rig, band, by_neighbours=False)
     # The height is known without the time, and predicts the capture.
-    by_height = rig.predict("NIR", Observation(None, {}, {}, altitude_m=86.5))
+    by_height = predict_band(rig, "NIR", Observation(None, {}, {}, altitude_m=86.5))
     assert by_height.source == "neighbours"
     assert distance_px(by_height.fixed_to_moving, mappings(1.75)["NIR"], SIZE) < 0.3
 
@@ -298,8 +301,8 @@ def test_a_band_that_few_captures_show_has_a_finite_error() -> None:
     assert error < 0.3
     assert error < 3 * std < 1.0
     # Neither the model's file nor the sidecar holds anything but finite numbers.
-    assert "Infinity" not in rig.as_json()
-    prediction = rig.predict("NIR", observation(30.0, 0.5, without=("NIR",)))
+    assert "Infinity" not in rig_to_json(rig)
+    prediction = predict_band(rig, "NIR", observation(30.0, 0.5, without=("NIR",)))
     part = PredictionPart(source=prediction.source, std_px=prediction.std_px, off_px=prediction.off_px)
     assert PredictionPart.model_validate_json(part.model_dump_json()) == part
 
@@ -308,9 +311,9 @@ def test_the_extremes_of_a_flight_without_a_typical_capture_are_its_most_typical
     rig = learn_rig(flight(3), SIZE, {})
     assert rig is not None
     outliers = [(90.0, 0.0, 0.0, 0.0, 0.0), (0.0, 50.0, 0.0, 0.0, 0.0), (0.0, 0.0, 70.0, 0.0, 0.0)]
-    seen = tuple(replace(s, factors=f) for s, f in zip(rig.seen, outliers, strict=True))
-    rig = replace(rig, factors=("distance", "tilt"), seen=seen)
-    (extreme,) = rig.extremes("NIR")
+    captures = tuple(replace(c, factors=f) for c, f in zip(rig.captures, outliers, strict=True))
+    rig = replace(rig, factors=("distance", "tilt"), captures=captures)
+    (extreme,) = extreme_mappings(rig, "NIR")
     tilted = np.array(rig.baselines["NIR"]) * 50.0
     moved_px = geometry.apply(extreme, [1279.0, 479.5]) - geometry.apply(rig.mean["NIR"], [1279.0, 479.5])
     np.testing.assert_allclose(moved_px, tilted * 1.5, rtol=0.02)

@@ -11,7 +11,8 @@ import numpy as np
 
 from agalign.errors import InputError
 from agalign.flight.rig import Rig
-from agalign.flight.rig_file import read_rig, rig_rows
+from agalign.flight.rig_file import read_rig
+from agalign.flight.rig_prediction import band_summaries
 from agalign.products.report.facts import CaptureEntry
 from agalign.values import geometry
 
@@ -86,7 +87,7 @@ def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
 
 
 def _rig_view(camera: str, rig: Rig) -> RigView:
-    rows = rig_rows(rig)
+    rows = band_summaries(rig)
     reach = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
     to_plan = 0.36 * PLAN_WIDTH / reach
     width, height = rig.size_px
@@ -100,7 +101,7 @@ def _rig_view(camera: str, rig: Rig) -> RigView:
             )
         )  # fmt: skip
     shared = ", ".join(rig.factors) or "nothing"
-    return RigView(camera, len(rig.seen), shared, FIELD_WIDTH * height / width, tuple(bands))
+    return RigView(camera, len(rig.captures), shared, FIELD_WIDTH * height / width, tuple(bands))
 
 
 def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...]:
