@@ -26,7 +26,7 @@ from agalign.values.image import Mask, Raster
 
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 _READ_WHOLE_PX = 1 << 26
-"""Images up to this are decoded at once where they are to be averaged."""
+"""Images up to this are decoded as a whole before they are averaged: 128 MB in 16 bits."""
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 _BLOCK_CACHE_BYTES = 256 * 2**20
 """rasterio takes an integer as bytes. GDAL's default is 5 % of the machine's memory, which every worker would take."""
@@ -40,7 +40,8 @@ a description of other files or of a server.
 _DRIVERS = {
     b"II*\0": "GTiff", b"MM\0*": "GTiff", b"II+\0": "GTiff", b"MM\0+": "GTiff", b"\xff\xd8\xff": "JPEG",
 }  # fmt: skip
-"""By how a file begins. GDAL has drivers that execute, or ask other computers, for whatever name a file has."""
+"""By the first bytes of a file: of GDAL's other drivers some execute code or contact servers, whatever the file's name.
+"""
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
 _PREVIEW_SIDE_PX = 2048
@@ -51,7 +52,7 @@ _MAX_MICROMETRES = 20.0
 
 @dataclass(frozen=True)
 class RasterInfo:
-    """The shape and description of a raster file."""
+    """The shape and the metadata of a raster file."""
 
     width_px: int
     height_px: int
@@ -75,10 +76,10 @@ class RasterInfo:
 
 @contextmanager
 def without_warnings() -> Iterator[None]:
-    """Rasterio warns of images without a georeference, which is what drone images are.
+    """Silence rasterio's warning about images without a georeference: drone images have none.
 
-    Filters are the process's: around several threads that read, one more of these keeps each from giving back what
-    another still needs.
+    Warning filters belong to the process. Code that reads in several threads needs one more of these around all of
+    them, so that no thread restores a filter that another still needs.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -97,7 +98,7 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
     except UnicodeEncodeError:
         raise UnreadableFileError(f"{path}: its name is not in this system's letters; set LC_ALL=C.UTF-8") from None
     except Exception as error:
-        # Some of what GDAL says rasterio raises by classes that it does not give out.
+        # rasterio raises some of GDAL's errors as classes that are not public.
         if not isinstance(error, UnicodeDecodeError) and not type(error).__module__.startswith("rasterio."):
             raise
         text = why(error).replace(str(path), "").strip(" :'")
@@ -105,16 +106,18 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
 
 
 def why(error: BaseException) -> str:
-    """What GDAL says of an error, in a line; rasterio's own word for it is that there was one."""
+    """The first line of GDAL's message, which is the innermost cause; rasterio's own message is generic."""
     while error.__cause__ is not None:
         error = error.__cause__
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _driver_of(path: Path) -> str:
-    """Raises UnreadableFileError for what is no file, cannot be read, or is neither TIFF nor JPEG."""
+    """The GDAL driver of a file by its first bytes. Raises UnreadableFileError where the path is not a file, cannot be
+    read, or is neither a TIFF nor a JPEG.
+    """
     try:
-        # What is no file, such as a pipe, would keep whoever opens it waiting.
+        # Opening something else, such as a pipe, would wait forever.
         if not stat.S_ISREG(path.stat().st_mode):
             raise UnreadableFileError(f"{path}: is no file; take it out of the folder")
         with path.open("rb") as file:
@@ -138,8 +141,8 @@ def probe(path: Path, max_pixels: int = MAX_PIXELS) -> RasterInfo:
     except UnreadableFileError:
         raise
     except Exception as error:  # a damaged file makes a reader fail in any way
-        said = next(iter(str(error).splitlines()), type(error).__name__)
-        raise UnreadableFileError(f"{path}: cannot be read ({said}); copy it from the card again") from None
+        text = next(iter(str(error).splitlines()), type(error).__name__)
+        raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
 
 
 def _probe(path: Path, max_pixels: int) -> RasterInfo:
@@ -186,7 +189,7 @@ def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]
     """A band averaged down to (height, width)."""
     plain = band.nodata is None and not band.has_mask and np.dtype(band.dtype).kind == "u"
     if plain and band.width_px * band.height_px <= _READ_WHOLE_PX:
-        # GDAL's own averaging decodes a photograph over and over: seconds a band.
+        # GDAL's own averaging decodes a photograph many times: seconds per band.
         return np.asarray(cv2.resize(dataset.read(band.band_index), shape[::-1], interpolation=cv2.INTER_AREA))
     return np.asarray(dataset.read(band.band_index, out_shape=shape, resampling=Resampling.average))
 
@@ -233,7 +236,7 @@ def crs_code(crs_wkt: str) -> str | None:
 def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDArray[np.float64]:
     """(n, 2) map positions, x or longitude first, in another coordinate reference system (WKT or EPSG:number).
 
-    Raises GeometryError where there is no way.
+    Raises GeometryError where GDAL cannot transform them.
     """
     try:
         x, y = warp.transform(

@@ -1,7 +1,7 @@
-"""Images on other pixel grids: a moving band onto the reference's, once, tile by tile, and what estimation needs.
+"""Resampling: of a moving band onto the reference's grid, tile by tile, and of reduced images for the estimation.
 
-A reference pixel goes through the reference's lens model, the homography and the moving camera's lens model:
-raw reference px -> undistorted -> H -> undistorted -> raw moving px. Nothing that is written is interpolated twice.
+A reference pixel is mapped by the reference's lens model, the homography and the moving camera's lens model:
+raw reference px -> undistorted -> H -> undistorted -> raw moving px. Pixels that are written are interpolated once.
 """
 
 from collections.abc import Iterator
@@ -85,7 +85,8 @@ def resample(
 ) -> tuple[NDArray[np.generic], Mask]:
     """Pixels (h, w) of a window at positions (H, W, 2) in px of that window.
 
-    `sensor_start` and `sensor_end` (x, y) say where the whole image begins and ends in the window's px.
+    `sensor_start` (x, y) is the whole image's first pixel in the window's px, `sensor_end` one past its last pixel.
+    Returns (H, W) of the pixels' type, integers rounded and clipped, and the mask of valid pixels.
     """
     map_xy = positions.astype(np.float32)
     everything = bool(valid.all())
@@ -101,7 +102,7 @@ def resample(
 
 
 def _between(positions: Points, minimum: Points, maximum: Points) -> Mask:
-    """(H, W) True where positions (H, W, 2) lie within a rectangle, its border included."""
+    """(H, W) True where positions (H, W, 2) are within a rectangle, its border included."""
     return np.asarray(cv2.inRange(positions, tuple(map(float, minimum)), tuple(map(float, maximum))) != 0)
 
 
@@ -169,7 +170,7 @@ def single(raster: Raster) -> Raster:
 
 
 def textured(raster: Raster, min_share: float = 0.02) -> bool:
-    """False where the valid pixels are (nearly) all alike or too few for a structure to exist."""
+    """False where the valid pixels are constant, or at most `min_share` of the image."""
     if np.count_nonzero(raster.valid) <= min_share * raster.valid.size:
         return False
     planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
