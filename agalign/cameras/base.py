@@ -141,7 +141,7 @@ def band_of(path: Path, info: RasterInfo, name: str, index: int = 1) -> Band:
         dtype=info.dtypes[index - 1],
         nodata=info.nodata[index - 1],
         has_mask=info.has_mask,
-        saturation_value=largest_value(info.dtypes[index - 1]),
+        saturation_value=max_value(info.dtypes[index - 1]),
         georeference=info.georeference,
         scale_offset=info.scales_offsets[index - 1] if info.scales_offsets else (1.0, 0.0),
         overviews=info.overviews,
@@ -159,7 +159,7 @@ def colour_bands(
     )
 
 
-def largest_value(dtype: str) -> float | None:
+def max_value(dtype: str) -> float | None:
     """The value at which an integer type saturates; None for floats."""
     return {"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}.get(dtype)
 

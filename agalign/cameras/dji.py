@@ -5,9 +5,9 @@ DewarpData makes the bands fit worse than none (0.13 to 0.19 px against 0.08 to 
 DewarpHMatrix is worse than no seed at all: neither is used.
 
 Mavic 3: after undistortion by DewarpData, CalibratedHMatrix maps a band to a plane that all bands share, the designed
-bands' frame: H(reference -> band) = C_band^-1 C_reference. The rule of the Phantom 4 is tried beside it, and takes its
-place where firmware does not write it. DewarpHMatrix, in the bands' files, maps that frame to the colour photograph's.
-Its bands are exposed one after another, so that in motion a seed is off by tens of pixels.
+bands' frame: H(reference -> band) = C_band^-1 C_reference. The rule of the Phantom 4 is a second seed, and the
+only one where firmware does not write the matrix. DewarpHMatrix, in the bands' files, maps that frame to the colour
+photograph's. Its bands are exposed one after another, so that in motion a seed is off by tens of pixels.
 """
 
 import math
@@ -56,12 +56,14 @@ class _TagTransfer(TagTransfer):
     geometry = TagTransfer.geometry | {
         *_CENTRE, *_RELATIVE_CENTRE, _DEWARP_DATA, _FOCAL_LENGTH_PX, _H_MATRIX, _DEWARP_FLAG, _TO_COLOUR,
     }  # fmt: skip
-    of_the_sensor = TagTransfer.of_the_sensor | {_VIGNETTING}
+    sensor_only = TagTransfer.sensor_only | {_VIGNETTING}
     radiometry = TagTransfer.radiometry | {(_DJI, "BlackLevel")}
     in_px = (_FOCAL_LENGTH_PX, *_RELATIVE_CENTRE)
 
-    def put_geometry(self, packet: Packet, theirs: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
-        super().put_geometry(packet, theirs, reference, tags, grid)
+    def put_geometry(
+        self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
+    ) -> None:
+        super().put_geometry(packet, reference_packet, reference, tags, grid)
         centre = _pair(tags, _CENTRE)
         if centre is not None:
             for name, value in zip(_CENTRE, grid.px(*centre), strict=True):
@@ -200,7 +202,7 @@ def _matrix(tags: Tags, name: Name) -> Matrix | None:
 
 
 def _lens(tags: Tags) -> Lens | None:
-    """K = [fx, fy, COCx + cx, COCy + cy] from DewarpData, without distortion where DewarpFlag says that is done."""
+    """K = [fx, fy, COCx + cx, COCy + cy] from DewarpData, without distortion where DewarpFlag is 1."""
     (_, terms), centre = _dewarp_data(tags), _pair(tags, _CENTRE)
     if centre is None or not terms or not (terms[0] > 0 and terms[1] > 0):
         return None
@@ -211,7 +213,7 @@ def _lens(tags: Tags) -> Lens | None:
 
 def _dewarp_data(tags: Tags) -> tuple[str, list[float]]:
     """(date, fx, fy, cx, cy, k1, k2, p1, p2, k3) of DewarpData 'date;fx,fy,…', px and OpenCV's order; no terms where
-    it says something else.
+    it has another form.
     """
     date, _, text = tags.text(*_DEWARP_DATA).rpartition(";")
     try:

@@ -58,7 +58,7 @@ class Generic(Camera):
         return self.split(path)[0] or path.absolute().parent.name
 
     def split(self, path: Path) -> tuple[str, str]:
-        """(capture, band) as the file's name has them; the band is empty where the name does not tell."""
+        """(capture, band) as the file's name has them; the band is empty where the name holds none."""
         for pattern in self._patterns:
             match = pattern.fullmatch(path.name)
             if match:

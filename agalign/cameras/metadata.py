@@ -33,7 +33,7 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 @dataclass(frozen=True)
 class Tags:
-    """What the metadata of one file says. Absent or unusable tags are empty strings, empty mappings or None."""
+    """The metadata of one file. Absent or unusable tags are empty strings, empty mappings or None."""
 
     make: str = ""
     model: str = ""
@@ -42,7 +42,7 @@ class Tags:
     captured_at: str = ""
     """ISO 8601 as written by the camera, without a time zone where it gives none."""
     orientation: int = 1
-    """EXIF's: how the stored image is to be turned to be seen upright."""
+    """EXIF's: 1 for an image that is stored upright, 3 for one rotated by 180 degrees."""
     black_level: float | None = None
     """Mean of the tag's values."""
     xmp: Mapping[Name, tuple[str, ...]] = field(default_factory=dict)

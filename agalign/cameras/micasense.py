@@ -1,8 +1,8 @@
 """MicaSense RedEdge-3, -M, -MX, -P, dual, Altum and Altum-PT: one TIFF a band, everything in EXIF and XMP.
 
 Between undistorted pixels H(reference -> band) = K_band R_band^T R_reference K_reference^-1 with
-R(a, b, c) = Rx(a) Ry(b) Rz(c) from Camera:RigRelatives in degrees. What is left is a shift by parallax; between the two
-cameras of a dual, which stand farther apart, a larger one.
+R(a, b, c) = Rx(a) Ry(b) Rz(c) from Camera:RigRelatives in degrees. The residual is a shift by parallax, larger between
+the two cameras of a dual, whose baseline is longer.
 """
 
 import math
@@ -10,7 +10,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import Camera, band_of, is_thermal, largest_value, rays_to_rig, rotation
+from agalign.cameras.base import Camera, band_of, is_thermal, max_value, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, rational
 from agalign.cameras.pix4d import (
     BAND_NAME,
@@ -33,7 +33,7 @@ _FULL_SCALE = 65536.0
 """Bands are stored as 16 bits."""
 _HORIZONTAL_IRRADIANCE_UNIT = 0.01
 """W / m^2 / nm, where no tag gives the scale."""
-_TWELVE_BIT_TOP = 65520.0
+_MAX_TWELVE_BIT_VALUE = 65520.0
 """RedEdge cameras store 12 bits in the upper bits of uint16."""
 
 
@@ -69,7 +69,7 @@ class MicaSense(Camera):
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
         band = spectral(band_of(path, info, tags.text(*BAND_NAME) or _index_in_name(path) or path.stem), tags)
         lens = perspective_lens(tags)
-        top = _TWELVE_BIT_TOP if band.dtype == "uint16" else largest_value(band.dtype)
+        top = _MAX_TWELVE_BIT_VALUE if band.dtype == "uint16" else max_value(band.dtype)
         to_rig = rays_to_rig(lens, rotation(*rig_degrees(tags)))
         parallax = parallax_of(tags) or (_LAYOUT.get(band.name) if tags.model == "RedEdge-M" else None)
         radiometry = _CENTIKELVIN if is_thermal(band) else _radiometry(tags)
@@ -80,7 +80,7 @@ class MicaSense(Camera):
         )  # fmt: skip
 
     def pose(self, tags: Tags) -> Pose | None:
-        """As its tags say, else turned as its light sensor is, which stands on the same aircraft."""
+        """From the camera's tags, else with the yaw of the light sensor, which is on the same aircraft."""
         yaw, focal_px = tags.number(_DLS, "Yaw"), focal_length_px(tags)
         return pose_of(tags) or (None if yaw is None else Pose(math.degrees(yaw), focal_length_px=focal_px))
 

@@ -28,8 +28,8 @@ from agalign.cameras.pix4d import (
     perspective_lens,
     principal_point_px,
     rig_degrees,
+    rotated_180,
     spectral,
-    turned,
 )
 from agalign.cameras.xmp import Name, Packet
 from agalign.pixels.raster import RasterInfo
@@ -40,8 +40,11 @@ from agalign.values.lens import Lens, radial_coefficients
 
 _NAMES = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
 _SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
-_WIDEST_RAY = 3.0
-"""tan of the largest angle from the axis that is looked for in an image: 72 degrees."""
+_MAX_RAY_TAN = 3.0
+"""tan of the largest angle from the axis that a lens is fitted to: 72 degrees."""
+_CORNER_MARGIN = 1.1
+"""The lens is fitted to this multiple of the corners' rays, so that it holds at the image's border."""
+_FIT_SAMPLES = 1000
 _MAX_SHEAR = 1e-3
 """Of a fisheye's affine matrix, relative to its scale: more cannot be expressed and leaves the lens out."""
 
@@ -54,10 +57,12 @@ _FISHEYE: tuple[Name, ...] = (_POLYNOMIAL, _AFFINE, (CAMERA, "FisheyeAffineSymme
 class _TagTransfer(TagTransfer):
     geometry = TagTransfer.geometry | {*_FISHEYE}
     in_px = (_AFFINE,)
-    turned_where_orientation_is_3 = True
+    principal_point_follows_orientation = True
 
-    def put_geometry(self, packet: Packet, theirs: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
-        super().put_geometry(packet, theirs, reference, tags, grid)
+    def put_geometry(
+        self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
+    ) -> None:
+        super().put_geometry(packet, reference_packet, reference, tags, grid)
         density = self.pixels_per_mm(tags)
         if grid.undistorted and tags.numbers(*_AFFINE) and density and reference.lens is not None:
             # What was a fisheye is a pinhole now.
@@ -82,7 +87,7 @@ class Sequoia(Camera):
         fisheye = "fisheye" in tags.text(*MODEL_TYPE).lower()
         lens = _fisheye_lens(tags, info) if fisheye else perspective_lens(tags)
         to_camera = np.eye(3)
-        if self.tag_transfer.is_turned(tags):
+        if self.tag_transfer.is_rotated(tags):
             lens, to_camera = lens and _upside_down(lens, info), np.diag([-1.0, -1.0, 1.0])
         to_rig = rays_to_rig(lens, rotation(*rig_degrees(tags)) @ to_camera)
         if len(info.dtypes) > 1:
@@ -112,14 +117,14 @@ def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
         theta = 2 / math.pi * np.arctan(r)
         return np.asarray(np.polynomial.polynomial.polyval(theta, polynomial) * math.pi / (2 * slope))
 
-    rays = np.linspace(0.0, _WIDEST_RAY, 1000)
+    rays = np.linspace(0.0, _MAX_RAY_TAN, _FIT_SAMPLES)
     corner = np.interp(reach, bent(rays), rays)
-    return Lens(fx, fy, cx, cy, radial_coefficients(bent, 1.1 * float(corner)))
+    return Lens(fx, fy, cx, cy, radial_coefficients(bent, _CORNER_MARGIN * float(corner)))
 
 
 def _upside_down(lens: Lens, info: RasterInfo) -> Lens:
-    """The lens in pixels of the stored image, which is turned by 180 degrees."""
+    """The lens in pixels of the stored image, which is rotated by 180 degrees."""
     k = lens.distortion
     flipped = (*k[:2], -k[2], -k[3], *k[4:]) if len(k) > 3 else k
-    cx, cy = turned((lens.cx_px, lens.cy_px), (info.width_px, info.height_px))
+    cx, cy = rotated_180((lens.cx_px, lens.cy_px), (info.width_px, info.height_px))
     return replace(lens, cx_px=cx, cy_px=cy, distortion=flipped)

@@ -1,7 +1,6 @@
 """The tags that most makers share, in the namespace that Pix4D gave them: lens, rig, band, and vignetting.
 
-What they mean for a band that is written on the reference's grid is here too (`TagTransfer`); a maker with tags
-of its own adds to it.
+`TagTransfer` converts them for a band that is written on the reference's grid; a maker with tags of its own extends it.
 """
 
 import math
@@ -38,10 +37,10 @@ _MAX_MAGNIFICATION = 1.02
 """Beyond this a polynomial of vignetting in the band's own pixels is dropped."""
 
 FromSource = Callable[[float, float], tuple[float, float]]
-"""Where a pixel of the band's own file lies in the reference's pixels; nan where that cannot be told."""
+"""Maps a pixel (x, y) of the band's own file to the reference's pixels; nan where the mapping has no inverse."""
 
 
-# ---- what they say
+# ---- reading
 
 
 def perspective_lens(tags: Tags) -> Lens | None:
@@ -61,7 +60,7 @@ def principal_point_px(tags: Tags) -> tuple[float, float] | None:
 
 
 def pixels_per_mm(tags: Tags) -> float | None:
-    """EXIF's density, else from a focal length in px beside EXIF's in mm."""
+    """EXIF's density, else the ratio of a focal length in px to EXIF's in mm."""
     if tags.pixels_per_mm:
         return tags.pixels_per_mm
     focal_px = tags.number(*FOCAL_LENGTH) if focal_length_is_in_px(tags) else None
@@ -75,7 +74,7 @@ def focal_length_is_in_px(tags: Tags) -> bool:
 
 
 def focal_length_px(tags: Tags) -> float | None:
-    """Camera:PerspectiveFocalLength; None where it is missing or none that can be."""
+    """Camera:PerspectiveFocalLength; None where it is missing or not positive."""
     focal, density = tags.number(*FOCAL_LENGTH), pixels_per_mm(tags)
     if focal is None or density is None or focal <= 0:
         return None
@@ -83,14 +82,14 @@ def focal_length_px(tags: Tags) -> float | None:
 
 
 def rig_degrees(tags: Tags) -> tuple[float, ...]:
-    """The three angles of Camera:RigRelatives; none where they are missing."""
+    """The three angles of Camera:RigRelatives; zeros where they are missing."""
     angles = tags.numbers(*RIG_RELATIVES)
     return angles if len(angles) == 3 else (0.0, 0.0, 0.0)
 
 
 def parallax_of(tags: Tags) -> tuple[float, float] | None:
-    """Direction in which a band's pixels move as the ground comes nearer, from Camera:RigTranslations, where the lens
-    stands right of and below the rig's origin, metres or millimetres: the other way.
+    """Direction in which a band's pixels move as the ground comes nearer: opposite to the position of the lens right
+    of and below the rig's origin in Camera:RigTranslations, metres or millimetres. None where that is missing.
     """
     place = tags.numbers(*RIG_TRANSLATIONS)
     return (-place[0], -place[1]) if len(place) == 3 else None
@@ -135,35 +134,38 @@ def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, f
     return corners if inside and len(set(corners)) == len(corners) else ()
 
 
-# ---- what becomes of them
+# ---- writing on the reference's grid
 
 
 class TagTransfer:
-    """How XMP values follow a band onto the reference's grid."""
+    """How XMP values are converted for a band on the reference's grid."""
 
     geometry: frozenset[Name] = frozenset({
         PRINCIPAL_POINT, FOCAL_LENGTH, FOCAL_LENGTH_UNITS, DISTORTION, MODEL_TYPE, RIG_RELATIVES,
         RIG_TRANSLATIONS, (CAMERA, "RigRelativesReferenceRigCameraIndex"),
     })  # fmt: skip
-    """Of the lens and the rig: the reference's take their place."""
-    of_the_sensor: frozenset[Name] = frozenset({
+    """Values of the lens and the rig, which are replaced by the reference's."""
+    sensor_only: frozenset[Name] = frozenset({
         (CAMERA, "InvalidPixel"), (CAMERA, "VignettingPolynomial2D"), (CAMERA, "VignettingPolynomial2DName"),
     })  # fmt: skip
-    """True of the sensor's own pixels only: they are left out."""
+    """Values that are true of the sensor's own pixels only, which are removed."""
     radiometry: frozenset[Name] = frozenset({VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL, (CAMERA, "BlackCurrent")})
-    """What is taken out of the pixels where reflectance is written."""
+    """Corrections that the pixels have had where reflectance is written."""
     in_px: tuple[Name, ...] = ()
     """Lengths in px, which grow with the resolution."""
-    turned_where_orientation_is_3 = False
-    """The principal point is of the image as EXIF's Orientation makes it, not as it is stored."""
+    principal_point_follows_orientation = False
+    """True where the principal point is in the image after EXIF's Orientation, not as it is stored."""
 
-    def put_geometry(self, packet: Packet, theirs: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
-        """Replace a band's geometry by the reference's on a grid; `theirs` and `tags` are the reference's file's.
+    def put_geometry(
+        self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
+    ) -> None:
+        """Replace a band's geometry by the reference's on a grid; `reference_packet` and `tags` are of the reference's
+        file.
 
-        Of the rig nothing is left: what takes the bands for a rig's would lay them on each other once more.
+        The rig is removed: software that reads it would align the bands a second time.
         """
-        packet.take(theirs, self.geometry)
-        packet.remove(self.of_the_sensor)
+        packet.take(reference_packet, self.geometry)
+        packet.remove(self.sensor_only)
         for name in (RIG_RELATIVES, RIG_TRANSLATIONS):
             packet.put(name, ["0", "0", "0"])
         self._put_principal_point(packet, reference, tags, grid)
@@ -178,9 +180,9 @@ class TagTransfer:
         point_px, density = principal_point_px(tags), self.pixels_per_mm(tags)
         if point_px is None or density is None:
             return
-        if self.is_turned(tags):
-            stored = turned(point_px, reference.size_px)
-            point_px = turned(grid.px(*stored), (grid.width, grid.height))
+        if self.is_rotated(tags):
+            stored = rotated_180(point_px, reference.size_px)
+            point_px = rotated_180(grid.px(*stored), (grid.width, grid.height))
         else:
             point_px = grid.px(*point_px)
         packet.put(PRINCIPAL_POINT, [number_text(v / (density * grid.scale)) for v in point_px])
@@ -188,9 +190,9 @@ class TagTransfer:
     def put_vignetting(
         self, packet: Packet, tags: Tags, grid: OutputGrid, from_source: FromSource, *, radiometry: bool
     ) -> None:
-        """The centre where it lies now, and the polynomial in the pixels that are written; `tags` are the band's own.
+        """Convert the vignetting's centre and polynomial to the pixels that are written; `tags` are the band's own.
 
-        With `radiometry` nothing of it, because the pixels have been corrected.
+        With `radiometry` they are removed, because the pixels have been corrected.
         """
         centre, k = tags.numbers(*VIGNETTING_CENTRE), tags.numbers(*VIGNETTING_POLYNOMIAL)
         if radiometry:
@@ -198,13 +200,13 @@ class TagTransfer:
             return
         if len(centre) != 2:
             return
-        here, beside = from_source(*centre), from_source(centre[0] + 1, centre[1])
-        magnification = math.dist(here, beside)
-        # Written so that nan passes nowhere.
+        new_centre, next_pixel = from_source(*centre), from_source(centre[0] + 1, centre[1])
+        magnification = math.dist(new_centre, next_pixel)
+        # In this form nan is out of range too.
         if not 1 / _MAX_MAGNIFICATION < magnification < _MAX_MAGNIFICATION:
             packet.remove([VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL])
             return
-        packet.put(VIGNETTING_CENTRE, [number_text(v) for v in grid.px(*here)])
+        packet.put(VIGNETTING_CENTRE, [number_text(v) for v in grid.px(*new_centre)])
         scaled = [v / (grid.scale * magnification) ** i for i, v in enumerate(k, start=1)]
         packet.put(VIGNETTING_POLYNOMIAL, [f"{v:.9e}" for v in scaled])
 
@@ -212,20 +214,20 @@ class TagTransfer:
         """Of the focal plane."""
         return pixels_per_mm(tags)
 
-    def is_turned(self, tags: Tags) -> bool:
-        """True where the principal point is of the image turned by 180 degrees."""
-        return self.turned_where_orientation_is_3 and tags.orientation == UPSIDE_DOWN
+    def is_rotated(self, tags: Tags) -> bool:
+        """True where the principal point is in the image rotated by 180 degrees."""
+        return self.principal_point_follows_orientation and tags.orientation == UPSIDE_DOWN
 
 
 UPSIDE_DOWN = 3
-"""EXIF Orientation of an image that is stored turned by 180 degrees."""
+"""EXIF Orientation of an image that is stored rotated by 180 degrees."""
 
 
-def turned(point_px: Sequence[float], size_px: tuple[int, int]) -> tuple[float, float]:
-    """A position of an image (width, height) in the image turned by 180 degrees, centres of pixels at whole numbers."""
+def rotated_180(point_px: Sequence[float], size_px: tuple[int, int]) -> tuple[float, float]:
+    """A position of an image (width, height) in the image rotated by 180 degrees, pixel centres at whole numbers."""
     return size_px[0] - 1 - point_px[0], size_px[1] - 1 - point_px[1]
 
 
 def number_text(value: float) -> str:
-    """As it stands in a tag."""
+    """A number as tags hold it."""
     return f"{value:.10g}"

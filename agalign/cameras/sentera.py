@@ -1,8 +1,8 @@
 """Sentera 6X (a folder a band) and Double 4K (two folders of JPEGs with equal names).
 
-6X files are registered on board by default, so that identity is tried beside Sentera:AlignMatrix, a band -> colour
+6X files are registered on board by default, so that identity is tried as well as Sentera:AlignMatrix, a band -> colour
 camera matrix. The Double 4K's second camera has red edge in its red and near infra-red in its blue channel; the two
-fire 0.3 s apart, so that hundreds of pixels lie between them.
+expose 0.3 s apart, which makes an offset of hundreds of pixels.
 """
 
 import re

@@ -1,6 +1,5 @@
-"""What is still true of a camera file once its band lies on the reference's grid: TIFF, Exif and GPS tags and the XMP
-packet, with the reference's geometry in place of the band's own, so that photogrammetry software takes the pixels for
-what they are.
+"""The tags of a camera file that still hold for its band on the reference's grid: TIFF, Exif and GPS tags and the XMP
+packet, with the reference's geometry in place of the band's own, as photogrammetry software needs them.
 """
 
 from collections.abc import Iterable
@@ -64,25 +63,25 @@ def band_tags(
 
     With `radiometry` black level, vignetting and exposure have been taken out of the pixels.
     """
-    own, theirs = _directories(source), _directories(reference.path)
+    own, of_reference = _directories(source), _directories(reference.path)
     first = _some(own[0], _OF_THE_FILE - _BLACK_LEVEL if radiometry else _OF_THE_FILE)
-    first |= _some(theirs[0], {_ORIENTATION})
+    first |= _some(of_reference[0], {_ORIENTATION})
     exif = {tag: entry for tag, entry in own[EXIF].items() if tag not in _NOT_CARRIED | _GEOMETRIC_EXIF}
     packet = Packet.parse(own[0][XMP].data if XMP in own[0] else b"")
     with suppress(UnreadableFileError):
-        theirs_packet = Packet.parse(theirs[0][XMP].data if XMP in theirs[0] else b"")
-        of_reference = read_tags(reference.path)
-        camera_of(of_reference).tag_transfer.put_geometry(packet, theirs_packet, reference, of_reference, grid)
-        of_source = read_tags(source)
-        tag_transfer = camera_of(of_source).tag_transfer
-        tag_transfer.put_vignetting(packet, of_source, grid, from_source, radiometry=radiometry)
+        reference_packet = Packet.parse(of_reference[0][XMP].data if XMP in of_reference[0] else b"")
+        reference_tags, own_tags = read_tags(reference.path), read_tags(source)
+        transfer = camera_of(reference_tags).tag_transfer
+        transfer.put_geometry(packet, reference_packet, reference, reference_tags, grid)
+        transfer = camera_of(own_tags).tag_transfer
+        transfer.put_vignetting(packet, own_tags, grid, from_source, radiometry=radiometry)
         if serialised := packet.serialised():
             first[XMP] = byte_string(serialised)
-    return TransferredTags(first, _on_grid(exif, theirs[EXIF], grid), own[GPS])
+    return TransferredTags(first, _on_grid(exif, of_reference[EXIF], grid), own[GPS])
 
 
 def _directories(path: Path) -> dict[int, Directory]:
-    """A file whose directories cannot be followed gives none: its pixels are good all the same."""
+    """A file's directories; empty ones where they are damaged, because its pixels may still be good."""
     try:
         return read_directories(path)
     except Exception:  # a damaged file makes a reader fail in any way

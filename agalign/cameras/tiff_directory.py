@@ -16,13 +16,20 @@ EXIF, GPS = 34665, 34853
 XMP = 700
 _SIZE = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 """Bytes of a value of each type."""
-_SWAPPED = {**_SIZE, 5: 4, 10: 4}
-"""Bytes that a byte order turns round together: a rational is two numbers."""
-_LONGEST_VALUE = 1 << 25
+_NUMBER_SIZE = {**_SIZE, 5: 4, 10: 4}
+"""Bytes of the numbers whose byte order is swapped: a rational is two numbers."""
+_RATIONAL, _SIGNED_RATIONAL = 5, 10
 _MAX_BYTES = 1 << 25
-"""Of the tags of one file, which are a few thousand; its pixels are elsewhere."""
+"""Of the tags of one file: cameras write a few thousand. Its pixels are elsewhere."""
 _MAX_ENTRIES = 4096
-_TOP = (1 << 32) - 1
+"""Of a directory: cameras write fewer than 100; a damaged count must not be followed."""
+_MAX_LONG = (1 << 32) - 1
+_MILLION = 1_000_000
+_MAX_MILLIONTHS = 4000
+"""Values below fit into 32 bits as millionths."""
+_HEADER_BYTES, _BIG_HEADER_BYTES = 8, 16
+_TIFF, _BIG_TIFF = 42, 43
+"""Version numbers."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,7 @@ def long(*values: int) -> Entry:
 
 
 def text(value: str) -> Entry:
-    """A text; what is not ASCII is written as UTF-8, as most readers take it."""
+    """A text; other characters than ASCII are written as UTF-8, which most readers expect."""
     data = value.encode() + b"\0"
     return Entry(2, len(data), data)
 
@@ -59,21 +66,21 @@ def byte_string(value: bytes, kind: int = 1) -> Entry:
 
 
 def rational(*values: float) -> Entry:
-    """Fractions, of millionths where they fit into 32 bits. Raises ValueError for what does not."""
+    """Fractions, of millionths where they fit into 32 bits. Raises ValueError for values that do not fit."""
     pairs = b""
     for value in values:
-        if not 0 <= value < _TOP:
-            raise ValueError(f"{value} is no TIFF fraction")
-        denominator = 1_000_000 if value < 4000 else max(1, int(_TOP / (value + 1)))
+        if not 0 <= value < _MAX_LONG:
+            raise ValueError(f"{value} does not fit into a TIFF fraction")
+        denominator = _MILLION if value < _MAX_MILLIONTHS else max(1, int(_MAX_LONG / (value + 1)))
         pairs += struct.pack("<II", round(value * denominator), denominator)
-    return Entry(5, len(values), pairs)
+    return Entry(_RATIONAL, len(values), pairs)
 
 
 def number(entry: Entry) -> float | None:
-    """The first value of an entry of numbers; None for others and for fractions of nothing."""
+    """The first value of an entry of numbers; None for other entries and for a denominator of 0."""
     formats = {3: "<H", 4: "<I", 8: "<h", 9: "<i", 11: "<f", 12: "<d"}
-    if entry.type in (5, 10):
-        numerator, denominator = struct.unpack_from("<II" if entry.type == 5 else "<ii", entry.data)
+    if entry.type in (_RATIONAL, _SIGNED_RATIONAL):
+        numerator, denominator = struct.unpack_from("<II" if entry.type == _RATIONAL else "<ii", entry.data)
         return numerator / denominator if denominator else None
     return float(struct.unpack_from(formats[entry.type], entry.data)[0]) if entry.type in formats else None
 
@@ -95,14 +102,14 @@ def read_directories(path: Path) -> dict[int, Directory]:
 
 
 def check_directories(path: Path) -> None:
-    """Raises ValueError where a TIFF is malformed or its tags declare more than a reader should be asked to hold."""
+    """Raises ValueError where a TIFF is malformed or its tags declare more bytes than any camera writes."""
     with path.open("rb") as file:
         layout, at, _ = _header(file)
         first = _entries(file, layout, at)[0]
         declared = sum(length for _, _, _, length, _ in first)
         for tag, kind, _, _, value in first:
             if tag in (EXIF, GPS) and kind in _SIZE:
-                place = _turned(value[: _SIZE[kind]], kind, layout.order)
+                place = _swapped(value[: _SIZE[kind]], kind, layout.order)
                 declared += sum(e[3] for e in _entries(file, layout, int.from_bytes(place, "little"))[0])
     if declared > _MAX_BYTES:
         raise ValueError(f"its tags declare {declared >> 20} MB")
@@ -140,7 +147,7 @@ class _Layout:
 
     @property
     def inline_bytes(self) -> int:
-        """Values up to this long stand in the entry itself."""
+        """Values up to this length are stored in the entry itself."""
         return struct.calcsize(self.offset)
 
     def pointer(self, place: int) -> Entry:
@@ -162,14 +169,14 @@ def _read_all(file: BinaryIO) -> dict[int, Directory]:
 def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
     """(layout, where the first directory is, where that is written)."""
     file.seek(0)
-    head = file.read(16)
+    head = file.read(_BIG_HEADER_BYTES)
     order = {b"II": "<", b"MM": ">"}.get(head[:2])
-    if order is None or len(head) < 8:
+    if order is None or len(head) < _HEADER_BYTES:
         raise ValueError("no TIFF header")
     (version,) = struct.unpack_from(order + "H", head, 2)
-    if version == 43 and len(head) == 16:
+    if version == _BIG_TIFF and len(head) == _BIG_HEADER_BYTES:
         return _Layout(order, "Q", "Q"), struct.unpack_from(order + "Q", head, 8)[0], 8
-    if version != 42:
+    if version != _TIFF:
         raise ValueError("no TIFF header")
     return _Layout(order, "I", "H"), struct.unpack_from(order + "I", head, 4)[0], 4
 
@@ -180,13 +187,13 @@ def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory
     result: Directory = {}
     left = _MAX_BYTES
     for tag, kind, number, length, value in entries:
-        if length == 0 or length > min(left, _LONGEST_VALUE):
+        if length == 0 or length > left:
             continue
         left -= length
         if length > layout.inline_bytes:
             file.seek(struct.unpack(layout.order + layout.offset, value)[0])
             value = _exactly(file, length)
-        result[tag] = Entry(kind, number, _turned(value[:length], kind, layout.order))
+        result[tag] = Entry(kind, number, _swapped(value[:length], kind, layout.order))
     return result, following
 
 
@@ -212,7 +219,7 @@ def _write_directory(file: BinaryIO, layout: _Layout, entries: Directory, follow
     """Append a directory, values first, and return where it is."""
     packed = []
     for tag, entry in sorted(entries.items()):
-        value = _turned(entry.data, entry.type, layout.order)
+        value = _swapped(entry.data, entry.type, layout.order)
         if len(value) > layout.inline_bytes:
             value = struct.pack(layout.order + layout.offset, _append(file, value))
         place = struct.pack(f"{layout.order}HH{layout.offset}", tag, entry.type, entry.count)
@@ -229,9 +236,9 @@ def _append(file: BinaryIO, data: bytes) -> int:
     return place
 
 
-def _turned(value: bytes, kind: int, order: str) -> bytes:
-    """Between little-endian and a file's byte order."""
-    size = _SWAPPED[kind]
+def _swapped(value: bytes, kind: int, order: str) -> bytes:
+    """A value converted between little-endian and a file's byte order."""
+    size = _NUMBER_SIZE[kind]
     if order == "<" or size == 1:
         return value
     return b"".join(value[i : i + size][::-1] for i in range(0, len(value), size))

@@ -21,12 +21,14 @@ Name = tuple[str, str]
 its URI without scheme, `www.`, version and closing slash, which firmware changes.
 """
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
-_DEEPEST_NAMESPACE = 4
-_DEEPEST = 50
-"""Elements within each other; cameras write six."""
-_LONGEST = 1 << 22
+_MAX_NAMESPACE_DEPTH = 4
+"""Parts of a namespace's path that a tag can be found by; cameras write at most three."""
+_MAX_DEPTH = 50
+"""Of nested elements; cameras write six."""
+_MAX_LENGTH = 1 << 22
+"""Characters of a packet; cameras write a few thousand."""
 _NAMESPACES = threading.Lock()
-_AROUND = re.compile(r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$", re.IGNORECASE)
+_SCHEME_AND_VERSION = re.compile(r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$", re.IGNORECASE)
 _PREFIX = re.compile(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""")
 
 
@@ -42,7 +44,7 @@ class Packet:
     def parse(cls, packet: Any) -> "Packet":
         """From bytes or text. A malformed packet is an empty one: cameras do write them, and the images are good."""
         text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
-        if not isinstance(text, str) or len(text) > _LONGEST:
+        if not isinstance(text, str) or len(text) > _MAX_LENGTH:
             return cls()
         start, end = text.find("<x:xmpmeta"), text.rfind("</x:xmpmeta>")
         if start < 0 or end < 0:
@@ -52,13 +54,13 @@ class Packet:
             root = fromstring(text)
         except (ParseError, DefusedXmlException, ValueError):
             return cls()
-        if _is_deeper(root, _DEEPEST):
+        if _is_deeper(root, _MAX_DEPTH):
             return cls()
         return cls(root, tuple(p for p in _PREFIX.findall(text) if not re.fullmatch(r"ns\d+", p[0])))
 
     def values(self) -> dict[Name, tuple[str, ...]]:
-        """{(namespace, name): values} from all rdf:Description blocks; the first of two counts. A value is found by
-        its own namespace and by those that it lies in.
+        """{(namespace, name): values} from all rdf:Description blocks; the first of two counts. A value has a key for
+        its own namespace and one for each namespace that contains it.
         """
         result: dict[Name, tuple[str, ...]] = {}
         for description in self._descriptions():
@@ -106,7 +108,7 @@ class Packet:
                     return
 
     def serialised(self) -> bytes:
-        """As it stands in a file; nothing for an empty packet."""
+        """The bytes of the packet as a file holds them; empty for an empty packet."""
         if self.root is None:
             return b""
         with _registered(self.prefixes):
@@ -120,19 +122,19 @@ class Packet:
 
 @contextmanager
 def _registered(prefixes: Sequence[tuple[str, str]]) -> Iterator[None]:
-    """Namespaces are written under the prefixes they came with: the library keeps one list for the whole process, in
-    which what one file says must not reach another.
+    """Write namespaces under the prefixes they were read with. The library keeps one list of prefixes for the whole
+    process, so it is restored afterwards: one file's prefixes must not reach another file.
     """
-    everybodys: dict[str, str] = vars(ElementTree)["_namespace_map"]
+    prefixes_of_the_process: dict[str, str] = vars(ElementTree)["_namespace_map"]
     with _NAMESPACES:
-        before = dict(everybodys)
+        before = dict(prefixes_of_the_process)
         try:
             for prefix, uri in prefixes:
                 ElementTree.register_namespace(prefix, uri)
             yield
         finally:
-            everybodys.clear()
-            everybodys.update(before)
+            prefixes_of_the_process.clear()
+            prefixes_of_the_process.update(before)
 
 
 def _is_deeper(root: Element, deepest: int) -> bool:
@@ -159,7 +161,7 @@ def _put_texts(element: Element, values: Sequence[str]) -> None:
 
 @lru_cache(maxsize=4096)  # a thousand captures of one camera have the same few tags
 def _names(tag: str) -> tuple[Name, ...]:
-    """A tag's name in its namespace and in those that it lies in; none for RDF's own and for one without a place."""
+    """A tag's name in its namespace and in those that contain it; none for RDF's own namespaces and for none."""
     uri, _, name = tag.removeprefix("{").rpartition("}")
     return tuple((namespace, name) for namespace in _namespaces(uri))
 
@@ -171,6 +173,6 @@ def _is_one_of(tag: str, names: Collection[Name]) -> bool:
 def _namespaces(uri: str) -> list[str]:
     if uri.startswith("http://www.w3.org/"):
         return []
-    place = _AROUND.sub("", uri)
-    parts = place.split("/")[:_DEEPEST_NAMESPACE]
+    place = _SCHEME_AND_VERSION.sub("", uri)
+    parts = place.split("/")[:_MAX_NAMESPACE_DEPTH]
     return ["/".join(parts[:count]) for count in range(len(parts), 0, -1)] if place else []
