@@ -40,20 +40,20 @@ def align(
     """Find the homography from one image to another of the same scene, whatever their modalities.
 
     fixed, moving
-        (H, W), (H, W, C) or (C, H, W) arrays of any numeric type; their sizes may differ. Integer images are taken as
-        saturated at their type's largest value; constant fill that runs in from the border, and nan, is left aside.
+        (H, W), (H, W, C) or (C, H, W) arrays of any numeric type; their sizes may differ. The largest value of an
+        integer type counts as saturated; constant fill connected to the border, and nan, are ignored.
     seed
-        3x3 fixed_to_moving to start from, good to some 10 % of the image; None starts from the images themselves.
+        3x3 fixed_to_moving to start from, within about 10 % of the image size; None starts from the images alone.
     seed_std_px
-        How well the seed is known, standard deviation in px of `fixed`. Where a scene repeats, the place within three
-        of these is taken; without it such a scene is not aligned.
+        Standard error of the seed in px of `fixed`. In a repetitive scene the match within three of these is taken;
+        without it such a scene is not aligned.
     fixed_valid, moving_valid
         (H, W), False where pixels must not be used.
 
-    Returns an Alignment whose `fixed_to_moving` (3x3) maps a pixel of `fixed` to a pixel of `moving`: x right, y down,
-    (0, 0) the centre of the top-left pixel. Look at its `status`: only `aligned` has passed the checks; `seed_only`
-    and `failed` carry the seed and say why in `reason`.
-    Raises InputError for arrays that are no images, GeometryError for a seed that is no homography.
+    Returns an Alignment. Its `fixed_to_moving` (3x3) maps a pixel of `fixed` to a pixel of `moving`: x right, y down,
+    (0, 0) the centre of the top-left pixel. Check its `status`: only `aligned` has passed verification; `seed_only` and
+    `failed` have the seed's homography and a `reason`.
+    Raises InputError for arrays that are not images, GeometryError for a seed that is not a homography.
     """
     settings = settings or Settings()
     one = raster_of(fixed, fixed_valid, "fixed")
@@ -74,7 +74,7 @@ def warp_onto(
     valid: ArrayLike | None = None,
     interpolation: Interpolation = "lanczos",
 ) -> tuple[NDArray[np.generic], Mask]:
-    """Resample a single-band image (H, W) onto a fixed grid of (width, height) pixels; its type is kept.
+    """Resample a single-band image (H, W) onto a fixed grid of (width, height) pixels; the type stays the same.
 
     Returns the pixels and their mask, (height, width) each. Raises InputError and GeometryError.
     """
@@ -108,9 +108,9 @@ def align_folder(
 ) -> list[CaptureReport]:
     """Align every capture below `folder` into `out` and write the summary and the report.
 
-    `run` says how: how many captures at a time, or on which executor; with several processes the calling script must
-    be importable (`if __name__ == "__main__":`). `model` is a file of an earlier run's `models` folder to start from.
-    Raises InputError where there is no such folder, OutputError where `out` cannot be written, ConfigurationError
+    `run` sets the number of captures at a time, or the executor; with several processes the calling script must be
+    importable (`if __name__ == "__main__":`). `model` is a file from the `models` folder of an earlier run.
+    Raises InputError if the folder does not exist, OutputError where `out` cannot be written, ConfigurationError
     for a model of another camera.
     """
     from agalign.products.report import write_pages

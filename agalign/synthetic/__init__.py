@@ -1,4 +1,4 @@
-"""A synthetic flight whose truth is known: the ground, the rig, the files, and the score of an alignment."""
+"""A synthetic flight with ground truth: the ground, the rig, the files, and the score of an alignment."""
 
 from agalign.synthetic.flight import make_flight
 

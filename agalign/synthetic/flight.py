@@ -1,7 +1,7 @@
-"""A synthetic flight over a farm, written as a MicaSense-like camera would, with the truth beside it.
+"""A synthetic flight over a farm in the files of a MicaSense-like camera, with its ground truth.
 
 The scene is a plane of parcels with crop rows of different directions and spacings, bare soil, tracks and trees, or
-terraces with trees that stand up from them. Each band sees it through its own lens (distortion, principal point), from
+terraces with trees on them. Each band sees it through its own lens (distortion, principal point), from
 its own place and angle in the rig, with its own spectrum: vegetation is darker than soil in the visible bands and far
 brighter in the near infra-red.
 """
@@ -34,33 +34,33 @@ from agalign.values.mapping import splined
 ALTITUDE_M = 22.0, 34.0
 _TIES, _TIES_OVER_RELIEF = (25, 19), (65, 49)
 _CAPTURES_A_FIELD = 4
-"""Taken beside each other over one painted ground: memory is one ground's, however long the flight."""
+"""Captures over one painted ground; a longer flight gets more grounds in turn, so that memory stays constant."""
 _WARMEST_C, _HEAT_NOISE_C = 50.0, 0.05
 _VIGNETTING = 0.35
-"""What the corners lack of the middle's light."""
+"""Share of the light at the centre that the corners lack."""
 
 
 Spoil = Callable[[Field, np.random.Generator], Field]
-"""What becomes of the light (height, width), 0 to 1, that falls on a sensor."""
+"""Changes the light (height, width), 0 to 1, that reaches a sensor."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One capture to be taken."""
+    """One planned capture."""
 
     pose: Pose
     ground: Ground
     spoil: Spoil | None = None
     spoilt: tuple[str, ...] | None = None
-    """Names of the bands that are spoilt; None for all."""
+    """Names of the bands that `spoil` changes; None for all."""
     without: tuple[str, ...] = ()
-    """Bands whose files are missing."""
+    """Bands without a file."""
     trouble: str = ""
-    """What is wrong with it."""
+    """What is wrong with the capture, as truth.json names it."""
     sun: float = 1.0
-    """How bright it is, beside what the light sensor says."""
+    """Sunlight as a multiple of what the light sensor measures."""
     shutter: float = 1.0
-    """How long it is exposed, beside the others."""
+    """Exposure time as a multiple of the usual one."""
 
 
 def make_flight(
@@ -72,8 +72,8 @@ def make_flight(
     The truth is {capture: {"reference": file, "bands": {file: {"fixed_to_moving": [[...]], "ties": [[x_ref, y_ref,
     x_mov, y_mov], ...]}}}}: the homography between undistorted pixels, and ties in raw pixels, exact to 0.001 px; the
     centre of the top-left pixel is (0, 0). With `relief_m` the ground has terraces of that height and trees half as
-    high: the homography then is the plane's below them, and the ties are true. `altitude_m` is between what heights
-    above the plane the captures are taken. Returns the path of truth.json.
+    high; the homography is then that of the plane below them, and the ties include the relief. `altitude_m` is the
+    lowest and the highest altitude above the plane. Returns the path of truth.json.
     """
     rng, truth = np.random.default_rng(rng_seed), dict[str, Any]()
     for first in range(0, captures, _CAPTURES_A_FIELD):
@@ -86,7 +86,7 @@ def make_flight(
 def write_shots(
     folder: Path, shots: Sequence[Shot], size_px: tuple[int, int], camera: CameraSpec, rng: np.random.Generator
 ) -> Path:
-    """Write captures and their truth as `make_flight` does, with each one's "trouble" beside it."""
+    """Write captures and their truth as `make_flight` does; the truth also has the "trouble" of each capture."""
     return _write_truth(folder, _write(folder, shots, size_px, camera, rng))
 
 
@@ -94,7 +94,7 @@ def _write(
     folder: Path, shots: Sequence[Shot], size_px: tuple[int, int], camera: CameraSpec, rng: np.random.Generator,
     before: int = 0,
 ) -> dict[str, Any]:  # fmt: skip
-    """Write captures, of which so many were taken before on other fields, farther south; returns their truth."""
+    """Write captures after `before` others on other fields farther south; returns their truth."""
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
     grounds = {id(shot.ground): shot.ground for shot in shots}
@@ -155,7 +155,7 @@ def plan_flight(
 def true_ties(
     ground: Ground, reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]
 ) -> list[list[float]]:
-    """[x_ref, y_ref, x_mov, y_mov] in raw pixels on a lattice, where both lie in their images."""
+    """[x_ref, y_ref, x_mov, y_mov] in raw pixels on a lattice, where both points are inside their images."""
     here = geometry.lattice(*reference.size_px(size_px), *(_TIES if ground.height_m is None else _TIES_OVER_RELIEF))
     place, rays = place_and_rays(band, pose, size_px)
     seen = on_ground(ground, reference, pose, size_px, here)

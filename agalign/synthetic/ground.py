@@ -34,9 +34,9 @@ class Ground:
     vigour: Field
     metres_per_px: float
     height_m: Field | None = None
-    """Above the plane; None where everything lies on it."""
-    laid_out: Field | None = None
-    """Reflectance of what was laid on it, alike in all bands; nan where the ground is bare."""
+    """Height above the plane; None for flat ground."""
+    overlay: Field | None = None
+    """Reflectance of objects on the ground, equal in all bands; nan elsewhere."""
 
 
 def paint_ground(
@@ -92,8 +92,8 @@ def reflectance(ground: Ground, band: BandSpec) -> Field:
     soil = band.soil * ground.brightness
     bare = 1 - ground.crop - ground.tree
     result = soil * bare + crop * ground.crop + band.tree * (1 + 0.5 * ground.vigour) * ground.tree
-    if ground.laid_out is not None:
-        result = np.where(np.isnan(ground.laid_out), result, ground.laid_out)
+    if ground.overlay is not None:
+        result = np.where(np.isnan(ground.overlay), result, ground.overlay)
     return np.asarray(result, np.float32)
 
 
@@ -169,7 +169,7 @@ def _trees(rng: np.random.Generator, side: int, metre: float) -> Field:
 
 
 def _noise(rng: np.random.Generator, side: int, grain_px: float) -> Field:
-    """Gaussian noise of mean 0 and standard deviation 1 whose blobs are `grain_px` wide."""
+    """Gaussian noise of mean 0 and standard deviation 1 with blobs `grain_px` wide."""
     reduction = max(1.0, grain_px / 2)
     small = max(8, int(np.ceil(side / reduction)))
     coarse = cv2.GaussianBlur(

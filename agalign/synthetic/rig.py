@@ -1,5 +1,6 @@
-"""What a synthetic camera is: the lenses of its bands, their places and angles in the rig, what they are sensitive to,
-and how they see the ground from a pose. `synthetic.cameras` has the camera of the demo.
+"""A synthetic camera: the lenses, positions, angles and spectra of its bands, and their view of the ground.
+
+`synthetic.cameras` has the camera of the demo.
 """
 
 from abc import ABC, abstractmethod
@@ -33,21 +34,21 @@ class BandSpec:
     rig_index: int
     rig_degrees: tuple[float, float, float]
     baseline_m: tuple[float, float]
-    """Place of the lens in the rig, metres right of and below the rig's centre."""
+    """Position of the lens in the rig, metres right of and below the centre of the rig."""
     distortion: tuple[float, float, float, float, float]
     """k1, k2, p1, p2, k3."""
     centre_offset_px: tuple[float, float]
     """Of the principal point from the middle of a 1280 x 960 sensor."""
     delay_s: float = 0.0
-    """How much later than the first band it is exposed."""
+    """Delay of its exposure after the first band's."""
     sees: Literal["light", "colour", "heat"] = "light"
-    """In colour it is one of three that share a file; what a thermal band sees is given as shares of 50 degrees."""
+    """colour: one of three bands in one file; heat: the reflectances are temperatures, as shares of 50 degrees C."""
     size_ratio: tuple[float, float] = (1.0, 1.0)
-    """Pixels of its sensor beside the camera's, along x and y."""
+    """Width and height of its images in those of the reference."""
     tags_off_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """By how much its tags miss its angles."""
+    """Error of the angles in its tags."""
     view: float = 1.0
-    """Its field of view beside that of the first camera below."""
+    """Field of view as a multiple of the RedEdge-M's."""
 
     @property
     def exposure(self) -> float:
@@ -133,12 +134,12 @@ class CameraSpec(ABC):
 
     @property
     def sharpest(self) -> float:
-        """Most pixels an angle that a band has, beside the first camera's."""
+        """Highest angular resolution of a band, as a multiple of the RedEdge-M's."""
         return max(b.size_ratio[0] / b.view for b in self.bands)
 
     @property
     def widest(self) -> float:
-        """Widest field of view, likewise."""
+        """Widest field of view of a band, as a multiple of the RedEdge-M's."""
         return max(b.view for b in self.bands)
 
 

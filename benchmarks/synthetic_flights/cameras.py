@@ -90,4 +90,4 @@ SENTERA_6X = SenteraCamera("6X", tuple(
         (BANDS[4], "RedEdge", 715.0, 10.0), (BANDS[3], "NIR", 840.0, 20.0),
     ))
 ), 1, (2048, 1536))  # fmt: skip
-"""A folder a band; registered on board but for what is left by angles and parallax."""
+"""One folder per band; registered on board except for the parallax and small angles."""

@@ -14,7 +14,7 @@ from agalign.values import geometry
 _BAND_NAMES = {"Green": "G", "Red": "R", "RedEdge": "RE", "NIR": "NIR"}
 _SERIAL = "SYNTHETIC0000001"
 _TO_COLOUR = 1.7162, (1296.0, 972.0), (2639.9, 1978.0), (2592, 5280)
-"""Of one real Mavic 3M: scale, and what of the designed bands' frame lies where in the colour photograph, of widths."""
+"""Of one real Mavic 3M, band frame to colour photograph: scale, a point in each, and their widths in px."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class DjiCamera(CameraSpec):
         write_tiff(path, pixels, self, band, exposure, xmp, _SERIAL, {}, {})
 
     def _plane(self, band: BandSpec, size_px: tuple[int, int]) -> str:
-        """Where a band's pixels lie in what all share, as far as the unit's tags tell, and that in the photograph."""
+        """The tags that map a band's pixels to the common plane, or to the photograph."""
         if self.calibrated:
             plane = geometry.normalised(to_plane(self.bands[self.reference], band, size_px))
             return f'drone-dji:CalibratedHMatrix="{_numbers(plane)}"'
@@ -64,7 +64,7 @@ class DjiCamera(CameraSpec):
         )
 
     def _write_colour(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
-        """One plane of a photograph: the others are as they were, or dark where there is no file yet."""
+        """Write one plane of a photograph and keep the others; without a file they are dark."""
         planes = [b.name for b in self.bands if b.sees == "colour"]
         kept = path.with_suffix(".npy")
         before = np.load(kept) if kept.is_file() else np.zeros((*pixels.shape, len(planes)), np.uint8)

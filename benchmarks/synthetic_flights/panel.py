@@ -49,14 +49,14 @@ def with_panel(ground: Ground) -> Ground:
     side = len(ground.crop)
     axis = (np.arange(side) - (side - 1) / 2) * ground.metres_per_px
     x, y = axis[None, :] + _APART_M / 2, axis[:, None]
-    laid = np.full((side, side), np.nan, np.float32)
-    laid[(np.abs(x - _APART_M / 2) < 0.24) & (np.abs(y) < 0.15)] = _CASE
-    laid[_within(x, y, _SQUARE_M)] = PANEL_ALBEDO
-    laid[_within(x - _APART_M, y, 1.3 * _CODE_M)] = _LABEL
+    overlay = np.full((side, side), np.nan, np.float32)
+    overlay[(np.abs(x - _APART_M / 2) < 0.24) & (np.abs(y) < 0.15)] = _CASE
+    overlay[_within(x, y, _SQUARE_M)] = PANEL_ALBEDO
+    overlay[_within(x - _APART_M, y, 1.3 * _CODE_M)] = _LABEL
     here = _within(x - _APART_M, y, _CODE_M)
     rows, columns = np.flatnonzero(here.any(axis=1)), np.flatnonzero(here.any(axis=0))
-    laid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = _code(len(columns), len(rows))
-    return replace(ground, laid_out=laid)
+    overlay[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = _code(len(columns), len(rows))
+    return replace(ground, overlay=overlay)
 
 
 def _within(x: Field, y: Field, side_m: float) -> Field:

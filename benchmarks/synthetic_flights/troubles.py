@@ -1,4 +1,4 @@
-"""A flight of troubles: what goes wrong in a season, in one flight, with the truth beside it."""
+"""A flight with the faults of a whole season, with its ground truth."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -25,8 +25,8 @@ Make = Callable[[np.random.Generator, Pose, tuple[int, int]], Shot]
 def make_troubled_flight(
     folder: Path, captures: int = 60, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0
 ) -> Path:
-    """Write a flight of which about the half is troubled; its truth names each capture's "trouble", "" where there is
-    none. Returns the path of truth.json, as `make_flight` does.
+    """Write a flight with faults in about half of its captures; its truth has the "trouble" of each, "" for none.
+    Returns the path of truth.json, as `make_flight` does.
     """
     rng = np.random.default_rng(rng_seed)
     shots = [make(rng, _pose(rng, number), size_px) for number, make in enumerate(_plan(captures))]
@@ -38,7 +38,7 @@ def make_two_headings(
     camera: CameraSpec = MAVIC, line: int = _LINE, *, lakes: bool = True,
 ) -> Path:  # fmt: skip
     """Write a flight of lines to and fro with the camera facing one way, by default one that exposes its bands one
-    after another; with `lakes` the captures before and after each turn lie over water.
+    after another; with `lakes` the captures before and after each turn are over water.
     """
     rng = np.random.default_rng(rng_seed)
     shots = []
@@ -149,7 +149,7 @@ def _planted(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> 
     along = (np.cos(angle) * axis[None, :] + np.sin(angle) * axis[:, None]) / period
     across = (np.cos(angle) * axis[:, None] - np.sin(angle) * axis[None, :]) / period
     row, column = np.floor(along).astype(int), np.floor(across).astype(int)
-    # Each tree stands a little beside its place.
+    # Each tree is a little off the lattice.
     jitter = 0.03 * rng.normal(size=(2, 512, 512)).astype(np.float32)
     off = np.hypot(along - row - 0.5 + jitter[0][row % 512, column % 512],
                    across - column - 0.5 + jitter[1][row % 512, column % 512])  # fmt: skip
