@@ -21,6 +21,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path, tmp_path: Path) -> None:
     """Where none is said it is the system's, which on Windows is not UTF-8."""
     options = ["--only-seed", "--layout", "both", "--error-map", "--stac"]
@@ -31,6 +32,7 @@ def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path
         assert done.returncode in (0, 3), done.stderr
 
 
+@pytest.mark.slow
 def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As they do on Windows and macOS: nothing of this process is there in them."""
     monkeypatch.setattr(workers, "get_all_start_methods", lambda: ["spawn"])

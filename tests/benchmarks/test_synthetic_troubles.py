@@ -19,6 +19,7 @@ from agalign.values import geometry
 SIZE = 160, 120
 
 
+@pytest.mark.slow
 def test_every_trouble_is_in_the_flight_and_in_its_truth(tmp_path: Path) -> None:
     truth = json.loads(make_troubled_flight(tmp_path, 32, SIZE).read_text())
     troubles = [t["trouble"] for t in truth.values()]
@@ -31,6 +32,7 @@ def test_every_trouble_is_in_the_flight_and_in_its_truth(tmp_path: Path) -> None
         assert len(result[name].moving) == (3 if known["trouble"] == "no NIR" else 4)
 
 
+@pytest.mark.slow
 def test_half_of_the_pixels_are_saturated(tmp_path: Path) -> None:
     truth = json.loads(make_troubled_flight(tmp_path, 32, SIZE).read_text())
     (name,) = (n for n, t in truth.items() if t["trouble"] == "half saturated")

@@ -20,6 +20,7 @@ def told(*arguments: str) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_it_knows_versions_devices_and_the_disk(tmp_path: Path) -> None:
     code, text = told(str(tmp_path), "--json")
     facts = json.loads(text)
