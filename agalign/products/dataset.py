@@ -1,5 +1,6 @@
-"""Aligned captures as xarray has them: a variable a band, with its wavelength and unit, read when it is asked for."""
+"""Aligned captures as xarray datasets: a variable for each band, with its wavelength and unit, read lazily."""
 
+import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 
 _RAW_UNIT = "count"
 _MORE = re.compile(r"(?:\.stac)?\.json$|\.tiff?$", re.IGNORECASE)
+_COORDINATES = ("latitude", "longitude", "altitude_m")
 _CHUNKS = {"x": 1024, "y": 1024}
 
 
@@ -40,30 +42,37 @@ def open_flight(out: str | Path, *, masked: bool = False) -> "xarray.Dataset":
     """
     xr = import_xarray()
     folder = Path(out)
-    sidecars = [(p, read_sidecar(p)) for p in find_sidecars(folder)] if folder.is_dir() else []
-    sidecars = [(p, s) for p, s in sidecars if s.output is not None]
-    if not sidecars:
-        raise InputError(f"{folder}: no aligned captures there; give the output folder of a run")
-    sizes = {s.output.crop[2:]: p for p, s in sidecars if s.output is not None}
-    if len(sizes) > 1:
-        raise InputError(
-            f"{folder}: its captures differ in size ({', '.join(p.stem for p in sizes.values())}); open them one by one"
-        )
-    opened = [_dataset(s, p.parent, masked=masked) for p, s in sidecars]
+    captures = _captures_with_output(folder)
+    opened = [_dataset(s, p.parent, masked=masked) for p, s in captures]
     common = [name for name in opened[0].data_vars if all(name in one for one in opened)]
-    # Each capture has a place of its own on the map: in a stack only the pixels are alike.
-    plain = [_without_place(one[common]) for one in opened]
+    # Each capture has its own position on the map: only their pixels can be stacked.
+    plain = [_in_pixels(one[common]) for one in opened]
     stacked = xr.concat(plain, dim="capture", join="override", combine_attrs="override", coords="minimal")
-    places = [s.position for _, s in sidecars]
     stacked.attrs = {k: opened[0].attrs[k] for k in ("camera", "reference_band")}
     flight: xarray.Dataset = stacked.assign_coords(
-        capture=[(p.parent / p.stem).relative_to(folder).as_posix() for p, _ in sidecars],
-        time=("capture", [_moment(s) for _, s in sidecars]),
-        latitude=("capture", [float("nan") if q is None else q.latitude for q in places]),
-        longitude=("capture", [float("nan") if q is None else q.longitude for q in places]),
-        altitude_m=("capture", [float("nan") if q is None or q.altitude_m is None else q.altitude_m for q in places]),
+        capture=[(p.parent / p.stem).relative_to(folder).as_posix() for p, _ in captures],
+        time=("capture", [_moment(s) for _, s in captures]),
+        **{name: ("capture", [_coordinate(s, name) for _, s in captures]) for name in _COORDINATES},
     )
     return flight
+
+
+def _captures_with_output(folder: Path) -> list[tuple[Path, Sidecar]]:
+    """The sidecars with rasters of one size, and their paths. Raises InputError."""
+    read = [(p, read_sidecar(p)) for p in find_sidecars(folder)] if folder.is_dir() else []
+    written = [(p, s) for p, s in read if s.output is not None]
+    if not written:
+        raise InputError(f"{folder}: no aligned captures there; give the output folder of a run")
+    sizes = {s.output.crop[2:]: p.stem for p, s in written if s.output is not None}
+    if len(sizes) > 1:
+        raise InputError(f"{folder}: its captures differ in size ({', '.join(sizes.values())}); open them one by one")
+    return written
+
+
+def _coordinate(sidecar: Sidecar, name: str) -> float:
+    """A coordinate of the capture's position; nan where it is unknown."""
+    value = None if sidecar.position is None else getattr(sidecar.position, name)
+    return math.nan if value is None else float(value)
 
 
 def import_xarray() -> Any:
@@ -125,7 +134,7 @@ def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str) -
     return one
 
 
-def _without_place(dataset: "xarray.Dataset") -> "xarray.Dataset":
+def _in_pixels(dataset: "xarray.Dataset") -> "xarray.Dataset":
     counted = {axis: range(dataset.sizes[axis]) for axis in ("y", "x")}
     return dataset.drop_vars("spatial_ref", errors="ignore").assign_coords(counted)
 

@@ -101,9 +101,9 @@ def sidecar_of(context: ProductContext) -> Sidecar:
 
 def _output_part(context: ProductContext) -> OutputPart:
     """The stack and the band files, which readers of before `products` know."""
-    stack = next((_file_part(f, context) for f in context.written if f.kind == Stack.kind), None)
-    band_files = [_file_part(f, context) for f in context.written if f.kind == BandFiles.kind]
-    values = {f.nodata for f in band_files} if stack is None else {stack.nodata}
+    stacks, band_files = _file_parts(Stack.kind, context), _file_parts(BandFiles.kind, context)
+    stack = stacks[0] if stacks else None
+    values = {part.nodata for part in stacks or band_files}
     grid = context.grid
     return OutputPart(
         file=None if stack is None else stack.file,
@@ -116,8 +116,12 @@ def _output_part(context: ProductContext) -> OutputPart:
     )
 
 
-def _file_part(file: WrittenFile, context: ProductContext) -> FilePart:
-    return FilePart(file=_name(file.path, context), bytes=file.path.stat().st_size, nodata=_nodata(file.nodata))
+def _file_parts(kind: str, context: ProductContext) -> list[FilePart]:
+    return [
+        FilePart(file=_name(file.path, context), bytes=file.path.stat().st_size, nodata=_nodata(file.nodata))
+        for file in context.written
+        if file.kind == kind
+    ]
 
 
 def _product_part(file: WrittenFile, context: ProductContext) -> ProductPart:

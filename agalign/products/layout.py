@@ -1,4 +1,4 @@
-"""Which pixels are written of a capture: its layers, and the grid that they have in common."""
+"""Which pixels of a capture are written: its layers, and their common grid."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -17,7 +17,7 @@ from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping, mapping_of
 
 _FLIGHT_MARGIN_PX = 2
-"""What captures that the rig was not learnt on may differ by."""
+"""How far captures that the rig was not learnt on may exceed its extremes."""
 _BORDER_POINTS = 64
 
 
@@ -51,39 +51,79 @@ def output_layers(
 
     With the flight's `rig` the grid is that of all its captures: one flight, one geometry.
     """
-    reference = capture.reference
-    mappings = {b.name: mapping_of(reference, b, alignments[b.name]) for b in capture.moving if b.name in alignments}
-    scale = _finest_scale(mappings.values(), reference) if settings.resolution == "finest" else 1.0
-    own = PixelMapping(geometry.identity())
-    undistorted = settings.undistort and reference.lens is not None
-    size_px = round(reference.width_px * scale), round(reference.height_px * scale)
-    scales = size_px[0] / reference.width_px, size_px[1] / reference.height_px
+    pixels = _OutputPixels.of(capture, alignments, settings)
+    layers = _layers(capture, alignments, pixels)
+    moved = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
+    crop = _crop(capture, moved, pixels, settings, rig)
+    has_gaps = not _covers(moved, crop)
+    grid = OutputGrid(crop.x0, crop.y0, crop.width, crop.height, pixels.scale_xy, pixels.undistorted, has_gaps)
+    return layers, grid
 
-    def on_grid(mapping: PixelMapping) -> PixelMapping:
-        """A mapping of the reference's raw pixels as one of the pixels that are written."""
-        if reference.lens is not None and undistorted:
-            mapping = mapping.from_undistorted(reference.lens)
-        return mapping if scale == 1.0 else mapping.rescaled(scales, (1.0, 1.0))
 
-    mappings = {name: on_grid(mapping) for name, mapping in mappings.items()}
-    copied = scale == 1.0 and not undistorted
-    layers = [
-        Layer(b, None if copied else on_grid(own), is_reference=True)
-        if b is reference
-        else Layer(b, mappings.get(b.name))
+@dataclass(frozen=True)
+class _OutputPixels:
+    """The reference's pixels as they are written, before the crop: finer, or without lens distortion."""
+
+    reference: Band
+    size_px: tuple[int, int]
+    undistorted: bool
+
+    @classmethod
+    def of(cls, capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings) -> "_OutputPixels":
+        reference, scale = capture.reference, 1.0
+        if settings.resolution == "finest":
+            scale = _finest_scale(_mappings(capture, alignments).values(), reference)
+        size_px = round(reference.width_px * scale), round(reference.height_px * scale)
+        return cls(reference, size_px, settings.undistort and reference.lens is not None)
+
+    @property
+    def scale_xy(self) -> tuple[float, float]:
+        """Output pixels per pixel of the reference's file."""
+        return self.size_px[0] / self.reference.width_px, self.size_px[1] / self.reference.height_px
+
+    @property
+    def are_copied(self) -> bool:
+        """True where the reference's pixels are written as they are."""
+        return self.size_px == self.reference.size_px and not self.undistorted
+
+    def on_grid(self, mapping: PixelMapping) -> PixelMapping:
+        """Return a mapping of the reference's raw pixels as one of the output pixels."""
+        if self.reference.lens is not None and self.undistorted:
+            mapping = mapping.from_undistorted(self.reference.lens)
+        return mapping if self.size_px == self.reference.size_px else mapping.rescaled(self.scale_xy, (1.0, 1.0))
+
+
+def _mappings(capture: Capture, alignments: Mapping[str, Alignment]) -> dict[str, PixelMapping]:
+    """Raw pixels of the reference to raw pixels of each usable moving band."""
+    usable = [b for b in capture.moving if b.name in alignments]
+    return {b.name: mapping_of(capture.reference, b, alignments[b.name]) for b in usable}
+
+
+def _layers(capture: Capture, alignments: Mapping[str, Alignment], pixels: _OutputPixels) -> list[Layer]:
+    mappings = {name: pixels.on_grid(mapping) for name, mapping in _mappings(capture, alignments).items()}
+    own = None if pixels.are_copied else pixels.on_grid(PixelMapping(geometry.identity()))
+    return [
+        Layer(b, own, is_reference=True) if b is capture.reference else Layer(b, mappings.get(b.name))
         for b in capture.bands
     ]
-    moved = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
-    crop = Tile(0, 0, *size_px)
-    if settings.crop != "none":
-        whole = [] if rig is None or settings.crop == "common" else _of_the_flight(capture, rig)
-        given = [(on_grid(mapping), band) for mapping, band in whole]
-        # The reference's own border takes part where it is resampled too.
-        given += [(m, b) for m, b in moved if b is reference]
-        result = common_area(given if whole else moved, *size_px)
-        crop = crop if result is None else _inset(result, _FLIGHT_MARGIN_PX if whole else 0)
-    grid = OutputGrid(crop.x0, crop.y0, crop.width, crop.height, scales, undistorted, not _covers(moved, crop))
-    return layers, grid
+
+
+def _crop(
+    capture: Capture, moved: list[tuple[PixelMapping, Band]], pixels: _OutputPixels, settings: WriteSettings,
+    rig: Rig | None,
+) -> Tile:  # fmt: skip
+    """The rectangle of the output pixels that is written."""
+    whole = Tile(0, 0, *pixels.size_px)
+    if settings.crop == "none":
+        return whole
+    of_flight = [] if rig is None or settings.crop == "common" else _of_the_flight(capture, rig)
+    if not of_flight:
+        return common_area(moved, *pixels.size_px) or whole
+    limits = [(pixels.on_grid(mapping), band) for mapping, band in of_flight]
+    # The reference's own border takes part where it is resampled too.
+    limits += [(mapping, band) for mapping, band in moved if band is capture.reference]
+    area = common_area(limits, *pixels.size_px)
+    return whole if area is None else _inset(area, _FLIGHT_MARGIN_PX)
 
 
 def _of_the_flight(capture: Capture, rig: Rig) -> list[tuple[PixelMapping, Band]]:
@@ -104,19 +144,19 @@ def _inset(tile: Tile, margin_px: int) -> Tile:
 
 
 def _covers(mappings: list[tuple[PixelMapping, Band]], tile: Tile) -> bool:
-    """True where every pixel of a tile lies inside every moving image: where those along its border do."""
+    """True where every pixel of a tile is inside every moving image; only those along its border are tested."""
     x, y = (np.linspace(a, a + n - 1, _BORDER_POINTS) for a, n in ((tile.x0, tile.width), (tile.y0, tile.height)))
     sides = [(x, np.full_like(x, v)) for v in y[[0, -1]]] + [(np.full_like(y, v), y) for v in x[[0, -1]]]
     border = np.concatenate([np.stack(side, axis=-1) for side in sides])
     for mapping, band in mappings:
-        there = mapping(border)
-        if not ((there >= 0) & (there <= np.subtract(band.size_px, 1))).all():
+        mapped = mapping(border)
+        if not ((mapped >= 0) & (mapped <= np.subtract(band.size_px, 1))).all():
             return False
     return True
 
 
 def _finest_scale(mappings: Iterable[PixelMapping], reference: Band) -> float:
-    """How many of the finest band's pixels lie along one of the reference's, in the middle of the image."""
+    """Pixels of the finest band per pixel of the reference along a line in the middle of the image, at least 1."""
     middle = (np.array(reference.size_px) - 1) / 2
     finest = 1.0
     for mapping in mappings:
@@ -126,15 +166,15 @@ def _finest_scale(mappings: Iterable[PixelMapping], reference: Band) -> float:
 
 
 def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height_px: int) -> Tile | None:
-    """The largest rectangle of the reference grid that lies inside every moving image; None where there is none."""
+    """Return the largest rectangle of the reference grid that is inside every moving image; None for no such."""
     step = max(1, min(8, width_px // 64, height_px // 64))
     x = _cell_edges(width_px, step)
     y = _cell_edges(height_px, step)
     inside = np.ones((len(y), len(x)), dtype=bool)
     for mapping, band in mappings:
-        there = mapping.at_crossings(x, y)
+        mapped = mapping.at_crossings(x, y)
         with np.errstate(invalid="ignore"):
-            inside &= (there >= 0).all(axis=-1) & (there <= np.subtract(band.size_px, 1)).all(axis=-1)
+            inside &= (mapped >= 0).all(axis=-1) & (mapped <= np.subtract(band.size_px, 1)).all(axis=-1)
     # A cell counts where its four corners do: between them the mapping is all but straight.
     cells = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:] & inside[1:, 1:]
     result = _largest_rectangle(cells, np.diff(x), np.diff(y))

@@ -97,14 +97,16 @@ class _Sources:
 
 def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | None:
     """None where the panchromatic band is not aligned, or sees the light of no narrow band."""
-    capture, pan = context.capture, panchromatic(context.capture)
+    pan = panchromatic(context.capture)
     placed = {n: a for n, a in context.usable.items() if a.status in ("aligned", "predicted")}
-    if not pan or not all(b is capture.reference or b.name in placed for b in pan):
+    if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *placed}:
         return None
-    layers, grid = output_layers(capture, placed, settings, context.rig)
+    layers, grid = output_layers(context.capture, placed, settings, context.rig)
     narrow = [layer for layer in layers if _is_narrow(layer, pan)]
     is_seen = [_is_seen(layer.band, pan) for layer in narrow]
-    return _Sources(narrow, is_seen, [la for la in layers if la.band in pan], grid) if any(is_seen) else None
+    if not any(is_seen):
+        return None
+    return _Sources(narrow, is_seen, [layer for layer in layers if layer.band in pan], grid)
 
 
 def _is_narrow(layer: Layer, pan: Sequence[Band]) -> bool:

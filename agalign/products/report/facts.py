@@ -10,7 +10,16 @@ from urllib.parse import quote
 import numpy as np
 
 from agalign.products.failures import FailureGroups
-from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, Sidecar, SimilarityPart
+from agalign.products.sidecar import (
+    BandPart,
+    BandResult,
+    CaptureResult,
+    GridPart,
+    JointPart,
+    MetricsResult,
+    Sidecar,
+    SimilarityPart,
+)
 
 SCHEMA = "agalign-report/1"
 _SHIFT_STEP_PX = 0.01
@@ -135,26 +144,37 @@ class Facts:
         }  # fmt: skip
 
     def _pair(self, band: BandPart, sidecar: Sidecar) -> dict[str, Any]:
-        joint, metrics, local, prediction = band.joint, band.metrics, band.local, band.prediction
-        after = None if metrics is None else metrics.after
-        tiles = [] if metrics is None else metrics.tiles
-        offset, apart = _lies(band.grid, sidecar)
+        local, prediction = band.local, band.prediction
+        tiles = [] if band.metrics is None else band.metrics.tiles
+        offset_px, distance_px = _band_offset(band.grid, sidecar)
         lattice = tuple(v for t in tiles for v in t.centre_px)
         return {
             "band": band.band, "wavelength_nm": band.wavelength_nm, "status": band.status, "reason": band.reason,
             "seed": band.seed.kind if band.seed else None, "seconds": round(band.seconds, 2),
-            "written": band.place is not None, "offset_px": offset, "apart_px": apart,
-            "residual_px": None if after is None else _rounded(after.residual_px),
-            "residual_p95_px": None if after is None else _rounded(after.residual_p95_px),
-            "coverage": None if after is None else _rounded(after.residual_coverage),
-            "retrieval": _rounded(joint.retrieval) if joint else None,
-            "corner_std_px": _rounded(joint.corner_std_px) if joint else None,
-            "similarity": None if metrics is None else _similarity(metrics.before, metrics.after),
+            "written": band.place is not None, "offset_px": offset_px, "apart_px": distance_px,
+            **_residual(band.metrics), **_joint(band.joint),
             "prediction": None if prediction is None else prediction.model_dump(by_alias=True),
             "local": None if local is None else local.model_dump(),
             "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
             "shifts": [None if v is None else round(v / _SHIFT_STEP_PX) for t in tiles for v in t.shift_px],
         }  # fmt: skip
+
+
+def _residual(metrics: MetricsResult | None) -> dict[str, Any]:
+    """What the windows and the similarity show after alignment."""
+    if metrics is None:
+        return dict.fromkeys(("residual_px", "residual_p95_px", "coverage", "similarity"))
+    after = metrics.after
+    return {
+        "residual_px": _rounded(after.residual_px), "residual_p95_px": _rounded(after.residual_p95_px),
+        "coverage": _rounded(after.residual_coverage), "similarity": _similarity(metrics.before, after),
+    }  # fmt: skip
+
+
+def _joint(joint: JointPart | None) -> dict[str, float | None]:
+    if joint is None:
+        return {"retrieval": None, "corner_std_px": None}
+    return {"retrieval": _rounded(joint.retrieval), "corner_std_px": _rounded(joint.corner_std_px)}
 
 
 def _camera(result: CaptureResult) -> str:
@@ -174,17 +194,18 @@ def _similarity(before: SimilarityPart, after: SimilarityPart) -> dict[str, tupl
     return {n: (_rounded(getattr(before, n)), _rounded(getattr(after, n))) for n in names}
 
 
-def _lies(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:
-    """((x, y) of the reference's middle in the moving file beside where it is in the reference's, median distance
-    between the pixels of the two files that show the same), px; None where the files have different scales.
+def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:
+    """(offset (x, y) of a band's raw file in the middle of the reference, median length of the offset), px.
+
+    None where the two files have different scales.
     """
     if grid is None:
         return None, None
-    here, there = np.array(grid.reference_px), np.array(grid.moving_px)
-    along, moved = np.ptp(here, axis=0), np.ptp(there, axis=0)
-    if not (np.abs(moved - along) < _LIKE_SCALES * along).all():
+    reference_px, moving_px = np.array(grid.reference_px), np.array(grid.moving_px)
+    reference_span, moving_span = np.ptp(reference_px, axis=0), np.ptp(moving_px, axis=0)
+    if not (np.abs(moving_span - reference_span) < _LIKE_SCALES * reference_span).all():
         return None, None
-    apart = there - here
+    offsets = moving_px - reference_px
     middle = np.array([sidecar.reference.width - 1, sidecar.reference.height - 1]) / 2
-    dx, dy = apart[np.linalg.norm(here - middle, axis=1).argmin()].tolist()
-    return (round(dx, 3), round(dy, 3)), round(float(np.median(np.linalg.norm(apart, axis=1))), 3)
+    dx, dy = offsets[np.linalg.norm(reference_px - middle, axis=1).argmin()].tolist()
+    return (round(dx, 3), round(dy, 3)), round(float(np.median(np.linalg.norm(offsets, axis=1))), 3)
