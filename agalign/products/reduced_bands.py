@@ -1,4 +1,4 @@
-"""A capture's bands as grey pictures, before and after: what the picture and the preview beside a stack are made of."""
+"""A capture's bands as grey pictures, before and after: the source of the picture and the preview."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -15,7 +15,8 @@ from agalign.values.image import OutputGrid
 
 Grey = NDArray[np.uint8]
 """(height, width)"""
-_LONGEST_PX = 2048
+_MAX_SIDE_PX = 2048
+"""More than a screen shows."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class ReducedBands:
     """The bands of a capture on the grid of its aligned files, reduced where that is larger than a screen."""
 
     before: Mapping[str, Grey]
-    """By band that can be read: the raw file laid on the reference's as it is."""
+    """By band that can be read: the raw file, resized to the reference's."""
     after: Mapping[str, Grey]
     """By band that was written: what was written."""
     size_px: tuple[int, int]
@@ -51,7 +52,7 @@ def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, i
 
 
 def _reduced(width: int, height: int) -> tuple[int, int]:
-    reduction = max(1.0, max(width, height) / _LONGEST_PX)
+    reduction = max(1.0, max(width, height) / _MAX_SIDE_PX)
     return round(width / reduction), round(height / reduction)
 
 

@@ -20,7 +20,8 @@ from agalign.values.files import RUN_FILE, write_text
 from agalign.values.text import harmless
 
 _LIBRARIES = ("torch", "numpy", "rasterio", "opencv-python-headless", "tifffile", "pydantic")
-_LONGEST_BYTES = 1 << 28
+_MAX_BYTES = 1 << 28
+"""A record of 100,000 captures has a tenth of this."""
 
 RunState = Literal["running", "interrupted", "finished"]
 
@@ -125,7 +126,7 @@ def read_run_record(out: Path) -> RunPart | None:
     """Of the last run into a folder; None where there is none. Raises SidecarError for a file that is none of ours."""
     path = out / RUN_FILE
     try:
-        if path.stat().st_size > _LONGEST_BYTES:
+        if path.stat().st_size > _MAX_BYTES:
             raise SidecarError(f"{path}: is too large for what it should be; run again")
         return RunPart.model_validate_json(path.read_bytes())
     except FileNotFoundError:

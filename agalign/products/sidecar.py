@@ -181,7 +181,7 @@ class PredictionPart(_Part):
 
 
 class PlacePart(_Part):
-    """A file beside the sidecar that holds a band's aligned pixels, and the band's index there, from 1."""
+    """The file with a band's aligned pixels, relative to the sidecar's folder, and the band's index there, from 1."""
 
     file: RelativeFile
     band_index: Count
@@ -218,7 +218,7 @@ class BandPart(BandResult):
 
 
 class FilePart(_Part):
-    """A file beside the sidecar."""
+    """A file of single bands, relative to the sidecar's folder."""
 
     file: RelativeFile
     bytes: int
@@ -226,7 +226,7 @@ class FilePart(_Part):
 
 
 class OutputPart(_Part):
-    """The stack beside the sidecar, null where only single bands were written.
+    """The stack, relative to the sidecar's folder; null where only single bands were written.
 
     `nodata` is the stack's, or what the files of single bands have in common; null where they differ.
     `crop` is x0, y0, width, height on the reference's pixel grid, which has `scale` (x, y) times as many pixels along
@@ -253,9 +253,9 @@ class ProductPart(_Part):
 
 
 class PreviewPart(_Part):
-    """A sheet of small grey pictures of all bands beside the sidecar, which the report composes: a column for each band
-    of `bands`, in their order, and rows of the raw files as they lie, of what was written, of a detail of either, and
-    of the error to be expected where that was written, white for `error_full_px`.
+    """A sheet of small grey pictures of all bands, from which the report composes its views: a column for each band
+    of `bands`, in their order, and rows of the unaligned raw files, of what was written, of a detail of either, and
+    of the expected error where that was written, white for `error_full_px`.
     """
 
     file: RelativeFile
@@ -345,7 +345,7 @@ def _read(path: Path, model: type[Model]) -> Model:
     try:
         size = path.stat().st_size
         if size > _MAX_BYTES:
-            raise SidecarError(f"{path}: {size >> 20} MB are no sidecar; delete it and run again")
+            raise SidecarError(f"{path}: {size >> 20} MB are too many for a sidecar; delete it and run again")
         return model.model_validate_json(path.read_bytes())
     except OSError as error:
         raise SidecarError(f"{path}: cannot be read ({error.strerror or error})") from None
@@ -355,7 +355,7 @@ def _read(path: Path, model: type[Model]) -> Model:
         if first["type"] == "json_invalid":
             raise SidecarError(f"{path}: not valid JSON ({first['msg']}); delete it and run again") from None
         if not where:
-            raise SidecarError(f"{path}: is no sidecar of schema {SCHEMA!r}; delete it and run again") from None
+            raise SidecarError(f"{path}: not a sidecar of schema {SCHEMA!r}; delete it and run again") from None
         if "schema" in problems:
             result = _shortened(problems["schema"]["input"] if problems["schema"]["type"] != "missing" else None)
             raise SidecarError(f"{path}: schema is {result}, not {SCHEMA!r}; run again with --overwrite") from None
