@@ -154,7 +154,7 @@ def read_pairs(
     for bands in capture.moving_lenses:
         candidates = seed_candidates(capture.reference, bands[0], settings.seed)
         name = bands[0].name
-        if model is not None and name in model.mappings and settings.seed.force is None:
+        if model is not None and name in model.mappings:
             candidates = {"model": model.mappings[name], **candidates}
         if not candidates:
             absent = Issue("no_such_seed", detail=str(settings.seed.force))

@@ -45,7 +45,7 @@ def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Issue:
     if not textured(pair.moving):
         return Issue("blank_moving")
     candidates = pair.candidates
-    if pair.reference.settings.seed.force == "match":
+    if _forced_kind(pair) == "match":
         result = match_seed(_network(pair, model), pair.fixed, pair.moving)
         if result is None:
             return Issue("no_such_seed", detail="match")
@@ -115,8 +115,14 @@ def _sharpened(pair: BandPair, fixed_to_moving: Matrix, shown: Residual) -> Matr
 
 def _is_known(pair: BandPair) -> bool:
     """True where it is told, by the flight or by the user, where a pair lies: what is found elsewhere is wrong."""
-    forced = pair.reference.settings.seed.force is not None
-    return forced or pair.is_known_to_a_rig or "user" in pair.candidates
+    return _forced_kind(pair) is not None or pair.is_known_to_a_rig or "user" in pair.candidates
+
+
+def _forced_kind(pair: BandPair) -> SeedKind | None:
+    """The only kind of seed to be used. It is for the captures that a flight is learned from: the others start from
+    the flight's own mapping.
+    """
+    return None if "model" in pair.candidates else pair.reference.settings.seed.force
 
 
 def _matched(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors: bool) -> Iterator[Matrix]:
@@ -182,7 +188,7 @@ def best_seed(pair: BandPair, candidates: Candidates) -> Seed:
         best = max(scored, key=lambda seed: seed.score)
         if kind == "model" and best.trusted:
             return best
-    forced = [s for s in scored if s.kind == pair.reference.settings.seed.force]
+    forced = [s for s in scored if s.kind == _forced_kind(pair)]
     return max(forced or scored, key=lambda seed: seed.score)
 
 

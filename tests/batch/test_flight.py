@@ -16,7 +16,7 @@ from agalign.batch import RunOptions, run_flight, workers
 from agalign.batch import learn as batch_learn
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.cameras.discover import discover
-from agalign.config import FlightSettings, Settings
+from agalign.config import FlightSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError, GeometryError, InputError, OutputError
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
@@ -324,3 +324,13 @@ def test_a_picture_that_fails_is_told_and_costs_no_more(
     assert [r.shortcomings for r in reports] == [("a.png: cannot be written",)] * 2
     assert not any(r.good for r in reports)
     assert all(r.result is not None and r.result.status == "ok" for r in reports)
+
+
+def test_a_forced_seed_is_for_the_captures_that_the_flight_is_learnt_from(flight: Path, tmp_path: Path) -> None:
+    """The others start from the flight's own mapping: the identity is farther away than a frozen network reaches."""
+    settings = Settings(seed=SeedSettings(force="identity"))
+    reports = list(run_flight(discover(flight), tmp_path, settings))
+    bands = [b for r in reports for b in r.sidecar.bands if b.status != "reference"]
+    assert [b.status for b in bands] == ["aligned"] * 8
+    assert {b.seed.kind for b in bands if b.seed} <= {"model", "structure"}
+    assert {b.joint.recipe for b in bands if b.joint} == {"flight"}
