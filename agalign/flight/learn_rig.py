@@ -1,5 +1,6 @@
 """The rig of a flight fitted to the mappings of some of its captures, with its error by cross-validation."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -46,29 +47,38 @@ def learn_rig(
 
     `layout` has the position of each band's lens as far as it is known, in any unit.
     """
-    counts = {b: sum(b in c.mappings for c in captures) for b in dict.fromkeys(b for c in captures for b in c.mappings)}
+    counts = Counter(b for c in captures for b in c.mappings)
     bands = tuple(b for b, count in counts.items() if count >= MIN_CAPTURES)
+    captures = [c for c in captures if any(b in c.mappings for b in bands)]
     if not bands:
         return None
-    captures = [c for c in captures if any(b in c.mappings for b in bands)]
     table = _Table.of(captures, bands, size_px, _normalised_layout(layout, bands))
-    sets = _SETS_IN_MOTION if sum(c.motion is not None for c in captures) >= MIN_CAPTURES else _SETS
-    errors = {factors: table.errors_left_out(factors) for factors in sets}
-    best = sets[0]
-    for more in sets[1:]:
-        if len(bands) > 1 and _rms(errors[more].values()) < _MAX_ERROR_SHARE * _rms(errors[best].values()):
-            best = more
-    fitted = table.fit(np.ones(len(captures)), best or ("distance",))
-    learned = tuple(
-        CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f))
-        for c, f in zip(captures, fitted.factors.tolist(), strict=True)
+    factors, errors_px = _choose_factors(
+        table, motion_known=sum(c.motion is not None for c in captures) >= MIN_CAPTURES
     )
+    fitted = table.fit(np.ones(len(captures)), factors or ("distance",))
+    by_band = zip(bands, table.median, fitted.offset, fitted.t, strict=True)
+    mean, baselines = dict[str, Matrix](), dict[str, tuple[float, float]]()
+    for band, median, offset, t in by_band:
+        mean[band], baselines[band] = displaced(median, offset, size_px), (float(t[0]), float(t[1]))
+    learned = zip(captures, fitted.factors.tolist(), strict=True)
     return Rig(
-        size_px, {b: displaced(s, o, size_px) for b, s, o in zip(bands, table.median, fitted.offset, strict=True)},
-        {b: (float(t[0]), float(t[1])) for b, t in zip(bands, fitted.t, strict=True)},
-        dict(zip(bands, fitted.delay.tolist(), strict=True)), dict(zip(bands, fitted.t_std.tolist(), strict=True)),
-        {b: tuple(c) for b, c in zip(bands, fitted.centre.tolist(), strict=True)}, best, learned, errors[best],
+        size_px, mean, baselines, dict(zip(bands, fitted.delay.tolist(), strict=True)),
+        dict(zip(bands, fitted.t_std.tolist(), strict=True)),
+        dict(zip(bands, map(tuple, fitted.centre.tolist()), strict=True)), factors,
+        tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in learned), errors_px,
     )  # fmt: skip
+
+
+def _choose_factors(table: "_Table", *, motion_known: bool) -> tuple[tuple[Factor, ...], dict[str, float]]:
+    """(the factors that reduce the error of captures left out, that error by band, px)."""
+    best, *others = _SETS_IN_MOTION if motion_known else _SETS
+    errors_px = table.errors_left_out(best)
+    for more in others if len(table.bands) > 1 else ():
+        more_px = table.errors_left_out(more)
+        if _rms(more_px.values()) < _MAX_ERROR_SHARE * _rms(errors_px.values()):
+            best, errors_px = more, more_px
+    return best, errors_px
 
 
 @dataclass(frozen=True)

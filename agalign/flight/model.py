@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import safe_open
@@ -35,7 +36,7 @@ class FlightModel:
 
     net: Descriptor
     camera: str
-    """As `groups.camera_key` has it; empty for one that was learnt on pairs of any cameras."""
+    """As `groups.flight_camera` has it; empty for one that was learnt on pairs of any cameras."""
     bands: tuple[str, ...]
     """Names of the moving bands; the network's side of one is its place here, counted from 1."""
     mappings: Mapping[str, Matrix]
@@ -85,6 +86,22 @@ def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
 
 
 def _read_model(path: Path) -> FlightModel:
+    facts, tensors = _read_contents(path)
+    channels = [int(c) for c in json.loads(facts["channels"])]
+    if not 1 < len(channels) <= _MAX_SIDES or not all(0 < c <= _MAX_SIDES for c in channels):
+        raise ValueError(f"a network for images of {channels[:8]} channels")
+    net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
+    net.load_state_dict(_below("theta.", tensors))
+    net.learnt = True
+    fields = {band: values.numpy() for band, values in _below("field.", tensors).items()}
+    mappings = {band: normalised(matrix.numpy()) for band, matrix in _below("mapping.", tensors).items()}
+    bands = tuple(map(str, json.loads(facts["bands"])))
+    rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
+    return FlightModel(net, facts["camera"], bands, mappings, facts["fingerprint"], rig)
+
+
+def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """(the facts, the tensors) of a file that is a model, and a complete one."""
     if path.stat().st_size > _LONGEST_BYTES:
         raise ValueError("it is too large for one")
     with safe_open(path, framework="pt") as file:
@@ -97,19 +114,12 @@ def _read_model(path: Path) -> FlightModel:
         raise ValueError("it is damaged")
     if not all(torch.isfinite(t).all() for t in tensors.values()):
         raise ValueError("its numbers are none")
-    channels = [int(c) for c in json.loads(facts["channels"])]
-    if not 1 < len(channels) <= _MAX_SIDES or not all(0 < c <= _MAX_SIDES for c in channels):
-        raise ValueError(f"a network for images of {channels[:8]} channels")
-    net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
-    net.load_state_dict({k.removeprefix("theta."): v for k, v in tensors.items() if k.startswith("theta.")})
-    net.learnt = True
-    fields = {k.removeprefix("field."): v.numpy() for k, v in tensors.items() if k.startswith("field.")}
-    mappings = {
-        k.removeprefix("mapping."): normalised(v.numpy()) for k, v in tensors.items() if k.startswith("mapping.")
-    }
-    bands = tuple(map(str, json.loads(facts["bands"])))
-    rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
-    return FlightModel(net, facts["camera"], bands, mappings, facts["fingerprint"], rig)
+    return facts, tensors
+
+
+def _below(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The tensors whose names start so, by the rest of their names."""
+    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
 
 
 def _digest(tensors: Mapping[str, torch.Tensor], facts: Mapping[str, str]) -> str:
