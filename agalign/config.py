@@ -62,14 +62,8 @@ class FlightSettings(Stage):
 
     together: bool = True
     """False learns every capture alone."""
-    captures: Positive = 3
-    """How many the network is learnt on, spread over the flight."""
-    rig_captures: Positive = 48
-    """The rig is learnt on an eighth of the flight, but on no more than these,"""
-    min_rig_captures: Positive = 6
-    """and on no fewer than these, or all."""
     start: str = ""
-    """Fingerprint of the network that theta starts from, where one is given: results depend on it."""
+    """Fingerprint of the model that a run starts from, set by `run_flight`: a result is kept only by runs with it."""
 
 
 class SeedSettings(Stage):

@@ -1,7 +1,8 @@
 """Learning a flight: one network on a few of its captures, to be frozen for all of them."""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -16,10 +17,11 @@ from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.factors import median_mapping
 from agalign.flight.fingerprint import fingerprint, hashed
-from agalign.flight.groups import camera_key
+from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import MIN_CAPTURES, Observation, Rig
+from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
 from agalign.method.joint import Results, refine_with
@@ -32,6 +34,12 @@ from agalign.values.geometry import Matrix
 from agalign.verify.displacement_field import common_field
 
 _LOG = logging.getLogger(__name__)
+_NETWORK_CAPTURES = 3
+"""The network is learned on so many captures: what two do not show, a third mostly does, and each one costs seconds."""
+_RIG_SHARE = 8
+"""The rig is learned on one capture of so many: neighbours see the same heights and speeds,"""
+_MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48
+"""but on no fewer than its factors need, and on no more than make it better."""
 
 
 @one_thread()
@@ -48,73 +56,88 @@ def learn_flight(
     side where bands start that it does not know.
     """
     keep_freed_memory()
-    if start is not None and _still_holds(start, captures, settings, at_once):
-        return replace(start, fingerprint=learning_fingerprint(captures, settings))
-    loaded = _load(captures, settings, start)
-    if not loaded:
+    fingerprint_now = learning_fingerprint(captures, settings)
+    # Displacements of single captures are neither the network's nor the rig's.
+    plain = settings.model_copy(update={"local": settings.local.model_copy(update={"use": "never"})})
+    if start is not None and _still_holds(start, captures, plain, at_once):
+        return replace(start, fingerprint=fingerprint_now)
+    bands = flight_lenses(captures)
+    loaded = _load(captures, bands, plain, start)
+    network = _learn_network(loaded, bands, plain, progress, start, at_once)
+    if network is None:
         return None
-    state = JointState(settings.joint, progress)
-    groups = [group for one in loaded for _, group in one.groups]
-    bands = _sides(captures[0])
-    net = state.fast_descriptor([1] * (1 + len(bands)))
-    if start is not None:
-        start_from(net, start.net.state_dict())
-    try:
-        learn(state, groups, net, at_once)
-        with ThreadPoolExecutor(at_once) as pool:
-            refined = iter(list(pool.map(lambda s: refine_with(net, s, settings.joint, progress), groups)))
-    except (AgalignError, cv2.error) as why_not:
-        # What one capture does to the others' learning must not cost the flight: each is learnt alone then.
-        _LOG.debug("the flight could not be learnt from: %s", why_not)
-        return None
-    results = [one.in_order(refined) for one in loaded]
-    outcome: dict[str, list[Matrix]] = {}
-    for one, of_capture in zip(loaded, results, strict=True):
-        for pair, result in zip(one.pairs, of_capture, strict=True):
-            if isinstance(result, JointResult) and result.retrieval >= MIN_RETRIEVAL:
-                outcome.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
-    if not outcome:
-        return None
+    net, known = network
     size = captures[0].reference.size_px
-    mappings = {name: median_mapping(matrices, size) for name, matrices in outcome.items()}
-    model = FlightModel(net, camera_key(captures[0]), bands, mappings, learning_fingerprint(captures, settings))
-    known = {one.capture.label: _Refined(one, of) for one, of in zip(loaded, results, strict=True)}
-    rig = _learn_rig(captures, settings, model, known, progress, at_once)
+    mappings = {name: median_mapping(of, size) for name, of in _recognised(known).items()}
+    if not mappings:
+        return None
+    model = FlightModel(net, flight_camera(captures), bands, mappings, fingerprint_now)
+    rig = _learn_rig(captures, plain, model, {r.loaded.capture.label: r for r in known}, progress, at_once)
     if rig is None:
         rig = None if start is None else start.rig
     return replace(model, rig=rig, mappings=mappings if rig is None else {**mappings, **rig.mean})
 
 
+def _learn_network(
+    loaded: Sequence["_Loaded"], bands: Sequence[str], settings: Settings, progress: Progress,
+    start: FlightModel | None, at_once: int,
+) -> tuple[Descriptor, list["_Refined"]] | None:  # fmt: skip
+    """(the network, the captures with their mappings refined by it); None where it cannot be learned from them."""
+    if not loaded:
+        return None
+    state = JointState(settings.joint, progress)
+    groups = [group for one in loaded for _, group in one.groups]
+    net = state.fast_descriptor([1] * (1 + len(bands)))
+    if start is not None:
+        # A model of this camera may have bands that the flight lacks: weights go to the bands of the same names.
+        sides = [0, *(start.side(band) or len(start.bands) for band in bands)] if start.camera else None
+        start_from(net, start.net.state_dict(), sides)
+    try:
+        learn(state, groups, net, at_once)
+        with ThreadPoolExecutor(at_once) as pool:
+            refined = iter(list(pool.map(lambda s: refine_with(net, s, settings.joint, progress), groups)))
+    except (AgalignError, cv2.error) as why_not:
+        # What one capture does to the others' learning must not cost the flight: each is learned alone then.
+        _LOG.debug("the flight could not be learned from: %s", why_not)
+        return None
+    return net, [_Refined(one, one.in_order(refined)) for one in loaded]
+
+
+def _recognised(refined: Sequence["_Refined"]) -> dict[str, list[Matrix]]:
+    """The mappings of each band, between files, in the captures whose held-out patches were told apart."""
+    mappings: dict[str, list[Matrix]] = {}
+    for one in refined:
+        for pair, result in zip(one.loaded.pairs, one.results, strict=True):
+            if isinstance(result, JointResult) and result.retrieval >= MIN_RETRIEVAL:
+                mappings.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
+    return mappings
+
+
 def _still_holds(model: FlightModel, captures: Sequence[Capture], settings: Settings, at_once: int) -> bool:
-    """True where captures of a flight can be aligned, and a model's rig foretells each of their bands from the others
+    """True where captures of a flight can be aligned, and a model's rig predicts each of their bands from the others
     well enough for a lost one to count as delivered.
     """
-    rig = model.rig
-    if rig is None or model.bands != _sides(captures[0]):
+    rig, bands = model.rig, flight_lenses(captures)
+    if rig is None or not set(bands) <= set(model.bands):
         return False
-    plain = _without_local(settings)
 
     def fits(capture: Capture) -> tuple[int, int]:
-        """(bands that are aligned, those of which that the rig foretells)."""
+        """(bands that are aligned, those among them that the rig predicts)."""
         try:
-            pairs, _ = read_pairs(capture, plain, model)
-            result = align_pairs(pairs, plain, lambda *_: None, model, scratch=False)
-            told = with_predictions(pairs, result, rig, capture, settings.check)
+            pairs, _ = read_pairs(capture, settings, model)
+            result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
+            checked = with_predictions(pairs, result, rig, capture, settings.check)
         except (AgalignError, cv2.error):
             return 0, 0
-        aligned = [told[name] for name, a in result.items() if a.status == "aligned"]
+        aligned = [checked[name] for name, a in result.items() if a.status == "aligned"]
         limit_px = settings.check.accept_predicted_px
-        foretold = [a for a in aligned if a.prediction is not None and a.prediction.std_px <= limit_px]
-        return len(aligned), len(foretold)
+        predicted = [a for a in aligned if a.prediction is not None and a.prediction.std_px <= limit_px]
+        return len(aligned), len(predicted)
 
     with ThreadPoolExecutor(at_once) as pool:
         some = [captures[len(captures) * k // 3] for k in (1, 2)]
         counts = list(pool.map(fits, some))
-    return sum(aligned for aligned, _ in counts) >= len(model.bands) and all(a == f for a, f in counts)
-
-
-def _without_local(settings: Settings) -> Settings:
-    return settings.model_copy(update={"local": settings.local.model_copy(update={"use": "never"})})
+    return sum(aligned for aligned, _ in counts) >= len(bands) and all(a == p for a, p in counts)
 
 
 def _learn_rig(
@@ -122,41 +145,47 @@ def _learn_rig(
     progress: Progress, at_once: int,
 ) -> Rig | None:  # fmt: skip
     """What captures spread over the flight, refined with its network, have in common; some, by label, are already."""
-    stage = settings.flight
-    count = min(stage.rig_captures, max(stage.min_rig_captures, len(captures) // 8))
     if len(captures) < MIN_CAPTURES:
         return None
-    plain = _without_local(settings)
+    shown = _shown_by_enough(captures, settings, model, known, progress, at_once)
+    size = captures[0].reference.size_px
+    rig = learn_rig([s.observation for s in shown], size, _layout(captures))
+    if rig is None:
+        return None
+    residuals = {band: [s.residuals[band] for s in shown if band in s.residuals] for band in rig.mean}
+    with ThreadPoolExecutor(at_once) as pool:
+        fields = list(pool.map(lambda of_band: common_field(of_band, settings.local, size), residuals.values()))
+    return replace(rig, fields={b: field for b, field in zip(residuals, fields, strict=True) if field is not None})
+
+
+def _shown_by_enough(
+    captures: Sequence[Capture], settings: Settings, model: FlightModel, known: Mapping[str, "_Refined"],
+    progress: Progress, at_once: int,
+) -> list["_Shown"]:  # fmt: skip
+    """What captures show of the rig, until enough of them have shown every band that any of them has."""
+    count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(captures) // _RIG_SHARE))
 
     def look_at(capture: Capture) -> "_Shown | None":
         try:
-            return _shown(capture, plain, model, known.get(capture.label))
+            return _shown(capture, settings, model, known.get(capture.label))
         except (AgalignError, cv2.error) as why_not:
-            _LOG.debug("%s says nothing of the rig: %s", capture.label, why_not)
+            _LOG.debug("%s shows nothing of the rig: %s", capture.label, why_not)
             return None
 
-    seen: list[Observation] = []
-    residuals: dict[str, list[Residual]] = {}
+    result: list[_Shown] = []
+    counts: Counter[str] = Counter()
     with ThreadPoolExecutor(at_once) as pool:
-        # Those that were learnt from cost little.
-        learnt = [c for c in captures if c.label in known]
-        for shown in pool.map(look_at, [*learnt, *(c for c in _spread(captures, count) if c.label not in known)]):
+        # Those that the network was learned from cost little.
+        first = [c for c in captures if c.label in known]
+        for shown in pool.map(look_at, [*first, *(c for c in _spread(captures, count) if c.label not in known)]):
             if shown is None:
                 continue
-            seen.append(shown.observation)
-            for band, residual in shown.residuals.items():
-                residuals.setdefault(band, []).append(residual)
-            progress("the rig", min(1.0, len(seen) / count))
-            if residuals and min(map(len, residuals.values())) >= count:
+            result.append(shown)
+            counts.update(list(shown.residuals))
+            progress("the rig", min(1.0, len(result) / count))
+            if counts and min(counts.values()) >= count:
                 break
-    size = captures[0].reference.size_px
-    rig = learn_rig(seen, size, _layout(captures[0]))
-    if rig is None:
-        return None
-    bands = [band for band in residuals if band in rig.mean]
-    with ThreadPoolExecutor(at_once) as pool:
-        fields = list(pool.map(lambda band: common_field(residuals[band], settings.local, size), bands))
-    return replace(rig, fields={b: field for b, field in zip(bands, fields, strict=True) if field is not None})
+    return result
 
 
 def _spread(captures: Sequence[Capture], count: int) -> list[Capture]:
@@ -165,17 +194,21 @@ def _spread(captures: Sequence[Capture], count: int) -> list[Capture]:
     return [captures[i] for i in (*places[::2], *places[1::2])]
 
 
-def _layout(capture: Capture) -> dict[str, tuple[float, float]]:
-    """Where the lenses stand beside the reference's, as far as the camera knows."""
-    here = capture.reference.parallax
-    known = {b.name: b.parallax for b in capture.moving if b.parallax is not None}
-    return {} if here is None else {name: (x - here[0], y - here[1]) for name, (x, y) in known.items()}
+def _layout(captures: Iterable[Capture]) -> dict[str, tuple[float, float]]:
+    """Where the lenses are relative to the reference's, as far as the camera has it."""
+    result: dict[str, tuple[float, float]] = {}
+    for capture in captures:
+        here = capture.reference.parallax
+        for band in capture.moving:
+            if here is not None and band.parallax is not None:
+                result.setdefault(band.name, (band.parallax[0] - here[0], band.parallax[1] - here[1]))
+    return result
 
 
 def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:
     """Changes when the captures that would be learnt from, or the settings, do."""
     stages = settings.joint, settings.seed, settings.flight
-    return hashed(camera_key(captures[0]), *(fingerprint(c, *stages) for c in captures))
+    return hashed(flight_camera(captures), *(fingerprint(c, *stages) for c in captures))
 
 
 @dataclass(frozen=True)
@@ -230,15 +263,17 @@ def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Ref
     return _Shown(observed(pairs, result, capture), good)
 
 
-def _load(captures: Sequence[Capture], settings: Settings, start: FlightModel | None) -> list[_Loaded]:
+def _load(
+    captures: Sequence[Capture], bands: Sequence[str], settings: Settings, start: FlightModel | None
+) -> list[_Loaded]:
     """Of each stretch of the flight, one capture: the first of three whose bands plainly show the same, else the one
     that shows it best. Water and fog teach nothing.
     """
     loaded = []
-    for stretch in np.array_split(np.arange(len(captures)), min(settings.flight.captures, len(captures))):
+    for stretch in np.array_split(np.arange(len(captures)), min(_NETWORK_CAPTURES, len(captures))):
         best: _Loaded | None = None
         for k in dict.fromkeys((len(stretch) // 2, 0, len(stretch) - 1)):
-            result = _read(captures[stretch[k]], settings, start)
+            result = _read(captures[stretch[k]], bands, settings, start)
             if result is not None and (best is None or result.shows > best.shows):
                 best = result
             if best is not None and all(s.trusted for s in best.seeds):
@@ -248,8 +283,8 @@ def _load(captures: Sequence[Capture], settings: Settings, start: FlightModel | 
     return loaded
 
 
-def _read(capture: Capture, settings: Settings, start: FlightModel | None) -> _Loaded | None:
-    """None where there is nothing that can be read.
+def _read(capture: Capture, bands: Sequence[str], settings: Settings, start: FlightModel | None) -> _Loaded | None:
+    """None where there is nothing that can be read. The network's side of a band is its place among `bands`.
 
     `start` is the network with which a seed of kind `match` is found.
     """
@@ -257,14 +292,8 @@ def _read(capture: Capture, settings: Settings, start: FlightModel | None) -> _L
         pairs, _ = read_pairs(capture, settings)
     except AgalignError:
         return None
-    sides = _sides(capture)
     result = [(p, seed) for p in pairs if p.is_the_rigs and isinstance(seed := find_seed(p, start), Seed)]
     if not result:
         return None
     usable, seeds = [p for p, _ in result], [seed for _, seed in result]
-    return _Loaded(capture, image_groups(usable, seeds, [sides.index(p.name) + 1 for p in usable]), usable, seeds)
-
-
-def _sides(capture: Capture) -> tuple[str, ...]:
-    """Names of the moving bands that get a side of the network: one for each lens."""
-    return tuple(bands[0].name for bands in capture.moving_lenses)
+    return _Loaded(capture, image_groups(usable, seeds, [bands.index(p.name) + 1 for p in usable]), usable, seeds)

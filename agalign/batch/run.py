@@ -29,7 +29,7 @@ from agalign.capture.align import PairProgress
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
 from agalign.flight.fingerprint import fingerprint
-from agalign.flight.groups import camera_key, flights_of, model_names
+from agalign.flight.groups import flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panels import PanelReading, read_panel, reflectance_factors, with_height, with_panels
 from agalign.method.device import choose_device
@@ -239,8 +239,9 @@ def _given_model(path: Path, flight: FolderScan, settings: Settings) -> FlightMo
     model = load_model(path, lambda: choose_device(settings.joint.device))
     if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
         raise ConfigurationError(f"{path}: was learnt unshared; add --sharing unshared")
-    if model.camera and flight.captures and not any(camera_key(c) == model.camera for c in flight.captures):
-        here = camera_key(flight.captures[0])
+    flights = flights_of(flight.captures)
+    if flights and not any(is_flight_of(captures, model.camera) for captures in flights):
+        here = flight_camera(flights[0])
         raise ConfigurationError(f"{path}: was learnt for {model.camera}; the images here are of {here}")
     return model
 
@@ -252,7 +253,7 @@ def _learn(
     """The path of the flight's model, learnt now or found from an earlier run; None where none could be learnt."""
     if not settings.learns_flights:
         return None
-    start = known if known is not None and known.camera in ("", camera_key(captures[0])) else None
+    start = known if known is not None and is_flight_of(captures, known.camera) else None
     device = settings.joint.device
     if path.is_file():
         with suppress(AgalignError):

@@ -31,7 +31,7 @@ from agalign.values.capture import Capture
 
 pytestmark = pytest.mark.slow
 
-SETTINGS = Settings(flight=FlightSettings(captures=1))
+SETTINGS = Settings()
 
 
 def cpu() -> torch.device:
@@ -141,7 +141,7 @@ def test_a_model_is_learnt_anew_where_what_it_depends_on_has_changed(flight: Pat
     assert learning_fingerprint(discover(flight).captures, SETTINGS) == before
     no_lens = [replace(c, bands=tuple(replace(b, lens=None) for b in c.bands)) for c in captures]
     other_reference = [replace(c, reference_index=0) for c in captures]
-    elsewhere = Settings(flight=FlightSettings(captures=1, start="another network"))
+    elsewhere = Settings(flight=FlightSettings(start="another network"))
     assert len({learning_fingerprint(c, SETTINGS) for c in (captures, no_lens, other_reference)}) == 3
     assert learning_fingerprint(captures, elsewhere) != before
 
@@ -334,3 +334,39 @@ def test_a_forced_seed_is_for_the_captures_that_the_flight_is_learnt_from(flight
     assert [b.status for b in bands] == ["aligned"] * 8
     assert {b.seed.kind for b in bands if b.seed} <= {"model", "structure"}
     assert {b.joint.recipe for b in bands if b.joint} == {"flight"}
+
+
+def without_band(flight: Path, folder: Path, *files: str) -> Path:
+    """A copy of a flight that lacks some files."""
+    shutil.copytree(flight, folder)
+    for name in files:
+        next(folder.rglob(name)).unlink()
+    return folder
+
+
+def test_a_first_capture_that_lacks_a_band_belongs_to_its_flight(flight: Path, tmp_path: Path) -> None:
+    folder = without_band(flight, tmp_path / "in", "IMG_0001_4.tif")
+    captures = discover(folder).captures
+    assert [len(c.bands) for c in captures] == [4, 5]
+    (group,) = flights_of(captures)
+    assert group == list(captures)
+    reports = list(run_flight(discover(folder), tmp_path / "out", Settings()))
+    (path,) = (tmp_path / "out" / "models").iterdir()
+    model = load_model(path, cpu)
+    assert set(model.bands) == {b.name for b in captures[1].moving}
+    bands = [b for r in reports for b in r.sidecar.bands if b.status != "reference"]
+    assert [b.status for b in bands] == ["aligned"] * 7
+    assert {b.joint.recipe for b in bands if b.joint} == {"flight"}
+    assert {r.label: r.sidecar.missing_bands for r in reports} == {captures[0].label: ["NIR"], captures[1].label: []}
+    # Such a capture alone is of the model's camera too.
+    alone = without_band(folder, tmp_path / "alone", *(b.path.name for b in captures[1].bands))
+    (report,) = run_flight(discover(alone), tmp_path / "again", Settings(), model=path)
+    assert report.useful
+
+
+def test_captures_whose_bands_have_other_sizes_are_of_another_flight(flight: Path) -> None:
+    whole, other = discover(flight).captures
+    smaller = [replace(b, width_px=100) if b.name == "NIR" else b for b in other.bands]
+    assert len(flights_of([whole, replace(other, bands=tuple(smaller))])) == 2
+    without = [b for b in other.bands if b.name != "NIR"]
+    assert len(flights_of([replace(other, bands=tuple(without)), whole])) == 1

@@ -12,13 +12,13 @@ import agalign
 from agalign.batch import RunOptions, dask_executor, run_flight, workers
 from agalign.batch.workers import Task, done_by, own_processes
 from agalign.cameras.discover import discover
-from agalign.config import FlightSettings, SeedSettings, Settings
+from agalign.config import SeedSettings, Settings
 from agalign.errors import ConfigurationError
 from agalign.products.sidecar import CaptureResult
 
 pytestmark = pytest.mark.slow
 
-SETTINGS = Settings(flight=FlightSettings(captures=1))
+SETTINGS = Settings()
 
 
 def test_a_dask_cluster_does_the_captures(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
