@@ -4,7 +4,7 @@ import os
 import stat
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,18 +12,9 @@ from pathlib import Path
 from agalign.batch.capture import discard_outputs, paths_written, quiet
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.batch.output_folder import is_full, locked
-from agalign.batch.workers import (
-    MAX_HANDED_OVER,
-    CaptureReport,
-    Submit,
-    Task,
-    do_capture,
-    done_by,
-    loaded_model,
-    own_processes,
-    read_ahead,
-    stamp,
-)
+from agalign.batch.report import CaptureReport
+from agalign.batch.runners import choose_runner
+from agalign.batch.workers import Task, loaded_model, stamp
 from agalign.cameras.discover import FolderScan
 from agalign.capture.align import PairProgress
 from agalign.config import Settings, WriteSettings
@@ -34,7 +25,6 @@ from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panels import PanelReading, read_panel, reflectance_factors, with_height, with_panels
 from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
-from agalign.pixels.raster import without_warnings
 from agalign.products.panels import write_panels
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths
@@ -43,10 +33,8 @@ from agalign.products.sidecar import CaptureResult, read_result
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
 
-_CAPTURES_WORTH_A_PROCESS = 4
-"""To start one takes as long as these."""
-MAX_THREADS = 4
-"""Of one process: more wait for the interpreter."""
+_MAX_THREADS = 4
+"""Threads that learn a flight: more wait for the interpreter."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +44,7 @@ class RunOptions:
     overwrite: bool = False
     """Do captures again that an earlier run finished."""
     jobs: int = 1
-    """Captures at a time, each in a process of its own, or a thread where they are few; 0 is one a core."""
+    """Captures at a time, in as many processes; few captures are done one after another. 0 is one for each core."""
     align_panels: bool = False
     """Captures of calibration panels are aligned like any other."""
     executor: Executor | None = None
@@ -141,13 +129,9 @@ def _with_seconds(listener: Listener, tally: Tally) -> Listener:
 
 
 def _reports(
-    flight: FolderScan,
-    out: Path,
-    settings: Settings,
-    options: RunOptions,
-    listener: Listener,
+    flight: FolderScan, out: Path, settings: Settings, options: RunOptions, listener: Listener,
     known: FlightModel | None,
-) -> Iterator[CaptureReport]:
+) -> Iterator[CaptureReport]:  # fmt: skip
     panels, captures = _panels(flight.captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
         discard_outputs(reading.capture, out, settings.write)
@@ -157,27 +141,37 @@ def _reports(
     for group, name in zip(groups, model_names(groups), strict=True):
         mine = []
         for raw in group:
-            capture = with_radiometry(raw, settings.write.radiometry, reflectance_factors(raw, panels))
-            capture = with_height(capture, panels)
-            earlier = None if options.overwrite else finished_before(capture, out, settings)
-            if earlier is None or (options.retry_failed and earlier.status != "ok"):
+            capture = _calibrated(raw, panels, settings.write)
+            kept = _kept(capture, out, settings, options)
+            if kept is None:
                 mine.append(capture)
             else:
-                yield CaptureReport(capture.label, "kept", earlier, CapturePaths.of(capture, out).sidecar)
+                yield CaptureReport(capture.label, "kept", kept, CapturePaths.of(capture, out).sidecar)
         if mine:
             left.append((group, name, mine))
-    with _workers(sum(len(mine) for _, _, mine in left), options, settings) as (submit, maximum):
-        waiting: list[Task] = []
+    count, cores = sum(len(mine) for _, _, mine in left), _cores(options, settings)
+    with choose_runner(
+        count, cores, options.executor, options.timeout_s, listener.on_start, listener.on_pair
+    ) as runner:
+        tasks: list[Task] = []
         for whole, name, mine in left:
-            at_once = min(MAX_THREADS, _cores(options, settings))
-            path = _learn(whole, out / "models" / name, settings, listener, known, at_once)
-            waiting += [Task(c, out, settings, path, preview_bytes(len(flight.captures))) for c in mine]
-        if submit is None:
-            yield from _one_by_one(waiting, listener)
-        else:
-            yield from done_by(submit, [t.absolute() for t in waiting], maximum, options.timeout_s)
+            path = _learn(whole, out / "models" / name, settings, listener, known, min(_MAX_THREADS, cores))
+            tasks += [Task(c, out, settings, path, preview_bytes(len(flight.captures))) for c in mine]
+        yield from runner.reports(tasks)
     if settings.write.stac:
         write_collections(captures, out)
+
+
+def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
+    """The capture with the radiometry to be written, and its height above the ground where a panel shows it."""
+    capture = with_radiometry(capture, settings.radiometry, reflectance_factors(capture, panels))
+    return with_height(capture, panels)
+
+
+def _kept(capture: Capture, out: Path, settings: Settings, options: RunOptions) -> CaptureResult | None:
+    """The result of an earlier run; None where the capture is to be done (again)."""
+    earlier = None if options.overwrite else finished_before(capture, out, settings)
+    return None if earlier is None or (options.retry_failed and earlier.status != "ok") else earlier
 
 
 def _panels(
@@ -190,40 +184,6 @@ def _panels(
     seen = with_panels(captures, by_look=bool(albedos))
     panels = [read_panel(c, albedos) for c in seen if c.panel is not None]
     return panels, [c for c in seen if c.panel is None]
-
-
-def _one_by_one(tasks: Sequence[Task], listener: Listener) -> Iterator[CaptureReport]:
-    """In this process; the next capture's files are read meanwhile."""
-    with ThreadPoolExecutor(1) as reader:
-        for number, task in enumerate(tasks, start=1):
-            listener.on_start(task.capture)
-            for following in tasks[number : number + 1]:
-                reader.submit(read_ahead, following.capture)
-            yield do_capture(task, listener.on_pair)
-
-
-@contextmanager
-def _workers(captures: int, options: RunOptions, settings: Settings) -> Iterator[tuple[Submit | None, int]]:
-    """(what does so many captures at a time, how many it is handed); None where they are done one by one.
-
-    Processes of our own load what they need while the flight is learnt; few captures are done by threads instead.
-    """
-    if options.executor is not None:
-        executor = options.executor
-        yield lambda task: executor.submit(do_capture, task), MAX_HANDED_OVER
-        return
-    cores, must_end = _cores(options, settings), options.timeout_s is not None
-    processes = min(cores, captures if must_end else captures // _CAPTURES_WORTH_A_PROCESS)
-    if processes > 1 or (processes and must_end):
-        with own_processes(processes, options.timeout_s) as submit:
-            yield submit, 2 * processes
-        return
-    threads = min(cores, captures, MAX_THREADS)
-    if threads <= 1:
-        yield None, 0
-        return
-    with without_warnings(), ThreadPoolExecutor(threads) as few:
-        yield lambda task: few.submit(do_capture, task), threads
 
 
 def _cores(options: RunOptions, settings: Settings) -> int:

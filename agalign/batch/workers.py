@@ -4,7 +4,7 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -15,32 +15,30 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
 from multiprocessing import get_all_start_methods, get_context
 from multiprocessing.context import BaseContext
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 from pebble import ProcessExpired, ProcessPool
 
 from agalign.batch.capture import process_capture, quiet
-from agalign.batch.stages import StageClock
+from agalign.batch.report import CaptureReport, StageClock
 from agalign.capture.align import PairProgress
 from agalign.config import Settings
 from agalign.errors import AgalignError, ConfigurationError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
 from agalign.products.preview import preview_bytes
-from agalign.products.sidecar import CaptureResult, Sidecar, read_sidecar
 from agalign.values.capture import Capture
 from agalign.values.processes import follow_parent, without_interrupt_key
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 _LOG = logging.getLogger(__name__)
-_MAX_READ_AHEAD_BYTES = 64 << 20
 _DASK_ANSWERS_WITHIN_S = 10
 _GIVEN_UP_EXIT_CODE = 75
 _OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
@@ -48,55 +46,6 @@ _MAX_BREAKS = 100
 """Captures that are handed over again in a run because all processes were lost."""
 _CAPTURES_A_PROCESS = 500
 """Libraries keep some kilobytes of each; then a process makes room for a new one."""
-MAX_HANDED_OVER = 1000
-"""Captures that wait in an executor at a time: enough for any cluster, and little memory."""
-
-
-@dataclass(frozen=True)
-class CaptureReport:
-    """What became of one capture."""
-
-    label: str
-    state: Literal["done", "kept", "error", "panel"]
-    """`kept` means that an earlier run's result with the same settings was there, and `panel` that it shows a
-    calibration panel and takes no part.
-    """
-    result: CaptureResult | None = None
-    """What its sidecar says, without the long tables."""
-    path: Path | None = None
-    """Of the sidecar."""
-    error: str | None = None
-    panel: str | None = None
-    """What the calibration panel is, in words."""
-    shortcomings: tuple[str, ...] = ()
-    """What was not written though the capture is done, and why."""
-    seconds: float = 0.0
-    """What it took in this run."""
-    stages: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    """The same by (band, stage)."""
-
-    @property
-    def sidecar(self) -> Sidecar | None:
-        """The whole of it, read from its file; None where there is none. Raises SidecarError."""
-        return None if self.path is None else read_sidecar(self.path)
-
-    @property
-    def good(self) -> bool:
-        """True where nothing is left to be wished for: every band pair of the capture is aligned, or predicted well
-        enough, none is missing, and all is written.
-        """
-        done = self.result is not None and self.result.status == "ok" and not self.shortcomings
-        return self.state == "panel" or done
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """What went wrong, but for bands that are not aligned, which the sidecar has."""
-        return self.shortcomings if self.error is None else (self.error, *self.shortcomings)
-
-    @property
-    def useful(self) -> bool:
-        """True where at least one band pair is aligned or predicted."""
-        return self.result is not None and any(b.status in ("aligned", "predicted") for b in self.result.bands)
 
 
 @dataclass(frozen=True)
@@ -117,6 +66,7 @@ class Task:
 
 
 Submit = Callable[[Task], "Future[CaptureReport]"]
+OnStart = Callable[[Capture], None]
 
 
 def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
@@ -147,7 +97,7 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
 def done_by(
     submit: Submit, tasks: Sequence[Task], maximum: int, timeout_s: float | None = None
 ) -> Iterator[CaptureReport]:
-    """Never more than `most` handed over at a time, so that a season's captures do not wait in memory."""
+    """Never more than `maximum` handed over at a time, so that a season's captures do not wait in memory."""
     futures: dict[Future[CaptureReport], Task] = {}
     remaining, breaks = iter(tasks), 0
     try:
@@ -315,14 +265,6 @@ def threads_of_children(count: int) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-def read_ahead(capture: Capture) -> None:
-    """Bring the files of the capture to come into the system's cache."""
-    for path in {b.path for b in capture.bands}:
-        with suppress(OSError):
-            if path.stat().st_size <= _MAX_READ_AHEAD_BYTES:
-                path.read_bytes()
 
 
 def stamp(path: Path) -> int:

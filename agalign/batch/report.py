@@ -1,0 +1,91 @@
+"""The report of one capture, and the clock that measures its stages."""
+
+import time
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from agalign.capture.align import PairProgress
+from agalign.products.sidecar import CaptureResult, Sidecar, read_sidecar
+
+
+@dataclass(frozen=True)
+class CaptureReport:
+    """What became of one capture."""
+
+    label: str
+    state: Literal["done", "kept", "error", "panel"]
+    """`kept` means that an earlier run's result with the same settings was there, and `panel` that it shows a
+    calibration panel and takes no part.
+    """
+    result: CaptureResult | None = None
+    """What its sidecar says, without the long tables."""
+    path: Path | None = None
+    """Of the sidecar."""
+    error: str | None = None
+    panel: str | None = None
+    """What the calibration panel is, in words."""
+    shortcomings: tuple[str, ...] = ()
+    """What was not written though the capture is done, and why."""
+    seconds: float = 0.0
+    """What it took in this run."""
+    stages: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    """The same by (band, stage)."""
+
+    @property
+    def sidecar(self) -> Sidecar | None:
+        """The whole of it, read from its file; None where there is none. Raises SidecarError."""
+        return None if self.path is None else read_sidecar(self.path)
+
+    @property
+    def good(self) -> bool:
+        """True where nothing is left to be wished for: every band pair of the capture is aligned, or predicted well
+        enough, none is missing, and all is written.
+        """
+        done = self.result is not None and self.result.status == "ok" and not self.shortcomings
+        return self.state == "panel" or done
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What went wrong, but for bands that are not aligned, which the sidecar has."""
+        return self.shortcomings if self.error is None else (self.error, *self.shortcomings)
+
+    @property
+    def useful(self) -> bool:
+        """True where at least one band pair is aligned or predicted."""
+        return self.result is not None and any(b.status in ("aligned", "predicted") for b in self.result.bands)
+
+
+class StageClock:
+    """Forwards progress, and adds the time between two calls to the stage that the first of them began."""
+
+    def __init__(self, progress: PairProgress) -> None:
+        self._progress = progress
+        self._seconds: defaultdict[tuple[str, str], float] = defaultdict(float)
+        self._current: tuple[str, str] | None = None
+        self._since = self._started = time.perf_counter()
+
+    def __call__(self, band: str, stage: str, share: float) -> None:
+        """The signature of `PairProgress`."""
+        if (band, stage) != self._current:
+            self._book()
+            self._current = band, stage
+        self._progress(band, stage, share)
+
+    @property
+    def seconds(self) -> float:
+        """Since it began."""
+        return time.perf_counter() - self._started
+
+    def stages(self) -> Mapping[tuple[str, str], float]:
+        """Seconds by (band, stage), the current one included."""
+        self._book()
+        return dict(self._seconds)
+
+    def _book(self) -> None:
+        now = time.perf_counter()
+        if self._current is not None:
+            self._seconds[self._current] += now - self._since
+        self._since = now
