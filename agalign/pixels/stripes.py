@@ -28,8 +28,8 @@ _MIN_CORRELATION = 0.3
 _SMOOTHING_PX = 1.0
 """The structure field's: what it does not see, such as amplifiers that differ between even and odd lines, may stay."""
 _KERNEL_PX = 7
-_BLOCKS = 128
-"""Of lines that are averaged before the median over them is taken."""
+_BLOCKS = 32
+"""Lines are averaged to so many before the median over them is taken; 128 show the same in twice the time."""
 _DRIFT_PX = 15.0
 """Integrated differences drift; slower than this (1 sigma), the pattern stays in the image. Of 15, 40 and 80 px, this
 leaves the smallest residual of white stripes."""
@@ -88,8 +88,9 @@ def _halves(image: Raster, axis: int) -> tuple[_Profile, _Profile]:
     if axis == 1:
         blocks, inside = np.ascontiguousarray(blocks.T), np.ascontiguousarray(inside.T)
     differences = np.diff(cv2.GaussianBlur(blocks, (_KERNEL_PX, 1), _SMOOTHING_PX), axis=1)
-    inside = cv2.erode(inside, np.ones((1, _KERNEL_PX), np.uint8), borderValue=0) == 1
-    differences[~(inside[:, 1:] & inside[:, :-1])] = 0
+    # Averages of ones are not exactly 1.
+    whole = cv2.erode((inside > 0.999).astype(np.uint8), np.ones((1, _KERNEL_PX), np.uint8), borderValue=0) > 0
+    differences[~(whole[:, 1:] & whole[:, :-1])] = 0
     middle = len(differences) // 2
     upper, lower = (np.median(part, axis=0).astype(float) for part in (differences[:middle], differences[middle:]))
     return upper, lower
