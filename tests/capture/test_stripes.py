@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 import agalign
 from agalign.synthetic.cameras import REDEDGE
@@ -28,3 +29,10 @@ def test_a_capture_whose_bands_share_stripes_is_aligned(tmp_path: Path) -> None:
     scores = score_against_truth(reports, truth)
     assert [score.status for score in scores] == ["aligned"] * 4
     assert max(score.median_px for score in scores) < 0.3
+    (sidecar,) = (report.sidecar for report in reports)
+    assert sidecar is not None
+    x0, y0, width, height = sidecar.output.crop
+    (source,), (stack,) = tmp_path.rglob(sidecar.reference.file), (tmp_path / "out").rglob(sidecar.output.file)
+    with rasterio.open(source) as read, rasterio.open(stack) as written:
+        pixels = written.read(1 + written.descriptions.index(sidecar.reference.band))
+        np.testing.assert_array_equal(pixels, read.read(1)[y0 : y0 + height, x0 : x0 + width])
