@@ -4,6 +4,7 @@ One theta for as many captures as are given, each pair with its own psi (the pap
 what each choice gained.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -56,7 +57,7 @@ _FIRST_UPDATES = 5
 """Steps on psi before the first on weights that are not random; twice as many where those suffice."""
 _STEPS_BETWEEN_UPDATES = 10
 _HOPELESS_STEPS = 30
-"""Steps after which a level is given up where no held-out patches could be told apart."""
+"""Steps after which a level is given up where no held-out patches could be retrieved."""
 _PATCHES = 300
 """Patches in a Gauss-Newton step: the cost of a step grows with them, its error falls with their square root."""
 
@@ -76,37 +77,44 @@ DEFAULT_SCHEDULE = Schedule()
 
 
 def learn(
-    state: JointState,
-    groups: Sequence[ImageGroup],
-    net: Descriptor,
-    at_once: int = 1,
+    state: JointState, groups: Sequence[ImageGroup], net: Descriptor, at_once: int = 1,
     schedule: Schedule = DEFAULT_SCHEDULE,
-) -> tuple[int, float]:
-    """Theta and every psi of all subjects, coarse to fine; theta is carried from level to level.
+) -> tuple[int, float]:  # fmt: skip
+    """Learn theta and every psi of all groups, coarse to fine; theta is carried from level to level.
 
-    The psi of so many subjects move at a time, each in a thread; on how many, nothing depends. Returns the steps taken
-    and the last loss. Raises NoContrastError.
+    The psi of `at_once` groups move at a time, each group in a thread; the result does not depend on it. Returns the
+    number of steps on theta and the last loss, NaN without a step. Raises NoContrastError.
     """
-    scales = learn_scales(max(max(s.fixed.size_px) for s in groups))
-    steps, loss = 0, float("nan")
-    # Random numbers of its own each: what is drawn for one does not depend on the others.
+    scales = learn_scales(max(max(g.fixed.size_px) for g in groups))
+    steps, loss = 0, math.nan
+    # Each group has its own random numbers: what is drawn for one does not depend on the others.
     states = [JointState(state.settings, state.progress) for _ in groups]
     with ThreadPoolExecutor(at_once) as pool:
-        for number, scale in enumerate(scales):
-            last = number == len(scales) - 1
-            wanted = [[b for b in s.hopeful if last or not s.trusted[b]] for s in groups]
+
+        def move_psi(some: Sequence[_GroupAtLevel]) -> list[bool]:
+            return list(pool.map(_move_psi, some))
+
+        for scale in scales:
             at_level = [
-                _AtLevel(own, net, s, bands, own.level(s, scale, bands), schedule)
-                for own, s, bands in zip(states, groups, wanted, strict=True) if bands
-            ]  # fmt: skip
-            if number == 0 and net.learnt:
+                _GroupAtLevel(own, net, group, bands, own.level(group, scale, bands), schedule)
+                for own, group in zip(states, groups, strict=True)
+                if (bands := _bands_at(group, is_finest=scale == scales[-1]))
+            ]
+            if not at_level:
+                continue
+            if scale == scales[0] and net.learnt:
                 list(pool.map(_search, at_level))
-            if at_level:
-                taken, loss = _learn_level(state, net, at_level, schedule, lambda some: list(pool.map(_move_psi, some)))
+            if not net.learnt or not _converges(at_level, move_psi):
+                taken, loss = _train(state, net, at_level, schedule, move_psi)
                 steps += taken
-            for a in at_level:
-                a.hand_on()
+            for group in at_level:
+                group.hand_on()
     return steps, loss
+
+
+def _bands_at(group: ImageGroup, *, is_finest: bool) -> list[int]:
+    """The moving images that take part at a level: those with a trusted seed only at the finest one."""
+    return [b for b in group.active if is_finest or not group.trusted[b]]
 
 
 def learn_scales(longer_side_px: int) -> list[float]:
@@ -118,27 +126,27 @@ def learn_scales(longer_side_px: int) -> list[float]:
 
 
 @dataclass
-class _AtLevel:
-    """Some moving images of a subject at one level, with their psi as homographies of that level."""
+class _GroupAtLevel:
+    """Some moving images of a group at one level, with their psi as homographies of that level."""
 
     state: JointState
-    """The subject's own."""
+    """The group's own."""
     net: Descriptor
     group: ImageGroup
     which: Sequence[int]
-    """Of the subject's moving images."""
+    """Indices of the moving images in the group."""
     level: Level
     schedule: Schedule
     h: list[Tensor] = field(init=False)
-    settled: list[bool] = field(init=False)
-    """Those whose psi has been at rest once; it is moved on all the same."""
-    told_apart: list[bool] = field(init=False)
-    """Those whose held-out patches have been, so that psi could move."""
+    converged: list[bool] = field(init=False)
+    """True once psi has been at rest; it is moved on all the same."""
+    distinguished: list[bool] = field(init=False)
+    """True once held-out patches could be retrieved, so that psi could move."""
     retrieved: list[float] = field(init=False)
-    """Share of the held-out patches that were retrieved when it was last looked at."""
+    """Share of the held-out patches that were retrieved at the last test."""
 
     def __post_init__(self) -> None:
-        self.settled, self.told_apart = ([False] * len(self.which) for _ in range(2))
+        self.converged, self.distinguished = ([False] * len(self.which) for _ in range(2))
         self.retrieved = [0.0] * len(self.which)
         self.h = [self.level.homography(self.group.mappings[b], i) for i, b in enumerate(self.which)]
 
@@ -147,21 +155,25 @@ class _AtLevel:
         return [MovingBand(self.net, self.level, i, self.group.sides[b]) for i, b in enumerate(self.which)]
 
     @property
-    def is_on_its_way(self) -> bool:
-        """True where the patches of all psi that are not at rest are told apart well: more steps are all they need."""
+    def needs_only_steps(self) -> bool:
+        """True where the descriptors are good enough for every psi that has not converged: steps on psi suffice."""
         enough = self.schedule.enough_retrieval
-        return all(r > enough for r, settled in zip(self.retrieved, self.settled, strict=True) if not settled)
+        return all(r > enough for r, converged in zip(self.retrieved, self.converged, strict=True) if not converged)
 
     def hand_on(self) -> None:
-        """Give what was found to the subject; a homography that cannot be inverted is not handed on."""
-        self.group.given_up |= {b: self.retrieved[i] for i, b in enumerate(self.which) if not self.told_apart[i]}
+        """Write the result into the group; a homography that cannot be inverted is left out."""
+        self.group.dropped |= {b: self.retrieved[i] for i, b in enumerate(self.which) if not self.distinguished[i]}
         for i, b in enumerate(self.which):
             with suppress(GeometryError):
                 self.group.mappings[b] = self.level.full_matrix(self.h[i], i)
 
 
+_MovePsi = Callable[[Sequence[_GroupAtLevel]], list[bool]]
+"""One step on each psi of some groups; True for each group whose psi have all converged."""
+
+
 @torch.no_grad()
-def _search(at: _AtLevel) -> None:
+def _search(at: _GroupAtLevel) -> None:
     """Move each untrusted psi by the translation under which the patches' loss is least.
 
     Around the truth the loss is a funnel (paper, Fig. 2) that is wider than what one Gauss-Newton step sees.
@@ -178,58 +190,59 @@ def _search(at: _AtLevel) -> None:
         at.h[i] = at.h[i] @ translation(shift).to(at.h[i])
 
 
-def _learn_level(
-    state: JointState, net: Descriptor, at_level: Sequence[_AtLevel], schedule: Schedule,
-    move_psi: Callable[[Sequence[_AtLevel]], list[bool]],
-) -> tuple[int, float]:  # fmt: skip
-    """Theta by Adam, a capture at a time; each psi by Gauss-Newton once held-out patches are told apart.
+def _converges(at_level: Sequence[_GroupAtLevel], move_psi: _MovePsi) -> bool:
+    """Move every psi with the network as it is; True where all converge, so that no step on theta is needed."""
+    remaining = at_level
+    for update in range(1, 2 * _FIRST_UPDATES + 1):
+        remaining = [g for g, converged in zip(remaining, move_psi(remaining), strict=True) if not converged]
+        if not remaining:
+            return True
+        if update >= _FIRST_UPDATES and not all(g.needs_only_steps for g in remaining):
+            return False
+    return False
 
-    A network that is learnt already needs no step where its first ones on psi are enough.
+
+def _train(
+    state: JointState, net: Descriptor, at_level: Sequence[_GroupAtLevel], schedule: Schedule, move_psi: _MovePsi
+) -> tuple[int, float]:
+    """Theta by Adam, one group a step; every few steps each psi whose held-out patches are retrieved by Gauss-Newton.
+
+    Returns the number of steps and the last loss.
     """
-    loss_value = float("nan")
-    max_steps = schedule.max_steps * len(at_level)
-    between = _STEPS_BETWEEN_UPDATES * len(at_level)
+    loss_value, count = math.nan, len(at_level)
+    max_steps = schedule.max_steps * count
     warm_up = 0 if net.learnt else _WARM_UP_STEPS
-    if net.learnt:
-        restless = at_level
-        for update in range(2 * _FIRST_UPDATES):
-            restless = [a for a, settled in zip(restless, move_psi(restless), strict=True) if not settled]
-            if not restless:
-                return 0, loss_value
-            if update >= _FIRST_UPDATES - 1 and not all(a.is_on_its_way for a in restless):
-                break
     optimiser = Adam(net.parameters(), schedule.learning_rate)
     for step in range(1, max_steps + 1):
-        loss = _loss(at_level[step % len(at_level)])
+        loss = _loss(at_level[step % count])
         if loss is not None:
             optimiser.step(loss)
             loss_value = float(loss.detach())
-        if step < warm_up or step % between:
+        if step < warm_up or step % (_STEPS_BETWEEN_UPDATES * count):
             continue
         state.progress("learning", step / max_steps)
         if all(move_psi(at_level)):
             break
-        hopeless = step >= warm_up + _HOPELESS_STEPS * len(at_level)
-        if hopeless and not any(any(a.told_apart) for a in at_level):
+        if step >= warm_up + _HOPELESS_STEPS * count and not any(any(g.distinguished) for g in at_level):
             break
     net.learnt = True
     return step, loss_value
 
 
-def _loss(at: _AtLevel) -> Tensor | None:
+def _loss(at: _GroupAtLevel) -> Tensor | None:
     """The in-batch loss of one capture's pairs on keypoints that are drawn anew; None where none can be drawn."""
     state, level = at.state, at.level
     p, inside = state.sampler.draw(level, level.trainable, at.h, BATCH, _OCTAVES)
     rows = [inside[:, i].nonzero()[:, 0] for i in range(len(at.h))]
-    taking_part = [band for band in at.bands if len(rows[band.index]) >= MIN_KEYPOINTS]
-    if not taking_part:
+    visible = [band for band in at.bands if len(rows[band.index]) >= MIN_KEYPOINTS]
+    if not visible:
         return None
     patches = [level.fixed.patches(patch_positions(p))]
-    patches += [band.patches(p[rows[band.index]], at.h[band.index]) for band in taking_part]
-    f, *f_primes = at.net.describe(patches, [REFERENCE, *(band.side for band in taking_part)])
+    patches += [band.patches(p[rows[band.index]], at.h[band.index]) for band in visible]
+    f, *f_primes = at.net.describe(patches, [REFERENCE, *(band.side for band in visible)])
     apart = far_apart(p)
     terms = []
-    for band, f_prime in zip(taking_part, f_primes, strict=True):
+    for band, f_prime in zip(visible, f_primes, strict=True):
         mine = rows[band.index]
         terms.append(in_batch_loss(f[mine], f_prime, apart[mine][:, mine]))
     return torch.stack(terms).mean()
@@ -250,8 +263,8 @@ def in_batch_loss(f: Tensor, f_prime: Tensor, allowed: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _move_psi(at: _AtLevel) -> bool:
-    """One step on each psi of a capture whose held-out patches are retrieved; True where all have settled."""
+def _move_psi(at: _GroupAtLevel) -> bool:
+    """One step on each psi of a capture whose held-out patches are retrieved; True where all have converged."""
     state, level = at.state, at.level
     test, _ = state.sampler.draw(level, level.held_out, at.h, TEST_KEYPOINTS, _OCTAVES)
     p, _ = state.sampler.draw(level, level.anywhere, at.h, _PATCHES, _OCTAVES)
@@ -265,9 +278,9 @@ def _move_psi(at: _AtLevel) -> bool:
         at.retrieved[i] = retrieved
         if retrieved < MIN_RETRIEVAL:
             continue
-        at.told_apart[i] = True
+        at.distinguished[i] = True
         with suppress(NotEnoughTextureError):
             step = solver.step(band, at.h[i], reference_patches)
             at.h[i] = moved(at.h[i], step)
-            at.settled[i] |= retrieved > at.schedule.enough_retrieval and step.length_px < REST_PX
-    return all(at.settled)
+            at.converged[i] |= retrieved > at.schedule.enough_retrieval and step.length_px < REST_PX
+    return all(at.converged)

@@ -3,14 +3,14 @@
     argmin over theta and psi of   sum L0(x, w(x; psi); theta) + sum L1(x, x'; theta)
 
 theta are the weights of the descriptor f, psi the parameters of the homography w from I (`fixed`) to I' (`moving`),
-L0 the distance of two descriptors and L1 the hinge on those that do not belong together. Two recipes do this on the
+L0 the distance of two matching descriptors and L1 the hinge on the others. Two recipes do this on the
 same levels, keypoints, patches and networks:
 
 * `paper` (`paper.descend`): SGD on theta and psi together, coarse to fine, one pair at a time, as published.
 * `fast` (`fast.learn`, then `refine.refine`): Adam on theta through in-batch negatives; every few steps one
   Gauss-Newton step on psi minimises L0 squared; at full resolution psi alone, theta frozen.
 
-Where theta is known already, from the flight, psi alone is left (`refine_with`).
+Where theta is known already, from the flight, only psi is optimised (`refine_with`).
 """
 
 from dataclasses import replace
@@ -26,7 +26,7 @@ from agalign.values.alignment import JointResult
 from agalign.values.issues import Issue
 
 Results = list[JointResult | Issue]
-"""For each moving image of a subject what was found, or why nothing was."""
+"""For each moving image of a group the result, or the reason why there is none."""
 
 
 def align_from_scratch(

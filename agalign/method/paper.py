@@ -69,7 +69,7 @@ def pyramid(longer_side_px: int) -> tuple[float, ...]:
 def align_by_paper(
     state: JointState, group: ImageGroup, training: Training = DEFAULT_TRAINING
 ) -> tuple[Descriptor, JointResult | Issue]:
-    """The network and what it found for a subject of one moving image.
+    """The network and the result for a group of one moving image.
 
     Coarse to fine: theta starts anew at each level, psi is handed on. Raises NotEnoughTextureError, NoContrastError,
     and GeometryError where psi ends in no homography.

@@ -212,10 +212,9 @@ def _losses_moved(band: MovingBand, homography: Tensor, keypoints: Keypoints, f:
 
 @torch.no_grad()
 def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool = True) -> list[JointResult | Issue]:
-    """Every psi of a capture at full resolution with theta frozen; a doubt says why a pair has none.
+    """Refine every psi of a capture at full resolution with theta frozen; an issue is why a pair has no result.
 
-    Without `move` psi stays where it is, and what is said of it is how sure it is.
-    Raises NoContrastError.
+    Without `move` psi stays as it is: only its retrieval and uncertainty are measured. Raises NoContrastError.
     """
     level = state.level(group, 1.0, range(len(group.moving)))
     h = [level.homography(matrix, b) for b, matrix in enumerate(group.mappings)]
@@ -229,28 +228,27 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
 
     def result(band: MovingBand, start: Tensor) -> JointResult | Issue:
         try:
-            results, step = (
-                solver.converge(band, start, reference_patches)
-                if move
-                else (start, solver.step(band, start, reference_patches))
-            )
-            matrix = level.full_matrix(results, band.index)
-        except NotEnoughTextureError as why_not:
-            return Issue("few_keypoints", why_not.keypoints, why_not.minimum)
+            if move:
+                homography, step = solver.converge(band, start, reference_patches)
+            else:
+                homography, step = start, solver.step(band, start, reference_patches)
+            matrix = level.full_matrix(homography, band.index)
+        except NotEnoughTextureError as error:
+            return Issue("few_keypoints", error.keypoints, error.minimum)
         except GeometryError:
             return Issue("not_invertible")
         std = _complete_std(step)
         if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
             return Issue("corners_unknown")
-        held_out, chance = held_out_retrieval(band, results, test, f_test)
+        held_out, chance = held_out_retrieval(band, homography, test, f_test)
         return JointResult(
             matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
             _complete_covariance(step),
         )  # fmt: skip
 
     return [
-        Issue("retrieval", group.given_up[b], MIN_RETRIEVAL)
-        if b in group.given_up
+        Issue("retrieval", group.dropped[b], MIN_RETRIEVAL)
+        if b in group.dropped
         else result(MovingBand(net, level, b, side), h[b])
         for b, side in enumerate(group.sides)
     ]

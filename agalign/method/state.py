@@ -1,4 +1,4 @@
-"""What a joint optimisation works on, the images of a capture, and what it carries along: settings, random numbers."""
+"""Inputs of a joint optimisation: the images of a capture, settings and random numbers."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,34 +17,34 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
 Progress = Callable[[str, float], None]
-"""Called with the name of what is being done and the share of it that is behind, 0 to 1."""
+"""Called with the name of a stage and the share of it that is done, 0 to 1."""
 ThetaStart = Literal["starter", "random"]
 
 
 @dataclass
 class ImageGroup:
-    """The images of one capture and where their alignment stands."""
+    """The images of one capture and the current state of their alignment."""
 
     fixed: Raster
     moving: Sequence[Raster]
     mappings: list[Matrix]
     """fixed_to_moving of each moving image, undistorted px; moved along by the optimisation."""
     sides: Sequence[int]
-    """Which of the network's sides describes each moving image."""
+    """The side of the network that describes each moving image."""
     trusted: Sequence[bool]
-    """Seeds that are good to a few pixels: recipe fast leaves the coarse levels out."""
+    """True for a seed that is good to a few pixels: recipe fast then skips the coarse levels."""
     reach_px: Sequence[float] = ()
-    """How far from its mapping each may lie, px of `fixed`; empty where nothing is known of that."""
-    given_up: dict[int, float] = field(default_factory=dict)
-    """Moving images whose patches could not be told apart at some level, and the retrieval there: nothing is learnt or
-    refined for them."""
+    """Largest distance of each result from its mapping, px of `fixed`; empty where there is no limit."""
+    dropped: dict[int, float] = field(default_factory=dict)
+    """{moving image: held-out retrieval} where the descriptors could not distinguish patches at some level: they are
+    neither learnt nor refined any more."""
     fields: Sequence[DisplacementField | None] = ()
     """Displacements of the reference's positions before each homography, px of `fixed`; empty for none at all."""
 
     @property
-    def hopeful(self) -> list[int]:
-        """The moving images that are not given up."""
-        return [b for b in range(len(self.moving)) if b not in self.given_up]
+    def active(self) -> list[int]:
+        """The moving images that are not dropped."""
+        return [b for b in range(len(self.moving)) if b not in self.dropped]
 
     @classmethod
     def of_one(cls, fixed: Raster, moving: Raster, fixed_to_moving: Matrix, *, trusted: bool = False) -> "ImageGroup":
@@ -53,7 +53,7 @@ class ImageGroup:
 
 
 class JointState:
-    """What both recipes share. Raises ConfigurationError where there is no such device."""
+    """What both recipes share: settings, device and random numbers. Raises ConfigurationError for an unknown device."""
 
     def __init__(self, settings: JointSettings, progress: Progress) -> None:
         self.settings = settings
@@ -63,7 +63,7 @@ class JointState:
         self.family = None if settings.model_family == "auto" else settings.model_family
 
     def level(self, group: ImageGroup, scale: float, bands: Sequence[int]) -> Level:
-        """The subject's reference and some of its moving images at a resolution. Raises NoContrastError."""
+        """The reference of a group and some of its moving images at a resolution. Raises NoContrastError."""
         level = make_level(
             group.fixed, [group.moving[b] for b in bands], [group.mappings[b] for b in bands], scale,
             self.sampler.generator, self.device,
@@ -86,7 +86,7 @@ class JointState:
         return net
 
     def _random_descriptor(self, channels: Sequence[int], *, half_rectified: bool, unit_length: bool) -> Descriptor:
-        """Its weights depend on nothing but the settings' rng_seed."""
+        """Its weights depend only on the rng_seed of the settings."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.settings.rng_seed)
             net = Descriptor(self.settings.sharing, channels, half_rectified=half_rectified, unit_length=unit_length)
