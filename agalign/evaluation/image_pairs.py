@@ -83,14 +83,17 @@ def _from_csv(path: Path) -> Iterator[PairFiles]:
             fixed, moving = (row[column] or "" for column in ("fixed", "moving"))
         except KeyError as missing:
             raise InputError(f"{path}: has no column {missing}; it needs fixed and moving") from None
-        homography = row.get("homography") or ""
-        numbers = homography.replace(",", " ").split()
-        if len(numbers) > 1:
-            matrix: Matrix | None = _as_homography(numbers, f"{path}, line {number}")
-        else:
-            matrix = _read_homography(path.parent / homography) if homography else None
         name = row.get("name") or f"{Path(fixed).stem} {Path(moving).stem}"
+        matrix = _homography_in(row.get("homography") or "", path, number)
         yield PairFiles(name, row.get("group") or path.stem, path.parent / fixed, path.parent / moving, matrix)
+
+
+def _homography_in(cell: str, path: Path, line: int) -> Matrix | None:
+    """Of a cell of a CSV file: nine numbers, the name of a file of them, or empty."""
+    numbers = cell.replace(",", " ").split()
+    if len(numbers) > 1:
+        return _as_homography(numbers, f"{path}, line {line}")
+    return _read_homography(path.parent / cell) if cell else None
 
 
 def _read_homography(path: Path) -> Matrix:

@@ -4,19 +4,23 @@ import csv
 import io
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 
 from agalign.errors import InputError
 from agalign.evaluation.image_pairs import PairFiles, read_image
-from agalign.evaluation.methods import Method, PairTask
+from agalign.evaluation.methods import Method, Outcome, PairTask
 from agalign.evaluation.protocol import average_precision, homography_error_px
 from agalign.method.detect import sift_keypoints, visible_in_both
 from agalign.method.device import one_memory_error, one_thread
+from agalign.method.patches import Keypoints
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
+
+Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,6 @@ def evaluate(
             raise InputError(f"{pair.fixed}: has no homography to compare with")
         fixed, moving = read_image(pair.fixed), read_image(pair.moving)
         keypoints = visible_in_both(sift_keypoints(fixed), truth, fixed, moving)
-        points = keypoints.xy.numpy().astype(np.float64)
         for name, method in methods.items():
             rng = np.random.default_rng((rng_seed, number))
             for shift, start in starts.of(truth, max(fixed.size_px), rng):
@@ -82,15 +85,23 @@ def evaluate(
                 with one_thread(), one_memory_error():
                     outcome = method(PairTask(fixed, moving, start, device, rng_seed, starts.seeding))
                 seconds = time.perf_counter() - began
-                precision = error = math.nan
-                if outcome.describe is not None and len(keypoints):
-                    precision = average_precision(*outcome.describe(keypoints, truth))
-                if outcome.fixed_to_moving is not None and len(points):
-                    error = homography_error_px(outcome.fixed_to_moving, truth, points)
-                share = error / max(moving.size_px)
-                yield Result(pair.name, pair.group, name, shift, len(points), precision, error, share, seconds)
+                precision, error_px = _scores(outcome, keypoints, truth)
+                yield Result(
+                    pair.name, pair.group, name, shift, len(keypoints), precision, error_px,
+                    error_px / max(moving.size_px), seconds,
+                )  # fmt: skip
                 if outcome.fixed_to_moving is None:
                     break
+
+
+def _scores(outcome: Outcome, keypoints: Keypoints, truth: Matrix) -> tuple[float, float]:
+    """(average precision, error in px of the second image); NaN for what a method does not give."""
+    precision = error_px = math.nan
+    if outcome.describe is not None and len(keypoints):
+        precision = average_precision(*outcome.describe(keypoints, truth))
+    if outcome.fixed_to_moving is not None and len(keypoints):
+        error_px = homography_error_px(outcome.fixed_to_moving, truth, keypoints.xy.numpy().astype(np.float64))
+    return precision, error_px
 
 
 def as_csv(results: Sequence[Result]) -> str:
@@ -103,36 +114,51 @@ def as_csv(results: Sequence[Result]) -> str:
 
 
 def precision_table(results: Sequence[Result]) -> list[list[str]]:
-    """Mean average precision, a row a method and a column a group, after a row of titles."""
+    """Mean average precision: a row of titles, then a row for each method with a column for each group."""
+    described = [r for r in results if not math.isnan(r.average_precision)]
     groups = list(dict.fromkeys(r.group for r in results))
-    rows = [["method", *groups, *(["all"] if len(groups) > 1 else []), "pairs"]]
-    for method in dict.fromkeys(r.method for r in results):
-        own = [r for r in results if r.method == method and not math.isnan(r.average_precision)]
-        if own:
-            wanted: list[str | None] = [*groups, *([None] if len(groups) > 1 else [])]
-            means = [_mean([r.average_precision for r in own if g in (None, r.group)]) for g in wanted]
-            rows.append([method, *(f"{m:.3f}" for m in means), str(len({r.pair for r in own}))])
+    totals = ["all"] if len(groups) > 1 else []
+    rows = [["method", *groups, *totals, "pairs"]]
+    for method, own in _grouped(described, lambda r: r.method).items():
+        by_group = _grouped(own, lambda r: r.group)
+        means = [_mean_precision(by_group.get(g, [])) for g in groups] + [_mean_precision(own) for _ in totals]
+        rows.append([method, *(f"{m:.3f}" for m in means), str(len({r.pair for r in own}))])
     return rows
+
+
+_ERROR_TITLES = (
+    "method", "start off by", "median error, px", "worst, px", "mean, % of the side", "under 1 px", "mAP", "s"
+)  # fmt: skip
 
 
 def error_table(results: Sequence[Result]) -> list[list[str]]:
-    """How far off the homographies are, a row a method and a shift, after a row of titles."""
-    rows = [
-        ["method", "start off by", "median error, px", "worst, px", "mean, % of the side", "under 1 px", "mAP", "s"]
-    ]
-    for method in dict.fromkeys(r.method for r in results):
-        for shift in dict.fromkeys(r.shift for r in results):
-            own = [r for r in results if (r.method, r.shift) == (method, shift) and not math.isnan(r.error_px)]
-            if own:
-                e = np.array([r.error_px for r in own])
-                share = _mean([r.error_share for r in own])
-                rows.append(
-                    [method, f"{shift:.1%}", f"{np.median(e):.3f}", f"{e.max():.2f}", f"{share:.3%}",
-                     f"{(e < 1).sum()} of {len(e)}", f"{_mean([r.average_precision for r in own]):.3f}",
-                     f"{np.median([r.seconds for r in own]):.1f}"]
-                )  # fmt: skip
+    """Errors of the homographies: a row of titles, then a row for each method and shift."""
+    rows = [list(_ERROR_TITLES)]
+    shifts = {shift: number for number, shift in enumerate(dict.fromkeys(r.shift for r in results))}
+    measured = [r for r in results if not math.isnan(r.error_px)]
+    for method, own in _grouped(measured, lambda r: r.method).items():
+        by_shift = _grouped(own, lambda r: r.shift)
+        rows += [_error_row(method, shift, by_shift[shift]) for shift in sorted(by_shift, key=lambda s: shifts[s])]
     return rows
 
 
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if values else math.nan
+def _error_row(method: str, shift: float, own: Sequence[Result]) -> list[str]:
+    e = np.array([r.error_px for r in own])
+    share = float(np.mean([r.error_share for r in own]))
+    return [
+        method, f"{shift:.1%}", f"{np.median(e):.3f}", f"{e.max():.2f}", f"{share:.3%}", f"{(e < 1).sum()} of {len(e)}",
+        f"{_mean_precision(own):.3f}", f"{np.median([r.seconds for r in own]):.1f}",
+    ]  # fmt: skip
+
+
+def _grouped(results: Sequence[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:
+    """The results by a key, in the order of the first of each."""
+    groups: dict[Key, list[Result]] = {}
+    for result in results:
+        groups.setdefault(key(result), []).append(result)
+    return groups
+
+
+def _mean_precision(results: Sequence[Result]) -> float:
+    """NaN without results."""
+    return float(np.mean([r.average_precision for r in results])) if results else math.nan
