@@ -12,8 +12,9 @@ from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
+from agalign.pixels.grey import channel_mean
 from agalign.pixels.raster import read_for_alignment
-from agalign.pixels.resample import single, warped
+from agalign.pixels.resample import warped
 from agalign.pixels.stripes import without_common_stripes
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementField
@@ -115,7 +116,7 @@ class BandPair:
 
     def warped_moving(self, mapping: PixelMapping) -> Raster:
         """The moving image, one channel, on the reference's pixels."""
-        return warped(single(self.moving_image), mapping, self.fixed.size_px)
+        return warped(channel_mean(self.moving_image), mapping, self.fixed.size_px)
 
     def is_expected(self, fixed_to_moving: Matrix, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
         """True where some candidate has a mapping, moved by a shift of the fixed image, within what it is known to."""

@@ -4,8 +4,9 @@ from dataclasses import replace
 from functools import cached_property
 
 from agalign.config import LocalScale, Settings
+from agalign.pixels.grey import channel_mean
 from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
-from agalign.pixels.resample import shrink, single, textured
+from agalign.pixels.resample import shrink, textured
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values.image import Raster
 from agalign.verify.displacement_field import DisplacementEstimator
@@ -24,7 +25,7 @@ class Reference:
     @cached_property
     def grey(self) -> Raster:
         """(H, W): the image or the mean of its channels."""
-        return single(self.image)
+        return channel_mean(self.image)
 
     @cached_property
     def raw(self) -> Raster:

@@ -14,8 +14,9 @@ from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import match_seed, starter_for_matching
 from agalign.method.state import ImageGroup
+from agalign.pixels.grey import channel_mean
 from agalign.pixels.landmarks import LANDMARK_INPUTS, agreed_homography, landmarks
-from agalign.pixels.resample import single, textured, warped
+from agalign.pixels.resample import textured, warped
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry, lens
 from agalign.values.alignment import Residual, Seed
@@ -204,7 +205,7 @@ def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[See
     """
     reference, settings = pair.reference, pair.reference.settings.seed
     size, scale = reference.seed_size_px, reference.seed_scale
-    small_moving = warped(single(pair.moving), pair.mapping(fixed_to_moving), size, scale)
+    small_moving = warped(channel_mean(pair.moving), pair.mapping(fixed_to_moving), size, scale)
     if small_moving.valid.mean() < settings.min_overlap:
         return [Seed(kind, fixed_to_moving, 0.0)]
     spectrum = windowed_spectra(structure_field(small_moving, settings.smoothing_px))

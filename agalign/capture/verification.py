@@ -7,7 +7,8 @@ import numpy as np
 
 from agalign.capture.band_pair import BandPair
 from agalign.config import CheckSettings, Settings
-from agalign.pixels.resample import shrink, single
+from agalign.pixels.grey import channel_mean
+from agalign.pixels.resample import shrink
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, DisplacementResult, JointResult, Prediction, Residual, Seed
@@ -98,7 +99,7 @@ def _with_displacements(
 ) -> tuple[DisplacementResult, WarpedPair | None]:
     """A field of displacements over a mapping, and the pair under it where nothing speaks against that."""
     refiner = pair.reference.finer_local if finer else pair.reference.local
-    local = refiner.refine(single(pair.moving_image), result)
+    local = refiner.refine(channel_mean(pair.moving_image), result)
     if local.field is None:
         return local, None
     displaced = WarpedPair.at(pair, replace(result, local=local.field))

@@ -26,14 +26,14 @@ from agalign.errors import ConfigurationError, GeometryError, InputError, NoCont
 from agalign.evaluation.protocol import grey_patches
 from agalign.flight.model import load_model
 from agalign.method.descriptor import Descriptor
-from agalign.method.detect import grey
 from agalign.method.fast import learn
 from agalign.method.match import matching_network
 from agalign.method.paper import align_by_paper, pyramid
 from agalign.method.patches import Keypoints, patch_positions, transform
 from agalign.method.refine import MovingBand, describe_fixed, refine
 from agalign.method.state import ImageGroup, JointState, ThetaStart
-from agalign.pixels.resample import single, warped
+from agalign.pixels.grey import channel_mean, luma
+from agalign.pixels.resample import warped
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
 from agalign.values.choices import Sharing
@@ -134,7 +134,7 @@ def _learnt_on_the_pair(task: PairTask, settings: JointSettings, start: ThetaSta
 
 
 def _without_colour(raster: Raster) -> Raster:
-    return replace(raster, pixels=grey(raster.pixels))
+    return replace(raster, pixels=luma(raster.pixels))
 
 
 def _by_network(net: Descriptor, state: JointState, one: Raster, other: Raster) -> Describe:
@@ -243,9 +243,9 @@ def _torchscript(path: Path, side: int) -> Method:
 
 def _elastix(task: PairTask) -> Outcome:
     """On the pyramid of recipe paper; its own default parameters otherwise."""
-    laid = warped(single(task.moving), PixelMapping(task.start), task.fixed.size_px)
+    moving = warped(channel_mean(task.moving), PixelMapping(task.start), task.fixed.size_px)
     levels = len(pyramid(max(task.fixed.size_px)))
-    result = elastix_affinity(single(task.fixed), laid, levels)
+    result = elastix_affinity(channel_mean(task.fixed), moving, levels)
     return Outcome(None, task.start if result is None else geometry.compose(task.start, result))
 
 

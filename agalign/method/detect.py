@@ -9,27 +9,18 @@ from numpy.typing import NDArray
 
 from agalign.method.descriptor import PATCH_PX
 from agalign.method.patches import Keypoints, patch_positions, transform
-from agalign.pixels.landmarks import eight_bit
+from agalign.pixels.grey import eight_bit, luma
 from agalign.values.geometry import Matrix
-from agalign.values.image import FloatImage, Raster
+from agalign.values.image import Raster
 
 MAX_KEYPOINTS = 2000
 _SPACING_PER_SIZE = 6 / PATCH_PX
 """SIFT describes an area 6 times its keypoint's size wide; so do the patches."""
 
 
-def grey(image: FloatImage) -> FloatImage:
-    """(H, W): the luma of three channels (ITU-R BT.601), the mean of any other number, a single band as it is."""
-    if image.ndim == 2:
-        return image
-    if len(image) != 3:
-        return np.asarray(image.mean(axis=0), np.float32)
-    return np.tensordot(np.array([0.299, 0.587, 0.114], np.float32), image, axes=1)
-
-
 def to_8_bit(raster: Raster) -> NDArray[np.uint8]:
     """(H, W), grey, between the 1st and the 99th percentile of the valid pixels."""
-    return eight_bit(grey(raster.pixels), raster.valid)
+    return eight_bit(luma(raster.pixels), raster.valid)
 
 
 def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.errors import GeometryError
-from agalign.pixels.resample import shrink, single
+from agalign.pixels.grey import channel_mean, eight_bit
+from agalign.pixels.resample import shrink
 from agalign.pixels.structure import gradient_magnitude
 from agalign.values import geometry, lens
 from agalign.values.geometry import Matrix, Points
-from agalign.values.image import FloatImage, Mask, Raster
+from agalign.values.image import Raster
 from agalign.values.lens import Lens
 
 LandmarkInput = Literal["edges", "image"]
@@ -50,7 +51,7 @@ def landmarks(raster: Raster, view: LandmarkInput) -> Landmarks:
     """The strongest ones of an image, whatever its channels."""
     width, height = raster.size_px
     scale = min(1.0, _LONGEST_SIDE_PX / max(width, height))
-    small = shrink(single(raster), (max(8, round(width * scale)), max(8, round(height * scale))))
+    small = shrink(channel_mean(raster), (max(8, round(width * scale)), max(8, round(height * scale))))
     looked_at, valid = small.pixels, small.valid
     if view == "edges":
         smooth = cv2.GaussianBlur(np.where(valid, looked_at, 0).astype(np.float32), (0, 0), _EDGES_SMOOTHED_PX)
@@ -86,9 +87,3 @@ def agreed_homography(fixed: Landmarks, moving: Landmarks, size_px: tuple[int, i
         return geometry.normalised(result)
     except GeometryError:
         return None
-
-
-def eight_bit(image: FloatImage, valid: Mask) -> NDArray[np.uint8]:
-    """(H, W) between the 1st and the 99th percentile of the valid pixels."""
-    low, high = np.percentile(image[valid], (1, 99)) if valid.any() else (0.0, 1.0)
-    return np.asarray((np.clip((image - low) / max(high - low, 1e-9), 0, 1) * 255).round().astype(np.uint8))

@@ -162,13 +162,6 @@ def warped(
     return Raster(np.asarray(pixels, np.float32), np.asarray(valid))
 
 
-def single(raster: Raster) -> Raster:
-    """One channel: the mean of several."""
-    if raster.pixels.ndim == 2:
-        return raster
-    return Raster(np.asarray(raster.pixels.mean(axis=0), np.float32), raster.valid, raster.lens)
-
-
 def textured(raster: Raster, min_share: float = 0.02) -> bool:
     """False where the valid pixels are constant, or at most `min_share` of the image."""
     if np.count_nonzero(raster.valid) <= min_share * raster.valid.size:

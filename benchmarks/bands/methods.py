@@ -25,7 +25,8 @@ from agalign.capture.seeding import best_seed
 from agalign.config import CheckSettings, Settings
 from agalign.errors import AgalignError
 from agalign.evaluation.methods import elastix_affinity
-from agalign.method.detect import grey, to_8_bit
+from agalign.method.detect import to_8_bit
+from agalign.pixels.grey import luma
 from agalign.pixels.masks import raster_of
 from agalign.pixels.resample import warped
 from agalign.values import geometry
@@ -65,7 +66,7 @@ def method_named(name: str) -> Align:
 def grey_raster(image: Image) -> Raster:
     """Grey float32; constant fill that runs in from the border, and saturated areas, are not valid."""
     raster = raster_of(image, None, "image")
-    return replace(raster, pixels=grey(raster.pixels))
+    return replace(raster, pixels=luma(raster.pixels))
 
 
 def grey_8_bit(image: Image) -> NDArray[np.uint8]:
