@@ -24,7 +24,7 @@ def to_8_bit(raster: Raster) -> NDArray[np.uint8]:
 
 
 def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:
-    """The `most` strongest SIFT keypoints of an image, raw px."""
+    """The `maximum` strongest SIFT keypoints of an image, raw px."""
     result = cv2.SIFT.create(nfeatures=maximum).detect(to_8_bit(raster), raster.valid.astype(np.uint8))
     result = sorted(result, key=lambda k: -k.response)[:maximum]
     return Keypoints(
@@ -35,7 +35,7 @@ def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:
 
 
 def visible_in_both(keypoints: Keypoints, fixed_to_moving: Matrix, fixed: Raster, moving: Raster) -> Keypoints:
-    """Those whose patches lie in both images."""
+    """The keypoints whose patches are inside both images."""
     grid = patch_positions(keypoints)
     there = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
     inside = torch.ones(len(keypoints), dtype=torch.bool)

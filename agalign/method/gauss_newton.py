@@ -19,7 +19,7 @@ from agalign.values.choices import ModelFamily
 _REWEIGHTINGS = 4
 _DAMPING = 1e-4
 _CELL_PX = 48
-"""Patches whose centres share a cell of this side count as one witness of the uncertainty."""
+"""Patches whose centres share a cell of this side overlap: the covariance takes them as one observation."""
 _RICH_ENOUGH_STD_PX = 0.5
 """A model family is rich enough while its least certain corner is known this well, px of the level: beyond it a simpler
 family has the smaller error."""
@@ -41,8 +41,8 @@ class Step:
     level."""
     family: ModelFamily
     corner_covariance_px2: Tensor
-    """(8, 8) of (x, y) of the corners in turn, for a homography whatever the family: what the patches do not say is
-    unknown there."""
+    """(8, 8) of (x, y) of the corners in turn, always of a homography, so that directions that the patches do not
+    determine have a large variance even where a simpler family was taken."""
 
     @property
     def corner_std_px(self) -> float:
@@ -59,7 +59,11 @@ def shift_gradient(describe: Callable[[Keypoints], Tensor], keypoints: Keypoints
 
 
 def shift_over_psi(xy: Tensor, width_px: int, height_px: int) -> Tensor:
-    """Derivative of a warped position over psi at psi = 0, (N, 2, 8), float64."""
+    """Derivative of a warped position over psi at psi = 0, (N, 2, 8), float64.
+
+    `geometry.over_corners` is the same derivative over the displacements of the corners, in numpy: a linear change of
+    parameters apart. This one stays on the device of the descriptors.
+    """
     x, y = exact(xy).unbind(dim=1)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
     along_x = [x, y, zero, zero, one * width_px, zero, -x * x / width_px, -x * y / height_px]
@@ -69,8 +73,11 @@ def shift_over_psi(xy: Tensor, width_px: int, height_px: int) -> Tensor:
 
 @dataclass(frozen=True)
 class PatchEquations:
-    """What each patch says of a small shift s of its centre: its squared residual is energy - 2 pull.s + s.stiffness.s
-    to second order. All float64.
+    """The squared residual of each patch over a small shift s of its centre, to second order:
+
+        energy - 2 pull.s + s.stiffness.s
+
+    All tensors are float64.
     """
 
     xy: Tensor
@@ -88,7 +95,7 @@ class PatchEquations:
     def of(cls, keypoints: Keypoints, residual: Tensor, gradient: Tensor, size_px: tuple[int, int]) -> "PatchEquations":
         """`residual` is f(x) - f'(w(x)), (N, 256), `gradient` that of f over a shift of x, (N, 256, 2).
 
-        The residual's mean over the patches is what the two modalities disagree on everywhere: it is removed.
+        The mean of the residuals over the patches is the constant difference of the two modalities: it is removed.
         """
         centred, g = exact(residual - residual.mean(dim=0)), exact(gradient)
         pull = torch.einsum("ndk,nd->nk", g, centred)
@@ -97,7 +104,7 @@ class PatchEquations:
 
     @property
     def cell(self) -> Tensor:
-        """(N,) index of the cell of the image that a patch's centre lies in."""
+        """(N,) index of the cell of the image that contains the centre of a patch."""
         column, row = (self.xy / _CELL_PX).floor().long().clamp_min(0).unbind(dim=1)
         return row * (self.size_px[0] // _CELL_PX + 2) + column
 
@@ -128,8 +135,11 @@ def _solve_family(equations: PatchEquations, family: ModelFamily, max_step_px: f
     delta = pull.new_zeros(len(parameters))
     for _ in range(_REWEIGHTINGS):
         shift = torch.einsum("nki,i->nk", j, delta)
-        left = equations.energy - 2 * (shift * pull).sum(dim=1) + torch.einsum("nk,nkl,nl->n", shift, stiffness, shift)
-        weight = 1 / (1 + left.clamp_min(0) / left.median().clamp_min(1e-12))
+        squared = (
+            equations.energy - 2 * (shift * pull).sum(dim=1) + torch.einsum("nk,nkl,nl->n", shift, stiffness, shift)
+        )
+        # Cauchy weights, as `values.robust.cauchy_weights`, of residuals that are known by their squares.
+        weight = 1 / (1 + squared.clamp_min(0) / squared.median().clamp_min(1e-12))
         normal = torch.einsum("n,nij->ij", weight, per_patch_normal)
         normal = normal + torch.diag(_DAMPING * normal.diagonal() + 1e-12)
         delta = torch.linalg.solve(normal, torch.einsum("n,ni->i", weight, per_patch_pull))
@@ -154,10 +164,10 @@ def _solve_family(equations: PatchEquations, family: ModelFamily, max_step_px: f
 
 
 def _covariances(normal: Tensor, score: Tensor, cell: Tensor) -> Tensor:
-    """(2, P, P) sandwich covariances: what the patches disagree by, not what a noise model says, sets the uncertainty.
+    """(2, P, P) sandwich covariances: the scatter of the patches sets the uncertainty, not a noise model.
 
-    Patches that overlap see the same pixels, so cells of the image count as one witness each (Liang & Zeger 1986);
-    where there are few cells the patches by themselves may say more. `score` (N, P) is what each patch still pulls.
+    Patches that overlap share pixels, so the second is clustered by cells of the image (Liang & Zeger 1986); where there
+    are few cells the first, by single patches, may be larger. `score` (N, P) is the gradient of each patch.
     """
     of_cells = score.new_zeros((int(cell.max()) + 1, score.shape[1])).index_add_(0, cell, score)
     inverse = torch.linalg.inv(normal)

@@ -1,6 +1,6 @@
-"""Psi with theta frozen: Gauss-Newton on L0 squared, inverse-compositional.
+"""Psi with theta frozen: inverse-compositional Gauss-Newton on L0 squared.
 
-The descriptors of the reference and their gradient over a shift are worked out once and serve every moving band and
+The descriptors of the reference and their gradient over a shift are computed once and serve every moving band and
 every step (Baker & Matthews 2004, Sec. 3.2): a step costs one pass of the moving band's patches.
 """
 
@@ -43,9 +43,10 @@ _DIFFERENCE_PX = 0.75
 """Half width of the central differences that give a descriptor's gradient."""
 _FIRST_PATCHES, _LIKELY_SHIFTS, _AT_ONCE = 24, 64, 16
 _MAX_RATIO = 0.6
-"""Of one step to the one before, for what follows to be believed a geometric series."""
-_PLAIN_GAIN = 3.0
-"""Standard errors by which a loss must be less to count."""
+"""Largest ratio of a step to the one before at which the steps are taken as a geometric series: above it the sum would
+be dominated by the error of the ratio."""
+_MIN_GAIN_SIGMA = 3.0
+"""Standard errors by which the loss of a shift must be less than without it."""
 
 
 @dataclass(frozen=True)
@@ -155,8 +156,9 @@ def moved(homography: Tensor, step: Step, times: float = 1.0) -> Tensor:
 
 @torch.no_grad()
 def held_out_retrieval(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor) -> tuple[float, float]:
-    """How often the nearest descriptor in I' is the right one among the keypoints that lie in both images, and what
-    guessing would give. `f` (N, 256) are the reference's descriptors.
+    """(share of the keypoints that are visible in both images whose nearest descriptor in I' is their own, chance).
+
+    `f` (N, 256) are the descriptors of the reference.
     """
     rows = band.sees(keypoints, homography)
     if len(rows) < MIN_KEYPOINTS:
@@ -187,7 +189,7 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach
         enough = table.isfinite().sum(dim=1) >= MIN_KEYPOINTS
         return table, table.nanmean(dim=1).masked_fill(~enough, float("inf"))
 
-    # A part of the patches tells which shifts are worth all of them.
+    # Some of the patches select the shifts that are tried with all of them.
     _, rough = table_of(shifts, _FIRST_PATCHES)
     likely = shifts[rough.argsort()[:_LIKELY_SHIFTS]]
     table, means = table_of(torch.cat([homography.new_zeros(1, 2), likely]), len(keypoints))
@@ -196,7 +198,7 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach
     gain = gain[gain.isfinite()]
     if not bool(means[best].isfinite()) or len(gain) < MIN_KEYPOINTS:
         return homography.new_zeros(2)
-    plain = float(gain.mean()) > _PLAIN_GAIN * float(gain.std()) / math.sqrt(len(gain))
+    plain = float(gain.mean()) > _MIN_GAIN_SIGMA * float(gain.std()) / math.sqrt(len(gain))
     return likely[best - 1] if plain and best > 0 else homography.new_zeros(2)
 
 

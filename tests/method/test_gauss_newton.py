@@ -5,6 +5,7 @@ import torch
 from agalign.method.gauss_newton import PatchEquations, Step, shift_gradient, shift_over_psi
 from agalign.method.gauss_newton import solve as solve_equations
 from agalign.method.patches import Keypoints, homography_from_psi, transform
+from agalign.values import geometry
 
 WIDTH, HEIGHT = 300, 200
 
@@ -43,6 +44,15 @@ def test_shift_over_psi_is_that_of_finite_differences() -> None:
         plus = transform(homography_from_psi(step, WIDTH, HEIGHT), p)
         minus = transform(homography_from_psi(-step, WIDTH, HEIGHT), p)
         torch.testing.assert_close(jacobian[:, :, k], (plus - minus) / 2e-5, atol=1e-5, rtol=1e-5)
+
+
+def test_shift_over_psi_is_the_derivative_over_corners_in_other_parameters() -> None:
+    """The homography's derivative is written twice, in torch and in numpy: they must agree."""
+    p = scattered(10).xy
+    corners = torch.from_numpy(geometry.corners(WIDTH, HEIGHT))
+    of_corners = shift_over_psi(corners, WIDTH, HEIGHT).reshape(8, 8).numpy()
+    expected = geometry.over_corners(p.numpy(), WIDTH, HEIGHT) @ of_corners
+    np.testing.assert_allclose(shift_over_psi(p, WIDTH, HEIGHT), expected, atol=1e-9)
 
 
 def test_shift_gradient_of_a_linear_descriptor() -> None:

@@ -78,7 +78,7 @@ def test_a_translation_stays_a_translation() -> None:
     np.testing.assert_allclose(result.fixed_to_moving[:2, 2], [6, -4], atol=0.08)
 
 
-def test_unrelated_images_are_not_told_apart() -> None:
+def test_unrelated_images_are_not_distinguished() -> None:
     valid = np.ones((320, 400), bool)
     pair = [Raster(textured_image(400, 320, s), valid) for s in (8, 9)]
     result = scratch(*pair, np.eye(3), JointSettings())

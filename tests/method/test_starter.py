@@ -32,7 +32,7 @@ def test_three_equal_channels_are_described_as_one() -> None:
     torch.testing.assert_close(net(PATCHES.repeat(1, 3, 1, 1), REFERENCE), net(PATCHES, 1))
 
 
-def test_patches_are_told_apart_and_contrast_does_not_matter_much() -> None:
+def test_patches_are_distinguished_and_contrast_does_not_matter_much() -> None:
     net = started("siamese", (1,))
     f, reversed_f = net(PATCHES, REFERENCE), net(-PATCHES, REFERENCE)
     d = torch.cdist(f, f) + 10 * torch.eye(len(f))
@@ -48,7 +48,7 @@ def test_the_recipe_starts_from_it_by_default() -> None:
     assert (first() - first("random")).abs().max() > 0.1
 
 
-def test_each_side_takes_the_side_it_is_told() -> None:
+def test_each_side_takes_the_chosen_side() -> None:
     learnt = Descriptor("unshared", [1, 1, 1], half_rectified=True, unit_length=True)
     two = Descriptor("unshared", [1, 1], half_rectified=True, unit_length=True)
     start_from(two, learnt.state_dict(), (REFERENCE, 2))
