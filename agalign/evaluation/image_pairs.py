@@ -114,7 +114,7 @@ def read_image(path: Path) -> Raster:
     """An image file, red first. Raises UnreadableFileError."""
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise UnreadableFileError(f"{path}: is missing or is no image that can be read")
+        raise UnreadableFileError(f"{path}: is missing or cannot be read as an image")
     if image.ndim == 3:
         image = image[..., :3][..., ::-1].transpose(2, 0, 1)
     return raster_of(image, None, str(path))

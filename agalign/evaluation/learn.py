@@ -111,7 +111,7 @@ def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, ste
 
 def read_rough_pairs(source: Path, settings: Settings) -> list[BandPair]:
     """The pairs of a CSV file or folder, as `find_pairs` has them, their homographies taken as rough ones; without one
-    the images are laid on each other. Raises InputError.
+    alignment starts from the same outline. Raises InputError.
     """
     result = []
     for files in find_pairs(source):

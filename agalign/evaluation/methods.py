@@ -99,7 +99,7 @@ def method_named(name: str) -> Method:
         file, _, side = name.partition("@")
         return _torchscript(Path(file), int(side) if side.isdigit() else 32)
     raise ConfigurationError(
-        f"'{name}' is no method; there are sift, daisy, elastix, fast:SHARING, paper:SHARING, and files of networks"
+        f"unknown method '{name}'; choose from sift, daisy, elastix, fast:SHARING, paper:SHARING, or a network file"
     )
 
 
@@ -191,7 +191,7 @@ def _daisy(task: PairTask) -> Outcome:
 
 
 def _mosaic(patches: Tensor) -> tuple[NDArray[np.float32], int, int]:
-    """(image, its columns, side of a cell): square patches (N, 1, P, P) beside each other, row by row, so that OpenCV
+    """(image, its columns, side of a cell): square patches (N, 1, P, P) next to each other, row by row, so that OpenCV
     and scikit-image see them all at once. Each is continued beyond its edges, so that none sees its neighbours.
     """
     padded = functional.pad(patches, [patches.shape[-1] // _MARGIN_SHARE] * 4, mode="replicate")
@@ -232,7 +232,7 @@ def _torchscript(path: Path, side: int) -> Method:
             module(torch.zeros(2, 1, side, side))
     except (OSError, RuntimeError, ValueError) as error:
         problem = str(error).strip().splitlines()[-1]
-        raise InputError(f"{path}: is no TorchScript module of {side} x {side} patches ({problem})") from None
+        raise InputError(f"{path}: not a TorchScript module of {side} x {side} patches ({problem})") from None
 
     @torch.no_grad()
     def describe(patches: Tensor) -> Tensor:

@@ -166,8 +166,8 @@ def _solve_family(equations: PatchEquations, family: ModelFamily, max_step_px: f
 def _covariances(normal: Tensor, score: Tensor, cell: Tensor) -> Tensor:
     """(2, P, P) sandwich covariances: the scatter of the patches sets the uncertainty, not a noise model.
 
-    Patches that overlap share pixels, so the second is clustered by cells of the image (Liang & Zeger 1986); where there
-    are few cells the first, by single patches, may be larger. `score` (N, P) is the gradient of each patch.
+    Patches that overlap share pixels, so the second is clustered by cells of the image (Liang & Zeger 1986); where
+    there are few cells the first, by single patches, may be larger. `score` (N, P) is the gradient of each patch.
     """
     of_cells = score.new_zeros((int(cell.max()) + 1, score.shape[1])).index_add_(0, cell, score)
     inverse = torch.linalg.inv(normal)

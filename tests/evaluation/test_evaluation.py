@@ -107,11 +107,11 @@ def test_starts_are_off_by_the_share_asked_for() -> None:
 
 
 def test_names_of_methods(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="'surf' is no method"):
+    with pytest.raises(ConfigurationError, match="unknown method 'surf'"):
         method_named("surf")
-    with pytest.raises(ConfigurationError, match="'fast:twins' is no method"):
+    with pytest.raises(ConfigurationError, match="unknown method 'fast:twins'"):
         method_named("fast:twins")
-    with pytest.raises(InputError, match=r"none\.pt: is no TorchScript module"):
+    with pytest.raises(InputError, match=r"none\.pt: not a TorchScript module"):
         method_named(str(tmp_path / "none.pt"))
     with pytest.raises(InputError, match=r"none\.safetensors"):
         method_named(str(tmp_path / "none.safetensors"))
@@ -240,7 +240,7 @@ def test_evaluate_prints_tables_and_writes_rows(tmp_path: Path) -> None:
     assert len((tmp_path / "rows.csv").read_text().splitlines()) == 2
     wrong = runner.invoke(app, ["evaluate", str(table), "-m", "surf"])
     assert wrong.exit_code == 2
-    assert "is no method" in wrong.stderr
+    assert "unknown method" in wrong.stderr
     assert runner.invoke(app, ["evaluate", str(tmp_path / "none")]).exit_code == 1
     assert runner.invoke(app, ["evaluate", str(table), "--shift", "far"]).exit_code == 2
     assert runner.invoke(app, ["learn", str(table), "--sharing", "twins"]).exit_code == 2
