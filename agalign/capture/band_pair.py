@@ -119,11 +119,16 @@ class BandPair:
         return warped(channel_mean(self.moving_image), mapping, self.fixed.size_px)
 
     def is_expected(self, fixed_to_moving: Matrix, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        """True where some candidate has a mapping, moved by a shift of the fixed image, within what it is known to."""
-        moved = geometry.compose(fixed_to_moving, geometry.translation(*shift_px))
+        """True where a mapping, after a shift in px of the fixed image, agrees with some candidate within three of the
+        candidate's standard errors.
+
+        Both map the same moving point: its distance in the fixed image is what the standard errors refer to.
+        """
+        shifted = geometry.compose(fixed_to_moving, geometry.translation(*shift_px))
         middle = (np.array(self.fixed.size_px) - 1) / 2
+        mapped = geometry.apply(shifted, middle)
         return any(
-            np.linalg.norm(geometry.apply(moved, middle) - geometry.apply(self.candidates[kind], middle))
+            np.linalg.norm(geometry.apply(geometry.invert(self.candidates[kind]), mapped) - middle)
             <= _STANDARD_DEVIATIONS * std_px
             for kind, std_px in self.known_to_px.items()
             if kind in self.candidates

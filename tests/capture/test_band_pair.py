@@ -10,14 +10,16 @@ from synthetic_flights.troubles import make_two_headings
 import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.align import align_capture_bands
-from agalign.capture.band_pair import _known_to_px, longest_for, read_pairs
+from agalign.capture.band_pair import BandPair, _known_to_px, longest_for, read_pairs
 from agalign.capture.prediction import observed
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
 from agalign.synthetic.score import score_against_truth
+from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Band
+from agalign.values.image import Raster
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -112,3 +114,15 @@ def test_what_a_rig_misses_is_brought_to_px_of_the_reference(monkeypatch: pytest
     monkeypatch.setattr(Rig, "missed_px", lambda *_, **__: 0.5)
     model = FlightModel(None, "", (band,), {}, "", rig)  # type: ignore[arg-type]
     assert _known_to_px(band, model, (0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
+def test_the_tolerance_of_a_candidate_is_in_px_of_the_fixed_image_at_any_scale(scale: float) -> None:
+    """A candidate known to 4 px (1 sigma) admits mappings within 12 px of the fixed image."""
+    fixed, moving = (Raster(np.zeros(shape, np.float32), np.ones(shape, bool)) for shape in ((300, 400), (30, 40)))
+    candidate = geometry.compose(np.diag([scale, scale, 1.0]), geometry.translation(7.0, -5.0))
+    pair = BandPair.of_images("nir", fixed, moving, {"rig": candidate}, Settings(), {"rig": 4.0})
+    for offset_px, is_expected in ((8.0, True), (11.5, True), (12.5, False), (20.0, False)):
+        mapping = geometry.compose(candidate, geometry.translation(0.6 * offset_px, 0.8 * offset_px))
+        assert pair.is_expected(mapping) is is_expected
+        assert pair.is_expected(candidate, (0.6 * offset_px, 0.8 * offset_px)) is is_expected
