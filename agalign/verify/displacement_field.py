@@ -202,8 +202,8 @@ def common_field(
     def gain(smoothness: float) -> _Gain:
         left = []
         for fold in folds:
-            rest = Shifts.together([c for other in folds if other is not fold for c in other])
-            field = fitted_field(rest, smoothness * len(captures), settings, lattice_px, size_px)
+            rest = [c for other in folds if other is not fold for c in other]
+            field = fitted_field(Shifts.together(rest), smoothness * len(rest), settings, lattice_px, size_px)
             left += [np.linalg.norm(c.shifts_px - field(c.centres_px), axis=1) for c in fold]
         return _gain_of(out, np.concatenate(left), smoothness)
 

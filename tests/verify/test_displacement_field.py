@@ -7,6 +7,7 @@ from agalign.values import geometry
 from agalign.values.alignment import DisplacementField, Residual
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping
+from agalign.verify import displacement_field
 from agalign.verify.displacement_field import Shifts, _folds, _Gain, _is_one_to_one, _near, common_field, fitted_field
 
 from ..conftest import textured_pair
@@ -136,3 +137,19 @@ def test_what_captures_have_in_common_is_the_lenses() -> None:
     # What each capture has of its own is none of the lenses'.
     own = [of_captures(1, h, k)[0] for k, h in enumerate((0.4, -0.4, 0.4, -0.4))]
     assert common_field(own, SETTINGS, SIZE) is None
+
+
+def test_cross_validation_smooths_by_the_captures_in_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Smoothness is per capture: a fit without some captures must not be stiffer than the final one."""
+    captures = of_captures(5, 0.4, 1)
+    fits: list[tuple[int, float]] = []
+
+    def recorded(shifts: Shifts, smoothness: float, *rest: object) -> DisplacementField:
+        fits.append((len(shifts) // len(centres()), smoothness))
+        return fitted_field(shifts, smoothness, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(displacement_field, "fitted_field", recorded)
+    assert common_field(captures, SETTINGS, SIZE) is not None
+    assert {count for count, _ in fits} == {3, 4, 5}
+    per_capture = {smoothness / count for count, smoothness in fits}
+    assert per_capture <= set(displacement_field._COMMON_SMOOTHNESS)
