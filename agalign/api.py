@@ -62,7 +62,7 @@ def align(
     if seed is not None:
         candidates = {"user": geometry.normalised(seed)}
     known: dict[SeedKind, float] = {} if seed_std_px is None else {"user": seed_std_px}
-    pair = BandPair.of_images("moving", one, other, candidates, settings, known)
+    pair = BandPair.of_images("moving", one, other, candidates, known)
     return with_metrics(align_pairs([pair], settings, quiet)["moving"], pair)
 
 

@@ -100,7 +100,7 @@ def automatic(pairs: list[PairFiles], _names: list[str]) -> None:
             path = Path(temporary) / f"automatic, {sharing}.safetensors"
             settings = Settings(joint=JointSettings.model_validate({"sharing": sharing}))
             aligned = []
-            pairs = [BandPair.of_images(*c, settings) for c in coarse]
+            pairs = [BandPair.of_images(*c) for c in coarse]
             model = learn_descriptor(pairs, settings, on_pair=lambda lesson, a=aligned: a.append(lesson.status))
             print(f"{sharing}: {aligned.count('aligned')} of {len(aligned)} pairs aligned", flush=True)
             save_model(model, path)

@@ -15,7 +15,7 @@ import numpy as np
 from agalign.cameras.discover import discover
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.seeding import best_seed
-from agalign.config import Settings
+from agalign.config import SeedSettings
 from agalign.values import geometry
 from agalign.values.capture import Capture
 from agalign.values.mapping import PixelMapping
@@ -38,7 +38,7 @@ def seeds_of(pair: BandPair) -> dict[str, PixelMapping]:
 
 def errors(capture: Capture, ties: dict | None) -> dict[str, list[float]]:
     """Median error of each pair in px, by kind of seed."""
-    pairs, _ = read_pairs(capture, Settings())
+    pairs, _ = read_pairs(capture, SeedSettings())
     result: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for pair in pairs:
         known = None if ties is None else ties["bands"].get(pair.bands[0].path.name)
@@ -50,7 +50,7 @@ def errors(capture: Capture, ties: dict | None) -> dict[str, list[float]]:
                 error = np.linalg.norm(mapping(points[:, :2]) - points[:, 2:], axis=1)
                 result[kind].append(float(np.median(error)))
             else:
-                result[kind].append(pair.reference.windows.residuals(pair.laid(mapping)).median_px)
+                result[kind].append(pair.reference.windows.residuals(pair.warped_moving(mapping)).median_px)
     return result
 
 

@@ -72,7 +72,7 @@ def main() -> None:
             errors, seconds, pairs = [], [], 0
             for _, images, ties in groups(folder):
                 began = time.perf_counter()
-                reference = Reference(images[0][1], settings)
+                reference = Reference(images[0][1])
                 pairs_here = [BandPair(name, reference, moving, starts) for name, _, moving, starts in images]
                 descriptor = partialmethod(JointState.fast_descriptor, start=start)
                 with patch.object(JointState, "fast_descriptor", descriptor):

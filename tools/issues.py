@@ -2,15 +2,15 @@
 
     python tools/issues.py [--check]
 
-The sentences are the program's own (agalign/values/issues.py).
+The sentences are the program's own (agalign/values/issues.py and the checks in agalign/verify).
 """
 
 import re
 import sys
 from pathlib import Path
-from typing import get_args
 
-from agalign.values.issues import Issue, IssueKind, remedy, sentence
+from agalign.values.issues import Issue, sentence
+from agalign.verify.checks import KINDS
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "troubleshooting.md"
 _BEGIN, _END = "<!-- doubts -->\n", "<!-- end of doubts -->"
@@ -19,11 +19,11 @@ _BEGIN, _END = "<!-- doubts -->\n", "<!-- end of doubts -->"
 def table() -> str:
     """Markdown; numbers and details are dots."""
     rows = {}
-    for kind in get_args(IssueKind):
-        detail = "FILE: cannot be read (\0)" if kind == "unreadable" else "\0"
+    for kind in KINDS.values():
+        detail = "FILE: cannot be read (\0)" if kind.code == "unreadable" else "\0"
         said = sentence(Issue(kind, 0.0, 0.0, detail))
         said = re.sub(r"\d+(\.\d+)?", "…", said.replace("\0", "…"))
-        rows.setdefault(remedy(kind), []).append(f"`{said}`")
+        rows.setdefault(kind.remedy, []).append(f"`{said}`")
     lines = ["| said of a pair | mostly | try |", "|---|---|---|"]
     lines += [f"| {'; '.join(said)} | {r.cause} | {r.advice} |" for r, said in rows.items()]
     return "\n".join(lines) + "\n"

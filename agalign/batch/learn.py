@@ -124,9 +124,9 @@ def _still_holds(model: FlightModel, captures: Sequence[Capture], settings: Sett
     def fits(capture: Capture) -> tuple[int, int]:
         """(bands that are aligned, those among them that the rig predicts)."""
         try:
-            pairs, _ = read_pairs(capture, settings, model)
+            pairs, _ = read_pairs(capture, settings.seed, model)
             result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
-            checked = with_predictions(pairs, result, rig, capture, settings.check)
+            checked = with_predictions(pairs, result, rig, capture)
         except (AgalignError, cv2.error):
             return 0, 0
         aligned = [checked[name] for name, a in result.items() if a.status == "aligned"]
@@ -154,7 +154,7 @@ def _learn_rig(
         return None
     residuals = {band: [s.residuals[band] for s in shown if band in s.residuals] for band in rig.mean}
     with ThreadPoolExecutor(at_once) as pool:
-        fields = list(pool.map(lambda of_band: common_field(of_band, settings.local, size), residuals.values()))
+        fields = list(pool.map(lambda of_band: common_field(of_band, size), residuals.values()))
     return replace(rig, fields={b: field for b, field in zip(residuals, fields, strict=True) if field is not None})
 
 
@@ -251,12 +251,12 @@ class _Shown:
 def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Refined | None) -> _Shown:
     """Raises UnreadableFileError where the reference cannot be read."""
     if known is None:
-        pairs, _ = read_pairs(capture, settings, model)
+        pairs, _ = read_pairs(capture, settings.seed, model)
         result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
     else:
         pairs = known.loaded.pairs
         starts = list(zip(pairs, known.loaded.seeds, strict=True))
-        result = dict(verify_together(starts, known.results, model, settings))
+        result = verify_together(starts, known.results, model, settings)
     pairs = [p for p in pairs if p.is_the_rigs]
     in_file_px = {p.name: result[p.name].between_files(*p.scales) for p in pairs}
     good = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
@@ -289,10 +289,12 @@ def _read(capture: Capture, bands: Sequence[str], settings: Settings, start: Fli
     `start` is the network with which a seed of kind `match` is found.
     """
     try:
-        pairs, _ = read_pairs(capture, settings)
+        pairs, _ = read_pairs(capture, settings.seed)
     except AgalignError:
         return None
-    result = [(p, seed) for p in pairs if p.is_the_rigs and isinstance(seed := find_seed(p, start), Seed)]
+    result = [
+        (p, seed) for p in pairs if p.is_the_rigs and isinstance(seed := find_seed(p, settings.seed, start), Seed)
+    ]
     if not result:
         return None
     usable, seeds = [p for p, _ in result], [seed for _, seed in result]

@@ -1,1 +1,1 @@
-"""One capture: its bands beside the reference, where each starts, and what comes of it."""
+"""One capture: the seed of each band pair, its alignment, and the verification of the result."""

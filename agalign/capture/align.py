@@ -1,14 +1,15 @@
-"""The band pairs of one capture: seeded, aligned together, each one checked."""
+"""The band pairs of one capture: seeded, aligned together, and each one verified."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
-from agalign.capture.prediction import with_predictions, worth_learning
-from agalign.capture.seeding import find_seed, image_groups, unscored
+from agalign.capture.prediction import bands_to_learn, with_predictions
+from agalign.capture.seeding import find_seed, first_candidate, image_groups
 from agalign.capture.verification import WarpedPair, verified, with_metrics, without_result
 from agalign.config import Settings
 from agalign.flight.model import FlightModel
@@ -18,12 +19,30 @@ from agalign.method.state import ImageGroup
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Capture
-from agalign.values.issues import Issue
+from agalign.values.issues import SEED_ASKED_FOR, Issue
 
 PairProgress = Callable[[str, str, float], None]
-"""Called with the band's name, the stage, and the share of the stage that is behind."""
+"""Called with the band's name, the stage, and the share of the stage that is done."""
 Start = tuple[BandPair, Seed]
 _Align = Callable[[ImageGroup, Callable[[str, float], None]], Results]
+
+
+class _Timer:
+    """Seconds by band; time spent on several bands together is divided among them."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, float] = {}
+
+    @contextmanager
+    def measure(self, names: Sequence[str]) -> Iterator[None]:
+        """Count the time of a block as that of these bands."""
+        since = time.perf_counter()
+        yield
+        for name in names:
+            self._seconds[name] = self._seconds.get(name, 0.0) + (time.perf_counter() - since) / len(names)
+
+    def added_to(self, result: dict[str, Alignment]) -> dict[str, Alignment]:
+        return {name: replace(a, seconds=a.seconds + self._seconds.get(name, 0.0)) for name, a in result.items()}
 
 
 def align_capture_bands(
@@ -33,53 +52,44 @@ def align_capture_bands(
 
     Raises UnreadableFileError where the reference cannot be read.
     """
-    reference = capture.reference
-    progress(reference.name, "reading", 0.0)
-    pairs, left_out = read_pairs(capture, settings, model)
+    progress(capture.reference.name, "reading", 0.0)
+    pairs, left_out = read_pairs(capture, settings.seed, model)
     aligned = align_pairs(pairs, settings, progress, model, capture)
     if model is not None and model.rig is not None and not settings.seed.only:
-        aligned = with_predictions(pairs, aligned, model.rig, capture, settings.check)
-    aligned = _measured(pairs, aligned, progress)
+        aligned = with_predictions(pairs, aligned, model.rig, capture)
+    aligned = _with_metrics(pairs, aligned, progress)
     result: dict[str, Alignment] = {}
     for band in capture.bands_of_the_references_lens:
         unmoved = Seed("identity", geometry.identity(), 0.0)
         result[band.name] = Alignment(unmoved.fixed_to_moving, "pixel", "aligned", (), unmoved, None, None, 0.0)
     for pair in pairs:
-        alignment = aligned[pair.name].between_files(*pair.scales)
-        if pair.is_reduced and alignment.status == "aligned":
-            alignment = at_full_resolution(reference, pair.bands[0], alignment, settings.check)
-        shared = replace(alignment, seconds=alignment.seconds / len(pair.bands))
-        result |= dict.fromkeys((b.name for b in pair.bands), shared)
+        result |= _between_files(capture, pair, aligned[pair.name])
     for band in capture.moving:
         if band.name in left_out:
-            lying = Seed("identity", geometry.overlay(reference.size_px, band.size_px), 0.0)
-            result[band.name] = without_result(lying, "pixel", left_out[band.name])
+            overlay = Seed("identity", geometry.overlay(capture.reference.size_px, band.size_px), 0.0)
+            result[band.name] = without_result(overlay, "pixel", left_out[band.name])
     return {band.name: result[band.name] for band in capture.moving}
 
 
-def verify_together(
-    starts: Sequence[Start], results: Sequence[JointResult | Issue], model: FlightModel | None, settings: Settings
-) -> Iterator[tuple[str, Alignment]]:
-    """The alignments of a capture's pairs, by name, of which these results were found: moved to what is most probable
-    of all bands together, each one checked.
-    """
-    warped_pairs = [
-        WarpedPair.at(pair, pair.mapping(result.fixed_to_moving)) if isinstance(result, JointResult) else None
-        for (pair, _), result in zip(starts, results, strict=True)
-    ]
-    better = _whole(starts, results, warped_pairs, model, settings)
-    for (pair, seed), result, warped_pair in zip(starts, better, warped_pairs, strict=True):
-        yield pair.name, verified(pair, seed, result, settings, warped_pair)
+def _between_files(capture: Capture, pair: BandPair, aligned: Alignment) -> dict[str, Alignment]:
+    """The alignment of a pair as one between the files of each of its bands, refined on them where they have more."""
+    alignment = aligned.between_files(*pair.scales)
+    if pair.is_reduced and alignment.status == "aligned":
+        alignment = at_full_resolution(capture.reference, pair.bands[0], alignment)
+    shared = replace(alignment, seconds=alignment.seconds / len(pair.bands))
+    return dict.fromkeys((b.name for b in pair.bands), shared)
 
 
-def _measured(pairs: Sequence[BandPair], result: dict[str, Alignment], progress: PairProgress) -> dict[str, Alignment]:
-    """With metrics, whose time is the pair's too."""
-    watch, measured = _Watch(), {}
+def _with_metrics(
+    pairs: Sequence[BandPair], result: dict[str, Alignment], progress: PairProgress
+) -> dict[str, Alignment]:
+    """The alignments with their similarity metrics."""
+    timer, measured = _Timer(), {}
     for pair in pairs:
         progress(pair.name, "measuring", 0.0)
-        measured[pair.name] = with_metrics(result[pair.name], pair)
-        watch.lap([pair.name])
-    return watch.added_to(measured)
+        with timer.measure([pair.name]):
+            measured[pair.name] = with_metrics(result[pair.name], pair)
+    return timer.added_to(measured)
 
 
 @one_thread()
@@ -89,99 +99,134 @@ def align_pairs(
 ) -> dict[str, Alignment]:  # fmt: skip
     """Align the pairs of one `capture`, which share a reference, by name.
 
-    Those that the flight's network cannot align are learnt from scratch, together; with a rig at hand only those that
-    are worth it, and without `scratch` none.
+    The pairs that the flight's network cannot align are learnt from scratch, together: with a rig only those that it
+    does not predict, and without `scratch` only those that the network does not know.
     """
-    watch = _Watch()
-    result: dict[str, Alignment] = {}
-    starts: list[Start] = []
-    for pair in pairs:
-        progress(pair.name, "seeding", 0.0)
-        seed = find_seed(pair, model)
-        if isinstance(seed, Issue):
-            result[pair.name] = without_result(unscored(pair), pair.space, seed)
-        else:
-            starts.append((pair, seed))
-    watch.lap([p.name for p in pairs])
+    aligner = _PairAligner(settings, model, progress)
+    starts = aligner.seed(pairs)
     if settings.seed.only:
-        asked = Issue("seed_asked_for")
-        result |= {pair.name: verified(pair, seed, asked, settings) for pair, seed in starts}
-        watch.lap([pair.name for pair, _ in starts])
-        return watch.added_to(result)
+        aligner.keep_seeds(starts)
+        return aligner.timed_result()
+    aligner.refine(starts)
+    left = [s for s in starts if not aligner.is_aligned(s)]
+    if left and model is not None and model.rig is not None and capture is not None:
+        chosen = bands_to_learn(pairs, aligner.result, model.rig, capture, settings.check.accept_predicted_px)
+        left = [s for s in left if s[0].name in chosen]
+    if not scratch:
+        left = [s for s in left if s[0].name not in aligner.result]
+    aligner.learn(left)
+    return aligner.timed_result()
 
-    def attempt(some: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
-        results = _results(some, sides, align, progress)
-        watch.lap([pair.name for pair, _ in some])
-        verified_pairs = verify_together(some, results, model, settings)
-        for pair, _ in some:
-            progress(pair.name, "checking", 0.0)
-            name, result[name] = next(verified_pairs)
-            watch.lap([name])
 
-    if model is not None and settings.joint.recipe == "fast":
-        net = model.net
+@dataclass
+class _PairAligner:
+    """The steps of `align_pairs`; each adds its alignments to `result`."""
+
+    settings: Settings
+    model: FlightModel | None
+    progress: PairProgress
+    result: dict[str, Alignment] = field(default_factory=dict)
+    """By band."""
+    timer: _Timer = field(default_factory=_Timer)
+
+    def timed_result(self) -> dict[str, Alignment]:
+        return self.timer.added_to(self.result)
+
+    def is_aligned(self, start: Start) -> bool:
+        name = start[0].name
+        return name in self.result and self.result[name].status == "aligned"
+
+    def seed(self, pairs: Sequence[BandPair]) -> list[Start]:
+        """The pairs with their seeds; a pair without one has failed."""
+        starts: list[Start] = []
+        with self.timer.measure([p.name for p in pairs]):
+            for pair in pairs:
+                self.progress(pair.name, "seeding", 0.0)
+                seed = find_seed(pair, self.settings.seed, self.model)
+                if isinstance(seed, Issue):
+                    self.result[pair.name] = without_result(first_candidate(pair), pair.space, seed)
+                else:
+                    starts.append((pair, seed))
+        return starts
+
+    def keep_seeds(self, starts: Sequence[Start]) -> None:
+        """Nothing but the seeds was requested."""
+        for pair, seed in starts:
+            with self.timer.measure([pair.name]):
+                self.result[pair.name] = verified(pair, seed, Issue(SEED_ASKED_FOR), self.settings)
+
+    def refine(self, starts: Sequence[Start]) -> None:
+        """With the flight's network, the pairs that it has a side for."""
+        model = self.model
+        if model is None or self.settings.joint.recipe != "fast":
+            return
         known = [s for s in starts if model.side(s[0].name) is not None]
         sides = [model.side(pair.name) or 0 for pair, _ in known]
-        attempt(known, sides, lambda group, report: refine_with(net, group, settings.joint, report))
-    left = [s for s in starts if s[0].name not in result or result[s[0].name].status != "aligned"]
-    if left and model is not None and model.rig is not None and capture is not None:
-        worth = worth_learning(pairs, result, model.rig, capture, settings.check)
-        left = [s for s in left if s[0].name in worth]
-    if not scratch:
-        left = [s for s in left if s[0].name not in result]
-    attempt(left, [], lambda group, report: align_from_scratch(group, settings.joint, report))
-    return watch.added_to(result)
+        self._attempt(known, sides, lambda group, report: refine_with(model.net, group, self.settings.joint, report))
+
+    def learn(self, starts: Sequence[Start]) -> None:
+        """From scratch, together."""
+        self._attempt(starts, [], lambda group, report: align_from_scratch(group, self.settings.joint, report))
+
+    def _attempt(self, starts: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
+        with self.timer.measure([pair.name for pair, _ in starts]):
+            results = _results(starts, sides, align, self.progress)
+        self.result |= verify_together(starts, results, self.model, self.settings, self.progress, self.timer)
+
+
+def _quiet(band: str, stage: str, share: float) -> None:
+    """Progress that is not shown."""
+
+
+def verify_together(
+    starts: Sequence[Start], results: Sequence[JointResult | Issue], model: FlightModel | None, settings: Settings,
+    progress: PairProgress = _quiet, timer: _Timer | None = None,
+) -> dict[str, Alignment]:  # fmt: skip
+    """The alignments of a capture's pairs, by name: their results moved to the maximum a posteriori of all bands
+    together, each one verified.
+    """
+    timer = timer or _Timer()
+    with timer.measure([pair.name for pair, _ in starts]):
+        warped_pairs = [
+            WarpedPair.of(pair, pair.mapping(result.fixed_to_moving)) if isinstance(result, JointResult) else None
+            for (pair, _), result in zip(starts, results, strict=True)
+        ]
+        improved = _estimated_together(starts, results, warped_pairs, model, settings)
+    alignments: dict[str, Alignment] = {}
+    for (pair, seed), result, warped_pair in zip(starts, improved, warped_pairs, strict=True):
+        progress(pair.name, "checking", 0.0)
+        with timer.measure([pair.name]):
+            alignments[pair.name] = verified(pair, seed, result, settings, warped_pair)
+    return alignments
 
 
 def _results(
     starts: Sequence[Start], sides: Sequence[int], align: _Align, progress: PairProgress
 ) -> list[JointResult | Issue]:
-    """In the order of the pairs; those that share a subject are aligned together, with the network's `sides`."""
+    """In the order of the pairs; those of one image group are aligned together, with the network's `sides`."""
     result: dict[int, JointResult | Issue] = {}
-    for places, group in image_groups([p for p, _ in starts], [s for _, s in starts], sides):
-        first = starts[places[0]][0].name
+    for indices, group in image_groups([p for p, _ in starts], [s for _, s in starts], sides):
+        first = starts[indices[0]][0].name
 
         def report(stage: str, share: float, first: str = first) -> None:
-            """Pairs that advance together are told as the first one."""
+            """Pairs that advance together are reported as the first one."""
             progress(first, stage, share)
 
         report("refining", 0.0)
-        result |= dict(zip(places, align(group, report), strict=True))
+        result |= dict(zip(indices, align(group, report), strict=True))
     return [result[i] for i in range(len(starts))]
 
 
-def _whole(
+def _estimated_together(
     starts: Sequence[Start], results: Sequence[JointResult | Issue], warped_pairs: Sequence[WarpedPair | None],
     model: FlightModel | None, settings: Settings,
 ) -> list[JointResult | Issue]:  # fmt: skip
-    """The results moved to what is most probable of all bands of the capture together."""
+    """The results moved to the maximum a posteriori of all bands of the capture together."""
     if settings.joint.model_family not in ("auto", "homography"):
-        return list(results)  # what was asked for is not left
+        return list(results)  # the family that the user chose would be left
     names = [pair.name for pair, _ in starts]
-    result = {name: r for name, r in zip(names, results, strict=True) if isinstance(r, JointResult)}
-    shown = {
-        name: warped_pair.residual
-        for name, warped_pair in zip(names, warped_pairs, strict=True)
-        if warped_pair is not None
-    }
+    joint = {name: r for name, r in zip(names, results, strict=True) if isinstance(r, JointResult)}
+    residuals = {name: w.residual for name, w in zip(names, warped_pairs, strict=True) if w is not None}
     rig = None if model is None else model.rig
-    better = map_estimate([pair for pair, _ in starts], result, shown, rig)
-    return [better[name] if isinstance(r, JointResult) else r for name, r in zip(names, results, strict=True)]
-
-
-class _Watch:
-    """Seconds by name; what is done for several together is shared by them."""
-
-    def __init__(self) -> None:
-        self._seconds: dict[str, float] = {}
-        self._since = time.perf_counter()
-
-    def lap(self, names: Sequence[str]) -> None:
-        """The time since the last lap was theirs."""
-        now = time.perf_counter()
-        for name in names:
-            self._seconds[name] = self._seconds.get(name, 0.0) + (now - self._since) / len(names)
-        self._since = now
-
-    def added_to(self, result: dict[str, Alignment]) -> dict[str, Alignment]:
-        return {name: replace(a, seconds=a.seconds + self._seconds.get(name, 0.0)) for name, a in result.items()}
+    improved = map_estimate([pair for pair, _ in starts], joint, residuals, rig)
+    return [improved[name] if isinstance(r, JointResult) else r for name, r in zip(names, results, strict=True)]

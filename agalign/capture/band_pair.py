@@ -1,4 +1,4 @@
-"""A moving image beside the reference, as the estimation sees the two, with the mappings that its tags offer."""
+"""A pair of a moving image and the reference, in the form that estimation takes, with its candidate mappings."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,7 +8,7 @@ import numpy as np
 
 from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import seed_candidates
-from agalign.config import Settings
+from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
@@ -22,16 +22,19 @@ from agalign.values.capture import Band, Capture
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
-from agalign.values.issues import Issue
+from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
 
 Candidates = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of trust."""
 _STANDARD_DEVIATIONS = 3.0
+"""Errors of candidates beyond this many standard deviations are not expected."""
 _TAGS_STD_PX = 5.0
 """Rig tags are off by 2 px in the median and 12 at most on five cameras (docs/cameras.md)."""
 _MIN_MODEL_STD_PX = 1.0
+"""Captures of a flight differ by as much in height and tilt, whatever the rig's own errors."""
 _PLAINLY_REDUCED = 0.7
+"""Scale of the images relative to their files below which the files are worth another look."""
 _LONGEST_SIDE_PX = 4096
 """Larger images are reduced to this for estimation: it bounds memory and time; `full_resolution` refines the result."""
 _COARSE_RATIO = 0.4
@@ -46,57 +49,58 @@ _NOT_REDUCED = (1.0, 1.0), (1.0, 1.0)
 
 @dataclass(frozen=True)
 class BandPair:
-    """One moving image beside the reference."""
+    """One moving image and the reference."""
 
     name: str
-    """The moving band's, or of several that one lens took, the first one's."""
+    """The name of the moving band, or of the first of several bands of one lens."""
     reference: Reference
     moving_image: Raster
     candidates: Candidates
     bands: tuple[Band, ...] = ()
-    """The moving bands: one, but for colour photographs; none where the images are arrays."""
+    """The moving bands: one, or three of a colour photograph; none where the images are arrays."""
     scales: tuple[tuple[float, float], tuple[float, float]] = _NOT_REDUCED
     """(x, y) of the fixed and of the moving image relative to their files."""
     known_to_px: Mapping[SeedKind, float] = dataclasses.field(default_factory=dict)
-    """Standard deviation of candidates of which one is known: px of the fixed image."""
+    """Standard deviations of candidates, where known: px of the fixed image."""
     is_coarse: bool = False
-    """The moving image shows so much less that the reference's is reduced for it."""
+    """The moving image has so few pixels that the reference is reduced for it."""
     field: DisplacementField | None = None
-    """Displacements before any homography, px of the fixed image: what the flight's rig knows of the lenses."""
+    """Displacements before any homography, px of the fixed image: the flight's field of the lenses."""
 
     @classmethod
     def of_images(
-        cls, name: str, fixed: Raster, moving: Raster, candidates: Candidates, settings: Settings,
+        cls, name: str, fixed: Raster, moving: Raster, candidates: Candidates,
         known_to_px: Mapping[SeedKind, float] | None = None,
     ) -> "BandPair":  # fmt: skip
-        """A single pair of images that are no files' reductions."""
-        return cls(name, Reference(fixed, settings), moving, candidates, known_to_px=known_to_px or {})
+        """A single pair of images at their own resolution."""
+        return cls(name, Reference(fixed), moving, candidates, known_to_px=known_to_px or {})
 
     @property
     def space(self) -> Space:
-        """What the homographies are between: without both lenses nothing can be undistorted."""
+        """The pixels between which the homographies are: undistorted ones where both lenses are known."""
         both = self.reference.image.lens is not None and self.moving_image.lens is not None
         return "undistorted" if both else "pixel"
 
     @property
     def is_reduced(self) -> bool:
-        """True where the files show so much more than the images that it is worth looking at them again."""
+        """True where the files have enough more pixels than the images for a refinement on them."""
         return min(*self.scales[1], *(() if self.is_coarse else self.scales[0])) < _PLAINLY_REDUCED
 
     @property
     def reach_px(self) -> float:
-        """How far from its seed it may lie, px of the fixed image: what a user knows is not left."""
+        """Largest distance of a result from its seed, px of the fixed image: infinite unless the user gave the seed."""
         return _STANDARD_DEVIATIONS * self.known_to_px.get("user", np.inf)
 
     @property
     def is_known_to_a_rig(self) -> bool:
-        """True where the captures of a flight told where this band lies."""
+        """True where the flight's rig has a mapping of this band."""
         return "model" in self.known_to_px
 
     @property
     def is_the_rigs(self) -> bool:
-        """True where the homographies are between the pixels of the flight's rig: of a reference whose lens is known,
-        undistorted ones.
+        """True where the homographies are between the same pixels as those of the flight's rig.
+
+        These are undistorted where the lens of the reference is known.
         """
         return self.space == ("pixel" if self.reference.image.lens is None else "undistorted")
 
@@ -146,49 +150,39 @@ class BandPair:
 
 
 def read_pairs(
-    capture: Capture, settings: Settings, model: FlightModel | None = None
+    capture: Capture, settings: SeedSettings, model: FlightModel | None = None
 ) -> tuple[list[BandPair], dict[str, Issue]]:
     """(the pairs, one for each lens; {band: why it cannot take part}).
 
-    What a flight's `model` knows is tried before what the tags say.
+    The mappings of a flight's `model` come before those of the tags.
     Raises UnreadableFileError where the reference cannot be read.
     """
-    longest = _LONGEST_SIDE_PX
-    references = {longest: Reference(read_for_alignment(capture.reference, longest), settings)}
+    references = {_LONGEST_SIDE_PX: Reference(read_for_alignment(capture.reference, _LONGEST_SIDE_PX))}
     pairs: list[BandPair] = []
     left_out: dict[str, Issue] = {}
     for bands in capture.moving_lenses:
-        candidates = seed_candidates(capture.reference, bands[0], settings.seed)
-        name = bands[0].name
-        if model is not None and name in model.mappings:
-            candidates = {"model": model.mappings[name], **candidates}
+        candidates = _candidates(capture.reference, bands[0], settings, model)
         if not candidates:
-            absent = Issue("no_such_seed", detail=str(settings.seed.force))
-            left_out |= dict.fromkeys((b.name for b in bands), absent)
+            issue = Issue(NO_SUCH_SEED, detail=str(settings.force))
+            left_out |= dict.fromkeys((b.name for b in bands), issue)
             continue
         try:
-            moving = _mean(read_for_alignment(b, longest) for b in bands)
+            moving = _mean(read_for_alignment(b, _LONGEST_SIDE_PX) for b in bands)
         except AgalignError as error:
-            left_out |= dict.fromkeys((b.name for b in bands), Issue("unreadable", detail=str(error)))
+            left_out |= dict.fromkeys((b.name for b in bands), Issue(UNREADABLE, detail=str(error)))
             continue
-        maximum = longest_for(capture.reference, next(iter(candidates.values())))
-        if maximum not in references:
-            references[maximum] = Reference(read_for_alignment(capture.reference, maximum), settings)
-        reference, is_coarse = references[maximum], maximum < min(longest, max(capture.reference.size_px))
-        scales = _scale(reference.image, capture.reference), _scale(moving, bands[0])
-        down: Candidates = {kind: geometry.rescale(m, *scales) for kind, m in candidates.items()}
-        field = None if model is None or model.rig is None else model.rig.fields.get(name)
-        field = None if field is None else field.rescaled(scales[0])
-        known = _known_to_px(name, model, scales[0])
-        pairs.append(BandPair(name, reference, moving, down, bands, scales, known, is_coarse, field))
-    return _without_stripes(pairs, references[longest]), left_out
+        longest = longest_for(capture.reference, next(iter(candidates.values())))
+        if longest not in references:
+            references[longest] = Reference(read_for_alignment(capture.reference, longest))
+        pairs.append(_pair(capture.reference, references[longest], longest, bands, moving, candidates, model))
+    return _without_stripes(pairs, references[_LONGEST_SIDE_PX]), left_out
 
 
 def _without_stripes(pairs: Sequence[BandPair], reference: Reference) -> list[BandPair]:
     """The pairs; those with this reference, without the pattern of rows and columns that their sensors share."""
     moving = [pair.moving_image for pair in pairs if pair.reference is reference]
     fixed, *cleaned = without_common_stripes([reference.image, *moving])
-    same = reference if fixed is reference.image else Reference(fixed, reference.settings)
+    same = reference if fixed is reference.image else Reference(fixed)
     images = iter(cleaned)
     return [
         replace(pair, reference=same, moving_image=next(images)) if pair.reference is reference else pair
@@ -196,9 +190,33 @@ def _without_stripes(pairs: Sequence[BandPair], reference: Reference) -> list[Ba
     ]
 
 
+def _candidates(reference: Band, moving: Band, settings: SeedSettings, model: FlightModel | None) -> Candidates:
+    """fixed_to_moving between undistorted pixels of the files; none where a forced kind is not available."""
+    candidates = seed_candidates(reference, moving, settings)
+    if model is not None and moving.name in model.mappings:
+        return {"model": model.mappings[moving.name], **candidates}
+    return candidates
+
+
+def _pair(
+    band: Band, reference: Reference, longest: int, bands: Sequence[Band], moving: Raster, candidates: Candidates,
+    model: FlightModel | None,
+) -> BandPair:  # fmt: skip
+    """The pair of `reference`, the image of `band` with its longer side at most `longest`, and the `moving` image."""
+    name = bands[0].name
+    is_coarse = longest < min(_LONGEST_SIDE_PX, max(band.size_px))
+    scales = _scale(reference.image, band), _scale(moving, bands[0])
+    reduced: Candidates = {kind: geometry.rescale(m, *scales) for kind, m in candidates.items()}
+    field = None if model is None or model.rig is None else model.rig.fields.get(name)
+    field = None if field is None else field.rescaled(scales[0])
+    known = _known_to_px(name, model, scales[0])
+    return BandPair(name, reference, moving, reduced, tuple(bands), scales, known, is_coarse, field)
+
+
 def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
-    """Longer side that the reference's image is to have beside a moving band: its own, but where the band's pixels are
-    much larger, a thermal camera's, so many that a few of them make one of the band's.
+    """Longer side to which the reference is reduced for a moving band, px.
+
+    Only a band with much larger pixels, as of a thermal camera, needs fewer than the usual maximum.
     """
     ratio = abs(float(geometry.local_scale(fixed_to_moving, *reference.size_px)[-1]))
     if not 0 < ratio < _COARSE_RATIO:
@@ -208,11 +226,11 @@ def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
 
 
 def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float]) -> dict[SeedKind, float]:
-    """Tags are as good as their makers' parallax; the flight's mean as captures left out of it showed."""
+    """Standard deviations of candidates, px of the fixed image: of tags, and of the flight's mean."""
     known: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), _TAGS_STD_PX * scale[0])
     if model is not None and model.rig is not None and band in model.rig.mean:
         mean, rig = model.rig.mean[band], model.rig
-        # What a rig misses is in px of the band's own file.
+        # The errors of a rig are in px of the band's own file.
         ratio = abs(float(geometry.local_scale(mean, *rig.size_px)[-1]))
         known["model"] = max(unobserved_error_px(rig, band, by_neighbours=False) / ratio, _MIN_MODEL_STD_PX) * scale[0]
     return known

@@ -1,122 +1,177 @@
-"""An alignment that was found on reduced images, sharpened on tiles of the files themselves.
+"""Refining an alignment of reduced images on tiles of the files themselves.
 
-The reduced images say where both show the same; there, tiles of full resolution are read, laid on each other, and the
-shifts of their windows move the homography. Memory is that of a few tiles, whatever the size of the files.
+The residual of the reduced images shows where both bands have structure. Tiles of full resolution are read there. The
+shifts of the windows in half of them, like the black fields of a chessboard, move the homography, and those in the
+other half verify the result. Memory is that of the windows of 48 tiles, whatever the size of the files.
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agalign.capture.corner_fit import fit_corners
-from agalign.config import CheckSettings
+from agalign.capture.corner_fit import CornerFit, corner_correction, with_corners
+from agalign.capture.verification import without_result
+from agalign.errors import GeometryError, UnreadableFileError
+from agalign.flight.factors import distance_px
 from agalign.pixels.masks import learnable
 from agalign.pixels.raster import open_raster, read_window
 from agalign.pixels.resample import resample_tile
 from agalign.pixels.structure import structure_field
-from agalign.values import geometry, lens
-from agalign.values.alignment import Alignment, Residual
+from agalign.values.alignment import Alignment, JointResult, Residual
 from agalign.values.capture import Band
 from agalign.values.image import Raster, Tile
+from agalign.values.issues import UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping, mapping_of
+from agalign.verify.check import Evidence
+from agalign.verify.checks import issues_of
 from agalign.verify.residuals import FixedWindows
 
 _TILE_PX = 640
-_COLUMNS, _ROWS = 8, 6
-"""A tile in each cell of the image."""
+"""Side of a tile: 36 windows, which a few pixels of error of the reduced images do not move out of it."""
+_MIN_CELLS, _MAX_CELLS = (4, 3), (8, 6)
+"""(columns, rows) of the cells with a tile each: as many as tiles fit side by side, enough for eight unknowns in half
+of them, and no more than memory allows."""
 _ROUNDS = 3
-_MIN_WINDOWS = 24
+"""A correction is right to first order: later rounds correct what the first leaves."""
 _REST_PX = 0.02
+"""A step that moves no corner by more is the last one: the windows' own noise is as large."""
 _MAX_STEP_PX = 40.0
-"""Of a corner: beyond, the windows contradict what the reduced images say."""
+"""Displacement of a corner beyond which the windows contradict the reduced images instead of refining them."""
 
 
-def at_full_resolution(reference: Band, moving: Band, alignment: Alignment, check: CheckSettings) -> Alignment:
-    """An alignment between the files of two bands, found on their reductions, moved to where full resolution has it.
+def at_full_resolution(reference: Band, moving: Band, alignment: Alignment) -> Alignment:
+    """An alignment between the files of two bands, estimated on reduced images, refined at full resolution.
 
-    Where the tiles show too little it stays as it is. Raises UnreadableFileError.
+    The earlier alignment stays where the tiles show too little, or where the refined one does not pass verification. A
+    moving file with an unreadable tile makes the alignment `failed`: its pixels could not be written either.
+    Raises UnreadableFileError for the reference.
     """
-    best, tiles = alignment, _tiles(reference, alignment)
-    shown = _shifts(reference, moving, mapping_of(reference, moving, best), tiles, check)
-    for _ in range(_ROUNDS):
-        known = np.isfinite(shown.shifts_px[:, 0])
-        if known.sum() < _MIN_WINDOWS:
-            return best
-        fixed_lens = reference.lens if alignment.space == "undistorted" else None
-        at, there = (lens.undistort(fixed_lens, p[known]) for p in (shown.centres_px, _seen_at(shown)))
-        fit = fit_corners(at, there - at, shown.peaks_sigma[known], reference.size_px)
-        if not np.abs(fit.mean_px).max() <= _MAX_STEP_PX:
-            return best
-        change = geometry.moving_corners(fit.mean_px, *reference.size_px)
-        step = replace(best, fixed_to_moving=geometry.compose(best.fixed_to_moving, change))
-        again = _shifts(reference, moving, mapping_of(reference, moving, step), tiles, check)
-        if not again.median_px < shown.median_px:
-            break
-        best, shown = _known_to(step, fit.covariance_px2, again), again
-        if np.abs(fit.mean_px).max() <= _REST_PX:
-            break
-    return best
+    if alignment.joint is None:
+        return alignment
+    tiles = [_FixedTile.read(reference, cell, tile) for cell, tile in _tiles(reference, alignment).items()]
+    start = mapping_of(reference, moving, alignment)
+    try:
+        fitted = _fitted(moving, start, [t for t in tiles if t.is_for_fit], reference.size_px)
+        if fitted is None:
+            return alignment
+        held_out = [t for t in tiles if not t.is_for_fit]
+        before, after = (_residual(moving, mapping, held_out) for mapping in (start, fitted[0]))
+    except UnreadableFileError as error:
+        failed = without_result(alignment.seed, alignment.space, Issue(UNREADABLE, detail=str(error)))
+        return replace(failed, seconds=alignment.seconds)
+    if not after.median_px < before.median_px:
+        return alignment
+    refined = _refined(alignment, alignment.joint, *fitted, after, reference.size_px)
+    return alignment if refined is None else refined
 
 
-def _known_to(alignment: Alignment, covariance_px2: np.ndarray, residual: Residual) -> Alignment:
-    joint = alignment.joint
-    if joint is not None:
-        std = np.sqrt(np.diag(covariance_px2)).reshape(4, 2)
-        pairs = tuple((float(x), float(y)) for x, y in std)
-        joint = replace(
-            joint,
-            fixed_to_moving=alignment.fixed_to_moving,
-            corner_std_xy_px=pairs,
-            corner_covariance_px2=covariance_px2,
-        )
-    return replace(alignment, joint=joint, residual=residual)
+@dataclass(frozen=True)
+class _FixedTile:
+    """A tile of the reference, read and cut into windows once."""
 
+    cell: tuple[int, int]
+    tile: Tile
+    windows: FixedWindows
 
-def _seen_at(residual: Residual) -> np.ndarray:
-    return residual.centres_px + residual.shifts_px
-
-
-def _tiles(reference: Band, alignment: Alignment) -> list[Tile]:
-    """Around the window of each cell that stands out most on the reduced images."""
-    residual, (width, height) = alignment.residual, reference.size_px
-    if residual is None:
-        return []
-    side_x, side_y = min(_TILE_PX, width), min(_TILE_PX, height)
-    best: dict[tuple[int, int], tuple[float, Tile]] = {}
-    for (x, y), shift, sigma in zip(residual.centres_px, residual.shifts_px, residual.peaks_sigma, strict=True):
-        if not math.isfinite(shift[0]):
-            continue
-        cell = int(x / width * _COLUMNS), int(y / height * _ROWS)
-        x0, y0 = (int(np.clip(v - s / 2, 0, n - s)) for v, s, n in ((x, side_x, width), (y, side_y, height)))
-        if cell not in best or sigma > best[cell][0]:
-            best[cell] = float(sigma), Tile(x0, y0, side_x, side_y)
-    return [tile for _, tile in best.values()]
-
-
-def _shifts(
-    reference: Band, moving: Band, mapping: PixelMapping, tiles: Sequence[Tile], check: CheckSettings
-) -> Residual:
-    """What the windows of all tiles show, px of the reference's file."""
-    result = list(_in_tiles(reference, moving, mapping, tiles, check))
-    if not result:
-        return Residual.of(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
-    centres, shifts, sigma = (np.concatenate(part) for part in zip(*result, strict=True))
-    return Residual.of(centres, shifts, sigma)
-
-
-def _in_tiles(
-    reference: Band, moving: Band, mapping: PixelMapping, tiles: Sequence[Tile], check: CheckSettings
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    for tile in tiles:
+    @classmethod
+    def read(cls, reference: Band, cell: tuple[int, int], tile: Tile) -> "_FixedTile":
+        """Raises UnreadableFileError."""
         with open_raster(reference.path) as source:
             pixels, valid = read_window(source, reference, tile.x0, tile.y0, tile.width, tile.height)
         fixed = _raster(pixels, valid, reference)
-        there = _raster(*resample_tile(moving, mapping, tile, "lanczos"), moving)
-        windows = FixedWindows(fixed.valid, structure_field(fixed, check.smoothing_px), check)
-        residual = windows.residuals(there)
-        yield residual.centres_px + np.array([tile.x0, tile.y0]), residual.shifts_px, residual.peaks_sigma
+        return cls(cell, tile, FixedWindows(fixed.valid, structure_field(fixed)))
+
+    @property
+    def is_for_fit(self) -> bool:
+        """True for the black fields of the chessboard; the white ones verify."""
+        return sum(self.cell) % 2 == 0
+
+    def residual(self, moving: Band, mapping: PixelMapping) -> Residual:
+        """The residual of its windows, px of the reference's file. Raises UnreadableFileError for the moving file."""
+        warped = _raster(*resample_tile(moving, mapping, self.tile, "lanczos"), moving)
+        residual = self.windows.residuals(warped)
+        return replace(residual, centres_px=residual.centres_px + np.array([self.tile.x0, self.tile.y0]))
+
+
+def _fitted(
+    moving: Band, start: PixelMapping, tiles: Sequence[_FixedTile], size_px: tuple[int, int]
+) -> tuple[PixelMapping, CornerFit] | None:
+    """The mapping corrected in rounds, as long as the median shift falls, and the last correction; None without any."""
+    result: tuple[PixelMapping, CornerFit] | None = None
+    mapping, residual = start, _residual(moving, start, tiles)
+    for _ in range(_ROUNDS):
+        fit = corner_correction(mapping, residual, size_px)
+        if fit is None or not fit.max_px <= _MAX_STEP_PX:
+            break
+        try:
+            step = replace(mapping, fixed_to_moving=fit.applied_to(mapping.fixed_to_moving, size_px))
+        except GeometryError:
+            break
+        again = _residual(moving, step, tiles)
+        if not again.median_px < residual.median_px:
+            break
+        result, mapping, residual = (step, fit), step, again
+        if fit.max_px <= _REST_PX:
+            break
+    return result
+
+
+def _refined(
+    alignment: Alignment, joint: JointResult, mapping: PixelMapping, fit: CornerFit, residual: Residual,
+    size_px: tuple[int, int],
+) -> Alignment | None:  # fmt: skip
+    """The alignment with another mapping and its uncertainty; None where the held-out `residual` or the rig speaks
+    against it.
+    """
+    joint = with_corners(joint, mapping.fixed_to_moving, fit.covariance_px2)
+    prediction = alignment.prediction
+    if prediction is not None:
+        off_px = distance_px(mapping.fixed_to_moving, prediction.fixed_to_moving, size_px)
+        prediction = replace(prediction, off_px=off_px)
+    if issues_of(Evidence(joint, residual, size_px, prediction=prediction)):
+        return None
+    return replace(
+        alignment, fixed_to_moving=mapping.fixed_to_moving, joint=joint, residual=residual, prediction=prediction
+    )
+
+
+def _tiles(reference: Band, alignment: Alignment) -> dict[tuple[int, int], Tile]:
+    """By cell (column, row): a tile inside the cell, around its window with the highest peak on the reduced images."""
+    residual, size_px = alignment.residual, reference.size_px
+    if residual is None:
+        return {}
+    counts = [min(max(n // _TILE_PX, low), high) for n, low, high in zip(size_px, _MIN_CELLS, _MAX_CELLS, strict=True)]
+    best: dict[tuple[int, int], tuple[float, Tile]] = {}
+    for centre, shift, sigma in zip(residual.centres_px, residual.shifts_px, residual.peaks_sigma, strict=True):
+        if not math.isfinite(shift[0]):
+            continue
+        (column, x0, width), (row, y0, height) = (
+            _side(v, n, count) for v, n, count in zip(centre, size_px, counts, strict=True)
+        )
+        if (column, row) not in best or sigma > best[column, row][0]:
+            best[column, row] = float(sigma), Tile(x0, y0, width, height)
+    return {cell: tile for cell, (_, tile) in best.items()}
+
+
+def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
+    """(cell, start, side) of the tile around a position, along one axis of an image, without leaving the cell."""
+    cell = min(max(int(centre_px / length_px * cells), 0), cells - 1)
+    first, end = cell * length_px // cells, (cell + 1) * length_px // cells
+    side = min(_TILE_PX, end - first)
+    return cell, int(np.clip(centre_px - side / 2, first, end - side)), side
+
+
+def _residual(moving: Band, mapping: PixelMapping, tiles: Sequence[_FixedTile]) -> Residual:
+    """The residual of the windows of all tiles, px of the reference's file."""
+    parts = [tile.residual(moving, mapping) for tile in tiles]
+    if not parts:
+        return Residual.of(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
+    return Residual.of(
+        np.concatenate([p.centres_px for p in parts]), np.concatenate([p.shifts_px for p in parts]),
+        np.concatenate([p.peaks_sigma for p in parts]),
+    )  # fmt: skip
 
 
 def _raster(pixels: np.ndarray, valid: np.ndarray, band: Band) -> Raster:

@@ -1,4 +1,4 @@
-"""Where a pair's alignment starts: candidates scored on the images, the best kept; and the method's subject of it."""
+"""The seed of a pair: candidates from tags, flight and landmarks are scored on the images, and the best one is kept."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair, Candidates
-from agalign.capture.corner_fit import fit_corners
+from agalign.capture.corner_fit import corner_correction
 from agalign.capture.verification import WarpedPair
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
@@ -17,121 +17,118 @@ from agalign.method.state import ImageGroup
 from agalign.pixels.grey import channel_mean
 from agalign.pixels.landmarks import LANDMARK_INPUTS, agreed_homography, landmarks
 from agalign.pixels.resample import textured, warped
-from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
-from agalign.values import geometry, lens
+from agalign.pixels.structure import Peak, correlation_surfaces, find_peak, structure_field, windowed_spectra
+from agalign.values import geometry
 from agalign.values.alignment import Residual, Seed
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
-from agalign.values.issues import Issue
+from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
 from agalign.verify.acceptance import seed_fits
 
-_PLAIN_SIGMA = 120.0
-"""A peak that only images reach which lie on each other everywhere: turned by one degree they have one of 60 to 120, by
-three degrees of 17."""
-_CLOSE_PX = 3.0
-"""Where nearly all windows lie this close under a match, no better one is looked for."""
-_MIN_WINDOWS = 12
-_MAX_TURN_DEGREES, _MAX_SCALE = 1.0, 0.02
-"""By which a band may lie otherwise than a rig has it."""
-_MAX_KEYPOINTS = 1000
-"""Where learnt descriptors are the last resort."""
+_CERTAIN_SIGMA = 120.0
+"""Correlation peak that only images reach which agree everywhere: images rotated by one degree have one of 60 to 120,
+by three degrees of 17."""
+_TRUSTED_SIGMA = 12.0
+"""Correlation peak of a seed that is good to a few pixels. Unrelated images reach 9."""
+_TRUSTED_RATIO = 1.5
+"""Ratio of a trusted seed's peak to the second highest: a repetitive scene has several of one height."""
+_MIN_OVERLAP = 0.2
+"""Share of the reference that the moving image must cover: on a sliver of common area the correlation peak means
+nothing, and the correlation is circular, so that its peak may put the images next to each other."""
+_MIN_SHIFT_PX = 0.25
+"""Structure shifts below this, in px of the reduced images, are noise and leave a candidate as it is."""
 _SAME_PEAK_PX = 2.0
-"""A candidate no farther from the peak than this, in working px, is on its flank."""
+"""A candidate no farther from the peak than this, in px of the reduced images, is on its flank."""
+_CLOSE_PX = 3.0
+"""95th percentile of the residual under a match, below which no better one is looked for."""
+_MAX_ROTATION_DEGREES, _MAX_SCALE_CHANGE = 1.0, 0.02
+"""Difference of a band from its rig that temperature and mounting explain."""
+_MAX_KEYPOINTS = 1000
+"""Matching all keypoints of a full image by learnt descriptors, the last resort, takes seconds."""
 
 
-def find_seed(pair: BandPair, model: FlightModel | None = None) -> Seed | Issue:
-    """The best seed of a pair, or why it can have none. `model` is the network that a `match` is found with."""
+def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None = None) -> Seed | Issue:
+    """The best seed of a pair, or why it can have none. `model` has the network that a `match` is found with."""
     if not pair.reference.is_textured:
-        return Issue("blank_reference")
+        return Issue(BLANK_REFERENCE)
     if not textured(pair.moving):
-        return Issue("blank_moving")
+        return Issue(BLANK_MOVING)
     candidates = pair.candidates
-    if _forced_kind(pair) == "match":
+    # A forced kind is for the captures that a flight is learned from: the others start from the flight's own mapping.
+    force = None if "model" in candidates else settings.force
+    if force == "match":
         result = match_seed(_network(pair, model), pair.fixed, pair.moving)
         if result is None:
-            return Issue("no_such_seed", detail="match")
+            return Issue(NO_SUCH_SEED, detail="match")
         candidates = {"match": result}
-    best = best_seed(pair, candidates)
-    if best.score >= _PLAIN_SIGMA or _is_known(pair):
+    best = best_seed(pair, candidates, force)
+    # A mapping from the flight or the user, or a forced seed: anything found elsewhere would be wrong.
+    is_given = force is not None or pair.is_known_to_a_rig or "user" in pair.candidates
+    if best.score >= _CERTAIN_SIGMA or is_given:
         return best
-    shown = _windows_under(pair, best)
-    # Tags that a peak agrees with say no more of the middle than of the corners: the windows do.
-    expected = best.trusted and pair.is_expected(best.fixed_to_moving)
-    if expected and seed_fits(shown, pair.reference.settings.check):
+    residual = _residual_under(pair, best.fixed_to_moving)
+    # A peak at the mapping of the tags verifies the middle of the image; the windows verify the corners.
+    if best.trusted and pair.is_expected(best.fixed_to_moving) and seed_fits(residual):
         return best
-    for result in _matched(pair, model, by_learnt_descriptors=not best.trusted):
-        there = _windows_under(pair, matched := _at_its_place(pair, result))
-        sharpened = _sharpened(pair, result, there)
-        if sharpened is not None:
-            again = _windows_under(pair, other := _at_its_place(pair, sharpened))
-            if again.is_better_than(there):
-                matched, there = other, again
-        if seed_fits(there, pair.reference.settings.check) and there.is_better_than(shown):
-            best, shown = replace(matched, trusted=True), there
-        if best.kind == "match" and shown.p95_px <= _CLOSE_PX:
+    return _best_match(pair, model, best, residual)
+
+
+def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual: Residual) -> Seed:
+    """A match under which the windows agree better than under the best seed so far, or that seed."""
+    for mapping in _matches(pair, model, by_learnt_descriptors=not best.trusted):
+        match, match_residual = _unshifted(pair, mapping), _residual_under(pair, mapping)
+        corrected = _corrected(pair, mapping, match_residual)
+        if corrected is not None:
+            corrected_residual = _residual_under(pair, corrected)
+            if corrected_residual.is_better_than(match_residual):
+                match, match_residual = _unshifted(pair, corrected), corrected_residual
+        if seed_fits(match_residual) and match_residual.is_better_than(residual):
+            best, residual = replace(match, trusted=True), match_residual
+        if best.kind == "match" and residual.p95_px <= _CLOSE_PX:
             break
     return best
 
 
 def find_rotated(pair: BandPair, fixed_to_moving: Matrix, under: Residual) -> Matrix | None:
-    """A mapping that landmarks of both images agree on, and their windows better than `under` the one that is given,
-    and that is turned or scaled beside it, as no rigid camera's bands are; None where there is none. One that is merely
-    shifted may be a scene that repeats.
+    """A mapping by landmarks that is rotated or scaled relative to the given one, as no band of a rigid camera is.
+
+    The windows must agree better with it than they do `under` the given mapping. None where there is none: a mapping
+    that is merely shifted may be another place of a repetitive scene.
     """
-    if seed_fits(under, pair.reference.settings.check):
+    if seed_fits(under):
         return None
-    for result in _matched(pair, None, by_learnt_descriptors=False):
-        there = WarpedPair.at(pair, pair.mapping(result)).residual
-        fits = seed_fits(there, pair.reference.settings.check) and there.is_better_than(under)
-        if fits and _is_rotated_or_scaled(
-            geometry.compose(geometry.invert(fixed_to_moving), result), pair.fixed.size_px
-        ):
+    for result in _matches(pair, None, by_learnt_descriptors=False):
+        residual = _residual_under(pair, result)
+        change = geometry.compose(geometry.invert(fixed_to_moving), result)
+        if seed_fits(residual) and residual.is_better_than(under) and _is_rotated_or_scaled(change, pair.fixed.size_px):
             return result
     return None
 
 
 def _is_rotated_or_scaled(matrix: Matrix, size_px: tuple[int, int]) -> bool:
-    """By what a homography does to a step right and a step down in the middle of the image."""
+    """By the images of a step right and a step down in the middle of an image (width, height)."""
     middle = (np.array(size_px) - 1) / 2
-    here, right, down = geometry.apply(matrix, middle + np.array([(0, 0), (1, 0), (0, 1)]))
-    angle = np.degrees(np.arctan2(*(right - here)[::-1]))
-    scale = np.sqrt(abs(np.linalg.det([right - here, down - here])))
-    return bool(abs(angle) > _MAX_TURN_DEGREES or abs(scale - 1) > _MAX_SCALE)
+    origin, right, down = geometry.apply(matrix, middle + np.array([(0, 0), (1, 0), (0, 1)]))
+    angle = np.degrees(np.arctan2(*(right - origin)[::-1]))
+    scale = np.sqrt(abs(np.linalg.det([right - origin, down - origin])))
+    return bool(abs(angle) > _MAX_ROTATION_DEGREES or abs(scale - 1) > _MAX_SCALE_CHANGE)
 
 
-def _sharpened(pair: BandPair, fixed_to_moving: Matrix, shown: Residual) -> Matrix | None:
-    """A mapping moved to where most of the windows have it; None where they are few."""
-    known = np.isfinite(shown.shifts_px[:, 0])
-    if known.sum() < _MIN_WINDOWS:
-        return None
-    at, there = (
-        lens.undistort(pair.fixed.lens, p[known]) for p in (shown.centres_px, shown.centres_px + shown.shifts_px)
-    )
-    fit = fit_corners(at, there - at, shown.peaks_sigma[known], pair.fixed.size_px)
+def _corrected(pair: BandPair, fixed_to_moving: Matrix, residual: Residual) -> Matrix | None:
+    """A mapping corrected by the windows under it; None where these are few."""
+    fit = corner_correction(pair.mapping(fixed_to_moving), residual, pair.fixed.size_px)
     try:
-        return geometry.compose(fixed_to_moving, geometry.moving_corners(fit.mean_px, *pair.fixed.size_px))
+        return None if fit is None else fit.applied_to(fixed_to_moving, pair.fixed.size_px)
     except GeometryError:
         return None
 
 
-def _is_known(pair: BandPair) -> bool:
-    """True where it is told, by the flight or by the user, where a pair lies: what is found elsewhere is wrong."""
-    return _forced_kind(pair) is not None or pair.is_known_to_a_rig or "user" in pair.candidates
-
-
-def _forced_kind(pair: BandPair) -> SeedKind | None:
-    """The only kind of seed to be used. It is for the captures that a flight is learned from: the others start from
-    the flight's own mapping.
-    """
-    return None if "model" in pair.candidates else pair.reference.settings.seed.force
-
-
-def _matched(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors: bool) -> Iterator[Matrix]:
-    """Mappings, however turned, scaled or far apart, that landmarks or learnt descriptors of both images agree on."""
+def _matches(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors: bool) -> Iterator[Matrix]:
+    """Mappings, however rotated, scaled or shifted, that landmarks or learnt descriptors of both images agree on."""
     for source in LANDMARK_INPUTS:
-        here = pair.reference.landmarks(source).undistorted(pair.fixed.lens)
-        there = landmarks(pair.moving, source).undistorted(pair.moving.lens)
-        result = agreed_homography(here, there, pair.fixed.size_px)
+        fixed = pair.reference.landmarks(source).undistorted(pair.fixed.lens)
+        moving = landmarks(pair.moving, source).undistorted(pair.moving.lens)
+        result = agreed_homography(fixed, moving, pair.fixed.size_px)
         if result is not None:
             yield result
     if by_learnt_descriptors:
@@ -140,8 +137,8 @@ def _matched(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors
             yield result
 
 
-def _windows_under(pair: BandPair, seed: Seed) -> Residual:
-    return WarpedPair.at(pair, pair.mapping(seed.fixed_to_moving)).residual
+def _residual_under(pair: BandPair, fixed_to_moving: Matrix) -> Residual:
+    return WarpedPair.of(pair, pair.mapping(fixed_to_moving)).residual
 
 
 def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
@@ -152,23 +149,24 @@ def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
 def image_groups(
     pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int] = ()
 ) -> list[tuple[list[int], ImageGroup]]:
-    """What the method works on: the pairs of a capture that see one image of the reference in one space, with their
-    seeds and the network's side for each, by default counted; and which of the pairs those are.
+    """The inputs of the joint method: (indices of pairs with one reference image and one space, these as a group).
+
+    `sides` are the network's side for each pair, by default counted within each group.
     """
     groups: dict[tuple[int, Space], list[int]] = {}
-    for place, pair in enumerate(pairs):
-        groups.setdefault((id(pair.reference), pair.space), []).append(place)
+    for index, pair in enumerate(pairs):
+        groups.setdefault((id(pair.reference), pair.space), []).append(index)
     return [
         (
-            places,
-            _subject([pairs[i] for i in places], [seeds[i] for i in places],
-                     [sides[i] for i in places] if sides else range(1, len(places) + 1)),
+            indices,
+            _image_group([pairs[i] for i in indices], [seeds[i] for i in indices],
+                         [sides[i] for i in indices] if sides else range(1, len(indices) + 1)),
         )
-        for places in groups.values()
+        for indices in groups.values()
     ]  # fmt: skip
 
 
-def _subject(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> ImageGroup:
+def _image_group(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> ImageGroup:
     mappings = [s.fixed_to_moving for s in seeds]
     fields = [p.field for p in pairs]
     return ImageGroup(
@@ -177,11 +175,11 @@ def _subject(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[i
     )  # fmt: skip
 
 
-def best_seed(pair: BandPair, candidates: Candidates) -> Seed:
+def best_seed(pair: BandPair, candidates: Candidates, force: SeedKind | None = None) -> Seed:
     """The candidate under which the structures agree best, or one shifted onto the peak of their correlation.
 
-    Each is scored at no shift and at its best shift; a candidate whose best shift is below `min_shift_px` stays as it
-    is. Where the flight's own mapping leaves no doubt, the others are not looked at.
+    A candidate of the kind to `force` wins whatever its score. Where the flight's own mapping is trusted, the others
+    are not scored.
     """
     scored: list[Seed] = []
     for kind, matrix in candidates.items():
@@ -189,54 +187,56 @@ def best_seed(pair: BandPair, candidates: Candidates) -> Seed:
         best = max(scored, key=lambda seed: seed.score)
         if kind == "model" and best.trusted:
             return best
-    forced = [s for s in scored if s.kind == _forced_kind(pair)]
+    forced = [s for s in scored if s.kind == force]
     return max(forced or scored, key=lambda seed: seed.score)
 
 
-def _at_its_place(pair: BandPair, fixed_to_moving: Matrix) -> Seed:
-    """A match as it is, with what the structures say of it."""
+def first_candidate(pair: BandPair) -> Seed:
+    """The candidate of highest trust, without a score."""
+    kind, matrix = next(iter(pair.candidates.items()))
+    return Seed(kind, matrix, 0.0)
+
+
+def _unshifted(pair: BandPair, fixed_to_moving: Matrix) -> Seed:
+    """A match as it is, with its score."""
     return _scored(pair, "match", fixed_to_moving)[0]
 
 
 def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[Seed]:
     """The candidate itself first and, where the structures agree better a shift away, its `structure` variant.
 
-    On a sliver of common area the peak of the correlation means nothing: such a candidate scores 0.
+    A candidate with too little common area scores 0.
     """
-    reference, settings = pair.reference, pair.reference.settings.seed
-    size, scale = reference.seed_size_px, reference.seed_scale
-    small_moving = warped(channel_mean(pair.moving), pair.mapping(fixed_to_moving), size, scale)
-    if small_moving.valid.mean() < settings.min_overlap:
+    scale = pair.reference.seed_scale
+    peak = _peak(pair, kind, fixed_to_moving)
+    if peak is None:
         return [Seed(kind, fixed_to_moving, 0.0)]
-    spectrum = windowed_spectra(structure_field(small_moving, settings.smoothing_px))
-    surface = correlation_surfaces(reference.seed_spectrum, spectrum)
-    # Where a candidate's place is known to some px, a period farther away is another place.
-    within_px = max(_SAME_PEAK_PX, pair.reach_px * max(scale)) if kind == "user" else np.inf
-    peak = find_peak(surface, apart_px=max(size) // 16, within_px=within_px)
 
-    def seed(kind: SeedKind, matrix: Matrix, sigma: float, rival: float) -> Seed:
-        return Seed(kind, matrix, sigma, sigma, rival, _is_unambiguous(sigma, rival, settings))
+    def seed(kind: SeedKind, matrix: Matrix, sigma: float, runner_up: float) -> Seed:
+        is_trusted = sigma >= max(_TRUSTED_SIGMA, _TRUSTED_RATIO * runner_up)
+        return Seed(kind, matrix, sigma, sigma, runner_up, is_trusted)
 
-    if np.hypot(*peak.shift_px) < settings.min_shift_px:
+    if np.hypot(*peak.shift_px) < _MIN_SHIFT_PX:
         return [seed(kind, fixed_to_moving, peak.sigma, peak.runner_up_sigma)]
-    shift = geometry.translation(peak.shift_px[0] / scale[0], peak.shift_px[1] / scale[1])
-    shifted = geometry.compose(fixed_to_moving, shift)
-    # Where the peak is another place, it is what this candidate has to stand up to.
+    # Where the peak is another place, it is the unshifted candidate's rival.
     rival = peak.sigma if np.hypot(*peak.shift_px) > _SAME_PEAK_PX else peak.runner_up_sigma
     unmoved = seed(kind, fixed_to_moving, peak.sigma_at_zero, rival)
-    # The correlation is circular: its peak may lay the images beside each other.
+    shift = geometry.translation(peak.shift_px[0] / scale[0], peak.shift_px[1] / scale[1])
+    shifted = geometry.compose(fixed_to_moving, shift)
     points = pair.mapping(shifted)(geometry.lattice(*pair.fixed.size_px, 16, 12))
     within = ((points >= 0) & (points <= np.subtract(pair.moving.size_px, 1))).all(axis=1)
-    if within.mean() < settings.min_overlap:
+    if within.mean() < _MIN_OVERLAP:
         return [unmoved]
     return [unmoved, seed("structure", shifted, peak.sigma, peak.runner_up_sigma)]
 
 
-def _is_unambiguous(sigma: float, rival: float, settings: SeedSettings) -> bool:
-    return sigma >= max(settings.trusted_sigma, settings.trusted_ratio * rival)
-
-
-def unscored(pair: BandPair) -> Seed:
-    """The first candidate, where none can be scored."""
-    kind, matrix = next(iter(pair.candidates.items()))
-    return Seed(kind, matrix, 0.0)
+def _peak(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> Peak | None:
+    """The correlation peak of the reduced structures under a candidate; None where too little is common to both."""
+    size, scale = pair.reference.seed_size_px, pair.reference.seed_scale
+    small_moving = warped(channel_mean(pair.moving), pair.mapping(fixed_to_moving), size, scale)
+    if small_moving.valid.mean() < _MIN_OVERLAP:
+        return None
+    surface = correlation_surfaces(pair.reference.seed_spectrum, windowed_spectra(structure_field(small_moving)))
+    # Where the user knows a candidate to some px, a peak a period away is another place.
+    within_px = max(_SAME_PEAK_PX, pair.reach_px * max(scale)) if kind == "user" else np.inf
+    return find_peak(surface, apart_px=max(size) // 16, within_px=within_px)

@@ -2,9 +2,6 @@
 
 from contextlib import suppress
 
-import cv2
-import numpy as np
-
 from agalign.cameras import other_rig_seed, rig_seed
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
@@ -18,12 +15,12 @@ _FROM_TAGS: tuple[SeedKind, ...] = ("rig", "geo", "identity")
 
 
 def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> dict[SeedKind, Matrix]:
-    """fixed_to_moving between undistorted pixels of the files, in order of trust; identity is always among them.
+    """fixed_to_moving between undistorted pixels of the files, in order of trust, identity last.
 
-    Where settings force a kind that tags can give, that one alone, or nothing where the tags do not give it.
+    Where the settings force a kind that tags can give, only that one, or none where the tags do not give it.
     """
     candidates: dict[SeedKind, Matrix] = {}
-    with suppress(GeometryError):  # numbers in the tags that make no camera
+    with suppress(GeometryError):  # values in the tags that do not describe a camera
         rig = rig_seed(reference, moving)
         if rig is not None:
             candidates["rig"] = rig
@@ -44,22 +41,22 @@ def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> di
 def geo_seed(reference: Band, moving: Band) -> Matrix | None:
     """fixed_to_moving from the two files' geotransforms; None where either has none.
 
-    Between two coordinate reference systems it is the homography nearest to the transformation. Geotransforms count
-    from the corner of the top-left pixel, this package from its centre: hence the half pixels. Raises GeometryError.
+    Between two coordinate reference systems it is the homography closest to the transformation. Geotransforms refer to
+    the corner of the top-left pixel, this package to its centre: hence the half pixels. Raises GeometryError.
     """
-    here, there = reference.georeference, moving.georeference
-    if here is None or there is None:
+    fixed, other = reference.georeference, moving.georeference
+    if fixed is None or other is None:
         return None
     to_corner = geometry.translation(0.5, 0.5)
     try:
-        map_to_there = geometry.invert(there.transform)
+        map_to_moving = geometry.invert(other.transform)
     except GeometryError:
         raise GeometryError(f"{moving.path}: its geotransform cannot be inverted") from None
-    if here.crs_wkt == there.crs_wkt:
-        return geometry.compose(geometry.invert(to_corner), map_to_there, here.transform, to_corner)
+    if fixed.crs_wkt == other.crs_wkt:
+        return geometry.compose(geometry.invert(to_corner), map_to_moving, fixed.transform, to_corner)
     points = geometry.lattice(*reference.size_px, 9, 7)
-    on_map = transformed(geometry.apply(here.transform, points + 0.5), here.crs_wkt, there.crs_wkt)
-    result, _ = cv2.findHomography(points, geometry.apply(map_to_there, on_map) - 0.5, 0)
-    if result is None or not np.isfinite(result).all():
-        raise GeometryError(f"{moving.path}: lies where {reference.path.name}'s coordinates do not reach")
-    return geometry.normalised(result)
+    on_map = transformed(geometry.apply(fixed.transform, points + 0.5), fixed.crs_wkt, other.crs_wkt)
+    try:
+        return geometry.fit_homography(points, geometry.apply(map_to_moving, on_map) - 0.5)
+    except GeometryError:
+        raise GeometryError(f"{moving.path}: is outside the coordinates of {reference.path.name}") from None

@@ -1,31 +1,35 @@
-"""A pair's alignment with everything that speaks for and against it, measured on the images laid on each other."""
+"""Verification of a pair: its alignment with every reason for and against it, measured on the warped images."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.config import CheckSettings, Settings
+from agalign.config import Settings
 from agalign.pixels.grey import channel_mean
 from agalign.pixels.resample import shrink
-from agalign.pixels.structure import structure_field, windowed_spectra
+from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, DisplacementResult, JointResult, Prediction, Residual, Seed
-from agalign.values.choices import SeedKind, Space
+from agalign.values.choices import LocalUse, SeedKind, Space
 from agalign.values.image import Raster
-from agalign.values.issues import Issue
+from agalign.values.issues import SEED_DOES_NOT_FIT, Issue
 from agalign.values.mapping import PixelMapping
-from agalign.verify.acceptance import is_as_it_was, issues_of, seed_fits, status_of
-from agalign.verify.repetition import alias_peak
+from agalign.verify.acceptance import is_unchanged, seed_fits, status_of
+from agalign.verify.check import Evidence
+from agalign.verify.checks import issues_of
 from agalign.verify.residuals import residual_under
+from agalign.verify.window_check import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX
 
-_AS_FILES_LIE: tuple[SeedKind, ...] = ("geo", "identity")
+_UNCHANGED: tuple[SeedKind, ...] = ("geo", "identity")
 """Seeds that change nothing: an input aligned already is left untouched, not resampled by a hundredth of a pixel."""
 
-_ALL_BUT_EQUAL_PX = 0.15
-"""Mappings no farther apart leave shifts that differ by that, to a hundredth of a px: what interpolation does to the
-windows' shifts is a tenth to a quarter of how far they lie from whole pixels."""
+_SAME_PX = 0.15
+"""Mappings no farther apart leave shifts that differ by that, to a hundredth of a px: interpolation changes the
+windows' shifts by a tenth to a quarter of their distance from whole pixels."""
+
+_MENDABLE = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
+"""Issues that parallax causes and a displacement field removes."""
 
 
 def without_result(seed: Seed, space: Space, issue: Issue) -> Alignment:
@@ -35,7 +39,7 @@ def without_result(seed: Seed, space: Space, issue: Issue) -> Alignment:
 
 @dataclass(frozen=True)
 class WarpedPair:
-    """A pair laid on each other by a mapping, and what its windows show there."""
+    """A pair with the moving image on the reference's pixels, and the residual of its windows."""
 
     pair: BandPair
     mapping: PixelMapping
@@ -44,106 +48,130 @@ class WarpedPair:
     residual: Residual
 
     @classmethod
-    def at(cls, pair: BandPair, mapping: PixelMapping) -> "WarpedPair":
-        """Laid now."""
+    def of(cls, pair: BandPair, mapping: PixelMapping) -> "WarpedPair":
+        """Warped and measured."""
         warped = pair.warped_moving(mapping)
         return cls(pair, mapping, warped, pair.reference.windows.residuals(warped))
 
     def under(self, mapping: PixelMapping) -> "WarpedPair":
-        """Under another mapping: where the two are all but equal, without looking again."""
+        """The pair under another mapping; where the two are all but equal, it is not measured again."""
         if mapping.local is self.mapping.local:
             corners = geometry.corners(*self.pair.fixed.size_px)
             apart_px = float(np.linalg.norm(mapping(corners) - self.mapping(corners), axis=1).max())
-            if apart_px <= _ALL_BUT_EQUAL_PX:
+            if apart_px <= _SAME_PX:
                 return replace(self, mapping=mapping, residual=residual_under(self.residual, self.mapping, mapping))
-        return WarpedPair.at(self.pair, mapping)
+        return WarpedPair.of(self.pair, mapping)
+
+    @property
+    def reduced_scale(self) -> tuple[float, float]:
+        """(x, y) of the reduced images relative to the fixed image."""
+        return self.pair.reference.seed_scale
+
+    def reduced_spectra(self) -> tuple[Field, Field]:
+        """Windowed spectra (height, width) of the structure of the reduced fixed image, and of the moving image."""
+        small = shrink(self.warped, self.pair.reference.seed_size_px)
+        return self.pair.reference.seed_spectrum, windowed_spectra(structure_field(small))
+
+    def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
+        """True where the pair's candidates expect the mapping after a shift (x, y), px of the fixed image."""
+        return self.pair.is_expected(self.mapping.fixed_to_moving, shift_px)
+
+    def issues(self, joint: JointResult) -> tuple[Issue, ...]:
+        """Of the result that this mapping is from."""
+        return issues_of(Evidence(joint, self.residual, self.pair.fixed.size_px, images=self))
 
 
 def verified(
     pair: BandPair, seed: Seed, result: JointResult | Issue, settings: Settings, warped_pair: WarpedPair | None = None
 ) -> Alignment:
-    """The alignment with its verdict, px of the images. A result that is doubted leaves the seed.
+    """The alignment with its status, px of the images. A result with issues leaves the seed.
 
-    `look` is one at the pair under a mapping that may be near the result's.
+    `warped_pair` is the pair under a mapping that may be close to the result's: it saves measuring again.
     """
-    check, size_px = settings.check, pair.fixed.size_px
     joint: JointResult | None = None
     local: DisplacementResult | None = None
-    issues: tuple[Issue, ...] = (result,) if isinstance(result, Issue) else ()
+    issues: tuple[Issue, ...] = ()
     if isinstance(result, JointResult):
-        joint = _snapped(result, pair, check)
-        results = pair.mapping(joint.fixed_to_moving)
-        warped_pair = WarpedPair.at(pair, results) if warped_pair is None else warped_pair.under(results)
-        issues = issues_of(joint, warped_pair.residual, size_px, check) or _repetition(joint, warped_pair, check)
-        if settings.local.is_wanted_for(issues, rig_known=pair.is_known_to_a_rig):
-            local, displaced = _with_displacements(pair, joint, results, check)
-            if displaced is None and issues:
-                # What stands close together, such as the leaves of large plants, needs a finer field.
-                local, displaced = _with_displacements(pair, joint, results, check, finer=True)
-            if displaced is not None:
-                warped_pair, issues = displaced, ()
+        joint = _snapped(result, pair)
+        mapping = pair.mapping(joint.fixed_to_moving)
+        warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.under(mapping)
+        warped_pair, issues, local = _verified(warped_pair, joint, settings.local.use)
+    else:
+        issues = (result,)
     if warped_pair is None or issues:
-        warped_pair = WarpedPair.at(pair, pair.mapping(seed.fixed_to_moving))
+        warped_pair = WarpedPair.of(pair, pair.mapping(seed.fixed_to_moving))
     usable = seed.trusted or settings.seed.only
-    status = status_of(issues, warped_pair.residual, check, seed=usable)
-    if usable and issues and not seed_fits(warped_pair.residual, check):
-        issues = (*issues, Issue("seed_does_not_fit"))
+    status = status_of(issues, warped_pair.residual, seed=usable)
+    if usable and issues and not seed_fits(warped_pair.residual):
+        issues = (*issues, Issue(SEED_DOES_NOT_FIT))
     return Alignment(
         warped_pair.mapping.fixed_to_moving, pair.space, status, issues, seed, joint, warped_pair.residual, 0.0,
         local=local, field=warped_pair.mapping.local,
     )  # fmt: skip
 
 
+def _verified(
+    warped_pair: WarpedPair, joint: JointResult, use: LocalUse
+) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult | None]:
+    """(the pair under the result, with a displacement field where one is wanted and passes; its issues; the field)."""
+    issues = warped_pair.issues(joint)
+    if not _is_field_wanted(use, issues, rig_known=warped_pair.pair.is_known_to_a_rig):
+        return warped_pair, issues, None
+    local, displaced = _with_displacements(warped_pair, joint)
+    if displaced is None and issues:
+        # Close neighbours at different heights, such as the leaves of large plants, need a finer field.
+        local, displaced = _with_displacements(warped_pair, joint, finer=True)
+    return (warped_pair, issues, local) if displaced is None else (displaced, (), local)
+
+
+def _is_field_wanted(use: LocalUse, issues: tuple[Issue, ...], *, rig_known: bool) -> bool:
+    """True where a displacement field is to be tried for a result with these issues.
+
+    `auto` tries one where parallax may be the only issue, and where no rig knows the distortion that the lenses leave.
+    """
+    mendable = all(issue.kind in _MENDABLE for issue in issues)
+    return mendable and (use == "always" or (use == "auto" and (bool(issues) or not rig_known)))
+
+
 def _with_displacements(
-    pair: BandPair, joint: JointResult, result: PixelMapping, check: CheckSettings, *, finer: bool = False
+    warped_pair: WarpedPair, joint: JointResult, *, finer: bool = False
 ) -> tuple[DisplacementResult, WarpedPair | None]:
-    """A field of displacements over a mapping, and the pair under it where nothing speaks against that."""
-    refiner = pair.reference.finer_local if finer else pair.reference.local
-    local = refiner.refine(channel_mean(pair.moving_image), result)
+    """(a displacement field over a mapping; the pair under it where it passes verification)."""
+    pair, mapping = warped_pair.pair, warped_pair.mapping
+    estimator = pair.reference.finer_local if finer else pair.reference.local
+    local = estimator.refine(channel_mean(pair.moving_image), mapping)
     if local.field is None:
         return local, None
-    displaced = WarpedPair.at(pair, replace(result, local=local.field))
-    # The verdict is asked again: what a field makes worse, or no better, is not aligned by it.
-    if issues_of(joint, displaced.residual, pair.fixed.size_px, check) or _repetition(joint, displaced, check):
+    displaced = WarpedPair.of(pair, replace(mapping, local=local.field))
+    # All checks run again: a field that does not help must not be written.
+    if displaced.issues(joint):
         return replace(local, field=None), None
     return local, displaced
 
 
 def as_predicted(alignment: Alignment, pair: BandPair, prediction: Prediction) -> Alignment:
-    """The alignment of a pair whose own images do not say where it lies, by what the rig says, px of the images."""
-    residual = WarpedPair.at(pair, pair.mapping(prediction.fixed_to_moving)).residual
+    """The alignment of a pair by its rig's prediction: px of the images, of the files for the prediction itself."""
+    fixed_to_moving = geometry.rescale(prediction.fixed_to_moving, *pair.scales)
+    residual = WarpedPair.of(pair, pair.mapping(fixed_to_moving)).residual
     return replace(
-        alignment, fixed_to_moving=prediction.fixed_to_moving, status="predicted", residual=residual, local=None,
+        alignment, fixed_to_moving=fixed_to_moving, status="predicted", residual=residual, local=None,
         field=pair.field, prediction=prediction,
     )  # fmt: skip
 
 
 def with_metrics(alignment: Alignment, pair: BandPair) -> Alignment:
-    """The alignment with how alike the two images are before, as their files lie, and after."""
+    """The alignment with the similarity of the two images before, with outer edges coinciding, and after."""
     similarity = pair.reference.similarity
     before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
     after = pair.warped_moving(pair.mapping(alignment.fixed_to_moving, alignment.field))
     return replace(alignment, before=similarity.to(before), after=similarity.to(after))
 
 
-def _repetition(joint: JointResult, warped_pair: WarpedPair, check: CheckSettings) -> tuple[Issue, ...]:
-    """A doubt where another place fits nearly as well and nothing that was known beforehand rules it out."""
-    pair = warped_pair.pair
-    small = shrink(warped_pair.warped, pair.reference.seed_size_px)
-    spectrum = windowed_spectra(structure_field(small, pair.reference.settings.seed.smoothing_px))
-    rival = alias_peak(pair.reference.seed_spectrum, spectrum)
-    if rival.share <= check.max_alias_peak:
-        return ()
-    x, y = (s / scale for s, scale in zip(rival.shift_px, pair.reference.seed_scale, strict=True))
-    if pair.is_expected(joint.fixed_to_moving) and not pair.is_expected(joint.fixed_to_moving, (x, y)):
-        return ()
-    return (Issue("repeats", math.hypot(x, y)),)
-
-
-def _snapped(joint: JointResult, pair: BandPair, settings: CheckSettings) -> JointResult:
-    for given in (pair.candidates[kind] for kind in _AS_FILES_LIE if kind in pair.candidates):
+def _snapped(joint: JointResult, pair: BandPair) -> JointResult:
+    """The result, or the mapping that the files came with where it does not differ from that."""
+    for given in (pair.candidates[kind] for kind in _UNCHANGED if kind in pair.candidates):
         if pair.mapping(given).is_curved:
-            continue  # the files do not lie that way
-        if is_as_it_was(joint, given, pair.fixed.size_px, settings, max(pair.scales[0])):
+            continue  # a lens is to be corrected: the files are not aligned as they are
+        if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales[0])):
             return replace(joint, fixed_to_moving=given)
     return joint

@@ -150,7 +150,7 @@ def learn(
             terminal.event("pair", text if verbose or lesson.status != "aligned" else "", **vars(lesson))
 
         settings = Settings(joint=joint)
-        result = read_rough_pairs(pairs, settings)
+        result = read_rough_pairs(pairs)
         model = learn_descriptor(result, settings, steps_a_pair=steps, on_pair=on_pair)
         save_model(model, out)
         terminal.event("learnt", f"{out}: learnt from {aligned} of {len(result)} pairs", file=str(out))

@@ -109,7 +109,7 @@ def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, ste
         annealing.step()
 
 
-def read_rough_pairs(source: Path, settings: Settings) -> list[BandPair]:
+def read_rough_pairs(source: Path) -> list[BandPair]:
     """The pairs of a CSV file or folder, as `find_pairs` has them, their homographies taken as rough ones; without one
     alignment starts from the same outline. Raises InputError.
     """
@@ -119,5 +119,5 @@ def read_rough_pairs(source: Path, settings: Settings) -> list[BandPair]:
         start = files.fixed_to_moving
         if start is None:
             start = geometry.overlay(fixed.size_px, moving.size_px)
-        result.append(BandPair.of_images(files.name, fixed, moving, {"user": start}, settings))
+        result.append(BandPair.of_images(files.name, fixed, moving, {"user": start}))
     return result

@@ -21,7 +21,7 @@ from torch.nn import functional
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import best_seed, image_groups
-from agalign.config import JointSettings, Settings
+from agalign.config import JointSettings
 from agalign.errors import ConfigurationError, GeometryError, InputError, NoContrastError, NotEnoughTextureError
 from agalign.evaluation.protocol import grey_patches
 from agalign.flight.model import load_model
@@ -116,7 +116,7 @@ def _learnt_on_the_pair(task: PairTask, settings: JointSettings, start: ThetaSta
         fixed, moving = (_without_colour(r) for r in (fixed, moving))
     settings = settings.model_copy(update={"device": task.device, "rng_seed": task.rng_seed})
     seed = Seed("user", task.start, 0.0)
-    pair = BandPair.of_images("moving", fixed, moving, {"user": task.start}, Settings())
+    pair = BandPair.of_images("moving", fixed, moving, {"user": task.start})
     if task.seeding:
         seed = best_seed(pair, pair.candidates)
     state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([pair], [seed])

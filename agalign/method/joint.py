@@ -23,7 +23,7 @@ from agalign.method.paper import DEFAULT_TRAINING, Training, align_by_paper
 from agalign.method.refine import refine
 from agalign.method.state import ImageGroup, JointState, Progress, ThetaStart
 from agalign.values.alignment import JointResult
-from agalign.values.issues import Issue
+from agalign.values.issues import FEW_KEYPOINTS, NO_CONTRAST, NOT_INVERTIBLE, Issue
 
 Results = list[JointResult | Issue]
 """For each moving image of a group the result, or the reason why there is none."""
@@ -46,7 +46,7 @@ def align_from_scratch(
         steps, loss = learn(state, [group], net, schedule=schedule)
         results = refine(state, net, group)
     except NoContrastError:
-        return [Issue("no_contrast")] * len(group.moving)
+        return [Issue(NO_CONTRAST)] * len(group.moving)
     return [r if isinstance(r, Issue) else replace(r, loss=loss, iterations=steps) for r in results]
 
 
@@ -55,7 +55,7 @@ def refine_with(net: Descriptor, group: ImageGroup, settings: JointSettings, pro
     try:
         results = refine(JointState(settings, progress), net, group)
     except NoContrastError:
-        return [Issue("no_contrast")] * len(group.moving)
+        return [Issue(NO_CONTRAST)] * len(group.moving)
     return [r if isinstance(r, Issue) else replace(r, recipe="flight") for r in results]
 
 
@@ -64,8 +64,8 @@ def _by_paper(state: JointState, group: ImageGroup, band: int, training: Trainin
     try:
         return align_by_paper(state, one, training)[1]
     except NotEnoughTextureError as why_not:
-        return Issue("few_keypoints", why_not.keypoints, why_not.minimum)
+        return Issue(FEW_KEYPOINTS, why_not.keypoints, why_not.minimum)
     except NoContrastError:
-        return Issue("no_contrast")
+        return Issue(NO_CONTRAST)
     except GeometryError:
-        return Issue("not_invertible")
+        return Issue(NOT_INVERTIBLE)

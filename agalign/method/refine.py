@@ -22,7 +22,7 @@ from agalign.method.patches import Keypoints, far_apart, patch_positions, transf
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL, JointResult
 from agalign.values.choices import ModelFamily
-from agalign.values.issues import Issue
+from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NOT_INVERTIBLE, RETRIEVAL, Issue
 
 MIN_KEYPOINTS = 16
 TEST_KEYPOINTS = 256
@@ -223,7 +223,7 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
     p, _ = state.sampler.draw(level, level.anywhere, h, _FINAL_PATCHES, _FINAL_OCTAVES)
     test, _ = state.sampler.draw(level, level.held_out, h, TEST_KEYPOINTS, _FINAL_OCTAVES)
     if len(p) < MIN_KEYPOINTS:
-        return [Issue("few_keypoints", len(p), MIN_KEYPOINTS)] * len(h)
+        return [Issue(FEW_KEYPOINTS, len(p), MIN_KEYPOINTS)] * len(h)
     reference_patches = describe_reference(net, level, p)
     f_test = describe_fixed(net, level, test)
     solver = Solver(state.family)
@@ -236,12 +236,12 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
                 homography, step = start, solver.step(band, start, reference_patches)
             matrix = level.full_matrix(homography, band.index)
         except NotEnoughTextureError as error:
-            return Issue("few_keypoints", error.keypoints, error.minimum)
+            return Issue(FEW_KEYPOINTS, error.keypoints, error.minimum)
         except GeometryError:
-            return Issue("not_invertible")
+            return Issue(NOT_INVERTIBLE)
         std = _complete_std(step)
         if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
-            return Issue("corners_unknown")
+            return Issue(CORNERS_UNKNOWN)
         held_out, chance = held_out_retrieval(band, homography, test, f_test)
         return JointResult(
             matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
@@ -249,7 +249,7 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
         )  # fmt: skip
 
     return [
-        Issue("retrieval", group.dropped[b], MIN_RETRIEVAL)
+        Issue(RETRIEVAL, group.dropped[b], MIN_RETRIEVAL)
         if b in group.dropped
         else result(MovingBand(net, level, b, side), h[b])
         for b, side in enumerate(group.sides)

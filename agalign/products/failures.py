@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field
 
 from agalign.products.sidecar import BandResult, CaptureResult
-from agalign.values.issues import MISSING_BAND, Remedy, remedy
+from agalign.values.issues import MISSING_BAND, Remedy
+from agalign.verify.checks import KINDS
 
 _GRAVITY = {"failed": 0, "seed_only": 1, "missing": 2, "predicted": 3}
 """The worse comes first."""
@@ -67,4 +68,4 @@ class FailureGroups:
 
 def _remedy_of(band: BandResult) -> Remedy:
     """The first doubt is the one that the reason tells."""
-    return remedy(band.issues[0].kind) if band.issues else _UNTOLD
+    return KINDS[band.issues[0].kind].remedy if band.issues else _UNTOLD

@@ -179,7 +179,7 @@ def _moving_part(reference: Band, band: Band, alignment: Alignment, place: Place
         band_index=band.band_index,
         status=alignment.status,
         reason=alignment.reason,
-        doubts=[IssuePart(kind=d.kind, value=_finite(d.value), limit=_finite(d.limit)) for d in alignment.issues],
+        doubts=[IssuePart(kind=d.code, value=_finite(d.value), limit=_finite(d.limit)) for d in alignment.issues],
         homography=HomographyPart(fixed_to_moving=_rows(alignment.fixed_to_moving), space=alignment.space),
         seed=SeedPart(
             kind=alignment.seed.kind,

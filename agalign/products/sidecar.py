@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from agalign.errors import SidecarError
 from agalign.values.choices import CaptureStatus, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.files import is_inside, write_text
-from agalign.values.issues import IssueKind
+from agalign.verify.checks import KINDS
 
 SCHEMA = "agalign/1"
 
@@ -97,10 +97,16 @@ class GridPart(_Part):
     moving_px: list[PointPx]
 
 
+def _known_kind(code: str) -> str:
+    if code not in KINDS:
+        raise ValueError(f"unknown kind of issue {code!r}")
+    return code
+
+
 class IssuePart(_Part):
     """One thing that speaks against an alignment: what was measured, and what it should have been."""
 
-    kind: IssueKind
+    kind: Annotated[str, AfterValidator(_known_kind), Field(json_schema_extra={"enum": list(KINDS)})]
     value: float | None
     limit: float | None
 

@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from agalign.values import geometry
 from agalign.values.choices import ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.geometry import Matrix
-from agalign.values.issues import Issue, explanation, sentence
+from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, explanation, sentence
 
 MIN_RETRIEVAL = 0.2
 """Held-out retrieval below which descriptors do not match: psi does not move and no result is accepted. Chance is below
@@ -172,9 +172,10 @@ _SOURCES: dict[PredictionSource, str] = {
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where the rig of a flight says that a band lies."""
+    """The mapping of a band that the rig of a flight predicts."""
 
     fixed_to_moving: Matrix
+    """Between the files, undistorted where the rig's mappings are."""
     source: PredictionSource
     """From the capture's other bands, from the captures around it, or from the flight's mean."""
     std_px: float
@@ -232,7 +233,7 @@ class Alignment:
             return f"{told}; the rig of the flight says where it lies, {known}"
         if self.status == "seed_only":
             return f"{told}; the {self.seed.kind} seed is used as it is"
-        if self.issues[-1].kind == "seed_does_not_fit":
+        if self.issues[-1].kind == SEED_DOES_NOT_FIT:
             return f"{told}; the {self.seed.kind} seed is used as it is, {sentence(self.issues[-1])}"
         return told
 

@@ -37,11 +37,14 @@ class PixelMapping:
 
     def __call__(self, reference_px: ArrayLike) -> Points:
         """(..., 2) raw reference pixels to raw moving pixels."""
+        return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, self.undistorted(reference_px)))
+
+    def undistorted(self, reference_px: ArrayLike) -> Points:
+        """(..., 2) raw reference pixels to those that the homography maps: displaced, then undistorted."""
         raw = lens.distort(self.pre_distortion, reference_px)
         if self.local is not None:
             raw = raw + self.local((raw + 0.5) * self.local_scale - 0.5) / self.local_scale
-        undistorted = lens.undistort(self.fixed_lens, raw)
-        return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, undistorted))
+        return lens.undistort(self.fixed_lens, raw)
 
     def from_undistorted(self, reference_lens: Lens) -> "PixelMapping":
         """The mapping for undistorted pixels of the reference instead of its raw ones."""

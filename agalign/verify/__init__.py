@@ -1,1 +1,1 @@
-"""What is measured of an alignment without asking how it was found, and the verdict that follows."""
+"""Measurements of an alignment that do not depend on how it was estimated, and the checks that use them."""

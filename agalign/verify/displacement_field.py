@@ -1,5 +1,6 @@
-"""When one plane is not enough: a smooth field of displacements over the homography, from the shifts that windows of
-the two bands still show. It is kept only where it explains windows that it was not fitted to, and it never folds.
+"""Displacement fields over a homography, for parallax: smooth, fitted to the residual shifts of windows.
+
+A field is kept only where it explains windows that it was not fitted to, and where it does not fold the image.
 """
 
 import math
@@ -13,103 +14,138 @@ from scipy.sparse import coo_matrix, csr_matrix, dia_matrix, diags, identity, kr
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from agalign.config import CheckSettings, LocalScale, LocalSettings
 from agalign.pixels.resample import warped
 from agalign.pixels.structure import Field
 from agalign.values.alignment import DisplacementField, DisplacementResult, Residual
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
+from agalign.values.robust import cauchy_weights
 from agalign.verify.residuals import FixedWindows
+
+
+@dataclass(frozen=True)
+class FieldScale:
+    """How fine a displacement field is, px."""
+
+    window_px: int
+    """Side of the windows in which shifts are measured; they overlap by half."""
+    lattice_px: int
+    """Spacing of the field's nodes."""
+
+
+COARSE = FieldScale(window_px=64, lattice_px=48)
+FINE = FieldScale(window_px=32, lattice_px=24)
+"""For plants and walls that are too high above the ground for the coarse field to follow."""
+
+_MAX_WINDOWS = 4000
+"""In larger images the windows are farther apart: it bounds the time, and a field is smooth."""
+_SMOOTHNESS = (0.3, 1.0, 4.0, 16.0, 64.0)
+"""Weights of the field's second differences relative to the shift of one window; cross-validation chooses."""
+_PULL = 0.003
+"""Weight of the field's own length, likewise: it decides only where nothing was measured."""
+_MIN_SPREAD_PX, _OUTLIER_SPREADS = 0.05, 4.0
+"""A window has half its weight at four times the typical misfit: only wrong peaks are farther out. Misfits below 0.05
+px are the noise of shifts."""
+_REWEIGHTINGS = 4
+"""A fixed number, enough for the weights to settle."""
+_ROUNDS, _SETTLED_PX, _MAX_ROUNDS = 2, 0.2, 4
+"""Shifts are measured twice, and again, up to four times, while their median is above 0.2 px: long shifts are found in
+steps."""
+_MIN_WINDOWS = 24
+"""Windows with a shift without which no field is fitted; a fit without a fold may have half as many."""
+_MIN_GAIN_SIGMA = 4.0
+"""A field is kept where the squared shifts of held-out windows fall by as many standard errors."""
+_FAR_PX = 0.1
+"""Scale on which residual shifts are compared: several times the noise of a shift."""
+_MIN_CAPTURES, _COMMON_FOLDS = 3, 4
+"""A field of the lenses needs captures to leave out; four folds leave out a quarter at a time."""
+_COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
+"""As `_SMOOTHNESS`, relative to one window of each capture, for the field that the lenses cause."""
+_MIN_COMMON_GAIN_SIGMA, _MAX_COMMON_P95_GROWTH = 2.5, 1.05
+"""Less strict than within one capture: whole captures that are left out share nothing but their lenses."""
+_ALL_FOLDS = range(16)
+_SOME_FOLDS = (0, 2, 8, 10)
+"""Far enough apart to choose the smoothness by."""
+_MIN_TRUST = 0.1
+"""Windows with a lower relative weight do not take part in the comparison: parallax within a window lowers its peak
+too."""
 
 
 class DisplacementEstimator:
     """The reference cut into small, overlapping windows, ready for any number of moving bands."""
 
-    def __init__(
-        self, valid: Mask, structure: Field, settings: LocalSettings, check: CheckSettings, scale: LocalScale
-    ) -> None:
-        """`valid` and `structure` (height, width) are the reference's."""
-        self.settings, self.size_px, self.lattice_px = settings, (valid.shape[1], valid.shape[0]), scale.lattice_px
-        step = max(scale.window_px // 2, round((valid.size / settings.max_windows) ** 0.5))
-        small = check.model_copy(update={"tile_px": scale.window_px})
-        self.windows = FixedWindows(valid, structure, small, step)
+    def __init__(self, valid: Mask, structure: Field, scale: FieldScale) -> None:
+        """`valid` and `structure` (height, width) are those of the reference."""
+        self.size_px, self.lattice_px = (valid.shape[1], valid.shape[0]), scale.lattice_px
+        step_px = max(scale.window_px // 2, round((valid.size / _MAX_WINDOWS) ** 0.5))
+        self.windows = FixedWindows(valid, structure, scale.window_px, step_px)
 
     def refine(self, moving: Raster, mapping: PixelMapping) -> DisplacementResult:
-        """The field over a mapping, with the displacements that it has already, and what it gains on windows that it
-        was not fitted to.
+        """The field over a mapping, including the displacements that it already has, and its gain on held-out windows.
 
-        The shifts are measured again after each round, under the field so far: windows over steps sharpen so, and long
-        shifts are found in steps.
+        The shifts are measured again under the field of each round: windows over steps become sharper, and long shifts
+        are found in steps.
         """
-        before = None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px)
         first = self._measure(moving, mapping)
-        some = [self._held_out_gain(first, s, _SOME_FOLDS, apart_px=0) for s in self.settings.smoothness]
-        finest = min(some, key=lambda g: g.left).smoothness
-        # Windows that lie farther from those of the fit may know a smoother field only.
-        for smoothness in (s for s in self.settings.smoothness if s >= finest):
-            gain = self._held_out_gain(first, smoothness, _ALL_FOLDS, apart_px=self.windows.side)
-            if gain.is_plain(self.settings.min_gain_sigma):
-                break
-        else:
+        gain = self._best_gain(first)
+        if not gain.is_plain(_MIN_GAIN_SIGMA):
             return DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
+        before = None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px)
         field = before
-        for number in range(self.settings.max_rounds):
-            result = first if number == 0 else self._measure(moving, replace(mapping, local=field))
-            more = self._field(Shifts.of(result), gain.smoothness)
+        for number in range(_MAX_ROUNDS):
+            residual = first if number == 0 else self._measure(moving, replace(mapping, local=field))
+            more = self._field(Shifts.of(residual), gain.smoothness)
             total = more if field is None else field.plus(more)
             if not _is_one_to_one(total, self.size_px):
                 break
             field = total
-            if number + 1 >= self.settings.rounds and result.median_px <= self.settings.settled_px:
+            if number + 1 >= _ROUNDS and residual.median_px <= _SETTLED_PX:
                 break
         return DisplacementResult(None if field is before else field, gain.before_p95_px, gain.after_p95_px)
 
+    def _best_gain(self, first: Residual) -> "_Gain":
+        """The gain of the first smoothness with a plain gain, from the finest upwards; else that of the last."""
+        some = [self._held_out_gain(first, s, _SOME_FOLDS, apart_px=0) for s in _SMOOTHNESS]
+        finest = min(some, key=lambda g: g.left).smoothness
+        # Held-out windows that are farther from those of the fit may only support a smoother field.
+        for smoothness in (s for s in _SMOOTHNESS if s >= finest):
+            gain = self._held_out_gain(first, smoothness, _ALL_FOLDS, apart_px=self.windows.side)
+            if gain.is_plain(_MIN_GAIN_SIGMA):
+                break
+        return gain
+
     def _held_out_gain(self, residual: Residual, smoothness: float, folds: Iterable[int], apart_px: float) -> "_Gain":
-        """Windows are left out in turn, and with them from the fit all nearer than `apart_px` to one of them."""
-        result = Shifts.of(residual)
-        if len(result) < self.settings.min_windows:
+        """Leaves windows out in turn, and with them those nearer to one of them than `apart_px`."""
+        shifts = Shifts.of(residual)
+        if len(shifts) < _MIN_WINDOWS:
             return _Gain(smoothness)
-        fold = _folds(result.centres_px)
-        left = np.full(len(result), np.nan)
+        fold = _folds(shifts.centres_px)
+        left = np.full(len(shifts), np.nan)
         for k in folds:
             out = fold == k
-            kept = ~out & ~_near(result.centres_px, result.centres_px[out], apart_px)
-            if kept.sum() >= self.settings.min_windows // 2:
-                field = self._field(result.some(kept), smoothness)
-                left[out] = np.linalg.norm(result.shifts_px[out] - field(result.centres_px[out]), axis=1)
-        return _gain_of(result, left, smoothness)
+            kept = ~out & ~_near(shifts.centres_px, shifts.centres_px[out], apart_px)
+            if kept.sum() >= _MIN_WINDOWS // 2:
+                field = self._field(shifts.some(kept), smoothness)
+                left[out] = np.linalg.norm(shifts.shifts_px[out] - field(shifts.centres_px[out]), axis=1)
+        return _gain_of(shifts, left, smoothness)
 
-    def _field(self, result: "Shifts", smoothness: float) -> DisplacementField:
-        return fitted_field(result, smoothness, self.settings, self.lattice_px, self.size_px)
+    def _field(self, shifts: "Shifts", smoothness: float) -> DisplacementField:
+        return fitted_field(shifts, smoothness, self.lattice_px, self.size_px)
 
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Residual:
         return self.windows.residuals(warped(moving, mapping, self.size_px), min_valid=1.0)
 
 
-_FAR_PX = 0.1
-_MIN_CAPTURES = 3
-_COMMON_FOLDS = 4
-_COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
-"""Of what is the lenses' own, beside one window of each capture."""
-_MIN_COMMON_GAIN_SIGMA, _NO_WORSE = 2.5, 1.05
-"""Less than of one capture's windows: whole captures that are left out share nothing but their lenses."""
-_ALL_FOLDS = range(16)
-_SOME_FOLDS = (0, 2, 8, 10)
-"""Far enough apart to say how smooth a field should be."""
-_MIN_TRUST = 0.1
-"""Of windows that are asked what a field explains; parallax within a window lowers its peak too."""
-
-
 @dataclass(frozen=True)
 class Shifts:
-    """The windows in which a shift was found."""
+    """The windows with a measured shift."""
 
     centres_px: Points
     shifts_px: Points
     trust: NDArray[np.float64]
-    """(n,) relative weights, 1 in the median: inverse variances, as the error of a shift falls with the square of how
-    far its peak stands out."""
+    """(n,) relative weights, 1 in the median: inverse variances, as the error of a shift falls with the square of its
+    peak's height."""
 
     @classmethod
     def of(cls, residual: Residual) -> "Shifts":
@@ -120,7 +156,7 @@ class Shifts:
 
     @classmethod
     def together(cls, several: Sequence["Shifts"]) -> "Shifts":
-        """The windows of several captures as one's."""
+        """The windows of several captures in one."""
         return cls(
             np.concatenate([s.centres_px for s in several]), np.concatenate([s.shifts_px for s in several]),
             np.concatenate([s.trust for s in several]),
@@ -135,41 +171,40 @@ class Shifts:
 
 @dataclass(frozen=True)
 class _Gain:
-    """What a field gains on windows left out of its fit."""
+    """The gain of a field on windows left out of its fit."""
 
     smoothness: float
     before_p95_px: float = math.nan
     after_p95_px: float = math.nan
     left: float = math.inf
-    """What is left, on a scale on which wrong peaks and the edges of trees, which no smooth field follows, hardly
-    count: mean log(1 + (shift / 0.1 px)^2), weighted by trust."""
+    """Mean log(1 + (shift / 0.1 px)^2) of the remaining shifts, weighted by trust: wrong peaks and the edges of trees,
+    which no smooth field follows, hardly count."""
     sigma: float = 0.0
     """Mean fall of the squared shifts, in standard errors of that mean."""
 
     def is_plain(self, min_sigma: float) -> bool:
-        """True where a field helps on the whole and makes the worst windows no worse."""
+        """True where a field helps on the whole and does not make the worst windows worse."""
         return self.sigma >= min_sigma and self.after_p95_px <= self.before_p95_px
 
 
-def _gain_of(result: Shifts, left: NDArray[np.float64], smoothness: float) -> _Gain:
-    """From what is `left` (n,) of the shifts, px, nan for windows that were not left out."""
-    # What is measured badly says little of a field.
-    tried = np.isfinite(left) & (result.trust >= _MIN_TRUST)
+def _gain_of(shifts: Shifts, left: NDArray[np.float64], smoothness: float) -> _Gain:
+    """From the lengths `left` (n,) of the remaining shifts, px, nan for windows that were not left out."""
+    tried = np.isfinite(left) & (shifts.trust >= _MIN_TRUST)
     if not tried.any():
         return _Gain(smoothness)
-    before, after = np.linalg.norm(result.shifts_px[tried], axis=1), left[tried]
-    # Wrong peaks must not decide: what lies far out counts no more than twice the 95th percentile.
+    before, after = np.linalg.norm(shifts.shifts_px[tried], axis=1), left[tried]
+    # Wrong peaks must not decide: a length counts up to twice the 95th percentile.
     maximum = 2 * np.percentile(before, 95)
     fall = np.minimum(before, maximum) ** 2 - np.minimum(after, maximum) ** 2
     sigma = fall.mean() / max(fall.std() / math.sqrt(len(fall)), 1e-12)
-    what_is_left = float(np.average(np.log1p((after / _FAR_PX) ** 2), weights=result.trust[tried]))
-    before_p95, after_p95 = (float(np.percentile(shifts, 95)) for shifts in (before, after))
-    return _Gain(smoothness, before_p95, after_p95, what_is_left, float(sigma))
+    left_over = float(np.average(np.log1p((after / _FAR_PX) ** 2), weights=shifts.trust[tried]))
+    before_p95, after_p95 = (float(np.percentile(lengths, 95)) for lengths in (before, after))
+    return _Gain(smoothness, before_p95, after_p95, left_over, float(sigma))
 
 
 def _folds(centres_px: Points) -> NDArray[np.int64]:
-    """(n,) which fold each window is left out in: every fourth along both axes, so that between two of them there is
-    one that overlaps neither.
+    """(n,) the fold in which each window is left out: every fourth along both axes, so that between two of them there
+    is one that overlaps neither.
     """
     column, row = (np.unique(centres_px[:, axis], return_inverse=True)[1] for axis in (0, 1))
     return np.asarray(column % 4 + 4 * (row % 4))
@@ -185,71 +220,67 @@ def _near(centres_px: Points, others_px: Points, apart_px: float) -> NDArray[np.
     return np.asarray(nearest < apart_px)
 
 
-def common_field(
-    residuals: Sequence[Residual], settings: LocalSettings, size_px: tuple[int, int]
-) -> DisplacementField | None:
+def common_field(residuals: Sequence[Residual], size_px: tuple[int, int]) -> DisplacementField | None:
     """The smooth field that the windows of several captures have in common, on an image (width, height).
 
-    None where it does not explain captures that are left out of its fit: what is the lenses' is the same in all.
+    None where it does not explain captures that are left out of its fit: the lenses are the same in all.
     """
     captures = [s for s in map(Shifts.of, residuals) if len(s)]
     if len(captures) < _MIN_CAPTURES:
         return None
-    lattice_px = settings.scale.lattice_px
-    folds = [captures[k :: min(len(captures), _COMMON_FOLDS)] for k in range(min(len(captures), _COMMON_FOLDS))]
-    out = Shifts.together([c for fold in folds for c in fold])
+    count = min(len(captures), _COMMON_FOLDS)
+    folds = [captures[k::count] for k in range(count)]
+
+    def fitted(some: Sequence[Shifts], smoothness: float) -> DisplacementField:
+        return fitted_field(Shifts.together(some), smoothness * len(some), COARSE.lattice_px, size_px)
 
     def gain(smoothness: float) -> _Gain:
         left = []
         for fold in folds:
-            rest = [c for other in folds if other is not fold for c in other]
-            field = fitted_field(Shifts.together(rest), smoothness * len(rest), settings, lattice_px, size_px)
+            field = fitted([c for other in folds if other is not fold for c in other], smoothness)
             left += [np.linalg.norm(c.shifts_px - field(c.centres_px), axis=1) for c in fold]
-        return _gain_of(out, np.concatenate(left), smoothness)
+        return _gain_of(Shifts.together([c for fold in folds for c in fold]), np.concatenate(left), smoothness)
 
     best = min(map(gain, _COMMON_SMOOTHNESS), key=lambda g: g.left)
-    if best.sigma < _MIN_COMMON_GAIN_SIGMA or best.after_p95_px > _NO_WORSE * best.before_p95_px:
+    if best.sigma < _MIN_COMMON_GAIN_SIGMA or best.after_p95_px > _MAX_COMMON_P95_GROWTH * best.before_p95_px:
         return None
-    field = fitted_field(out, best.smoothness * len(captures), settings, lattice_px, size_px)
+    field = fitted([c for fold in folds for c in fold], best.smoothness)
     return field if _is_one_to_one(field, size_px) else None
 
 
-def fitted_field(
-    result: Shifts, smoothness: float, settings: LocalSettings, lattice_px: int, size_px: tuple[int, int]
-) -> DisplacementField:
+def fitted_field(shifts: Shifts, smoothness: float, lattice_px: int, size_px: tuple[int, int]) -> DisplacementField:
     """The smooth field d through shifts s at centres x: on a lattice,
 
         min sum_i t_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + pull |d|^2
 
-    with trust t, second differences D2, and Cauchy weights w against windows that found a wrong peak. The pull to
-    nothing is small: it decides where nothing was measured.
+    with trust t, second differences D2, and Cauchy weights w against wrong peaks. The pull to 0 is small: it decides
+    where nothing was measured.
     """
-    step = lattice_px
-    columns, rows = (int(np.ceil(n / step)) + 1 for n in size_px)
-    design = _interpolation(result.centres_px / step, columns, rows)
-    penalty = smoothness * _bending(columns, rows) + settings.pull * identity(rows * columns)
-    weight = np.ones(len(result))
+    columns, rows = (int(np.ceil(n / lattice_px)) + 1 for n in size_px)
+    design = _interpolation(shifts.centres_px / lattice_px, columns, rows)
+    penalty = smoothness * _bending(columns, rows) + _PULL * identity(rows * columns)
+    weight = np.ones(len(shifts))
     nodes = np.zeros((rows * columns, 2))
-    for _ in range(settings.reweightings):
-        weighted = design.T @ diags(result.trust * weight)
-        nodes = splu((weighted @ design + penalty).tocsc()).solve(weighted @ result.shifts_px)
-        off = np.linalg.norm(result.shifts_px - design @ nodes, axis=1)
-        spread = max(1.4826 * float(np.median(off)), settings.min_spread_px)
-        weight = 1 / (1 + (off / (settings.outlier_spreads * spread)) ** 2)
-    return DisplacementField(float(step), nodes.reshape(rows, columns, 2))
+    for _ in range(_REWEIGHTINGS):
+        weighted = design.T @ diags(shifts.trust * weight)
+        nodes = splu((weighted @ design + penalty).tocsc()).solve(weighted @ shifts.shifts_px)
+        off = np.linalg.norm(shifts.shifts_px - design @ nodes, axis=1)
+        spread = max(1.4826 * float(np.median(off)), _MIN_SPREAD_PX)
+        weight = cauchy_weights(off, _OUTLIER_SPREADS * spread)
+    return DisplacementField(float(lattice_px), nodes.reshape(rows, columns, 2))
 
 
-def _interpolation(at: Points, columns: int, rows: int) -> csr_matrix:
+def _interpolation(points: Points, columns: int, rows: int) -> csr_matrix:
     """(n, rows columns): bilinear weights of the lattice's nodes at points in its steps."""
-    cell = np.clip(np.floor(at).astype(int), 0, (columns - 2, rows - 2))
-    part = at - cell
+    cell = np.clip(np.floor(points).astype(int), 0, (columns - 2, rows - 2))
+    part = points - cell
     entries = []
     for dx in (0, 1):
         for dy in (0, 1):
             weight = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
-            entries.append((weight, np.arange(len(at)), (cell[:, 1] + dy) * columns + cell[:, 0] + dx))
+            entries.append((weight, np.arange(len(points)), (cell[:, 1] + dy) * columns + cell[:, 0] + dx))
     weights, which, nodes = (np.concatenate(column) for column in zip(*entries, strict=True))
-    return coo_matrix((weights, (which, nodes)), shape=(len(at), rows * columns)).tocsr()
+    return coo_matrix((weights, (which, nodes)), shape=(len(points), rows * columns)).tocsr()
 
 
 @lru_cache(maxsize=8)
@@ -270,6 +301,6 @@ def _is_one_to_one(field: DisplacementField, size_px: tuple[int, int]) -> bool:
     x = np.arange(0.0, size_px[0], field.step_px / 4)
     y = np.arange(0.0, size_px[1], field.step_px / 4)
     points = np.stack(np.meshgrid(x, y), axis=-1)
-    there = points + field(points)
-    by_x, by_y = np.diff(there, axis=1)[:-1], np.diff(there, axis=0)[:, :-1]
+    displaced = points + field(points)
+    by_x, by_y = np.diff(displaced, axis=1)[:-1], np.diff(displaced, axis=0)[:, :-1]
     return bool((by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0] > 0).all())

@@ -1,4 +1,4 @@
-"""How far apart the structures of two bands on one grid still lie, window by window."""
+"""Residual shifts between the structures of two bands on one grid, window by window."""
 
 import math
 from typing import Any
@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from agalign.config import CheckSettings
 from agalign.pixels.structure import Field, peak_positions, structure_field, whitened_cross_spectra, windowed_spectra
 from agalign.values.alignment import Residual
 from agalign.values.image import Mask, Raster
@@ -15,37 +14,49 @@ from agalign.values.mapping import PixelMapping
 
 _Origin = tuple[int, int]
 
+_WINDOW_PX = 112
+"""Side of the windows: large enough for a plain peak over crops, small enough to localise what is not aligned."""
+_MIN_WINDOW_PX = 32
+"""Smaller windows of small images have no reliable peak."""
+_MIN_STRENGTH = 0.05
+"""Mean structure, of at most 1, below which a window shows nothing but noise."""
+_MIN_PEAK_SIGMA = 7.0
+"""Correlation peak, in standard deviations of its surface, from which a shift counts: lower peaks are chance."""
+_MIN_VALID = 0.9
+"""Share of a window's pixels that must be valid in both images."""
+
 
 class FixedWindows:
     """The reference cut into windows, ready to be compared with any number of moving bands."""
 
-    def __init__(self, valid: Mask, structure: Field, settings: CheckSettings, step_px: int | None = None) -> None:
-        """`valid` and `structure` (height, width) are the reference's; `step_px` is how far apart the windows lie, by
+    def __init__(self, valid: Mask, structure: Field, side_px: int = _WINDOW_PX, step_px: int | None = None) -> None:
+        """`valid` and `structure` (height, width) are those of the reference.
+
+        Windows have a side of `side_px`, less on images smaller than four windows, and start every `step_px`, by
         default side by side.
         """
-        self.settings = settings
         self.valid = valid
         height, width = valid.shape
-        self.side = max(32, min(settings.tile_px, width // 4, height // 4))
+        self.side = max(_MIN_WINDOW_PX, min(side_px, width // 4, height // 4))
         origins = [(x, y) for y in _starts(height, self.side, step_px) for x in _starts(width, self.side, step_px)]
         self.origins, windows = self._strong(structure, origins if min(width, height) >= self.side else [])
         self.spectra = windowed_spectra(windows)
 
-    def residuals(self, moving: Raster, min_valid: float = 0.9) -> Residual:
-        """The shift of each window's content; a window counts as measured where its peak stands out.
+    def residuals(self, moving: Raster, min_valid: float = _MIN_VALID) -> Residual:
+        """The shift of each window's content, px; nan where no correlation peak stands out.
 
-        It is looked at where this share of it is valid in both. What is not valid holds no structure, but its outline
-        pulls at the shift: by some tenths of a px in windows of 64 px of which a twentieth is missing.
+        Windows with a smaller share of valid pixels than `min_valid` are left out. An invalid area has no structure,
+        but its outline biases the shift: by some tenths of a px in windows of 64 px with a twentieth missing.
         """
         both = self.valid & moving.valid
-        field = structure_field(moving, self.settings.smoothing_px)
+        field = structure_field(moving)
         minimum = min_valid * self.side**2
         valid = [o for o in self.origins if np.count_nonzero(self._cut(both, o)) >= minimum]
         origins, windows = self._strong(field, valid)
         rows = {o: i for i, o in enumerate(self.origins)}
         tried = self.spectra if len(origins) == len(rows) else self.spectra[[rows[o] for o in origins]]
         cross = whitened_cross_spectra(tried, windowed_spectra(windows))
-        result, sigma = _peaks(cross, self.settings.min_peak_sigma)
+        result, sigma = _peaks(cross)
         centres_px = np.array(origins, dtype=np.float64).reshape(-1, 2) + (self.side - 1) / 2
         return Residual.of(centres_px, result, sigma)
 
@@ -54,13 +65,14 @@ class FixedWindows:
         return image[y : y + self.side, x : x + self.side]
 
     def _strong(self, field: Field, origins: list[_Origin]) -> tuple[list[_Origin], Field]:
-        """(those of the windows that hold structure; their content (n, side, side), each without its mean: the mean
-        orientation of a row crop is the same everywhere and tells no place from another).
+        """(origins of the windows with structure; their content (n, side, side), each without its mean).
+
+        The mean orientation of a row crop is the same everywhere and does not distinguish places.
         """
         cut = np.empty((len(origins), self.side, self.side), np.complex64)
         for window, origin in zip(cut, origins, strict=True):
             window[:] = self._cut(field, origin)
-        strong = np.abs(cut[:, ::2, ::2]).mean(axis=(1, 2)) >= self.settings.min_strength
+        strong = np.abs(cut[:, ::2, ::2]).mean(axis=(1, 2)) >= _MIN_STRENGTH
         if not strong.all():
             cut = cut[strong]
         cut -= cut.mean(axis=(1, 2), keepdims=True)
@@ -68,9 +80,9 @@ class FixedWindows:
 
 
 def residual_under(residual: Residual, before: PixelMapping, after: PixelMapping) -> Residual:
-    """The shifts of windows that were looked at under one mapping, as another one that is all but equal leaves them.
+    """The residual of windows measured under one mapping, as it is under another one that is all but equal.
 
-    What lies at p + s of the fixed image under the one lies at p + s - d under the other, with before(p + s) =
+    The content at p + s of the fixed image under `before` is at p + s - d under `after`, with before(p + s) =
     after(p + s - d); d to first order in the difference of the two.
     """
     shifts = residual.shifts_px
@@ -85,7 +97,7 @@ def _starts(length: int, side: int, step: int | None) -> list[int]:
     return [round(v) for v in np.linspace(0, max(0, length - side), count)]
 
 
-def _peaks(cross: Field, min_sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _peaks(cross: Field) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """((n, 2) shifts, nan where no peak stands out; (n,) heights in standard deviations) of cross spectra."""
     count, height, width = cross.shape
     surfaces = fft.ifft2(cross).real.reshape(count, height * width)
@@ -97,6 +109,6 @@ def _peaks(cross: Field, min_sigma: float) -> tuple[NDArray[np.float64], NDArray
     # Shifts are circular: beyond half a window they are negative.
     at = np.stack([(column + width // 2) % width - width // 2, (row + height // 2) % height - height // 2], axis=1)
     result = np.full((count, 2), np.nan)
-    plain = sigma >= min_sigma
+    plain = sigma >= _MIN_PEAK_SIGMA
     result[plain] = peak_positions(cross[plain], at[plain].astype(np.float64))
     return result, sigma.astype(np.float64)

@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 
 import agalign
 from agalign.capture.band_pair import BandPair
-from agalign.capture.reference import Reference
 from agalign.capture.seeding import best_seed
-from agalign.config import CheckSettings, Settings
 from agalign.errors import AgalignError
 from agalign.evaluation.methods import elastix_affinity
 from agalign.method.detect import to_8_bit
 from agalign.pixels.grey import luma
 from agalign.pixels.masks import raster_of
 from agalign.pixels.resample import warped
+from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
+from agalign.verify.residuals import FixedWindows
 from bands.score import Matrix
 
 Image = NDArray[Any]
@@ -156,7 +156,7 @@ def kornia_registrator(fixed: Image, moving: Image) -> Matrix | None:
 
 def structure_seed(fixed: Raster, moving: Raster) -> Matrix:
     """Where the program starts on a pair without tags."""
-    pair = BandPair.of_images("moving", fixed, moving, {"identity": np.eye(3)}, Settings())
+    pair = BandPair.of_images("moving", fixed, moving, {"identity": np.eye(3)})
     return best_seed(pair, pair.candidates).fixed_to_moving
 
 
@@ -164,7 +164,7 @@ def structure_ties(fixed: Image, moving: Image) -> Matrix | None:
     """The structure seed, then local shifts in windows as ties, then MAGSAC++."""
     f, m = grey_raster(fixed), grey_raster(moving)
     seed = structure_seed(f, m)
-    windows = Reference(f, Settings(check=CheckSettings(tile_px=64))).windows
+    windows = FixedWindows(f.valid, structure_field(f), side_px=64)
     result = windows.residuals(warped(m, PixelMapping(seed), f.size_px))
     some = np.isfinite(result.shifts_px[:, 0])
     if some.sum() < 8:

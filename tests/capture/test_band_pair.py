@@ -34,7 +34,7 @@ def test_a_seed_that_tags_do_not_give_is_not_replaced_by_another(flight: Path, k
 
 
 def test_the_reference_is_worked_out_once_for_all_bands(flight: Path) -> None:
-    pairs, left_out = read_pairs(discover(flight).captures[0], Settings())
+    pairs, left_out = read_pairs(discover(flight).captures[0], SeedSettings())
     assert not left_out
     assert len(pairs) == 4
     assert len({id(p.reference) for p in pairs}) == 1
@@ -49,7 +49,7 @@ def test_without_one_lens_neither_is_corrected(flight: Path) -> None:
 
     capture = discover(flight).captures[0]
     bands = [dataclasses.replace(b, lens=None) if b.name == "NIR" else b for b in capture.bands]
-    pairs, _ = read_pairs(dataclasses.replace(capture, bands=tuple(bands)), Settings())
+    pairs, _ = read_pairs(dataclasses.replace(capture, bands=tuple(bands)), SeedSettings())
     by_name = {p.name: p for p in pairs}
     assert by_name["NIR"].space == "pixel"
     assert by_name["NIR"].fixed.lens is None
@@ -86,7 +86,7 @@ def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path
         assert score.status == ("predicted" if is_lost else "aligned")
         assert score.median_px < (0.3 if score.band == "LWIR" else 0.1)
     capture = discover(tmp_path).captures[0]
-    pairs, _ = read_pairs(capture, Settings())
+    pairs, _ = read_pairs(capture, SeedSettings())
     assert [(p.name, p.is_coarse, p.is_reduced) for p in pairs] == [("NIR", False, False), ("LWIR", True, False)]
     assert 270 < pairs[1].fixed.size_px[0] < 310  # about two of its pixels to one of the thermal band's
     assert pairs[1].reference_file_px == (800, 600)
@@ -94,7 +94,7 @@ def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path
 
 def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
     """Of a band whose pixels are ten times as large a mapping known to 0.2 px of the reference is known to 0.02."""
-    pairs, _ = read_pairs(discover(flight).captures[0], Settings())
+    pairs, _ = read_pairs(discover(flight).captures[0], SeedSettings())
     pair = pairs[0]
     joint = JointResult(
         np.eye(3), 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, ((0.2 / 2**0.5, 0.2 / 2**0.5),) * 4
@@ -121,7 +121,7 @@ def test_the_tolerance_of_a_candidate_is_in_px_of_the_fixed_image_at_any_scale(s
     """A candidate known to 4 px (1 sigma) admits mappings within 12 px of the fixed image."""
     fixed, moving = (Raster(np.zeros(shape, np.float32), np.ones(shape, bool)) for shape in ((300, 400), (30, 40)))
     candidate = geometry.compose(np.diag([scale, scale, 1.0]), geometry.translation(7.0, -5.0))
-    pair = BandPair.of_images("nir", fixed, moving, {"rig": candidate}, Settings(), {"rig": 4.0})
+    pair = BandPair.of_images("nir", fixed, moving, {"rig": candidate}, {"rig": 4.0})
     for offset_px, is_expected in ((8.0, True), (11.5, True), (12.5, False), (20.0, False)):
         mapping = geometry.compose(candidate, geometry.translation(0.6 * offset_px, 0.8 * offset_px))
         assert pair.is_expected(mapping) is is_expected

@@ -1,12 +1,23 @@
+"""Alignments of reduced images that are refined on the files."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import tifffile
 
 from agalign.cameras.discover import discover
-from agalign.capture import band_pair
+from agalign.capture import corner_fit, full_resolution
 from agalign.capture.align import align_capture_bands
+from agalign.capture.full_resolution import at_full_resolution
 from agalign.config import JointSettings, Settings
+from agalign.errors import UnreadableFileError
+from agalign.flight.rig import distance_px
 from agalign.values import geometry
+from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed
 from agalign.values.capture import Capture
 
 from ..conftest import textured_pair
@@ -20,26 +31,125 @@ TRUTH = np.array([[1.002, 0.004, 12.4], [-0.003, 0.999, -7.7], [1e-6, -1e-6, 1.0
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     folder = tmp_path_factory.mktemp("large")
-    for name, image in zip(("green", "nir"), textured_pair(TRUTH, *SIZE), strict=True):
+    green, nir = textured_pair(TRUTH, *SIZE)
+    for name, image in {"green": green, "nir": nir, "red": nir}.items():
         tifffile.imwrite(folder / f"field_{name}.tif", (30000 + 4000 * image).astype(np.uint16), metadata=None)
     return discover(folder).captures[0]
 
 
-def error_px(capture: Capture) -> float:
-    settings = Settings(joint=JointSettings(device="cpu"))
-    result = align_capture_bands(capture, settings, None, lambda *_: None)["nir"]
-    assert result.status == "aligned"
-    assert result.residual is not None
-    assert result.residual.centres_px.max() > 1000  # px of the file
-    return geometry.corner_error_px(result.fixed_to_moving, TRUTH, *SIZE)
+def aligned_on_reduced_images(off_px: float = 1.2) -> Alignment:
+    """An alignment between the files that is off by some px of the file, as one of reduced images may be."""
+    off = geometry.compose(TRUTH, geometry.translation(off_px, -off_px / 2))
+    centres = geometry.lattice(*SIZE, 12, 9) * 0.9 + np.array(SIZE) * 0.05
+    residual = Residual.of(centres, np.zeros_like(centres), np.full(len(centres), 20.0))
+    joint = JointResult(
+        off, 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, ((1.0, 1.0),) * 4, np.eye(8)
+    )  # fmt: skip
+    return Alignment(off, "pixel", "aligned", (), Seed("identity", np.eye(3), 30.0), joint, residual, 2.5)
 
 
-def test_what_was_found_on_reduced_images_is_sharpened_on_the_files(
+def refined(capture: Capture, alignment: Alignment) -> Alignment:
+    return at_full_resolution(capture.reference, capture.moving[0], alignment)
+
+
+def align_reduced(capture: Capture, monkeypatch: pytest.MonkeyPatch, longest_side_px: int) -> dict[str, Alignment]:
+    monkeypatch.setattr("agalign.capture.band_pair._LONGEST_SIDE_PX", longest_side_px)
+    return align_capture_bands(capture, Settings(joint=JointSettings(device="cpu")), None, lambda *_: None)
+
+
+def error_px(result: dict[str, Alignment]) -> float:
+    nir = result["nir"]
+    assert nir.status == "aligned"
+    assert nir.residual is not None
+    assert nir.residual.centres_px.max() > 1000  # px of the file
+    return geometry.corner_error_px(nir.fixed_to_moving, TRUTH, *SIZE)
+
+
+def test_a_result_of_reduced_images_is_refined_on_the_files(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    at_full = error_px(align_reduced(capture, monkeypatch, 400))
+    monkeypatch.setattr("agalign.capture.align.at_full_resolution", lambda _r, _m, alignment: alignment)
+    reduced = error_px(align_reduced(capture, monkeypatch, 400))
+    assert at_full < 0.05
+    assert at_full < 0.5 * reduced
+
+
+def test_a_band_with_an_unreadable_tile_fails_and_stops_no_other(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(band_pair, "_LONGEST_SIDE_PX", 400)
-    sharpened = error_px(capture)
-    monkeypatch.setattr("agalign.capture.align.at_full_resolution", lambda _r, _m, alignment, _c: alignment)
-    reduced = error_px(capture)
-    assert sharpened < 0.05
-    assert sharpened < 0.5 * reduced
+    resample_tile = full_resolution.resample_tile
+
+    def unreadable(band: Any, *rest: Any) -> Any:
+        if band.name == "nir":
+            raise UnreadableFileError(f"{band.path}: cannot be read (tile 7); copy it from the card again")
+        return resample_tile(band, *rest)
+
+    monkeypatch.setattr(full_resolution, "resample_tile", unreadable)
+    result = align_reduced(capture, monkeypatch, 400)
+    assert {name: a.status for name, a in result.items()} == {"nir": "failed", "red": "aligned"}
+    assert "field_nir.tif: cannot be read (tile 7)" in (result["nir"].reason or "")
+    assert geometry.corner_error_px(result["red"].fixed_to_moving, TRUTH, *SIZE) < 0.05
+
+
+def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture: Capture) -> None:
+    good = aligned_on_reduced_images()
+    better = refined(capture, good)
+    assert geometry.corner_error_px(better.fixed_to_moving, TRUTH, *SIZE) < 0.05
+    assert better.joint is not None
+    assert better.joint.corner_std_px < 0.1
+    assert good.joint is not None
+    unsure = replace(good, joint=replace(good.joint, retrieval=0.05))
+    assert refined(capture, unsure) is unsure
+
+
+def test_the_windows_that_verify_share_no_pixel_with_those_of_the_fit(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted: list[np.ndarray] = []
+    fit_corners = corner_fit.fit_corners
+
+    def recorded(points_px: np.ndarray, *rest: Any) -> Any:
+        fitted.append(points_px)
+        return fit_corners(points_px, *rest)
+
+    monkeypatch.setattr(corner_fit, "fit_corners", recorded)
+    residual = refined(capture, aligned_on_reduced_images()).residual
+    assert residual is not None
+    assert len(residual.centres_px) > 50
+    apart = np.abs(residual.centres_px[:, None] - np.concatenate(fitted)[None]).max(axis=-1)
+    assert apart.min() >= 80  # the side of the windows
+
+
+def test_the_distance_from_the_prediction_is_that_of_the_refined_result(capture: Capture) -> None:
+    expected = geometry.compose(TRUTH, geometry.translation(0.5, 0.0))
+    prediction = Prediction(expected, "bands", 0.4, off_px=99.0)
+    result = refined(capture, replace(aligned_on_reduced_images(), prediction=prediction))
+    assert result.prediction is not None
+    assert result.prediction.off_px == pytest.approx(distance_px(result.fixed_to_moving, expected, SIZE))
+    assert result.prediction.off_px == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_refinement_that_the_rig_contradicts_leaves_the_earlier_result(capture: Capture) -> None:
+    elsewhere = Prediction(geometry.compose(TRUTH, geometry.translation(4.0, 0.0)), "bands", 0.2, off_px=2.9)
+    alignment = replace(aligned_on_reduced_images(), prediction=elsewhere)
+    assert refined(capture, alignment) is alignment
+
+
+def test_each_tile_of_the_reference_is_read_once(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: Counter[tuple[int, ...]] = Counter()
+    read_window = full_resolution.read_window
+
+    def counted(dataset: Any, band: Any, *window: int) -> Any:
+        reads[window] += 1
+        return read_window(dataset, band, *window)
+
+    monkeypatch.setattr(full_resolution, "read_window", counted)
+    refined(capture, aligned_on_reduced_images())
+    assert len(reads) >= 8
+    assert set(reads.values()) == {1}
+
+
+def test_an_unreadable_reference_is_an_error_of_the_capture(capture: Capture, tmp_path: Path) -> None:
+    (tmp_path / "broken.tif").write_bytes(b"II*\0")
+    reference = replace(capture.reference, path=tmp_path / "broken.tif")
+    with pytest.raises(UnreadableFileError, match=r"broken\.tif"):
+        at_full_resolution(reference, capture.moving[0], aligned_on_reduced_images())

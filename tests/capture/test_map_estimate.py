@@ -7,7 +7,6 @@ import numpy as np
 from agalign.capture.band_pair import BandPair
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.verification import WarpedPair
-from agalign.config import Settings
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import NO_FACTORS, Observation, Rig
 from agalign.values import geometry
@@ -32,7 +31,7 @@ def rig(std_px: float = 0.1) -> Rig:
 
 def pairs() -> list[BandPair]:
     blank = Raster(np.zeros(SIZE[::-1], np.float32), np.ones(SIZE[::-1], bool))
-    return [BandPair.of_images(name, blank, blank, {"identity": np.eye(3)}, Settings()) for name in ("red", "nir")]
+    return [BandPair.of_images(name, blank, blank, {"identity": np.eye(3)}) for name in ("red", "nir")]
 
 
 def result(corners_px: np.ndarray, std_px: np.ndarray) -> JointResult:
@@ -92,13 +91,13 @@ def test_windows_mend_what_the_descriptors_left() -> None:
     truth = geometry.translation(5.0, -3.0)
     fixed, moving = textured_pair(truth, *SIZE)
     images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, moving))
-    pair = BandPair.of_images("nir", *images, {"identity": np.eye(3)}, Settings())
+    pair = BandPair.of_images("nir", *images, {"identity": np.eye(3)})
     results = result(np.zeros((4, 2)), np.full((4, 2), 0.2))
     left_px = np.array([0.2, -0.15, 0.1, 0.2, -0.2, 0.1, 0.15, -0.1])
     off = geometry.compose(truth, geometry.moving_corners(left_px, *SIZE))
     before = replace(results, fixed_to_moving=off)
     after = map_estimate(
-        [pair], {"nir": before}, {"nir": WarpedPair.at(pair, pair.mapping(before.fixed_to_moving)).residual}, None
+        [pair], {"nir": before}, {"nir": WarpedPair.of(pair, pair.mapping(before.fixed_to_moving)).residual}, None
     )["nir"]
     assert geometry.corner_error_px(off, truth, *SIZE) > 0.2
     assert geometry.corner_error_px(after.fixed_to_moving, truth, *SIZE) < 0.08

@@ -116,7 +116,7 @@ def test_an_alignment_where_the_rig_cannot_be_is_not_believed(five: Path, model:
     wrong = replace(model, rig=replace(model.rig, mean=moved))
     result = align_capture_bands(discover(five).captures[0], Settings(), wrong, lambda *_: None)
     assert result["NIR"].status == "predicted"
-    assert result["NIR"].issues[0].kind == "unexpected_px"
+    assert result["NIR"].issues[0].code == "unexpected_px"
     assert result["NIR"].issues[0].value == pytest.approx(25, abs=3)
     assert result["Red"].status == "aligned"
 
@@ -135,5 +135,5 @@ def test_a_band_that_shows_itself_turned_is_not_placed_by_the_rig(
     capture = next(c for c in discover(copy).captures if c.name == "IMG_0001")
     result = align_capture_bands(capture, Settings(), model, lambda *_: None)
     assert result["Red"].status == "failed"
-    assert result["Red"].issues[0].kind == "unexpected_px"
+    assert result["Red"].issues[0].code == "unexpected_px"
     assert result["NIR"].status == "aligned"

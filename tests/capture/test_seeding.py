@@ -6,12 +6,13 @@ from agalign.capture.band_pair import BandPair, Candidates
 from agalign.capture.seeding import best_seed, find_rotated, find_seed
 from agalign.capture.tag_seeds import geo_seed
 from agalign.capture.verification import WarpedPair
-from agalign.config import SeedSettings, Settings
+from agalign.config import SeedSettings
 from agalign.errors import GeometryError
 from agalign.pixels.landmarks import LANDMARK_INPUTS, agreed_homography, landmarks
 from agalign.values import geometry
 from agalign.values.alignment import Seed
 from agalign.values.capture import Band, Georeference
+from agalign.values.choices import SeedKind
 from agalign.values.image import Raster
 
 from ..conftest import mean_error_px, textured_image, textured_pair
@@ -25,9 +26,8 @@ def rasters(matrix: np.ndarray, seed: int = 0) -> tuple[Raster, Raster]:
     return Raster(fixed, valid), Raster(moving, valid)
 
 
-def best(images: tuple[Raster, Raster], candidates: Candidates, seeds: SeedSettings | None = None) -> Seed:
-    settings = Settings(seed=seeds or SeedSettings())
-    return best_seed(BandPair.of_images("moving", *images, candidates, settings), candidates)
+def best(images: tuple[Raster, Raster], candidates: Candidates, force: SeedKind | None = None) -> Seed:
+    return best_seed(BandPair.of_images("moving", *images, candidates), candidates, force)
 
 
 def test_structure_finds_a_shift_that_nothing_told() -> None:
@@ -51,9 +51,9 @@ def test_an_aligned_input_keeps_its_identity() -> None:
 
 
 @pytest.mark.parametrize("kind", ["identity", "rig"])
-def test_a_forced_seed_is_used_whatever_its_score(kind: str) -> None:
+def test_a_forced_seed_is_used_whatever_its_score(kind: SeedKind) -> None:
     candidates = {"rig": geometry.translation(5, 5), "identity": np.eye(3)}
-    seed = best(rasters(SHIFTED), candidates, SeedSettings(force=kind))
+    seed = best(rasters(SHIFTED), candidates, kind)
     assert seed.kind == kind
     np.testing.assert_array_equal(seed.fixed_to_moving, candidates[kind])
 
@@ -114,7 +114,7 @@ def test_landmarks_find_what_is_turned_or_scaled(degrees: float, scale: float) -
     image, valid, to_turned = turned(moving, degrees, scale)
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
     overlay = geometry.overlay(images[0].size_px, images[1].size_px)
-    seed = find_seed(BandPair.of_images("moving", *images, {"identity": overlay}, Settings()))
+    seed = find_seed(BandPair.of_images("moving", *images, {"identity": overlay}), SeedSettings())
     assert isinstance(seed, Seed)
     assert (seed.kind, seed.trusted) == ("match", True)
     assert mean_error_px(seed.fixed_to_moving, geometry.compose(to_turned, SHIFTED), 400, 320) < 2 * scale
@@ -124,7 +124,7 @@ def pair_turned(degrees: float, candidates: Candidates, known_to_px: dict[str, f
     fixed, moving = textured_pair(np.eye(3), 640, 480)
     image, valid, _ = turned(moving, degrees, 1.0)
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
-    return BandPair.of_images("moving", *images, candidates, Settings(), known_to_px or {})  # type: ignore[arg-type]
+    return BandPair.of_images("moving", *images, candidates, known_to_px or {})  # type: ignore[arg-type]
 
 
 def test_tags_that_are_wrong_by_a_turn_are_found_out() -> None:
@@ -137,7 +137,7 @@ def test_tags_that_are_wrong_by_a_turn_are_found_out() -> None:
     first = best_seed(pair, told)
     assert first.trusted, "by the peak alone it looks right"
     assert pair.is_expected(first.fixed_to_moving)
-    result = find_seed(pair)
+    result = find_seed(pair, SeedSettings())
     assert isinstance(result, Seed)
     assert result.kind == "match"
     assert mean_error_px(result.fixed_to_moving, truth, 640, 480) < 2
@@ -149,7 +149,7 @@ def test_a_turn_that_no_rig_has_is_told_from_a_shift() -> None:
     pair = pair_turned(4.0, {"identity": np.eye(3)})
 
     def turned_beside(mapping: np.ndarray) -> np.ndarray | None:
-        return find_rotated(pair, mapping, WarpedPair.at(pair, pair.mapping(mapping)).residual)
+        return find_rotated(pair, mapping, WarpedPair.of(pair, pair.mapping(mapping)).residual)
 
     result = turned_beside(np.eye(3))
     assert result is not None
@@ -164,8 +164,8 @@ def test_what_a_user_knows_is_not_left_for_landmarks() -> None:
     image, valid, to_turned = turned(moving, 10, 1.0)
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
     elsewhere = geometry.translation(5, 5)
-    pair = BandPair.of_images("moving", *images, {"user": elsewhere}, Settings(), {"user": 3.0})
-    seed = find_seed(pair)
+    pair = BandPair.of_images("moving", *images, {"user": elsewhere}, {"user": 3.0})
+    seed = find_seed(pair, SeedSettings())
     assert isinstance(seed, Seed)
     assert seed.kind in ("user", "structure")
     assert mean_error_px(seed.fixed_to_moving, to_turned, 400, 320) > 5
@@ -183,9 +183,9 @@ def test_a_match_that_is_some_px_off_is_sharpened_by_the_windows(monkeypatch: py
     image, valid, to_turned = turned(moving, 45, 1.0)
     truth = geometry.compose(to_turned, SHIFTED)
     off = geometry.compose(truth, geometry.moving_corners([3.0, -2.0, -2.0, 2.0, 3.0, 2.0, -2.0, -3.0], 400, 320))
-    monkeypatch.setattr("agalign.capture.seeding._matched", lambda *_, **__: iter([off]))
+    monkeypatch.setattr("agalign.capture.seeding._matches", lambda *_, **__: iter([off]))
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
-    seed = find_seed(BandPair.of_images("moving", *images, {"identity": np.eye(3)}, Settings()))
+    seed = find_seed(BandPair.of_images("moving", *images, {"identity": np.eye(3)}), SeedSettings())
     assert isinstance(seed, Seed)
     assert mean_error_px(off, truth, 400, 320) > 1.0
     assert mean_error_px(seed.fixed_to_moving, truth, 400, 320) < 0.5

@@ -11,7 +11,8 @@ from agalign.config import LocalSettings, Settings
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementField, DisplacementResult, JointResult, Residual, Seed
 from agalign.values.image import Raster
-from agalign.values.issues import Issue
+from agalign.values.issues import FEW_KEYPOINTS, Issue
+from agalign.verify.displacement_field import FINE
 
 from ..conftest import textured_image, textured_pair
 
@@ -21,7 +22,7 @@ SEED = Seed("rig", geometry.translation(5, -3), 30.0, 30.0, 5.0, trusted=True)
 
 def pair_of(fixed: np.ndarray, moving: np.ndarray) -> BandPair:
     images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, moving))
-    return BandPair.of_images("nir", *images, {"rig": SEED.fixed_to_moving}, SETTINGS)
+    return BandPair.of_images("nir", *images, {"rig": SEED.fixed_to_moving})
 
 
 def result(matrix: np.ndarray, retrieval: float = 0.9) -> JointResult:
@@ -43,9 +44,9 @@ def test_what_passes_is_aligned_and_measured(pair: BandPair) -> None:
 
 
 def test_a_look_under_a_mapping_that_is_all_but_equal_is_what_looking_again_shows(pair: BandPair) -> None:
-    warped_pair = WarpedPair.at(pair, pair.mapping(geometry.translation(5.95, -3.95)))
+    warped_pair = WarpedPair.of(pair, pair.mapping(geometry.translation(5.95, -3.95)))
     mapping = pair.mapping(np.array([[1.0001, 0, 6.0], [0, 0.9999, -4.0], [0, 0, 1.0]]))
-    near, again = warped_pair.under(mapping), WarpedPair.at(pair, mapping)
+    near, again = warped_pair.under(mapping), WarpedPair.of(pair, mapping)
     assert near.warped is warped_pair.warped
     np.testing.assert_allclose(near.residual.shifts_px, again.residual.shifts_px, atol=0.04)
     assert near.residual.median_px == pytest.approx(again.residual.median_px, abs=0.04)
@@ -56,13 +57,13 @@ def test_a_look_under_a_mapping_that_is_all_but_equal_is_what_looking_again_show
 def test_a_doubted_result_leaves_the_seed_and_its_windows(pair: BandPair) -> None:
     results = verified(pair, SEED, result(geometry.translation(6, -4), retrieval=0.01), SETTINGS)
     assert results.status == "seed_only"
-    assert results.issues[0].kind == "retrieval"
+    assert results.issues[0].code == "retrieval"
     np.testing.assert_array_equal(results.fixed_to_moving, SEED.fixed_to_moving)
     assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.15)
 
 
 def test_no_result_at_all_is_told_in_its_own_words(pair: BandPair) -> None:
-    result = verified(pair, SEED, Issue("few_keypoints", 3, 16), SETTINGS)
+    result = verified(pair, SEED, Issue(FEW_KEYPOINTS, 3, 16), SETTINGS)
     assert result.status == "seed_only"
     assert result.reason == "only 3 keypoints lie on the common valid area; the rig seed is used as it is"
 
@@ -112,7 +113,7 @@ def bent_pair(height_px: float, apart_px: float | None = None) -> BandPair:
     back = grid - bump(grid - bump(grid))
     bent = cv2.remap(moving, back.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, bent))
-    return BandPair.of_images("nir", *images, {"rig": np.eye(3)}, Settings())
+    return BandPair.of_images("nir", *images, {"rig": np.eye(3)})
 
 
 @pytest.mark.parametrize(("use", "status"), [("auto", "aligned"), ("always", "aligned"), ("never", "seed_only")])
@@ -131,7 +132,7 @@ def test_what_changes_from_plant_to_plant_is_followed_by_a_finer_field() -> None
     results = verified(pair, seed, result(np.eye(3)), Settings())
     assert results.status == "aligned"
     assert results.field is not None
-    assert results.field.step_px == Settings().local.finer_scale.lattice_px
+    assert results.field.step_px == FINE.lattice_px
     assert results.residual.median_px < 0.1
     assert pair.reference.local.refine(pair.moving_image, pair.mapping(np.eye(3))).field is None
 
@@ -152,5 +153,5 @@ def test_what_a_field_cannot_mend_is_named(pair: BandPair) -> None:
     torn[:, 270:] = np.roll(moving, 15, axis=0)[:, 270:]
     results = verified(pair_of(fixed, torn), SEED, result(geometry.translation(6, -4)), Settings())
     assert results.status != "aligned"
-    assert {"close_windows", "cluster"} & {d.kind for d in results.issues}
+    assert {"close_windows", "cluster"} & {d.code for d in results.issues}
     assert "of the windows" in (results.reason or "")

@@ -28,7 +28,7 @@ from agalign.method.paper import Training
 from agalign.method.patches import patch_positions
 from agalign.values import geometry
 from agalign.values.image import Raster
-from agalign.values.issues import Issue
+from agalign.values.issues import NO_SUCH_SEED, Issue
 
 from ..conftest import textured_image, textured_pair
 
@@ -160,7 +160,7 @@ def test_the_loss_is_least_at_the_truth(tmp_path: Path) -> None:
 
 
 def rough_pair(name: str, fixed: Raster, moving: Raster, settings: Settings) -> BandPair:
-    return BandPair.of_images(name, fixed, moving, {"user": np.eye(3)}, settings)
+    return BandPair.of_images(name, fixed, moving, {"user": np.eye(3)})
 
 
 @pytest.fixture(scope="module")
@@ -220,9 +220,8 @@ def test_matching_finds_what_is_turned_and_far_away(learnt: Path) -> None:
 def test_matching_finds_nothing_in_unrelated_images() -> None:
     pair = raster(textured_image(400, 320, 70)), raster(textured_image(400, 320, 71))
     assert match_seed(starter_for_matching((1, 1)), *pair) is None
-    asked = Settings(seed=SeedSettings(force="match"))
-    result = find_seed(BandPair.of_images("moving", *pair, {"identity": np.eye(3)}, asked))
-    assert result == Issue("no_such_seed", detail="match")
+    result = find_seed(BandPair.of_images("moving", *pair, {"identity": np.eye(3)}), SeedSettings(force="match"))
+    assert result == Issue(NO_SUCH_SEED, detail="match")
 
 
 # ---- the commands

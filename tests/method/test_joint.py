@@ -13,7 +13,7 @@ from agalign.method.state import ImageGroup, JointState, ThetaStart
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.image import Raster
-from agalign.values.issues import Issue
+from agalign.values.issues import NO_CONTRAST, Issue
 
 from ..conftest import mean_error_px, textured_image, textured_pair
 
@@ -83,7 +83,7 @@ def test_unrelated_images_are_not_distinguished() -> None:
     pair = [Raster(textured_image(400, 320, s), valid) for s in (8, 9)]
     result = scratch(*pair, np.eye(3), JointSettings())
     assert isinstance(result, Issue)
-    assert result.kind == "retrieval"
+    assert result.code == "retrieval"
     assert result.value is not None
     assert result.value < 0.1
 
@@ -99,11 +99,11 @@ def test_rgb_against_a_single_band() -> None:
 def test_nothing_to_learn_from() -> None:
     fixed, moving = rasters(TRUTH)
     flat = Raster(np.zeros_like(fixed.pixels), fixed.valid)
-    assert scratch(flat, moving, NEAR, JointSettings()) == Issue("no_contrast")
+    assert scratch(flat, moving, NEAR, JointSettings()) == Issue(NO_CONTRAST)
     apart = geometry.translation(390, 0)
     result = scratch(fixed, moving, apart, JointSettings())
     assert isinstance(result, Issue)
-    assert result.kind == "few_keypoints"
+    assert result.code == "few_keypoints"
 
 
 def test_one_network_for_two_bands_and_one_that_does_not_belong() -> None:
@@ -114,7 +114,7 @@ def test_one_network_for_two_bands_and_one_that_does_not_belong() -> None:
     result = align_from_scratch(group, JointSettings(), lambda *_: None)
     assert [type(r) for r in result] == [JointResult, Issue, JointResult]
     assert mean_error_px(result[0].fixed_to_moving, TRUTH, 400, 320) < 0.1
-    assert result[1].kind == "retrieval"
+    assert result[1].code == "retrieval"
     assert mean_error_px(result[2].fixed_to_moving, np.eye(3), 400, 320) < 0.1
 
 

@@ -29,9 +29,10 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
-from agalign.values.issues import Issue
+from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
+from agalign.verify.window_check import COVERAGE
 
 SHIPPED = Path(agalign.__file__).with_name("sidecar.schema.json")
 
@@ -111,13 +112,13 @@ def test_a_rejected_solution_says_so() -> None:
     seed = Seed("rig", geometry.translation(3, 4), 30.0)
     bands = tuple(Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("green", "nir"))
     capture = Capture("c", Path(), bands, 0)
-    issues = (Issue("retrieval", 0.1, 0.2), Issue("coverage", math.nan, 0.6))
+    issues = (Issue(RETRIEVAL, 0.1, 0.2), Issue(COVERAGE, math.nan, 0.6))
     for status, issue in (("seed_only", issues), ("aligned", ())):
         alignment = Alignment(seed.fixed_to_moving, "pixel", status, issue, seed, joint, residual, 0.0)
         part = sidecar_of(context_of(capture, {"nir": alignment})).bands[1]
         assert part.joint is not None
         assert part.joint.accepted == (status == "aligned")
-        assert [d.kind for d in part.issues] == [d.kind for d in issue]
+        assert [d.kind for d in part.issues] == [d.code for d in issue]
     assert "retrieval" in (alignment.reason or "retrieval")
 
 

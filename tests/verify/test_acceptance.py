@@ -3,11 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.config import CheckSettings
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
-from agalign.values.issues import Issue, sentence
-from agalign.verify.acceptance import is_as_it_was, issues_of, status_of
+from agalign.values.issues import RETRIEVAL, SEED_DOES_NOT_FIT, Issue, sentence
+from agalign.verify.acceptance import is_unchanged, status_of
+from agalign.verify.check import Evidence
+from agalign.verify.checks import issues_of
 
 SEED = Seed("rig", np.eye(3), 100.0, 100.0, 5.0)
 GOOD_JOINT = JointResult(np.eye(3), 0.1, 0.95, 0.004, 75, (0.5, 1.0), "fast", "homography", 0.05, ((0.07, 0.07),) * 4)
@@ -17,12 +18,12 @@ SIZE = (1280, 960)
 
 
 def kinds(joint: JointResult = GOOD_JOINT, residual: Residual = GOOD_RESIDUAL) -> list[str]:
-    return [d.kind for d in issues_of(joint, residual, SIZE, CheckSettings())]
+    return [d.code for d in issues_of(Evidence(joint, residual, SIZE))]
 
 
 def test_all_well() -> None:
     assert kinds() == []
-    assert status_of((), GOOD_RESIDUAL, CheckSettings(), seed=False) == "aligned"
+    assert status_of((), GOOD_RESIDUAL, seed=False) == "aligned"
 
 
 NAN = float("nan")
@@ -52,23 +53,23 @@ NAN = float("nan")
 )
 def test_any_doubt_is_enough_and_each_is_named(joint: JointResult, residual: Residual, expected: list[str]) -> None:
     assert kinds(joint, residual) == expected
-    issues = issues_of(joint, residual, SIZE, CheckSettings())
-    assert status_of(issues, GOOD_RESIDUAL, CheckSettings(), seed=True) == "seed_only"
-    assert status_of(issues, GOOD_RESIDUAL, CheckSettings(), seed=False) == "failed"
+    issues = issues_of(Evidence(joint, residual, SIZE))
+    assert status_of(issues, GOOD_RESIDUAL, seed=True) == "seed_only"
+    assert status_of(issues, GOOD_RESIDUAL, seed=False) == "failed"
     assert all(sentence(d) for d in issues)
 
 
 def test_a_doubt_has_its_value_and_limit() -> None:
-    (issue,) = issues_of(replace(GOOD_JOINT, retrieval=0.1), GOOD_RESIDUAL, SIZE, CheckSettings())
-    assert issue == Issue("retrieval", 0.1, 0.2)
+    (issue,) = issues_of(Evidence(replace(GOOD_JOINT, retrieval=0.1), GOOD_RESIDUAL, SIZE))
+    assert issue == Issue(RETRIEVAL, 0.1, 0.2)
     assert "0.10" in sentence(issue)
 
 
 def test_a_seed_that_does_not_fit_is_not_used() -> None:
-    issues = (Issue("retrieval", 0.1, 0.2),)
+    issues = (Issue(RETRIEVAL, 0.1, 0.2),)
     off = replace(GOOD_RESIDUAL, median_px=9.0)
-    assert status_of(issues, off, CheckSettings(), seed=True) == "failed"
-    failed = Alignment(np.eye(3), "pixel", "failed", (*issues, Issue("seed_does_not_fit")), SEED, None, off, 0.0)
+    assert status_of(issues, off, seed=True) == "failed"
+    failed = Alignment(np.eye(3), "pixel", "failed", (*issues, Issue(SEED_DOES_NOT_FIT)), SEED, None, off, 0.0)
     assert failed.reason is not None
     assert "rig seed is used as it is, but it does not fit either" in failed.reason
 
@@ -77,11 +78,11 @@ def test_an_aligned_input_is_left_as_it_is() -> None:
     within = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.1, 0.1))
     beyond = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.4, 0.1))
     precise = replace(within, corner_std_xy_px=((0.01, 0.0),) * 4)
-    assert is_as_it_was(within, np.eye(3), SIZE, CheckSettings())
-    assert not is_as_it_was(beyond, np.eye(3), SIZE, CheckSettings())
-    assert not is_as_it_was(precise, np.eye(3), SIZE, CheckSettings())
+    assert is_unchanged(within, np.eye(3), SIZE)
+    assert not is_unchanged(beyond, np.eye(3), SIZE)
+    assert not is_unchanged(precise, np.eye(3), SIZE)
     # A quarter of a pixel of the file is less of an image that was reduced to a third.
-    assert not is_as_it_was(within, np.eye(3), SIZE, CheckSettings(), scale=1 / 3)
+    assert not is_unchanged(within, np.eye(3), SIZE, scale=1 / 3)
 
 
 def windows(off: np.ndarray) -> Residual:

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from agalign.capture.reference import Reference
-from agalign.config import LocalSettings, Settings
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementField, Residual
 from agalign.values.image import Raster, Tile
@@ -12,7 +11,6 @@ from agalign.verify.displacement_field import Shifts, _folds, _Gain, _is_one_to_
 
 from ..conftest import textured_pair
 
-SETTINGS = LocalSettings()
 SIZE = 640, 480
 
 
@@ -32,7 +30,7 @@ def test_a_smooth_field_is_found_through_noise_and_wrong_peaks() -> None:
     shifts = bump(at) + 0.08 * rng.normal(size=at.shape)
     wrong = rng.random(len(at)) < 0.05
     shifts[wrong] += rng.uniform(-20, 20, (wrong.sum(), 2))
-    field = fitted_field(Shifts(at, shifts, np.ones(len(at))), 1.0, SETTINGS, 48, SIZE)
+    field = fitted_field(Shifts(at, shifts, np.ones(len(at))), 1.0, 48, SIZE)
     error = np.linalg.norm(field(at) - bump(at), axis=1)
     assert np.sqrt((error**2).mean()) < 0.09
     assert np.linalg.norm(bump(at), axis=1).max() > 1.2
@@ -41,9 +39,7 @@ def test_a_smooth_field_is_found_through_noise_and_wrong_peaks() -> None:
 def test_far_from_all_measurements_the_field_goes_to_nothing() -> None:
     at = centres()
     near = at[at[:, 0] < 200]
-    field = fitted_field(
-        Shifts(near, np.tile([2.0, 0.0], (len(near), 1)), np.ones(len(near))), 1.0, SETTINGS, 48, (6400, 480)
-    )
+    field = fitted_field(Shifts(near, np.tile([2.0, 0.0], (len(near), 1)), np.ones(len(near))), 1.0, 48, (6400, 480))
     assert field(np.array([[100.0, 240.0]]))[0, 0] == pytest.approx(2.0, abs=0.05)
     assert abs(field(np.array([[6000.0, 240.0]]))[0]).max() < 0.2
 
@@ -71,7 +67,7 @@ def bent_pair(height: float) -> tuple[Raster, Raster]:
 
 def test_displacements_between_bands_are_followed() -> None:
     fixed, moving = bent_pair(1.5)
-    result = Reference(fixed, Settings()).local.refine(moving, PixelMapping(geometry.identity()))
+    result = Reference(fixed).local.refine(moving, PixelMapping(geometry.identity()))
     assert result.field is not None
     at = geometry.lattice(*SIZE, 17, 13)
     before, after = (np.linalg.norm(d, axis=1) for d in (bump(at), result.field(at) - bump(at)))
@@ -81,13 +77,13 @@ def test_displacements_between_bands_are_followed() -> None:
 
 def test_where_a_homography_is_enough_nothing_is_added() -> None:
     fixed, moving = bent_pair(0.0)
-    result = Reference(fixed, Settings()).local.refine(moving, PixelMapping(geometry.identity()))
+    result = Reference(fixed).local.refine(moving, PixelMapping(geometry.identity()))
     assert result.field is None or np.abs(result.field(geometry.lattice(*SIZE, 17, 13))).max() < 0.05
 
 
 def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:
     at = centres()
-    field = fitted_field(Shifts(at, bump(at), np.ones(len(at))), 1.0, SETTINGS, 48, SIZE)
+    field = fitted_field(Shifts(at, bump(at), np.ones(len(at))), 1.0, 48, SIZE)
     mapping = PixelMapping(geometry.translation(5, 3), local=field)
     points = geometry.lattice(*SIZE, 9, 7)
     np.testing.assert_allclose(mapping(points), points + field(points) + (5, 3))
@@ -127,16 +123,16 @@ def of_captures(count: int, height: float, seed: int) -> list[Residual]:
 
 
 def test_what_captures_have_in_common_is_the_lenses() -> None:
-    field = common_field(of_captures(6, 0.4, 1), SETTINGS, SIZE)
+    field = common_field(of_captures(6, 0.4, 1), SIZE)
     assert field is not None
     at = geometry.lattice(*SIZE, 17, 13)
     left = np.linalg.norm(field(at) - bump(at, 0.4), axis=1)
     assert np.sqrt((left**2).mean()) < 0.5 * np.sqrt((bump(at, 0.4) ** 2).sum(-1).mean())
-    assert common_field(of_captures(6, 0.0, 1), SETTINGS, SIZE) is None
-    assert common_field(of_captures(2, 0.4, 1), SETTINGS, SIZE) is None
+    assert common_field(of_captures(6, 0.0, 1), SIZE) is None
+    assert common_field(of_captures(2, 0.4, 1), SIZE) is None
     # What each capture has of its own is none of the lenses'.
     own = [of_captures(1, h, k)[0] for k, h in enumerate((0.4, -0.4, 0.4, -0.4))]
-    assert common_field(own, SETTINGS, SIZE) is None
+    assert common_field(own, SIZE) is None
 
 
 def test_cross_validation_smooths_by_the_captures_in_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,7 +145,7 @@ def test_cross_validation_smooths_by_the_captures_in_the_fit(monkeypatch: pytest
         return fitted_field(shifts, smoothness, *rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(displacement_field, "fitted_field", recorded)
-    assert common_field(captures, SETTINGS, SIZE) is not None
+    assert common_field(captures, SIZE) is not None
     assert {count for count, _ in fits} == {3, 4, 5}
     per_capture = {smoothness / count for count, smoothness in fits}
     assert per_capture <= set(displacement_field._COMMON_SMOOTHNESS)

@@ -4,7 +4,6 @@ import SimpleITK as sitk
 from skimage.metrics import normalized_mutual_information, structural_similarity
 
 from agalign.capture.reference import Reference
-from agalign.config import CheckSettings, Settings
 from agalign.values.alignment import Residual
 from agalign.values.image import Raster
 from agalign.verify.metrics import (
@@ -25,8 +24,8 @@ def similarity(fixed: np.ndarray, moving: np.ndarray, valid: np.ndarray) -> dict
     return FixedSimilarity(Raster(fixed, valid)).to(Raster(moving, valid))
 
 
-def tile_residuals(fixed: Raster, moving: Raster, settings: CheckSettings) -> Residual:
-    return Reference(fixed, Settings(check=settings)).windows.residuals(moving)
+def tile_residuals(fixed: Raster, moving: Raster) -> Residual:
+    return Reference(fixed).windows.residuals(moving)
 
 
 def elastix_mattes(fixed: np.ndarray, moving: np.ndarray) -> float:
@@ -139,7 +138,7 @@ def test_tile_residuals_measure_a_known_shift(shift: tuple[float, float]) -> Non
     matrix[:2, 2] = shift
     fixed, moving = textured_pair(matrix)
     valid = np.ones(fixed.shape, bool)
-    residual = tile_residuals(Raster(fixed, valid), Raster(moving, valid), CheckSettings())
+    residual = tile_residuals(Raster(fixed, valid), Raster(moving, valid))
     assert residual.coverage == 1.0
     np.testing.assert_allclose(np.median(residual.shifts_px, axis=0), shift, atol=0.08)
     assert residual.median_px == pytest.approx(np.hypot(*shift), abs=0.1)
@@ -148,7 +147,7 @@ def test_tile_residuals_measure_a_known_shift(shift: tuple[float, float]) -> Non
 def test_tile_residuals_of_unrelated_images_are_large_or_unmeasured() -> None:
     valid = np.ones((320, 400), bool)
     pair = [Raster(textured_image(400, 320, s), valid) for s in (1, 2)]
-    residual = tile_residuals(*pair, CheckSettings())
+    residual = tile_residuals(*pair)
     assert residual.coverage < 0.6 or residual.median_px > 3
 
 
@@ -156,7 +155,7 @@ def test_tiles_without_structure_are_not_tried() -> None:
     fixed, moving = textured_pair(np.eye(3))
     valid = np.ones(fixed.shape, bool)
     valid[:, 200:] = False
-    residual = tile_residuals(Raster(fixed, valid), Raster(moving, valid), CheckSettings())
+    residual = tile_residuals(Raster(fixed, valid), Raster(moving, valid))
     assert len(residual.centres_px) > 0
     assert residual.centres_px[:, 0].max() < 200
 
@@ -164,7 +163,7 @@ def test_tiles_without_structure_are_not_tried() -> None:
 def test_windows_that_are_nowhere_valid_say_nothing() -> None:
     one, other = textured_pair(np.eye(3))
     nowhere = Raster(other, np.zeros(other.shape, bool))
-    result = tile_residuals(Raster(one, np.ones(one.shape, bool)), nowhere, CheckSettings())
+    result = tile_residuals(Raster(one, np.ones(one.shape, bool)), nowhere)
     assert len(result.centres_px) == 0
     assert (result.median_px, result.coverage) == (np.inf, 0.0)
 

@@ -46,7 +46,7 @@ def test_a_scene_that_repeats_is_not_aligned_where_nothing_says_which_place(off:
     images = planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7)
     result = agalign.align(*images, seed=geometry.compose(truth, geometry.translation(*off)))
     assert result.status != "aligned"
-    assert result.issues[0].kind == "repeats"
+    assert result.issues[0].code == "repeats"
     assert "px away it fits nearly as well" in (result.reason or "")
 
 

@@ -1,0 +1,31 @@
+"""Check against the flight's rig: in a repetitive scene the images may agree whole periods away."""
+
+from collections.abc import Iterator
+
+from agalign.values.issues import Issue, IssueKind, Remedy
+from agalign.verify.check import Check, Evidence
+
+UNEXPECTED_PX = IssueKind(
+    "unexpected_px", "it lies {value:.1f} px from where the rig of the flight has it",
+    Remedy(
+        "it lies elsewhere than the rig of the flight has it",
+        "if a lens was knocked or changed, align without --model; else look at the picture",
+    ),
+)  # fmt: skip
+MAX_UNEXPECTED_PX = 3.0
+"""Distance from the prediction, px of the moving file, that is always accepted: relief alone causes as much."""
+_MAX_UNEXPECTED_STD = 5.0
+"""The same in standard errors of the prediction, where these are large."""
+
+
+def _issues(evidence: Evidence) -> Iterator[Issue]:
+    prediction = evidence.prediction
+    if prediction is None or prediction.off_px is None:
+        return
+    limit_px = max(MAX_UNEXPECTED_PX, _MAX_UNEXPECTED_STD * prediction.std_px)
+    # Written so that nan does not pass.
+    if not prediction.off_px <= limit_px:
+        yield Issue(UNEXPECTED_PX, prediction.off_px, limit_px)
+
+
+CHECK = Check((UNEXPECTED_PX,), _issues)
