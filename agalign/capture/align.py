@@ -109,11 +109,11 @@ def align_pairs(
         return aligner.timed_result()
     aligner.refine(starts)
     left = [s for s in starts if not aligner.is_aligned(s)]
-    if left and model is not None and model.rig is not None and capture is not None:
-        chosen = bands_to_learn(pairs, aligner.result, model.rig, capture, settings.check.accept_predicted_px)
-        left = [s for s in left if s[0].name in chosen]
     if not scratch:
         left = [s for s in left if s[0].name not in aligner.result]
+    if left and capture is not None:
+        chosen = aligner.worth_learning(pairs, capture)
+        left = [s for s in left if s[0].name in chosen]
     aligner.learn(left)
     return aligner.timed_result()
 
@@ -163,6 +163,12 @@ class _PairAligner:
         known = [s for s in starts if model.side(s[0].name) is not None]
         sides = [model.side(pair.name) or 0 for pair, _ in known]
         self._attempt(known, sides, lambda group, report: refine_with(model.net, group, self.settings.joint, report))
+
+    def worth_learning(self, pairs: Sequence[BandPair], capture: Capture) -> set[str]:
+        """The bands that are worth learning from scratch: without a rig, all."""
+        if self.model is None or self.model.rig is None:
+            return {pair.name for pair in pairs}
+        return bands_to_learn(pairs, self.result, self.model.rig, capture, self.settings.check.accept_predicted_px)
 
     def learn(self, starts: Sequence[Start]) -> None:
         """From scratch, together."""

@@ -19,7 +19,7 @@ from agalign.pixels.masks import learnable
 from agalign.pixels.raster import open_raster, read_window
 from agalign.pixels.resample import resample_tile
 from agalign.pixels.structure import structure_field
-from agalign.values.alignment import Alignment, JointResult, Residual
+from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Band
 from agalign.values.image import Raster, Tile
 from agalign.values.issues import UNREADABLE, Issue
@@ -48,22 +48,12 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment) -> A
     moving file with an unreadable tile makes the alignment `failed`: its pixels could not be written either.
     Raises UnreadableFileError for the reference.
     """
-    if alignment.joint is None:
-        return alignment
     tiles = [_FixedTile.read(reference, cell, tile) for cell, tile in _tiles(reference, alignment).items()]
-    start = mapping_of(reference, moving, alignment)
     try:
-        fitted = _fitted(moving, start, [t for t in tiles if t.is_for_fit], reference.size_px)
-        if fitted is None:
-            return alignment
-        held_out = [t for t in tiles if not t.is_for_fit]
-        before, after = (_residual(moving, mapping, held_out) for mapping in (start, fitted[0]))
+        refined = _refined(alignment, moving, mapping_of(reference, moving, alignment), tiles, reference.size_px)
     except UnreadableFileError as error:
         failed = without_result(alignment.seed, alignment.space, Issue(UNREADABLE, detail=str(error)))
         return replace(failed, seconds=alignment.seconds)
-    if not after.median_px < before.median_px:
-        return alignment
-    refined = _refined(alignment, alignment.joint, *fitted, after, reference.size_px)
     return alignment if refined is None else refined
 
 
@@ -119,21 +109,29 @@ def _fitted(
 
 
 def _refined(
-    alignment: Alignment, joint: JointResult, mapping: PixelMapping, fit: CornerFit, residual: Residual,
-    size_px: tuple[int, int],
-) -> Alignment | None:  # fmt: skip
-    """The alignment with another mapping and its uncertainty; None where the held-out `residual` or the rig speaks
-    against it.
+    alignment: Alignment, moving: Band, start: PixelMapping, tiles: Sequence[_FixedTile], size_px: tuple[int, int]
+) -> Alignment | None:
+    """The alignment moved to the fit of half of the tiles, with its uncertainty and the residual of the other half.
+
+    None where that half does not confirm it, or any check speaks against it. Raises UnreadableFileError.
     """
-    joint = with_corners(joint, mapping.fixed_to_moving, fit.covariance_px2)
+    fitted = _fitted(moving, start, [t for t in tiles if t.is_for_fit], size_px)
+    if fitted is None or alignment.joint is None:
+        return None
+    mapping, fit = fitted
+    held_out = [t for t in tiles if not t.is_for_fit]
+    before, after = _residual(moving, start, held_out), _residual(moving, mapping, held_out)
+    if not after.median_px < before.median_px:
+        return None
+    joint = with_corners(alignment.joint, mapping.fixed_to_moving, fit.covariance_px2)
     prediction = alignment.prediction
     if prediction is not None:
         off_px = distance_px(mapping.fixed_to_moving, prediction.fixed_to_moving, size_px)
         prediction = replace(prediction, off_px=off_px)
-    if issues_of(Evidence(joint, residual, size_px, prediction=prediction)):
+    if issues_of(Evidence(joint, after, size_px, prediction=prediction)):
         return None
     return replace(
-        alignment, fixed_to_moving=mapping.fixed_to_moving, joint=joint, residual=residual, prediction=prediction
+        alignment, fixed_to_moving=mapping.fixed_to_moving, joint=joint, residual=after, prediction=prediction
     )
 
 

@@ -1,5 +1,5 @@
-"""How far off a band is to be expected at every pixel: what is known of its mapping, what its windows still show, and
-what lies far from any window.
+"""The expected error of a band at every pixel: from the uncertainty of its mapping, and from the residual of the
+windows around.
 """
 
 import numpy as np
@@ -11,9 +11,9 @@ from agalign.values.alignment import Alignment, Residual
 from agalign.values.geometry import Points
 
 _NEIGHBOURS = 8
-"""Windows that tell of a place, those nearer more."""
+"""Windows that the error at a place is estimated from, those nearer with more weight."""
 _FAR_WINDOWS = 3.0
-"""So many distances between windows away from all of them nothing is known of the ground."""
+"""Distance from all windows, in units of their spacing, beyond which they do not show the ground."""
 
 
 def expected_error_px(alignment: Alignment, size_px: tuple[int, int], points_px: Points) -> NDArray[np.float64]:
@@ -22,8 +22,8 @@ def expected_error_px(alignment: Alignment, size_px: tuple[int, int], points_px:
         error^2 = trace of D(x) C D(x)^T + mean square of the windows around + (1 - near) p95^2
 
     with the covariance C of the corners and D as in `geometry.over_corners`, or for a predicted band the square of its
-    error bar. What the windows show falls off with the distance; far from all of them the plane may miss the ground by
-    as much as it does in the worst twentieth of the windows. Infinite where nothing at all is known.
+    standard error. The weight of the windows falls with the distance; far from all of them the plane may miss the
+    ground by as much as it does in the worst twentieth of the windows. Infinite where nothing is known.
     """
     square = _of_the_mapping(alignment, size_px, points_px)
     residual = alignment.residual
@@ -34,7 +34,7 @@ def expected_error_px(alignment: Alignment, size_px: tuple[int, int], points_px:
 
 def _of_the_mapping(alignment: Alignment, size_px: tuple[int, int], points_px: Points) -> NDArray[np.float64]:
     if alignment.status == "predicted" and alignment.prediction is not None:
-        # An error bar is in px of the moving file.
+        # A standard error is in px of the moving file.
         ratio = abs(float(geometry.local_scale(alignment.fixed_to_moving, *size_px)[-1]))
         return np.full(len(points_px), (alignment.prediction.std_px / ratio) ** 2)
     joint = alignment.joint

@@ -53,26 +53,26 @@ class FixedSimilarity:
         one, other = (r.pixels[self.lattice][valid] for r in (self.fixed, moving))
         joint = joint_histogram(self.bins[valid], other, _range(moving.pixels, both))
         gradient = _Gradient.of(moving.pixels, self.lattice)
-        beside = _eroded(both, 3)[self.lattice]
-        some = bool(beside.any())
+        inside = _eroded(both, 3)[self.lattice]
+        gradients = self.gradient.sampled[inside], gradient.sampled[inside]
         return {
             "mattes_mi": -mutual_information(joint),
             "nmi": normalised_mutual_information(joint),
             "ncc": correlation(one, other),
-            "gradient_correlation": correlation(self.gradient.here[beside], gradient.here[beside]) if some else 0.0,
+            "gradient_correlation": correlation(*gradients) if inside.any() else 0.0,
             "structure_ssim": _ssim(self.gradient, gradient, valid, _eroded(both, _SSIM_WINDOW_PX)[self.lattice]),
             "overlap": overlap,
         }  # fmt: skip
 
 
 def _eroded(valid: Mask, side_px: int) -> Mask:
-    """Where a square of this side holds nothing but valid pixels of the image."""
+    """True where all pixels of a square of this side are valid."""
     eroded = cv2.erode(valid.astype(np.uint8), np.ones((side_px, side_px), np.uint8), borderValue=0)
     return np.asarray(eroded > 0)
 
 
 def fixed_bins(fixed: NDArray[np.float32], limits: tuple[float, float]) -> NDArray[np.int32]:
-    """The bin of each fixed value, of the shape given; `limits` are the smallest and the largest value there are."""
+    """The bin of each fixed value, of the shape given; `limits` are the smallest and the largest value."""
     # The values are positive: casting to an integer is floor.
     return (_bin_position(fixed, limits, padding=0) + 0.5).astype(np.int32)
 
@@ -101,7 +101,7 @@ def _kernel() -> NDArray[np.float64]:
 
 
 def _range(image: FloatImage, valid: Mask) -> tuple[float, float]:
-    """The smallest and the largest valid value; (0, 1) where there is none."""
+    """The smallest and the largest valid value; (0, 1) without any."""
     if not valid.any():
         return 0.0, 1.0
     low, high, _, _ = cv2.minMaxLoc(image, mask=valid.view(np.uint8))
@@ -151,7 +151,7 @@ class _Gradient:
 
     lattice: tuple[slice, slice]
     magnitude: FloatImage
-    here: FloatImage
+    sampled: FloatImage
     local_mean: FloatImage
     local_variance: FloatImage
 
@@ -169,8 +169,8 @@ def _ssim(one: _Gradient, other: _Gradient, valid: Mask, inside: Mask) -> float:
     """
     if not inside.any():
         return 0.0
-    (mean_a, by_a), (mean_b, by_b) = (_standard(g.here[valid]) for g in (one, other))
-    if not by_a * by_b:  # an image without edges resembles nothing
+    (mean_a, by_a), (mean_b, by_b) = (_standard(g.sampled[valid]) for g in (one, other))
+    if not by_a * by_b:  # an image without edges has no structure
         return 0.0
     a, b = (g.local_mean[inside] for g in (one, other))
     product = _blur(one.magnitude * other.magnitude)[one.lattice][inside]

@@ -1,0 +1,41 @@
+"""Corner corrections from the residual of windows."""
+
+import numpy as np
+
+from agalign.capture.corner_fit import corner_correction
+from agalign.values import geometry
+from agalign.values.alignment import DisplacementField, Residual
+from agalign.values.mapping import PixelMapping
+
+SIZE = 640, 480
+
+
+def residual(shift_px: tuple[float, float], columns: int = 8, rows: int = 6) -> Residual:
+    centres = geometry.lattice(*SIZE, columns, rows) * 0.8 + np.array(SIZE) * 0.1
+    return Residual.of(centres, np.tile(shift_px, (len(centres), 1)), np.full(len(centres), 20.0))
+
+
+def test_the_windows_correct_the_homography_through_the_displacement_field() -> None:
+    """A field that stretches the image by a fifth along x: 1 px of the raw image is 1.2 px for the homography."""
+    nodes = np.zeros((12, 15, 2))
+    nodes[..., 0] = 0.2 * 48.0 * np.arange(15)
+    plain = PixelMapping(geometry.translation(5.0, 3.0))
+    stretched = PixelMapping(geometry.translation(5.0, 3.0), local=DisplacementField(48.0, nodes))
+    for mapping, expected_px in ((plain, 1.0), (stretched, 1.2)):
+        fit = corner_correction(mapping, residual((1.0, -0.5)), SIZE)
+        assert fit is not None
+        np.testing.assert_allclose(fit.mean_px, np.tile([expected_px, -0.5], 4), atol=0.01)
+        corrected = fit.applied_to(mapping.fixed_to_moving, SIZE)
+        np.testing.assert_allclose(geometry.apply(corrected, [300.0, 200.0]), [305.0 + expected_px, 202.5], atol=0.02)
+
+
+def test_what_all_windows_share_is_part_of_the_uncertainty() -> None:
+    fit = corner_correction(PixelMapping(np.eye(3)), residual((0.3, 0.0), 60, 40), SIZE)
+    assert fit is not None
+    std_px = np.sqrt(np.diag(fit.covariance_px2))
+    assert 0.01 <= std_px.min() <= std_px.max() < 0.015
+
+
+def test_too_few_windows_correct_nothing() -> None:
+    assert corner_correction(PixelMapping(np.eye(3)), residual((1.0, 0.0), 5, 3), SIZE) is None
+    assert corner_correction(PixelMapping(np.eye(3)), residual((1.0, 0.0), 4, 4), SIZE) is not None
