@@ -55,14 +55,16 @@ def with_corners(result: JointResult, fixed_to_moving: Matrix, covariance_px2: A
     )  # fmt: skip
 
 
-def corner_correction(mapping: PixelMapping, residual: Residual, size_px: tuple[int, int]) -> CornerFit | None:
+def corner_correction(
+    mapping: PixelMapping, residual: Residual, size_px: tuple[int, int], min_windows: int = _MIN_WINDOWS
+) -> CornerFit | None:
     """The correction of a mapping's homography from the residual of windows measured under that mapping.
 
     Windows are brought to the pixels that the homography maps: through the displacement field and the lens of the
-    reference image (width, height). None where too few windows were measured.
+    reference image (width, height). None where fewer than `min_windows` windows were measured.
     """
     measured = np.isfinite(residual.shifts_px[:, 0])
-    if measured.sum() < _MIN_WINDOWS:
+    if measured.sum() < min_windows:
         return None
     centres_px, shifts_px = residual.centres_px[measured], residual.shifts_px[measured]
     points_px, shifted_px = (mapping.undistorted(p) for p in (centres_px, centres_px + shifts_px))

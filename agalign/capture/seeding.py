@@ -41,6 +41,8 @@ _SAME_PEAK_PX = 2.0
 """A candidate no farther from the peak than this, in px of the reduced images, is on its flank."""
 _CLOSE_PX = 3.0
 """95th percentile of the residual under a match, below which no better one is looked for."""
+_MIN_WINDOWS = 12
+"""Windows that correct a match: fewer than for an estimate, as they must agree better with the corrected one."""
 _MAX_ROTATION_DEGREES, _MAX_SCALE_CHANGE = 1.0, 0.02
 """Difference of a band from its rig that temperature and mounting explain."""
 _MAX_KEYPOINTS = 1000
@@ -116,7 +118,7 @@ def _is_rotated_or_scaled(matrix: Matrix, size_px: tuple[int, int]) -> bool:
 
 def _corrected(pair: BandPair, fixed_to_moving: Matrix, residual: Residual) -> Matrix | None:
     """A mapping corrected by the windows under it; None where these are few."""
-    fit = corner_correction(pair.mapping(fixed_to_moving), residual, pair.fixed.size_px)
+    fit = corner_correction(pair.mapping(fixed_to_moving), residual, pair.fixed.size_px, _MIN_WINDOWS)
     try:
         return None if fit is None else fit.applied_to(fixed_to_moving, pair.fixed.size_px)
     except GeometryError:
