@@ -1,4 +1,6 @@
-"""The ways to do the captures of a run: one after another, in processes, or on an executor such as Dask's."""
+"""The ways to do the captures of a run: one after another, in threads, in processes, or on an executor such as
+Dask's.
+"""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -9,6 +11,7 @@ from agalign.batch.capture import quiet
 from agalign.batch.report import CaptureReport
 from agalign.batch.workers import OnStart, Task, do_capture, done_by, own_processes
 from agalign.capture.align import PairProgress
+from agalign.pixels.raster import without_warnings
 from agalign.values.capture import Capture
 
 _CAPTURES_WORTH_A_PROCESS = 4
@@ -17,6 +20,8 @@ _TASKS_PER_PROCESS = 2
 """One is done while the next one waits."""
 _MAX_WAITING_TASKS = 1000
 """In an executor: enough for any cluster, and little memory."""
+_MAX_THREADS = 4
+"""More wait for the interpreter's lock."""
 _MAX_READ_AHEAD_BYTES = 64 << 20
 """Larger files would push what the current capture reads out of the system's cache."""
 
@@ -103,19 +108,41 @@ class ExecutorRunner:
         )
 
 
+class ThreadRunner(ExecutorRunner):
+    """A few captures in threads of this process, which takes less time than to start processes for them."""
+
+    name = "threads"
+
+    def __init__(self, threads: int) -> None:
+        super().__init__(ThreadPoolExecutor(threads))
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        # Filters of warnings are of the whole process: threads that change them restore each other's.
+        self._stack.enter_context(without_warnings())
+        self._stack.enter_context(self._executor)
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self._stack.__exit__(*reason)  # type: ignore[arg-type]
+
+
 def choose_runner(
     captures: int, cores: int, executor: Executor | None, timeout_s: float | None, on_start: OnStart,
     on_pair: PairProgress,
 ) -> Runner:  # fmt: skip
     """The executor, where there is one; processes where there are captures enough for two, or where a timeout may have
-    to end one; else this process.
+    to end one; else threads, or for one core or capture none.
     """
     if executor is not None:
         return ExecutorRunner(executor, timeout_s)
     if timeout_s is not None and captures:
         return ProcessRunner(min(cores, captures), timeout_s)
     processes = min(cores, captures // _CAPTURES_WORTH_A_PROCESS)
-    return ProcessRunner(processes) if processes > 1 else SerialRunner(on_start, on_pair)
+    if processes > 1:
+        return ProcessRunner(processes)
+    threads = min(cores, captures, _MAX_THREADS)
+    return ThreadRunner(threads) if threads > 1 else SerialRunner(on_start, on_pair)
 
 
 def _read_ahead(capture: Capture) -> None:
