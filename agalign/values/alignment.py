@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Generic, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,14 @@ from agalign.values import geometry
 from agalign.values.choices import ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.geometry import Matrix
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, explanation, sentence
+from agalign.values.pixel_units import (
+    SAME_PIXELS,
+    FixedFilePx,
+    FixedImagePx,
+    FixedPx,
+    MovingFilePx,
+    PixelScale,
+)
 
 MIN_RETRIEVAL = 0.2
 """Held-out retrieval below which descriptors do not match: psi does not move and no result is accepted. Chance is below
@@ -38,8 +47,8 @@ class Seed:
 
 
 @dataclass(frozen=True)
-class JointResult:
-    """What the joint optimisation ended with."""
+class JointResult(Generic[FixedPx]):
+    """The result of the joint optimisation, on the grid of the images or of the files (`FixedPx`)."""
 
     fixed_to_moving: Matrix
     loss: float
@@ -60,33 +69,32 @@ class JointResult:
     """(8, 8) of (x, y) of those corners, for a homography whatever the family; None where it is not known."""
 
     @property
-    def corner_std_px(self) -> float:
-        """Root mean square distance of the least certain corner from where it is mapped to."""
-        return max(math.hypot(*std) for std in self.corner_std_xy_px)
+    def corner_std_px(self) -> FixedPx:
+        """Standard error of the mapping at the least certain corner: root mean square over both axes together."""
+        return cast(FixedPx, max(math.hypot(*std) for std in self.corner_std_xy_px))
 
-    def enlarged(self, up: tuple[float, float], moving_up: tuple[float, float]) -> "JointResult":
-        """The same of images that are larger by these factors (x, y)."""
-        return replace(
-            self,
-            fixed_to_moving=geometry.rescale(self.fixed_to_moving, up, moving_up),
-            corner_std_xy_px=tuple((x * up[0], y * up[1]) for x, y in self.corner_std_xy_px),
-            last_step_px=self.last_step_px * up[0],
-            corner_covariance_px2=None
-            if self.corner_covariance_px2 is None
-            else self.corner_covariance_px2 * np.outer(np.tile(up, 4), np.tile(up, 4)),
-        )
+    def in_file_px(self: "JointResult[FixedImagePx]", scales: "PairScales") -> "JointResult[FixedFilePx]":
+        """The same between the files."""
+        up = scales.fixed.inverse
+        per_axis = np.outer(np.tile(up, 4), np.tile(up, 4))
+        covariance = None if self.corner_covariance_px2 is None else self.corner_covariance_px2 * per_axis
+        return JointResult(
+            scales.between_files(self.fixed_to_moving), self.loss, self.retrieval, self.chance, self.iterations,
+            self.levels, self.recipe, self.model_family, self.last_step_px * up.mean,
+            tuple((x * up.x, y * up.y) for x, y in self.corner_std_xy_px), covariance,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Residual:
-    """Local shifts that an alignment leaves, measured independently of how it was found."""
+class Residual(Generic[FixedPx]):
+    """Shifts of windows that an alignment leaves, measured independently of how it was found, on the fixed grid."""
 
     centres_px: NDArray[np.float64]
-    """(n, 2) tile centres on the reference grid."""
+    """(n, 2) centres of the windows."""
     shifts_px: NDArray[np.float64]
-    """(n, 2) where the moving band's structure lies minus where the reference's does; nan where not measured."""
-    median_px: float
-    p95_px: float
+    """(n, 2) position of the moving band's structure minus that of the reference's; nan where not measured."""
+    median_px: FixedPx
+    p95_px: FixedPx
     coverage: float
     """Share of the tiles with enough structure in which a shift could be measured."""
     peaks_sigma: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.empty(0))
@@ -96,26 +104,25 @@ class Residual:
     @classmethod
     def of(
         cls, centres_px: NDArray[np.float64], shifts_px: NDArray[np.float64], peaks_sigma: NDArray[np.float64]
-    ) -> "Residual":
-        """What (n, 2) shifts say of all windows together."""
+    ) -> "Residual[FixedPx]":
+        """The statistics of shifts (n, 2), whose peaks (n,) stand out by so many standard deviations."""
         measured = np.isfinite(shifts_px[:, 0])
         length = np.linalg.norm(shifts_px[measured], axis=1)
         median, p95 = np.percentile(length, (50, 95)) if len(length) else (np.inf, np.inf)
         coverage = float(measured.mean()) if len(measured) else 0.0
-        return cls(centres_px, shifts_px, float(median), float(p95), coverage, peaks_sigma)
+        return cls(
+            centres_px, shifts_px, cast(FixedPx, float(median)), cast(FixedPx, float(p95)), coverage, peaks_sigma
+        )
 
-    def is_better_than(self, other: "Residual") -> bool:
-        """True where more windows lie close: half of all, weighed with how many could be measured, within less."""
+    def is_better_than(self, other: "Residual[FixedPx]") -> bool:
+        """True where the median shift, divided by the share of windows that could be measured, is smaller."""
         return self.median_px / max(self.coverage, 1e-6) < other.median_px / max(other.coverage, 1e-6)
 
-    def enlarged(self, up: tuple[float, float]) -> "Residual":
-        """The same on an image that is larger by these factors (x, y)."""
-        return replace(
-            self,
-            centres_px=(self.centres_px + 0.5) * up - 0.5,
-            shifts_px=self.shifts_px * up,
-            median_px=self.median_px * up[0],
-            p95_px=self.p95_px * up[0],
+    def in_file_px(self: "Residual[FixedImagePx]", scales: "PairScales") -> "Residual[FixedFilePx]":
+        """The same on the grid of the reference band's file."""
+        up = scales.fixed.inverse
+        return Residual[FixedFilePx].of(
+            up.positions(self.centres_px), up.displacements(self.shifts_px), self.peaks_sigma
         )
 
 
@@ -124,21 +131,24 @@ class DisplacementField:
     """A smooth field of displacements on an image, px, by its values on a lattice."""
 
     step_px: float
+    """Distance of the lattice's nodes, px of the image that it was made for."""
     displacements_px: NDArray[np.float64]
-    """(rows, columns, 2); the first lies at (0, 0)."""
+    """(rows, columns, 2), px of that image; the first node is the centre of its top-left pixel."""
+    scale: PixelScale = SAME_PIXELS
+    """Size of that image relative to the one on which the field is evaluated."""
 
     def __call__(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """The displacement (..., 2) at points (..., 2), by cubic splines; beyond the lattice that of its edge."""
         points = np.asarray(points_px)
-        at = points.reshape(-1, 2)[:, ::-1].T / self.step_px
+        on_lattice = points if self.scale == SAME_PIXELS else self.scale.positions(points)
+        at = on_lattice.reshape(-1, 2)[:, ::-1].T / self.step_px
         planes = np.moveaxis(self.displacements_px, -1, 0)
-        result = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
-        return np.stack(result, axis=-1).reshape(points.shape)
+        values = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
+        return self.scale.inverse.displacements(np.stack(values, axis=-1).reshape(points.shape))
 
-    def rescaled(self, scale: tuple[float, float]) -> "DisplacementField":
-        """The same on an image that is larger by these factors (x, y), which are all but equal."""
-        # The lattice's first node lies at the centre of a pixel; half a pixel is nothing to a smooth field.
-        return DisplacementField(self.step_px * scale[0], self.displacements_px * scale)
+    def rescaled(self, scale: PixelScale) -> "DisplacementField":
+        """The same on an image that is resized by `scale`."""
+        return replace(self, scale=self.scale.over(scale))
 
     def on_lattice(self, step_px: float, size_px: tuple[int, int]) -> "DisplacementField":
         """The same by its values on another lattice, which covers an image (width, height)."""
@@ -147,22 +157,40 @@ class DisplacementField:
         return DisplacementField(float(step_px), self(nodes))
 
     def plus(self, other: "DisplacementField") -> "DisplacementField":
-        """X -> x + d(x) with this field, measured again under it: d(x) + other(x)."""
+        """The sum of two fields on one lattice: x -> d(x) + other(x)."""
         return DisplacementField(self.step_px, self.displacements_px + other.displacements_px)
 
 
 @dataclass(frozen=True)
-class DisplacementResult:
+class DisplacementResult(Generic[FixedPx]):
     """A field of displacements, where it gains something, and what it gains on windows it was not fitted to."""
 
     field: DisplacementField | None
-    before_p95_px: float
-    after_p95_px: float
+    before_p95_px: FixedPx
+    after_p95_px: FixedPx
 
-    def enlarged(self, up: tuple[float, float]) -> "DisplacementResult":
-        """The same on an image that is larger by these factors (x, y)."""
-        larger = None if self.field is None else self.field.rescaled(up)
-        return DisplacementResult(larger, self.before_p95_px * up[0], self.after_p95_px * up[0])
+    def in_file_px(self: "DisplacementResult[FixedImagePx]", scales: "PairScales") -> "DisplacementResult[FixedFilePx]":
+        """The same on the grid of the reference band's file."""
+        up = scales.fixed.inverse
+        field = None if self.field is None else self.field.rescaled(up)
+        before, after = (FixedFilePx(p95 * up.mean) for p95 in (self.before_p95_px, self.after_p95_px))
+        return DisplacementResult(field, before, after)
+
+
+@dataclass(frozen=True)
+class PairScales:
+    """The sizes of the two images of a band pair, each relative to its file."""
+
+    fixed: PixelScale = SAME_PIXELS
+    moving: PixelScale = SAME_PIXELS
+
+    def between_files(self, fixed_to_moving: Matrix) -> Matrix:
+        """A homography between the images as one between their files."""
+        return geometry.rescale(fixed_to_moving, self.fixed.inverse, self.moving.inverse)
+
+    def between_images(self, fixed_to_moving: Matrix) -> Matrix:
+        """A homography between the files as one between the images."""
+        return geometry.rescale(fixed_to_moving, self.fixed, self.moving)
 
 
 _SOURCES: dict[PredictionSource, str] = {
@@ -178,15 +206,15 @@ class Prediction:
     """Between the files, undistorted where the rig's mappings are."""
     source: PredictionSource
     """From the capture's other bands, from the captures around it, or from the flight's mean."""
-    std_px: float
-    """Root mean square error that is to be expected over the image, px of the moving file."""
-    off_px: float | None = None
-    """Root mean square distance of what the band's own image says; None where it says nothing."""
+    std_px: MovingFilePx
+    """Standard error: root mean square over the image."""
+    off_px: MovingFilePx | None = None
+    """Root mean square distance from the band's own alignment; None where it has none."""
 
 
 @dataclass(frozen=True)
-class Alignment:
-    """The mapping found for one band pair and everything known about it."""
+class Alignment(Generic[FixedPx]):
+    """The mapping of one band pair and everything known about it, between the images or between the files."""
 
     fixed_to_moving: Matrix
     """Between undistorted pixels where both lenses are known, else between raw pixels."""
@@ -195,32 +223,30 @@ class Alignment:
     issues: tuple[Issue, ...]
     """What speaks against it, the plainest first; none where it is `aligned`."""
     seed: Seed
-    joint: JointResult | None
-    residual: Residual | None
+    joint: JointResult[FixedPx] | None
+    residual: Residual[FixedPx] | None
     seconds: float
     before: Mapping[str, float] = dataclasses.field(default_factory=dict)
     after: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    local: DisplacementResult | None = None
+    local: DisplacementResult[FixedPx] | None = None
     """What a field of displacements of this capture's own gains; None where it was not asked for."""
     field: DisplacementField | None = None
     """All displacements in raw px of the reference, before the homography: the rig's and the capture's own."""
     prediction: Prediction | None = None
     """What the flight's rig says of it; None without a rig."""
 
-    def between_files(self, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> "Alignment":
-        """An alignment of images that were reduced by these scales (x, y) as one of their files."""
-        if fixed_scale == moving_scale == (1.0, 1.0):
-            return self
-        up, there = ((1 / x, 1 / y) for x, y in (fixed_scale, moving_scale))
-        return replace(
-            self,
-            fixed_to_moving=geometry.rescale(self.fixed_to_moving, up, there),
-            seed=replace(self.seed, fixed_to_moving=geometry.rescale(self.seed.fixed_to_moving, up, there)),
-            joint=None if self.joint is None else self.joint.enlarged(up, there),
-            residual=None if self.residual is None else self.residual.enlarged(up),
-            local=None if self.local is None else self.local.enlarged(up),
-            field=None if self.field is None else self.field.rescaled(up),
-        )
+    def in_file_px(self: "Alignment[FixedImagePx]", scales: "PairScales") -> "Alignment[FixedFilePx]":
+        """The same between the files of the two bands."""
+        up = scales.fixed.inverse
+        return Alignment(
+            scales.between_files(self.fixed_to_moving), self.space, self.status, self.issues,
+            replace(self.seed, fixed_to_moving=scales.between_files(self.seed.fixed_to_moving)),
+            None if self.joint is None else self.joint.in_file_px(scales),
+            None if self.residual is None else self.residual.in_file_px(scales),
+            self.seconds, self.before, self.after,
+            None if self.local is None else self.local.in_file_px(scales),
+            None if self.field is None else self.field.rescaled(up), self.prediction,
+        )  # fmt: skip
 
     @property
     def reason(self) -> str | None:

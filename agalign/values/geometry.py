@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import GeometryError
+from agalign.values.pixel_units import PixelScale, Size
 
 Matrix = NDArray[np.float64]
 Points = NDArray[np.float64]
@@ -71,23 +72,14 @@ def invert(matrix: Matrix) -> Matrix:
     return normalised(np.linalg.inv(normalised(matrix)))
 
 
-def resolution_change(scale_x: float, scale_y: float) -> Matrix:
-    """Maps full-resolution pixels to pixels of an image resized by (scale_x, scale_y).
-
-    With centres at integers, x_small = (x + 0.5) * scale_x - 0.5: the outer edges of both images coincide.
-    """
-    return np.array([[scale_x, 0.0, 0.5 * scale_x - 0.5], [0.0, scale_y, 0.5 * scale_y - 0.5], [0.0, 0.0, 1.0]])
+def rescale(fixed_to_moving: Matrix, fixed_scale: PixelScale, moving_scale: PixelScale) -> Matrix:
+    """The same mapping between images that are resized by `fixed_scale` and `moving_scale`."""
+    return compose(moving_scale.matrix, fixed_to_moving, invert(fixed_scale.matrix))
 
 
-def rescale(fixed_to_moving: Matrix, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> Matrix:
-    """The same mapping between images resized by `fixed_scale` and `moving_scale` (each x, y; 0.5 halves)."""
-    to_full = invert(resolution_change(*fixed_scale))
-    return compose(resolution_change(*moving_scale), fixed_to_moving, to_full)
-
-
-def overlay(fixed_size_px: tuple[int, int], moving_size_px: tuple[int, int]) -> Matrix:
-    """fixed_to_moving that lays the outline of one image (width, height) on the other's: identity for equal sizes."""
-    return resolution_change(moving_size_px[0] / fixed_size_px[0], moving_size_px[1] / fixed_size_px[1])
+def overlay(fixed_size_px: Size, moving_size_px: Size) -> Matrix:
+    """fixed_to_moving that maps the outline of one image (width, height) onto the other's: identity for equal sizes."""
+    return PixelScale.between(fixed_size_px, moving_size_px).matrix
 
 
 def corners(width_px: int, height_px: int) -> Points:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from agalign.values.geometry import Matrix, Points
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12)
 
@@ -81,18 +82,12 @@ def undistort(lens: Lens | None, raw_px: ArrayLike) -> Points:
     return np.asarray(straight, dtype=np.float64).reshape(points.shape)
 
 
-def rescaled(lens: Lens | None, scale: tuple[float, float]) -> Lens | None:
-    """The same lens on an image resized by (scale_x, scale_y), outer edges coinciding."""
-    if lens is None or scale == (1.0, 1.0):
+def rescaled(lens: Lens | None, scale: PixelScale) -> Lens | None:
+    """The same lens on an image that is resized by `scale`."""
+    if lens is None or scale == SAME_PIXELS:
         return lens
-    sx, sy = scale
-    return replace(
-        lens,
-        fx_px=lens.fx_px * sx,
-        fy_px=lens.fy_px * sy,
-        cx_px=(lens.cx_px + 0.5) * sx - 0.5,
-        cy_px=(lens.cy_px + 0.5) * sy - 0.5,
-    )
+    cx_px, cy_px = scale.positions((lens.cx_px, lens.cy_px)).tolist()
+    return replace(lens, fx_px=lens.fx_px * scale.x, fy_px=lens.fy_px * scale.y, cx_px=cx_px, cy_px=cy_px)
 
 
 def radial_coefficients(bent: Callable[[Points], Points], reach: float) -> tuple[float, ...]:

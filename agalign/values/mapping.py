@@ -15,6 +15,7 @@ from agalign.values.capture import Band
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Tile
 from agalign.values.lens import Lens
+from agalign.values.pixel_units import FixedFilePx, PixelScale
 
 _KNOT_STEP_PX = 32
 """Curved mappings are evaluated this far apart and splined between: with real lenses below 0.0001 px of error."""
@@ -32,8 +33,7 @@ class PixelMapping:
     pre_distortion: Lens | None = None
     """Lens through which the given pixels go first, where they are undistorted ones of the reference."""
     local: DisplacementField | None = None
-    """Displacements of raw reference px before anything else; `local_scale` is px of its image for one of these."""
-    local_scale: tuple[float, float] = (1.0, 1.0)
+    """Displacements of raw reference px before anything else."""
 
     def __call__(self, reference_px: ArrayLike) -> Points:
         """(..., 2) raw reference pixels to raw moving pixels."""
@@ -43,7 +43,7 @@ class PixelMapping:
         """(..., 2) raw reference pixels to those that the homography maps: displaced, then undistorted."""
         raw = lens.distort(self.pre_distortion, reference_px)
         if self.local is not None:
-            raw = raw + self.local((raw + 0.5) * self.local_scale - 0.5) / self.local_scale
+            raw = raw + self.local(raw)
         return lens.undistort(self.fixed_lens, raw)
 
     def from_undistorted(self, reference_lens: Lens) -> "PixelMapping":
@@ -52,15 +52,14 @@ class PixelMapping:
             return replace(self, fixed_lens=None)
         return replace(self, pre_distortion=reference_lens)
 
-    def rescaled(self, fixed_scale: tuple[float, float], moving_scale: tuple[float, float]) -> "PixelMapping":
-        """The same mapping between images resized by `fixed_scale` and `moving_scale` (each x, y)."""
+    def rescaled(self, fixed_scale: PixelScale, moving_scale: PixelScale) -> "PixelMapping":
+        """The same mapping between images that are resized by `fixed_scale` and `moving_scale`."""
         return PixelMapping(
             geometry.rescale(self.fixed_to_moving, fixed_scale, moving_scale),
             lens.rescaled(self.fixed_lens, fixed_scale),
             lens.rescaled(self.moving_lens, moving_scale),
             lens.rescaled(self.pre_distortion, fixed_scale),
-            self.local,
-            (self.local_scale[0] / fixed_scale[0], self.local_scale[1] / fixed_scale[1]),
+            None if self.local is None else self.local.rescaled(fixed_scale),
         )
 
     @property
@@ -92,7 +91,7 @@ def _along(start: int, length: int) -> Points:
     return np.arange(start, start + length, dtype=np.float64)
 
 
-def mapping_of(reference: Band, moving: Band, alignment: Alignment) -> PixelMapping:
+def mapping_of(reference: Band, moving: Band, alignment: Alignment[FixedFilePx]) -> PixelMapping:
     """The complete mapping between the raw pixels of two files, of which an alignment was found."""
     local = alignment.field
     if alignment.space == "pixel":

@@ -1,0 +1,119 @@
+"""Lengths in pixels, one type for each pixel grid of a band pair, and the scale between two grids.
+
+A band pair has four pixel grids. The *files* of the fixed (reference) and of the moving band; and the *images* that
+estimation works on: the files themselves, or reductions of them where the files are large. A moving pixel may cover
+several times the ground of a fixed one, so a limit in fixed px must never be compared with a distance in moving px.
+The types below let mypy reject that. At run time a length is a plain float: arithmetic costs what it costs for floats.
+
+Positions count from the CENTRE of the top-left pixel, (0, 0). Two images of the same area share their outer EDGES, so
+a position x of one is (x + 0.5) * scale - 0.5 in the other. `PixelScale` is the only place that knows this formula.
+"""
+
+import math
+from typing import TYPE_CHECKING, NamedTuple, NewType, Self, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Size = tuple[int, int]
+"""(width, height) of an image in pixels."""
+
+
+class Px(float):
+    """A length in pixels of some grid. Subclasses name the grid; mypy lets only equal types be compared or added."""
+
+    __slots__ = ()
+
+    if TYPE_CHECKING:
+
+        def __lt__(self, other: Self) -> bool: ...  # type: ignore[override]
+        def __le__(self, other: Self) -> bool: ...  # type: ignore[override]
+        def __gt__(self, other: Self) -> bool: ...  # type: ignore[override]
+        def __ge__(self, other: Self) -> bool: ...  # type: ignore[override]
+        def __add__(self, other: Self) -> Self: ...  # type: ignore[override]
+        def __radd__(self, other: Self) -> Self: ...  # type: ignore[override]
+        def __sub__(self, other: Self) -> Self: ...  # type: ignore[override]
+        def __rsub__(self, other: Self) -> Self: ...  # type: ignore[override]
+        def __mul__(self, factor: float) -> Self: ...
+        def __rmul__(self, factor: float) -> Self: ...
+        def __truediv__(self, divisor: float) -> Self: ...
+
+
+class FixedImagePx(Px):
+    """Pixels of the reference image that estimation works on."""
+
+    __slots__ = ()
+
+
+class FixedFilePx(Px):
+    """Pixels of the reference band's file."""
+
+    __slots__ = ()
+
+
+class MovingImagePx(Px):
+    """Pixels of the moving image that estimation works on."""
+
+    __slots__ = ()
+
+
+class MovingFilePx(Px):
+    """Pixels of the moving band's file."""
+
+    __slots__ = ()
+
+
+FixedPx = TypeVar("FixedPx", FixedImagePx, FixedFilePx)
+"""The grid that a result is given on: of the images, or of the files."""
+
+FixedImagePoints = NewType("FixedImagePoints", NDArray[np.float64])
+"""(..., 2) positions in the reference image."""
+FixedFilePoints = NewType("FixedFilePoints", NDArray[np.float64])
+"""(..., 2) positions in the reference band's file."""
+MovingImagePoints = NewType("MovingImagePoints", NDArray[np.float64])
+"""(..., 2) positions in the moving image."""
+MovingFilePoints = NewType("MovingFilePoints", NDArray[np.float64])
+"""(..., 2) positions in the moving band's file."""
+
+
+class PixelScale(NamedTuple):
+    """Pixels of one image for a pixel of another that shows the same area: 0.5 halves the resolution."""
+
+    x: float
+    y: float
+
+    @classmethod
+    def between(cls, full_size_px: Size, size_px: Size) -> "PixelScale":
+        """From an image of one (width, height) to one of another."""
+        return cls(size_px[0] / full_size_px[0], size_px[1] / full_size_px[1])
+
+    @property
+    def inverse(self) -> "PixelScale":
+        """The scale in the other direction."""
+        return PixelScale(1 / self.x, 1 / self.y)
+
+    def over(self, other: "PixelScale") -> "PixelScale":
+        """The scale from an image of scale `other` to one of this scale, both relative to the same image."""
+        return PixelScale(self.x / other.x, self.y / other.y)
+
+    @property
+    def mean(self) -> float:
+        """Geometric mean of both axes: the factor for lengths of unknown direction."""
+        return math.sqrt(self.x * self.y)
+
+    def positions(self, positions_px: ArrayLike) -> NDArray[np.float64]:
+        """Where positions (..., 2) of the one image are in the other."""
+        return np.asarray((np.asarray(positions_px, np.float64) + 0.5) * self - 0.5)
+
+    def displacements(self, displacements_px: ArrayLike) -> NDArray[np.float64]:
+        """Displacements (..., 2) of the one image as those of the other."""
+        return np.asarray(np.asarray(displacements_px, np.float64) * self)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The homography (3, 3) that does to positions what `positions` does."""
+        return np.array([[self.x, 0.0, 0.5 * self.x - 0.5], [0.0, self.y, 0.5 * self.y - 0.5], [0.0, 0.0, 1.0]])
+
+
+SAME_PIXELS = PixelScale(1.0, 1.0)
+"""An image that is its file's own."""

@@ -1,0 +1,78 @@
+"""The types of pixel grids, and the scale between two of them."""
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mypy import api
+from numpy.testing import assert_allclose
+
+from agalign.values import geometry
+from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, FixedImagePx, PixelScale
+
+REJECTED = {
+    "a limit in fixed px and a distance in moving px": "FixedImagePx(1.0) >= MovingImagePx(0.5)",
+    "pixels of an image and of its file": "FixedFilePx(1.0) >= FixedImagePx(0.5)",
+    "a sum over two grids": "FixedFilePx(1.0) + MovingFilePx(0.5)",
+    "an alignment between images where one between files is written": "mapping_of(band, band, between_images)",
+    "positions of the moving image as those of the fixed one": "fixed_only(MovingImagePoints(np.zeros((1, 2))))",
+}
+ACCEPTED = "FixedImagePx(1.0) * 3.0 >= FixedImagePx(0.5)"
+PREAMBLE = """
+import numpy as np
+from agalign.values.alignment import Alignment
+from agalign.values.capture import Band
+from agalign.values.mapping import mapping_of
+from agalign.values.pixel_units import FixedFilePx, FixedImagePx, FixedImagePoints, MovingFilePx, MovingImagePoints
+from agalign.values.pixel_units import MovingImagePx
+def fixed_only(points: FixedImagePoints) -> None: ...
+def check(band: Band, between_images: Alignment[FixedImagePx]) -> None:
+"""
+
+
+def test_mypy_rejects_units_that_do_not_match(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = [ACCEPTED, *REJECTED.values()]
+    snippet = tmp_path / "snippet.py"
+    snippet.write_text(PREAMBLE + "".join(f"    {line}\n" for line in lines), encoding="utf-8")
+    root = Path(geometry.__file__).parents[2]
+    monkeypatch.setenv("MYPYPATH", str(root))
+    cache = str(root / ".mypy_cache")
+    options = ["--config-file", str(root / "pyproject.toml"), "--no-error-summary", "--cache-dir", cache]
+    printed, problem, _ = api.run([*options, "--python-executable", sys.executable, str(snippet)])
+    first = PREAMBLE.count("\n") + 1
+    found = {int(line.split(":")[1]) for line in printed.splitlines() if line.startswith(str(snippet))}
+    assert not problem
+    assert found == {first + number for number in range(1, len(lines))}, printed
+
+
+def test_a_scale_maps_outer_edges_onto_outer_edges() -> None:
+    scale = PixelScale.between((200, 100), (50, 20))
+    edges = np.array([[-0.5, -0.5], [199.5, 99.5]])
+    assert_allclose(scale.positions(edges), [[-0.5, -0.5], [49.5, 19.5]])
+    assert_allclose(scale.inverse.positions(scale.positions(edges)), edges)
+    assert_allclose(geometry.apply(scale.matrix, edges), scale.positions(edges))
+    assert_allclose(scale.displacements([4.0, 5.0]), [1.0, 1.0])
+    assert scale.mean == pytest.approx(np.sqrt(0.25 * 0.2))
+
+
+def test_a_scale_is_that_of_an_image_resize() -> None:
+    """A resized ramp holds at each pixel the position that the scale gives."""
+    ramp = np.tile(np.arange(80, dtype=np.float32), (40, 1))
+    small = cv2.resize(ramp, (20, 10), interpolation=cv2.INTER_AREA)
+    columns = PixelScale.between((80, 40), (20, 10)).inverse.positions([[x, 0.0] for x in range(20)])[:, 0]
+    assert_allclose(small[5], columns, atol=1e-5)
+
+
+def test_scales_relative_to_one_image_give_the_scale_between_two() -> None:
+    half, third = PixelScale(0.5, 0.25), PixelScale(2.0, 3.0)
+    point = np.array([7.0, 9.0])
+    assert_allclose(half.over(third).positions(third.positions(point)), half.positions(point))
+    assert SAME_PIXELS.over(half) == half.inverse
+
+
+def test_a_length_is_a_float_wherever_it_goes() -> None:
+    assert json.dumps({"px": FixedImagePx(0.25)}) == '{"px": 0.25}'
+    assert f"{FixedFilePx(1.5):.2f}" == "1.50"
