@@ -1,6 +1,7 @@
 """The command that shows what was found: the captures of a folder, or what a model knows of its camera."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -61,21 +62,23 @@ def info(
             problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
             typer.echo(json.dumps({"folder": str(folder), "captures": rows, "problems": problems}, indent=1))
         else:
-            table = Table("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
-            for row in rows:
-                bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
-                size = "{width} x {height}".format(**row["bands"][0])
-                cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
-                table.add_row(*(shown(c) for c in cells), shown(", ".join(row["missing_bands"])))
-            terminal.result(table)
-            panels = [row for row in rows if row["panel"] is not None]
-            for row in panels:
-                terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip()))
-            result = (
-                f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {len(flight.problems)} problems"
-            )
-            terminal.result(result)
+            _show_captures(rows, len(flight.problems), terminal)
         raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
+
+
+def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:
+    """The captures of a folder as a table, its calibration panels, and a line of totals."""
+    table = Table("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
+    for row in rows:
+        bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
+        size = "{width} x {height}".format(**row["bands"][0])
+        cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
+        table.add_row(*(shown(c) for c in cells), shown(", ".join(row["missing_bands"])))
+    terminal.result(table)
+    for row in rows:
+        if row["panel"] is not None:
+            terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip()))
+    terminal.result(f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {problems} problems")
 
 
 def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:

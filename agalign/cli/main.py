@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 from rich.table import Table
@@ -37,6 +37,9 @@ from agalign.cli.terminal import (
     shown,
 )
 from agalign.values.choices import LocalUse, RadiometryChoice
+
+if TYPE_CHECKING:
+    from agalign.products.index_rasters import IndexReport
 
 _EXAMPLES = examples(
     ("agalign demo", "a synthetic flight, aligned and compared with its truth"),
@@ -148,8 +151,6 @@ def ndvi(
     """Vegetation indices of aligned captures: a raster and a picture each."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
-        from statistics import median
-
         from agalign.products.index_rasters import IndexReport, write_indices
         from agalign.products.indices import index_named
 
@@ -168,18 +169,25 @@ def ndvi(
                 "the bands are raw numbers, not reflectance: their indices compare places within a capture, not "
                 "captures or cameras; align with --radiometry where the camera's tags allow it"
             )
-        table = Table("Index", title=f"{len(written)} of {len(reports)} written; medians of captures")
-        for name in ("Captures", "Middle", "Lowest", "Highest"):
-            table.add_column(name, justify="right")
-        for one in chosen:
-            values = [r.median for r in written if r.index == one.name]
-            if values:
-                numbers = (f"{v:.3f}" for v in (median(values), min(values), max(values)))
-                table.add_row(one.name, str(len(values)), *numbers)
         if written:
-            terminal.result(table)
+            terminal.result(_index_table([one.name for one in chosen], reports))
             terminal.result(shown(f"Rasters and pictures beside each capture: {written[0].path}, …"))
         raise typer.Exit(EXIT_NOTHING if not written else EXIT_OK if len(written) == len(reports) else EXIT_PARTIAL)
+
+
+def _index_table(names: Sequence[str], reports: "Sequence[IndexReport]") -> Table:
+    """A row per index: the medians of its captures."""
+    from statistics import median
+
+    written = [r for r in reports if r.path is not None]
+    table = Table("Index", title=f"{len(written)} of {len(reports)} written; medians of captures")
+    for name in ("Captures", "Median", "Lowest", "Highest"):
+        table.add_column(name, justify="right")
+    for name in names:
+        values = [r.median for r in written if r.index == name]
+        if values:
+            table.add_row(name, str(len(values)), *(f"{v:.3f}" for v in (median(values), min(values), max(values))))
+    return table
 
 
 app.command()(onto)

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from agalign.cameras.discover import DiscoverOptions, FolderScan
     from agalign.config import Settings
     from agalign.products.failures import FailureGroups
+    from agalign.products.sidecar import BandResult, CaptureResult
     from agalign.values.capture import Capture
 
 GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
@@ -233,52 +234,72 @@ class _Pace:
 
 
 def _print_report(report: "CaptureReport", terminal: Terminal, number: int, count: int) -> None:
+    """Print a finished capture, and log it: with its stages and pairs where that is asked for."""
+    place = f"[{number}/{count}] {report.label}"
     if report.panel is not None:
-        text = f"[{number}/{count}] {report.label}: {report.panel}"
-        terminal.event("panel", text, capture=report.label, panel=report.panel)
+        terminal.event("panel", f"{place}: {report.panel}", capture=report.label, panel=report.panel)
         return
     for text in report.problems:
         terminal.problem(f"{report.label}: {text}", capture=report.label)
-    for (name, stage), seconds in report.stages.items() if terminal.log_json else ():
-        terminal.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(seconds, 4))
+    if terminal.log_json:
+        for (name, stage), seconds in report.stages.items():
+            terminal.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(seconds, 4))
     if report.result is None:
         terminal.event("capture", capture=report.label, state=report.state, seconds=round(report.seconds, 3))
         return
     pairs = [b for b in report.result.bands if b.status != "reference"]
+    if terminal.verbose or terminal.log_json or not terminal.err.is_terminal:
+        _print_capture(report, report.result, pairs, terminal, place)
+    if terminal.verbose or terminal.log_json:
+        for band in pairs:
+            _print_pair(report.label, band, terminal)
+
+
+def _print_capture(
+    report: "CaptureReport", result: "CaptureResult", pairs: "Sequence[BandResult]", terminal: Terminal, place: str
+) -> None:
     aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
     also = f", {predicted} predicted" if predicted else ""
     kept = ", kept from an earlier run" if report.state == "kept" else ""
     seconds = sum(b.seconds for b in pairs)
-    text = f"[{number}/{count}] {report.label}: {aligned} of {len(pairs)} aligned{also}, {seconds:.1f} s{kept}"
-    if terminal.verbose or not terminal.err.is_terminal or terminal.log_json:
-        terminal.event(
-            "capture",
-            text,
-            capture=report.label,
-            state=report.state,
-            status=report.result.status,
-            aligned=aligned,
-            predicted=predicted,
-            pairs=len(pairs),
-            seconds=round(report.seconds, 3),
-        )
-    for band in pairs:
-        residual = band.metrics.after.residual_px if band.metrics else None
-        shown = "" if residual is None else f", residual {residual:.3f} px"
-        if terminal.verbose or terminal.log_json:
-            terminal.event(
-                "pair", f"    {band.band}: {band.status}{shown}, {band.seconds:.1f} s",
-                capture=report.label, band=band.band, status=band.status, reason=band.reason,
-                residual_px=residual, seconds=band.seconds,
-            )  # fmt: skip
-        if band.status != "aligned" and (terminal.verbose or terminal.log_json):
-            terminal.problem(
-                f"{report.label} {band.band}: {band.status}: {band.reason}", capture=report.label, band=band.band
-            )
+    terminal.event(
+        "capture", f"{place}: {aligned} of {len(pairs)} aligned{also}, {seconds:.1f} s{kept}",
+        capture=report.label, state=report.state, status=result.status, aligned=aligned, predicted=predicted,
+        pairs=len(pairs), seconds=round(report.seconds, 3),
+    )  # fmt: skip
+
+
+def _print_pair(capture: str, band: "BandResult", terminal: Terminal) -> None:
+    residual = band.metrics.after.residual_px if band.metrics else None
+    measured = "" if residual is None else f", residual {residual:.3f} px"
+    terminal.event(
+        "pair", f"    {band.band}: {band.status}{measured}, {band.seconds:.1f} s",
+        capture=capture, band=band.band, status=band.status, reason=band.reason, residual_px=residual,
+        seconds=band.seconds,
+    )  # fmt: skip
+    if band.status != "aligned":
+        terminal.problem(f"{capture} {band.band}: {band.status}: {band.reason}", capture=capture, band=band.band)
 
 
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
-    """The closing table, and the exit code."""
+    """Print the closing table and what failed; return the exit code."""
+    if totals.bands:
+        terminal.result(_table(totals))
+    explain(totals.failures.groups(), terminal)
+    for made, count in totals.radiometry.items():
+        terminal.result(shown(f"Written as {made}: {count} captures"))
+    terminal.result(shown(f"Report: {out / 'index.html'}"))
+    if totals.states and set(totals.states) == {"panel"}:
+        terminal.problem("all captures show calibration panels; --align-panels aligns them like any other")
+        return EXIT_NOTHING
+    if not totals.useful:
+        terminal.problem("no band pair could be aligned" if totals.bands else "no capture could be processed")
+        return EXIT_PARTIAL if totals.bands else EXIT_NOTHING
+    return EXIT_OK if totals.good else EXIT_PARTIAL
+
+
+def _table(totals: RunTotals) -> Table:
+    """A row per band: how many pairs have each status, residuals, time."""
     from statistics import median
 
     statuses = sum((band.statuses for band in totals.bands.values()), Counter[str]())
@@ -290,16 +311,4 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
         known = band.residuals_px
         worst = (f"{median(known):.3f}", f"{max(known):.3f}") if known else ("-", "-")
         table.add_row(shown(name), *counts, *worst, f"{median(band.seconds):.1f}")
-    if totals.bands:
-        terminal.result(table)
-    explain(totals.failures.groups(), terminal)
-    for made, count in totals.radiometry.items():
-        terminal.result(shown(f"Written as {made}: {count} captures"))
-    terminal.result(shown(f"Report: {out / 'index.html'}"))
-    if totals.states and set(totals.states) == {"panel"}:
-        terminal.problem("nothing but calibration panels there; --align-panels aligns them all the same")
-        return EXIT_NOTHING
-    if not totals.useful:
-        terminal.problem("no band pair could be aligned" if totals.bands else "no capture could be done")
-        return EXIT_PARTIAL if totals.bands else EXIT_NOTHING
-    return EXIT_OK if totals.good else EXIT_PARTIAL
+    return table
