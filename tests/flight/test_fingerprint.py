@@ -1,35 +1,70 @@
-import dataclasses
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from agalign.cameras.discover import discover
-from agalign.config import SeedSettings, Settings
+from agalign.config import Settings, WriteSettings
 from agalign.flight.fingerprint import fingerprint, hashed
+from agalign.values.capture import Georeference
 
 
-def test_how_numpy_prints_changes_nothing(flight: object) -> None:
+def test_how_numpy_prints_changes_nothing(flight: Path) -> None:
     capture = discover(flight).captures[0]
     before = fingerprint(capture, Settings())
     with np.printoptions(precision=2, threshold=3, suppress=True):
         assert fingerprint(capture, Settings()) == before
 
 
-def test_what_a_result_depends_on_changes_it(flight: object) -> None:
+def test_every_fact_that_a_result_depends_on_changes_it(flight: Path) -> None:
     capture = discover(flight).captures[0]
     band = capture.bands[0]
-    moved = band.to_rig + 1e-12
-    captures = [
-        capture,
-        dataclasses.replace(capture, bands=(dataclasses.replace(band, to_rig=moved), *capture.bands[1:])),
-        dataclasses.replace(capture, bands=(dataclasses.replace(band, lens=None), *capture.bands[1:])),
-        dataclasses.replace(capture, reference_index=0),
+    assert band.to_rig is not None
+    assert band.radiometry is not None
+    calibrated = replace(capture, bands=(replace(band, radiometry=None), *capture.bands[1:]))
+    brighter = replace(band.radiometry, gain=2 * band.radiometry.gain)
+    reflectance = replace(band.radiometry, quantity="reflectance")
+    changes = [
+        replace(band, name="other"),
+        replace(band, band_index=2),
+        replace(band, lens=None),
+        replace(band, to_rig=band.to_rig + 1e-12),
+        replace(band, georeference=Georeference(np.eye(3), "EPSG:32632")),
+        replace(band, radiometry=brighter),
+        replace(band, radiometry=reflectance),
+        replace(band, path=band.path.with_name("missing.tif")),
     ]
-    result = {fingerprint(c, Settings()) for c in captures}
-    result.add(fingerprint(capture, Settings(seed=SeedSettings(only=True))))
-    assert len(result) == 5
+    captures = [replace(capture, bands=(changed, *capture.bands[1:])) for changed in changes]
+    captures += [capture, calibrated, replace(capture, reference_index=0)]
+    fingerprints = [fingerprint(c, Settings()) for c in captures]
+    fingerprints.append(fingerprint(capture, Settings(write=WriteSettings(stac=True))))
+    assert len(set(fingerprints)) == len(fingerprints)
 
 
-def test_facts_are_told_apart() -> None:
+def test_a_file_that_is_written_again_is_another_file(flight: Path, tmp_path: Path) -> None:
+    copied = tmp_path / "copy"
+    shutil.copytree(flight, copied)
+    capture = discover(copied).captures[0]
+    before = fingerprint(capture, Settings())
+    path = capture.bands[0].path
+    status = path.stat()
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns + 1000))
+    later = fingerprint(capture, Settings())
+    with path.open("ab") as file:
+        file.write(b"\0")
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert len({before, later, fingerprint(capture, Settings())}) == 3
+
+
+def test_the_other_captures_of_a_flight_do_not_change_it(flight: Path) -> None:
+    captures = discover(flight).captures
+    assert fingerprint(captures[0], Settings()) == fingerprint(replace(captures[0], flight_id="x"), Settings())
+    assert fingerprint(captures[0], Settings()) != fingerprint(captures[1], Settings())
+
+
+def test_different_facts_have_different_hashes() -> None:
     facts = [
         ("ab", "c"),
         ("a", "bc"),
