@@ -23,6 +23,7 @@ from agalign.values.capture import Capture
 from agalign.values.choices import Interpolation, SeedKind
 from agalign.values.image import Mask, Tile
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import FixedImagePx
 
 _LOG = logging.getLogger(__name__)
 
@@ -36,7 +37,7 @@ def align(
     fixed_valid: ArrayLike | None = None,
     moving_valid: ArrayLike | None = None,
     settings: Settings | None = None,
-) -> Alignment:
+) -> Alignment[FixedImagePx]:
     """Find the homography from one image to another of the same scene, whatever their modalities.
 
     fixed, moving
@@ -61,7 +62,7 @@ def align(
     candidates: Candidates = {"identity": geometry.overlay(one.size_px, other.size_px)}
     if seed is not None:
         candidates = {"user": geometry.normalised(seed)}
-    known: dict[SeedKind, float] = {} if seed_std_px is None else {"user": seed_std_px}
+    known: dict[SeedKind, FixedImagePx] = {} if seed_std_px is None else {"user": FixedImagePx(seed_std_px)}
     pair = BandPair.of_images("moving", one, other, candidates, known)
     return with_metrics(align_pairs([pair], settings, quiet)["moving"], pair)
 

@@ -21,6 +21,7 @@ from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import OutputGrid
+from agalign.values.pixel_units import FixedFilePx
 
 
 def quiet(*_: object) -> None:
@@ -66,8 +67,8 @@ def process_capture(
 
 
 def _context(
-    capture: Capture, paths: CapturePaths, settings: Settings, alignments: Mapping[str, Alignment], rig: Rig | None,
-    max_preview_bytes: int,
+    capture: Capture, paths: CapturePaths, settings: Settings, alignments: Mapping[str, Alignment[FixedFilePx]],
+    rig: Rig | None, max_preview_bytes: int,
 ) -> ProductContext:  # fmt: skip
     whole = OutputGrid(0, 0, *capture.reference.size_px)
     context = ProductContext(capture, paths, settings, alignments, (), whole, rig, max_preview_bytes)

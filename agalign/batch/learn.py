@@ -31,6 +31,7 @@ from agalign.pixels.raster import without_warnings
 from agalign.values.alignment import MIN_RETRIEVAL, JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
+from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.displacement_field import common_field
 
 _LOG = logging.getLogger(__name__)
@@ -109,7 +110,7 @@ def _recognised(refined: Sequence["_Refined"]) -> dict[str, list[Matrix]]:
     for one in refined:
         for pair, result in zip(one.loaded.pairs, one.results, strict=True):
             if isinstance(result, JointResult) and result.retrieval >= MIN_RETRIEVAL:
-                mappings.setdefault(pair.name, []).append(pair.in_file_px(result.fixed_to_moving))
+                mappings.setdefault(pair.name, []).append(pair.scales.between_files(result.fixed_to_moving))
     return mappings
 
 
@@ -245,7 +246,7 @@ class _Shown:
     """What a capture says of the rig: its mappings, and the shifts that its windows still show."""
 
     observation: Observation
-    residuals: dict[str, Residual]
+    residuals: dict[str, Residual[FixedFilePx]]
 
 
 def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Refined | None) -> _Shown:
@@ -258,7 +259,7 @@ def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Ref
         starts = list(zip(pairs, known.loaded.seeds, strict=True))
         result = verify_together(starts, known.results, model, settings)
     pairs = [p for p in pairs if p.is_the_rigs]
-    in_file_px = {p.name: result[p.name].between_files(*p.scales) for p in pairs}
+    in_file_px = {p.name: result[p.name].in_file_px(p.scales) for p in pairs}
     good = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
     return _Shown(observed(pairs, result, capture), good)
 

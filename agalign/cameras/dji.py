@@ -70,7 +70,7 @@ class _TagTransfer(TagTransfer):
                 packet.put(name, [number_text(value)])
         date, terms = _dewarp_data(tags)
         if terms:
-            scaled = [v * grid.scale for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]
+            scaled = [v * grid.scale.mean for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]
             packet.put(_DEWARP_DATA, [f"{date};" + ",".join(map(number_text, scaled))])
         if grid.undistorted:
             packet.put(_DEWARP_FLAG, ["1"])

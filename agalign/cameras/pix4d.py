@@ -171,8 +171,8 @@ class TagTransfer:
         self._put_principal_point(packet, reference, tags, grid)
         for name in (*self.in_px, *([FOCAL_LENGTH] if focal_length_is_in_px(tags) else [])):
             values = tags.numbers(*name)
-            if values and grid.scale != 1:
-                packet.put(name, [number_text(v * grid.scale) for v in values])
+            if values and grid.scale.mean != 1:
+                packet.put(name, [number_text(v * grid.scale.mean) for v in values])
         if grid.undistorted:
             packet.put(DISTORTION, ["0"] * len(tags.numbers(*DISTORTION)))
 
@@ -185,7 +185,7 @@ class TagTransfer:
             point_px = rotated_180(grid.px(*stored), (grid.width, grid.height))
         else:
             point_px = grid.px(*point_px)
-        packet.put(PRINCIPAL_POINT, [number_text(v / (density * grid.scale)) for v in point_px])
+        packet.put(PRINCIPAL_POINT, [number_text(v / (density * grid.scale.mean)) for v in point_px])
 
     def put_vignetting(
         self, packet: Packet, tags: Tags, grid: OutputGrid, from_source: FromSource, *, radiometry: bool
@@ -207,7 +207,7 @@ class TagTransfer:
             packet.remove([VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL])
             return
         packet.put(VIGNETTING_CENTRE, [number_text(v) for v in grid.px(*new_centre)])
-        scaled = [v / (grid.scale * magnification) ** i for i, v in enumerate(k, start=1)]
+        scaled = [v / (grid.scale.mean * magnification) ** i for i, v in enumerate(k, start=1)]
         packet.put(VIGNETTING_POLYNOMIAL, [f"{v:.9e}" for v in scaled])
 
     def pixels_per_mm(self, tags: Tags) -> float | None:

@@ -95,10 +95,10 @@ def _some(directory: Directory, tags: Iterable[int]) -> Directory:
 def _on_grid(exif: Directory, reference: Directory, grid: OutputGrid) -> Directory:
     """With the reference's focal length and pixel density, and the size that is written."""
     result = exif | _some(reference, _GEOMETRIC_EXIF)
-    for tag in _DENSITIES & result.keys() if grid.scale != 1 else ():
+    for tag in _DENSITIES & result.keys() if grid.scale.mean != 1 else ():
         density = number(result[tag])
         if density is not None and density > 0:
             with suppress(ValueError):  # a density that no camera has
-                result[tag] = rational(grid.scale * density)
+                result[tag] = rational(grid.scale.mean * density)
     sizes = zip(_EXIF_SIZES, (grid.width, grid.height), strict=True)
     return result | {tag: long(size) for tag, size in sizes if tag in result}

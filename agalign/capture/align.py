@@ -20,6 +20,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Capture
 from agalign.values.issues import SEED_ASKED_FOR, Issue
+from agalign.values.pixel_units import FixedFilePx, FixedImagePx
 
 PairProgress = Callable[[str, str, float], None]
 """Called with the band's name, the stage, and the share of the stage that is done."""
@@ -41,13 +42,13 @@ class _Timer:
         for name in names:
             self._seconds[name] = self._seconds.get(name, 0.0) + (time.perf_counter() - since) / len(names)
 
-    def added_to(self, result: dict[str, Alignment]) -> dict[str, Alignment]:
+    def added_to(self, result: dict[str, Alignment[FixedImagePx]]) -> dict[str, Alignment[FixedImagePx]]:
         return {name: replace(a, seconds=a.seconds + self._seconds.get(name, 0.0)) for name, a in result.items()}
 
 
 def align_capture_bands(
     capture: Capture, settings: Settings, model: FlightModel | None, progress: PairProgress
-) -> dict[str, Alignment]:
+) -> dict[str, Alignment[FixedFilePx]]:
     """Align every moving band of a capture, by name; a band that cannot be read is `failed` and stops no other.
 
     Raises UnreadableFileError where the reference cannot be read.
@@ -58,7 +59,7 @@ def align_capture_bands(
     if model is not None and model.rig is not None and not settings.seed.only:
         aligned = with_predictions(pairs, aligned, model.rig, capture)
     aligned = _with_metrics(pairs, aligned, progress)
-    result: dict[str, Alignment] = {}
+    result: dict[str, Alignment[FixedFilePx]] = {}
     for band in capture.bands_of_the_references_lens:
         unmoved = Seed("identity", geometry.identity(), 0.0)
         result[band.name] = Alignment(unmoved.fixed_to_moving, "pixel", "aligned", (), unmoved, None, None, 0.0)
@@ -71,9 +72,11 @@ def align_capture_bands(
     return {band.name: result[band.name] for band in capture.moving}
 
 
-def _between_files(capture: Capture, pair: BandPair, aligned: Alignment) -> dict[str, Alignment]:
+def _between_files(
+    capture: Capture, pair: BandPair, aligned: Alignment[FixedImagePx]
+) -> dict[str, Alignment[FixedFilePx]]:
     """The alignment of a pair as one between the files of each of its bands, refined on them where they have more."""
-    alignment = aligned.between_files(*pair.scales)
+    alignment = aligned.in_file_px(pair.scales)
     if pair.is_reduced and alignment.status == "aligned":
         alignment = at_full_resolution(capture.reference, pair.bands[0], alignment)
     shared = replace(alignment, seconds=alignment.seconds / len(pair.bands))
@@ -81,8 +84,8 @@ def _between_files(capture: Capture, pair: BandPair, aligned: Alignment) -> dict
 
 
 def _with_metrics(
-    pairs: Sequence[BandPair], result: dict[str, Alignment], progress: PairProgress
-) -> dict[str, Alignment]:
+    pairs: Sequence[BandPair], result: dict[str, Alignment[FixedImagePx]], progress: PairProgress
+) -> dict[str, Alignment[FixedImagePx]]:
     """The alignments with their similarity metrics."""
     timer, measured = _Timer(), {}
     for pair in pairs:
@@ -96,7 +99,7 @@ def _with_metrics(
 def align_pairs(
     pairs: Sequence[BandPair], settings: Settings, progress: PairProgress, model: FlightModel | None = None,
     capture: Capture | None = None, *, scratch: bool = True,
-) -> dict[str, Alignment]:  # fmt: skip
+) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
     """Align the pairs of one `capture`, which share a reference, by name.
 
     The pairs that the flight's network cannot align are learnt from scratch, together: with a rig only those that it
@@ -125,11 +128,11 @@ class _PairAligner:
     settings: Settings
     model: FlightModel | None
     progress: PairProgress
-    result: dict[str, Alignment] = field(default_factory=dict)
+    result: dict[str, Alignment[FixedImagePx]] = field(default_factory=dict)
     """By band."""
     timer: _Timer = field(default_factory=_Timer)
 
-    def timed_result(self) -> dict[str, Alignment]:
+    def timed_result(self) -> dict[str, Alignment[FixedImagePx]]:
         return self.timer.added_to(self.result)
 
     def is_aligned(self, start: Start) -> bool:
@@ -185,9 +188,9 @@ def _quiet(band: str, stage: str, share: float) -> None:
 
 
 def verify_together(
-    starts: Sequence[Start], results: Sequence[JointResult | Issue], model: FlightModel | None, settings: Settings,
+    starts: Sequence[Start], results: Results, model: FlightModel | None, settings: Settings,
     progress: PairProgress = _quiet, timer: _Timer | None = None,
-) -> dict[str, Alignment]:  # fmt: skip
+) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
     """The alignments of a capture's pairs, by name: their results moved to the maximum a posteriori of all bands
     together, each one verified.
     """
@@ -198,7 +201,7 @@ def verify_together(
             for (pair, _), result in zip(starts, results, strict=True)
         ]
         improved = _estimated_together(starts, results, warped_pairs, model, settings)
-    alignments: dict[str, Alignment] = {}
+    alignments: dict[str, Alignment[FixedImagePx]] = {}
     for (pair, seed), result, warped_pair in zip(starts, improved, warped_pairs, strict=True):
         progress(pair.name, "checking", 0.0)
         with timer.measure([pair.name]):
@@ -208,9 +211,9 @@ def verify_together(
 
 def _results(
     starts: Sequence[Start], sides: Sequence[int], align: _Align, progress: PairProgress
-) -> list[JointResult | Issue]:
+) -> list[JointResult[FixedImagePx] | Issue]:
     """In the order of the pairs; those of one image group are aligned together, with the network's `sides`."""
-    result: dict[int, JointResult | Issue] = {}
+    result: dict[int, JointResult[FixedImagePx] | Issue] = {}
     for indices, group in image_groups([p for p, _ in starts], [s for _, s in starts], sides):
         first = starts[indices[0]][0].name
 
@@ -224,9 +227,9 @@ def _results(
 
 
 def _estimated_together(
-    starts: Sequence[Start], results: Sequence[JointResult | Issue], warped_pairs: Sequence[WarpedPair | None],
+    starts: Sequence[Start], results: Results, warped_pairs: Sequence[WarpedPair | None],
     model: FlightModel | None, settings: Settings,
-) -> list[JointResult | Issue]:  # fmt: skip
+) -> list[JointResult[FixedImagePx] | Issue]:  # fmt: skip
     """The results moved to the maximum a posteriori of all bands of the capture together."""
     if settings.joint.model_family not in ("auto", "homography"):
         return list(results)  # the family that the user chose would be left

@@ -1,6 +1,7 @@
 """A pair of a moving image and the reference, in the form that estimation takes, with its candidate mappings."""
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -17,13 +18,21 @@ from agalign.pixels.raster import read_for_alignment
 from agalign.pixels.resample import warped
 from agalign.pixels.stripes import without_common_stripes
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementField
+from agalign.values.alignment import SAME_SCALES, DisplacementField, PairScales
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import (
+    FixedFilePx,
+    FixedImagePoints,
+    FixedImagePx,
+    MovingFilePx,
+    MovingImagePoints,
+    PixelScale,
+)
 
 Candidates = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of trust."""
@@ -44,7 +53,6 @@ _COARSE_OVERSAMPLING = 2.0
 """Pixels of the reduced reference for each pixel of a coarse band: more of them add no detail that both images show."""
 _COARSE_MIN_PX = 128
 """Longer side of a reference that is reduced for a coarse band, at least: fewer pixels leave no room for windows."""
-_NOT_REDUCED = (1.0, 1.0), (1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -58,10 +66,10 @@ class BandPair:
     candidates: Candidates
     bands: tuple[Band, ...] = ()
     """The moving bands: one, or three of a colour photograph; none where the images are arrays."""
-    scales: tuple[tuple[float, float], tuple[float, float]] = _NOT_REDUCED
-    """(x, y) of the fixed and of the moving image relative to their files."""
-    known_to_px: Mapping[SeedKind, float] = dataclasses.field(default_factory=dict)
-    """Standard deviations of candidates, where known: px of the fixed image."""
+    scales: PairScales = SAME_SCALES
+    """Of the two images relative to their files."""
+    known_to_px: Mapping[SeedKind, FixedImagePx] = dataclasses.field(default_factory=dict)
+    """Standard errors of candidates, where known."""
     is_coarse: bool = False
     """The moving image has so few pixels that the reference is reduced for it."""
     field: DisplacementField | None = None
@@ -70,7 +78,7 @@ class BandPair:
     @classmethod
     def of_images(
         cls, name: str, fixed: Raster, moving: Raster, candidates: Candidates,
-        known_to_px: Mapping[SeedKind, float] | None = None,
+        known_to_px: Mapping[SeedKind, FixedImagePx] | None = None,
     ) -> "BandPair":  # fmt: skip
         """A single pair of images at their own resolution."""
         return cls(name, Reference(fixed), moving, candidates, known_to_px=known_to_px or {})
@@ -84,12 +92,12 @@ class BandPair:
     @property
     def is_reduced(self) -> bool:
         """True where the files have enough more pixels than the images for a refinement on them."""
-        return min(*self.scales[1], *(() if self.is_coarse else self.scales[0])) < _PLAINLY_REDUCED
+        return min(*self.scales.moving, *(() if self.is_coarse else self.scales.fixed)) < _PLAINLY_REDUCED
 
     @property
-    def reach_px(self) -> float:
-        """Largest distance of a result from its seed, px of the fixed image: infinite unless the user gave the seed."""
-        return _STANDARD_DEVIATIONS * self.known_to_px.get("user", np.inf)
+    def reach_px(self) -> FixedImagePx:
+        """Largest distance of a result from its seed: infinite unless the user gave the seed."""
+        return self.known_to_px.get("user", FixedImagePx(math.inf)) * _STANDARD_DEVIATIONS
 
     @property
     def is_known_to_a_rig(self) -> bool:
@@ -129,24 +137,32 @@ class BandPair:
         Both map the same moving point: its distance in the fixed image is what the standard errors refer to.
         """
         shifted = geometry.compose(fixed_to_moving, geometry.translation(*shift_px))
-        middle = (np.array(self.fixed.size_px) - 1) / 2
-        mapped = geometry.apply(shifted, middle)
+        middle = FixedImagePoints((np.array(self.fixed.size_px) - 1) / 2)
+        mapped = MovingImagePoints(geometry.apply(shifted, middle))
         return any(
-            np.linalg.norm(geometry.apply(geometry.invert(self.candidates[kind]), mapped) - middle)
-            <= _STANDARD_DEVIATIONS * std_px
+            self._distance_px(middle, mapped, self.candidates[kind]) <= std_px * _STANDARD_DEVIATIONS
             for kind, std_px in self.known_to_px.items()
             if kind in self.candidates
         )
 
+    @staticmethod
+    def _distance_px(fixed: FixedImagePoints, moving: MovingImagePoints, fixed_to_moving: Matrix) -> FixedImagePx:
+        """Distance of a point (2,) of the fixed image from the one that a homography maps to a point (2,) of the
+        moving image.
+        """
+        return FixedImagePx(np.linalg.norm(geometry.apply(geometry.invert(fixed_to_moving), moving) - fixed))
+
     @property
     def reference_file_px(self) -> tuple[int, int]:
         """(width, height) of the reference's file."""
-        width, height = (round(n / s) for n, s in zip(self.fixed.size_px, self.scales[0], strict=True))
+        width, height = (round(n / s) for n, s in zip(self.fixed.size_px, self.scales.fixed, strict=True))
         return width, height
 
-    def in_file_px(self, fixed_to_moving: Matrix) -> Matrix:
-        """A homography between the images as one between their files."""
-        return geometry.rescale(fixed_to_moving, *((1 / x, 1 / y) for x, y in self.scales))
+    def in_moving_file_px(self, distance_px: FixedImagePx, fixed_to_moving: Matrix) -> MovingFilePx:
+        """A distance in the fixed image as one in the moving file, under a homography between the images."""
+        between_files = self.scales.between_files(fixed_to_moving)
+        magnification = float(geometry.local_scale(between_files, *self.reference_file_px)[-1])
+        return MovingFilePx(distance_px / min(self.scales.fixed) * abs(magnification))
 
 
 def read_pairs(
@@ -205,11 +221,13 @@ def _pair(
     """The pair of `reference`, the image of `band` with its longer side at most `longest`, and the `moving` image."""
     name = bands[0].name
     is_coarse = longest < min(_LONGEST_SIDE_PX, max(band.size_px))
-    scales = _scale(reference.image, band), _scale(moving, bands[0])
-    reduced: Candidates = {kind: geometry.rescale(m, *scales) for kind, m in candidates.items()}
+    scales = PairScales(
+        PixelScale.between(band.size_px, reference.image.size_px), PixelScale.between(bands[0].size_px, moving.size_px)
+    )
+    reduced: Candidates = {kind: scales.between_images(matrix) for kind, matrix in candidates.items()}
     field = None if model is None or model.rig is None else model.rig.fields.get(name)
-    field = None if field is None else field.rescaled(scales[0])
-    known = _known_to_px(name, model, scales[0])
+    field = None if field is None else field.rescaled(scales.fixed)
+    known = _known_to_px(name, model, scales.fixed)
     return BandPair(name, reference, moving, reduced, tuple(bands), scales, known, is_coarse, field)
 
 
@@ -225,14 +243,15 @@ def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
     return min(_LONGEST_SIDE_PX, max(side, _COARSE_MIN_PX))
 
 
-def _known_to_px(band: str, model: FlightModel | None, scale: tuple[float, float]) -> dict[SeedKind, float]:
-    """Standard deviations of candidates, px of the fixed image: of tags, and of the flight's mean."""
-    known: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), _TAGS_STD_PX * scale[0])
+def _known_to_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, FixedImagePx]:
+    """Standard errors of candidates: of tags, and of the flight's mean. `scale` is that of the fixed image."""
+    known: dict[SeedKind, FixedImagePx] = dict.fromkeys(("rig", "centre"), FixedImagePx(_TAGS_STD_PX * scale.x))
     if model is not None and model.rig is not None and band in model.rig.mean:
         mean, rig = model.rig.mean[band], model.rig
         # The errors of a rig are in px of the band's own file.
         ratio = abs(float(geometry.local_scale(mean, *rig.size_px)[-1]))
-        known["model"] = max(unobserved_error_px(rig, band, by_neighbours=False) / ratio, _MIN_MODEL_STD_PX) * scale[0]
+        error_px = FixedFilePx(unobserved_error_px(rig, band, by_neighbours=False) / ratio)
+        known["model"] = FixedImagePx(max(error_px, _MIN_MODEL_STD_PX) * scale.x)
     return known
 
 
@@ -242,7 +261,3 @@ def _mean(rasters: Iterable[Raster]) -> Raster:
         return first
     pixels = np.asarray(np.mean([first.pixels, *(r.pixels for r in others)], axis=0, dtype=np.float32))
     return replace(first, pixels=pixels, valid=np.logical_and.reduce([first.valid, *(r.valid for r in others)]))
-
-
-def _scale(raster: Raster, band: Band) -> tuple[float, float]:
-    return raster.size_px[0] / band.width_px, raster.size_px[1] / band.height_px

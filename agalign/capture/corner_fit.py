@@ -9,6 +9,7 @@ from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import FixedPx
 from agalign.values.robust import cauchy_weights
 
 Array = NDArray[np.float64]
@@ -46,7 +47,7 @@ class CornerFit:
         return geometry.compose(fixed_to_moving, geometry.moving_corners(self.mean_px, *size_px))
 
 
-def with_corners(result: JointResult, fixed_to_moving: Matrix, covariance_px2: Array) -> JointResult:
+def with_corners(result: JointResult[FixedPx], fixed_to_moving: Matrix, covariance_px2: Array) -> JointResult[FixedPx]:
     """A result with another homography and the covariance (8, 8) of its corners."""
     std = np.sqrt(np.diag(covariance_px2)).reshape(4, 2)
     return replace(
@@ -56,7 +57,7 @@ def with_corners(result: JointResult, fixed_to_moving: Matrix, covariance_px2: A
 
 
 def corner_correction(
-    mapping: PixelMapping, residual: Residual, size_px: tuple[int, int], min_windows: int = _MIN_WINDOWS
+    mapping: PixelMapping, residual: Residual[FixedPx], size_px: tuple[int, int], min_windows: int = _MIN_WINDOWS
 ) -> CornerFit | None:
     """The correction of a mapping's homography from the residual of windows measured under that mapping.
 

@@ -24,6 +24,7 @@ from agalign.values.capture import Band
 from agalign.values.image import Raster, Tile
 from agalign.values.issues import UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping, mapping_of
+from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.check import Evidence
 from agalign.verify.checks import issues_of
 from agalign.verify.residuals import FixedWindows
@@ -41,7 +42,7 @@ _MAX_STEP_PX = 40.0
 """Displacement of a corner beyond which the windows contradict the reduced images instead of refining them."""
 
 
-def at_full_resolution(reference: Band, moving: Band, alignment: Alignment) -> Alignment:
+def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[FixedFilePx]) -> Alignment[FixedFilePx]:
     """An alignment between the files of two bands, estimated on reduced images, refined at full resolution.
 
     The earlier alignment stays where the tiles show too little, or where the refined one does not pass verification. A
@@ -52,7 +53,8 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment) -> A
     try:
         refined = _refined(alignment, moving, mapping_of(reference, moving, alignment), tiles, reference.size_px)
     except UnreadableFileError as error:
-        failed = without_result(alignment.seed, alignment.space, Issue(UNREADABLE, detail=str(error)))
+        issue = Issue(UNREADABLE, detail=str(error))
+        failed: Alignment[FixedFilePx] = without_result(alignment.seed, alignment.space, issue)
         return replace(failed, seconds=alignment.seconds)
     return alignment if refined is None else refined
 
@@ -78,11 +80,12 @@ class _FixedTile:
         """True for the black fields of the chessboard; the white ones verify."""
         return sum(self.cell) % 2 == 0
 
-    def residual(self, moving: Band, mapping: PixelMapping) -> Residual:
+    def residual(self, moving: Band, mapping: PixelMapping) -> Residual[FixedFilePx]:
         """The residual of its windows, px of the reference's file. Raises UnreadableFileError for the moving file."""
         warped = _raster(*resample_tile(moving, mapping, self.tile, "lanczos"), moving)
-        residual = self.windows.residuals(warped)
-        return replace(residual, centres_px=residual.centres_px + np.array([self.tile.x0, self.tile.y0]))
+        in_tile = self.windows.residuals(warped)
+        centres_px = in_tile.centres_px + np.array([self.tile.x0, self.tile.y0])
+        return Residual[FixedFilePx].of(centres_px, in_tile.shifts_px, in_tile.peaks_sigma)
 
 
 def _fitted(
@@ -109,8 +112,12 @@ def _fitted(
 
 
 def _refined(
-    alignment: Alignment, moving: Band, start: PixelMapping, tiles: Sequence[_FixedTile], size_px: tuple[int, int]
-) -> Alignment | None:
+    alignment: Alignment[FixedFilePx],
+    moving: Band,
+    start: PixelMapping,
+    tiles: Sequence[_FixedTile],
+    size_px: tuple[int, int],
+) -> Alignment[FixedFilePx] | None:
     """The alignment moved to the fit of half of the tiles, with its uncertainty and the residual of the other half.
 
     None where that half does not confirm it, or any check speaks against it. Raises UnreadableFileError.
@@ -135,7 +142,7 @@ def _refined(
     )
 
 
-def _tiles(reference: Band, alignment: Alignment) -> dict[tuple[int, int], Tile]:
+def _tiles(reference: Band, alignment: Alignment[FixedFilePx]) -> dict[tuple[int, int], Tile]:
     """By cell (column, row): a tile inside the cell, around its window with the highest peak on the reduced images."""
     residual, size_px = alignment.residual, reference.size_px
     if residual is None:
@@ -161,12 +168,12 @@ def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
     return cell, int(np.clip(centre_px - side / 2, first, end - side)), side
 
 
-def _residual(moving: Band, mapping: PixelMapping, tiles: Sequence[_FixedTile]) -> Residual:
+def _residual(moving: Band, mapping: PixelMapping, tiles: Sequence[_FixedTile]) -> Residual[FixedFilePx]:
     """The residual of the windows of all tiles, px of the reference's file."""
     parts = [tile.residual(moving, mapping) for tile in tiles]
     if not parts:
-        return Residual.of(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
-    return Residual.of(
+        return Residual[FixedFilePx].of(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
+    return Residual[FixedFilePx].of(
         np.concatenate([p.centres_px for p in parts]), np.concatenate([p.shifts_px for p in parts]),
         np.concatenate([p.peaks_sigma for p in parts]),
     )  # fmt: skip

@@ -26,6 +26,7 @@ from agalign.flight.rig import Rig
 from agalign.flight.rig_prediction import Expectation, expected_corners
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
+from agalign.values.pixel_units import FixedImagePx
 
 Array = NDArray[np.float64]
 
@@ -56,8 +57,11 @@ class InformationForm:
 
 
 def map_estimate(
-    pairs: Sequence[BandPair], results: Mapping[str, JointResult], residuals: Mapping[str, Residual], rig: Rig | None
-) -> dict[str, JointResult]:
+    pairs: Sequence[BandPair],
+    results: Mapping[str, JointResult[FixedImagePx]],
+    residuals: Mapping[str, Residual[FixedImagePx]],
+    rig: Rig | None,
+) -> dict[str, JointResult[FixedImagePx]]:
     """Each result, by band, moved to the maximum a posteriori of all, with its covariance.
 
     `residuals` are those of the windows under the results.
@@ -107,12 +111,14 @@ def _solve(own: Sequence[InformationForm], priors: Sequence[Expectation | None])
     return [(np.round(solution[s], 6), np.round(covariance[s, s], 12)) for s in blocks]
 
 
-def _of_descriptors(result: JointResult) -> InformationForm:
+def _of_descriptors(result: JointResult[FixedImagePx]) -> InformationForm:
     assert result.corner_covariance_px2 is not None
     return InformationForm.of(np.zeros(8), result.corner_covariance_px2)
 
 
-def _of_windows(pair: BandPair, result: JointResult, residual: Residual) -> InformationForm | None:
+def _of_windows(
+    pair: BandPair, result: JointResult[FixedImagePx], residual: Residual[FixedImagePx]
+) -> InformationForm | None:
     """The corners by the windows' shifts; None where these are few or too large."""
     fit = corner_correction(pair.mapping(result.fixed_to_moving), residual, pair.fixed.size_px)
     if fit is None or not fit.max_px <= _MAX_WINDOWS_PX:
@@ -120,7 +126,9 @@ def _of_windows(pair: BandPair, result: JointResult, residual: Residual) -> Info
     return InformationForm.of(fit.mean_px, fit.covariance_px2)
 
 
-def _expectation(pair: BandPair, result: JointResult, rig: Rig | None) -> Expectation | None:
+def _expectation(pair: BandPair, result: JointResult[FixedImagePx], rig: Rig | None) -> Expectation | None:
     if rig is None or pair.name not in rig.mean or not pair.is_the_rigs:
         return None
-    return expected_corners(rig, pair.name, pair.in_file_px(result.fixed_to_moving)).rescaled(pair.scales[0])
+    return expected_corners(rig, pair.name, pair.scales.between_files(result.fixed_to_moving)).rescaled(
+        pair.scales.fixed
+    )

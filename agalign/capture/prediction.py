@@ -9,37 +9,36 @@ from agalign.capture.verification import as_predicted
 from agalign.flight.factors import distance_px
 from agalign.flight.rig import Observation, Rig
 from agalign.flight.rig_prediction import predict_band
-from agalign.values import geometry
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment
 from agalign.values.capture import Capture
 from agalign.values.issues import Issue
+from agalign.values.pixel_units import FixedImagePx, MovingFilePx
 from agalign.verify.check import Evidence
 from agalign.verify.checks import issues_of
 from agalign.verify.rig_check import MAX_UNEXPECTED_PX, UNEXPECTED_PX
 
 
-def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment], capture: Capture) -> Observation:
+def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], capture: Capture) -> Observation:
     """The mappings of a capture that are aligned, in the form that the rig takes."""
     good = {p.name: (p, a) for p in pairs if (a := result[p.name]).status == "aligned" and a.joint is not None}
     return Observation(
         capture.time_s,
-        {name: pair.in_file_px(a.fixed_to_moving) for name, (pair, a) in good.items()},
+        {name: pair.scales.between_files(a.fixed_to_moving) for name, (pair, a) in good.items()},
         {name: _std_moving_px(pair, a) for name, (pair, a) in good.items()},
         None if capture.position is None else capture.position.altitude_m,
         capture.motion,
     )
 
 
-def _std_moving_px(pair: BandPair, alignment: Alignment) -> float:
-    """Standard deviation of a mapping, px of the moving file, the unit of the rig's errors."""
+def _std_moving_px(pair: BandPair, alignment: Alignment[FixedImagePx]) -> MovingFilePx:
+    """Standard error of a mapping, in the unit of the rig's errors."""
     assert alignment.joint is not None
-    scale = geometry.local_scale(pair.in_file_px(alignment.fixed_to_moving), *pair.reference_file_px)[-1]
-    return alignment.joint.corner_std_px / min(pair.scales[0]) * abs(float(scale))
+    return pair.in_moving_file_px(alignment.joint.corner_std_px, alignment.fixed_to_moving)
 
 
 def with_predictions(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment], rig: Rig, capture: Capture
-) -> dict[str, Alignment]:
+    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig, capture: Capture
+) -> dict[str, Alignment[FixedImagePx]]:
     """Each alignment with the rig's prediction, in px of the files; bands that are not aligned take its mapping.
 
     A band whose result the rig rules out is not aligned either: in a repetitive scene the images agree whole periods
@@ -53,7 +52,9 @@ def with_predictions(
     return checked
 
 
-def _with_prediction(pair: BandPair, alignment: Alignment, rig: Rig, known: Observation) -> Alignment:
+def _with_prediction(
+    pair: BandPair, alignment: Alignment[FixedImagePx], rig: Rig, known: Observation
+) -> Alignment[FixedImagePx]:
     prediction = predict_band(rig, pair.name, known)
     if pair.name in known.mappings and alignment.joint is not None and alignment.residual is not None:
         off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
@@ -68,12 +69,16 @@ def _with_prediction(pair: BandPair, alignment: Alignment, rig: Rig, known: Obse
     rotated = find_rotated(pair, predicted.fixed_to_moving, predicted.residual)
     if rotated is None:
         return predicted
-    off_px = distance_px(pair.in_file_px(rotated), prediction.fixed_to_moving, rig.size_px)
+    off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, rig.size_px)
     return replace(alignment, issues=(Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues))
 
 
 def bands_to_learn(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment], rig: Rig, capture: Capture, accept_predicted_px: float
+    pairs: Sequence[BandPair],
+    result: Mapping[str, Alignment[FixedImagePx]],
+    rig: Rig,
+    capture: Capture,
+    accept_predicted_px: float,
 ) -> set[str]:
     """The bands to be learnt from scratch where the flight's network did not align them.
 
@@ -91,6 +96,6 @@ def bands_to_learn(
     return {pair.name for pair in pairs if not is_given_up(pair)}
 
 
-def _has_something_in_common(alignment: Alignment) -> bool:
+def _has_something_in_common(alignment: Alignment[FixedImagePx]) -> bool:
     joint = alignment.joint
     return alignment.seed.trusted or (joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance)

@@ -8,6 +8,7 @@ from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
 from agalign.pixels.resample import shrink, textured
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values.image import Raster
+from agalign.values.pixel_units import PixelScale
 from agalign.verify.displacement_field import COARSE, FINE, DisplacementEstimator
 from agalign.verify.metrics import FixedSimilarity
 from agalign.verify.residuals import FixedWindows
@@ -48,9 +49,9 @@ class Reference:
         return max(8, round(width * scale)), max(8, round(height * scale))
 
     @cached_property
-    def seed_scale(self) -> tuple[float, float]:
-        """The same relative to the image, (x, y)."""
-        return self.seed_size_px[0] / self.image.size_px[0], self.seed_size_px[1] / self.image.size_px[1]
+    def seed_scale(self) -> PixelScale:
+        """Scale of these relative to the image."""
+        return PixelScale.between(self.image.size_px, self.seed_size_px)
 
     @cached_property
     def seed_spectrum(self) -> Field:

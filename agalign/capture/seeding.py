@@ -23,6 +23,7 @@ from agalign.values.alignment import Residual, Seed
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
+from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.acceptance import seed_fits
 
 _CERTAIN_SIGMA = 120.0
@@ -75,7 +76,7 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
     return _best_match(pair, model, best, residual)
 
 
-def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual: Residual) -> Seed:
+def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual: Residual[FixedImagePx]) -> Seed:
     """A match under which the windows agree better than under the best seed so far, or that seed."""
     for mapping in _matches(pair, model, by_learnt_descriptors=not best.trusted):
         match, match_residual = _unshifted(pair, mapping), _residual_under(pair, mapping)
@@ -91,7 +92,7 @@ def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual:
     return best
 
 
-def find_rotated(pair: BandPair, fixed_to_moving: Matrix, under: Residual) -> Matrix | None:
+def find_rotated(pair: BandPair, fixed_to_moving: Matrix, under: Residual[FixedImagePx]) -> Matrix | None:
     """A mapping by landmarks that is rotated or scaled relative to the given one, as no band of a rigid camera is.
 
     The windows must agree better with it than they do `under` the given mapping. None where there is none: a mapping
@@ -116,7 +117,7 @@ def _is_rotated_or_scaled(matrix: Matrix, size_px: tuple[int, int]) -> bool:
     return bool(abs(angle) > _MAX_ROTATION_DEGREES or abs(scale - 1) > _MAX_SCALE_CHANGE)
 
 
-def _corrected(pair: BandPair, fixed_to_moving: Matrix, residual: Residual) -> Matrix | None:
+def _corrected(pair: BandPair, fixed_to_moving: Matrix, residual: Residual[FixedImagePx]) -> Matrix | None:
     """A mapping corrected by the windows under it; None where these are few."""
     fit = corner_correction(pair.mapping(fixed_to_moving), residual, pair.fixed.size_px, _MIN_WINDOWS)
     try:
@@ -139,7 +140,7 @@ def _matches(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors
             yield result
 
 
-def _residual_under(pair: BandPair, fixed_to_moving: Matrix) -> Residual:
+def _residual_under(pair: BandPair, fixed_to_moving: Matrix) -> Residual[FixedImagePx]:
     return WarpedPair.of(pair, pair.mapping(fixed_to_moving)).residual
 
 

@@ -15,6 +15,7 @@ from agalign.values.choices import LocalUse, SeedKind, Space
 from agalign.values.image import Raster
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
 from agalign.verify.acceptance import is_unchanged, seed_fits, status_of
 from agalign.verify.check import Evidence
 from agalign.verify.checks import issues_of
@@ -32,7 +33,7 @@ _MENDABLE = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
 """Issues that parallax causes and a displacement field removes."""
 
 
-def without_result(seed: Seed, space: Space, issue: Issue) -> Alignment:
+def without_result(seed: Seed, space: Space, issue: Issue) -> Alignment[FixedPx]:
     """The failed alignment of a pair that could not be tried."""
     return Alignment(seed.fixed_to_moving, space, "failed", (issue,), seed, None, None, 0.0)
 
@@ -45,7 +46,7 @@ class WarpedPair:
     mapping: PixelMapping
     warped: Raster
     """The moving image, one channel, on the reference's pixels."""
-    residual: Residual
+    residual: Residual[FixedImagePx]
 
     @classmethod
     def of(cls, pair: BandPair, mapping: PixelMapping) -> "WarpedPair":
@@ -63,7 +64,7 @@ class WarpedPair:
         return WarpedPair.of(self.pair, mapping)
 
     @property
-    def reduced_scale(self) -> tuple[float, float]:
+    def reduced_scale(self) -> PixelScale:
         """(x, y) of the reduced images relative to the fixed image."""
         return self.pair.reference.seed_scale
 
@@ -76,20 +77,24 @@ class WarpedPair:
         """True where the pair's candidates expect the mapping after a shift (x, y), px of the fixed image."""
         return self.pair.is_expected(self.mapping.fixed_to_moving, shift_px)
 
-    def issues(self, joint: JointResult) -> tuple[Issue, ...]:
+    def issues(self, joint: JointResult[FixedImagePx]) -> tuple[Issue, ...]:
         """Of the result that this mapping is from."""
         return issues_of(Evidence(joint, self.residual, self.pair.fixed.size_px, images=self))
 
 
 def verified(
-    pair: BandPair, seed: Seed, result: JointResult | Issue, settings: Settings, warped_pair: WarpedPair | None = None
-) -> Alignment:
+    pair: BandPair,
+    seed: Seed,
+    result: JointResult[FixedImagePx] | Issue,
+    settings: Settings,
+    warped_pair: WarpedPair | None = None,
+) -> Alignment[FixedImagePx]:
     """The alignment with its status, px of the images. A result with issues leaves the seed.
 
     `warped_pair` is the pair under a mapping that may be close to the result's: it saves measuring again.
     """
-    joint: JointResult | None = None
-    local: DisplacementResult | None = None
+    joint: JointResult[FixedImagePx] | None = None
+    local: DisplacementResult[FixedImagePx] | None = None
     issues: tuple[Issue, ...] = ()
     if isinstance(result, JointResult):
         joint = _snapped(result, pair)
@@ -111,8 +116,8 @@ def verified(
 
 
 def _verified(
-    warped_pair: WarpedPair, joint: JointResult, use: LocalUse
-) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult | None]:
+    warped_pair: WarpedPair, joint: JointResult[FixedImagePx], use: LocalUse
+) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult[FixedImagePx] | None]:
     """(the pair under the result, with a displacement field where one is wanted and passes; its issues; the field)."""
     issues = warped_pair.issues(joint)
     if not _is_field_wanted(use, issues, rig_known=warped_pair.pair.is_known_to_a_rig):
@@ -134,8 +139,8 @@ def _is_field_wanted(use: LocalUse, issues: tuple[Issue, ...], *, rig_known: boo
 
 
 def _with_displacements(
-    warped_pair: WarpedPair, joint: JointResult, *, finer: bool = False
-) -> tuple[DisplacementResult, WarpedPair | None]:
+    warped_pair: WarpedPair, joint: JointResult[FixedImagePx], *, finer: bool = False
+) -> tuple[DisplacementResult[FixedImagePx], WarpedPair | None]:
     """(a displacement field over a mapping; the pair under it where it passes verification)."""
     pair, mapping = warped_pair.pair, warped_pair.mapping
     estimator = pair.reference.finer_local if finer else pair.reference.local
@@ -149,9 +154,9 @@ def _with_displacements(
     return local, displaced
 
 
-def as_predicted(alignment: Alignment, pair: BandPair, prediction: Prediction) -> Alignment:
+def as_predicted(alignment: Alignment[FixedImagePx], pair: BandPair, prediction: Prediction) -> Alignment[FixedImagePx]:
     """The alignment of a pair by its rig's prediction: px of the images, of the files for the prediction itself."""
-    fixed_to_moving = geometry.rescale(prediction.fixed_to_moving, *pair.scales)
+    fixed_to_moving = pair.scales.between_images(prediction.fixed_to_moving)
     residual = WarpedPair.of(pair, pair.mapping(fixed_to_moving)).residual
     return replace(
         alignment, fixed_to_moving=fixed_to_moving, status="predicted", residual=residual, local=None,
@@ -159,7 +164,7 @@ def as_predicted(alignment: Alignment, pair: BandPair, prediction: Prediction) -
     )  # fmt: skip
 
 
-def with_metrics(alignment: Alignment, pair: BandPair) -> Alignment:
+def with_metrics(alignment: Alignment[FixedImagePx], pair: BandPair) -> Alignment[FixedImagePx]:
     """The alignment with the similarity of the two images before, with outer edges coinciding, and after."""
     similarity = pair.reference.similarity
     before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
@@ -167,11 +172,11 @@ def with_metrics(alignment: Alignment, pair: BandPair) -> Alignment:
     return replace(alignment, before=similarity.to(before), after=similarity.to(after))
 
 
-def _snapped(joint: JointResult, pair: BandPair) -> JointResult:
+def _snapped(joint: JointResult[FixedImagePx], pair: BandPair) -> JointResult[FixedImagePx]:
     """The result, or the mapping that the files came with where it does not differ from that."""
     for given in (pair.candidates[kind] for kind in _UNCHANGED if kind in pair.candidates):
         if pair.mapping(given).is_curved:
             continue  # a lens is to be corrected: the files are not aligned as they are
-        if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales[0])):
+        if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):
             return replace(joint, fixed_to_moving=given)
     return joint

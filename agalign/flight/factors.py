@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from agalign.flight.rig import FACTORS, Factor
 from agalign.values import geometry
 from agalign.values.geometry import Matrix, Points
+from agalign.values.pixel_units import MovingFilePx
 
 Array = NDArray[np.float64]
 
@@ -94,11 +95,13 @@ def displaced(mean: Matrix, coefficients: Array, size_px: tuple[int, int]) -> Ma
     return geometry.fit_homography(points, geometry.apply(mean, points) + coordinates(size_px) @ coefficients.T)
 
 
-def distance_px(one: Matrix, other: Matrix, size_px: tuple[int, int]) -> float:
-    """Root mean square distance between the images of an image's points (width, height) under two homographies."""
+def distance_px(one: Matrix, other: Matrix, size_px: tuple[int, int]) -> MovingFilePx:
+    """Root mean square distance between the positions in the moving file to which two homographies map an image
+    (width, height).
+    """
     points = lattice_points(size_px)
     difference_px = geometry.apply(one, points) - geometry.apply(other, points)
-    return float(np.sqrt((difference_px**2).sum(axis=1).mean()))
+    return MovingFilePx(np.sqrt((difference_px**2).sum(axis=1).mean()))
 
 
 def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matrix:

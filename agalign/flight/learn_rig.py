@@ -19,6 +19,7 @@ from agalign.flight.factors import (
 )
 from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig
 from agalign.values.geometry import Matrix
+from agalign.values.pixel_units import MovingFilePx
 
 Array = NDArray[np.float64]
 
@@ -70,7 +71,7 @@ def learn_rig(
     )  # fmt: skip
 
 
-def _choose_factors(table: "_Table", *, motion_known: bool) -> tuple[tuple[Factor, ...], dict[str, float]]:
+def _choose_factors(table: "_Table", *, motion_known: bool) -> tuple[tuple[Factor, ...], dict[str, MovingFilePx]]:
     """(the factors that reduce the error of captures left out, that error by band, px)."""
     best, *others = _SETS_IN_MOTION if motion_known else _SETS
     errors_px = table.errors_left_out(best)
@@ -158,7 +159,7 @@ class _Table:
         t_std = np.minimum(1 / np.sqrt(np.maximum(information + pull, 1e-9)), 1.0)
         return _Fit(offset, t, delay, t_std, result, centre)
 
-    def errors_left_out(self, factors: Sequence[Factor]) -> dict[str, float]:
+    def errors_left_out(self, factors: Sequence[Factor]) -> dict[str, MovingFilePx]:
         """Root mean square error by band, px, of captures that are predicted from rigs learnt on the others."""
         counts = factor_mask(factors)
         errors: dict[str, list[float]] = {b: [] for b in self.bands}
@@ -176,7 +177,7 @@ class _Table:
         # The rig is learned on one capture more than those that give its errors.
         seen = (self.weights > 0).sum(axis=0)
         gained = np.sqrt((1 + 1 / seen) / (1 + 1 / np.maximum(seen - 1, 1)))
-        return {b: _rms(errors[b]) * float(g) for b, g in zip(self.bands, gained, strict=True)}
+        return {b: MovingFilePx(_rms(errors[b]) * g) for b, g in zip(self.bands, gained, strict=True)}
 
     def _folds(self) -> list[NDArray[np.bool_]]:
         """Which captures (captures,) each fold leaves out. The others always show every band, so that each band has an

@@ -12,6 +12,7 @@ from agalign.pixels.panel import PanelSight, albedo_of, find_panel, inside
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, read_for_alignment, read_window, without_warnings
 from agalign.values.capture import Band, Capture, Panel
+from agalign.values.pixel_units import PixelScale
 
 Albedos = Mapping[str, float]
 """Reflectance of the panel by band in lower case, or by the empty name for all others: what a user says."""
@@ -169,7 +170,8 @@ def _seen(band: Band, *, without_code: bool) -> PanelSight | None:
     if result is None:
         return None
     scale = image.size_px[0] / band.width_px
-    return replace(result, area_px=tuple(((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5) for x, y in result.area_px))
+    in_file_px = PixelScale(scale, scale).inverse.positions(result.area_px)
+    return replace(result, area_px=tuple((x, y) for x, y in in_file_px.tolist()))
 
 
 def _read(band: Band, albedos: Albedos) -> BandReading:

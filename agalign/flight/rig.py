@@ -22,6 +22,7 @@ from typing import Literal
 
 from agalign.values.alignment import DisplacementField
 from agalign.values.geometry import Matrix
+from agalign.values.pixel_units import MovingFilePx
 
 Factor = Literal["distance", "tilt", "motion", "reference"]
 
@@ -40,7 +41,7 @@ class Observation:
     """When it was taken, from any beginning; None where that is unknown."""
     mappings: Mapping[str, Matrix]
     """fixed_to_moving by band, undistorted px of the files."""
-    std_px: Mapping[str, float]
+    std_px: Mapping[str, MovingFilePx]
     """Standard error of each."""
     altitude_m: float | None = None
     """As the camera has it, above anything."""
@@ -79,7 +80,7 @@ class Rig:
     """Which of them a capture adds."""
     captures: tuple[CaptureFactors, ...]
     """The captures that it was learned on, in their order."""
-    from_bands_px: Mapping[str, float]
+    from_bands_px: Mapping[str, MovingFilePx]
     """Root mean square error of each band in captures left out, predicted from their other bands. Everything of a band
     is in px of its own file.
     """

@@ -23,6 +23,7 @@ from agalign.flight.rig import FACTORS, MIN_CAPTURES, NO_FACTORS, CaptureFactors
 from agalign.values import geometry
 from agalign.values.alignment import Prediction
 from agalign.values.geometry import Matrix
+from agalign.values.pixel_units import MovingFilePx
 
 Array = NDArray[np.float64]
 
@@ -66,7 +67,7 @@ def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
     return _from_bands(rig, band, known, others) if others else _from_captures(rig, band, known)
 
 
-def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> float:
+def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> MovingFilePx:
     """Root mean square error of a band in captures in which no band is known, predicted from the captures around them,
     else from the flight's mean. Raises KeyError for a band that the rig does not know.
     """
@@ -75,7 +76,7 @@ def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> float:
         guess = interpolated_in_time(capture, others) if by_neighbours else None
         error = design @ (np.array(capture.factors) - (_TYPICAL if guess is None else guess).factors)
         squares.append(float((error**2).sum()))
-    return float(np.sqrt(np.mean(squares or [0.0]) + rig.from_bands_px[band] ** 2))
+    return MovingFilePx(np.sqrt(np.mean(squares or [0.0]) + rig.from_bands_px[band] ** 2))
 
 
 def expected_corners(rig: Rig, band: str, fixed_to_moving: Matrix) -> Expectation:
@@ -147,11 +148,11 @@ def _from_bands(rig: Rig, band: str, known: Observation, others: Sequence[str]) 
     design = band_design(rig, band)
     factors, covariance, excess_px = _factors_of(rig, known, others)
     if not rig.factors:
-        return Prediction(rig.mean[band], "flight", float(np.hypot(rig.from_bands_px[band], excess_px)))
+        return Prediction(rig.mean[band], "flight", MovingFilePx(np.hypot(rig.from_bands_px[band], excess_px)))
     less_certain = covariance - _usual_covariance(rig, band)
     spread = max(0.0, float(np.einsum("akf,fg,akg->", design, less_certain, design)))
     extrapolated = 2 * rig.baseline_std[band] ** 2 * _extrapolation_px2(rig, band, factors)
-    error_px = float(np.sqrt(rig.from_bands_px[band] ** 2 + spread + extrapolated + excess_px**2))
+    error_px = MovingFilePx(np.sqrt(rig.from_bands_px[band] ** 2 + spread + extrapolated + excess_px**2))
     return Prediction(displaced(rig.mean[band], design @ factors, rig.size_px), "bands", error_px)
 
 
@@ -260,7 +261,7 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
     return Prediction(mapping, "neighbours", errors_px[best])
 
 
-def _guess_error_px(rig: Rig, band: str, capture: CaptureFactors, result: FactorGuess, guess: _Guess) -> float:
+def _guess_error_px(rig: Rig, band: str, capture: CaptureFactors, result: FactorGuess, guess: _Guess) -> MovingFilePx:
     """Standard error of a guess for a band, px: the error of the same guess for learned captures with gaps as large as
     this one's, or the difference between the captures that it is taken from.
     """
@@ -271,7 +272,7 @@ def _guess_error_px(rig: Rig, band: str, capture: CaptureFactors, result: Factor
         if again is not None:
             errors.append((again.gap, float(((design @ (np.array(other.factors) - again.factors)) ** 2).sum())))
     if not errors and guess is not _typical:
-        return math.inf  # no capture that was left out measures its error
+        return MovingFilePx(math.inf)  # no capture that was left out measures its error
     errors.sort()
     alike = [square for gap, square in errors if gap <= _MAX_GAP_RATIO * result.gap]
     squares = alike if len(alike) >= MIN_CAPTURES else [square for _, square in errors[:MIN_CAPTURES]]
@@ -280,7 +281,7 @@ def _guess_error_px(rig: Rig, band: str, capture: CaptureFactors, result: Factor
     between = float(((design @ result.std) ** 2).sum())
     climb_px = _unknown_climb_px(rig, capture.altitude_m) * float(np.linalg.norm(rig.baselines[band]))
     square = max(inflation * float(np.mean(squares or [0.0])), between) + rig.from_bands_px[band] ** 2 + climb_px**2
-    return float(np.sqrt(square))
+    return MovingFilePx(np.sqrt(square))
 
 
 def _unknown_climb_px(rig: Rig, altitude_m: float | None) -> float:

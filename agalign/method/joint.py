@@ -24,8 +24,9 @@ from agalign.method.refine import refine
 from agalign.method.state import ImageGroup, JointState, Progress, ThetaStart
 from agalign.values.alignment import JointResult
 from agalign.values.issues import FEW_KEYPOINTS, NO_CONTRAST, NOT_INVERTIBLE, Issue
+from agalign.values.pixel_units import FixedImagePx
 
-Results = list[JointResult | Issue]
+Results = list[JointResult[FixedImagePx] | Issue]
 """For each moving image of a group the result, or the reason why there is none."""
 
 
@@ -59,7 +60,7 @@ def refine_with(net: Descriptor, group: ImageGroup, settings: JointSettings, pro
     return [r if isinstance(r, Issue) else replace(r, recipe="flight") for r in results]
 
 
-def _by_paper(state: JointState, group: ImageGroup, band: int, training: Training) -> JointResult | Issue:
+def _by_paper(state: JointState, group: ImageGroup, band: int, training: Training) -> JointResult[FixedImagePx] | Issue:
     one = ImageGroup.of_one(group.fixed, group.moving[band], group.mappings[band])
     try:
         return align_by_paper(state, one, training)[1]

@@ -20,6 +20,7 @@ from agalign.values.alignment import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.lens import Lens
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 _HELD_OUT_CELLS = 8
 """Cells along the longer side; every fifth cell, in a diagonal pattern, is kept from training."""
@@ -42,7 +43,7 @@ class LevelImage:
     """(C, H, W), mean 0 and standard deviation 1 over the valid pixels, 0 elsewhere."""
     room_px: Tensor
     """(H, W) distance from each pixel to the nearest invalid one or to the border."""
-    scale: tuple[float, float] = (1.0, 1.0)
+    scale: PixelScale = SAME_PIXELS
     """Size (x, y) relative to the image that it was reduced from."""
     lens: Lens | None = None
 
@@ -105,11 +106,10 @@ class Level:
         """The same level with displacements, px of the image that I was reduced from."""
         width, height = self.fixed.size_px
         nodes = geometry.lattice(width, height, _FIELD_COLUMNS, round(_FIELD_COLUMNS * height / width) + 1)
-        scale = np.array(self.fixed.scale)
         shape = (-1, _FIELD_COLUMNS, 2)
 
         def on_lattice(field: DisplacementField) -> Tensor:
-            shift = field((nodes + 0.5) / scale - 0.5) * scale
+            shift = field.rescaled(self.fixed.scale)(nodes)
             values = np.moveaxis(shift.reshape(shape), -1, 0)[None].astype(np.float32)
             return torch.from_numpy(np.ascontiguousarray(values)).to(self.fixed.image.device)
 
@@ -132,8 +132,8 @@ class Level:
 
     def full_matrix(self, homography: Tensor, band: int) -> Matrix:
         """The inverse of `homography`."""
-        up = [(1 / x, 1 / y) for x, y in (self.fixed.scale, self.moving[band].scale)]
-        return geometry.rescale(homography.cpu().double().numpy(), up[0], up[1])
+        up, moving_up = self.fixed.scale.inverse, self.moving[band].scale.inverse
+        return geometry.rescale(homography.cpu().double().numpy(), up, moving_up)
 
 
 def make_level_image(raster: Raster, scale: float, device: torch.device) -> LevelImage:
@@ -147,7 +147,7 @@ def make_level_image(raster: Raster, scale: float, device: torch.device) -> Leve
         mean, deviation = (float(v.item()) for v in cv2.meanStdDev(plane, mask=mask))
         np.multiply(plane - np.float32(mean), np.float32(1 / max(deviation, 1e-12)), out=standard)
         standard[~small.valid] = 0
-    relative = small.size_px[0] / width, small.size_px[1] / height
+    relative = PixelScale.between(raster.size_px, small.size_px)
     room = torch.from_numpy(_room_px(small.valid)).to(device)
     return LevelImage(torch.from_numpy(image).to(device), room, relative, small.lens)
 

@@ -63,9 +63,8 @@ def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MA
     result, inliers = cv2.findHomography(*xy, cv2.USAC_MAGSAC, _WITHIN_PX, maxIters=20_000, confidence=0.9999)
     if result is None or int(inliers.sum()) < _MIN_MATCHES:
         return None
-    up = [(1 / view.scale[0], 1 / view.scale[1]) for view, _ in (here, there)]
     try:
-        return geometry.rescale(geometry.normalised(result), up[0], up[1])
+        return geometry.rescale(geometry.normalised(result), here[0].scale.inverse, there[0].scale.inverse)
     except GeometryError:
         return None
 

@@ -31,6 +31,7 @@ from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
+from agalign.values.pixel_units import FixedImagePx
 
 _MOVING = 1
 _COARSEST_PX = 80
@@ -68,7 +69,7 @@ def pyramid(longer_side_px: int) -> tuple[float, ...]:
 
 def align_by_paper(
     state: JointState, group: ImageGroup, training: Training = DEFAULT_TRAINING
-) -> tuple[Descriptor, JointResult | Issue]:
+) -> tuple[Descriptor, JointResult[FixedImagePx] | Issue]:
     """The network and the result for a group of one moving image.
 
     Coarse to fine: theta starts anew at each level, psi is handed on. Raises NotEnoughTextureError, NoContrastError,

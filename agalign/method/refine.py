@@ -23,6 +23,7 @@ from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL, JointResult
 from agalign.values.choices import ModelFamily
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NOT_INVERTIBLE, RETRIEVAL, Issue
+from agalign.values.pixel_units import FixedImagePx
 
 MIN_KEYPOINTS = 16
 TEST_KEYPOINTS = 256
@@ -213,7 +214,9 @@ def _losses_moved(band: MovingBand, homography: Tensor, keypoints: Keypoints, f:
 
 
 @torch.no_grad()
-def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool = True) -> list[JointResult | Issue]:
+def refine(
+    state: JointState, net: Descriptor, group: ImageGroup, *, move: bool = True
+) -> list[JointResult[FixedImagePx] | Issue]:
     """Refine every psi of a capture at full resolution with theta frozen; an issue is why a pair has no result.
 
     Without `move` psi stays as it is: only its retrieval and uncertainty are measured. Raises NoContrastError.
@@ -228,7 +231,7 @@ def refine(state: JointState, net: Descriptor, group: ImageGroup, *, move: bool 
     f_test = describe_fixed(net, level, test)
     solver = Solver(state.family)
 
-    def result(band: MovingBand, start: Tensor) -> JointResult | Issue:
+    def result(band: MovingBand, start: Tensor) -> JointResult[FixedImagePx] | Issue:
         try:
             if move:
                 homography, step = solver.converge(band, start, reference_patches)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.values.image import FloatImage, Mask, Raster
+from agalign.values.pixel_units import PixelScale
 
 _LONGEST_PX = 1600
 _SHOWN_PERCENTILES = 1.0, 99.5
@@ -63,7 +64,7 @@ def find_panel(image: Raster, *, without_code: bool = False) -> PanelSight | Non
     largest = _largest_panel(shown, at)
     if largest is None:
         return PanelSight(code, ()) if code else None
-    area = (_shrunk(largest) + 0.5) / scale - 0.5
+    area = PixelScale(scale, scale).inverse.positions(_shrunk(largest))
     return PanelSight(code, tuple((float(x), float(y)) for x, y in area))
 
 

@@ -23,6 +23,7 @@ from agalign.values import lens
 from agalign.values.capture import Band, Georeference
 from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster
+from agalign.values.pixel_units import PixelScale
 
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 _READ_WHOLE_PX = 1 << 26
@@ -179,7 +180,7 @@ def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
     if band.nodata is None:
         valid &= ~undeclared_fill(pixels)
     valid = learnable(valid, pixels, band.saturation_value)
-    scale = shape[1] / band.width_px, shape[0] / band.height_px
+    scale = PixelScale.between(band.size_px, (shape[1], shape[0]))
     result = pixels.astype(np.float32)
     result[~valid] = 0
     return Raster(result, valid, lens.rescaled(band.lens, scale))

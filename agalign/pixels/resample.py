@@ -18,6 +18,7 @@ from agalign.values.choices import Interpolation
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster, Tile
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 _FLAGS: dict[str, int] = {
     "nearest": cv2.INTER_NEAREST,
@@ -136,21 +137,21 @@ def _as_type(values: NDArray[np.generic], dtype: np.dtype[np.generic]) -> NDArra
 
 
 def warped(
-    moving: Raster, mapping: PixelMapping, size_px: tuple[int, int], fixed_scale: tuple[float, float] = (1.0, 1.0)
+    moving: Raster, mapping: PixelMapping, size_px: tuple[int, int], fixed_scale: PixelScale = SAME_PIXELS
 ) -> Raster:
     """The moving raster resampled onto the fixed grid reduced by `fixed_scale` to `size_px`, without aliasing.
 
     `mapping` is between the raw pixels of the two images at their full size.
     """
     unmoved = not mapping.is_curved and np.array_equal(mapping.fixed_to_moving, np.eye(3))
-    if unmoved and size_px == moving.size_px and fixed_scale == (1.0, 1.0):
+    if unmoved and size_px == moving.size_px and fixed_scale == SAME_PIXELS:
         return moving
     full = round(size_px[0] / fixed_scale[0]), round(size_px[1] / fixed_scale[1])
     magnification = float(np.median(np.abs(geometry.local_scale(mapping.fixed_to_moving, *full))))
     reduce = float(np.clip(fixed_scale[0] / magnification, _MIN_SIDE_PX / min(moving.size_px), 1.0))
     width, height = (max(_MIN_SIDE_PX, round(side * reduce)) for side in moving.size_px)
     moving_size = width, height
-    moving_scale = moving_size[0] / moving.size_px[0], moving_size[1] / moving.size_px[1]
+    moving_scale = PixelScale.between(moving.size_px, moving_size)
     small = shrink(moving, moving_size)
     positions = mapping.rescaled(fixed_scale, moving_scale).positions(Tile(0, 0, *size_px), np.float32)
     cv2.patchNaNs(positions, _NOWHERE)
@@ -175,7 +176,7 @@ def shrink(raster: Raster, size_px: tuple[int, int]) -> Raster:
     """Area-averaged copy of `size_px` (width, height); a pixel is valid where all of its source pixels are."""
     if size_px == raster.size_px:
         return raster
-    scale = size_px[0] / raster.size_px[0], size_px[1] / raster.size_px[1]
+    scale = PixelScale.between(raster.size_px, size_px)
     weight = cv2.resize(raster.valid.astype(np.float32), size_px, interpolation=cv2.INTER_AREA)
     planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
     shrunk = np.stack([cv2.resize(np.where(raster.valid, p, 0), size_px, interpolation=cv2.INTER_AREA) for p in planes])

@@ -115,6 +115,7 @@ def _from_source(layer: Layer, grid: OutputGrid) -> FromSource:
             return math.nan, math.nan
         if not np.abs(to_file(at) - (x, y)).max() < _MAX_INVERSE_ERROR_PX:
             return math.nan, math.nan
-        return (at[0] + 0.5) / grid.scale_xy[0] - 0.5, (at[1] + 0.5) / grid.scale_xy[1] - 0.5
+        x_px, y_px = grid.scale.inverse.positions(at).tolist()
+        return x_px, y_px
 
     return from_source

@@ -15,10 +15,12 @@ from agalign.errors import OutputError
 from agalign.pixels.raster import GDAL_ENVIRONMENT, why, without_warnings
 from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import GEOTIFF, check_complete, georeferenced
+from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid
+from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.expected_error import expected_error_px
 
 _LATTICE_PX = 16
@@ -44,7 +46,9 @@ class ErrorMap(Product):
         return [WrittenFile(self.kind, path, StacAsset("error", GEOTIFF, ("metadata",)))]
 
 
-def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid: OutputGrid, path: Path) -> None:
+def write_error_map(
+    capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], grid: OutputGrid, path: Path
+) -> None:
     """Write (bands, height, width) float32, px of the reference's file, on the grid of the capture's aligned files,
     complete or not at all. Raises OutputError.
     """
@@ -68,19 +72,19 @@ def write_error_map(capture: Capture, alignments: Mapping[str, Alignment], grid:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
 
 
-def error_lattice_px(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
+def error_lattice_px(
+    alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid
+) -> NDArray[np.float32]:
     """Return the expected error (rows, columns) on a lattice over a grid, px of the reference (width, height); nan
     where it is unknown.
     """
     columns, rows = (max(2, -(-n // _LATTICE_PX)) for n in (grid.width, grid.height))
-    x = (grid.x0 + np.linspace(0, grid.width - 1, columns) + 0.5) / grid.scale_xy[0] - 0.5
-    y = (grid.y0 + np.linspace(0, grid.height - 1, rows) + 0.5) / grid.scale_xy[1] - 0.5
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = grid.reference_positions(geometry.lattice(grid.width, grid.height, columns, rows))
     nodes = expected_error_px(alignment, size_px, points).reshape(rows, columns)
     return np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
 
 
-def _error_px(alignment: Alignment, size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
+def _error_px(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
     """(height, width): linear between the nodes of a lattice."""
     nodes = error_lattice_px(alignment, size_px, grid)
     rows, columns = nodes.shape

@@ -43,6 +43,7 @@ from agalign.values.capture import Band, Capture
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping, mapping_of
+from agalign.values.pixel_units import FixedFilePx
 
 _GRID = 17, 13
 """Columns and rows of the sampled mapping, which is nearly a homography."""
@@ -111,7 +112,7 @@ def _output_part(context: ProductContext) -> OutputPart:
         band_files=band_files,
         radiometry=None if context.write_settings.radiometry == "off" else _radiometry(context.capture),
         crop=(grid.x0, grid.y0, grid.width, grid.height),
-        scale=grid.scale_xy,
+        scale=(grid.scale.x, grid.scale.y),
         nodata=values.pop() if len(values) == 1 else None,
     )
 
@@ -165,7 +166,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     )  # fmt: skip
 
 
-def _moving_part(reference: Band, band: Band, alignment: Alignment, place: PlacePart | None) -> BandPart:
+def _moving_part(reference: Band, band: Band, alignment: Alignment[FixedFilePx], place: PlacePart | None) -> BandPart:
     joint, residual = alignment.joint, alignment.residual
     local = alignment.local
     mapping = mapping_of(reference, band, alignment)
@@ -199,7 +200,7 @@ def _moving_part(reference: Band, band: Band, alignment: Alignment, place: Place
     )
 
 
-def _residual_metrics(residual: Residual | None) -> dict[str, float]:
+def _residual_metrics(residual: Residual[FixedFilePx] | None) -> dict[str, float]:
     if residual is None:
         return {}
     coverage = {"residual_coverage": residual.coverage}
@@ -225,12 +226,12 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def _local_part(local: DisplacementResult) -> LocalPart:
+def _local_part(local: DisplacementResult[FixedFilePx]) -> LocalPart:
     before, after = _finite(local.before_p95_px), _finite(local.after_p95_px)
     return LocalPart(applied=local.field is not None, before_p95_px=before, after_p95_px=after)
 
 
-def _joint_part(joint: JointResult, *, accepted: bool) -> JointPart:
+def _joint_part(joint: JointResult[FixedFilePx], *, accepted: bool) -> JointPart:
     return JointPart(
         accepted=accepted, loss=_finite(joint.loss), retrieval=joint.retrieval, chance=joint.chance,
         iterations=joint.iterations, levels=list(joint.levels), recipe=joint.recipe, model_family=joint.model_family,
@@ -244,7 +245,7 @@ def _similarity_part(metrics: Mapping[str, float]) -> SimilarityPart:
     return SimilarityPart(**{k: round(v, 6) if math.isfinite(v) else v for k, v in metrics.items()})
 
 
-def _tile_parts(residual: Residual | None) -> list[ResidualTile]:
+def _tile_parts(residual: Residual[FixedFilePx] | None) -> list[ResidualTile]:
     if residual is None:
         return []
     return [

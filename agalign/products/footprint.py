@@ -23,7 +23,7 @@ def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
     """
     x0, y0 = grid.x0, grid.y0
     x1, y1 = x0 + grid.width, y0 + grid.height
-    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]], dtype=np.float64) / grid.scale_xy
+    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]], dtype=np.float64) / grid.scale
     georeference = capture.reference.georeference
     try:
         if georeference is not None:

@@ -15,6 +15,7 @@ from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping, mapping_of
+from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, PixelScale
 
 _FLIGHT_MARGIN_PX = 2
 """How far captures that the rig was not learnt on may exceed its extremes."""
@@ -45,7 +46,7 @@ class Layer:
 
 
 def output_layers(
-    capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings, rig: Rig | None = None
+    capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], settings: WriteSettings, rig: Rig | None = None
 ) -> tuple[list[Layer], OutputGrid]:
     """The layers of a capture, whose usable moving bands have these alignments, and the grid they are written on.
 
@@ -56,7 +57,7 @@ def output_layers(
     moved = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
     crop = _crop(capture, moved, pixels, settings, rig)
     has_gaps = not _covers(moved, crop)
-    grid = OutputGrid(crop.x0, crop.y0, crop.width, crop.height, pixels.scale_xy, pixels.undistorted, has_gaps)
+    grid = OutputGrid(crop.x0, crop.y0, crop.width, crop.height, pixels.scale, pixels.undistorted, has_gaps)
     return layers, grid
 
 
@@ -69,7 +70,9 @@ class _OutputPixels:
     undistorted: bool
 
     @classmethod
-    def of(cls, capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings) -> "_OutputPixels":
+    def of(
+        cls, capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], settings: WriteSettings
+    ) -> "_OutputPixels":
         reference, scale = capture.reference, 1.0
         if settings.resolution == "finest":
             scale = _finest_scale(_mappings(capture, alignments).values(), reference)
@@ -77,9 +80,9 @@ class _OutputPixels:
         return cls(reference, size_px, settings.undistort and reference.lens is not None)
 
     @property
-    def scale_xy(self) -> tuple[float, float]:
+    def scale(self) -> PixelScale:
         """Output pixels per pixel of the reference's file."""
-        return self.size_px[0] / self.reference.width_px, self.size_px[1] / self.reference.height_px
+        return PixelScale.between(self.reference.size_px, self.size_px)
 
     @property
     def are_copied(self) -> bool:
@@ -90,16 +93,16 @@ class _OutputPixels:
         """Return a mapping of the reference's raw pixels as one of the output pixels."""
         if self.reference.lens is not None and self.undistorted:
             mapping = mapping.from_undistorted(self.reference.lens)
-        return mapping if self.size_px == self.reference.size_px else mapping.rescaled(self.scale_xy, (1.0, 1.0))
+        return mapping if self.size_px == self.reference.size_px else mapping.rescaled(self.scale, SAME_PIXELS)
 
 
-def _mappings(capture: Capture, alignments: Mapping[str, Alignment]) -> dict[str, PixelMapping]:
+def _mappings(capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]]) -> dict[str, PixelMapping]:
     """Raw pixels of the reference to raw pixels of each usable moving band."""
     usable = [b for b in capture.moving if b.name in alignments]
     return {b.name: mapping_of(capture.reference, b, alignments[b.name]) for b in usable}
 
 
-def _layers(capture: Capture, alignments: Mapping[str, Alignment], pixels: _OutputPixels) -> list[Layer]:
+def _layers(capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], pixels: _OutputPixels) -> list[Layer]:
     mappings = {name: pixels.on_grid(mapping) for name, mapping in _mappings(capture, alignments).items()}
     own = None if pixels.are_copied else pixels.on_grid(PixelMapping(geometry.identity()))
     return [

@@ -123,7 +123,7 @@ def _write(sources: _Sources, path: Path, context: ProductContext, settings: Wri
             # Ratios are of light: what a sensor counts in the dark is none.
             dark = [_dark(layer.band, settings) for layer in layers]
             with complete_file(path) as partial:
-                _sharpen(unsharpened, partial, bands, pan, sources.is_seen, dark, max(grid.scale_xy), nodata)
+                _sharpen(unsharpened, partial, bands, pan, sources.is_seen, dark, max(grid.scale), nodata)
                 check_complete(partial)
     except RasterioError as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None

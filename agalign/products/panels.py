@@ -16,6 +16,7 @@ from agalign.products.drawing import Picture, with_text, write_png
 from agalign.products.sidecar import compact_lists
 from agalign.values.capture import PanelSource
 from agalign.values.files import write_text
+from agalign.values.pixel_units import PixelScale
 
 PANELS_FILE = "panels.json"
 _TILE_PX = 320
@@ -139,7 +140,7 @@ def _tile(reading: BandReading) -> Picture:
     grey = np.clip(np.nan_to_num((pixels - low) / max(high - low, 1e-9)), 0, 1) * 255
     image = np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
     if band.panel is not None and band.panel.corners_px:
-        corners = ((np.asarray(band.panel.corners_px) + 0.5) * scale - 0.5).round().astype(np.int32)
+        corners = PixelScale(scale, scale).positions(band.panel.corners_px).round().astype(np.int32)
         cv2.polylines(image, [corners], isClosed=True, color=_AREA_COLOUR, thickness=2, lineType=cv2.LINE_AA)
     said = f"{band.name}: " + ("?" if reading.albedo is None else f"{reading.albedo:.3f}")
     strip = np.full((_TITLE_PX, _TILE_PX, 3), 255, np.uint8)

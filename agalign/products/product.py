@@ -15,6 +15,7 @@ from agalign.products.sidecar import PreviewPart
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
+from agalign.values.pixel_units import FixedFilePx
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class ProductContext:
     capture: Capture
     paths: CapturePaths
     settings: Settings
-    alignments: Mapping[str, Alignment]
+    alignments: Mapping[str, Alignment[FixedFilePx]]
     """By moving band; failed ones included."""
     layers: Sequence[Layer]
     """Of all bands, in their order; empty where no moving band can be written."""
@@ -90,7 +91,7 @@ class ProductContext:
         return self.settings.write
 
     @property
-    def usable(self) -> dict[str, Alignment]:
+    def usable(self) -> dict[str, Alignment[FixedFilePx]]:
         """The alignments that did not fail, by band, in the order of the capture's bands."""
         return {b.name: a for b in self.capture.moving if (a := self.alignments[b.name]).status != "failed"}
 

@@ -96,7 +96,7 @@ def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any
     """Return rasterio's `transform` and `crs` of an output grid, given the georeference of the reference's file."""
     # Only where the source has one: an identity transform would be an invented georeference.
     # Geotransforms count from corners, where a change of resolution is a mere factor.
-    shrunk = np.diag([1 / grid.scale_xy[0], 1 / grid.scale_xy[1], 1.0])
+    shrunk = np.diag([1 / grid.scale.x, 1 / grid.scale.y, 1.0])
     written = georeference.transform @ shrunk @ geometry.translation(grid.x0, grid.y0)
     return {"transform": Affine(*written[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
 

@@ -44,7 +44,7 @@ def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]],
 
 
 def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, int]) -> NDArray[np.float32]:
-    sx, sy = (n / (s * m) for n, s, m in zip(band.size_px, grid.scale_xy, reference.size_px, strict=True))
+    sx, sy = (n / (s * m) for n, s, m in zip(band.size_px, grid.scale, reference.size_px, strict=True))
     window = (
         round(grid.x0 * sx), round(grid.y0 * sy), max(1, round(grid.width * sx)), max(1, round(grid.height * sy)),
     )  # fmt: skip

@@ -193,6 +193,9 @@ class PairScales:
         return geometry.rescale(fixed_to_moving, self.fixed, self.moving)
 
 
+SAME_SCALES = PairScales()
+"""Both images are those of their files."""
+
 _SOURCES: dict[PredictionSource, str] = {
     "bands": "the capture's other bands", "neighbours": "the captures around it", "flight": "the flight's mean",
 }  # fmt: skip

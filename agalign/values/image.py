@@ -1,12 +1,12 @@
 """Images as the estimation sees them, and the pixel grids they lie on."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from agalign.values.lens import Lens
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -46,23 +46,18 @@ class Tile:
 
 @dataclass(frozen=True)
 class OutputGrid:
-    """The pixels that are written, within the reference's: its pixel x lies at scale (x + 0.5) - 0.5 - x0."""
+    """The pixels that are written: a rectangle, from (x0, y0) on, of the reference's pixels at a scale."""
 
     x0: int
     y0: int
     width: int
     height: int
-    scale_xy: tuple[float, float] = (1.0, 1.0)
-    """Written pixels along one of the reference, in whole numbers a side."""
+    scale: PixelScale = SAME_PIXELS
+    """Written pixels for a pixel of the reference; each side has a whole number of pixels."""
     undistorted: bool = False
     """The lens-corrected grid of the reference."""
     has_gaps: bool = True
     """Some of its pixels may lie outside the image of some band that is written."""
-
-    @property
-    def scale(self) -> float:
-        """`scale_xy` for what has one number for both."""
-        return math.sqrt(self.scale_xy[0] * self.scale_xy[1])
 
     @property
     def tile(self) -> Tile:
@@ -70,6 +65,10 @@ class OutputGrid:
         return Tile(self.x0, self.y0, self.width, self.height)
 
     def px(self, x: float, y: float) -> tuple[float, float]:
-        """Where a pixel of the reference lies."""
-        sx, sy = self.scale_xy
-        return sx * (x + 0.5) - 0.5 - self.x0, sy * (y + 0.5) - 0.5 - self.y0
+        """The written pixel at a position of the reference."""
+        on_grid_x, on_grid_y = self.scale.positions((x, y)).tolist()
+        return on_grid_x - self.x0, on_grid_y - self.y0
+
+    def reference_positions(self, positions_px: ArrayLike) -> NDArray[np.float64]:
+        """Positions (..., 2) among the written pixels as positions in the reference's file."""
+        return self.scale.inverse.positions(np.asarray(positions_px) + np.array([self.x0, self.y0]))

@@ -2,19 +2,20 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Generic, Protocol
 
 from agalign.pixels.structure import Field
 from agalign.values.alignment import JointResult, Prediction, Residual
 from agalign.values.issues import Issue, IssueKind
+from agalign.values.pixel_units import FixedPx, PixelScale
 
 
 class AlignedImages(Protocol):
     """The two images of a result on one grid, for checks that need pixels."""
 
     @property
-    def reduced_scale(self) -> tuple[float, float]:
-        """(x, y) of the reduced images relative to the fixed image."""
+    def reduced_scale(self) -> PixelScale:
+        """Scale of the reduced images relative to the fixed image."""
 
     def reduced_spectra(self) -> tuple[Field, Field]:
         """Windowed spectra (height, width) of the structure of the reduced fixed image, and of the moving image."""
@@ -24,11 +25,11 @@ class AlignedImages(Protocol):
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Everything that checks may look at, px of the fixed image."""
+class Evidence(Generic[FixedPx]):
+    """Everything that checks may look at, on the grid of the images or of the files (`FixedPx`)."""
 
-    joint: JointResult
-    residual: Residual
+    joint: JointResult[FixedPx]
+    residual: Residual[FixedPx]
     """The windows under the result."""
     size_px: tuple[int, int]
     """(width, height) of the fixed image."""
@@ -43,6 +44,6 @@ class Check:
     """One check: the kinds of issues that it defines and the function that finds them."""
 
     kinds: tuple[IssueKind, ...]
-    issues: Callable[[Evidence], Iterable[Issue]]
+    issues: Callable[[Evidence[Any]], Iterable[Issue]]
     is_costly: bool = False
     """Runs only where no other check has found an issue."""

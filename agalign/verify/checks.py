@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from agalign.values import issues
 from agalign.values.issues import Issue, IssueKind
+from agalign.values.pixel_units import FixedPx
 from agalign.verify import descriptor_check, mapping_check, repetition, rig_check, window_check
 from agalign.verify.check import Check, Evidence
 
@@ -19,7 +20,7 @@ KINDS: Mapping[str, IssueKind] = {
 """Every kind of issue that a sidecar may contain, by code."""
 
 
-def issues_of(evidence: Evidence) -> tuple[Issue, ...]:
+def issues_of(evidence: Evidence[FixedPx]) -> tuple[Issue, ...]:
     """Every reason for not accepting a result; none where it passes verification."""
     result = tuple(i for check in CHECKS if not check.is_costly for i in check.issues(evidence))
     return result or tuple(i for check in CHECKS if check.is_costly for i in check.issues(evidence))

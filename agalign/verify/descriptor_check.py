@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
 from agalign.values.issues import RETRIEVAL, TEXTURELESS, Issue, IssueKind
+from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
 CORNER_STD_PX = IssueKind("corner_std_px", "the corners are known to {value:.1f} px only", TEXTURELESS)
@@ -11,7 +12,7 @@ _MAX_CORNER_STD_PX = 2.0
 """Standard deviation of the least certain mapped corner: beyond, the windows in the middle verify nothing there."""
 
 
-def _issues(evidence: Evidence) -> Iterator[Issue]:
+def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     joint = evidence.joint
     minimum = max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * joint.chance)
     # Both are written so that nan does not pass.

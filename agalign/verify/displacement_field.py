@@ -20,6 +20,7 @@ from agalign.values.alignment import DisplacementField, DisplacementResult, Resi
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import FixedImagePx
 from agalign.values.robust import cauchy_weights
 from agalign.verify.residuals import FixedWindows
 
@@ -81,7 +82,7 @@ class DisplacementEstimator:
         step_px = max(scale.window_px // 2, round((valid.size / _MAX_WINDOWS) ** 0.5))
         self.windows = FixedWindows(valid, structure, scale.window_px, step_px)
 
-    def refine(self, moving: Raster, mapping: PixelMapping) -> DisplacementResult:
+    def refine(self, moving: Raster, mapping: PixelMapping) -> DisplacementResult[FixedImagePx]:
         """The field over a mapping, including the displacements that it already has, and its gain on held-out windows.
 
         The shifts are measured again under the field of each round: windows over steps become sharper, and long shifts
@@ -104,7 +105,7 @@ class DisplacementEstimator:
                 break
         return DisplacementResult(None if field is before else field, gain.before_p95_px, gain.after_p95_px)
 
-    def _best_gain(self, first: Residual) -> "_Gain":
+    def _best_gain(self, first: Residual[FixedImagePx]) -> "_Gain":
         """The gain of the first smoothness with a plain gain, from the finest upwards; else that of the last."""
         some = [self._held_out_gain(first, s, _SOME_FOLDS, apart_px=0) for s in _SMOOTHNESS]
         finest = min(some, key=lambda g: g.left).smoothness
@@ -115,7 +116,9 @@ class DisplacementEstimator:
                 break
         return gain
 
-    def _held_out_gain(self, residual: Residual, smoothness: float, folds: Iterable[int], apart_px: float) -> "_Gain":
+    def _held_out_gain(
+        self, residual: Residual[FixedImagePx], smoothness: float, folds: Iterable[int], apart_px: float
+    ) -> "_Gain":
         """Leaves windows out in turn, and with them those nearer to one of them than `apart_px`."""
         shifts = Shifts.of(residual)
         if len(shifts) < _MIN_WINDOWS:
@@ -133,7 +136,7 @@ class DisplacementEstimator:
     def _field(self, shifts: "Shifts", smoothness: float) -> DisplacementField:
         return fitted_field(shifts, smoothness, self.lattice_px, self.size_px)
 
-    def _measure(self, moving: Raster, mapping: PixelMapping) -> Residual:
+    def _measure(self, moving: Raster, mapping: PixelMapping) -> Residual[FixedImagePx]:
         return self.windows.residuals(warped(moving, mapping, self.size_px), min_valid=1.0)
 
 
@@ -148,7 +151,7 @@ class Shifts:
     peak's height."""
 
     @classmethod
-    def of(cls, residual: Residual) -> "Shifts":
+    def of(cls, residual: Residual[FixedImagePx]) -> "Shifts":
         known = np.isfinite(residual.shifts_px[:, 0])
         sigma = residual.peaks_sigma[known]
         trust = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
@@ -169,13 +172,16 @@ class Shifts:
         return len(self.centres_px)
 
 
+_UNKNOWN_PX = FixedImagePx(math.nan)
+
+
 @dataclass(frozen=True)
 class _Gain:
     """The gain of a field on windows left out of its fit."""
 
     smoothness: float
-    before_p95_px: float = math.nan
-    after_p95_px: float = math.nan
+    before_p95_px: FixedImagePx = _UNKNOWN_PX
+    after_p95_px: FixedImagePx = _UNKNOWN_PX
     left: float = math.inf
     """Mean log(1 + (shift / 0.1 px)^2) of the remaining shifts, weighted by trust: wrong peaks and the edges of trees,
     which no smooth field follows, hardly count."""
@@ -198,7 +204,7 @@ def _gain_of(shifts: Shifts, left: NDArray[np.float64], smoothness: float) -> _G
     fall = np.minimum(before, maximum) ** 2 - np.minimum(after, maximum) ** 2
     sigma = fall.mean() / max(fall.std() / math.sqrt(len(fall)), 1e-12)
     left_over = float(np.average(np.log1p((after / _FAR_PX) ** 2), weights=shifts.trust[tried]))
-    before_p95, after_p95 = (float(np.percentile(lengths, 95)) for lengths in (before, after))
+    before_p95, after_p95 = (FixedImagePx(np.percentile(lengths, 95)) for lengths in (before, after))
     return _Gain(smoothness, before_p95, after_p95, left_over, float(sigma))
 
 
@@ -220,7 +226,7 @@ def _near(centres_px: Points, others_px: Points, apart_px: float) -> NDArray[np.
     return np.asarray(nearest < apart_px)
 
 
-def common_field(residuals: Sequence[Residual], size_px: tuple[int, int]) -> DisplacementField | None:
+def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int, int]) -> DisplacementField | None:
     """The smooth field that the windows of several captures have in common, on an image (width, height).
 
     None where it does not explain captures that are left out of its fit: the lenses are the same in all.

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Residual
 from agalign.values.geometry import Points
+from agalign.values.pixel_units import FixedFilePx
 
 _NEIGHBOURS = 8
 """Windows that the error at a place is estimated from, those nearer with more weight."""
@@ -16,7 +17,9 @@ _FAR_WINDOWS = 3.0
 """Distance from all windows, in units of their spacing, beyond which they do not show the ground."""
 
 
-def expected_error_px(alignment: Alignment, size_px: tuple[int, int], points_px: Points) -> NDArray[np.float64]:
+def expected_error_px(
+    alignment: Alignment[FixedFilePx], size_px: tuple[int, int], points_px: Points
+) -> NDArray[np.float64]:
     """Root mean square error to be expected at points (n, 2) of the reference (width, height), raw px, (n,).
 
         error^2 = trace of D(x) C D(x)^T + mean square of the windows around + (1 - near) p95^2
@@ -32,7 +35,9 @@ def expected_error_px(alignment: Alignment, size_px: tuple[int, int], points_px:
     return np.asarray(np.sqrt(square + _of_the_windows(residual, points_px)))
 
 
-def _of_the_mapping(alignment: Alignment, size_px: tuple[int, int], points_px: Points) -> NDArray[np.float64]:
+def _of_the_mapping(
+    alignment: Alignment[FixedFilePx], size_px: tuple[int, int], points_px: Points
+) -> NDArray[np.float64]:
     if alignment.status == "predicted" and alignment.prediction is not None:
         # A standard error is in px of the moving file.
         ratio = abs(float(geometry.local_scale(alignment.fixed_to_moving, *size_px)[-1]))
@@ -44,7 +49,7 @@ def _of_the_mapping(alignment: Alignment, size_px: tuple[int, int], points_px: P
     return np.asarray(np.einsum("nki,ij,nkj->n", over, joint.corner_covariance_px2, over))
 
 
-def _of_the_windows(residual: Residual, points_px: Points) -> NDArray[np.float64]:
+def _of_the_windows(residual: Residual[FixedFilePx], points_px: Points) -> NDArray[np.float64]:
     some = np.isfinite(residual.shifts_px[:, 0])
     centres, squares = residual.centres_px[some], (residual.shifts_px[some] ** 2).sum(axis=1)
     count = min(_NEIGHBOURS, len(centres))

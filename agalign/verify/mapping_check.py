@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 from agalign.values import geometry
 from agalign.values.issues import UNLIKE, Issue, IssueKind
+from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
 FOLDS = IssueKind("folds", "the mapping folds or stretches the image", UNLIKE)
@@ -11,7 +12,7 @@ _MAX_STRETCH = 4.0
 """Largest over smallest magnification within an image: more is a degenerate homography, not a perspective."""
 
 
-def _issues(evidence: Evidence) -> Iterator[Issue]:
+def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     scale = geometry.local_scale(evidence.joint.fixed_to_moving, *evidence.size_px)
     # Written so that nan does not pass.
     if not (scale.min() > 0 and scale.max() <= _MAX_STRETCH * scale.min()):

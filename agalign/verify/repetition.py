@@ -8,6 +8,7 @@ import numpy as np
 
 from agalign.pixels.structure import Field, correlation_surfaces
 from agalign.values.issues import Issue, IssueKind, Remedy
+from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
 REPEATS = IssueKind(
@@ -35,7 +36,7 @@ class AliasPeak:
     """Its height over that of the result's peak."""
 
 
-def _issues(evidence: Evidence) -> Iterator[Issue]:
+def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     """One where another place fits nearly as well and nothing known beforehand rules it out."""
     images = evidence.images
     if images is None:

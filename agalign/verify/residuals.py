@@ -11,6 +11,7 @@ from agalign.pixels.structure import Field, peak_positions, structure_field, whi
 from agalign.values.alignment import Residual
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import FixedImagePx, FixedPx
 
 _Origin = tuple[int, int]
 
@@ -42,7 +43,7 @@ class FixedWindows:
         self.origins, windows = self._strong(structure, origins if min(width, height) >= self.side else [])
         self.spectra = windowed_spectra(windows)
 
-    def residuals(self, moving: Raster, min_valid: float = _MIN_VALID) -> Residual:
+    def residuals(self, moving: Raster, min_valid: float = _MIN_VALID) -> Residual[FixedImagePx]:
         """The shift of each window's content, px; nan where no correlation peak stands out.
 
         Windows with a smaller share of valid pixels than `min_valid` are left out. An invalid area has no structure,
@@ -79,7 +80,7 @@ class FixedWindows:
         return [o for o, s in zip(origins, strong, strict=True) if s], cut
 
 
-def residual_under(residual: Residual, before: PixelMapping, after: PixelMapping) -> Residual:
+def residual_under(residual: Residual[FixedPx], before: PixelMapping, after: PixelMapping) -> Residual[FixedPx]:
     """The residual of windows measured under one mapping, as it is under another one that is all but equal.
 
     The content at p + s of the fixed image under `before` is at p + s - d under `after`, with before(p + s) =

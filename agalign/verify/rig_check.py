@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from agalign.values.issues import Issue, IssueKind, Remedy
+from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
 UNEXPECTED_PX = IssueKind(
@@ -18,7 +19,7 @@ _MAX_UNEXPECTED_STD = 5.0
 """The same in standard errors of the prediction, where these are large."""
 
 
-def _issues(evidence: Evidence) -> Iterator[Issue]:
+def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     prediction = evidence.prediction
     if prediction is None or prediction.off_px is None:
         return

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from agalign.values.alignment import Residual
 from agalign.values.geometry import Points
 from agalign.values.issues import TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
+from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
 _RELIEF = Remedy(
@@ -40,7 +41,7 @@ _NEIGHBOUR = 1.6
 """Distance of adjacent windows in units of their spacing: diagonal neighbours (1.41) count."""
 
 
-def _issues(evidence: Evidence) -> Iterator[Issue]:
+def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     residual = evidence.residual
     if len(residual.centres_px) < _MIN_WINDOWS:
         yield Issue(FEW_WINDOWS, len(residual.centres_px), _MIN_WINDOWS)
@@ -53,7 +54,7 @@ def _issues(evidence: Evidence) -> Iterator[Issue]:
         yield Issue(RESIDUAL_PX, residual.median_px, _MAX_MEDIAN_PX)
 
 
-def _issues_of_outliers(residual: Residual) -> Iterator[Issue]:
+def _issues_of_outliers(residual: Residual[FixedPx]) -> Iterator[Issue]:
     measured = np.isfinite(residual.shifts_px[:, 0])
     count = max(int(measured.sum()), 1)
     off = measured & (np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _CLOSE_PX)

@@ -31,6 +31,7 @@ from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import PixelScale
 from agalign.verify.residuals import FixedWindows
 from bands.score import Matrix
 
@@ -123,12 +124,12 @@ def ecc(fixed: Image, moving: Image) -> Matrix | None:
     for halvings in (3, 2, 1, 0):
         scale = 0.5**halvings
         small = [cv2.resize(e, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for e in edges]
-        start = geometry.rescale(matrix, (scale, scale), (scale, scale)).astype(np.float32)
+        start = geometry.rescale(matrix, PixelScale(scale, scale), PixelScale(scale, scale)).astype(np.float32)
         try:
             _, result = cv2.findTransformECC(small[0], small[1], start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
         except cv2.error:
             return None
-        matrix = geometry.rescale(result.astype(float), (1 / scale, 1 / scale), (1 / scale, 1 / scale))
+        matrix = geometry.rescale(result.astype(float), *(PixelScale(scale, scale).inverse,) * 2)
     return matrix
 
 
@@ -260,7 +261,9 @@ def _as_tensors(torch: Any, fixed: Image, moving: Image, longest_px: int) -> tup
 def _at_full_size(matrix: Matrix | None, fixed_scale: float, moving_scale: float) -> Matrix | None:
     if matrix is None:
         return None
-    return geometry.rescale(matrix, (1 / fixed_scale,) * 2, (1 / moving_scale,) * 2)
+    return geometry.rescale(
+        matrix, PixelScale(fixed_scale, fixed_scale).inverse, PixelScale(moving_scale, moving_scale).inverse
+    )
 
 
 _PLAIN: dict[str, Align] = {

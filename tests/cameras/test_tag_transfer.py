@@ -33,6 +33,7 @@ from agalign.pixels.raster import probe
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
+from agalign.values.pixel_units import PixelScale
 
 from .test_vendors import DJI, MICASENSE, SIZE, VENDORS, packet, write_capture
 
@@ -144,7 +145,7 @@ def carried(tmp_path: Path, vendor: str, file: str, reference: str, grid: Output
 
 
 def test_djis_geometry_is_the_references(tmp_path: Path) -> None:
-    grid = OutputGrid(20, 10, 200, 180, scale_xy=(2.0, 2.0))
+    grid = OutputGrid(20, 10, 200, 180, scale=PixelScale(2.0, 2.0))
     prefix = "DJI_20230607112233_0001_MS_"
     result = carried(tmp_path, "Mavic 3", f"{prefix}NIR.TIF", f"{prefix}G.TIF", grid)
     assert result.text(CAMERA, "BandName") == "NIR"
@@ -225,7 +226,7 @@ def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
     exif = {37386: rational(5.45)}
     add_directories(path, {271: text("MicaSense"), 700: byte_string(packet(values, "elements"))}, exif, {})
     (before,) = MicaSense().bands(path, read_tags(path), probe(path))
-    tags = band_tags(path, before, OutputGrid(40, 30, 200, 150, scale_xy=(2.0, 2.0)), lambda x, y: (x, y))
+    tags = band_tags(path, before, OutputGrid(40, 30, 200, 150, scale=PixelScale(2.0, 2.0)), lambda x, y: (x, y))
     out = tmp_path / "IMG_0002_2.tif"
     tifffile.imwrite(out, np.zeros((150, 200), np.uint16), photometric="minisblack", metadata=None)
     add_directories(out, tags.first, tags.exif, tags.gps)
@@ -251,7 +252,7 @@ def test_a_turned_principal_point_stays_on_its_pixel_at_any_resolution(tmp_path:
     """The centre of a pixel is at whole numbers: turned by 180 degrees, pixel p is size - 1 - p."""
     files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
     density, seen = 266.67, (80.0, 58.667)
-    result = carried(tmp_path, "Sequoia", *files, OutputGrid(0, 0, 320, 240, scale_xy=(2.0, 2.0)))
+    result = carried(tmp_path, "Sequoia", *files, OutputGrid(0, 0, 320, 240, scale=PixelScale(2.0, 2.0)))
     x, y = (v * 2 * density for v in result.numbers(CAMERA, "PrincipalPoint"))
     # Of an image of twice as many pixels: 2 (p + 0.5) - 0.5, whichever way it is seen.
     assert (x, y) == pytest.approx((2 * (seen[0] + 0.5) - 0.5, 2 * (seen[1] + 0.5) - 0.5), abs=0.02)

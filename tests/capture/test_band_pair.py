@@ -20,6 +20,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Band
 from agalign.values.image import Raster
+from agalign.values.pixel_units import PixelScale
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -113,7 +114,7 @@ def test_what_a_rig_misses_is_brought_to_px_of_the_reference(monkeypatch: pytest
     rig = Rig(size, {band: np.diag([0.1, 0.1, 1.0])}, {band: (1.0, 0.0)}, {}, {}, {}, (), (), {band: 0.5})
     monkeypatch.setattr(Rig, "missed_px", lambda *_, **__: 0.5)
     model = FlightModel(None, "", (band,), {}, "", rig)  # type: ignore[arg-type]
-    assert _known_to_px(band, model, (0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
+    assert _known_to_px(band, model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])

@@ -9,9 +9,10 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.verification import WarpedPair, verified, with_metrics
 from agalign.config import LocalSettings, Settings
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementField, DisplacementResult, JointResult, Residual, Seed
+from agalign.values.alignment import DisplacementField, DisplacementResult, JointResult, PairScales, Residual, Seed
 from agalign.values.image import Raster
 from agalign.values.issues import FEW_KEYPOINTS, Issue
+from agalign.values.pixel_units import PixelScale
 from agalign.verify.displacement_field import FINE
 
 from ..conftest import textured_image, textured_pair
@@ -93,7 +94,8 @@ def test_the_verdict_is_asked_again_under_a_local_field(pair: BandPair, monkeypa
 
 
 def test_residuals_of_a_reduced_image_are_given_in_px_of_the_file() -> None:
-    residual = Residual(np.array([[10.0, 20.0]]), np.array([[0.5, 0.0]]), 0.5, 0.5, 1.0).enlarged((4.0, 4.0))
+    at_quarter = PairScales(PixelScale(0.25, 0.25), PixelScale(0.25, 0.25))
+    residual = Residual.of(np.array([[10.0, 20.0]]), np.array([[0.5, 0.0]]), np.array([9.0])).in_file_px(at_quarter)
     np.testing.assert_allclose(residual.centres_px, [[41.5, 81.5]])
     assert (residual.median_px, residual.shifts_px[0, 0]) == (2.0, 2.0)
 

@@ -24,6 +24,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.mapping import mapping_of
+from agalign.values.pixel_units import PixelScale
 
 from ..conftest import textured_image
 
@@ -90,11 +91,11 @@ def test_a_finer_grid_has_the_same_outline_on_the_map() -> None:
     place = Georeference(transform, rasterio.CRS.from_epsg(32631).to_wkt())
     one = Band("a", Path("a"), 1, 100, 80, "uint8", georeference=place)
     pan = Band("pan", Path("b"), 1, 200, 160, "uint8")
-    seed = Seed("identity", geometry.resolution_change(2, 2), 0.0)
+    seed = Seed("identity", PixelScale(2.0, 2.0).matrix, 0.0)
     alignment = Alignment(seed.fixed_to_moving, "pixel", "aligned", (), seed, None, None, 0.0)
     capture = Capture("c", Path(), (one, pan), 0)
     layers, grid = output_layers(capture, {"pan": alignment}, WriteSettings(resolution="finest", crop="none"))
-    assert (grid.width, grid.height, grid.scale) == (200, 160, 2.0)
+    assert (grid.width, grid.height, grid.scale) == (200, 160, (2.0, 2.0))
     assert layers[1].mapping is not None
     np.testing.assert_allclose(layers[1].mapping(np.array([[10.0, 7.0]])), [[10.0, 7.0]], atol=1e-9)
     np.testing.assert_allclose(mapping_of(one, pan, alignment)(np.array([[0.0, 0.0]])), [[0.5, 0.5]])

@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose
 
 from agalign.errors import GeometryError
 from agalign.values import geometry
+from agalign.values.pixel_units import PixelScale
 
 small = st.floats(-0.2, 0.2)
 matrices = st.builds(
@@ -32,7 +33,7 @@ def test_compose_applies_the_last_first(one: np.ndarray, other: np.ndarray) -> N
 
 @given(matrices, st.sampled_from([0.25, 0.5, 2.0]), st.sampled_from([0.5, 1.0]))
 def test_rescale_commutes_with_resizing(matrix: np.ndarray, fixed_scale: float, moving_scale: float) -> None:
-    scaled = geometry.rescale(matrix, (fixed_scale, fixed_scale), (moving_scale, moving_scale))
+    scaled = geometry.rescale(matrix, PixelScale(fixed_scale, fixed_scale), PixelScale(moving_scale, moving_scale))
     small_points = (points + 0.5) * fixed_scale - 0.5
     expected = (geometry.apply(matrix, points) + 0.5) * moving_scale - 0.5
     assert_allclose(geometry.apply(scaled, small_points), expected, atol=1e-6)
@@ -40,7 +41,7 @@ def test_rescale_commutes_with_resizing(matrix: np.ndarray, fixed_scale: float, 
 
 def test_halving_keeps_the_outer_edges() -> None:
     # Edges of a 10 px row lie at -0.5 and 9.5; of its 5 px half at -0.5 and 4.5.
-    half = geometry.resolution_change(0.5, 0.5)
+    half = PixelScale(0.5, 0.5).matrix
     assert_allclose(geometry.apply(half, [[-0.5, -0.5], [9.5, 9.5]]), [[-0.5, -0.5], [4.5, 4.5]])
 
 

@@ -4,6 +4,7 @@ from numpy.testing import assert_allclose
 
 from agalign.values import lens
 from agalign.values.lens import Lens
+from agalign.values.pixel_units import PixelScale
 
 MODEL = Lens(1453.0, 1453.0, 652.0, 489.0, (-0.109, 0.156, -0.0003, 0.0005, -0.05))
 POINTS = np.random.default_rng(0).uniform((0, 0), (1279, 959), (200, 2))
@@ -27,7 +28,7 @@ def test_shapes_are_kept_and_no_lens_is_the_identity() -> None:
 
 
 def test_a_resized_image_has_a_resized_lens() -> None:
-    scale = (0.5, 0.25)
+    scale = PixelScale(0.5, 0.25)
     small = lens.rescaled(MODEL, scale)
     there = (lens.distort(MODEL, POINTS) + 0.5) * scale - 0.5
     assert_allclose(lens.distort(small, (POINTS + 0.5) * scale - 0.5), there, atol=1e-9)

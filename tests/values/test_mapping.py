@@ -4,6 +4,7 @@ from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.image import Tile
 from agalign.values.mapping import PixelMapping, splined
+from agalign.values.pixel_units import PixelScale
 
 H = np.array([[1.01, 0.02, 5.0], [-0.01, 0.99, -3.0], [1e-5, -2e-5, 1.0]])
 
@@ -23,7 +24,7 @@ def test_tiny_tiles() -> None:
 
 def test_rescaled_maps_the_same_ground() -> None:
     mapping = PixelMapping(H, cameras.BANDS[1].lens(1280, 960), cameras.BANDS[3].lens(1280, 960))
-    small = mapping.rescaled((0.5, 0.5), (0.25, 0.25))
+    small = mapping.rescaled(PixelScale(0.5, 0.5), PixelScale(0.25, 0.25))
     points = geometry.lattice(1280, 960, 7, 5)
     expected = (mapping(points) + 0.5) * 0.25 - 0.5
     np.testing.assert_allclose(small((points + 0.5) * 0.5 - 0.5), expected, atol=1e-6)

@@ -6,6 +6,7 @@ from agalign.values import geometry
 from agalign.values.alignment import DisplacementField, Residual
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 from agalign.verify import displacement_field
 from agalign.verify.displacement_field import Shifts, _folds, _Gain, _is_one_to_one, _near, common_field, fitted_field
 
@@ -87,7 +88,7 @@ def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:
     mapping = PixelMapping(geometry.translation(5, 3), local=field)
     points = geometry.lattice(*SIZE, 9, 7)
     np.testing.assert_allclose(mapping(points), points + field(points) + (5, 3))
-    twice = mapping.rescaled((2.0, 2.0), (1.0, 1.0))
+    twice = mapping.rescaled(PixelScale(2.0, 2.0), SAME_PIXELS)
     np.testing.assert_allclose(twice((points + 0.5) * 2 - 0.5), mapping(points), atol=1e-9)
     dense = mapping.positions(Tile(200, 150, 200, 150))
     direct = mapping(np.stack(np.meshgrid(np.arange(200, 400), np.arange(150, 300)), -1).astype(float))
