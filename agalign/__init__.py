@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     )
     from agalign.products.dataset import open_capture, open_flight
     from agalign.values.alignment import Alignment, Prediction, Residual, Seed
+    from agalign.values.pixel_units import FixedFilePx, FixedImagePx, MovingFilePx
 
 __all__ = [
     "AgalignError",
@@ -46,12 +47,15 @@ __all__ = [
     "CheckSettings",
     "ConfigurationError",
     "DiscoverOptions",
+    "FixedFilePx",
+    "FixedImagePx",
     "FlightSettings",
     "FolderScan",
     "GeometryError",
     "InputError",
     "JointSettings",
     "LocalSettings",
+    "MovingFilePx",
     "NoContrastError",
     "NoSuchBandError",
     "NotEnoughTextureError",
@@ -81,6 +85,7 @@ _OTHER_MODULES = {
     "agalign.cameras.discover": ("DiscoverOptions", "FolderScan", "discover"),
     "agalign.products.dataset": ("open_capture", "open_flight"),
     "agalign.values.alignment": ("Alignment", "Prediction", "Residual", "Seed"),
+    "agalign.values.pixel_units": ("FixedFilePx", "FixedImagePx", "MovingFilePx"),
 }
 """Where the public names are defined that are neither settings nor errors."""
 

@@ -113,9 +113,9 @@ def test_alignment_takes_one_thread_and_gives_the_others_back(monkeypatch: pytes
     seen = []
     real = joint.learn
 
-    def learn(*arguments: object) -> object:
+    def learn(*arguments: object, **options: object) -> object:
         seen.append(torch.get_num_threads())
-        return real(*arguments)
+        return real(*arguments, **options)
 
     monkeypatch.setattr(joint, "learn", learn)
     before = torch.get_num_threads()

@@ -10,7 +10,7 @@ import pytest
 
 import agalign
 from agalign import api, config, errors
-from agalign.values.issues import Issue
+from agalign.values.issues import BLANK_MOVING, Issue
 
 FUNCTIONS = {
     "align", "align_capture", "align_folder", "discover", "open_capture", "open_flight", "warp_onto",
@@ -21,6 +21,7 @@ SETTINGS = {
 OPTIONS_AND_RESULTS = {
     "Alignment", "CaptureReport", "DiscoverOptions", "FolderScan", "Prediction", "Residual", "RunOptions", "Seed",
 }  # fmt: skip
+UNITS = {"FixedFilePx", "FixedImagePx", "MovingFilePx"}
 ERRORS = {
     "AgalignError", "ConfigurationError", "GeometryError", "InputError", "NoContrastError", "NoSuchBandError",
     "NotEnoughTextureError", "OutputError", "SidecarError", "UnreadableFileError",
@@ -28,7 +29,7 @@ ERRORS = {
 
 
 def test_the_public_names() -> None:
-    names = FUNCTIONS | SETTINGS | OPTIONS_AND_RESULTS | ERRORS | {"__version__"}
+    names = FUNCTIONS | SETTINGS | OPTIONS_AND_RESULTS | UNITS | ERRORS | {"__version__"}
     assert set(agalign.__all__) == set(dir(agalign)) == names
     assert len(agalign.__all__) == len(names)
     for name in names:
@@ -72,6 +73,6 @@ def test_an_alignment_prints_one_short_line() -> None:
     residual = agalign.Residual(np.zeros((44, 2)), np.zeros((44, 2)), 0.0512, 0.1, 0.9)
     result = agalign.Alignment(np.eye(3), "pixel", "aligned", (), seed, None, residual, 1.0)
     assert repr(result) == "Alignment(status='aligned', residual_median_px=0.051, corner_std_px=None)"
-    failed = agalign.Alignment(np.eye(3), "pixel", "failed", (Issue("blank_moving"),), seed, None, None, 1.0)
+    failed = agalign.Alignment(np.eye(3), "pixel", "failed", (Issue(BLANK_MOVING),), seed, None, None, 1.0)
     assert repr(failed).startswith("Alignment(status='failed', residual_median_px=None, corner_std_px=None, reason='")
     assert "array" not in repr(failed)

@@ -9,6 +9,7 @@ from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.capture import band_pair
 from agalign.capture.align import align_capture_bands
 from agalign.capture.band_pair import BandPair, _known_to_px, longest_for, read_pairs
 from agalign.capture.prediction import observed
@@ -112,7 +113,7 @@ def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
 def test_what_a_rig_misses_is_brought_to_px_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     band, size = "LWIR", (800, 600)
     rig = Rig(size, {band: np.diag([0.1, 0.1, 1.0])}, {band: (1.0, 0.0)}, {}, {}, {}, (), (), {band: 0.5})
-    monkeypatch.setattr(Rig, "missed_px", lambda *_, **__: 0.5)
+    monkeypatch.setattr(band_pair, "unobserved_error_px", lambda *_, **__: 0.5)
     model = FlightModel(None, "", (band,), {}, "", rig)  # type: ignore[arg-type]
     assert _known_to_px(band, model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
 

@@ -10,7 +10,7 @@ from agalign.method.patches import Keypoints
 from agalign.method.refine import ReferencePatches, Solver, refine
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.image import Raster
-from agalign.values.issues import Issue
+from agalign.values.issues import CORNERS_UNKNOWN, Issue
 
 from ..conftest import textured_pair
 
@@ -64,4 +64,4 @@ def test_a_pair_whose_last_step_is_infinite_has_unknown_corners(monkeypatch: pyt
     valid = np.ones(fixed.shape, bool)
     state = JointState(JointSettings(device="cpu"), lambda *_: None)
     group = ImageGroup.of_one(Raster(fixed, valid), Raster(moving, valid), np.eye(3))
-    assert refine(state, state.fast_descriptor([1, 1]), group) == [Issue("corners_unknown")]
+    assert refine(state, state.fast_descriptor([1, 1]), group) == [Issue(CORNERS_UNKNOWN)]

@@ -18,6 +18,7 @@ from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import Interpolation
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import PixelScale
 
 from ..conftest import textured_image, textured_pair
 
@@ -177,7 +178,7 @@ def test_warped_shows_the_moving_image_on_the_fixed_grid() -> None:
     there = warped(moving, PixelMapping(shifted), fixed.size_px)
     inside = there.valid & fixed.valid
     assert np.corrcoef(fixed.pixels[inside], there.pixels[inside])[0, 1] < -0.9
-    half = warped(moving, PixelMapping(shifted), (200, 160), (0.5, 0.5))
+    half = warped(moving, PixelMapping(shifted), (200, 160), PixelScale(0.5, 0.5))
     assert half.size_px == (200, 160)
 
 
@@ -185,7 +186,7 @@ def test_an_identity_between_grids_of_two_scales_is_not_taken_for_nothing() -> N
     """The moving image has as many pixels as the reduced grid, and shows but a quarter of the fixed image."""
     image = textured_image(200, 160)
     moving = Raster(image, np.ones(image.shape, bool))
-    there = warped(moving, PixelMapping(np.eye(3)), (200, 160), (0.5, 0.5))
+    there = warped(moving, PixelMapping(np.eye(3)), (200, 160), PixelScale(0.5, 0.5))
     assert not there.valid[100:].any()
     assert there.valid[2:78, 2:98].all()
 
