@@ -37,10 +37,8 @@ from mutants import Mutant, sample
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("verify", "capture", "flight", "values")
 ELSEWHERE = {
-    "agalign/capture/align.py": ("tests/test_api.py", "tests/batch/test_flight.py"),
+    "agalign/capture/align.py": ("tests/test_api.py",),
     "agalign/capture/reference.py": ("tests/test_api.py",),
-    "agalign/flight/rig.py": ("tests/batch/test_flight.py",),
-    "agalign/flight/learn_rig.py": ("tests/batch/test_flight.py",),
     "agalign/flight/model.py": ("tests/batch/test_flight.py",),
     "agalign/values/alignment.py": ("tests/capture/test_band_pair.py", "tests/products/test_sidecar.py"),
     "agalign/values/capture.py": ("tests/cameras/test_cameras.py", "tests/cameras/test_discover.py"),

@@ -27,7 +27,7 @@ def test_a_dask_cluster_does_the_captures(flight: Path, tmp_path: Path, monkeypa
     alone = agalign.align_folder(flight.name, tmp_path / "alone", settings=SETTINGS)
     with dask_executor("local", 2) as executor:
         reports = run_flight(discover(flight), tmp_path / "out", SETTINGS, RunOptions(executor=executor))
-        workers_ = [p for p in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
+        workers_ = [p for p in psutil.Process().children(recursive=True) if is_worker(p)]
         assert len(workers_) == 2
         result = []
         for number, report in enumerate(reports):
@@ -38,6 +38,11 @@ def test_a_dask_cluster_does_the_captures(flight: Path, tmp_path: Path, monkeypa
     assert {r.label: r.result and without_seconds(r.result) for r in result} == {
         r.label: r.result and without_seconds(r.result) for r in alone
     }
+
+
+def is_worker(process: psutil.Process) -> bool:
+    """Dask names its workers where setproctitle is installed."""
+    return any(text in " ".join(process.cmdline()) for text in ("spawn_main", "dask worker"))
 
 
 def without_seconds(result: CaptureResult) -> CaptureResult:
