@@ -45,7 +45,7 @@ ELSEWHERE = {
     "agalign/values/issues.py": ("tests/verify/test_acceptance.py", "tests/products/test_failures.py"),
     "agalign/values/image.py": ("tests/pixels/test_masks.py", "tests/pixels/test_resample.py"),
     "agalign/values/mapping.py": ("tests/pixels/test_resample.py",),
-    "agalign/values/processes.py": ("tests/test_platforms.py", "tests/batch/test_workers.py"),
+    "agalign/values/processes.py": ("tests/test_platforms.py",),
     "agalign/values/text.py": ("tests/products/test_failures.py",),
 }
 """Modules whose behaviour is also tested outside tests/<package>; those tests run after the package's own."""

@@ -258,7 +258,7 @@ def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Ref
         pairs = known.loaded.pairs
         starts = list(zip(pairs, known.loaded.seeds, strict=True))
         result = verify_together(starts, known.results, model, settings)
-    pairs = [p for p in pairs if p.is_the_rigs]
+    pairs = [p for p in pairs if p.has_rig_pixels]
     in_file_px = {p.name: result[p.name].in_file_px(p.scales) for p in pairs}
     good = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
     return _Shown(observed(pairs, result, capture), good)
@@ -294,7 +294,7 @@ def _read(capture: Capture, bands: Sequence[str], settings: Settings, start: Fli
     except AgalignError:
         return None
     result = [
-        (p, seed) for p in pairs if p.is_the_rigs and isinstance(seed := find_seed(p, settings.seed, start), Seed)
+        (p, seed) for p in pairs if p.has_rig_pixels and isinstance(seed := find_seed(p, settings.seed, start), Seed)
     ]
     if not result:
         return None

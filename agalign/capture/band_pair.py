@@ -105,7 +105,7 @@ class BandPair:
         return "model" in self.known_to_px
 
     @property
-    def is_the_rigs(self) -> bool:
+    def has_rig_pixels(self) -> bool:
         """True where the homographies are between the same pixels as those of the flight's rig.
 
         These are undistorted where the lens of the reference is known.

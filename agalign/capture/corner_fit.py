@@ -10,7 +10,7 @@ from agalign.values.alignment import JointResult, Residual
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedPx
-from agalign.values.robust import cauchy_weights
+from agalign.values.robust import MAD_TO_STD, cauchy_weights
 
 Array = NDArray[np.float64]
 
@@ -78,15 +78,16 @@ def fit_corners(points_px: Array, shifts_px: Array, peaks_sigma: Array, size_px:
     Weights are the fourth power of the heights (n,) of the correlation peaks, and Cauchy's against outliers.
     """
     design = geometry.over_corners(points_px, *size_px)
-    trust, vote = (peaks_sigma / np.median(peaks_sigma)) ** 4, np.ones(len(shifts_px))
+    by_peak, robust = (peaks_sigma / np.median(peaks_sigma)) ** 4, np.ones(len(shifts_px))
     for _ in range(_REWEIGHTINGS):
-        weight = trust * vote
+        weight = by_peak * robust
         normal = np.einsum("n,nki,nkj->ij", weight, design, design)
         mean = np.linalg.lstsq(normal, np.einsum("n,nki,nk->i", weight, design, shifts_px), rcond=None)[0]
-        left = shifts_px - design @ mean
-        off = np.linalg.norm(left, axis=1)
-        vote = cauchy_weights(off, _SPREADS * max(1.4826 * float(np.median(off)), _MIN_SPREAD_PX))
-    score = np.einsum("n,nki,nk->ni", weight, design, left)
+        misfits_px = shifts_px - design @ mean
+        lengths_px = np.linalg.norm(misfits_px, axis=1)
+        spread_px = max(MAD_TO_STD * float(np.median(lengths_px)), _MIN_SPREAD_PX)
+        robust = cauchy_weights(lengths_px, _SPREADS * spread_px)
+    score = np.einsum("n,nki,nk->ni", weight, design, misfits_px)
     # Windows in a line agree, and do not determine the corners away from it.
     inverse = np.linalg.inv(normal + _UNKNOWN * np.trace(normal) * np.eye(8))
     disagreement = inverse @ (score.T @ score) @ inverse

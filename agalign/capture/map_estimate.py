@@ -127,7 +127,7 @@ def _of_windows(
 
 
 def _expectation(pair: BandPair, result: JointResult[FixedImagePx], rig: Rig | None) -> Expectation | None:
-    if rig is None or pair.name not in rig.mean or not pair.is_the_rigs:
+    if rig is None or pair.name not in rig.mean or not pair.has_rig_pixels:
         return None
     return expected_corners(rig, pair.name, pair.scales.between_files(result.fixed_to_moving)).rescaled(
         pair.scales.fixed

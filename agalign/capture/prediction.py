@@ -44,10 +44,10 @@ def with_predictions(
     A band whose result the rig rules out is not aligned either: in a repetitive scene the images agree whole periods
     away. A band whose image is evidently rotated or scaled does not belong to this rig, and keeps its result.
     """
-    known = observed([p for p in pairs if p.is_the_rigs], result, capture)
+    known = observed([p for p in pairs if p.has_rig_pixels], result, capture)
     checked = dict(result)
     for pair in pairs:
-        if pair.name in rig.mean and pair.is_the_rigs:
+        if pair.name in rig.mean and pair.has_rig_pixels:
             checked[pair.name] = _with_prediction(pair, result[pair.name], rig, known)
     return checked
 
@@ -85,11 +85,11 @@ def bands_to_learn(
     These have something in common with the reference, and the rig does not predict them to `accept_predicted_px`. A low
     capture shows much that the flight has not seen; water shows nothing, and the rig predicts blurred bands.
     """
-    known = observed([p for p in pairs if p.is_the_rigs and p.name in result], result, capture)
+    known = observed([p for p in pairs if p.has_rig_pixels and p.name in result], result, capture)
 
     def is_given_up(pair: BandPair) -> bool:
         tried = result.get(pair.name)
-        if tried is None or pair.name not in rig.mean or not pair.is_the_rigs:
+        if tried is None or pair.name not in rig.mean or not pair.has_rig_pixels:
             return False
         return predict_band(rig, pair.name, known).std_px <= accept_predicted_px or not _has_something_in_common(tried)
 

@@ -13,6 +13,7 @@ from agalign.flight.rig import FACTORS, Factor
 from agalign.values import geometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.pixel_units import MovingFilePx
+from agalign.values.robust import cauchy_weights
 
 Array = NDArray[np.float64]
 
@@ -59,7 +60,7 @@ def solve_factors(differences: Array, designs: Array, weights: Array, mask: Arra
         covariance = np.linalg.inv(np.einsum("cb,bif,big->cfg", w, x, x) + prior)
         result = np.einsum("cfg,cg->cf", covariance, np.einsum("cbi,big->cg", w[:, :, None] * y, x))
         squared_px2 = ((y - np.einsum("bif,cf->cbi", x, result)) ** 2).sum(axis=2)
-        robust = 1 / (1 + squared_px2 / _OUTLIER_PX**2)
+        robust = cauchy_weights(np.sqrt(squared_px2), _OUTLIER_PX)
     return result, covariance * np.outer(mask, mask)
 
 

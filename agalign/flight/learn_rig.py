@@ -20,6 +20,7 @@ from agalign.flight.factors import (
 from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import MovingFilePx
+from agalign.values.robust import cauchy_weights
 
 Array = NDArray[np.float64]
 
@@ -142,7 +143,7 @@ class _Table:
             # The mean is at the typical factors, even of a flight that was low here and there.
             result -= np.median(result[kept > 0], axis=0)
             # Captures far from typical factors are off by errors of the baselines: they count less for the means.
-            trust = 1 / (1 + (_LAYOUT_STD / MIN_STD_PX) ** 2 * (result[:, :3] ** 2).sum(axis=1))
+            trust = cauchy_weights(np.linalg.norm(result[:, :3], axis=1), MIN_STD_PX / _LAYOUT_STD)
             target = t if self.prior is None else self._without_delays(self.prior, delay, counts)
             each = [
                 _fit_band(self.differences[:, j], weights[:, j] * trust, result, target[j], delay[j], pull)

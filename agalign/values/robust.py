@@ -3,6 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+MAD_TO_STD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
 
 def cauchy_weights(residuals: ArrayLike, scale: float | NDArray[np.float64]) -> NDArray[np.float64]:
     """Cauchy weights 1 / (1 + (r / scale)^2), the shape of `residuals` (Holland & Welsch 1977).

@@ -21,7 +21,7 @@ from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
-from agalign.values.robust import cauchy_weights
+from agalign.values.robust import MAD_TO_STD, cauchy_weights
 from agalign.verify.residuals import FixedWindows
 
 
@@ -271,7 +271,7 @@ def fitted_field(shifts: Shifts, smoothness: float, lattice_px: int, size_px: tu
         weighted = design.T @ diags(shifts.trust * weight)
         nodes = splu((weighted @ design + penalty).tocsc()).solve(weighted @ shifts.shifts_px)
         off = np.linalg.norm(shifts.shifts_px - design @ nodes, axis=1)
-        spread = max(1.4826 * float(np.median(off)), _MIN_SPREAD_PX)
+        spread = max(MAD_TO_STD * float(np.median(off)), _MIN_SPREAD_PX)
         weight = cauchy_weights(off, _OUTLIER_SPREADS * spread)
     return DisplacementField(float(lattice_px), nodes.reshape(rows, columns, 2))
 
