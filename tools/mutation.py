@@ -2,14 +2,16 @@
 
     pip install "mutmut>=3.8,<4"
     python tools/mutation.py [--count 300] [--seed 0] [--packages verify capture flight values] [--list]
-                             [--results FILE [--resume] [--retry-survivors]] [--mypy]
+                             [--results FILE [--resume] [--retry-survivors]] [--max-test-seconds S] [--mypy]
 
 The mutants are a random sample of those that mutmut's operators make (mutants.py). Each one runs the tests of its
 package, first the file named after its module and then the fastest, and stops at the first failure. The work tree is
 not touched: two copies of it in a temporary folder take the mutants in turn. The libraries are imported once, and a
 process is forked for each mutant; this needs Linux or macOS. Results are appended to FILE, one JSON object a line; an
 interrupted run continues with `--resume`, and `--retry-survivors` also runs the survivors again, after tests were
-added. `--mypy` runs mypy on each survivor.
+added. With `--max-test-seconds`, a file of tests that takes longer on unchanged code runs only against the module that
+it is named after: faster, and a survivor may then be one that a slow test would detect. `--mypy` runs mypy on each
+survivor.
 """
 
 import argparse
@@ -17,6 +19,7 @@ import contextlib
 import importlib
 import importlib.util
 import json
+import math
 import os
 import shutil
 import signal
@@ -45,7 +48,6 @@ ELSEWHERE = {
     "agalign/values/issues.py": ("tests/verify/test_acceptance.py", "tests/products/test_failures.py"),
     "agalign/values/image.py": ("tests/pixels/test_masks.py", "tests/pixels/test_resample.py"),
     "agalign/values/mapping.py": ("tests/pixels/test_resample.py",),
-    "agalign/values/processes.py": ("tests/test_platforms.py",),
     "agalign/values/text.py": ("tests/products/test_failures.py",),
 }
 """Modules whose behaviour is also tested outside tests/<package>; those tests run after the package's own."""
@@ -72,12 +74,13 @@ class Result:
     seconds: float
 
 
-def tests_of(path: str, seconds: dict[str, float]) -> tuple[str, ...]:
+def files_with_tests(path: str, seconds: dict[str, float], max_seconds: float = math.inf) -> tuple[str, ...]:
     """The tests of a module, relative to the root: the file named after it, then the others of its package and those
-    elsewhere, the fastest first.
+    elsewhere that take up to `max_seconds`, the fastest first.
     """
     folder, own = ROOT / "tests" / Path(path).parts[1], f"test_{Path(path).name}"
     files = {*(p.relative_to(ROOT).as_posix() for p in folder.glob("test_*.py")), *ELSEWHERE.get(path, ())}
+    files = {f for f in files if Path(f).name == own or seconds.get(f, 0.0) <= max_seconds}
     return tuple(sorted(files, key=lambda f: (Path(f).name != own, seconds.get(f, 0.0), f)))
 
 
@@ -207,14 +210,15 @@ def _kill(pid: int) -> None:
         os.waitpid(pid, 0)
 
 
-def _durations(slots: list[Slot], mutants: list[Mutant]) -> dict[str, float]:
-    """Seconds that each file of tests takes on the unchanged code, which must pass."""
-    seconds = {}
-    files = sorted({file for m in mutants for file in tests_of(m.path, {})})
+def _durations(slots: list[Slot], mutants: list[Mutant], cache: Path) -> dict[str, float]:
+    """Seconds that each file of tests takes on the unchanged code, which must pass; those in `cache` are not run."""
+    seconds: dict[str, float] = json.loads(cache.read_text(encoding="utf-8")) if cache.is_file() else {}
+    files = sorted({file for m in mutants for file in files_with_tests(m.path, {})} - set(seconds))
     for run, status in run_all(slots, [Run(None, (file,), BASELINE_LIMIT_S) for file in files]):
         if status != "survived":
             sys.exit(f"{run.tests[0]} does not pass on the unchanged code")
         seconds[run.tests[0]] = run.seconds
+        cache.write_text(json.dumps(seconds), encoding="utf-8")
         print(f"unchanged  {run.seconds:5.1f} s {run.tests[0]}", flush=True)
     return seconds
 
@@ -240,6 +244,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--results", type=Path, metavar="FILE", default=Path("mutation.jsonl"))
     parser.add_argument("--resume", action="store_true", help="keep the results in FILE")
     parser.add_argument("--retry-survivors", action="store_true", help="the same, but run survivors again")
+    parser.add_argument("--max-test-seconds", type=float, default=math.inf, metavar="S")
     parser.add_argument("--mypy", action="store_true", help="run mypy on survivors")
     return parser.parse_args()
 
@@ -249,6 +254,8 @@ def _earlier(asked: argparse.Namespace) -> dict[str, Result]:
     lines: list[str] = []
     if (asked.resume or asked.retry_survivors) and asked.results.is_file():
         lines = asked.results.read_text(encoding="utf-8").splitlines()
+    else:
+        asked.results.with_suffix(".durations.json").unlink(missing_ok=True)
     kept = {r.key: r for r in (Result(**json.loads(line)) for line in lines)}
     if asked.retry_survivors:
         kept = {k: r for k, r in kept.items() if r.status == "killed"}
@@ -276,10 +283,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="agalign-mutation-") as folder:
         copies = [Slot(Path(folder).resolve() / name / "agalign") for name in ("0", "1", "mypy")]
         slots, for_mypy = copies[:2], copies[2]
-        durations = _durations(slots, todo)
+        durations = _durations(slots, todo, asked.results.with_suffix(".durations.json"))
         runs = []
         for m in todo:
-            tests = tests_of(m.path, durations)
+            tests = files_with_tests(m.path, durations, asked.max_test_seconds)
             runs.append(Run(m, tests, TIMEOUT_FACTOR * sum(durations[f] for f in tests) + TIMEOUT_S))
         for number, (run, status) in enumerate(run_all(slots, runs), start=1):
             seconds, m = round(run.seconds, 1), run.mutant

@@ -1,0 +1,100 @@
+"""The factors that the bands of a capture share, estimated from mappings that are known exactly."""
+
+import numpy as np
+import pytest
+
+from agalign.flight.factors import (
+    FACTOR_STD_PX,
+    affine_difference,
+    coordinates,
+    displaced,
+    distance_px,
+    factor_design,
+    factor_mask,
+    mapping_weight,
+    median_mapping,
+    solve_factors,
+)
+from agalign.values import geometry
+
+SIZE = 640, 480
+BASELINES = np.array([[0.6, 0.0], [0.0, 0.7], [-0.3, 0.2]])
+DELAYS = np.array([0.2, -0.5, 0.8])
+DESIGNS = np.stack([factor_design(t, d) for t, d in zip(BASELINES, DELAYS, strict=True)])
+ALL = factor_mask(("distance", "tilt", "motion"))
+
+
+def test_the_mask_has_the_columns_of_each_factor() -> None:
+    assert factor_mask(()).tolist() == [0] * 5
+    assert factor_mask(("distance",)).tolist() == [1, 0, 0, 0, 0]
+    assert factor_mask(("tilt", "motion")).tolist() == [0, 1, 1, 1, 1]
+    assert factor_mask(("reference",)).tolist() == [0, 0, 0, 1, 1]
+
+
+def test_a_design_moves_a_band_along_its_baseline_and_by_its_delay() -> None:
+    change = factor_design(np.array([0.6, -0.8]), 0.5) @ np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    np.testing.assert_allclose(change, [[0.6 + 0.5 * 4, 1.2, 1.8], [-0.8 + 0.5 * 5, -1.6, -2.4]])
+
+
+def test_the_coordinates_have_mean_0_and_variance_1() -> None:
+    g = coordinates(SIZE)
+    np.testing.assert_array_equal(g[:, 0], 1.0)
+    np.testing.assert_allclose(g[:, 1:].mean(axis=0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(g[:, 1:].std(axis=0), 1.0)
+    centre = coordinates(SIZE, np.array([[319.5, 239.5]]))
+    np.testing.assert_allclose(centre, [[1.0, 0.0, 0.0]], atol=1e-12)
+
+
+def test_a_displaced_mapping_differs_by_its_coefficients() -> None:
+    mean = geometry.normalised([[1.01, 0.02, 5.0], [-0.01, 0.99, -3.0], [0.0, 0.0, 1.0]])
+    coefficients = np.array([[2.0, 0.3, -0.1], [-1.0, 0.2, 0.4]])
+    moved = displaced(mean, coefficients, SIZE)
+    np.testing.assert_allclose(affine_difference(mean, moved, SIZE), coefficients, atol=1e-5)
+    # The columns of g are orthonormal in the mean: the norm is the root mean square distance.
+    assert distance_px(mean, moved, SIZE) == pytest.approx(np.linalg.norm(coefficients), rel=1e-6)
+    assert distance_px(mean, mean, SIZE) == 0
+
+
+def test_the_median_mapping_ignores_one_that_is_wrong() -> None:
+    matrices = [geometry.translation(x, 2.0) for x in (3.0, 3.0, 90.0)]
+    np.testing.assert_allclose(median_mapping(matrices, SIZE), geometry.translation(3.0, 2.0), atol=1e-6)
+    assert median_mapping(matrices[2:], SIZE) is matrices[2]
+
+
+def test_factors_are_recovered_from_all_bands() -> None:
+    factors = np.array([[3.0, 0.5, -0.4, 2.0, -1.0], [-6.0, 0.0, 0.2, 0.0, 0.5]])
+    differences = np.einsum("bakf,cf->cbak", DESIGNS, factors)
+    weights = np.full((2, 3), 1 / 0.01**2)
+    result, covariance = solve_factors(differences, DESIGNS, weights, ALL)
+    np.testing.assert_allclose(result, factors, atol=2e-3)
+    x = DESIGNS.reshape(3, 6, 5)
+    normal = 1 / 0.01**2 * np.einsum("bif,big->fg", x, x) + np.diag(1 / np.square(FACTOR_STD_PX))
+    np.testing.assert_allclose(covariance[0], np.linalg.inv(normal), rtol=1e-3)
+
+
+def test_factors_that_do_not_count_are_0_and_certain() -> None:
+    differences = np.einsum("bakf,cf->cbak", DESIGNS, np.array([[3.0, 0, 0, 0, 0]]))
+    result, covariance = solve_factors(differences, DESIGNS, np.full((1, 3), 1e4), factor_mask(("distance",)))
+    assert result[0, 0] == pytest.approx(3.0, abs=1e-3)
+    assert not result[0, 1:].any()
+    assert not covariance[0, 1:].any()
+    assert covariance[0, 0, 0] > 0
+
+
+def test_one_band_that_disagrees_hardly_moves_the_factors() -> None:
+    factors = np.array([[3.0, 0.0, 0.0, 0.0, 0.0]])
+    differences = np.einsum("bakf,cf->cbak", DESIGNS, factors)
+    differences[0, 2, :, 0] += 5.0
+    result, _ = solve_factors(differences, DESIGNS, np.full((1, 3), 1e3), factor_mask(("distance",)))
+    assert result[0, 0] == pytest.approx(3.0, abs=0.1)
+
+
+def test_without_any_band_the_factors_are_the_prior() -> None:
+    result, covariance = solve_factors(np.zeros((1, 0, 2, 3)), np.zeros((0, 2, 3, 5)), np.zeros((1, 0)), ALL)
+    np.testing.assert_array_equal(result, 0.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance[0])), FACTOR_STD_PX)
+
+
+def test_a_weight_is_the_inverse_of_all_variances() -> None:
+    assert mapping_weight(0.3, 0.4) == pytest.approx(1 / (0.3**2 + 0.4**2 + 0.05**2))
+    assert mapping_weight(0.0) == pytest.approx(400.0)

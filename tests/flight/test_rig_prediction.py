@@ -1,0 +1,205 @@
+"""Predictions of a rig that is written down by hand: each term of their errors by itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agalign.flight.factors import displaced, distance_px
+from agalign.flight.rig import CaptureFactors, Observation, Rig
+from agalign.flight.rig_prediction import (
+    band_design,
+    band_summaries,
+    expected_corners,
+    extreme_mappings,
+    interpolated_in_height,
+    interpolated_in_time,
+    predict_band,
+    regressed_on_motion,
+    unobserved_error_px,
+)
+from agalign.values import geometry
+from agalign.values.pixel_units import MovingFilePx
+
+SIZE = 640, 480
+FROM_BANDS_PX = MovingFilePx(0.1)
+
+
+def capture(
+    distance_px: float, seconds: float | None = None, altitude_m: float | None = None,
+    motion: tuple[float, float] | None = None, steps_px: tuple[float, float] = (0.0, 0.0),
+) -> CaptureFactors:  # fmt: skip
+    return CaptureFactors(seconds, altitude_m, motion, (distance_px, 0.0, 0.0, *steps_px))
+
+
+def rig(*captures: CaptureFactors, baseline_std: float = 0.0) -> Rig:
+    """Two bands with baselines along x and y; only the distance counts."""
+    bands = ("Red", "NIR")
+    return Rig(
+        SIZE, {"Red": geometry.translation(30, -5), "NIR": geometry.translation(-12, 8)},
+        {"Red": (0.6, 0.0), "NIR": (0.0, 0.8)}, {"Red": 1.0, "NIR": 0.5}, dict.fromkeys(bands, baseline_std),
+        dict.fromkeys(bands, (0.0,) * 5), ("distance",), captures, dict.fromkeys(bands, FROM_BANDS_PX),
+    )  # fmt: skip
+
+
+def showing(rig: Rig, band: str, distance_px: float, std_px: float = 0.01) -> Observation:
+    factors = np.array([distance_px, 0, 0, 0, 0])
+    mapping = displaced(rig.mean[band], band_design(rig, band) @ factors, SIZE)
+    return Observation(None, {band: mapping}, {band: MovingFilePx(std_px)})
+
+
+def test_a_band_moves_along_its_baseline_with_the_other_band() -> None:
+    some = rig(capture(1.0), capture(-1.0), capture(0.0))
+    predicted = predict_band(some, "NIR", showing(some, "Red", 2.0))
+    assert predicted.source == "bands"
+    # The factor's prior is wide: it pulls by a thousandth.
+    assert distance_px(predicted.fixed_to_moving, geometry.translation(-12, 8 + 0.8 * 2.0), SIZE) < 0.01
+
+
+def test_the_mean_square_of_few_captures_is_inflated() -> None:
+    some = rig(capture(1.0), capture(-1.0), capture(2.0))
+    error_px = predict_band(some, "Red", Observation(None, {}, {})).std_px
+    mean_square = 0.6**2 * (1 + 1 + 4) / 3
+    assert error_px == pytest.approx(np.sqrt((3 + 1) / (3 - 1) * mean_square + FROM_BANDS_PX**2))
+
+
+def test_factors_beyond_those_learned_add_the_error_of_the_baseline() -> None:
+    captures = capture(1.0), capture(-1.0), capture(2.0)
+    exact, rough = rig(*captures), rig(*captures, baseline_std=0.05)
+    far, near = showing(exact, "Red", 10.0), showing(exact, "Red", 1.0)
+    excess = predict_band(rough, "NIR", far).std_px ** 2 - predict_band(exact, "NIR", far).std_px ** 2
+    assert excess == pytest.approx(2 * 0.05**2 * (10.0**2 - 2.0), rel=0.01)
+    assert predict_band(rough, "NIR", near).std_px == predict_band(exact, "NIR", near).std_px
+
+
+def test_an_uncertain_mapping_makes_the_prediction_uncertain() -> None:
+    some = rig(capture(1.0), capture(-1.0), capture(0.0))
+    sure = predict_band(some, "NIR", showing(some, "Red", 1.0, std_px=0.05)).std_px
+    unsure = predict_band(some, "NIR", showing(some, "Red", 1.0, std_px=1.0)).std_px
+    # One px of Red, of which a factor moves it by 0.6, moves NIR by 0.8 / 0.6 of that.
+    assert sure < 0.2
+    assert unsure == pytest.approx(0.8 / 0.6 / np.sqrt(2), rel=0.5)
+
+
+def test_bands_that_leave_more_than_usual_make_the_prediction_uncertain() -> None:
+    some = rig(capture(1.0), capture(-1.0), capture(0.0))
+    known = showing(some, "Red", 1.0)
+    across = geometry.compose(geometry.translation(0.0, 3.0), known.mappings["Red"])
+    disagreeing = replace(known, mappings={"Red": across})
+    usual, unusual = (predict_band(some, "NIR", k).std_px for k in (known, disagreeing))
+    assert usual < 0.2
+    # The excess itself, and a factor that is less certain as the band's weight falls.
+    assert np.sqrt(3.0**2 - FROM_BANDS_PX**2) < unusual < 3.6
+
+
+def test_without_factors_every_capture_is_the_mean() -> None:
+    still = replace(rig(capture(1.0), capture(-1.0), capture(0.0)), factors=())
+    known = showing(rig(), "Red", 0.0)
+    predicted = predict_band(still, "NIR", known)
+    assert predicted.source == "flight"
+    np.testing.assert_array_equal(predicted.fixed_to_moving, still.mean["NIR"])
+    assert predicted.std_px == pytest.approx(FROM_BANDS_PX, rel=0.05)
+
+
+def test_errors_of_unobserved_captures() -> None:
+    line = rig(*(capture(float(k), seconds=10.0 * k) for k in range(5)))
+    squares = [0.6**2 * k**2 for k in range(5)]
+    expected = np.sqrt(np.mean(squares) + FROM_BANDS_PX**2)
+    assert unobserved_error_px(line, "Red", by_neighbours=False) == pytest.approx(expected)
+    # Between neighbours a line is exact; its ends take their neighbour's factors.
+    expected = np.sqrt(0.6**2 * (1 + 0 + 0 + 0 + 1) / 5 + FROM_BANDS_PX**2)
+    assert unobserved_error_px(line, "Red", by_neighbours=True) == pytest.approx(expected)
+
+
+def test_factors_are_interpolated_in_time_with_the_error_of_a_random_walk() -> None:
+    known = [capture(4.0, seconds=30.0), capture(0.0, seconds=10.0)]
+    guess = interpolated_in_time(capture(0.0, seconds=15.0), known)
+    assert guess is not None
+    assert guess.factors[0] == pytest.approx(1.0)
+    assert guess.gap == pytest.approx(5.0)
+    assert guess.std[0] == pytest.approx(4.0 * np.sqrt(0.25 * 0.75))
+    before = interpolated_in_time(capture(0.0, seconds=0.0), known)
+    assert before is not None
+    assert (before.factors[0], before.gap, before.std[0]) == (0.0, 10.0, 0.0)
+    assert interpolated_in_time(capture(0.0), known) is None
+
+
+def test_the_distance_is_interpolated_in_height_and_the_rest_in_time() -> None:
+    known = [
+        capture(2.0 * k, seconds=float(k), altitude_m=50.0 + k, steps_px=(float(k), 0.0)) for k in range(3)
+    ]  # fmt: skip
+    guess = interpolated_in_height(capture(0.0, seconds=2.0, altitude_m=50.5), known)
+    assert guess is not None
+    assert guess.factors[0] == pytest.approx(1.0)
+    assert guess.factors[3] == pytest.approx(2.0)
+    assert guess.gap == pytest.approx(0.5)
+    assert guess.std[0] == pytest.approx(2.0 * 0.5)
+    assert interpolated_in_height(capture(0.0, altitude_m=50.5), known[:2]) is None
+    assert interpolated_in_height(capture(0.0, seconds=1.0), known) is None
+
+
+def test_steps_are_a_linear_function_of_the_motion() -> None:
+    known = [capture(7.0, 0.0, motion=(x, y), steps_px=(1 + 2 * x, 3 * y)) for x, y in ((0, 0), (1, 0), (0, 1), (2, 2))]
+    guess = regressed_on_motion(capture(0.0, 0.0, motion=(3.0, 1.0)), known)
+    assert guess is not None
+    np.testing.assert_allclose(guess.factors, [7.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
+    assert guess.gap == pytest.approx(np.sqrt(2))
+    np.testing.assert_array_equal(guess.std[3:], 0.0)
+    assert regressed_on_motion(capture(0.0, motion=(1.0, 1.0)), known[:2]) is None
+    assert regressed_on_motion(capture(0.0), known) is None
+
+
+def test_an_altitude_that_no_capture_has_adds_the_error_of_a_climb() -> None:
+    captures = [capture(0.5 * k, altitude_m=60.0 + k) for k in range(3)]
+    here = predict_band(rig(*captures), "Red", Observation(None, {}, {}, altitude_m=61.0)).std_px
+    above = predict_band(rig(*captures), "Red", Observation(None, {}, {}, altitude_m=66.0)).std_px
+    # Precision of the slope: the prior's, and three altitudes a metre apart with at least 0.5 px of scatter.
+    slope_std = 1 / np.sqrt(1 / 1.5**2 + 2 / 0.5**2)
+    climb_px = 0.6 * 4 * (slope_std + 0.5)
+    assert np.sqrt(above**2 - here**2) == pytest.approx(climb_px, rel=1e-6)
+
+
+def test_with_few_captures_there_is_no_choice_of_guesses() -> None:
+    """Heights would tell these captures exactly; with five of them that may be chance."""
+    captures = [capture(float(k % 3), seconds=float(k * 7 % 6), altitude_m=50.0 + k % 3) for k in range(6)]
+    known = Observation(2.5, {}, {}, altitude_m=51.0)
+    assert predict_band(rig(*captures), "NIR", known).source == "neighbours"
+    six = predict_band(rig(*captures), "NIR", known).std_px
+    five = predict_band(rig(*captures[:5]), "NIR", known).std_px
+    assert six < 0.5 * five
+
+
+def test_expected_corners_are_those_of_the_rig_from_any_mapping() -> None:
+    some = rig(capture(1.0), capture(-1.0), capture(0.0))
+    expectation = expected_corners(some, "Red", geometry.translation(28, -5))
+    np.testing.assert_allclose(expectation.corners, [2.0, 0.0] * 4, atol=1e-9)
+    np.testing.assert_allclose(expectation.by_factor[:, 0], [0.6, 0.0] * 4, atol=1e-9)
+    assert not expectation.by_factor[:, 3:].any()
+    points = geometry.lattice(*SIZE, 7, 5)
+    over = geometry.over_corners(points, *SIZE)
+    squares = np.einsum("nki,ij,nkj->n", over, expectation.covariance, over)
+    assert squares.mean() == pytest.approx(FROM_BANDS_PX**2)
+    double = expectation.rescaled((2.0, 3.0))
+    np.testing.assert_allclose(double.corners, [4.0, 0.0] * 4, atol=1e-9)
+    np.testing.assert_allclose(double.by_factor[0::2, 0], 1.2)
+    up = np.diag([2.0, 3.0] * 4)
+    np.testing.assert_allclose(double.covariance, up @ expectation.covariance @ up)
+
+
+def test_the_extremes_leave_out_a_capture_unlike_all_others() -> None:
+    captures = [capture(d) for d in (-2.0, 0.5, 3.0, 1.0, 100.0)]
+    ends = extreme_mappings(rig(*captures), "Red")
+    offsets = sorted(round(float(m[0, 2]), 6) for m in ends)
+    # The factors that do not count are the same in all captures: their ends are the first of these.
+    assert offsets == [pytest.approx(30 - 0.6 * 2), pytest.approx(30 + 0.6 * 3)]
+    assert len(extreme_mappings(replace(rig(*captures), factors=()), "Red")) == 1
+
+
+def test_the_summary_has_the_offset_of_the_centre_and_the_errors() -> None:
+    red, nir = band_summaries(rig(*(capture(float(k), seconds=float(k)) for k in range(4))))
+    assert (red["band"], nir["band"]) == ("Red", "NIR")
+    assert red["offset_px"] == pytest.approx([30, -5])
+    assert red["baseline"] == (0.6, 0.0)
+    assert red["from_bands_px"] == FROM_BANDS_PX
+    assert red["from_neighbours_px"] < red["from_flight_px"]
+    assert red["field_px"] is None
