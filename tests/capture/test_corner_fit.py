@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from agalign.capture.corner_fit import corner_correction
+from agalign.capture.corner_fit import corner_correction, fit_corners
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementField, Residual
 from agalign.values.mapping import PixelMapping
@@ -39,3 +39,36 @@ def test_what_all_windows_share_is_part_of_the_uncertainty() -> None:
 def test_too_few_windows_correct_nothing() -> None:
     assert corner_correction(PixelMapping(np.eye(3)), residual((1.0, 0.0), 5, 3), SIZE) is None
     assert corner_correction(PixelMapping(np.eye(3)), residual((1.0, 0.0), 4, 4), SIZE) is not None
+
+
+def test_windows_with_a_wrong_peak_do_not_move_the_corners() -> None:
+    some = residual((0.4, -0.2))
+    shifts = some.shifts_px + np.random.default_rng(0).normal(0, 0.03, some.shifts_px.shape)
+    clean = fit_corners(some.centres_px, shifts, some.peaks_sigma, SIZE)
+    wrong = shifts.copy()
+    wrong[np.random.default_rng(1).permutation(48)[:10]] += (6.0, -3.0)
+    fit = fit_corners(some.centres_px, wrong, some.peaks_sigma, SIZE)
+    np.testing.assert_allclose(fit.mean_px, np.tile([0.4, -0.2], 4), atol=0.08)
+    np.testing.assert_allclose(clean.mean_px, np.tile([0.4, -0.2], 4), atol=0.05)
+    # A fifth of the windows less: the corners are less certain.
+    assert np.trace(fit.covariance_px2) > np.trace(clean.covariance_px2)
+
+
+def test_windows_with_low_peaks_hardly_count() -> None:
+    some = residual((0.0, 0.0), 16, 12)
+    shifts, peaks = some.shifts_px.copy(), some.peaks_sigma.copy()
+    low = np.random.default_rng(2).permutation(192)[:96]
+    shifts[low] = (0.1, 0.0)
+    peaks[low] = 10.0
+    fit = fit_corners(some.centres_px, shifts, peaks, SIZE)
+    # Half the height, a sixteenth of the weight.
+    np.testing.assert_allclose(fit.mean_px[0::2].mean(), 0.1 / 17, atol=0.002)
+
+
+def test_the_covariance_is_what_repeated_fits_scatter_by() -> None:
+    rng = np.random.default_rng(3)
+    some = residual((0.0, 0.0), 16, 12)
+    fits = [fit_corners(some.centres_px, rng.normal(0, 0.1, (192, 2)), some.peaks_sigma, SIZE) for _ in range(200)]
+    scatter = np.cov(np.stack([f.mean_px for f in fits]).T)
+    expected = np.mean([f.covariance_px2 for f in fits], axis=0) - 0.01**2 * np.eye(8)
+    np.testing.assert_allclose(np.sqrt(np.diag(scatter)), np.sqrt(np.diag(expected)), rtol=0.25)

@@ -107,3 +107,103 @@ def test_windows_that_could_not_be_measured_are_no_tail() -> None:
     residual = windows(np.zeros((9, 12), bool))
     residual.shifts_px[:20] = np.nan
     assert kinds(residual=residual) == []
+
+
+def shifted(count_off: int, off_px: float, total: int = 100, spacing_px: float = 100.0) -> Residual:
+    """Windows in a row, of which some at scattered places are off."""
+    centres = np.stack([np.arange(total) * spacing_px, np.zeros(total)], axis=1)
+    shifts = np.zeros((total, 2))
+    shifts[: 3 * count_off : 3, 0] = off_px
+    return Residual(centres, shifts, 0.0, 0.0, 1.0)
+
+
+def at_limits(**changes: float) -> Residual:
+    return replace(GOOD_RESIDUAL, **changes)
+
+
+@pytest.mark.parametrize(
+    ("within", "beyond", "code", "value", "limit"),
+    [
+        (at_limits(coverage=0.6), at_limits(coverage=0.59), "coverage", 0.59, 0.6),
+        (at_limits(median_px=1.0), at_limits(median_px=1.01), "residual_px", 1.01, 1.0),
+        (shifted(0, 0.0, 4), shifted(0, 0.0, 3), "few_windows", 3, 4),
+    ],
+)  # fmt: skip
+def test_windows_pass_at_their_limits(
+    within: Residual, beyond: Residual, code: str, value: float, limit: float
+) -> None:  # fmt: skip
+    assert issues_of(Evidence(GOOD_JOINT, within, SIZE)) == ()
+    (issue,) = issues_of(Evidence(GOOD_JOINT, beyond, SIZE))
+    assert (issue.code, issue.value, issue.limit) == (code, value, limit)
+
+
+@pytest.mark.parametrize(
+    ("within", "beyond", "code", "value", "limit"),
+    [
+        ({"retrieval": 0.2}, {"retrieval": 0.19}, "retrieval", 0.19, 0.2),
+        ({"retrieval": 0.5, "chance": 0.1}, {"retrieval": 0.49, "chance": 0.1}, "retrieval", 0.49, 0.5),
+        ({"corner_std_xy_px": ((2.0, 0.0),)}, {"corner_std_xy_px": ((2.01, 0.0),)}, "corner_std_px", 2.01, 2.0),
+        ({"fixed_to_moving": geometry.normalised(np.diag([2.0, 0.5, 1.0]))},
+         {"fixed_to_moving": np.array([[1, 0, 0], [0, 1, 0], [-5e-4, 0, 1.0]])}, "folds", None, 4.0),
+    ],
+)  # fmt: skip
+def test_results_pass_at_their_limits(
+    within: dict[str, object], beyond: dict[str, object], code: str, value: float | None, limit: float
+) -> None:
+    assert issues_of(Evidence(replace(GOOD_JOINT, **within), GOOD_RESIDUAL, SIZE)) == ()  # type: ignore[arg-type]
+    joint = replace(GOOD_JOINT, **beyond)  # type: ignore[arg-type]
+    (issue,) = issues_of(Evidence(joint, GOOD_RESIDUAL, SIZE))
+    assert (issue.code, issue.limit) == (code, limit)
+    scale = geometry.local_scale(joint.fixed_to_moving, *SIZE)
+    assert issue.value == pytest.approx(scale.max() / scale.min() if value is None else value)
+
+
+def test_nine_in_ten_windows_must_be_close() -> None:
+    assert kinds(residual=shifted(10, 1.5)) == []
+    assert kinds(residual=shifted(11, 1.5)) == ["close_windows"]
+    assert kinds(residual=shifted(11, 1.0)) == []
+    (issue,) = issues_of(Evidence(GOOD_JOINT, shifted(11, 1.5), SIZE))
+    assert (issue.value, issue.limit, issue.detail) == (pytest.approx(0.89), 0.9, "1 px")
+
+
+@pytest.mark.parametrize(("total", "allowed"), [(100, 4), (125, 4), (150, 5), (200, 7)])
+def test_the_windows_of_a_cluster_are_counted(total: int, allowed: int) -> None:
+    """Five adjacent windows, or a twenty-fifth of those measured where that is more."""
+    for count in (allowed, allowed + 1):
+        residual = shifted(0, 0.0, total)
+        residual.shifts_px[10 : 10 + count, 0] = 2.0
+        assert kinds(residual=residual) == ([] if count == allowed else ["cluster"]), (total, count)
+
+
+def test_windows_a_gap_apart_are_no_cluster() -> None:
+    residual = shifted(0, 0.0)
+    residual.shifts_px[10:20:2, 0] = 2.0
+    assert kinds(residual=residual) == []
+
+
+@pytest.mark.parametrize(
+    ("coverage", "median_px", "status"),
+    [(0.3, 8.0, "seed_only"), (0.29, 8.0, "failed"), (0.3, 8.1, "failed")],
+)  # fmt: skip
+def test_a_seed_is_used_up_to_its_limits(coverage: float, median_px: float, status: str) -> None:
+    residual = at_limits(coverage=coverage, median_px=median_px)
+    assert status_of((Issue(RETRIEVAL, 0.1, 0.2),), residual, seed=True) == status
+    assert status_of((Issue(RETRIEVAL, 0.1, 0.2),), residual, seed=False) == "failed"
+
+
+@pytest.mark.parametrize("magnification", [0.5, 1.0, 3.0])
+def test_an_input_is_unchanged_within_px_of_the_fixed_image_at_any_scale(magnification: float) -> None:
+    given = np.diag([magnification, magnification, 1.0])
+    uncertain = replace(GOOD_JOINT, corner_std_xy_px=((0.5, 0.5),) * 4)
+    for shift_px, expected in ((0.24, True), (0.26, False)):
+        result = replace(uncertain, fixed_to_moving=geometry.compose(given, geometry.translation(shift_px, 0.0)))
+        assert is_unchanged(result, given, SIZE) == expected
+
+
+def test_an_input_is_unchanged_within_three_standard_errors() -> None:
+    certain = replace(GOOD_JOINT, corner_std_xy_px=((0.03, 0.0),) * 4)
+    for shift_px, expected in ((0.089, True), (0.091, False)):
+        assert (
+            is_unchanged(replace(certain, fixed_to_moving=geometry.translation(shift_px, 0)), np.eye(3), SIZE)
+            == expected
+        )
