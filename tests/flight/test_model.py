@@ -1,0 +1,140 @@
+"""The file of a model: what is written is read back, and what is damaged is refused with the file's name."""
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+
+from agalign.errors import InputError
+from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.flight.rig import CaptureFactors, Rig
+from agalign.flight.rig_file import read_rig
+from agalign.method.descriptor import Descriptor
+from agalign.values import geometry
+from agalign.values.alignment import DisplacementField
+from agalign.values.pixel_units import MovingFilePx
+
+FIELD = DisplacementField(48.0, np.arange(24.0).reshape(3, 4, 2) / 100)
+
+
+def cpu() -> torch.device:
+    return torch.device("cpu")
+
+
+@pytest.fixture
+def model() -> FlightModel:
+    torch.manual_seed(0)
+    net = Descriptor("pseudo-siamese", [1, 1, 1], half_rectified=True, unit_length=True)
+    captures = tuple(CaptureFactors(float(k), None, (0.1, 0.2), (float(k), 0.0, 0.0, 0.0, 0.0)) for k in range(3))
+    rig = Rig(
+        (640, 480), {"Red": geometry.translation(3, 4)}, {"Red": (1.0, 0.0)}, {"Red": 0.5}, {"Red": 0.01},
+        {"Red": (0.0,) * 5}, ("distance",), captures, {"Red": MovingFilePx(0.1)}, {"Red": FIELD},
+    )  # fmt: skip
+    mappings = {"Red": geometry.translation(3, 4), "NIR": geometry.translation(-1, 2)}
+    return FlightModel(net, "Maker Model 1 [Green 640x480]", ("Red", "NIR"), mappings, "abc", rig)
+
+
+def test_a_model_is_read_back_as_it_was_written(model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    again = load_model(path, cpu)
+    assert (again.camera, again.bands, again.fingerprint) == (model.camera, model.bands, model.fingerprint)
+    assert again.net.learnt
+    assert again.net.channels == (1, 1, 1)
+    for name, value in model.net.state_dict().items():
+        assert torch.equal(again.net.state_dict()[name], value)
+    assert set(again.mappings) == {"Red", "NIR"}
+    for band, mapping in model.mappings.items():
+        np.testing.assert_array_equal(again.mappings[band], mapping)
+    assert model.rig is not None
+    assert again.rig is not None
+    same = ("size_px", "baselines", "delays", "baseline_std", "centres", "factors", "captures", "from_bands_px")
+    assert [getattr(again.rig, n) for n in same] == [getattr(model.rig, n) for n in same]
+    np.testing.assert_array_equal(again.rig.fields["Red"].displacements_px, FIELD.displacements_px)
+    assert again.rig.fields["Red"].step_px == 48.0
+    camera, rig = read_rig(path)
+    assert camera == model.camera
+    assert rig is not None
+    assert rig.captures == model.rig.captures
+
+
+def test_the_same_model_is_the_same_bytes_and_may_have_no_rig(model: FlightModel, tmp_path: Path) -> None:
+    one, other, plain = (tmp_path / f"{n}.safetensors" for n in ("one", "other", "plain"))
+    save_model(model, one)
+    save_model(model, other)
+    assert one.read_bytes() == other.read_bytes()
+    save_model(replace(model, rig=None), plain)
+    assert load_model(plain, cpu).rig is None
+    assert read_rig(plain) == (model.camera, None)
+
+
+def test_sides_are_counted_from_1(model: FlightModel) -> None:
+    assert (model.side("Red"), model.side("NIR"), model.side("Blue")) == (1, 2, None)
+
+
+@pytest.mark.parametrize("part", ["weight", "fact"])
+def test_a_model_that_was_changed_is_damaged(model: FlightModel, tmp_path: Path, part: str) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    contents = bytearray(path.read_bytes())
+    if part == "weight":
+        contents[-3] ^= 1
+    else:
+        at = contents.index(b"Maker")
+        contents[at] = ord("N")
+    path.write_bytes(contents)
+    with pytest.raises(InputError, match=r"m\.safetensors: cannot be read as a model \(it is damaged\)"):
+        load_model(path, cpu)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"format": "other/1"}, "is no model of agalign"),
+        ({"channels": "[1]"}, "a network for images of"),
+        ({"channels": "[0, 1, 1]"}, "a network for images of"),
+    ],
+)
+def test_facts_that_no_model_has_are_refused(
+    model: FlightModel, tmp_path: Path, change: dict[str, str], said: str
+) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    contents = path.read_bytes()
+    (length,) = struct.unpack_from("<Q", contents)
+    header = json.loads(contents[8 : 8 + length])
+    header["__metadata__"] |= change
+    del header["__metadata__"]["digest"]
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + contents[8 + length :])
+    with pytest.raises(InputError, match=said):
+        load_model(path, cpu)
+
+
+def test_numbers_that_are_not_finite_are_refused(model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(replace(model, mappings={"Red": np.full((3, 3), np.nan)}), path)
+    with pytest.raises(InputError, match="cannot be read as a model"):
+        load_model(path, cpu)
+    path.write_bytes(b"not a model")
+    with pytest.raises(InputError, match=r"m\.safetensors"):
+        load_model(path, cpu)
+    with pytest.raises(InputError, match=r"m\.safetensors: its rig cannot be read"):
+        read_rig(path)
+
+
+def test_facts_are_sorted_in_the_file(model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    with safe_open(path, framework="np") as file:
+        facts = file.metadata()
+    assert {"format", "agalign", "camera", "bands", "sharing", "channels", "fingerprint", "rig", "digest"} == set(facts)
+    (length,) = struct.unpack_from("<Q", path.read_bytes())
+    header = json.loads(path.read_bytes()[8 : 8 + length])
+    assert list(header) == sorted(header)
+    assert length % 8 == 0
