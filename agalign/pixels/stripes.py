@@ -22,6 +22,8 @@ from agalign.values.image import Raster
 _LOG = logging.getLogger(__name__)
 _Profile = NDArray[np.float64]
 
+_MIN_SIDE_PX = 64
+"""Smaller images have too few rows and columns to tell a pattern from the scene."""
 _MIN_CORRELATION = 0.3
 """Of one half of a band with the other half of another one, median over bands. Clean captures of eight cameras reach
 0.14, white stripes of 5 % of the range 0.34, and those of 2 % 0.08."""
@@ -51,7 +53,7 @@ def without_common_stripes(images: Sequence[Raster]) -> list[Raster]:
     sizes = {image.size_px for image in images if image.channels == 1}
     for size in sizes:
         places = [i for i, image in enumerate(images) if image.size_px == size and image.channels == 1]
-        if len(places) < 2:
+        if len(places) < 2 or min(size) < _MIN_SIDE_PX:
             continue
         for i, cleaned in zip(places, _cleaned([images[i] for i in places]), strict=True):
             result[i] = cleaned

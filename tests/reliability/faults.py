@@ -384,8 +384,8 @@ def band_file_is_a_folder(scene: Scene) -> None:
 def held_by_another(scene: Scene) -> None:
     scene.out.mkdir()
     code = (
-        "import sys, time; from pathlib import Path; from agalign.batch.output_folder import held\n"
-        "with held(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+        "import sys, time; from pathlib import Path; from agalign.batch.output_folder import locked\n"
+        "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     other = subprocess.Popen([sys.executable, "-c", code, str(scene.out)], stdout=subprocess.PIPE, text=True)
     assert other.stdout is not None
