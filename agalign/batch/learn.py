@@ -105,7 +105,7 @@ def _learn_network(
 
 
 def _recognised(refined: Sequence["_Refined"]) -> dict[str, list[Matrix]]:
-    """The mappings of each band, between files, in the captures whose held-out patches were told apart."""
+    """The mappings of each band, between files, in the captures with distinguishable held-out patches."""
     mappings: dict[str, list[Matrix]] = {}
     for one in refined:
         for pair, result in zip(one.loaded.pairs, one.results, strict=True):

@@ -40,7 +40,7 @@ class FlightModel:
     bands: tuple[str, ...]
     """Names of the moving bands; the network's side of one is its place here, counted from 1."""
     mappings: Mapping[str, Matrix]
-    """Median fixed_to_moving of the bands whose held-out patches were told apart, undistorted px of the files."""
+    """Median fixed_to_moving of the bands with distinguishable held-out patches, undistorted px of the files."""
     fingerprint: str
     """Of what it was learnt from, and how."""
     rig: Rig | None = None
@@ -118,7 +118,7 @@ def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]
 
 
 def _below(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The tensors whose names start so, by the rest of their names."""
+    """The tensors with names that start with the prefix, by the rest of their names."""
     return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
 
 

@@ -108,7 +108,7 @@ def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
 
 
 def _of_the_same_outing(readings: Iterable[PanelReading], time_s: float) -> list[tuple[float, PanelReading]]:
-    """(time, reading) of the panels that were taken within hours of a time; none whose own time is unknown."""
+    """(time, reading) of the panels that were taken within hours of a time; panels of unknown time are left out."""
     return [
         (panel_time_s, r) for r in readings
         if (panel_time_s := r.capture.time_s) is not None and abs(panel_time_s - time_s) <= _SAME_OUTING_S

@@ -32,9 +32,9 @@ _CLIMB_STD_PX_PER_M = 1.5
 _MIN_CLIMB_SPREAD_PX = 0.5
 """Scatter of that factor around a straight line over the altitude, at the least."""
 _MAX_TYPICAL_RATIO, _MIN_TYPICAL_PX = 6.0, 3.0
-"""A capture does not set the crop where a factor is so many times the flight's median, or than this if that is less."""
+"""A capture does not set the crop where a factor exceeds the larger of the flight's median and this by the ratio."""
 _MAX_GAP_RATIO = 2.0
-"""A guess is checked on captures whose gap to their neighbours is at most so many times this one's."""
+"""Largest ratio of the gaps, to their neighbours, of the captures on which a guess is checked to that of this one."""
 _MIN_CAPTURES_FOR_A_CHOICE = 6
 """With fewer captures the best of several guesses is best by chance."""
 
