@@ -51,6 +51,10 @@ class OutputError(AgalignError):
     """A result cannot be written (no permission, disk full, a folder where a file should be)."""
 
 
+class WorkerError(AgalignError):
+    """The worker processes cannot be started, or end one after another."""
+
+
 _SAID_OF_MEMORY = (
     "not enough memory", "can't allocate memory", "Cannot allocate memory", "bad_alloc", "Insufficient memory",
 )  # fmt: skip

@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "licences.md"
 BEGIN, END = "<!-- licences -->\n", "<!-- end of licences -->\n"
-READ = {"atheris": "Apache-2.0", "exifread": "BSD-3-Clause", "odc-stac": "Apache-2.0", "pebble": "LGPL-3.0"}
+READ = {"atheris": "Apache-2.0", "exifread": "BSD-3-Clause", "odc-stac": "Apache-2.0"}
 """Licences that the package's metadata do not tell, or not exactly, by its licence file."""
 SPELT = {
     "Apache Software License": "Apache-2.0",

@@ -9,15 +9,13 @@ from typing import Protocol, Self
 
 from agalign.batch.capture import quiet
 from agalign.batch.report import CaptureReport
-from agalign.batch.workers import OnStart, Task, do_capture, done_by, own_processes
+from agalign.batch.workers import OnStart, Task, do_capture, done_by, done_in, own_processes
 from agalign.capture.align import PairProgress
 from agalign.pixels.raster import without_warnings
 from agalign.values.capture import Capture
 
 _CAPTURES_WORTH_A_PROCESS = 4
 """To start a process takes as long as these."""
-_TASKS_PER_PROCESS = 2
-"""One is done while the next one waits."""
 _MAX_WAITING_TASKS = 1000
 """In an executor: enough for any cluster, and little memory."""
 _MAX_THREADS = 4
@@ -74,7 +72,7 @@ class ProcessRunner:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        self._submit = self._stack.enter_context(own_processes(self._processes, self._timeout_s))
+        self._pool = self._stack.enter_context(own_processes(self._processes))
         return self
 
     def __exit__(self, *reason: object) -> None:
@@ -82,8 +80,7 @@ class ProcessRunner:
 
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
         """As `Runner` has it."""
-        absolute = [task.absolute() for task in tasks]
-        return done_by(self._submit, absolute, _TASKS_PER_PROCESS * self._processes, self._timeout_s)
+        return done_in(self._pool, [task.absolute() for task in tasks], self._timeout_s)
 
 
 class ExecutorRunner:

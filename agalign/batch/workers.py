@@ -11,7 +11,6 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
-    ThreadPoolExecutor,
     wait,
 )
 from contextlib import ExitStack, contextmanager, suppress
@@ -24,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-from pebble import ProcessExpired, ProcessPool
 
 from agalign.batch.capture import process_capture, quiet
 from agalign.batch.report import CaptureReport, StageClock
@@ -35,15 +33,14 @@ from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
 from agalign.products.preview import preview_bytes
 from agalign.values.capture import Capture
-from agalign.values.processes import follow_parent, without_interrupt_key
+from agalign.values.process_pool import Outcome, ProcessPool, WorkerDiedError
+from agalign.values.processes import follow_parent
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 _LOG = logging.getLogger(__name__)
 _DASK_ANSWERS_WITHIN_S = 10
 _GIVEN_UP_EXIT_CODE = 75
 _OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
-_MAX_BREAKS = 100
-"""Captures that are handed over again in a run because all processes were lost."""
 _CAPTURES_A_PROCESS = 500
 """Libraries keep some kilobytes of each; then a process makes room for a new one."""
 
@@ -66,6 +63,7 @@ class Task:
 
 
 Submit = Callable[[Task], "Future[CaptureReport]"]
+CapturePool = ProcessPool[Task, CaptureReport]
 OnStart = Callable[[Capture], None]
 
 
@@ -99,84 +97,73 @@ def done_by(
 ) -> Iterator[CaptureReport]:
     """Never more than `maximum` handed over at a time, so that a season's captures do not wait in memory."""
     futures: dict[Future[CaptureReport], Task] = {}
-    remaining, breaks = iter(tasks), 0
+    remaining = iter(tasks)
     try:
         for task in islice(remaining, maximum):
-            futures[submit(task)] = task
+            futures[_submitted(submit, task)] = task
         while futures:
             done, _ = wait(futures, return_when=FIRST_COMPLETED)
             for future in done:
                 task = futures.pop(future)
-                broken = not future.cancelled() and isinstance(future.exception(), BrokenExecutor)
-                if broken and breaks < _MAX_BREAKS:
-                    breaks += 1
-                    futures[submit(task)] = task
-                    continue
-                yield _report_of(future, task, timeout_s)
+                yield _report_of(future.result, task, timeout_s)
                 for following in islice(remaining, 1):
-                    futures[submit(following)] = following
+                    futures[_submitted(submit, following)] = following
     finally:
         for future in futures:
             future.cancel()
 
 
-def _report_of(future: "Future[CaptureReport]", task: Task, timeout_s: float | None) -> CaptureReport:
+def _submitted(submit: Submit, task: Task) -> "Future[CaptureReport]":
+    """The future of a task; an executor that lost its processes refuses it, which is this task's outcome."""
+    try:
+        return submit(task)
+    except BrokenExecutor as error:
+        refused: Future[CaptureReport] = Future()
+        refused.set_exception(error)
+        return refused
+
+
+def done_in(pool: CapturePool, tasks: Sequence[Task], timeout_s: float | None = None) -> Iterator[CaptureReport]:
+    """The report of each task, as worker processes do them. Raises WorkerError where they cannot."""
+
+    def report(outcome: Outcome[Task, CaptureReport]) -> CaptureReport:
+        return _report_of(outcome.value, outcome.argument, timeout_s)
+
+    return map(report, pool.run(tasks, timeout_s))
+
+
+def _report_of(result: Callable[[], CaptureReport], task: Task, timeout_s: float | None) -> CaptureReport:
     label = task.capture.label
     try:
-        return future.result()
+        return result()
     except TimeoutError:
         problem = f"given up after {timeout_s or 0:g} s, as --timeout asks"
-    except ProcessExpired as error:
-        how = f"signal {-error.exitcode}" if error.exitcode < 0 else f"exit code {error.exitcode}"
-        problem = f"its worker process was killed ({how}; out of memory?); run again to do what is left"
+    except WorkerDiedError as error:
+        problem = f"its worker process was killed ({error}; out of memory?); run again to do what is left"
     except BrokenExecutor:
-        problem = "the processes end as soon as they begin (out of memory?); try again with --jobs 1"
+        problem = "the executor lost its processes (out of memory?); run again to do what is left"
     except MemoryError:
         problem = _OUT_OF_MEMORY
-    except Exception as error:
-        lost = isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed"
-        if not lost:
-            raise
+    except (Exception, CancelledError) as error:
         said = next(iter(str(error).splitlines()), type(error).__name__)
-        problem = f"the cluster lost it ({said}); run again to do what is left"
+        if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
+            problem = f"the cluster lost it ({said}); run again to do what is left"
+        else:
+            problem = f"agalign failed on it ({type(error).__name__}: {said}); please report this"
     return CaptureReport(label, "error", error=problem)
 
 
 @contextmanager
-def own_processes(jobs: int, timeout_s: float | None) -> Iterator[Submit]:
-    """So many processes of our own. One that is killed costs the capture that it was doing, and so does one that takes
-    longer than the timeout; another takes its place.
-
-    They load what they need while the caller does something else.
-    """
+def own_processes(jobs: int) -> Iterator[CapturePool]:
+    """So many processes of our own, which load what they need while the caller does something else."""
     threads = max(1, (os.cpu_count() or 1) // jobs)
-    with threads_of_children(threads), ThreadPoolExecutor(1) as meanwhile:
-
-        def new_pool() -> ProcessPool:
-            pool = ProcessPool(jobs, _CAPTURES_A_PROCESS, start_worker, (threads,), worker_context())
-            with without_interrupt_key():
-                for _ in range(jobs):
-                    pool.schedule(quiet)
-            return pool
-
-        started = meanwhile.submit(new_pool)
-
-        def submit(task: Task) -> "Future[CaptureReport]":
-            nonlocal started
-            if not started.result().active:  # a process that was killed while it waited breaks a pool
-                started.result().stop()
-                started = meanwhile.submit(new_pool)
-            result: Future[CaptureReport] = started.result().schedule(do_capture, args=(task,), timeout=timeout_s)
-            return result
-
-        try:
-            yield submit
-            started.result().close()
-        except BaseException:
-            started.result().stop()
-            raise
-        finally:
-            started.result().join()
+    with (
+        threads_of_children(threads),
+        ProcessPool(
+            do_capture, jobs, worker_context(), start_worker, (threads,), max_tasks_per_worker=_CAPTURES_A_PROCESS
+        ) as pool,
+    ):
+        yield pool
 
 
 LOCAL = "local"

@@ -1,12 +1,10 @@
 """The tags and bands of many image files, read by one process or by several."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-
-from pebble import ProcessExpired, ProcessPool
 
 from agalign.cameras import known_cameras
 from agalign.cameras.base import Camera
@@ -17,7 +15,8 @@ from agalign.errors import UnreadableFileError
 from agalign.pixels.radiometry import is_physical
 from agalign.pixels.raster import TIFF_SUFFIXES, RasterInfo, probe
 from agalign.values.capture import Band
-from agalign.values.processes import follow_parent, without_interrupt_key
+from agalign.values.process_pool import ProcessPool, WorkerDiedError
+from agalign.values.processes import follow_parent
 
 _FILES_PER_TASK = 100
 """A file that kills its process takes the others of its task with it; smaller tasks cost more per file."""
@@ -70,23 +69,18 @@ def _read_in_processes(
     tasks: Sequence[Sequence[Path]], options: DiscoverOptions, processes: int
 ) -> Iterator[ImageFile | Problem]:
     # Spawned, not forked: a fork would copy the locks that threads of the calling program hold.
-    pool = ProcessPool(processes, context=get_context("spawn"), initializer=follow_parent)
-    try:
-        with without_interrupt_key():
-            futures = [pool.schedule(_read_task, args=(task, options)) for task in tasks]
-        for task, future in zip(tasks, futures, strict=True):
+    read = partial(_read_task, options=options)
+    early: dict[int, list[ImageFile | Problem]] = {}
+    following = 0
+    with ProcessPool(read, processes, get_context("spawn"), follow_parent) as pool:
+        for outcome in pool.run(tasks):
             try:
-                yield from future.result()
-            except BrokenExecutor:  # all processes were killed, and not by a file
-                yield from _read_task(task, options)
-            except ProcessExpired:
-                yield from (Problem(path, _killed(path)) for path in task)
-        pool.close()
-    except BaseException:
-        pool.stop()
-        raise
-    finally:
-        pool.join()
+                early[outcome.number] = outcome.value()
+            except WorkerDiedError:
+                early[outcome.number] = [Problem(path, _killed(path)) for path in outcome.argument]
+            while following in early:
+                yield from early.pop(following)
+                following += 1
 
 
 def _killed(path: Path) -> UnreadableFileError:

@@ -1,8 +1,12 @@
 """Processes that do captures, of our own and of a Dask cluster, and what becomes of a capture whose process ends."""
 
 import os
+import signal
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import psutil
@@ -10,11 +14,13 @@ import pytest
 
 import agalign
 from agalign.batch import RunOptions, dask_executor, run_flight, workers
-from agalign.batch.workers import Task, done_by, own_processes
+from agalign.batch.workers import Task, do_capture, done_by, done_in, own_processes
 from agalign.cameras.discover import discover
 from agalign.config import SeedSettings, Settings
 from agalign.errors import ConfigurationError
 from agalign.products.sidecar import CaptureResult
+
+from ..values.pool_tasks import signal_self
 
 pytestmark = pytest.mark.slow
 
@@ -58,18 +64,72 @@ def test_a_scheduler_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> No
         pass
 
 
-def test_a_killed_process_costs_one_capture_at_most(flight: Path, tmp_path: Path) -> None:
-    tasks = [Task(c, tmp_path, Settings(seed=SeedSettings(only=True)), None) for c in discover(flight).captures]
-    states = []
-    with own_processes(1, None) as submit:
-        for report in done_by(submit, [task for _ in range(4) for task in tasks], 8):
-            if not states:
-                (worker,) = (c for c in psutil.Process().children(recursive=True) if c.ppid() != os.getpid())
-                worker.kill()
-            states.append(report.state)
-            assert report.state == "done" or "killed (signal 9" in (report.error or "")
-    assert len(states) == 8
-    assert states.count("done") >= 7
+def seeds_only(flight: Path, out: Path) -> list[Task]:
+    return [Task(c, out, Settings(seed=SeedSettings(only=True)), None) for c in discover(flight).captures]
+
+
+def only_worker() -> psutil.Process:
+    (worker,) = (c for c in psutil.Process().children(recursive=True) if c.ppid() != os.getpid())
+    return worker
+
+
+def test_a_process_killed_once_costs_no_capture(flight: Path, tmp_path: Path) -> None:
+    tasks = seeds_only(flight, tmp_path)
+    with own_processes(1) as pool:
+        reports = done_in(pool, tasks * 4)
+        states = [next(reports).state]
+        only_worker().kill()
+        states += [r.state for r in reports]
+    assert states == ["done"] * 8
+
+
+def test_a_process_killed_twice_costs_its_capture(flight: Path, tmp_path: Path) -> None:
+    capture, *_ = tasks = seeds_only(flight, tmp_path)
+    mark = tmp_path / "mark"
+    deadly = replace(capture, settings=KillsWhenRead(mark, 2))
+    with own_processes(1) as pool:
+        reports = {r.label: r for r in done_in(pool, [deadly, *tasks[1:]])}
+    lost = reports.pop(capture.capture.label)
+    assert (lost.state, lost.error) == (
+        "error", "its worker process was killed (signal 9; out of memory?); run again to do what is left",
+    )  # fmt: skip
+    assert [r.state for r in reports.values()] == ["done"] * (len(tasks) - 1)
+
+
+def test_a_stopped_process_is_told_as_late(flight: Path, tmp_path: Path) -> None:
+    capture, *_ = tasks = seeds_only(flight, tmp_path)
+    deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", 1, signal.SIGSTOP))
+    with own_processes(1) as pool:
+        reports = {r.label: r for r in done_in(pool, [deadly, *tasks[1:]], timeout_s=10)}
+    assert reports.pop(capture.capture.label).error == "given up after 10 s, as --timeout asks"
+    assert [r.state for r in reports.values()] == ["done"] * (len(tasks) - 1)
+
+
+def test_an_executor_that_loses_its_processes_costs_the_captures(flight: Path, tmp_path: Path) -> None:
+    """Also those that it refuses to take afterwards."""
+    capture, *_ = seeds_only(flight, tmp_path)
+    deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", 1))
+    with ProcessPoolExecutor(1, get_context("spawn")) as executor:
+        reports = list(done_by(lambda task: executor.submit(do_capture, task), [deadly, capture, capture], 1))
+    assert {r.error for r in reports} == {
+        "the executor lost its processes (out of memory?); run again to do what is left"
+    }
+
+
+class KillsWhenRead(Settings):
+    """Settings that send a signal to the process that unpickles them, so many times in all."""
+
+    def __init__(self, mark: Path, times: int, number: int = signal.SIGKILL) -> None:
+        super().__init__(seed=SeedSettings(only=True))
+        self._given = mark, times, number
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return kill_and_read, self._given
+
+
+def kill_and_read(mark: Path, times: int, number: int) -> Settings:
+    signal_self(mark, number, times)
+    return Settings(seed=SeedSettings(only=True))
 
 
 def test_a_capture_that_takes_too_long_ends_its_process_on_a_cluster() -> None:

@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,8 @@ SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])
 SIZE_PX = 320, 240
 MANY = 12
 """Captures of a run that something happens to."""
+ALL = tuple("abcdefghijkl")
+"""Their names."""
 XMP = 700
 STRANGE_NAMES = "with space é 雨", "-rf", "quote'\"`$(x)", "new\nline", "\x1b[31mred\a", "_", "x" * 200
 _PACKET = (
@@ -107,8 +110,14 @@ def make_flight(folder: Path, names: str = "ab") -> None:
 
 
 def write_capture(folder: Path, name: str, number: int = 0, suffix: str = ".tif") -> None:
-    for band, image in zip(("green", "nir"), textured_pair(SHIFT, *SIZE_PX, seed=number), strict=True):
-        tifffile.imwrite(folder / f"{name}_{band}{suffix}", as_numbers(image))
+    for band, image in zip(("green", "nir"), images(number), strict=True):
+        tifffile.imwrite(folder / f"{name}_{band}{suffix}", image)
+
+
+@cache
+def images(number: int) -> tuple[np.ndarray, ...]:
+    """The two bands of the capture of this number."""
+    return tuple(map(as_numbers, textured_pair(SHIFT, *SIZE_PX, seed=number)))
 
 
 def as_numbers(image: np.ndarray) -> np.ndarray:
@@ -435,9 +444,7 @@ def when_begun(act: Callable[["subprocess.Popen[str]", Scene], None], *arguments
         scene.arguments = list(arguments)
 
         def watch(process: "subprocess.Popen[str]") -> None:
-            deadline = time.monotonic() + 60
-            while time.monotonic() < deadline and not any(scene.out.glob("?.json")):
-                time.sleep(0.01)
+            wait_until(lambda: any(scene.out.glob("?.json")))
             act(process, scene)
 
         scene.watch = watch
@@ -456,20 +463,67 @@ def kill_worker(process: "subprocess.Popen[str]", _scene: Scene) -> None:
     a_worker(process).kill()
 
 
+def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
+    """Kill the only worker, and again when it tries the same capture once more, which it does last."""
+    workers(process)[0].kill()
+    wait_until(lambda: len(list(scene.out.glob("?.json"))) == MANY - 1)
+    time.sleep(0.2)  # of the second or more that a capture takes
+    workers(process)[0].kill()
+
+
+def kill_workers_as_they_appear(process: "subprocess.Popen[str]", scene: Scene) -> None:
+    wait_until(lambda: some_are_reported(scene))
+    while process.poll() is None:
+        kill_all_workers(process, scene)
+        time.sleep(0.005)
+
+
+def kill_all_workers(process: "subprocess.Popen[str]", _scene: Scene) -> None:
+    for worker in workers(process):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            worker.kill()
+
+
+def kill_server(process: "subprocess.Popen[str]", _scene: Scene) -> None:
+    """The process that starts the workers."""
+    server = psutil.Process(workers(process)[0].ppid())
+    assert server.pid != process.pid
+    server.kill()
+
+
+def workers(process: "subprocess.Popen[str]") -> list[psutil.Process]:
+    try:
+        return [c for c in psutil.Process(process.pid).children(recursive=True) if c.ppid() != process.pid]
+    except psutil.NoSuchProcess:
+        return []
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not true():
+        time.sleep(0.01)
+
+
 def stop_worker(process: "subprocess.Popen[str]", _scene: Scene) -> None:
     a_worker(process).suspend()
 
 
-def starve_workers(process: "subprocess.Popen[str]", _scene: Scene) -> None:
-    for child in psutil.Process(process.pid).children(recursive=True):
-        if child.ppid() != process.pid:
-            child.rlimit(psutil.RLIMIT_AS, (1 << 20, 1 << 20))
+def starve_workers(process: "subprocess.Popen[str]", scene: Scene) -> None:
+    wait_until(lambda: some_are_reported(scene))
+    for worker in workers(process):
+        worker.rlimit(psutil.RLIMIT_AS, (1 << 20, 1 << 20))
+
+
+def some_are_reported(scene: Scene) -> bool:
+    """Of three captures of two workers: a worker begins its second one when its first one is reported."""
+    return len(list(scene.out.glob("?.json"))) >= 3
 
 
 def larger(scene: Scene) -> None:
-    """Images for which a process must ask for memory, whatever it has left from before."""
+    """Images that become larger and larger: a process must ask for more memory than it keeps from those before."""
     for path in scene.folder.iterdir():
-        tifffile.imwrite(path, np.kron(tifffile.imread(path), np.ones((6, 6), np.uint16)))
+        times = 2 + ALL.index(path.name[0]) // 3
+        tifffile.imwrite(path, np.kron(tifffile.imread(path), np.ones((times, times), np.uint16)))
 
 
 def signalled(number_: int) -> Callable[["subprocess.Popen[str]", Scene], None]:
@@ -487,9 +541,23 @@ def interrupted_while_workers_start(scene: Scene) -> None:
     act = signalled(signal.SIGINT)
 
     def watch(process: "subprocess.Popen[str]") -> None:
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline and not psutil.Process(process.pid).children():
-            time.sleep(0.005)
+        wait_until(lambda: bool(psutil.Process(process.pid).children()))
+        act(process, scene)
+
+    scene.watch = watch
+
+
+def terminated_while_files_are_read(scene: Scene) -> None:
+    """SIGTERM to all processes while several of them read the tags of the files."""
+    for number_ in range(1500):
+        for band in ("green", "nir"):
+            os.link(scene.file(f"a_{band}.tif"), scene.file(f"x{number_}_{band}.tif"))
+    scene.arguments = ["-j", "2"]
+    act = signalled(signal.SIGTERM)
+
+    def watch(process: "subprocess.Popen[str]") -> None:
+        wait_until(lambda: len(psutil.Process(process.pid).children()) > 1)
+        time.sleep(0.3)
         act(process, scene)
 
     scene.watch = watch
@@ -582,16 +650,21 @@ FAULTS = (
     Fault("an output that is a file", lambda s: s.out.write_text("x") and None, 1, "out: is a file", ()),
     Fault("a file that vanishes during the run", vanishing, 3, r"b_nir\.tif: cannot be read \(No such file"),
     Fault("the disk full", full_disk, 3, "the disk is full|cannot be written", ("a",)),
-    Fault("a worker killed by SIGKILL", when_begun(kill_worker, "-j", "2", "--timeout", "100"), 3,
-          "its worker process was killed", (), 1),
+    Fault("a worker killed by SIGKILL", when_begun(kill_worker, "-j", "2", "--timeout", "100"), 0, "", ALL),
+    Fault("both workers killed by SIGKILL", when_begun(kill_all_workers, "-j", "2"), 0, "", ALL),
+    Fault("a capture whose worker is killed twice", when_begun(kill_capture, "-j", "1", "--timeout", "100"), 3,
+          r"its worker process was killed \(signal 9; ", (), 1),
+    Fault("each worker killed as it appears", when_begun(kill_workers_as_they_appear, "-j", "2"), 3,
+          r"^3 worker processes one after another ended before they finished anything \(the last by signal 9", ()),
+    Fault("the process that starts workers killed", when_begun(kill_server, "-j", "2"), 0, "", ALL),
     Fault("memory short in the workers", both(when_begun(starve_workers, "-j", "2", "--timeout", "100"), larger), 3,
           "out of memory|killed", ()),
-    # Stopped while it hands over what it has done, a worker may be seen as dead before it is seen as late.
     Fault("a capture that takes for ever", when_begun(stop_worker, "-j", "2", "--timeout", "4"), 3,
-          "given up after 4 s|its worker process was killed", (), 1),
+          "given up after 4 s, as --timeout asks", (), 1),
     Fault("the interrupt key", when_begun(signalled(signal.SIGINT), "-j", "2"), 130, "interrupted; what is", ()),
     Fault("the interrupt key while workers start", interrupted_while_workers_start, 130, "interrupted; what is", ()),
     Fault("SIGTERM", when_begun(signalled(signal.SIGTERM), "-j", "2"), 143, "interrupted; what is", ()),
+    Fault("SIGTERM while files are read", terminated_while_files_are_read, 143, "interrupted; what is", ()),
     Fault("XML entities that multiply", tagged(_BOMB), 0, "", ("a", "b")),
     Fault("an XML entity that names a file", tagged(_OUTSIDE), 0, "", ("a", "b")),
     Fault("XMP nested 1200 deep", tagged(_PACKET.format(_NESTED)), 0, "", ("a", "b")),

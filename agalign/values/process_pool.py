@@ -1,0 +1,268 @@
+"""Tasks done by worker processes that share no lock: none that is killed or stopped can hold up another.
+
+No library does this: concurrent.futures, loky, multiprocess, billiard, mpire and pebble have their workers share a
+queue or a lock, and most give up all workers when one is killed.
+"""
+
+import pickle
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from multiprocessing.context import BaseContext
+from typing import Any, Generic, Self, TypeVar
+
+from agalign.errors import WorkerError
+from agalign.values.worker_process import ENDS_WITHIN_S, LOST_SERVER_EXIT_CODE, Worker, is_out_of_memory
+
+_MAX_DEATHS = 3
+"""In a row without a finished task between them: more would be lost, one by one, to what ends the workers."""
+_MAX_TRIES = 2
+"""A worker may be killed by a signal for other reasons than its task, such as a lack of memory."""
+_STARTS_WITHIN_S = 120.0
+"""To load torch from a cold disk on a network takes up to a minute."""
+_SENDS_ON_WITHIN_S = 1.0
+"""Between two chunks of a result. Whoever asks for outcomes may look away until a worker that sends is late."""
+_LOOKS_EVERY_S = 1.0
+"""On Windows the interrupt key is heard only between two waits."""
+_MAX_WINDOWS_PROCESSES = 30
+"""Windows waits for 63 things at most; a worker is two."""
+
+A = TypeVar("A")
+R = TypeVar("R")
+
+
+class WorkerDiedError(Exception):
+    """The worker process of a task ended before the task was done."""
+
+    def __init__(self, exit_code: int | None) -> None:
+        super().__init__(exit_code)
+        self.exit_code = exit_code
+
+    def __str__(self) -> str:
+        if self.exit_code is None:
+            return "killed"
+        return f"signal {-self.exit_code}" if self.exit_code < 0 else f"exit code {self.exit_code}"
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[A, R]):
+    """What became of a task: a result, or why there is none."""
+
+    number: int
+    """The place of the argument among those given, from 0."""
+    argument: A
+    result: R | None = None
+    error: Exception | None = None
+    """What the function raised, TimeoutError after the time limit, or WorkerDiedError."""
+
+    def value(self) -> R:
+        """The result. Raises the error."""
+        if self.error is not None:
+            raise self.error
+        return self.result  # type: ignore[return-value]
+
+
+@dataclass(eq=False)
+class _Task(Generic[A]):
+    number: int
+    argument: A
+    tries: int = 0
+
+
+@dataclass(eq=False)
+class _Place(Generic[A]):
+    """A worker, and what it is given to do."""
+
+    worker: Worker
+    deadline_s: float | None
+    task: _Task[A] | None = None
+    finished: int = 0
+
+    @property
+    def idle(self) -> bool:
+        return self.worker.ready and self.task is None
+
+    @property
+    def late_s(self) -> float:
+        """When its worker is to be ended, by the monotonic clock."""
+        return (
+            float("inf") if self.deadline_s is None else max(self.deadline_s, self.worker.heard_s + _SENDS_ON_WITHIN_S)
+        )
+
+
+class ProcessPool(Generic[A, R]):
+    """A function done by worker processes, each argument in one of them. They start at once, in the background.
+
+    A worker that is killed by a signal costs its task nothing the first time: it is tried again, last. A worker that
+    cannot be started, or fails in `initializer`, is one less. A worker makes room for a new one after
+    `max_tasks_per_worker`.
+    """
+
+    def __init__(
+        self, function: Callable[[A], R], processes: int, context: BaseContext,
+        initializer: Callable[..., object], arguments: tuple[Any, ...] = (), *, max_tasks_per_worker: int = sys.maxsize,
+    ) -> None:  # fmt: skip
+        self._function, self._max_tasks = function, max_tasks_per_worker
+        self._how = context, initializer, arguments
+        self._size = min(processes, _MAX_WINDOWS_PROCESSES) if sys.platform == "win32" else processes
+        self._places: list[_Place[A]] = []
+        self._leaving: list[Worker] = []
+        self._waiting: deque[_Task[A]] = deque()
+        self._deaths, self._last_death_s, self._given_up = 0, 0.0, ""
+        self._start(self._size)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_reason: object) -> None:
+        """No process is left: idle ones end, and the others are killed."""
+        workers = [*self._leaving, *(place.worker for place in self._places)]
+        for place in self._places:
+            if place.task is None:
+                place.worker.let_end()
+        until_s = time.monotonic() + ENDS_WITHIN_S
+        for place in self._places:
+            if not place.idle:
+                place.worker.kill(max(until_s - time.monotonic(), 0.0))
+        for worker in workers:
+            if worker.exit_code(max(until_s - time.monotonic(), 0.0)) is None:
+                worker.kill(max(until_s - time.monotonic(), 0.0))
+                worker.exit_code()
+        self._places, self._leaving = [], []
+
+    def run(self, arguments: Iterable[A], timeout_s: float | None = None) -> Iterator[Outcome[A, R]]:
+        """The outcome of each task, as it is done. A task that takes longer than the timeout ends its worker.
+
+        Raises WorkerError where no worker can be started, or where workers end one after another.
+        """
+        self._waiting.extend(_Task(number, argument) for number, argument in enumerate(arguments))
+        while self._is_unfinished():
+            outcomes = [*self._hand_over(timeout_s)]
+            if not outcomes:
+                self._wait()
+                for place in list(self._places):
+                    outcomes += self._look_after(place)
+                outcomes += self._hand_over(timeout_s)  # before whoever asks for the outcomes takes time over them
+            yield from outcomes
+            if self._given_up and self._is_unfinished():
+                raise WorkerError(self._given_up)
+
+    def _is_unfinished(self) -> bool:
+        return bool(self._waiting) or any(place.task for place in self._places)
+
+    def _start(self, count: int) -> None:
+        for _ in range(count):
+            try:
+                worker = Worker(*self._how)
+            except (OSError, RuntimeError, MemoryError) as error:
+                self._one_less(f"{type(error).__name__}: {error}")
+            else:
+                self._places.append(_Place(worker, worker.created_s + _STARTS_WITHIN_S))
+
+    def _one_less(self, problem: str) -> None:
+        """A worker could not be started; when none can, the run ends."""
+        self._size -= 1
+        if self._size == 0:
+            self._given_up = f"no worker process can be started ({problem}); close other programs, or try --jobs 1"
+
+    def _hand_over(self, timeout_s: float | None) -> Iterator[Outcome[A, R]]:
+        """Give waiting tasks to idle workers, and replace those that are gone where there are tasks for them.
+
+        Yields the outcome of tasks that cannot be sent.
+        """
+        for place in [place for place in self._places if place.idle]:
+            while self._waiting and place.idle and place in self._places:
+                task = self._waiting.popleft()
+                try:
+                    message = pickle.dumps((self._function, task.argument), pickle.HIGHEST_PROTOCOL)
+                except Exception as error:
+                    yield Outcome(task.number, task.argument, error=error)
+                    continue
+                try:
+                    place.worker.send(message)
+                except OSError:  # it ended while it was idle: the task has not been tried
+                    self._waiting.appendleft(task)
+                    self._remove(place)
+                else:
+                    place.task = task
+                    place.deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        coming = sum(not place.worker.ready for place in self._places)
+        if not self._given_up:
+            self._start(min(self._size - len(self._places), len(self._waiting) - coming))
+
+    def _wait(self) -> None:
+        """Until a worker sends something, ends or is late."""
+        left_s = min((place.late_s for place in self._places), default=0.0) - time.monotonic()
+        things = [thing for place in self._places for thing in place.worker.waits_for()]
+        wait(things, min(max(left_s, 0.0), _LOOKS_EVERY_S))
+
+    def _look_after(self, place: _Place[A]) -> list[Outcome[A, R]]:
+        """Take what a worker has sent; see whether it has ended or is late."""
+        worker, task = place.worker, place.task
+        message = worker.receive()
+        if message is not None:
+            return self._take(place, message)
+        if worker.has_ended():
+            return self._remove(place)
+        if time.monotonic() < place.late_s:
+            return []
+        self._end(place)
+        if task is not None:
+            return [Outcome(task.number, task.argument, error=TimeoutError())]
+        self._one_less(f"not ready after {_STARTS_WITHIN_S:g} s")
+        return []
+
+    def _take(self, place: _Place[A], message: bytes) -> list[Outcome[A, R]]:
+        """A worker is ready, or cannot be, or has done its task."""
+        try:
+            good, value = pickle.loads(message)
+        except Exception as unreadable:
+            good, value = False, unreadable
+        place.deadline_s, task, place.task = None, place.task, None
+        if task is None:
+            place.worker.ready = good
+            if not good:
+                self._end(place)
+                self._one_less(str(value))
+            return []
+        self._deaths = 0
+        place.finished += 1
+        if place.finished >= self._max_tasks:
+            self._end(place)
+        result, error = (value, None) if good else (None, value)
+        return [Outcome(task.number, task.argument, result, error)]
+
+    def _end(self, place: _Place[A]) -> None:
+        """Part from a worker, which may take a moment to end."""
+        self._places.remove(place)
+        place.worker.let_end() if place.idle else place.worker.kill()
+        self._leaving = [worker for worker in [*self._leaving, place.worker] if worker.exit_code(0) is None]
+
+    def _remove(self, place: _Place[A]) -> list[Outcome[A, R]]:
+        """A worker has ended by itself, or was ended by others."""
+        worker, task = place.worker, place.task
+        code = worker.exit_code()
+        self._end(place)
+        by_signal = code is not None and (code < 0 or code == LOST_SERVER_EXIT_CODE)
+        if not (worker.ready or by_signal):
+            self._one_less(worker.problem or f"ended with exit code {code}")
+            return []
+        error: Exception = MemoryError() if is_out_of_memory(code) else WorkerDiedError(code)
+        # Several that were killed at once count once: those that came after the last one that counted.
+        if worker.created_s > self._last_death_s:
+            self._deaths, self._last_death_s = self._deaths + 1, time.monotonic()
+        if self._deaths >= _MAX_DEATHS:
+            self._given_up = (
+                f"{_MAX_DEATHS} worker processes one after another ended before they finished anything (the last by "
+                f"{error}; out of memory?); what is finished stays; try again with fewer --jobs"
+            )
+        if task is None:
+            return []
+        task.tries += 1
+        if by_signal and task.tries < _MAX_TRIES:
+            self._waiting.append(task)
+            return []
+        return [Outcome(task.number, task.argument, error=error)]

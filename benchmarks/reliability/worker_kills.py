@@ -1,0 +1,218 @@
+"""Kill one worker process after another, at random moments, and look at what became of every task.
+
+    python benchmarks/reliability/worker_kills.py [--kills 1000] [--minutes 10] [--markdown FILE]
+
+First the pool alone: eight workers on however many cores, tasks of some milliseconds with arguments and results of up
+to 400 kB, so that kills also come while a task or a result is on its way. Then, for so many minutes, runs of
+`agalign -j 2` over a small flight. After each run the same command goes on undisturbed, and every file is compared with
+those of a run without kills.
+"""
+
+import argparse
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from multiprocessing import get_context
+from pathlib import Path
+
+import psutil
+from report import Section
+
+from agalign.errors import WorkerError
+from agalign.values.process_pool import ProcessPool, WorkerDiedError
+from agalign.values.processes import follow_parent
+
+WORKERS, TASKS = 8, 400
+MAX_BYTES = 400_000
+CAPTURES, SIZE_PX = 16, (240, 180)
+HUNG_S = 300.0
+"""An undisturbed batch takes seconds, a run half a minute, and more where other programs take the cores."""
+KINDS = ("lost", "hung", "wrong", "left over")
+Tiny = tuple[int, float, bytes, int]
+"""Number, seconds, argument, size of the result."""
+
+
+def do_tiny(task: Tiny) -> tuple[int, int, bytes]:
+    """What can be checked: the number, a checksum of the argument, a result of the size that was asked for."""
+    number, seconds, data, size = task
+    time.sleep(seconds)
+    return number, zlib.crc32(data), bytes(size)
+
+
+def make_tiny(rng: random.Random) -> list[Tiny]:
+    def data_size() -> int:
+        return rng.choice([10, 1000, MAX_BYTES])
+
+    return [(n, rng.uniform(0, 0.02), rng.randbytes(data_size()), data_size()) for n in range(TASKS)]
+
+
+def workers_below(process: psutil.Process) -> list[psutil.Process]:
+    """The processes that the fork server has started."""
+    try:
+        children = process.children(recursive=True)
+        return [c for c in children if c.ppid() != process.pid and c.status() != psutil.STATUS_ZOMBIE]
+    except psutil.NoSuchProcess:
+        return []
+
+
+class Killer(threading.Thread):
+    """Kills a worker of a process, again and again, until it is to stop or has killed enough."""
+
+    def __init__(self, target: psutil.Process, rng: random.Random, rest_s: tuple[float, float], maximum: int) -> None:
+        super().__init__(daemon=True)
+        self.killed = 0
+        self._stopped = threading.Event()
+        self._target, self._rng, self._rest_s, self._maximum = target, rng, rest_s, maximum
+
+    def run(self) -> None:
+        while self.killed < self._maximum and not self._stopped.wait(self._rng.uniform(*self._rest_s)):
+            alive = workers_below(self._target)
+            if alive:
+                try:
+                    self._rng.choice(alive).kill()
+                    self.killed += 1
+                except psutil.NoSuchProcess:
+                    continue
+
+    def stop(self) -> int:
+        """How many it has killed."""
+        self._stopped.set()
+        self.join()
+        return self.killed
+
+
+def run_tiny(kills: int, rng: random.Random) -> Counter[str]:
+    """Batches of tiny tasks until there were so many kills."""
+    result: Counter[str] = Counter()
+    here = psutil.Process()
+    while result["kills"] < kills:
+        given, began = make_tiny(rng), time.monotonic()
+        killer = Killer(here, rng, (0.0, 0.2), kills - result["kills"])
+        seen: Counter[int] = Counter()
+        with ProcessPool(do_tiny, WORKERS, get_context("forkserver"), follow_parent) as pool:
+            killer.start()
+            try:
+                for outcome in pool.run(given, timeout_s=20):
+                    seen[outcome.number] += 1
+                    number, _, data, size = given[outcome.number]
+                    if isinstance(outcome.error, WorkerDiedError):
+                        result["told as killed"] += 1
+                        result["wrong"] += str(outcome.error) != "signal 9"
+                    else:
+                        result["wrong"] += outcome.result != (number, zlib.crc32(data), bytes(size))
+            except WorkerError:
+                result["runs ended with a reason"] += 1
+            else:
+                result["lost"] += sum(seen[n] != 1 for n in range(TASKS))
+            result["kills"] += killer.stop()
+        result["runs"] += 1
+        result["tasks"] += seen.total()
+        result["hung"] += time.monotonic() - began > HUNG_S
+        result["left over"] += len(workers_below(here))
+    return result
+
+
+def flights(minutes: float, rng: random.Random, folder: Path) -> Iterator[Counter[str]]:
+    """What came of each disturbed run over the same flight."""
+    # Each worker of the tiny tasks imports this module: what loads slowly is imported here.
+    from kills import contents, files
+
+    from agalign.synthetic import flight as synthetic
+
+    flight, whole, out = folder / "flight", folder / "whole", folder / "out"
+    synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=6)
+    command = [sys.executable, "-m", "agalign", str(flight), "-j", "2", "-q", "-o"]
+    subprocess.run([*command, str(whole)], check=True)
+    expected = {name: contents(path) for name, path in files(whole).items()}
+    end_s = time.monotonic() + 60 * minutes
+    while time.monotonic() < end_s:
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.copytree(whole / "models", out / "models")  # a run learns for longer than it aligns
+        yield disturbed([*command, str(out)], out, expected, rng)
+
+
+def disturbed(command: list[str], out: Path, expected: dict[str, object], rng: random.Random) -> Counter[str]:
+    """One run with kills, and the same command again."""
+    from kills import differences
+
+    result = Counter(runs=1)
+    with started(command) as process:
+        killer = Killer(psutil.Process(process.pid), rng, (0.2, 4.0), sys.maxsize)
+        killer.start()
+        said = what_it_said(process, result)
+        result["kills"] += killer.stop()
+    told = set(re.findall(r"agalign: (\S+): its worker process was killed \(signal 9", said))
+    finished = {p.relative_to(out).with_suffix("").as_posix() for p in out.rglob("IMG_*.json")}
+    result["told as killed"] = len(told)
+    if "worker processes one after another ended" in said:
+        result["runs ended with a reason"] += 1
+    else:
+        result["lost"] = max(CAPTURES - len(told | finished), 0)
+    with started(command) as process:
+        what_it_said(process, result)
+    after = differences(out, expected)
+    result["wrong"] = after["missing"] + after["corrupt"] + after["different"] + (process.returncode != 0)
+    result["left over"] = after["left over"]
+    result["tasks"] = CAPTURES
+    return result
+
+
+def started(command: list[str]) -> "subprocess.Popen[str]":
+    environment = {**os.environ, "PYTHONFAULTHANDLER": "1"}
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def what_it_said(process: "subprocess.Popen[str]", result: Counter[str]) -> str:
+    """Standard error of a run; one that hangs prints what its threads do."""
+    try:
+        return process.communicate(timeout=HUNG_S)[1]
+    except subprocess.TimeoutExpired:
+        result["hung"] += 1
+        process.send_signal(signal.SIGABRT)
+        said = process.communicate()[1]
+        print(said)
+        return said
+
+
+def row(name: str, result: Counter[str]) -> tuple[str, ...]:
+    also = ("runs", "tasks", "kills", "told as killed", "runs ended with a reason", *KINDS)
+    return (name, *(str(result[kind]) for kind in also))
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--kills", type=int, default=1000)
+    options.add_argument("--minutes", type=float, default=10.0)
+    options.add_argument("--rng-seed", type=int, default=0)
+    options.add_argument("--markdown", type=Path)
+    asked = options.parse_args()
+    rng = random.Random(asked.rng_seed)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    warnings.simplefilter("ignore")  # of rasters without georeference
+    tiny = run_tiny(asked.kills, rng)
+    print(dict(tiny), flush=True)
+    real: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        for one in flights(asked.minutes, rng, Path(folder)):
+            real += one
+            print({k: v for k, v in one.items() if v}, flush=True)
+    section = Section("worker kills", asked.markdown)
+    heads = ("", "runs", "tasks", "kills", "told as killed", "ended with a reason", *KINDS)
+    section.table([heads, row("tiny tasks, 8 workers", tiny), row(f"flights of {CAPTURES} captures, 2 workers", real)])
+    if any(counts[kind] for counts in (tiny, real) for kind in KINDS):
+        raise SystemExit("something was lost, hung, wrong or left over")
+
+
+if __name__ == "__main__":
+    main()

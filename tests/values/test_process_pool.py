@@ -1,0 +1,388 @@
+"""Worker processes that are killed, stopped or cannot start: every task has its outcome, in time, and none is left."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from agalign.errors import WorkerError
+from agalign.values import process_pool, worker_process
+from agalign.values.process_pool import Outcome, ProcessPool, WorkerDiedError
+from agalign.values.worker_process import Worker
+
+from . import pool_tasks as tasks
+
+CONTEXT = get_context("forkserver" if sys.platform == "linux" else "spawn")
+LARGE = 3_000_000
+"""Bytes: more than the buffer of any pipe."""
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left() -> Iterator[None]:
+    """The test takes less than a minute, and ends all processes but the fork server and its helper."""
+    began, before = time.monotonic(), threading.active_count()
+    yield
+    assert time.monotonic() - began < 60
+    assert worker_processes() == []
+    assert threading.active_count() <= before + 1
+
+
+def worker_processes() -> list[psutil.Process]:
+    def is_worker(process: psutil.Process) -> bool:
+        try:
+            started_by_server = process.ppid() != os.getpid()
+            return started_by_server and process.status() != psutil.STATUS_ZOMBIE
+        except psutil.NoSuchProcess:
+            return False
+
+    return [p for p in psutil.Process().children(recursive=True) if is_worker(p)]
+
+
+def pool(function: Callable[[Any], Any], processes: int = 1, **more: Any) -> ProcessPool[Any, Any]:
+    return ProcessPool(function, processes, CONTEXT, more.pop("initializer", tasks.nothing), **more)
+
+
+def told(outcome: Outcome[Any, Any]) -> object:
+    return outcome.result if outcome.error is None else f"{type(outcome.error).__name__}: {outcome.error}"
+
+
+def test_each_argument_has_its_result() -> None:
+    with pool(tasks.size, 2) as workers:
+        outcomes = list(workers.run([bytes(n) for n in range(100)]))
+    assert sorted(o.number for o in outcomes) == list(range(100))
+    assert all(o.value() == o.number == len(o.argument) for o in outcomes)
+
+
+def test_large_arguments_and_results_pass_whole() -> None:
+    with pool(tasks.size) as workers:
+        assert [o.value() for o in workers.run([bytes(LARGE)])] == [LARGE]
+    with pool(tasks.zeros) as workers:
+        assert [len(o.value()) for o in workers.run([0, 1, 7999, 8000, 8001, LARGE])] == [0, 1, 7999, 8000, 8001, LARGE]
+
+
+def test_workers_are_replaced_after_their_tasks() -> None:
+    with pool(tasks.process_id, 1, max_tasks_per_worker=2) as workers:
+        seen = [o.value() for o in workers.run(range(6))]
+    assert [seen.count(p) for p in dict.fromkeys(seen)] == [2, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        (tasks.raise_key_error, "KeyError: 'what'"),
+        (tasks.raise_unpicklable, "RuntimeError: TwoArgumentsError: a"),
+        (tasks.unpicklable, "lambda"),
+        (tasks.result_that_cannot_be_read, "UnpicklingError"),
+    ],
+)
+def test_what_fails_costs_its_task_and_no_worker(function: Callable[[int], object], said: str) -> None:
+    with pool(function) as workers:
+        before = workers._places[0].worker
+        outcomes = [told(o) for o in workers.run([1, 2])]
+        assert workers._places[0].worker is before
+    assert all(said in str(o) for o in outcomes)
+    assert len(outcomes) == 2
+
+
+def test_an_argument_that_cannot_be_pickled_costs_itself() -> None:
+    with pool(tasks.received) as workers:
+        outcomes = {o.number: told(o) for o in workers.run([1, lambda: None, 2])}
+    assert outcomes[0] == outcomes[2] == "done"
+    assert "lambda" in str(outcomes[1])
+
+
+# ---- killed and stopped at each point of a task
+
+
+def at_first(monkeypatch: pytest.MonkeyPatch, point: str, number: int, times: int) -> None:
+    """Send a signal to the workers of the first tasks when they have part of it, or have sent part of the result."""
+    send, receive = Worker.send, Worker.receive
+    aimed_at: list[Worker] = []
+
+    def signal_to(worker: Worker) -> None:
+        aimed_at.remove(worker)
+        time.sleep(0.05)
+        assert worker.process.pid
+        os.kill(worker.process.pid, number)
+
+    def sending(self: Worker, message: bytes) -> None:
+        nonlocal times
+        send(self, message)
+        if times:
+            aimed_at.append(self)
+            times -= 1
+            if point == "receiving":
+                signal_to(self)
+
+    def receiving(self: Worker) -> bytes | None:
+        # Nothing was read, so the buffer of the pipe is full: the process waits within `send_bytes`.
+        if self in aimed_at and self.pipe.poll():
+            signal_to(self)
+        return receive(self)
+
+    monkeypatch.setattr(Worker, "send", sending)
+    monkeypatch.setattr(Worker, "receive", receiving)
+
+
+def ended_while(
+    point: str, number: int, times: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Callable[[Any], Any], object]:
+    """(function, argument) of a task during which its worker gets a signal."""
+    mark = folder / "mark"
+    if point == "receiving":
+        at_first(monkeypatch, point, number, times)
+        return tasks.received, bytes(LARGE)
+    if point == "unpickling":
+        return tasks.received, tasks.WhenUnpickled(mark, number, times)
+    if point == "computing":
+        return tasks.signalled, (mark, number, times)
+    at_first(monkeypatch, point, number, times)
+    return tasks.zeros, LARGE
+
+
+POINTS = ("receiving", "unpickling", "computing", "sending")
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("point", POINTS)
+def test_a_worker_killed_once_costs_nothing(
+    point: str, processes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    function, argument = ended_while(point, signal.SIGKILL, 1, tmp_path, monkeypatch)
+    with pool(function, processes) as workers:
+        (outcome,) = workers.run([argument])
+    assert outcome.value() in ("done", bytes(LARGE))
+
+
+@pytest.mark.parametrize("point", POINTS)
+def test_a_worker_killed_twice_costs_its_task_and_names_the_signal(
+    point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    function, argument = ended_while(point, signal.SIGKILL, 2, tmp_path, monkeypatch)
+    with pool(function) as workers:
+        (outcome,) = workers.run([argument])
+        assert told(outcome) == "WorkerDiedError: signal 9"
+        (outcome,) = workers.run([argument])
+        assert outcome.error is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("point", POINTS)
+def test_a_stopped_worker_is_late(point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other worker finishes meanwhile, and the task is not tried again."""
+    function, argument = ended_while(point, signal.SIGSTOP, 1, tmp_path, monkeypatch)
+    others = [1] * 5
+    with pool(function, 2) as workers:
+        began = time.monotonic()
+        outcomes = list(workers.run([argument, *others], timeout_s=2))
+        assert time.monotonic() - began < 20
+    assert [told(o) for o in outcomes if o.number == 0] == ["TimeoutError: "]
+    assert all(o.error is None for o in outcomes if o.number)
+    assert len(outcomes) == 6
+
+
+def test_a_worker_that_leaves_costs_its_task_at_once() -> None:
+    with pool(tasks.leave) as workers:
+        assert [told(o) for o in workers.run([0, 3, 0])] == [0, "WorkerDiedError: exit code 3", 0]
+
+
+def test_a_result_sent_before_the_kill_counts() -> None:
+    with pool(tasks.sleep, 1) as workers:
+        outcomes = workers.run([0.0, 0.2])
+        assert next(outcomes).value() == 0.0
+        time.sleep(1)  # the second result is in the pipe
+        (worker,) = worker_processes()
+        worker.kill()
+        worker.wait()
+        assert next(outcomes).value() == 0.2
+
+
+def test_time_limits_do_not_run_on_the_clock_of_the_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that is set forward in the middle of a task ends nothing."""
+    steps = iter(range(0, 10**9, 10**5))
+    monkeypatch.setattr(time, "time", lambda: next(steps))
+    with pool(tasks.sleep) as workers:
+        assert [o.value() for o in workers.run([0.3, 0.3], timeout_s=30)] == [0.3, 0.3]
+
+
+@pytest.mark.slow
+def test_what_came_while_nobody_looked_is_not_late() -> None:
+    """Whoever asks for the outcomes may take longer over one than the time limit of the next."""
+    with pool(tasks.zeros, 2) as workers:
+        outcomes = workers.run([1, LARGE, LARGE, LARGE], timeout_s=1)
+        next(outcomes)
+        time.sleep(2)
+        assert [len(o.value()) for o in outcomes] == [LARGE] * 3
+
+
+# ---- workers that cannot start
+
+
+def test_workers_that_cannot_start_end_the_run_in_one_line() -> None:
+    with pool(tasks.received, 3, initializer=tasks.refuse) as workers, pytest.raises(WorkerError) as raised:
+        list(workers.run([1, 2]))
+    assert str(raised.value).startswith("no worker process can be started (ValueError: no room); ")
+
+
+def test_a_worker_that_cannot_start_is_one_less(tmp_path: Path) -> None:
+    with pool(tasks.process_id, 3, initializer=tasks.refuse_after_first, arguments=(tmp_path,)) as workers:
+        assert len({o.value() for o in workers.run(range(20))}) == 1
+
+
+@pytest.mark.parametrize("what", ["pipe", "thread", "process"])
+def test_a_system_that_is_short_of_something(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def short(*_: object, **__: object) -> None:
+        raise RuntimeError("can't start new thread") if what == "thread" else OSError(11, "Resource unavailable")
+
+    owner, name = {
+        "pipe": (type(CONTEXT), "Pipe"), "thread": (threading.Thread, "start"), "process": (CONTEXT.Process, "start"),
+    }[what]  # fmt: skip
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, short)
+        workers = pool(tasks.received, 2)
+        with workers, pytest.raises(WorkerError, match=r"no worker process can be started \(\w+Error: "):
+            list(workers.run([1]))
+
+
+def test_a_worker_that_stops_while_it_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process_pool, "_STARTS_WITHIN_S", 1.0)
+    stopping = pool(tasks.received, initializer=tasks.stop_for_ever)
+    with stopping as workers, pytest.raises(WorkerError, match="not ready after 1 s"):
+        list(workers.run([1]))
+
+
+# ---- storms
+
+
+def killing(workers: ProcessPool[Any, Any], stop: threading.Event, rest_s: Callable[[], float]) -> list[int]:
+    """Kill one worker after another until the event is set: the ids of the killed ones."""
+    killed: list[int] = []
+    rng = random.Random(0)
+
+    def kill() -> None:
+        while not stop.wait(rest_s()):
+            alive = [p.worker.process.pid for p in list(workers._places) if p.worker._launched]
+            alive = [pid for pid in alive if pid and pid not in killed]
+            if alive:
+                killed.append(rng.choice(alive))
+                with suppress(ProcessLookupError):
+                    os.kill(killed[-1], signal.SIGKILL)
+
+    threading.Thread(target=kill, daemon=True).start()
+    return killed
+
+
+@pytest.mark.parametrize("processes", [1, 8])
+def test_a_storm_ends_the_run_with_its_reason(processes: int) -> None:
+    stop = threading.Event()
+    with pool(tasks.sleep, processes) as workers:
+        killing(workers, stop, lambda: 0.001)
+        began = time.monotonic()
+        with pytest.raises(WorkerError, match=r"3 worker processes one after another ended .*signal 9"):
+            list(workers.run([60.0] * 100))
+        assert time.monotonic() - began < 20
+        stop.set()
+
+
+def test_workers_killed_together_do_not_end_the_run() -> None:
+    with pool(tasks.sleep, 6) as workers:
+        outcomes = workers.run([0.0, *[0.3] * 12])
+        next(outcomes)
+        for worker in worker_processes():
+            worker.kill()
+        assert all(o.value() == 0.3 for o in outcomes)
+
+
+@pytest.mark.slow
+def test_a_killed_fork_server_costs_nothing() -> None:
+    if CONTEXT.get_start_method() != "forkserver":
+        pytest.skip("this system has no fork server")
+    with pool(tasks.sleep, 2) as workers:
+        outcomes = workers.run([0.0, 0.0, *[1.0] * 3])
+        next(outcomes), next(outcomes)
+        parents = {p.ppid() for p in worker_processes()}
+        assert len(parents) == 1
+        os.kill(parents.pop(), signal.SIGKILL)
+        assert [o.value() for o in outcomes] == [1.0] * 3
+
+
+@pytest.mark.slow
+def test_a_hundred_kills_at_random_moments() -> None:
+    """Eight workers, on however many cores."""
+    rng, stop = random.Random(5), threading.Event()
+    given, outcomes, runs = list(range(3000)), [], 0
+    with pool(tasks.wait_then_double, 8) as workers:
+        killed = killing(workers, stop, lambda: rng.uniform(0.0, 0.1))
+        while len(killed) < 100:
+            runs += 1
+            outcomes += list(workers.run(given, timeout_s=30))
+        stop.set()
+    assert len(outcomes) == runs * len(given)
+    for number in given:
+        assert sum(o.number == number for o in outcomes) == runs
+    lost = [o for o in outcomes if o.error is not None]
+    assert {told(o) for o in lost} <= {"WorkerDiedError: signal 9"}
+    assert len(lost) <= len(killed) / 2  # each of them was tried twice
+    assert all(o.result == 2 * o.number for o in outcomes if o.error is None)
+
+
+# ---- ends
+
+
+SCRIPT = """
+import signal
+import sys
+from multiprocessing import get_context
+from agalign.values.process_pool import ProcessPool
+from agalign.values.processes import follow_parent
+from tests.values.pool_tasks import sleep
+if __name__ == "__main__":
+    # A shell starts jobs in the background with this signal ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with ProcessPool(sleep, 4, get_context(sys.argv[1]), follow_parent) as workers:
+        outcomes = workers.run([0.0] * 4 + [60.0] * 8)
+        for _ in range(4):
+            next(outcomes)
+        print("begun", flush=True)
+        list(outcomes)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("whom", ["group", "parent"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+def test_no_process_outlives_its_parent(method: str, number: int, whom: str, tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    command = [sys.executable, str(script), method]
+    root = Path(__file__).resolve().parents[2]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    given = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "start_new_session": True, "env": environment}
+    with subprocess.Popen(command, **given) as process:  # type: ignore[call-overload]
+        try:
+            assert process.stdout.readline() == b"begun\n"
+            children = psutil.Process(process.pid).children(recursive=True)
+            assert len(children) >= 4
+            (os.killpg if whom == "group" else os.kill)(process.pid, number)
+            assert process.wait(20) != 0
+        finally:
+            process.kill()
+    _, left = psutil.wait_procs(children, timeout=10)
+    assert left == []
+
+
+def test_the_exit_code_of_a_worker_that_never_started() -> None:
+    assert str(WorkerDiedError(None)) == "killed"
+    assert not worker_process.is_out_of_memory(None)
