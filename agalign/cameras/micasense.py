@@ -19,6 +19,7 @@ from agalign.cameras.pix4d import (
     VIGNETTING_POLYNOMIAL,
     TagTransfer,
     focal_length_px,
+    lens_offset_m,
     parallax_of,
     perspective_lens,
     pose_of,
@@ -45,7 +46,7 @@ _CALIBRATION: Name = (_MICASENSE, "RadiometricCalibration")
 _CENTIKELVIN = Radiometry("temperature", 27315.0, 1.0, 0.01)
 """What thermal bands count in: the Altum's tag SceneTemperature agrees with it."""
 _LAYOUT = {
-    "Blue": (0.9, 0.0), "Green": (0.0, 0.0), "Red": (0.0, 0.65), "NIR": (0.9, 0.7), "Red edge": (0.4, 0.35),
+    "Blue": (-0.9, 0.0), "Green": (0.0, 0.0), "Red": (0.0, -0.65), "NIR": (-0.9, -0.7), "Red edge": (-0.4, -0.35),
 }  # fmt: skip
 """How a RedEdge-M's bands move against green as the ground comes nearer: two flights of two cameras agree on it within
 a twentieth (docs/method.md)."""
@@ -76,6 +77,7 @@ class MicaSense(Camera):
         return (
             replace(
                 band, saturation_value=top, lens=lens, to_rig=to_rig, parallax=parallax, radiometry=radiometry,
+                lens_offset_m=lens_offset_m(tags),
             ),
         )  # fmt: skip
 

@@ -33,6 +33,7 @@ _AREA_NUMBERS = 8
 """x and y of four corners."""
 _MAX_FOCAL_LENGTH_MM = 100.0
 """Larger numbers are px: lenses of drone cameras have 2 to 50 mm, or 300 px and more."""
+_MAX_OFFSET_M = 0.5
 _MAX_MAGNIFICATION = 1.02
 """Beyond this a polynomial of vignetting in the band's own pixels is dropped."""
 
@@ -93,6 +94,17 @@ def parallax_of(tags: Tags) -> tuple[float, float] | None:
     """
     place = tags.numbers(*RIG_TRANSLATIONS)
     return (-place[0], -place[1]) if len(place) == 3 else None
+
+
+def lens_offset_m(tags: Tags) -> tuple[float, float] | None:
+    """Position of a band's lens right of and below the rig's origin, metres, from Camera:RigTranslations; None where
+    that is missing. Some cameras write millimetres: no rig of a drone is half a metre wide.
+    """
+    place = tags.numbers(*RIG_TRANSLATIONS)
+    if len(place) != 3:
+        return None
+    scale = 1.0 if max(map(abs, place)) < _MAX_OFFSET_M else 1e-3
+    return place[0] * scale, place[1] * scale
 
 
 def spectral(band: Band, tags: Tags) -> Band:

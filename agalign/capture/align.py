@@ -6,11 +6,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.extrapolation import without_extrapolated
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.prediction import bands_to_learn, with_predictions
+from agalign.capture.relief import ReliefCandidate, aligned_by_relief
 from agalign.capture.seeding import find_seed, first_candidate, image_groups
 from agalign.capture.verification import WarpedPair, verified, with_metrics, without_result
+from agalign.capture.window_estimate import by_windows
 from agalign.config import Settings
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
@@ -58,6 +61,8 @@ def align_capture_bands(
     aligned = align_pairs(pairs, settings, progress, model, capture)
     if model is not None and model.rig is not None and not settings.seed.only:
         aligned = with_predictions(pairs, aligned, model.rig, capture)
+    if not settings.seed.only:
+        aligned = without_extrapolated(pairs, aligned, None if model is None else model.rig)
     aligned = _with_metrics(pairs, aligned, progress)
     result: dict[str, Alignment[FixedFilePx]] = {}
     for band in capture.bands_of_the_references_lens:
@@ -111,13 +116,14 @@ def align_pairs(
         aligner.keep_seeds(starts)
         return aligner.timed_result()
     aligner.refine(starts)
-    left = [s for s in starts if not aligner.is_aligned(s)]
+    left = [s for s in starts if not aligner.is_settled(s)]
     if not scratch:
         left = [s for s in left if s[0].name not in aligner.result]
     if left and capture is not None:
         chosen = aligner.worth_learning(pairs, capture)
         left = [s for s in left if s[0].name in chosen]
     aligner.learn(left)
+    aligner.fit_windows(starts)
     return aligner.timed_result()
 
 
@@ -135,9 +141,10 @@ class _PairAligner:
     def timed_result(self) -> dict[str, Alignment[FixedImagePx]]:
         return self.timer.added_to(self.result)
 
-    def is_aligned(self, start: Start) -> bool:
+    def is_settled(self, start: Start) -> bool:
+        """True where another attempt would find nothing better."""
         name = start[0].name
-        return name in self.result and self.result[name].status == "aligned"
+        return name in self.result and self.result[name].status in ("aligned", "predicted")
 
     def seed(self, pairs: Sequence[BandPair]) -> list[Start]:
         """The pairs with their seeds; a pair without one has failed."""
@@ -177,6 +184,15 @@ class _PairAligner:
         """From scratch, together."""
         self._attempt(starts, [], lambda group, report: align_from_scratch(group, self.settings.joint, report))
 
+    def fit_windows(self, starts: Sequence[Start]) -> None:
+        """Align by windows the pairs with descriptors that recognise nothing."""
+        if self.settings.joint.model_family not in ("auto", "homography"):
+            return
+        for pair, _ in starts:
+            if pair.name in self.result:
+                with self.timer.measure([pair.name]):
+                    self.result[pair.name] = by_windows(pair, self.result[pair.name])
+
     def _attempt(self, starts: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
         with self.timer.measure([pair.name for pair, _ in starts]):
             results = _results(starts, sides, align, self.progress)
@@ -201,12 +217,25 @@ def verify_together(
             for (pair, _), result in zip(starts, results, strict=True)
         ]
         improved = _estimated_together(starts, results, warped_pairs, model, settings)
-    alignments: dict[str, Alignment[FixedImagePx]] = {}
+        progress(starts[0][0].name if starts else "", "relief", 0.0)
+        alignments = aligned_by_relief(_relief_candidates(starts, improved, warped_pairs), settings.relief.use)
     for (pair, seed), result, warped_pair in zip(starts, improved, warped_pairs, strict=True):
+        if pair.name in alignments:
+            continue
         progress(pair.name, "checking", 0.0)
         with timer.measure([pair.name]):
             alignments[pair.name] = verified(pair, seed, result, settings, warped_pair)
     return alignments
+
+
+def _relief_candidates(
+    starts: Sequence[Start], results: Results, warped_pairs: Sequence[WarpedPair | None]
+) -> list[ReliefCandidate]:
+    return [
+        ReliefCandidate(pair, seed, result, warped)
+        for (pair, seed), result, warped in zip(starts, results, warped_pairs, strict=True)
+        if isinstance(result, JointResult) and warped is not None
+    ]
 
 
 def _results(

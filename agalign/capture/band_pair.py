@@ -33,6 +33,7 @@ from agalign.values.pixel_units import (
     MovingImagePoints,
     PixelScale,
 )
+from agalign.values.relief import Parallax
 
 Candidates = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of trust."""
@@ -74,6 +75,10 @@ class BandPair:
     """The moving image has so few pixels that the reference is reduced for it."""
     field: DisplacementField | None = None
     """Displacements before any homography, px of the fixed image: the flight's field of the lenses."""
+    layout: tuple[float, float] | None = None
+    """Direction (x, y) in which the moving image moves relative to the reference as the scene comes nearer, in the unit
+    of the camera's other bands; None where the tags do not give it.
+    """
 
     @classmethod
     def of_images(
@@ -122,9 +127,12 @@ class BandPair:
         """The moving image, likewise."""
         return self.moving_image if self.space == "undistorted" else replace(self.moving_image, lens=None)
 
-    def mapping(self, fixed_to_moving: Matrix, local: DisplacementField | None = None) -> PixelMapping:
+    def mapping(
+        self, fixed_to_moving: Matrix, local: DisplacementField | None = None, parallax: Parallax | None = None
+    ) -> PixelMapping:
         """The complete mapping between the raw pixels of the two images, by all displacements or else the rig's."""
-        return PixelMapping(fixed_to_moving, self.fixed.lens, self.moving.lens, local=local or self.field)
+        lenses = self.fixed.lens, self.moving.lens
+        return PixelMapping(fixed_to_moving, *lenses, local=local or self.field, parallax=parallax)
 
     def warped_moving(self, mapping: PixelMapping) -> Raster:
         """The moving image, one channel, on the reference's pixels."""
@@ -228,7 +236,16 @@ def _pair(
     field = None if model is None or model.rig is None else model.rig.fields.get(name)
     field = None if field is None else field.rescaled(scales.fixed)
     known = _known_to_px(name, model, scales.fixed)
-    return BandPair(name, reference, moving, reduced, tuple(bands), scales, known, is_coarse, field)
+    return BandPair(
+        name, reference, moving, reduced, tuple(bands), scales, known, is_coarse, field, _layout(band, bands[0])
+    )
+
+
+def _layout(reference: Band, moving: Band) -> tuple[float, float] | None:
+    """Difference of the directions of parallax of two bands."""
+    if reference.parallax is None or moving.parallax is None:
+        return None
+    return moving.parallax[0] - reference.parallax[0], moving.parallax[1] - reference.parallax[1]
 
 
 def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:

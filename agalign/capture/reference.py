@@ -9,12 +9,19 @@ from agalign.pixels.resample import shrink, textured
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.displacement_field import COARSE, FINE, DisplacementEstimator
+from agalign.verify.displacement_field import COARSE, FINE, LENS, DisplacementEstimator
 from agalign.verify.metrics import FixedSimilarity
 from agalign.verify.residuals import FixedWindows
 
 _SEED_LONGEST_PX = 384
 """Longer side of the images on which seeds are scored: shifts of a third of the image are found, and it is quick."""
+
+_FIT_PX = LENS.window_px
+"""Side of the windows in which planes and baselines are fitted: small enough to be on one surface."""
+_HELD_OUT_PX = 64
+"""Side of the windows that verify a relief: larger ones have less noise in their shifts."""
+_SMALL_WINDOW_PX = 32
+"""Side of windows between saturated spots: the smallest with a plain correlation peak."""
 
 
 class Reference:
@@ -77,6 +84,11 @@ class Reference:
         return FixedWindows(self.grey.valid, self.structure)
 
     @cached_property
+    def small_windows(self) -> FixedWindows:
+        """Windows for images with valid areas that are too small for those."""
+        return FixedWindows(self.grey.valid, self.structure, _SMALL_WINDOW_PX)
+
+    @cached_property
     def local(self) -> DisplacementEstimator:
         """Smaller windows, to which displacement fields are fitted."""
         return DisplacementEstimator(self.grey.valid, self.structure, COARSE)
@@ -85,6 +97,21 @@ class Reference:
     def finer_local(self) -> DisplacementEstimator:
         """The smallest windows."""
         return DisplacementEstimator(self.grey.valid, self.structure, FINE)
+
+    @cached_property
+    def fit_windows(self) -> FixedWindows:
+        """Windows in the black fields of a chessboard, in which planes and baselines are fitted."""
+        return FixedWindows.on_chessboard(self.grey.valid, self.structure, _FIT_PX, white=False)
+
+    @cached_property
+    def lens_field(self) -> DisplacementEstimator:
+        """Fits what lenses leave in the same windows."""
+        return DisplacementEstimator(self.grey.valid, self.structure, LENS, self.fit_windows)
+
+    @cached_property
+    def held_out_windows(self) -> FixedWindows:
+        """Windows of another size in the white fields, which verify what was fitted in the black ones."""
+        return FixedWindows.on_chessboard(self.grey.valid, self.structure, _HELD_OUT_PX, white=True)
 
     @cached_property
     def similarity(self) -> FixedSimilarity:

@@ -53,12 +53,13 @@ def resample_tile(
     """The moving band on a tile of the reference grid, (height, width), and its mask. The type is the band's own,
     integers rounded and clipped; calibrated with `radiometry` it is float32.
 
-    A pixel is valid where it is inside the moving image and no invalid pixel contributes to it.
+    A pixel is valid where it is inside the moving image, not occluded there, and no invalid pixel contributes to it.
     """
     positions = mapping.positions(tile)
     shape = tile.height, tile.width
-    # The mapping is smooth: a coarse sample of it, edges included, gives its extent to a pixel.
-    rows, columns = (np.append(np.arange(0, n, _SAMPLE_PX), n - 1) for n in shape)
+    # Without parallax the mapping is smooth: a coarse sample of it, edges included, gives its extent to a pixel.
+    step = _SAMPLE_PX if mapping.parallax is None else 1
+    rows, columns = (np.append(np.arange(0, n, step), n - 1) for n in shape)
     some = positions[np.ix_(rows, columns)]
     low = np.floor(np.nanmin(some, axis=(0, 1))).astype(int) - _SUPPORT_PX - 1
     high = np.ceil(np.nanmax(some, axis=(0, 1))).astype(int) + _SUPPORT_PX + 2
@@ -71,9 +72,10 @@ def resample_tile(
         pixels, valid = read_window(dataset, band, int(x0), int(y0), int(x1 - x0), int(y1 - y0))
     if radiometry is not None:
         pixels = calibrated(pixels, radiometry, int(x0), int(y0))
-    return resample(
+    resampled, whole = resample(
         pixels, valid, positions - (x0, y0), (band.width_px - x0, band.height_px - y0), (-x0, -y0), interpolation
     )
+    return resampled, whole & ~mapping.hidden(tile)
 
 
 def resample(
@@ -153,10 +155,13 @@ def warped(
     moving_size = width, height
     moving_scale = PixelScale.between(moving.size_px, moving_size)
     small = shrink(moving, moving_size)
-    positions = mapping.rescaled(fixed_scale, moving_scale).positions(Tile(0, 0, *size_px), np.float32)
+    rescaled, whole = mapping.rescaled(fixed_scale, moving_scale), Tile(0, 0, *size_px)
+    positions = rescaled.positions(whole, np.float32)
     cv2.patchNaNs(positions, _NOWHERE)
     pixels = cv2.remap(small.pixels, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     valid = _between(positions, np.zeros(2), np.subtract(small.size_px, 1))
+    if rescaled.parallax is not None:
+        valid &= ~rescaled.hidden(whole)
     if not small.valid.all():
         known = small.valid.astype(np.uint8) * 255
         valid &= cv2.remap(known, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) == 255

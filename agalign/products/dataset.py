@@ -5,6 +5,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.pixels.raster import without_warnings
 from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
@@ -13,6 +15,8 @@ if TYPE_CHECKING:
     import xarray
 
 _RAW_UNIT = "count"
+_RELIEF = {"parallax": "px", "confidence": "1", "range": "m"}
+"""Layers of a relief's raster, and their units."""
 _MORE = re.compile(r"(?:\.stac)?\.json$|\.tiff?$", re.IGNORECASE)
 _COORDINATES = ("latitude", "longitude", "altitude_m")
 _CHUNKS = {"x": 1024, "y": 1024}
@@ -24,8 +28,9 @@ def open_capture(path: str | Path, *, masked: bool = False) -> "xarray.Dataset":
     Dimensions are y and x, at the centres of pixels: on the map where the capture lies on one (`.rio.crs`), else in px
     of what was written. A variable is named after its band and has the attributes `wavelength_nm`, `units`, `status`
     and, where nodata is declared, `_FillValue`; with `masked` such pixels are nan instead.
-    Bands of which nothing was written are left out. Raises SidecarError, UnreadableFileError, and ConfigurationError
-    where xarray is not installed.
+    Bands without pixels are left out. A capture with a relief has the variables `parallax` (px along a
+    baseline of length 1, positive nearer) and, where they were asked for, `confidence` and `range` (m).
+    Raises SidecarError, UnreadableFileError, and ConfigurationError where xarray is not installed.
     """
     import_xarray()
     given = Path(path)
@@ -99,6 +104,13 @@ def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset
         if name not in files:
             files[name] = _opened(folder, name, masked=masked)
         result[band.band] = _variable(files[name], band, band.place.band_index, name)
+    relief = next((b.relief.file for b in sidecar.bands if b.relief is not None and b.relief.file), None)
+    if relief is not None:
+        layers = _opened(folder, relief, masked=True)
+        for index, name in enumerate(np.atleast_1d(layers.attrs.get("long_name", "parallax"))):
+            result[str(name)] = layers.isel(band=index, drop=True).assign_attrs(
+                long_name=str(name), units=_RELIEF[name]
+            )
     dataset: xarray.Dataset = xr.Dataset(result)
     dataset.attrs = {
         "capture": sidecar.capture, "capture_id": sidecar.capture_id, "flight_id": sidecar.flight_id,
@@ -140,8 +152,6 @@ def _in_pixels(dataset: "xarray.Dataset") -> "xarray.Dataset":
 
 
 def _moment(sidecar: Sidecar) -> Any:
-    import numpy as np
-
     try:
         return np.datetime64(sidecar.captured_at.partition("+")[0].rstrip("Z"), "ns")
     except ValueError:

@@ -5,20 +5,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import rasterio
-import tifffile
 from numpy.typing import NDArray
-from rasterio.errors import RasterioError
 
 from agalign.config import WriteSettings
-from agalign.errors import OutputError
-from agalign.pixels.raster import GDAL_ENVIRONMENT, why, without_warnings
 from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import GEOTIFF, check_complete, georeferenced
+from agalign.products.raster_file import GEOTIFF, write_layers
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
-from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.expected_error import expected_error_px
@@ -53,23 +47,9 @@ def write_error_map(
     complete or not at all. Raises OutputError.
     """
     size_px, georeference = capture.reference.size_px, capture.reference.georeference
-    profile = {
-        "driver": "GTiff", "width": grid.width, "height": grid.height, "count": len(alignments), "dtype": "float32",
-        "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate", "predictor": 3, "nodata": np.nan,
-    }  # fmt: skip
-    profile |= {} if georeference is None else georeferenced(georeference, grid)
-    try:
-        with complete_file(path) as partial:
-            with (
-                without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
-            ):  # fmt: skip
-                for index, (name, alignment) in enumerate(alignments.items(), start=1):
-                    dataset.write(_error_px(alignment, size_px, grid), index)
-                    dataset.set_band_description(index, name)
-                    dataset.update_tags(index, units="px of the reference", STATUS=alignment.status)
-            check_complete(partial)
-    except (RasterioError, tifffile.TiffFileError) as error:
-        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
+    layers = {name: _error_px(alignment, size_px, grid) for name, alignment in alignments.items()}
+    tags = {name: {"units": "px of the reference", "STATUS": a.status} for name, a in alignments.items()}
+    write_layers(path, layers, grid, georeference, tags=tags)
 
 
 def error_lattice_px(

@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from agalign.errors import OutputError
 from agalign.flight.fingerprint import fingerprint
 from agalign.products.band_files import BandFiles
 from agalign.products.product import ProductContext, WrittenFile
+from agalign.products.relief_map import ReliefMap
 from agalign.products.sidecar import (
     BandPart,
     CameraPart,
@@ -31,6 +32,7 @@ from agalign.products.sidecar import (
     PredictionPart,
     ProductPart,
     ReferencePart,
+    ReliefPart,
     ResidualTile,
     SeedPart,
     Sidecar,
@@ -38,12 +40,13 @@ from agalign.products.sidecar import (
 )
 from agalign.products.stack import Stack
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, DisplacementResult, JointResult, Prediction, Residual
+from agalign.values.alignment import DisplacementResult, JointResult, Prediction, Residual
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping, mapping_of
 from agalign.values.pixel_units import FixedFilePx
+from agalign.values.relief import Relief
 
 _GRID = 17, 13
 """Columns and rows of the sampled mapping, which is nearly a homography."""
@@ -159,18 +162,36 @@ def _place(context: ProductContext, band: Band) -> PlacePart | None:
 def _band_part(context: ProductContext, band: Band) -> BandPart:
     place = _place(context, band)
     if band is not context.capture.reference:
-        return _moving_part(context.capture.reference, band, context.alignments[band.name], place)
+        return _moving_part(context, band, place)
     return BandPart(
         band=band.name, wavelength_nm=band.wavelength_nm, file=band.path.name, band_index=band.band_index,
         status="reference", reason=None, place=place, seconds=0.0,
     )  # fmt: skip
 
 
-def _moving_part(reference: Band, band: Band, alignment: Alignment[FixedFilePx], place: PlacePart | None) -> BandPart:
+def _relief_part(context: ProductContext, mapping: PixelMapping) -> ReliefPart | None:
+    parallax = mapping.parallax
+    if parallax is None:
+        return None
+    nodes_px = geometry.lattice(*context.capture.reference.size_px, *_GRID)
+    flat = np.zeros((1, 1), np.float32)
+    at_zero, at_one = (
+        replace(mapping, parallax=replace(parallax, relief=Relief(flat + level, flat)))(nodes_px) for level in (0, 1)
+    )
+    file = next((f.path for f in context.written if f.kind == ReliefMap.kind), None)
+    occluded = 0.0 if parallax.hidden is None else float(parallax.hidden.mean())
+    return ReliefPart(
+        file=None if file is None else _name(file, context), baseline=parallax.baseline, occluded=round(occluded, 4),
+        reference_px=_points(nodes_px), plane_px=_points(at_zero), slope=_points(at_one - at_zero),
+    )  # fmt: skip
+
+
+def _moving_part(context: ProductContext, band: Band, place: PlacePart | None) -> BandPart:
+    reference, alignment = context.capture.reference, context.alignments[band.name]
     joint, residual = alignment.joint, alignment.residual
     local = alignment.local
     mapping = mapping_of(reference, band, alignment)
-    is_fine = alignment.field is not None or _is_curved(mapping, reference.size_px)
+    is_fine = alignment.field is not None or _is_curved(mapping.of_the_plane, reference.size_px)
     grid_px = geometry.lattice(*reference.size_px, *(_FINE_GRID if is_fine else _GRID))
     after = dict(alignment.after) | _residual_metrics(residual)
     return BandPart(
@@ -194,6 +215,7 @@ def _moving_part(reference: Band, band: Band, alignment: Alignment[FixedFilePx],
             before=_similarity_part(alignment.before), after=_similarity_part(after), tiles=_tile_parts(residual)
         ),
         local=None if local is None else _local_part(local),
+        relief=_relief_part(context, mapping),
         prediction=None if alignment.prediction is None else _prediction_part(alignment.prediction),
         place=place,
         seconds=round(alignment.seconds, 3),

@@ -54,9 +54,11 @@ def output_layers(
     """
     pixels = _OutputPixels.of(capture, alignments, settings)
     layers = _layers(capture, alignments, pixels)
-    moved = [(layer.mapping, layer.band) for layer in layers if layer.mapping is not None]
+    # The crop is that of the reference plane; relief may leave pixels of single bands without a value.
+    moved = [(layer.mapping.of_the_plane, layer.band) for layer in layers if layer.mapping is not None]
     crop = _crop(capture, moved, pixels, settings, rig)
-    has_gaps = not _covers(moved, crop)
+    has_relief = any(layer.mapping is not None and layer.mapping.parallax is not None for layer in layers)
+    has_gaps = has_relief or not _covers(moved, crop)
     grid = OutputGrid(crop.x0, crop.y0, crop.width, crop.height, pixels.scale, pixels.undistorted, has_gaps)
     return layers, grid
 

@@ -8,9 +8,11 @@ The sheet has a column for each band of the sidecar, in its order, and these row
     2  a detail of row 0 at full resolution of the reduced bands, where there are most edges
     3  the same detail of row 1
     4  where error maps are written: the expected error, white for `ERROR_FULL_PX` and more
+    5  (4 without error maps) in the first column, where a relief displaces the bands: its parallax, the nearest white
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -22,13 +24,16 @@ from agalign.products.error_map import error_lattice_px
 from agalign.products.picture import busiest_window
 from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.reduced_bands import Grey, ReducedBands
-from agalign.products.sidecar import PreviewPart
+from agalign.products.relief_map import relief_layers, relief_of
+from agalign.products.sidecar import PreviewPart, ReliefPreviewPart
 from agalign.values.files import complete_file
 from agalign.values.image import Tile
 
 ERROR_FULL_PX = 0.5
 _MAX_TILE_PX, _MIN_TILE_PX, _DETAIL_SHARE = 640, 96, 0.35
 """Longer side of a tile, and the size of a detail as a share of it."""
+_RELIEF_PERCENTILES = 1.0, 99.0
+"""Limits of what is black and white: single wrong pixels must not take the contrast."""
 _QUALITY, _BLOCK_PX = 35, 8
 """Of the JPEG: pictures that share no block do not show in each other."""
 _MAX_BYTES_EACH, _MAX_TOTAL_BYTES = 600_000, 44_000_000
@@ -38,6 +43,28 @@ _MAX_BYTES_EACH, _MAX_TOTAL_BYTES = 600_000, 44_000_000
 def preview_bytes(captures: int) -> int:
     """Return the largest size of the preview of one of this many captures, bytes."""
     return min(_MAX_BYTES_EACH, _MAX_TOTAL_BYTES // max(captures, 1))
+
+
+@dataclass(frozen=True)
+class ReliefView:
+    """The relief of a capture, small."""
+
+    parallax_px: NDArray[np.float32]
+    """(height, width)"""
+    range_m: tuple[float, float] | None
+    """Nearest and farthest; None where the range is unknown."""
+
+    @property
+    def limits_px(self) -> tuple[float, float]:
+        """What is black and white."""
+        low, high = np.percentile(self.parallax_px, _RELIEF_PERCENTILES)
+        return float(low), max(float(high), float(low) + 1e-3)
+
+    @property
+    def grey(self) -> Grey:
+        """(height, width)"""
+        low, high = self.limits_px
+        return np.asarray(np.rint(((self.parallax_px - low) / (high - low)).clip(0, 1) * 255), np.uint8)
 
 
 class Preview(Product):
@@ -54,20 +81,38 @@ class Preview(Product):
         bands = [b.name for b in context.capture.bands]
         mapped = context.usable if context.write_settings.error_map else {}
         errors_px = {name: error_lattice_px(a, size_px, context.grid) for name, a in mapped.items()}
-        part = write_preview(context.reduced_bands, bands, errors_px, path, context.max_preview_bytes)
+        part = write_preview(
+            context.reduced_bands, bands, errors_px, path, context.max_preview_bytes, relief_view(context)
+        )
         return [WrittenFile(self.kind, path, preview=part)]
 
 
+def relief_view(context: ProductContext) -> ReliefView | None:
+    """Return the relief of a capture as the preview has it; None where none displaces a band."""
+    relief = relief_of(context.usable)
+    if relief is None:
+        return None
+    reduction = max(1.0, max(context.grid.width, context.grid.height) / _MAX_TILE_PX)
+    size_px = round(context.grid.width / reduction), round(context.grid.height / reduction)
+    layers = relief_layers(context.capture, context.usable, relief, context.grid, size_px)
+    range_m = layers["range"][np.isfinite(layers["range"])]
+    if range_m.size == 0:
+        return ReliefView(layers["parallax"], None)
+    near, far = np.percentile(range_m, _RELIEF_PERCENTILES).tolist()
+    return ReliefView(layers["parallax"], (near, far))
+
+
 def write_preview(
-    views: ReducedBands, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], path: Path, max_bytes: int
-) -> PreviewPart:
+    views: ReducedBands, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], path: Path, max_bytes: int,
+    relief: ReliefView | None = None,
+) -> PreviewPart:  # fmt: skip
     """Write the sheet, about as large as `max_bytes` allows, with a detail where the first of the bands has most to
     show; `errors_px` has a coarse map (rows, columns) by band, or none. Raises OutputError.
     """
     longest_px = max(views.size_px)
     tile_px = min(_MAX_TILE_PX, longest_px)
     for _ in range(6):
-        part, sheet = _sheet(views, bands, errors_px, tile_px / longest_px, path.name)
+        part, sheet = _sheet(views, bands, errors_px, relief, tile_px / longest_px, path.name)
         encoded, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         if not encoded:
             raise OutputError(f"{path}: cannot be made")
@@ -80,8 +125,9 @@ def write_preview(
 
 
 def _sheet(
-    views: ReducedBands, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], scale: float, name: str
-) -> tuple[PreviewPart, Grey]:
+    views: ReducedBands, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], relief: ReliefView | None,
+    scale: float, name: str,
+) -> tuple[PreviewPart, Grey]:  # fmt: skip
     width, height = views.size_px
     tile_px = _blocks(width * scale, width), _blocks(height * scale, height)
     detail_px = _blocks(tile_px[0] * _DETAIL_SHARE, width), _blocks(tile_px[1] * _DETAIL_SHARE, height)
@@ -95,13 +141,15 @@ def _sheet(
     ]
     if errors_px:
         rows.append([_small(_as_grey(errors_px.get(n)), tile_px) for n in bands])
+    if relief is not None:
+        rows.append([_small(relief.grey, tile_px)])
     strips = [np.hstack(row) for row in rows]
     whole = max(s.shape[1] for s in strips)
     sheet = np.vstack([np.pad(s, ((0, 0), (0, whole - s.shape[1]))) for s in strips])
     part = PreviewPart(
         file=name, tile_px=tile_px, detail_px=detail_px,
         detail=(x / width, y / height, detail_px[0] / width, detail_px[1] / height),
-        error_full_px=ERROR_FULL_PX if errors_px else None,
+        error_full_px=ERROR_FULL_PX if errors_px else None, relief=None if relief is None else _relief_part(relief),
     )  # fmt: skip
     return part, np.asarray(sheet, np.uint8)
 
@@ -121,6 +169,12 @@ def _cut(image: Grey | None, tile: Tile) -> Grey:
     if image is None:
         return np.zeros((tile.height, tile.width), np.uint8)
     return image[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
+
+
+def _relief_part(relief: ReliefView) -> ReliefPreviewPart:
+    low, high = relief.limits_px
+    range_m = None if relief.range_m is None else (round(relief.range_m[0], 3), round(relief.range_m[1], 3))
+    return ReliefPreviewPart(parallax_px=(round(low, 2), round(high, 2)), range_m=range_m)
 
 
 def _as_grey(error_px: NDArray[np.float32] | None) -> Grey | None:

@@ -1,15 +1,18 @@
 """One aligned raster on the reference's pixel grid, a tiled GeoTIFF or COG: written, then checked to be complete."""
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import rasterio
 import tifffile
+from numpy.typing import NDArray
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
+from rasterio.fill import fillnodata
 from rasterio.shutil import copy as copy_dataset
 from rasterio.transform import Affine
 from rasterio.windows import Window
@@ -28,6 +31,7 @@ from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.files import complete_file
 from agalign.values.image import Mask, OutputGrid, Tile
+from agalign.values.mapping import PixelMapping
 
 GEOTIFF = "image/tiff; application=geotiff"
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
@@ -35,6 +39,8 @@ _TILE_PX = 256
 """Side of the tiles within a TIFF: GDAL's default, which viewers read quickly."""
 _WORK_TILE_PX = 2048
 """Side of the tiles in which moving bands are resampled: it bounds the memory."""
+_FILL_DISTANCE_PX = 100.0
+"""From which occluded pixels are interpolated: GDAL's default, wider than any occlusion."""
 _COG_TILE_PX = 512
 """GDAL's default for a COG."""
 
@@ -73,6 +79,37 @@ def write_raster(
     except (RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
     return nodata
+
+
+def write_layers(
+    path: Path, layers: Mapping[str, NDArray[np.float32]], grid: OutputGrid, georeference: Georeference | None,
+    units: Mapping[str, str] | None = None, tags: Mapping[str, Mapping[str, str]] | None = None,
+) -> None:  # fmt: skip
+    """Write float32 layers (height, width) by name, with their units and tags, complete or not at all; nan is nodata.
+
+    Raises OutputError.
+    """
+    profile: dict[str, Any] = {
+        "driver": "GTiff", "width": grid.width, "height": grid.height, "count": len(layers), "dtype": "float32",
+        "tiled": True, "blockxsize": _TILE_PX, "blockysize": _TILE_PX, "compress": "deflate", "predictor": 3,
+        "nodata": np.nan,
+    }  # fmt: skip
+    profile |= {} if georeference is None else georeferenced(georeference, grid)
+    try:
+        with complete_file(path) as partial:
+            with (
+                without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
+            ):  # fmt: skip
+                for index, (name, values) in enumerate(layers.items(), start=1):
+                    dataset.write(values, index)
+                    dataset.set_band_description(index, name)
+                    if units is not None:
+                        dataset.set_band_unit(index, units[name])
+                    if tags is not None:
+                        dataset.update_tags(index, **tags[name])
+            check_complete(partial)
+    except (RasterioError, tifffile.TiffFileError) as error:
+        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
 
 
 def media_type(settings: WriteSettings) -> str:
@@ -121,10 +158,35 @@ def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels 
         return None, np.zeros((tile.height, tile.width), dtype=bool)
     radiometry = None if settings.radiometry == "off" else layer.band.radiometry
     if layer.mapping is not None:
-        return resample_tile(layer.band, layer.mapping, tile, settings.interpolation, radiometry)
+        pixels, valid = resample_tile(layer.band, layer.mapping, tile, settings.interpolation, radiometry)
+        return (
+            _with_occluded(pixels, valid, _fillable(layer, layer.mapping, tile))
+            if settings.fill_occluded
+            else (pixels, valid)
+        )
     with open_raster(layer.band.path) as source:
         pixels, valid = read_window(source, layer.band, tile.x0, tile.y0, tile.width, tile.height)
     return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
+
+
+def _fillable(layer: Layer, mapping: PixelMapping, tile: Tile) -> Mask:
+    """(height, width) True for occluded pixels of a tile inside the image of the band: beyond it there is nothing."""
+    positions = mapping.positions(tile)
+    inside = ((positions >= 0) & (positions <= np.subtract(layer.band.size_px, 1))).all(axis=-1)
+    return np.asarray(mapping.hidden(tile) & inside)
+
+
+def _with_occluded(pixels: Pixels, valid: Mask, hidden: Mask) -> tuple[Pixels, Mask]:
+    """Pixels and their mask with the hidden ones interpolated from valid ones around, by GDAL's inverse distances."""
+    if not hidden.any() or not valid.any():
+        return pixels, valid
+    distance_px = cv2.distanceTransform((~valid).astype(np.uint8), cv2.DIST_L2, 3)
+    hidden = hidden & (distance_px < _FILL_DISTANCE_PX)
+    filled = fillnodata(np.where(valid, pixels, 0).astype(np.float32), valid, _FILL_DISTANCE_PX)
+    if pixels.dtype.kind in "iu":
+        limits = np.iinfo(str(pixels.dtype))
+        filled = np.clip(np.rint(filled), limits.min, limits.max)
+    return np.where(hidden, filled, pixels).astype(pixels.dtype), valid | hidden
 
 
 def _profile(

@@ -6,6 +6,7 @@ from agalign.products.pan_sharpen import PanSharpened
 from agalign.products.picture import BeforeAfterPicture
 from agalign.products.preview import Preview
 from agalign.products.product import Product
+from agalign.products.relief_map import ReliefMap
 from agalign.products.stac import StacItem
 from agalign.products.stack import Stack
 
@@ -13,6 +14,7 @@ PRODUCTS: tuple[Product, ...] = (
     BandFiles(),
     Stack(),
     PanSharpened(),
+    ReliefMap(),
     ErrorMap(),
     BeforeAfterPicture(),
     Preview(),

@@ -175,10 +175,29 @@ class LocalPart(_Part):
     after_p95_px: float | None
 
 
+class ReliefPart(_Part):
+    """How the relief of the capture displaces a band. At a pixel x of the reference with the parallax z in `file`, the
+    moving pixel is plane_px(x) + z slope(x), both interpolated by cubic splines between their nodes.
+    """
+
+    file: RelativeFile | None
+    """The raster with the parallax, on the grid of the aligned files; null where nothing was written."""
+    baseline: PointPx
+    """Displacement in undistorted px of the reference for a px of parallax; the longest baseline has length 1."""
+    occluded: float
+    """Share of the reference's pixels that nearer parts of the scene occlude in this band."""
+    reference_px: list[PointPx]
+    plane_px: list[PointPx]
+    """Where the reference plane maps the nodes, raw px of the moving file."""
+    slope: list[PointPx]
+    """Px of the moving file for a px of parallax, at the nodes."""
+
+
 class PredictionPart(_Part):
-    """Where the flight's rig says that the band lies: from the capture's other bands, from the captures before and
-    after, or from the flight's mean. `std_px` is the root mean square error to be expected; `off_px` how far from there
-    the band's own image has it, null where it does not say. Both are in px of the band's own file.
+    """Where the flight's rig has the band: from the capture's other bands, from the captures before and after, or from
+    the flight's mean; or the mapping extrapolated from the windows in a part of the image. `std_px` is the root mean
+    square error to be expected; `off_px` how far from there the band's own image has it, null where it does not show
+    it. Both are in px of the band's own file.
     """
 
     source: Annotated[PredictionSource, Field(alias="from")]
@@ -209,6 +228,7 @@ class BandResult(_Result):
     joint: JointPart | None = None
     metrics: MetricsResult | None = None
     local: LocalPart | None = None
+    """A smooth displacement field of this band alone."""
     prediction: PredictionPart | None = None
     place: PlacePart | None = None
     seconds: float
@@ -221,6 +241,8 @@ class BandPart(BandResult):
 
     metrics: MetricsPart | None = None
     grid: GridPart | None = None
+    relief: ReliefPart | None = None
+    """The relief that this band shares with the others of its capture."""
 
 
 class FilePart(_Part):
@@ -258,19 +280,30 @@ class ProductPart(_Part):
     sha256: str
 
 
+class ReliefPreviewPart(_Part):
+    """The relief on the sheet, a picture in the first column of the last row."""
+
+    parallax_px: tuple[float, float]
+    """What is black and what is white, the nearest, there."""
+    range_m: tuple[float, float] | None
+    """The nearest and the farthest of the scene, 1st and 99th percentile; null where the range is unknown."""
+
+
 class PreviewPart(_Part):
     """A sheet of small grey pictures of all bands, from which the report composes its views: a column for each band
     of `bands`, in their order, and rows of the unaligned raw files, of what was written, of a detail of either, and
-    of the expected error where that was written, white for `error_full_px`.
+    of the expected error where that was written, white for `error_full_px`. The last row has the relief where one
+    displaces the bands.
     """
 
     file: RelativeFile
     tile_px: tuple[Count, Count]
-    """(width, height) of a picture in rows 0, 1 and 4, and of a detail in rows 2 and 3,"""
+    """(width, height) of a picture in rows 0, 1, 4 and 5, and of a detail in rows 2 and 3,"""
     detail_px: tuple[Count, Count]
     detail: tuple[float, float, float, float]
     """x0, y0, width, height of the detail as shares of the picture's sides."""
     error_full_px: float | None = None
+    relief: ReliefPreviewPart | None = None
 
 
 class CaptureResult(_Result):
@@ -319,7 +352,7 @@ class Sidecar(CaptureResult):
 
     def result(self) -> CaptureResult:
         """The same without its bands' long tables, of which a season has no need at once."""
-        short: dict[str, Any] = {"bands": {"__all__": {"grid": True, "metrics": {"tiles"}}}}
+        short: dict[str, Any] = {"bands": {"__all__": {"grid": True, "relief": True, "metrics": {"tiles"}}}}
         return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude=short))
 
 

@@ -22,6 +22,7 @@ from agalign.values.pixel_units import (
     MovingFilePx,
     PixelScale,
 )
+from agalign.values.relief import Parallax
 
 MIN_RETRIEVAL = 0.2
 """Held-out retrieval below which descriptors do not match: psi does not move and no result is accepted. Chance is below
@@ -114,6 +115,11 @@ class Residual(Generic[FixedPx]):
             centres_px, shifts_px, cast(FixedPx, float(median)), cast(FixedPx, float(p95)), coverage, peaks_sigma
         )
 
+    @property
+    def measured_px(self) -> NDArray[np.float64]:
+        """(m, 2) centres of the windows in which a shift was measured."""
+        return self.centres_px[np.isfinite(self.shifts_px[:, 0])]
+
     def is_better_than(self, other: "Residual[FixedPx]") -> bool:
         """True where the median shift, divided by the share of windows that could be measured, is smaller."""
         return self.median_px / max(self.coverage, 1e-6) < other.median_px / max(other.coverage, 1e-6)
@@ -168,13 +174,17 @@ class DisplacementResult(Generic[FixedPx]):
     field: DisplacementField | None
     before_p95_px: FixedPx
     after_p95_px: FixedPx
+    held_out: "Residual[FixedPx] | None" = None
+    """Of windows under fields that they, and windows that overlap them, were left out of."""
 
     def in_file_px(self: "DisplacementResult[FixedImagePx]", scales: "PairScales") -> "DisplacementResult[FixedFilePx]":
         """The same on the grid of the reference band's file."""
         up = scales.fixed.inverse
         field = None if self.field is None else self.field.rescaled(up)
         before, after = (FixedFilePx(p95 * up.mean) for p95 in (self.before_p95_px, self.after_p95_px))
-        return DisplacementResult(field, before, after)
+        return DisplacementResult(
+            field, before, after, None if self.held_out is None else self.held_out.in_file_px(scales)
+        )
 
 
 @dataclass(frozen=True)
@@ -198,21 +208,26 @@ SAME_SCALES = PairScales()
 
 _SOURCES: dict[PredictionSource, str] = {
     "bands": "the capture's other bands", "neighbours": "the captures around it", "flight": "the flight's mean",
+    "windows": "windows in the image",
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """The mapping of a band that the rig of a flight predicts."""
+    """The mapping of a band where its own image does not determine it: by the rig of a flight, or extrapolated."""
 
     fixed_to_moving: Matrix
     """Between the files, undistorted where the rig's mappings are."""
     source: PredictionSource
-    """From the capture's other bands, from the captures around it, or from the flight's mean."""
+    """From the capture's other bands, from the captures around it, from the flight's mean, or from the windows in the
+    rest of the image."""
     std_px: MovingFilePx
     """Standard error: root mean square over the image."""
     off_px: MovingFilePx | None = None
     """Root mean square distance from the band's own alignment; None where it has none."""
+    covariance_px2: NDArray[np.float64] | None = None
+    """(12, 12) of an extrapolated mapping, over the corners and the lens shapes (`verify.lens_shapes`), px of the
+    reference's file; None for a rig's."""
 
 
 @dataclass(frozen=True)
@@ -235,6 +250,8 @@ class Alignment(Generic[FixedPx]):
     """What a field of displacements of this capture's own gains; None where it was not asked for."""
     field: DisplacementField | None = None
     """All displacements in raw px of the reference, before the homography: the rig's and the capture's own."""
+    parallax: Parallax | None = None
+    """The capture's relief, which displaces undistorted px of the reference along the band's baseline."""
     prediction: Prediction | None = None
     """What the flight's rig says of it; None without a rig."""
 
@@ -248,7 +265,8 @@ class Alignment(Generic[FixedPx]):
             None if self.residual is None else self.residual.in_file_px(scales),
             self.seconds, self.before, self.after,
             None if self.local is None else self.local.in_file_px(scales),
-            None if self.field is None else self.field.rescaled(up), self.prediction,
+            None if self.field is None else self.field.rescaled(up),
+            None if self.parallax is None else self.parallax.rescaled(up), self.prediction,
         )  # fmt: skip
 
     @property
@@ -259,6 +277,8 @@ class Alignment(Generic[FixedPx]):
             return None
         if self.status == "predicted" and self.prediction is not None:
             known = f"known to {self.prediction.std_px:.2f} px from {_SOURCES[self.prediction.source]}"
+            if self.prediction.source == "windows":
+                return f"{told}, {known}"
             return f"{told}; the rig of the flight says where it lies, {known}"
         if self.status == "seed_only":
             return f"{told}; the {self.seed.kind} seed is used as it is"

@@ -13,19 +13,20 @@ from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, DisplacementField
 from agalign.values.capture import Band
 from agalign.values.geometry import Matrix, Points
-from agalign.values.image import Tile
+from agalign.values.image import Mask, Tile
 from agalign.values.lens import Lens
 from agalign.values.pixel_units import FixedFilePx, PixelScale
+from agalign.values.relief import Parallax, between_levels
 
 _KNOT_STEP_PX = 32
 """Curved mappings are evaluated this far apart and splined between: with real lenses below 0.0001 px of error."""
 _FIELD_KNOT_STEP_PX = 12
-"""The same where displacements change from place to place."""
+"""The same at least where displacements change from place to place: four for a step of their lattice."""
 
 
 @dataclass(frozen=True)
 class PixelMapping:
-    """raw reference px -> undistorted -> homography -> undistorted -> raw moving px."""
+    """raw reference px -> undistorted (-> moved by parallax) -> homography -> undistorted -> raw moving px."""
 
     fixed_to_moving: Matrix
     fixed_lens: Lens | None = None
@@ -34,21 +35,28 @@ class PixelMapping:
     """Lens through which the given pixels go first, where they are undistorted ones of the reference."""
     local: DisplacementField | None = None
     """Displacements of raw reference px before anything else."""
+    parallax: Parallax | None = None
+    """Displacements of undistorted reference px, by the parallax at the raw ones."""
 
     def __call__(self, reference_px: ArrayLike) -> Points:
         """(..., 2) raw reference pixels to raw moving pixels."""
         return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, self.undistorted(reference_px)))
 
     def undistorted(self, reference_px: ArrayLike) -> Points:
-        """(..., 2) raw reference pixels to those that the homography maps: displaced, then undistorted."""
+        """(..., 2) raw reference pixels to those that the homography maps: displaced, undistorted, with parallax."""
         raw = lens.distort(self.pre_distortion, reference_px)
-        if self.local is not None:
-            raw = raw + self.local(raw)
-        return lens.undistort(self.fixed_lens, raw)
+        displaced = raw if self.local is None else raw + self.local(raw)
+        undistorted = lens.undistort(self.fixed_lens, displaced)
+        return undistorted if self.parallax is None else undistorted + self.parallax.displacements(raw)
+
+    @property
+    def of_the_plane(self) -> "PixelMapping":
+        """The mapping without parallax."""
+        return self if self.parallax is None else replace(self, parallax=None)
 
     def from_undistorted(self, reference_lens: Lens) -> "PixelMapping":
         """The mapping for undistorted pixels of the reference instead of its raw ones."""
-        if self.fixed_lens is not None and self.local is None:
+        if self.fixed_lens is not None and self.local is None and self.parallax is None:
             return replace(self, fixed_lens=None)
         return replace(self, pre_distortion=reference_lens)
 
@@ -60,13 +68,16 @@ class PixelMapping:
             lens.rescaled(self.moving_lens, moving_scale),
             lens.rescaled(self.pre_distortion, fixed_scale),
             None if self.local is None else self.local.rescaled(fixed_scale),
+            None if self.parallax is None else self.parallax.rescaled(fixed_scale),
         )
 
     @property
     def is_curved(self) -> bool:
-        """True where the mapping is not just a homography: a lens model or a local field takes part."""
-        return self.local is not None or any(
-            map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion))
+        """True where the mapping is not just a homography: a lens model or displacements take part."""
+        return (
+            self.local is not None
+            or self.parallax is not None
+            or any(map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion)))
         )
 
     def positions(self, tile: Tile, dtype: DTypeLike = np.float64) -> Points:
@@ -75,9 +86,10 @@ class PixelMapping:
 
     def at_crossings(self, x_px: Points, y_px: Points, dtype: DTypeLike = np.float64) -> Points:
         """The same for pixels of the columns x (n,) and the rows y (m,), in ascending order: (m, n, 2)."""
+        if self.parallax is not None:
+            return self._with_parallax(self.parallax, x_px, y_px, dtype)
         if self.is_curved:
-            step = _KNOT_STEP_PX if self.local is None else _FIELD_KNOT_STEP_PX
-            return splined(self, x_px, y_px, step, dtype)
+            return splined(self, x_px, y_px, self._knot_step_px, dtype)
         h = self.fixed_to_moving
         result = np.empty((len(y_px), len(x_px), 2), dtype)
         denominator = (h[2, 0] * x_px)[None, :] + (h[2, 1] * y_px + h[2, 2])[:, None]
@@ -86,6 +98,40 @@ class PixelMapping:
                 result[..., k] = ((h[k, 0] * x_px)[None, :] + (h[k, 1] * y_px + h[k, 2])[:, None]) / denominator
         return result
 
+    def _with_parallax(self, parallax: Parallax, x_px: Points, y_px: Points, dtype: DTypeLike) -> Points:
+        """`at_crossings` where the parallax jumps from pixel to pixel."""
+        plane, baseline = self.of_the_plane, np.array(parallax.baseline)
+
+        def at_level(parallax_px: float) -> Points:
+            def moved(points: Points) -> Points:
+                undistorted = plane.undistorted(points) + baseline * parallax_px
+                return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, undistorted))
+
+            return splined(moved, x_px, y_px, self._knot_step_px, dtype)
+
+        relief = parallax.relief
+        of_raw_pixels = self.pre_distortion is None
+        levels_px = relief.at_crossings(x_px, y_px) if of_raw_pixels else relief(self._raw_crossings(x_px, y_px))
+        return np.asarray(between_levels(at_level, np.asarray(levels_px, np.float32)), dtype)
+
+    def hidden(self, tile: Tile) -> Mask:
+        """(height, width) True for pixels of a tile that nearer parts of the scene occlude in the moving image."""
+        if self.parallax is None or self.parallax.hidden is None:
+            return np.zeros((tile.height, tile.width), dtype=bool)
+        return self.parallax.hides(self._raw_crossings(_along(tile.x0, tile.width), _along(tile.y0, tile.height)))
+
+    def _raw_crossings(self, x_px: Points, y_px: Points) -> Points:
+        """(m, n, 2) raw reference px of the pixels of columns x (n,) and rows y (m,)."""
+        if self.pre_distortion is None:
+            return np.stack(np.meshgrid(x_px, y_px), axis=-1)
+        return splined(lambda points: lens.distort(self.pre_distortion, points), x_px, y_px)
+
+    @property
+    def _knot_step_px(self) -> int:
+        if self.local is None:
+            return _KNOT_STEP_PX
+        return int(np.clip(self.local.step_px / 4, _FIELD_KNOT_STEP_PX, _KNOT_STEP_PX))
+
 
 def _along(start: int, length: int) -> Points:
     return np.arange(start, start + length, dtype=np.float64)
@@ -93,10 +139,10 @@ def _along(start: int, length: int) -> Points:
 
 def mapping_of(reference: Band, moving: Band, alignment: Alignment[FixedFilePx]) -> PixelMapping:
     """The complete mapping between the raw pixels of two files, of which an alignment was found."""
-    local = alignment.field
+    local, parallax = alignment.field, alignment.parallax
     if alignment.space == "pixel":
-        return PixelMapping(alignment.fixed_to_moving, local=local)
-    return PixelMapping(alignment.fixed_to_moving, reference.lens, moving.lens, local=local)
+        return PixelMapping(alignment.fixed_to_moving, local=local, parallax=parallax)
+    return PixelMapping(alignment.fixed_to_moving, reference.lens, moving.lens, local=local, parallax=parallax)
 
 
 def splined(

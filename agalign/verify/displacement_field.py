@@ -6,12 +6,12 @@ A field is kept only where it explains windows that it was not fitted to, and wh
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix, dia_matrix, diags, identity, kron, vstack
-from scipy.sparse.linalg import splu
+from scipy.linalg import solveh_banded
+from scipy.sparse import dia_matrix, diags, identity, kron, vstack
 from scipy.spatial import cKDTree
 
 from agalign.pixels.resample import warped
@@ -33,10 +33,15 @@ class FieldScale:
     """Side of the windows in which shifts are measured; they overlap by half."""
     lattice_px: int
     """Spacing of the field's nodes."""
+    verification_px: int = 48
+    """Side of the windows in which the field is verified: small enough to be close to windows that take part in the
+    fit, since none that shares a pixel does."""
 
 
+LENS = FieldScale(window_px=48, lattice_px=96)
+"""For what lenses leave under a relief: it changes over hundreds of pixels."""
 COARSE = FieldScale(window_px=64, lattice_px=48)
-FINE = FieldScale(window_px=32, lattice_px=24)
+FINE = FieldScale(window_px=32, lattice_px=24, verification_px=32)
 """For plants and walls that are too high above the ground for the coarse field to follow."""
 
 _MAX_WINDOWS = 4000
@@ -65,6 +70,8 @@ _COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
 """As `_SMOOTHNESS`, relative to one window of each capture, for the field that the lenses cause."""
 _MIN_COMMON_GAIN_SIGMA, _MAX_COMMON_P95_GROWTH = 2.5, 1.05
 """Less strict than within one capture: whole captures that are left out share nothing but their lenses."""
+_ITSELF_PX = 1.0
+"""Two windows of one grid that are nearer are the same."""
 _ALL_FOLDS = range(16)
 _SOME_FOLDS = (0, 2, 8, 10)
 """Far enough apart to choose the smoothness by."""
@@ -76,17 +83,27 @@ too."""
 class DisplacementEstimator:
     """The reference cut into small, overlapping windows, ready for any number of moving bands."""
 
-    def __init__(self, valid: Mask, structure: Field, scale: FieldScale) -> None:
-        """`valid` and `structure` (height, width) are those of the reference."""
+    def __init__(self, valid: Mask, structure: Field, scale: FieldScale, windows: FixedWindows | None = None) -> None:
+        """`valid` and `structure` (height, width) are those of the reference; a field is fitted in its `windows`, by
+        default all over the image.
+        """
+        self._valid, self._structure, self._verification_px = valid, structure, scale.verification_px
         self.size_px, self.lattice_px = (valid.shape[1], valid.shape[0]), scale.lattice_px
         step_px = max(scale.window_px // 2, round((valid.size / _MAX_WINDOWS) ** 0.5))
-        self.windows = FixedWindows(valid, structure, scale.window_px, step_px)
+        self.windows = windows or FixedWindows(valid, structure, scale.window_px, step_px)
 
-    def refine(self, moving: Raster, mapping: PixelMapping) -> DisplacementResult[FixedImagePx]:
+    @cached_property
+    def verification(self) -> FixedWindows:
+        """The windows in which a field is verified, side by side."""
+        return FixedWindows(self._valid, self._structure, self._verification_px)
+
+    def refine(
+        self, moving: Raster, mapping: PixelMapping, *, verify: bool = False
+    ) -> DisplacementResult[FixedImagePx]:
         """The field over a mapping, including the displacements that it already has, and its gain on held-out windows.
 
         The shifts are measured again under the field of each round: windows over steps become sharper, and long shifts
-        are found in steps.
+        are found in steps. To `verify` is to leave windows out of the fit that is kept.
         """
         first = self._measure(moving, mapping)
         gain = self._best_gain(first)
@@ -103,7 +120,27 @@ class DisplacementEstimator:
             field = total
             if number + 1 >= _ROUNDS and residual.median_px <= _SETTLED_PX:
                 break
-        return DisplacementResult(None if field is before else field, gain.before_p95_px, gain.after_p95_px)
+        if field is None or field is before:
+            return DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
+        result = DisplacementResult[FixedImagePx](field, gain.before_p95_px, gain.after_p95_px)
+        if not verify:
+            return result
+        return replace(result, held_out=self._held_out(moving, replace(mapping, local=field), field, gain.smoothness))
+
+    def _held_out(
+        self, moving: Raster, mapping: PixelMapping, field: DisplacementField, smoothness: float
+    ) -> Residual[FixedImagePx]:
+        """The residual of windows, each under a field that all windows which share a pixel with it are
+        left out of. Shifts are measured under the complete mapping, where the windows are sharp; the whole shift of
+        each is compared with the one that the others predict.
+        """
+        shifts = Shifts.of(self._measure(moving, mapping))
+        whole = replace(shifts, shifts_px=shifts.shifts_px + field(shifts.centres_px))
+        residual = self.verification.residuals(warped(moving, mapping, self.size_px))
+        apart_px = (self.windows.side + self.verification.side) / 2
+        predicted_px = self._left_out(whole, residual.centres_px, apart_px, smoothness)
+        left_px = residual.shifts_px + field(residual.centres_px) - predicted_px
+        return Residual.of(residual.centres_px, left_px, residual.peaks_sigma)
 
     def _best_gain(self, first: Residual[FixedImagePx]) -> "_Gain":
         """The gain of the first smoothness with a plain gain, from the finest upwards; else that of the last."""
@@ -123,15 +160,28 @@ class DisplacementEstimator:
         shifts = Shifts.of(residual)
         if len(shifts) < _MIN_WINDOWS:
             return _Gain(smoothness)
-        fold = _folds(shifts.centres_px)
-        left = np.full(len(shifts), np.nan)
+        predicted = self._left_out(shifts, shifts.centres_px, apart_px, smoothness, folds)
+        return _gain_of(shifts, np.linalg.norm(shifts.shifts_px - predicted, axis=1), smoothness)
+
+    def _left_out(
+        self,
+        shifts: "Shifts",
+        centres_px: Points,
+        apart_px: float,
+        smoothness: float,
+        folds: Iterable[int] = _ALL_FOLDS,
+    ) -> Points:
+        """(n, 2) shifts at centres (n, 2), each by a field through those of the windows that are at least `apart_px`
+        away along one axis; NaN in folds not tried.
+        """
+        fold = _folds(centres_px)
+        result = np.full((len(centres_px), 2), np.nan)
         for k in folds:
             out = fold == k
-            kept = ~out & ~_near(shifts.centres_px, shifts.centres_px[out], apart_px)
+            kept = ~_near(shifts.centres_px, centres_px[out], max(apart_px, _ITSELF_PX))
             if kept.sum() >= _MIN_WINDOWS // 2:
-                field = self._field(shifts.some(kept), smoothness)
-                left[out] = np.linalg.norm(shifts.shifts_px[out] - field(shifts.centres_px[out]), axis=1)
-        return _gain_of(shifts, left, smoothness)
+                result[out] = self._field(shifts.some(kept), smoothness)(centres_px[out])
+        return result
 
     def _field(self, shifts: "Shifts", smoothness: float) -> DisplacementField:
         return fitted_field(shifts, smoothness, self.lattice_px, self.size_px)
@@ -149,24 +199,26 @@ class Shifts:
     trust: NDArray[np.float64]
     """(n,) relative weights, 1 in the median: inverse variances, as the error of a shift falls with the square of its
     peak's height."""
+    peaks_sigma: NDArray[np.float64]
+    """(n,) heights of the peaks, standard deviations."""
 
     @classmethod
     def of(cls, residual: Residual[FixedImagePx]) -> "Shifts":
         known = np.isfinite(residual.shifts_px[:, 0])
         sigma = residual.peaks_sigma[known]
         trust = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
-        return cls(residual.centres_px[known], residual.shifts_px[known], trust)
+        return cls(residual.centres_px[known], residual.shifts_px[known], trust, sigma)
 
     @classmethod
     def together(cls, several: Sequence["Shifts"]) -> "Shifts":
         """The windows of several captures in one."""
         return cls(
             np.concatenate([s.centres_px for s in several]), np.concatenate([s.shifts_px for s in several]),
-            np.concatenate([s.trust for s in several]),
+            np.concatenate([s.trust for s in several]), np.concatenate([s.peaks_sigma for s in several]),
         )  # fmt: skip
 
     def some(self, which: NDArray[np.bool_]) -> "Shifts":
-        return Shifts(self.centres_px[which], self.shifts_px[which], self.trust[which])
+        return Shifts(self.centres_px[which], self.shifts_px[which], self.trust[which], self.peaks_sigma[which])
 
     def __len__(self) -> int:
         return len(self.centres_px)
@@ -261,41 +313,53 @@ def fitted_field(shifts: Shifts, smoothness: float, lattice_px: int, size_px: tu
 
     with trust t, second differences D2, and Cauchy weights w against wrong peaks. The pull to 0 is small: it decides
     where nothing was measured.
+
+    The normal equations couple nodes at most two rows apart, so they are solved as a banded matrix, which is filled
+    directly: with sparse matrices, their construction took most of the time of an alignment.
     """
     columns, rows = (int(np.ceil(n / lattice_px)) + 1 for n in size_px)
-    design = _interpolation(shifts.centres_px / lattice_px, columns, rows)
-    penalty = smoothness * _bending(columns, rows) + _PULL * identity(rows * columns)
-    weight = np.ones(len(shifts))
-    nodes = np.zeros((rows * columns, 2))
+    nodes, weights = _interpolation(shifts.centres_px / lattice_px, columns, rows)
+    penalty = smoothness * _bending(columns, rows)
+    penalty[0] += _PULL
+    first, second = np.triu_indices(len(nodes))
+    places = (nodes[second] - nodes[first]) * (rows * columns) + nodes[first]
+    products = weights[first] * weights[second]
+    trust = shifts.trust
     for _ in range(_REWEIGHTINGS):
-        weighted = design.T @ diags(shifts.trust * weight)
-        nodes = splu((weighted @ design + penalty).tocsc()).solve(weighted @ shifts.shifts_px)
-        off = np.linalg.norm(shifts.shifts_px - design @ nodes, axis=1)
+        normal = penalty + _sums(places, products * trust, penalty.size).reshape(penalty.shape)
+        right = [_sums(nodes, weights * trust * s, rows * columns) for s in shifts.shifts_px.T]
+        field = solveh_banded(normal, np.stack(right, axis=-1), overwrite_ab=True, lower=True, check_finite=False)
+        fitted = (weights[..., None] * field[nodes]).sum(axis=0)
+        off = np.linalg.norm(shifts.shifts_px - fitted, axis=1)
         spread = max(MAD_TO_STD * float(np.median(off)), _MIN_SPREAD_PX)
-        weight = cauchy_weights(off, _OUTLIER_SPREADS * spread)
-    return DisplacementField(float(lattice_px), nodes.reshape(rows, columns, 2))
+        trust = shifts.trust * cauchy_weights(off, _OUTLIER_SPREADS * spread)
+    return DisplacementField(float(lattice_px), field.reshape(rows, columns, 2))
 
 
-def _interpolation(points: Points, columns: int, rows: int) -> csr_matrix:
-    """(n, rows columns): bilinear weights of the lattice's nodes at points in its steps."""
-    cell = np.clip(np.floor(points).astype(int), 0, (columns - 2, rows - 2))
-    part = points - cell
-    entries = []
-    for dx in (0, 1):
-        for dy in (0, 1):
-            weight = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
-            entries.append((weight, np.arange(len(points)), (cell[:, 1] + dy) * columns + cell[:, 0] + dx))
-    weights, which, nodes = (np.concatenate(column) for column in zip(*entries, strict=True))
-    return coo_matrix((weights, (which, nodes)), shape=(len(points), rows * columns)).tocsr()
+def _interpolation(points: Points, columns: int, rows: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(4, n) each: the nodes around points in steps of the lattice, in ascending order, and their bilinear weights."""
+    cell = np.clip(np.floor(points).astype(np.int64), 0, (columns - 2, rows - 2))
+    (x, y), (column, row) = (points - cell).T, cell.T
+    nodes = row * columns + column + np.array([0, 1, columns, columns + 1])[:, None]
+    return nodes, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y])
+
+
+def _sums(places: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """(count,): the sum of the values at each place."""
+    return np.asarray(np.bincount(places.ravel(), values.ravel(), count), np.float64)
 
 
 @lru_cache(maxsize=8)
-def _bending(columns: int, rows: int) -> csr_matrix:
-    """(rows columns, rows columns): the quadratic form of the squared second differences along both axes."""
+def _bending(columns: int, rows: int) -> NDArray[np.float64]:
+    """(1 + 2 columns, rows columns): the quadratic form of the squared second differences along both axes, as the main
+    diagonal and those below it, each from its first element.
+    """
     bend = vstack([
         kron(identity(rows), _second_differences(columns)), kron(_second_differences(rows), identity(columns)),
     ])  # fmt: skip
-    return (bend.T @ bend).tocsr()
+    form = (bend.T @ bend).tocsr()
+    diagonals = [form.diagonal(-below) for below in range(2 * columns + 1)]
+    return np.stack([np.pad(d, (0, rows * columns - len(d))) for d in diagonals])
 
 
 def _second_differences(count: int) -> dia_matrix:

@@ -1,6 +1,7 @@
 """Residual shifts between the structures of two bands on one grid, window by window."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ _MIN_STRENGTH = 0.05
 """Mean structure, of at most 1, below which a window shows nothing but noise."""
 _MIN_PEAK_SIGMA = 7.0
 """Correlation peak, in standard deviations of its surface, from which a shift counts: lower peaks are chance."""
+_FIELD_PX = 128
+"""Side of the fields of a chessboard: twice that of a window."""
 _MIN_VALID = 0.9
 """Share of a window's pixels that must be valid in both images."""
 
@@ -30,18 +33,41 @@ _MIN_VALID = 0.9
 class FixedWindows:
     """The reference cut into windows, ready to be compared with any number of moving bands."""
 
-    def __init__(self, valid: Mask, structure: Field, side_px: int = _WINDOW_PX, step_px: int | None = None) -> None:
+    def __init__(
+        self, valid: Mask, structure: Field, side_px: int = _WINDOW_PX, step_px: int | None = None,
+        origins: Sequence[_Origin] | None = None,
+    ) -> None:  # fmt: skip
         """`valid` and `structure` (height, width) are those of the reference.
 
         Windows have a side of `side_px`, less on images smaller than four windows, and start every `step_px`, by
-        default side by side.
+        default side by side; or they start at `origins` (x, y).
         """
         self.valid = valid
         height, width = valid.shape
         self.side = max(_MIN_WINDOW_PX, min(side_px, width // 4, height // 4))
-        origins = [(x, y) for y in _starts(height, self.side, step_px) for x in _starts(width, self.side, step_px)]
-        self.origins, windows = self._strong(structure, origins if min(width, height) >= self.side else [])
+        if origins is None:
+            origins = [(x, y) for y in _starts(height, self.side, step_px) for x in _starts(width, self.side, step_px)]
+        inside = [(x, y) for x, y in origins if x + self.side <= width and y + self.side <= height]
+        self.origins, windows = self._strong(structure, inside)
         self.spectra = windowed_spectra(windows)
+
+    @classmethod
+    def on_chessboard(cls, valid: Mask, structure: Field, side_px: int, *, white: bool) -> "FixedWindows":
+        """Three by three windows inside each of the black, or of the white, fields of a chessboard.
+
+        Those of one colour share no pixel with those of the other: the ones can be fitted, the others verify.
+        """
+        height, width = valid.shape
+        starts = range(0, _FIELD_PX - side_px + 1, (_FIELD_PX - side_px) // 2)
+        origins = [
+            (x + dx, y + dy)
+            for y in range(0, height, _FIELD_PX)
+            for x in range(0, width, _FIELD_PX)
+            if ((x + y) // _FIELD_PX) % 2 == int(white)
+            for dy in starts
+            for dx in starts
+        ]
+        return cls(valid, structure, side_px, origins=origins)
 
     def residuals(self, moving: Raster, min_valid: float = _MIN_VALID) -> Residual[FixedImagePx]:
         """The shift of each window's content, px; nan where no correlation peak stands out.
@@ -58,8 +84,15 @@ class FixedWindows:
         tried = self.spectra if len(origins) == len(rows) else self.spectra[[rows[o] for o in origins]]
         cross = whitened_cross_spectra(tried, windowed_spectra(windows))
         result, sigma = _peaks(cross)
-        centres_px = np.array(origins, dtype=np.float64).reshape(-1, 2) + (self.side - 1) / 2
-        return Residual.of(centres_px, result, sigma)
+        return Residual.of(self._centres_px(origins), result, sigma)
+
+    @property
+    def centres_px(self) -> NDArray[np.float64]:
+        """(n, 2) of the windows with structure."""
+        return self._centres_px(self.origins)
+
+    def _centres_px(self, origins: Sequence[_Origin]) -> NDArray[np.float64]:
+        return np.asarray(np.array(origins, dtype=np.float64).reshape(-1, 2) + (self.side - 1) / 2)
 
     def _cut(self, image: NDArray[Any], origin: _Origin) -> NDArray[Any]:
         x, y = origin

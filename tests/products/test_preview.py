@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.products.preview import preview_bytes, write_preview
+from agalign.products.preview import ReliefView, preview_bytes, write_preview
 from agalign.products.reduced_bands import ReducedBands
 
 from ..conftest import textured_image
@@ -41,6 +41,30 @@ def test_every_picture_lies_where_the_sidecar_says(views: ReducedBands, tmp_path
     assert like(sheet[2 * h : 2 * h + dh, dw : 2 * dw], views.before["NIR"][y : y + dh, x : x + dw]) > 0.98
     assert like(sheet[2 * h + dh : 2 * h + 2 * dh, :dw], views.after["Green"][y : y + dh, x : x + dw]) > 0.98
     assert np.median(sheet[2 * h + 2 * dh :, w:]) == pytest.approx(255 * 0.25 / part.error_full_px, abs=3)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("has_errors", [False, True])
+def test_the_relief_is_the_last_row(views: ReducedBands, tmp_path: Path, has_errors: bool) -> None:
+    parallax_px = np.linspace(-3, 7, 320, dtype=np.float32)[None].repeat(240, axis=0)
+    parallax_px[:2, :2] = 1000.0  # wrong pixels take no contrast
+    errors = {"NIR": np.full((4, 5), 0.25, np.float32)} if has_errors else {}
+    relief = ReliefView(parallax_px, (1.23456, 2.5))
+    part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1), relief)
+    assert part.relief is not None
+    low, high = part.relief.parallax_px
+    assert (low, high) == pytest.approx((-2.9, 6.9), abs=0.1)
+    assert part.relief.range_m == (1.235, 2.5)
+    sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)
+    (w, h), (_, dh) = part.tile_px, part.detail_px
+    row = sheet[(3 if has_errors else 2) * h + 2 * dh :]
+    assert row.shape == (h, 2 * w)
+    assert row[:, w:].max() < 4
+    shown = low + row[h // 2, :w].astype(float) / 255 * (high - low)
+    np.testing.assert_allclose(shown, np.linspace(-3, 7, w).clip(low, high), atol=0.25)
+
+
+def test_a_level_relief_can_be_shown() -> None:
+    assert ReliefView(np.full((4, 5), 2.0, np.float32), None).grey.max() == 0
 
 
 @pytest.mark.parametrize("captures", [1, 200, 1000])

@@ -1,16 +1,31 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from agalign.capture.reference import Reference
+from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementField, Residual
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 from agalign.verify import displacement_field
-from agalign.verify.displacement_field import Shifts, _folds, _Gain, _is_one_to_one, _near, common_field, fitted_field
+from agalign.verify.displacement_field import (
+    COARSE,
+    FINE,
+    DisplacementEstimator,
+    FieldScale,
+    Shifts,
+    _folds,
+    _Gain,
+    _is_one_to_one,
+    _near,
+    common_field,
+    fitted_field,
+)
 
-from ..conftest import textured_pair
+from ..conftest import textured_image, textured_pair
 
 SIZE = 640, 480
 
@@ -25,13 +40,18 @@ def centres() -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(32, 640, 32.0), np.arange(32, 480, 32.0)), -1).reshape(-1, 2)
 
 
+def weights(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(trust, heights of the peaks), the same for all windows."""
+    return np.ones(len(at)), np.full(len(at), 20.0)
+
+
 def test_a_smooth_field_is_found_through_noise_and_wrong_peaks() -> None:
     rng = np.random.default_rng(0)
     at = centres()
     shifts = bump(at) + 0.08 * rng.normal(size=at.shape)
     wrong = rng.random(len(at)) < 0.05
     shifts[wrong] += rng.uniform(-20, 20, (wrong.sum(), 2))
-    field = fitted_field(Shifts(at, shifts, np.ones(len(at))), 1.0, 48, SIZE)
+    field = fitted_field(Shifts(at, shifts, *weights(at)), 1.0, 48, SIZE)
     error = np.linalg.norm(field(at) - bump(at), axis=1)
     assert np.sqrt((error**2).mean()) < 0.09
     assert np.linalg.norm(bump(at), axis=1).max() > 1.2
@@ -40,7 +60,7 @@ def test_a_smooth_field_is_found_through_noise_and_wrong_peaks() -> None:
 def test_far_from_all_measurements_the_field_goes_to_nothing() -> None:
     at = centres()
     near = at[at[:, 0] < 200]
-    field = fitted_field(Shifts(near, np.tile([2.0, 0.0], (len(near), 1)), np.ones(len(near))), 1.0, 48, (6400, 480))
+    field = fitted_field(Shifts(near, np.tile([2.0, 0.0], (len(near), 1)), *weights(near)), 1.0, 48, (6400, 480))
     assert field(np.array([[100.0, 240.0]]))[0, 0] == pytest.approx(2.0, abs=0.05)
     assert abs(field(np.array([[6000.0, 240.0]]))[0]).max() < 0.2
 
@@ -84,7 +104,7 @@ def test_where_a_homography_is_enough_nothing_is_added() -> None:
 
 def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:
     at = centres()
-    field = fitted_field(Shifts(at, bump(at), np.ones(len(at))), 1.0, 48, SIZE)
+    field = fitted_field(Shifts(at, bump(at), *weights(at)), 1.0, 48, SIZE)
     mapping = PixelMapping(geometry.translation(5, 3), local=field)
     points = geometry.lattice(*SIZE, 9, 7)
     np.testing.assert_allclose(mapping(points), points + field(points) + (5, 3))
@@ -150,3 +170,53 @@ def test_cross_validation_smooths_by_the_captures_in_the_fit(monkeypatch: pytest
     assert {count for count, _ in fits} == {3, 4, 5}
     per_capture = {smoothness / count for count, smoothness in fits}
     assert per_capture <= set(displacement_field._COMMON_SMOOTHNESS)
+
+
+# ---- what fits noise cannot pass
+
+
+@pytest.mark.parametrize("chance", range(3))
+@pytest.mark.parametrize("scale", [COARSE, FINE])
+def test_a_field_that_fits_unrelated_windows_explains_none_that_were_left_out(chance: int, scale: FieldScale) -> None:
+    """Random shifts, which a fine enough field follows where it was fitted."""
+    rng, at = np.random.default_rng(chance), centres()
+    shifts = rng.uniform(-4, 4, at.shape)
+    residual = Residual.of(at, shifts, np.full(len(at), 20.0))
+    valid = np.ones(SIZE[::-1], bool)
+    estimator = DisplacementEstimator(valid, structure_field(Raster(textured_image(*SIZE), valid)), scale)
+    gain = estimator._best_gain(residual)
+    assert not gain.is_plain(4.0)
+    field = estimator._field(Shifts.of(residual), 0.001)
+    explained = np.linalg.norm(shifts - field(at), axis=1)
+    assert np.median(explained) < 0.8 * np.median(np.linalg.norm(shifts, axis=1))
+
+
+def test_what_is_reported_of_a_field_was_left_out_of_its_fit() -> None:
+    """Smooth displacements with jumps of their own at each window: the field follows both, and predicts one."""
+    rng, at = np.random.default_rng(0), centres()
+    jumps = rng.normal(0, 0.7, at.shape)
+    shifts = Shifts(at, bump(at, 6.0) + jumps, *weights(at))
+    valid = np.ones(SIZE[::-1], bool)
+    estimator = DisplacementEstimator(valid, structure_field(Raster(textured_image(*SIZE), valid)), COARSE)
+    own, others = (
+        np.median(np.linalg.norm(shifts.shifts_px - prediction, axis=1))
+        for prediction in (estimator._field(shifts, 0.3)(at), estimator._left_out(shifts, at, 64, 0.3))
+    )
+    assert others > 1.1 * own
+    assert others == pytest.approx(np.median(np.linalg.norm(jumps, axis=1)), rel=0.25)
+
+
+def test_no_window_that_shares_a_pixel_takes_part_in_a_prediction() -> None:
+    """A window that is far off does not change what is predicted at it, however much it weighs."""
+    at = centres()
+    estimator = DisplacementEstimator(np.ones(SIZE[::-1], bool), np.zeros(SIZE[::-1], np.complex64), COARSE)
+    quiet = Shifts(at, bump(at), *weights(at))
+    one = int(np.argmin(np.linalg.norm(at - (320, 256), axis=1)))
+    moved = quiet.shifts_px.copy()
+    moved[np.abs(at - at[one]).max(axis=1) < 64] += 3.0
+    loud = replace(quiet, shifts_px=moved)
+    before, after = (estimator._left_out(s, at, 64, 1.0)[one] for s in (quiet, loud))
+    np.testing.assert_allclose(before, after, atol=1e-9)
+    neighbour = int(np.argmin(np.linalg.norm(at - at[one] - (96, 0), axis=1)))
+    changed = (estimator._left_out(s, at, 64, 1.0)[neighbour] for s in (quiet, loud))
+    assert np.linalg.norm(next(changed) - next(changed)) > 0.02

@@ -127,6 +127,7 @@ class Facts:
         output, preview, reference = sidecar.output, sidecar.preview, sidecar.reference
         crop = (0, 0, reference.width, reference.height) if output is None else output.crop
         picture = f"{base}{sidecar.capture}.png"
+        relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
         return {
             "label": entry.label, "captured_at": entry.captured_at, "camera": entry.camera, "status": entry.status,
             "position": entry.position, "altitude_m": None if sidecar.position is None else sidecar.position.altitude_m,
@@ -134,6 +135,7 @@ class Facts:
             "crop": crop, "scale": (1.0, 1.0) if output is None else output.scale,
             "radiometry": None if output is None else output.radiometry,
             "stack": quote(f"{base}{output.file}") if output is not None and output.file else None,
+            "relief": None if relief is None else quote(f"{base}{relief}"),
             "sidecar": quote(f"{base}{sidecar.capture}.json"),
             "picture": quote(picture) if (self.out / picture).is_file() else None,
             "preview": None if preview is None else {
@@ -155,6 +157,7 @@ class Facts:
             **_residual(band.metrics), **_joint(band.joint),
             "prediction": None if prediction is None else prediction.model_dump(by_alias=True),
             "local": None if local is None else local.model_dump(),
+            "occluded": None if band.relief is None else band.relief.occluded,
             "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
             "shifts": [None if v is None else round(v / _SHIFT_STEP_PX) for t in tiles for v in t.shift_px],
         }  # fmt: skip

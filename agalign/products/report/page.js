@@ -13,14 +13,17 @@
  *   seconds: number, written: boolean, offset_px: [number, number] | null, apart_px: number | null,
  *   residual_px: number | null, residual_p95_px: number | null, coverage: number | null, retrieval: number | null,
  *   corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
- *   prediction: Prediction | null, local: Local | null, lattice: number, shifts: (number | null)[]}} Pair
+ *   prediction: Prediction | null, local: Local | null, occluded: number | null, lattice: number, shifts: (number | null)[]}} Pair
  * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
- *   detail: [number, number, number, number], error_full_px: number | null}} Preview
+ *   detail: [number, number, number, number], error_full_px: number | null,
+ *   relief: {parallax_px: [number, number], range_m: [number, number] | null} | null}} Preview
  * @typedef {{label: string, captured_at: string, camera: string, status: string, position: [number, number] | null,
  *   radiometry: string | null, altitude_m: number | null, missing: string[], reference: string, seconds: number,
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
+ *   relief: string | null,
  *   picture: string | null, preview: Preview | null, bands: Pair[]}} Capture
  * @typedef {{schema: string, captures: Capture[], shift_step_px: number, lattices: number[][]}} Facts
+ * @typedef {{column: number, colour: string, inverted?: boolean}} Channel
  * @typedef {"before" | "after"} When
  */
 
@@ -70,6 +73,11 @@ function set(element, attributes) {
 /** @param {number | null | undefined} value @param {number} [digits] */
 function fixed(value, digits = 2) {
   return value === null || value === undefined ? "–" : value.toFixed(digits);
+}
+
+/** @param {number} share */
+function percent(share) {
+  return `${(100 * share).toFixed(1)} %`;
 }
 
 /** @param {string} status */
@@ -276,11 +284,15 @@ function ramp(share) {
 const CHANNELS = ["#f00", "#0f0", "#00f"];
 const LARGEST_ZOOM = 40;
 const FULL_PX = 0.5; // a residual's colour and arrow are full
+const FAR = [25, 35, 150]; // colours of the relief; between them the lightness grows with the parallax
+const NEAR = [205, 250, 45];
+const RELIEF_OPACITY = 0.75; // edges of the picture show through
 /** @type {Record<string, string>} */
 const NOTES = {
   vectors: `What is left of the shift in each window; an arrow of ${FULL_PX} px reaches most of the way to the next window. Grey: none could be measured.`,
   heat: `What is left of the shift in each window, full at ${FULL_PX} px.`,
   error: "The error to be expected at every pixel, as far as it is known: the more orange, the larger, full at 0.5 px.",
+  relief: "Parallax relative to the plane that most of the scene is on: the lighter, the nearer.",
 };
 const BLINK_MS = 700;
 const SCREEN_SHARE = 78; // of its height, at most, for a picture
@@ -337,7 +349,7 @@ function heading(capture) {
   };
   const where = capture.position === null ? "" : ` · ${capture.position.map((v) => v.toFixed(6)).join(", ")}${capture.altitude_m === null ? "" : `, ${capture.altitude_m.toFixed(0)} m`}`;
   const files = el("span", {}, capture.radiometry === null ? "" : ` · ${capture.radiometry}`);
-  for (const [file, name] of [[capture.stack, "aligned stack"], [capture.sidecar, "sidecar"], [capture.picture, "picture"]]) {
+  for (const [file, name] of [[capture.stack, "aligned stack"], [capture.sidecar, "sidecar"], [capture.relief, "relief"], [capture.picture, "picture"]]) {
     if (file !== null) files.append(" · ", el("a", { href: String(file) }, String(name)));
   }
   return [
@@ -443,6 +455,7 @@ function viewTools(capture) {
   });
   const overlays = [["none", "nothing"], ["vectors", "residual vectors"], ["heat", "residual heat map"]];
   if (capture.preview?.error_full_px) overlays.push(["error", "error to be expected"]);
+  if (capture.preview?.relief) overlays.push(["relief", "relief of all bands"]);
   line.append(
     choice("Over it", overlays, look.overlay, (value) => { look.overlay = value; paint(); }, "What lies over it"),
     choice("of", moving(capture).map((b) => [b.band, b.band]), look.overlayBand, (value) => { look.overlayBand = value; paint(); }, "Band of what lies over it"),
@@ -515,13 +528,18 @@ function onSheet(preview, column, line) {
   const [dw, dh] = preview.detail_px;
   if (line < 2) return [column * w, line * h, w, h];
   if (line < 4) return [column * dw, 2 * h + (line - 2) * dh, dw, dh];
-  return [column * w, 2 * h + 2 * dh, w, h];
+  return [column * w, (line - 2) * h + 2 * dh, w, h];
+}
+
+/** @param {number} share From far to near. */
+function reliefColour(share) {
+  return `rgb(${FAR.map((far, i) => Math.round(far + share * (NEAR[i] - far))).join(" ")})`;
 }
 
 /**
  * Grey pictures of a row of the sheet as the channels of one: each is dyed in its colour, and they add up.
  * @param {HTMLImageElement} sheet @param {Preview} preview @param {number} line
- * @param {{column: number, colour: string}[]} channels
+ * @param {Channel[]} channels
  */
 function compose(sheet, preview, line, channels) {
   const [, , width, height] = onSheet(preview, 0, line);
@@ -529,10 +547,15 @@ function compose(sheet, preview, line, channels) {
   const sum = /** @type {CanvasRenderingContext2D} */ (whole.getContext("2d"));
   sum.fillRect(0, 0, width, height);
   sum.globalCompositeOperation = "lighter";
-  for (const { column, colour } of channels) {
+  for (const { column, colour, inverted } of channels) {
     const one = el("canvas", { width, height });
     const dyed = /** @type {CanvasRenderingContext2D} */ (one.getContext("2d"));
     dyed.drawImage(sheet, ...onSheet(preview, column, line), 0, 0, width, height);
+    if (inverted) {
+      dyed.globalCompositeOperation = "difference";
+      dyed.fillStyle = "#fff";
+      dyed.fillRect(0, 0, width, height);
+    }
     dyed.globalCompositeOperation = "multiply";
     dyed.fillStyle = colour;
     dyed.fillRect(0, 0, width, height);
@@ -543,7 +566,7 @@ function compose(sheet, preview, line, channels) {
 
 /**
  * The composite of a row, made when it is first needed.
- * @param {number} line @param {{column: number, colour: string}[]} channels
+ * @param {number} line @param {Channel[]} channels
  */
 function composed(line, channels) {
   const preview = look.capture?.preview;
@@ -577,13 +600,32 @@ function paint() {
     pen.fillStyle = "#fff";
     pen.fillRect(middle - 1, 0, 2, high);
   }
-  const keys = ["vectors", "heat"].includes(look.overlay) ? [0, 0.5, 1] : [];
-  byId("over-note").replaceChildren(NOTES[look.overlay] ?? "", " ", ...keys.map((share) => el("span", { class: "key", style: `--key:${ramp(share)}` }, `${(share * FULL_PX).toFixed(2)} px`)));
+  byId("over-note").replaceChildren(NOTES[look.overlay] ?? "", " ", ...legend(preview));
   const now = look.mode === "blink" ? look.blinking : "";
   byId("tag-left").textContent = now || "before";
   byId("tag-right").textContent = capture.bands.some((b) => b.written) ? "after" : "after: nothing was written";
   byId("tag-right").hidden = Boolean(now);
   stage.dataset["blinking"] = now;
+}
+
+/**
+ * The legends of the overlays.
+ * @param {Preview} preview
+ */
+function legend(preview) {
+  /** @param {string} colour @param {string} text */
+  const key = (colour, text) => el("span", { class: "key", style: `--key:${colour}` }, text);
+  if (["vectors", "heat"].includes(look.overlay)) return [0, 0.5, 1].map((share) => key(ramp(share), `${(share * FULL_PX).toFixed(2)} px`));
+  if (look.overlay !== "relief" || !preview.relief) return [];
+  const [low, high] = preview.relief.parallax_px;
+  const keys = [0, 0.5, 1].map((share) => key(reliefColour(share), `${(low + share * (high - low)).toFixed(1)} px`));
+  const range = preview.relief.range_m;
+  return range ? [...keys, el("span", {}, `Range of the scene: ${inMetres(range[0])} to ${inMetres(range[1])} m.`)] : keys;
+}
+
+/** @param {number} range_m */
+function inMetres(range_m) {
+  return range_m.toFixed(range_m < 10 ? 2 : 1);
 }
 
 /**
@@ -621,12 +663,13 @@ function over(pen, capture, at) {
   const column = capture.bands.findIndex((b) => b.band === look.overlayBand);
   const pair = capture.bands[column];
   if (!pair || look.overlay === "none") return;
-  if (look.overlay === "error") {
-    const errors = composed(4, [{ column, colour: "#ff5a1f" }]);
-    pen.globalCompositeOperation = "screen";
+  if (look.overlay === "error" || look.overlay === "relief") {
+    const made = look.overlay === "relief" ? relief(capture) : capture.preview?.error_full_px ? composed(4, [{ column, colour: "#ff5a1f" }]) : null;
+    if (look.overlay === "error") pen.globalCompositeOperation = "screen";
+    else pen.globalAlpha = RELIEF_OPACITY;
     const [x, y] = at(0, 0);
     const [right, bottom] = at(1, 1);
-    if (errors) pen.drawImage(errors, x, y, right - x, bottom - y);
+    if (made) pen.drawImage(made, x, y, right - x, bottom - y);
     return;
   }
   const lattice = facts.lattices[pair.lattice];
@@ -647,6 +690,16 @@ function over(pen, capture, at) {
     }
     arrow(pen, x, y, shift === null ? [0, 0] : shift.map((v, k) => 1.6 * cell[k] * v / Math.max(FULL_PX, Math.hypot(...shift))));
   }
+}
+
+/**
+ * The relief in its colours, which stands on the last row of the sheet; null where there is none.
+ * @param {Capture} capture
+ */
+function relief(capture) {
+  const preview = capture.preview;
+  if (!preview?.relief) return null;
+  return composed(preview.error_full_px ? 5 : 4, [{ column: 0, colour: reliefColour(1) }, { column: 0, colour: reliefColour(0), inverted: true }]);
 }
 
 /**
@@ -760,12 +813,14 @@ function sentence(pair, reference) {
     if (left === null) return `${lay}is aligned; no window could measure what is left.`;
     const use = left <= 0.5 ? "fit for indices of single plants" : left <= 1 ? "fit for indices of rows and plots; edges of single leaves may be off" : "fit for averages over an area";
     const most = pair.residual_p95_px === null ? "" : `, and 95 % within ${fixed(pair.residual_p95_px)} px`;
-    return `${lay}is aligned: half of its windows now lie within ${fixed(left)} px${most}; ${use}.`;
+    const seen = pair.occluded === null ? "" : ` It follows the relief of the capture; ${percent(pair.occluded)} of the image is occluded in it.`;
+    return `${lay}is aligned: half of its windows now lie within ${fixed(left)} px${most}; ${use}.${seen}`;
   }
   if (pair.status === "predicted") {
     const std = pair.prediction?.std_px ?? Infinity;
     const use = std <= 1 ? "fit for indices, within that" : "too far off for indices";
-    return `${lay}is placed by the rig of the flight, to ±${fixed(std)} px (${use}): ${pair.reason ?? "no reason on record"}.`;
+    const how = pair.prediction?.from === "windows" ? "is extrapolated over a part of the image" : "is placed by the rig of the flight";
+    return `${lay}${how}, to ±${fixed(std)} px (${use}): ${pair.reason ?? "no reason on record"}.`;
   }
   if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason on record"}. It lies at its first guess; leave it out of indices.`;
   return `is lost: ${pair.reason ?? "no reason on record"}. Nothing is written of it.`;
@@ -773,7 +828,7 @@ function sentence(pair, reference) {
 
 /** @param {Capture} capture */
 function numbers(capture) {
-  const heads = ["Band", "Status", "Start", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Mattes MI", "NMI", "NCC", "Gradients", "SSIM", "Local field, 95 %", "Seconds"];
+  const heads = ["Band", "Status", "Start", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Mattes MI", "NMI", "NCC", "Gradients", "SSIM", "Local field, 95 %", "Relief, occluded", "Seconds"];
   const body = moving(capture).map((pair) => {
     /** @param {string} name @param {number} [digits] */
     const change = (name, digits = 3) => {
@@ -783,7 +838,7 @@ function numbers(capture) {
     const local = pair.local === null ? "–" : pair.local.applied ? `${fixed(pair.local.before_p95_px)} → ${fixed(pair.local.after_p95_px)}` : "not needed";
     const cells = [
       pair.seed ?? "–", fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3), pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`,
-      fixed(pair.corner_std_px, 3), fixed(pair.retrieval), change("mattes_mi"), change("nmi"), change("ncc", 2), change("gradient_correlation", 2), change("structure_ssim", 2), local, pair.seconds.toFixed(1),
+      fixed(pair.corner_std_px, 3), fixed(pair.retrieval), change("mattes_mi"), change("nmi"), change("ncc", 2), change("gradient_correlation", 2), change("structure_ssim", 2), local, pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
     ];
     return el("tr", {}, el("th", { scope: "row" }, pair.band), el("td", {}, badge(pair.status)), ...cells.map((text, i) => el("td", { class: i === 0 ? "" : "n" }, text)));
   });

@@ -1,0 +1,120 @@
+"""The relief of a capture: one parallax for each pixel, which moves all bands along their baselines.
+
+Plane + parallax (Irani & Anandan 1996; Hartley & Zisserman 2004, Sec. 13.2): an undistorted pixel x of the reference
+maps to
+
+    H_b (x + t_b z(x))
+
+in band b. H_b is the homography that the reference plane induces. The parallax z is one number for each pixel, and the
+same in all bands: it is proportional to 1 / range minus that of the plane. t_b is the direction of the band's lens.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import map_coordinates
+
+from agalign.values.image import FloatImage, Mask
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
+
+
+@dataclass(frozen=True)
+class Relief:
+    """Parallax relative to the reference plane, at every raw pixel of the reference."""
+
+    parallax_px: FloatImage
+    """(height, width) z: px along a baseline of length 1; positive where the scene is nearer than the plane."""
+    confidence: FloatImage
+    """(height, width) mean correlation, 0 to 1, of the bands' structure with that of the reference at this parallax."""
+    scale: PixelScale = SAME_PIXELS
+    """Size of this raster relative to the image on which the relief is evaluated."""
+    unit: float = 1.0
+    """Px of the image on which the relief is evaluated for a px of `parallax_px`."""
+
+    def __call__(self, points_px: ArrayLike) -> NDArray[np.float64]:
+        """Parallax (...) at points (..., 2), px of the image on which it is evaluated.
+
+        Beyond the raster that of its edge.
+        """
+        points = self.scale.positions(points_px)
+        rows_columns = points.reshape(-1, 2)[:, ::-1].T
+        values = map_coordinates(self.parallax_px, rows_columns, order=1, mode="nearest")
+        return np.asarray(values * self.unit, np.float64).reshape(points.shape[:-1])
+
+    def at_crossings(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> FloatImage:
+        """The same at all crossings of columns x (n,) and rows y (m,): (m, n), quicker."""
+        if self.scale == SAME_PIXELS and self._is_own(x_px, 1) and self._is_own(y_px, 0):
+            values = self.parallax_px[int(y_px[0]) : int(y_px[-1]) + 1, int(x_px[0]) : int(x_px[-1]) + 1]
+        else:
+            (x, _), (_, y) = (self.scale.positions(np.column_stack([v, v])).astype(np.float32).T for v in (x_px, y_px))
+            at_x, at_y = np.meshgrid(x, y)
+            values = np.asarray(
+                cv2.remap(self.parallax_px, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
+            )
+        return values if self.unit == 1.0 else np.asarray(values * np.float32(self.unit))
+
+    def _is_own(self, places_px: NDArray[np.float64], axis: int) -> bool:
+        """True for consecutive pixels of the raster along an axis."""
+        first, last = places_px[0], places_px[-1]
+        inside = first >= 0 and last < self.parallax_px.shape[axis]
+        return bool(inside and first == int(first) and last - first == len(places_px) - 1)
+
+    @property
+    def negated(self) -> "Relief":
+        """With the opposite sign."""
+        return replace(self, parallax_px=-self.parallax_px)
+
+    def rescaled(self, scale: PixelScale) -> "Relief":
+        """The same on an image that is resized by `scale`."""
+        return replace(self, scale=self.scale.over(scale), unit=self.unit * scale.mean)
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """The relief as it displaces one band."""
+
+    relief: Relief
+    baseline: tuple[float, float]
+    """t_b (x, y): displacement in undistorted px of the reference for a parallax of 1 px."""
+    hidden: Mask | None = None
+    """On the raster of the relief: pixels that nearer parts of the scene occlude in this band. None hides nothing."""
+
+    def hides(self, points_px: NDArray[np.float64]) -> Mask:
+        """(...) True where the band does not show a raw point (..., 2) of the reference."""
+        if self.hidden is None:
+            return np.zeros(points_px.shape[:-1], dtype=bool)
+        at = np.rint(self.relief.scale.positions(points_px)).astype(np.intp)
+        height, width = self.hidden.shape
+        return np.asarray(self.hidden[at[..., 1].clip(0, height - 1), at[..., 0].clip(0, width - 1)])
+
+    def rescaled(self, scale: PixelScale) -> "Parallax":
+        """The same on a reference that is resized by `scale`."""
+        baseline = (self.baseline[0] * scale.x / scale.mean, self.baseline[1] * scale.y / scale.mean)
+        return replace(self, relief=self.relief.rescaled(scale), baseline=baseline)
+
+    def displacements(self, points_px: ArrayLike) -> NDArray[np.float64]:
+        """t_b z (..., 2) at raw points (..., 2), undistorted px."""
+        return np.asarray(self.relief(points_px)[..., None] * np.array(self.baseline))
+
+
+def between_levels(
+    at_level: Callable[[float], NDArray[np.floating]], parallax_px: FloatImage
+) -> NDArray[np.floating]:  # fmt: skip
+    """A smooth function of the parallax and of the pixel, (height, width, 2), at each pixel's own parallax.
+
+    `at_level` evaluates it everywhere at one parallax. A parabola through three levels is exact to 0.001 px: the
+    function is a homography after a shift, and a lens.
+    """
+    low, high = float(parallax_px.min()), float(parallax_px.max())
+    if high - low < _SAME_LEVEL_PX:
+        return at_level((low + high) / 2)
+    half = (high - low) / 2
+    before, at, after = (at_level(low + k * half) for k in range(3))
+    u = ((parallax_px - np.float32(low + half)) / np.float32(half))[..., None]
+    return np.asarray(at + u * ((after - before) / 2 + u * ((after + before) / 2 - at)))
+
+
+_SAME_LEVEL_PX = 1e-4

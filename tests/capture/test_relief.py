@@ -1,0 +1,275 @@
+"""One relief for all bands of a capture, on rendered scenes with exact truth, without any learning."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view
+from synthetic_flights.relief import make_scene
+
+from agalign.capture.band_pair import BandPair
+from agalign.capture.reference import Reference
+from agalign.capture.relief import ReliefCandidate, _worse, aligned_by_relief, shows_relief
+from agalign.capture.verification import WarpedPair
+from agalign.relief.range import inverse_range
+from agalign.synthetic.flight import recorded
+from agalign.synthetic.rig import BandSpec, to_plane
+from agalign.values import geometry, lens
+from agalign.values.alignment import Alignment, JointResult, Residual, Seed
+from agalign.values.geometry import Matrix
+from agalign.values.image import Mask, Raster
+from agalign.values.mapping import PixelMapping
+
+from ..conftest import textured_image
+
+CAMERA = replace(
+    CLOSE_RANGE, bands=tuple(b for b in CLOSE_RANGE.bands if b.name in ("Green", "Blue", "Red", "NIR")), reference=1
+)
+REFERENCE = CAMERA.bands[CAMERA.reference]
+MOVING = tuple(b for b in CAMERA.bands if b is not REFERENCE)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A scene as the bands show it."""
+
+    size_px: tuple[int, int]
+    truth: Truth
+    images: Mapping[str, np.ndarray]
+
+    @classmethod
+    def of(cls, scene: Scene, size_px: tuple[int, int]) -> "Rendered":
+        rng = np.random.default_rng(0)
+        images = {b.name: recorded(view(scene, b, size_px), b, rng).astype(np.float32) for b in CAMERA.bands}
+        return cls(size_px, truth_of(scene, size_px, CAMERA), images)
+
+    @property
+    def pixels(self) -> np.ndarray:
+        return np.stack(np.meshgrid(*(np.arange(n) for n in self.size_px)), axis=-1).astype(float)
+
+    def raster(self, band: BandSpec, images: Mapping[str, np.ndarray]) -> Raster:
+        return Raster(images[band.name], np.ones(self.size_px[::-1], bool), band.lens(*self.size_px))
+
+    def plane(self, band: BandSpec) -> Matrix:
+        """The homography of the plane that most of the scene is on, as the joint optimisation finds it."""
+        known = self.truth.bands[band.name]
+        some = np.argwhere(known.scored)[::101]
+        here, there = some[:, ::-1].astype(float), known.moving_px[some[:, 0], some[:, 1]].astype(float)
+        lenses = (b.lens(*self.size_px) for b in (REFERENCE, band))
+        undistorted = (lens.undistort(each, points) for each, points in zip(lenses, (here, there), strict=True))
+        matrix, _ = cv2.findHomography(*undistorted, cv2.RANSAC, 1.0)
+        return np.asarray(matrix)
+
+    def candidates(self, instead: Mapping[str, np.ndarray] | None = None) -> list[ReliefCandidate]:
+        """Of all moving bands, some of which show something else `instead`."""
+        images = {**self.images, **(instead or {})}
+        reference = Reference(self.raster(REFERENCE, images))
+        result = []
+        for band in MOVING:
+            layout = -band.baseline_m[0], -band.baseline_m[1]
+            matrix = self.plane(band)
+            pair = BandPair(band.name, reference, self.raster(band, images), {"rig": matrix}, layout=layout)
+            corners = ((0.05, 0.05),) * 4
+            joint = JointResult(matrix, 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, corners)
+            seed = Seed("rig", matrix, 30.0, 30.0, 5.0)
+            result.append(ReliefCandidate(pair, seed, joint, WarpedPair.of(pair, pair.mapping(matrix))))
+        return result
+
+    def mapping(self, band: BandSpec, alignment: Alignment) -> PixelMapping:
+        lenses = (b.lens(*self.size_px) for b in (REFERENCE, band))
+        return PixelMapping(alignment.fixed_to_moving, *lenses, local=alignment.field, parallax=alignment.parallax)
+
+    def error_px(self, band: BandSpec, mapping: PixelMapping) -> np.ndarray:
+        """(n,) distance from the truth of all pixels that the band shows."""
+        known = self.truth.bands[band.name]
+        return np.asarray(np.linalg.norm(mapping(self.pixels) - known.moving_px, axis=-1)[known.visible])
+
+
+@pytest.fixture(scope="module")
+def boxes() -> Rendered:
+    size_px = 640, 480
+    return Rendered.of(make_scene("boxes", 8, width_px=size_px[0]), size_px)
+
+
+@pytest.fixture(scope="module")
+def flat() -> Rendered:
+    size_px = 448, 336
+    return Rendered.of(make_scene("flat", 1, width_px=size_px[0]), size_px)
+
+
+@pytest.fixture(scope="module")
+def candidates(boxes: Rendered) -> list[ReliefCandidate]:
+    return boxes.candidates()
+
+
+@pytest.fixture(scope="module")
+def aligned(candidates: Sequence[ReliefCandidate]) -> dict[str, Alignment]:
+    return aligned_by_relief(candidates, "auto")
+
+
+def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
+    assert set(aligned) == {b.name for b in MOVING}
+    reliefs = [a.parallax.relief for a in aligned.values() if a.parallax is not None]
+    assert len(reliefs) == 3
+    assert all(r is reliefs[0] for r in reliefs)
+    for band in MOVING:
+        alignment = aligned[band.name]
+        assert (alignment.status, alignment.issues) == ("aligned", ())
+        complete = boxes.mapping(band, alignment)
+        errors, plane = (boxes.error_px(band, m) for m in (complete, complete.of_the_plane))
+        assert np.median(errors) < 0.2
+        assert np.percentile(errors, 90) < 0.6
+        assert np.percentile(plane, 90) > 3
+        # What verification reports is measured under the relief of the other bands.
+        assert alignment.residual is not None
+        assert alignment.residual.median_px < 0.25
+
+
+def near(mask: Mask) -> Mask:
+    """With a pixel around."""
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+
+
+def test_occluded_pixels_are_found(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
+    in_all = np.logical_and.reduce([t.inside for t in boxes.truth.bands.values()])
+    found, true, found_right, true_found = 0, 0, 0, 0
+    for band in MOVING:
+        parallax = aligned[band.name].parallax
+        assert parallax is not None
+        assert parallax.hidden is not None
+        hidden, known = parallax.hidden & in_all, boxes.truth.bands[band.name].hidden & in_all
+        found, found_right = found + int(hidden.sum()), found_right + int((hidden & near(known)).sum())
+        true, true_found = true + int(known.sum()), true_found + int((known & near(hidden)).sum())
+    assert true > 5000
+    assert found_right / found > 0.7
+    assert true_found / true > 0.7
+
+
+def test_range_is_right_to_two_percent(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
+    parallax = aligned["NIR"].parallax
+    assert parallax is not None
+    infinite = [geometry.invert(to_plane(REFERENCE, b, boxes.size_px)) for b in MOVING]
+    towards_m = np.subtract(REFERENCE.baseline_m, [b.baseline_m for b in MOVING])
+    inverse_m = inverse_range(
+        [boxes.mapping(b, aligned[b.name]) for b in MOVING], infinite, towards_m, REFERENCE.lens(*boxes.size_px),
+        boxes.pixels, parallax.relief(boxes.pixels),
+    )  # fmt: skip
+    ratio = 1 / inverse_m / boxes.truth.range_m
+    assert np.median(np.abs(ratio - 1)) < 0.02
+    # Nearer is positive: the range falls as the parallax rises.
+    assert np.corrcoef(parallax.relief(boxes.pixels).ravel(), boxes.truth.range_m.ravel())[0, 1] < -0.9
+
+
+def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[ReliefCandidate]) -> None:
+    """From what occludes. The reference plane may be another one than with a layout."""
+    unknown = [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
+    result = aligned_by_relief(unknown, "auto")
+    assert len(result) == len(MOVING)
+    parallax = result["NIR"].parallax
+    assert parallax is not None
+    assert np.corrcoef(parallax.relief(boxes.pixels).ravel(), boxes.truth.range_m.ravel())[0, 1] < -0.5
+
+
+def test_bands_that_were_measured_in_windows_of_different_sizes(candidates: Sequence[ReliefCandidate]) -> None:
+    """They are compared in windows that all of them have."""
+    counts = {len(c.warped.residual.centres_px) for c in candidates}
+    assert len(counts) > 1
+    without = [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
+    assert shows_relief(candidates)
+    assert shows_relief(without)
+
+
+def test_use(candidates: Sequence[ReliefCandidate]) -> None:
+    assert aligned_by_relief(candidates, "never") == {}
+    # One moving band has no other to verify it; a coarse one has another reference.
+    assert aligned_by_relief(candidates[:1], "always") == {}
+    coarse = [replace(c, pair=replace(c.pair, is_coarse=True)) for c in candidates[1:]]
+    assert aligned_by_relief([candidates[0], *coarse], "always") == {}
+
+
+def test_a_flat_scene_gets_no_relief(flat: Rendered) -> None:
+    candidates = flat.candidates()
+    assert not shows_relief(candidates)
+    assert aligned_by_relief(candidates, "auto") == {}
+    # Where one is asked for, it is no better than the homographies.
+    assert aligned_by_relief(candidates, "always") == {}
+
+
+@pytest.mark.parametrize(("height_px", "shown"), [(0.25, False), (1.0, True)])
+def test_parallax_as_small_as_the_noise_of_large_windows_is_no_relief(
+    flat: Rendered, height_px: float, shown: bool
+) -> None:
+    """However well the bands agree on it."""
+    result = []
+    for candidate, band in zip(flat.candidates(), MOVING, strict=True):
+        at = candidate.pair.reference.windows.centres_px
+        z = np.where(np.arange(len(at)) % 3 == 0, height_px, 0.0)
+        shift = z[:, None] * np.array(band.baseline_m) / 0.0367
+        residual = Residual.of(at, shift, np.full(len(at), 20.0))
+        result.append(replace(candidate, warped=replace(candidate.warped, residual=residual)))
+    assert shows_relief(result) == shown
+
+
+def of_lengths(median_px: float, p95_px: float) -> Residual:
+    lengths = np.where(np.arange(100) < 90, median_px, p95_px)
+    at = np.zeros((100, 2))
+    return Residual.of(at, np.column_stack([lengths, np.zeros(100)]), np.full(100, 20.0))
+
+
+@pytest.mark.parametrize(("relief", "plane", "worse"), [
+    ((0.10, 0.30), (0.20, 0.50), False),
+    ((0.13, 0.33), (0.08, 6.30), False),  # most windows are on the plane, and some far from it
+    ((0.08, 0.25), (0.04, 0.12), True),  # a flat scene
+    ((0.30, 0.40), (0.10, 0.50), True),
+    ((0.10, 0.60), (0.30, 0.50), True),
+    ((0.10, 0.50), (0.10, 0.50), False),
+])  # fmt: skip
+def test_a_relief_may_not_be_worse_than_its_plane(
+    relief: tuple[float, float], plane: tuple[float, float], worse: bool
+) -> None:
+    assert _worse(of_lengths(*relief), of_lengths(*plane)) == worse
+
+
+# ---- what fits noise cannot pass
+
+
+def noise(size_px: tuple[int, int], seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(500, 4000, size_px[::-1]).astype(np.float32)
+
+
+def scrambled(image: np.ndarray, rng_seed: int) -> np.ndarray:
+    """The image in pieces, each displaced by itself: windows have shifts, and no parallax explains them."""
+    rng, result = np.random.default_rng(rng_seed), image.copy()
+    for y in range(0, image.shape[0], 64):
+        for x in range(0, image.shape[1], 64):
+            piece = slice(y, y + 64), slice(x, x + 64)
+            result[piece] = np.roll(image, tuple(rng.integers(-6, 7, 2)), (0, 1))[piece]
+    return result
+
+
+def unrelated(size_px: tuple[int, int], seed: int) -> np.ndarray:
+    return np.asarray(2000 + 500 * textured_image(*size_px, seed), np.float32)
+
+
+@pytest.mark.parametrize("kind", ["noise", "unrelated", "scrambled"])
+def test_a_band_of_something_else_is_not_aligned(boxes: Rendered, kind: str) -> None:
+    makers = {"noise": noise(boxes.size_px, 7), "unrelated": unrelated(boxes.size_px, 7)}
+    nir = makers[kind] if kind in makers else scrambled(boxes.images["NIR"], 3)
+    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "always")
+    assert "NIR" not in result
+    for band in MOVING:
+        if band.name in result:
+            assert np.percentile(boxes.error_px(band, boxes.mapping(band, result[band.name])), 90) < 0.7
+
+
+@pytest.mark.parametrize("kind", ["noise", "unrelated", "scrambled"])
+def test_nothing_but_something_else(boxes: Rendered, kind: str) -> None:
+    def instead(name: str, number: int) -> np.ndarray:
+        if kind == "scrambled":
+            return scrambled(boxes.images[name], number)
+        return (noise if kind == "noise" else unrelated)(boxes.size_px, number)
+
+    images = {b.name: instead(b.name, n) for n, b in enumerate(MOVING)}
+    assert aligned_by_relief(boxes.candidates(images), "always") == {}

@@ -1,0 +1,120 @@
+"""What a nearer layer hides, compared with what geometry says."""
+
+import numpy as np
+import pytest
+
+from agalign.relief.occlusion import nearer_sign, occluded
+from agalign.values.image import Mask
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
+from agalign.values.relief import Relief
+
+HEIGHT, WIDTH = 60, 90
+BOX = slice(20, 40), slice(30, 55)
+NEAR_PX = 6
+
+
+def layers(box: tuple[slice, slice] = BOX, near_px: float = NEAR_PX, far_px: float = 0.0) -> Relief:
+    z = np.full((HEIGHT, WIDTH), far_px, np.float32)
+    z[box] = near_px
+    return Relief(z, np.ones_like(z))
+
+
+def shadow(box: tuple[slice, slice], dx: int, dy: int) -> Mask:
+    """The box where a band sees it, without the box itself."""
+    result = np.zeros((HEIGHT + 40, WIDTH + 40), bool)
+    rows, columns = box
+    result[rows.start + 20 + dy : rows.stop + 20 + dy, columns.start + 20 + dx : columns.stop + 20 + dx] = True
+    result = result[20:-20, 20:-20]
+    result[box] = False
+    return result
+
+
+@pytest.mark.parametrize("baseline", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -0.5), (0.5, -1.0), (-0.5, 1 / 3)])
+def test_a_nearer_box_hides_the_ground_next_to_it(baseline: tuple[float, float]) -> None:
+    dx, dy = (round(b * NEAR_PX) for b in baseline)
+    np.testing.assert_array_equal(occluded(layers(), baseline), shadow(BOX, dx, dy))
+
+
+def test_a_band_without_a_baseline_sees_everything() -> None:
+    assert not occluded(layers(), (0.0, 0.0)).any()
+
+
+def test_a_hole_is_hidden_by_its_edge() -> None:
+    """The edge at which the ground comes over the hole, on the side that it moves from."""
+    hidden = occluded(layers(near_px=-NEAR_PX), (1.0, 0.0))
+    rows, columns = BOX
+    expected = np.zeros_like(hidden)
+    # The bottom of the hole moves 6 px to the left, below the ground there.
+    expected[rows, columns.start : columns.start + NEAR_PX] = True
+    np.testing.assert_array_equal(hidden, expected)
+
+
+def test_only_differences_of_parallax_count() -> None:
+    raised = layers(near_px=NEAR_PX + 4, far_px=4)
+    np.testing.assert_array_equal(occluded(raised, (1.0, 0.0)), occluded(layers(), (1.0, 0.0)))
+
+
+def test_low_relief_of_a_surface_hides_nothing() -> None:
+    slope = np.linspace(0, 20, WIDTH, dtype=np.float32)[None, :].repeat(HEIGHT, axis=0)
+    for baseline in ((1.0, 0.0), (-0.7, 0.7)):
+        assert not occluded(Relief(slope, np.ones_like(slope)), baseline).any()
+        assert not occluded(layers(near_px=0.9), baseline).any()
+
+
+@pytest.mark.parametrize("box", [
+    (slice(0, 15), slice(0, 12)), (slice(45, HEIGHT), slice(80, WIDTH)), (slice(0, HEIGHT), slice(0, 8)),
+])  # fmt: skip
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_box_at_the_border_hides_only_what_is_inside(box: tuple[slice, slice], sign: int) -> None:
+    """Pixels that leave the image hide nothing, neither each other nor those at the other side."""
+    hidden = occluded(layers(box), (sign * 1.0, 0.0))
+    expected = shadow(box, sign * NEAR_PX, 0)
+    np.testing.assert_array_equal(hidden, expected)
+
+
+def test_a_magnified_surface_has_no_gaps() -> None:
+    """A steep bank, displaced pixels of which are 1.5 px apart, hides all of the ground below it."""
+    z = np.clip(np.arange(WIDTH, dtype=np.float32)[None, :].repeat(HEIGHT, axis=0) * 0.5 - 10, 0, 20)
+    z[:, 60:] = 0
+    hidden = occluded(Relief(z, np.ones_like(z)), (1.0, 0.0))
+    # Its edge at x = 59 has z = 19.5 and is seen at 78 or 79.
+    inner = slice(2, -2)
+    assert hidden[inner, 61:78].all()
+    assert not hidden[:, 81:].any()
+    assert not hidden[:, :60].any()
+
+
+def test_a_reduced_relief() -> None:
+    """A raster of half the size keeps its parallax in px of the image."""
+    half = layers()
+    full = Relief(half.parallax_px * 2, half.confidence, PixelScale(0.5, 0.5))
+    np.testing.assert_array_equal(occluded(full, (1.0, 0.0)), shadow(BOX, NEAR_PX, 0))
+    assert half.scale == SAME_PIXELS
+
+
+def matched(sign: int, baselines: np.ndarray, shown: float = 0.9, behind: float = 0.2) -> Relief:
+    """The relief as matching finds it: hidden ground correlates little. With sign -1 all parallax is reversed."""
+    z = layers().parallax_px
+    hidden = np.logical_or.reduce([occluded(layers(), (x, y)) for x, y in (sign * baselines).tolist()])
+    rng = np.random.default_rng(0)
+    confidence = np.where(hidden, behind, shown) + rng.normal(0, 0.05, z.shape)
+    return Relief(z * np.float32(sign), confidence.astype(np.float32))
+
+
+BASELINES = np.array([[1.0, 0.0], [0.0, 0.6]])
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_matches_is_nearer_than_what_does_not(sign: int) -> None:
+    assert nearer_sign(matched(sign, BASELINES), BASELINES) == sign
+
+
+def test_where_hidden_pixels_match_as_well_nothing_is_known() -> None:
+    assert nearer_sign(matched(1, BASELINES, behind=0.9), BASELINES) == 0
+
+
+def test_without_occlusions_nothing_is_known() -> None:
+    flat = layers(near_px=0.0)
+    assert nearer_sign(flat, BASELINES) == 0
+    small = Relief(layers((slice(20, 22), slice(30, 32))).parallax_px, matched(1, BASELINES).confidence)
+    assert nearer_sign(small, BASELINES / 6) == 0

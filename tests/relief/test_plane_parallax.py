@@ -1,0 +1,153 @@
+"""Planes, baselines and parallax from shifts of windows that are calculated from them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agalign.relief.plane_parallax import PlaneParallax, WindowShifts, fit_plane_parallax, parallax_of
+from agalign.synthetic import cameras
+from agalign.values import geometry
+from agalign.values.alignment import Residual
+from agalign.values.mapping import PixelMapping
+from agalign.values.relief import Parallax, Relief
+
+SIZE = 640, 480
+BASELINES = np.array([[-0.8, 0.0], [0.0, -0.6], [-0.8, -0.6], [-0.4, -0.3]])
+"""The longest of length 1; pixels move against the places of the lenses."""
+POINTS = np.stack(np.meshgrid(np.arange(24, 640, 24.0), np.arange(24, 480, 24.0)), axis=-1).reshape(-1, 2)
+
+
+def heights() -> np.ndarray:
+    """Parallax (n,) of the windows: most on the ground, some on a bench and some on boxes, and a few below."""
+    z = np.zeros(len(POINTS))
+    z[(POINTS[:, 0] > 250) & (POINTS[:, 0] < 400)] = 4
+    z[(POINTS[:, 0] > 300) & (POINTS[:, 0] < 370) & (POINTS[:, 1] > 200) & (POINTS[:, 1] < 330)] = 11
+    z[POINTS[:, 1] > 430] = -3
+    return z
+
+
+def corners() -> np.ndarray:
+    """Errors (bands, 8) of the homographies."""
+    return np.random.default_rng(1).normal(0, 1.5, (len(BASELINES), 8))
+
+
+def shifts(noise_px: float = 0.06, wrong: float = 0.2, missing: float = 0.0) -> WindowShifts:
+    """Of all windows in all bands, with wrong peaks anywhere within 20 px."""
+    rng = np.random.default_rng(0)
+    planes = np.einsum("nki,bi->nbk", geometry.over_corners(POINTS, *SIZE), corners())
+    result = planes + heights()[:, None, None] * BASELINES
+    result += rng.normal(0, noise_px, result.shape)
+    off = rng.random(result.shape[:2]) < wrong
+    result[off] = rng.uniform(-20, 20, (off.sum(), 2))
+    gone = rng.random(result.shape[:2]) < missing
+    result[gone] = np.nan
+    return WindowShifts(POINTS, POINTS, result, np.where(gone, 0.0, 1.0))
+
+
+def assert_recovered(model: PlaneParallax | None, sign: int = 1, tolerance_px: float = 0.15) -> None:
+    assert model is not None
+    np.testing.assert_allclose(model.baselines, sign * BASELINES, atol=0.02)
+    error = np.abs(model.parallax_px - sign * heights())
+    assert np.percentile(error, 75) < tolerance_px
+    for band in range(len(BASELINES)):
+        plane = geometry.over_corners(POINTS, *SIZE) @ corners()[band]
+        assert np.abs(model.shifts_px(POINTS, SIZE, band) - plane).max() < tolerance_px
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.001, 40.0])
+def test_everything_is_recovered_through_noise_and_wrong_peaks(unit: float) -> None:
+    """Whatever the unit of the layout."""
+    model = fit_plane_parallax(shifts(), SIZE, BASELINES * unit)
+    assert_recovered(model)
+    assert np.nanmedian(model.misfits_px) < 0.15
+    assert 0.1 < (model.misfits_px > 2).mean() < 0.25
+
+
+def test_windows_that_some_bands_do_not_show() -> None:
+    some = shifts(missing=0.3)
+    model = fit_plane_parallax(some, SIZE, BASELINES)
+    assert_recovered(model)
+    np.testing.assert_array_equal(np.isfinite(model.misfits_px), some.weights > 0)
+
+
+def test_the_layout_may_be_wrong_but_for_its_sign() -> None:
+    rough = BASELINES + np.random.default_rng(5).normal(0, 0.15, BASELINES.shape)
+    assert_recovered(fit_plane_parallax(shifts(), SIZE, rough))
+
+
+def test_the_layout_decides_the_sign() -> None:
+    assert_recovered(fit_plane_parallax(shifts(), SIZE, BASELINES))
+    assert_recovered(fit_plane_parallax(shifts(), SIZE, -BASELINES), sign=-1)
+
+
+def test_without_a_layout_all_but_the_sign_is_found() -> None:
+    model = fit_plane_parallax(shifts(), SIZE)
+    assert model is not None
+    assert_recovered(model, sign=1 if (model.baselines * BASELINES).sum() > 0 else -1)
+
+
+def test_the_reference_plane_is_the_one_that_most_windows_are_on() -> None:
+    """Adding a plane to the parallax and taking it from the homographies changes no shift."""
+    tilted = shifts()
+    tilt = 0.01 * (POINTS[:, 0] - 320) - 0.02 * (POINTS[:, 1] - 240) + 5
+    tilted = replace(tilted, shifts_px=tilted.shifts_px + tilt[:, None, None] * BASELINES)
+    model = fit_plane_parallax(tilted, SIZE, BASELINES)
+    assert model is not None
+    assert np.percentile(np.abs(model.parallax_px - heights()), 75) < 0.15
+
+
+def test_too_few_windows_are_no_model() -> None:
+    windows = shifts()
+    few = WindowShifts(POINTS[:7], POINTS[:7], windows.shifts_px[:7], windows.weights[:7])
+    assert fit_plane_parallax(few, SIZE) is None
+    # Eight windows are enough, and none of them may be missing in a band.
+    nothing = replace(windows, weights=np.where(np.arange(4) == 2, 0.0, windows.weights))
+    assert fit_plane_parallax(nothing, SIZE) is None
+    assert fit_plane_parallax(windows, SIZE, np.zeros((4, 2))) is None
+
+
+def test_parallax_is_the_projection_onto_the_baselines() -> None:
+    baselines, weights = np.array([[1.0, 0.0], [0.0, 0.5]]), np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
+    shift = np.array([[[3.0, 9.0], [9.0, 1.5]]] * 4)
+    shift[1, 1] = shift[2, 0] = shift[3] = np.nan
+    np.testing.assert_allclose(parallax_of(shift, baselines, weights), [3, 3, 3, 0], rtol=0.05)
+    np.testing.assert_allclose(parallax_of(shift[:2], baselines, weights[:2]), [3, 3], rtol=0.02)
+
+
+# ---- windows of several bands
+
+
+def residual(centres: np.ndarray, shift: np.ndarray, sigma: float = 20.0) -> Residual:
+    return Residual.of(centres, shift, np.full(len(centres), sigma))
+
+
+def test_windows_are_matched_by_their_centres() -> None:
+    at = np.array([[10.0, 20.0], [30.0, 20.0], [50.0, 20.0]])
+    one = residual(at, np.array([[1.0, 0], [2, 0], [np.nan, np.nan]]))
+    other = residual(at[[2, 0]], np.array([[3.0, 0], [4, 0]]), sigma=60.0)
+    plain = PixelMapping(np.eye(3))
+    windows = WindowShifts.of([one, other], [plain, plain])
+    np.testing.assert_array_equal(windows.centres_px, at)
+    np.testing.assert_array_equal(windows.shifts_px[..., 0], [[1, 4], [2, np.nan], [np.nan, 3]])
+    # Higher peaks weigh more, up to a limit; what was not measured has no weight.
+    np.testing.assert_allclose(windows.weights, [[0.25, 2], [0.25, 0], [0, 2]])
+    assert WindowShifts.of([residual(at, np.full((3, 2), np.nan))], [plain]).weights.tolist() == [[0.0]] * 3
+    assert len(WindowShifts.of([residual(at[:0], at[:0])], [plain])) == 0
+
+
+def test_shifts_are_those_of_undistorted_pixels() -> None:
+    """A shift near a corner of a distorted image, measured under a relief."""
+    lens = cameras.BANDS[1].lens(*SIZE)
+    relief = Relief(np.full(SIZE[::-1], 5.0, np.float32), np.ones(SIZE[::-1], np.float32))
+    mapping = PixelMapping(np.eye(3), lens, None, parallax=Parallax(relief, (0.6, -0.8)))
+    centre, shift = np.array([[40.0, 30.0]]), np.array([[3.0, 2.0]])
+    windows = WindowShifts.of([residual(centre, shift)], [mapping])
+    plane = mapping.of_the_plane
+    np.testing.assert_allclose(windows.points_px, plane.undistorted(centre))
+    expected = plane.undistorted(centre + shift) - plane.undistorted(centre)
+    np.testing.assert_allclose(windows.shifts_px[:, 0], expected, atol=1e-6)
+    assert np.abs(expected - shift).max() > 0.05
+    # The whole shift from the plane has what the relief moved as well.
+    whole = windows.plus(relief(windows.centres_px), np.array([[0.6, -0.8]]))
+    np.testing.assert_allclose(whole.shifts_px[:, 0], expected + np.array([[3, -4]]), atol=1e-6)

@@ -1,0 +1,69 @@
+"""Semi-global matching, compared with its definition written out in loops."""
+
+import numpy as np
+import pytest
+
+from agalign.relief.semi_global import aggregated, sub_label_minimum
+
+
+def by_definition(costs: np.ndarray, small: int, large: int) -> np.ndarray:
+    labels, height, width = costs.shape
+    total = np.zeros(costs.shape, int)
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        path = np.zeros(costs.shape, int)
+        for y in range(height)[:: dy or 1]:
+            for x in range(width)[:: dx or 1]:
+                for d in range(labels):
+                    path[d, y, x] = costs[d, y, x]
+                    if 0 <= x - dx < width and 0 <= y - dy < height:
+                        before = path[:, y - dy, x - dx]
+                        steps = [before[k] + (0, small, large)[min(abs(k - d), 2)] for k in range(labels)]
+                        path[d, y, x] += min(steps) - before.min()
+        total += path
+    return total
+
+
+@pytest.mark.parametrize(("labels", "small", "large"), [(5, 6, 40), (7, 3, 15), (3, 10, 10), (1, 2, 5), (2, 2, 5)])
+def test_four_paths(labels: int, small: int, large: int) -> None:
+    costs = np.random.default_rng(labels).integers(0, 100, (labels, 6, 8)).astype(np.int16)
+    given = costs.copy()
+    np.testing.assert_array_equal(aggregated(costs, small, large), by_definition(costs, small, large))
+    np.testing.assert_array_equal(costs, given)
+
+
+def test_an_edge_stays_sharp_and_noise_goes() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.where(np.arange(30)[None, :] < 13, 2, 6).repeat(20, axis=0).reshape(20, 30)
+    costs = rng.integers(60, 100, (9, 20, 30)).astype(np.int16)
+    np.put_along_axis(costs, truth[None], 40, axis=0)
+    wrong = rng.random(truth.shape) < 0.15
+    costs[0][wrong] = 10
+    raw, smooth = costs.argmin(axis=0), aggregated(costs, 15, 60).argmin(axis=0)
+    assert (raw != truth).mean() > 0.1
+    assert (smooth != truth).mean() < 0.02
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+@pytest.mark.parametrize("at", [1.0, 1.4, 3.0, 3.45, 4.62, 5.0])
+def test_the_minimum_of_a_parabola(at: float, dtype: type) -> None:
+    labels = np.arange(7)
+    costs = np.round(1000 * (labels - at) ** 2 + 50).astype(dtype)[:, None, None]
+    assert sub_label_minimum(costs)[0, 0] == pytest.approx(at, abs=1e-3)
+
+
+@pytest.mark.parametrize(("costs", "label"), [
+    ([1, 5, 9, 20], 0),
+    ([20, 9, 5, 1], 3),
+    ([4, 4, 4, 4], 0),  # no minimum at all
+    ([9, 5, 5, 9], 1.5),  # halfway
+    ([9, 2, 4, 2], 1 + 0.5 * 5 / 9),  # the first of two: (9 - 4) / (2 * (9 - 4 + 4))
+])  # fmt: skip
+def test_at_the_borders_there_is_no_parabola(costs: list[float], label: float) -> None:
+    volume = np.array(costs, np.float32)[:, None, None]
+    assert sub_label_minimum(volume)[0, 0] == pytest.approx(label, abs=1e-6)
+
+
+def test_every_pixel_has_its_own_minimum() -> None:
+    at = np.random.default_rng(0).uniform(0.6, 4.4, (5, 6))
+    costs = ((np.arange(6)[:, None, None] - at) ** 2).astype(np.float32)
+    np.testing.assert_allclose(sub_label_minimum(costs), at, atol=1e-4)
