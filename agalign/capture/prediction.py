@@ -64,6 +64,8 @@ def _with_prediction(
         if not issues:
             return replace(alignment, prediction=prediction)
         alignment = replace(alignment, issues=issues)
+    if alignment.prediction is not None and alignment.prediction.std_px <= prediction.std_px:
+        return alignment
     predicted = as_predicted(alignment, pair, prediction)
     assert predicted.residual is not None
     rotated = find_rotated(pair, predicted.fixed_to_moving, predicted.residual)

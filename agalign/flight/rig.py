@@ -84,5 +84,12 @@ class Rig:
     """Root mean square error of each band in captures left out, predicted from their other bands. Everything of a band
     is in px of its own file.
     """
+    extrapolation_px: Mapping[str, MovingFilePx] = field(default_factory=dict)
+    """Root mean square error of a band's mean where no capture shows a quarter of the image: of the lens differences
+    that a homography extrapolates. Bands that are shown everywhere are left out."""
     fields: Mapping[str, DisplacementField] = field(default_factory=dict)
     """What no homography explains and all captures have in common, raw px of the reference's file, by band."""
+
+    def covers(self, band: str) -> bool:
+        """True where captures show the band's mapping over the whole image."""
+        return band in self.mean and band not in self.extrapolation_px

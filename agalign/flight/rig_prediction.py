@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -64,7 +64,10 @@ def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
     Raises KeyError for a band that the rig does not know.
     """
     others = [b for b in known.mappings if b != band and b in rig.mean]
-    return _from_bands(rig, band, known, others) if others else _from_captures(rig, band, known)
+    prediction = _from_bands(rig, band, known, others) if others else _from_captures(rig, band, known)
+    if rig.covers(band):
+        return prediction
+    return replace(prediction, std_px=MovingFilePx(np.hypot(prediction.std_px, rig.extrapolation_px[band])))
 
 
 def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> MovingFilePx:

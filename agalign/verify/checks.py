@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from agalign.values import issues
 from agalign.values.issues import Issue, IssueKind
 from agalign.values.pixel_units import FixedPx
-from agalign.verify import descriptor_check, mapping_check, repetition, rig_check, window_check
+from agalign.verify import descriptor_check, extrapolation_check, mapping_check, repetition, rig_check, window_check
 from agalign.verify.check import Check, Evidence
 
 CHECKS: tuple[Check, ...] = (
@@ -15,7 +15,12 @@ CHECKS: tuple[Check, ...] = (
 
 KINDS: Mapping[str, IssueKind] = {
     kind.code: kind
-    for kind in (*issues.KINDS, *(kind for check in CHECKS for kind in check.kinds), issues.SEED_DOES_NOT_FIT)
+    for kind in (
+        *issues.KINDS,
+        *(kind for check in CHECKS for kind in check.kinds),
+        extrapolation_check.EXTRAPOLATED,
+        issues.SEED_DOES_NOT_FIT,
+    )
 }
 """Every kind of issue that a sidecar may contain, by code."""
 

@@ -10,6 +10,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, Residual
 from agalign.values.geometry import Points
 from agalign.values.pixel_units import FixedFilePx
+from agalign.verify.lens_shapes import over_corners_and_lens
 
 _NEIGHBOURS = 8
 """Windows that the error at a place is estimated from, those nearer with more weight."""
@@ -24,9 +25,10 @@ def expected_error_px(
 
         error^2 = trace of D(x) C D(x)^T + mean square of the windows around + (1 - near) p95^2
 
-    with the covariance C of the corners and D as in `geometry.over_corners`, or for a predicted band the square of its
-    standard error. The weight of the windows falls with the distance; far from all of them the plane may miss the
-    ground by as much as it does in the worst twentieth of the windows. Infinite where nothing is known.
+    with the covariance C of the corners and D as in `geometry.over_corners`, with the lens shapes where the mapping is
+    extrapolated. For a band that a rig predicts, the first term is the square of its standard error. The weight of the
+    windows falls with the distance; far from all of them the plane may miss the ground by as much as it does in the
+    worst twentieth of the windows. Infinite where nothing is known.
     """
     square = _of_the_mapping(alignment, size_px, points_px)
     residual = alignment.residual
@@ -41,6 +43,9 @@ def _of_the_mapping(
     if alignment.status == "predicted" and alignment.prediction is not None:
         # A standard error is in px of the moving file.
         ratio = abs(float(geometry.local_scale(alignment.fixed_to_moving, *size_px)[-1]))
+        if alignment.prediction.covariance_px2 is not None:
+            over = over_corners_and_lens(points_px, size_px)
+            return np.asarray(np.einsum("nki,ij,nkj->n", over, alignment.prediction.covariance_px2, over))
         return np.full(len(points_px), (alignment.prediction.std_px / ratio) ** 2)
     joint = alignment.joint
     if alignment.status != "aligned" or joint is None or joint.corner_covariance_px2 is None:

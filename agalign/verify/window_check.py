@@ -13,9 +13,7 @@ from agalign.values.issues import TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
 from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
-_RELIEF = Remedy(
-    "a part of the image lies apart: trees, buildings or terraces near the camera", "--local follows the relief"
-)
+_RELIEF = Remedy("a part of the image lies apart: trees, buildings or terraces near the camera", "--relief follows it")
 FEW_WINDOWS = IssueKind("few_windows", "too little structure in common to check the result", TEXTURELESS)
 COVERAGE = IssueKind("coverage", "the structures agree in only {value:.0%} of the windows", UNLIKE)
 CLOSE_WINDOWS = IssueKind(

@@ -8,18 +8,21 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+import torch
 
 import agalign
+from agalign.batch import CaptureReport
 from agalign.batch.learn import learn_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align import align_capture_bands
 from agalign.config import CheckSettings, Settings
-from agalign.flight.model import FlightModel
+from agalign.flight.model import FlightModel, load_model
 from agalign.products.fill_sidecar import capture_status
 from agalign.synthetic import make_flight
 from agalign.values import geometry
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
+Run = tuple[Path, dict[str, CaptureReport]]
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +41,17 @@ def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def model(five: Path) -> FlightModel:
-    result = learn_flight(discover(five).captures, Settings(), lambda *_: None)
-    assert result is not None
-    return result
+def run(five: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The output folder of the five captures, and the report of each; no prediction is good enough here."""
+    out = tmp_path_factory.mktemp("run")
+    settings = Settings(check=CheckSettings(accept_predicted_px=0.0))
+    return out, {r.label[-8:]: r for r in agalign.align_folder(five, out, settings=settings)}
+
+
+@pytest.fixture(scope="module")
+def model(run: Run) -> FlightModel:
+    (path,) = (run[0] / "models").iterdir()
+    return load_model(path, lambda: torch.device("cpu"))
 
 
 def error_px(five: Path, capture: str, file: str, matrix: np.ndarray) -> float:
@@ -85,14 +95,13 @@ def test_a_lost_band_is_predicted_with_an_error_bar_and_never_called_aligned(fiv
     assert result["Red"].prediction.off_px is not None
 
 
-def test_a_capture_over_water_costs_little_and_is_written(five: Path, tmp_path: Path) -> None:
-    settings = Settings(check=CheckSettings(accept_predicted_px=0.0))
-    reports = {r.label[-8:]: r for r in agalign.align_folder(five, tmp_path, settings=settings)}
+def test_a_capture_over_water_costs_little_and_is_written(run: Run) -> None:
+    out, reports = run
     water = reports["IMG_0005"].sidecar
     assert water is not None
     assert {b.status for b in water.bands} == {"reference", "predicted"}
     assert {b.prediction.source for b in water.bands if b.prediction} <= {"neighbours", "flight"}
-    assert (tmp_path / "0000SET" / "000" / "IMG_0005.tif").is_file()
+    assert (out / "0000SET" / "000" / "IMG_0005.tif").is_file()
     others = [b.seconds for b in reports["IMG_0001"].sidecar.bands if b.status == "aligned"]
     assert max(b.seconds for b in water.bands) < 3 * max(others)
     # What counts as delivered is the user's choice: here no prediction is good enough.
@@ -100,11 +109,11 @@ def test_a_capture_over_water_costs_little_and_is_written(five: Path, tmp_path: 
     bands = reports["IMG_0003"].sidecar.bands
     assert capture_status(bands, 0.0) == "degraded"
     assert capture_status(bands, 50.0) == "ok"
-    rows = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
+    rows = list(csv.DictReader((out / "summary.csv").read_text().splitlines()))
     (nir,) = [r for r in rows if r["capture"] == "IMG_0003" and r["band"] == "NIR"]
     assert (nir["status"], nir["prediction_from"]) == ("predicted", "bands")
     assert float(nir["prediction_std_px"]) > 0
-    assert "predicted by the rig" in (tmp_path / "index.html").read_text()
+    assert "predicted by the rig" in (out / "index.html").read_text()
 
 
 def test_an_alignment_where_the_rig_cannot_be_is_not_believed(five: Path, model: FlightModel) -> None:

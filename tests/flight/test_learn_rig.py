@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -44,14 +45,29 @@ def flight(count: int = 8, spread_px: float = 1.0, noise: float = 0.03) -> list[
     return [observation(float(k), spread_px * rng.normal(), noise=noise, seed=k) for k in range(count)]
 
 
+@cache
+def usual_rig() -> Rig:
+    """The rig of `flight`, learned once: it takes a second, and a rig does not change."""
+    rig = learn_rig(flight(), SIZE, {})
+    assert rig is not None
+    return rig
+
+
+@cache
+def sinking_rig() -> Rig:
+    """The rig of a drone that sinks steadily from the mean."""
+    rig = learn_rig([observation(10.0 * k, 0.5 * k) for k in range(9)], SIZE, {})
+    assert rig is not None
+    return rig
+
+
 def error_px(rig: Rig, band: str, known: Observation, truth: np.ndarray) -> tuple[float, float]:
     prediction = predict_band(rig, band, known)
     return distance_px(prediction.fixed_to_moving, truth, SIZE), prediction.std_px
 
 
 def test_the_baselines_are_found_up_to_a_factor() -> None:
-    rig = learn_rig(flight(), SIZE, {})
-    assert rig is not None
+    rig = usual_rig()
     assert rig.factors == ("distance",)
     result, wanted = (np.array([b[name] for name in BASELINES]) for b in (rig.baselines, BASELINES))
     wanted = wanted / np.linalg.norm(wanted)
@@ -60,8 +76,7 @@ def test_the_baselines_are_found_up_to_a_factor() -> None:
 
 
 def test_a_band_without_evidence_is_where_the_others_say() -> None:
-    rig = learn_rig(flight(), SIZE, {})
-    assert rig is not None
+    rig = usual_rig()
     low = observation(9.0, 4.0, without=("NIR",))
     error, std = error_px(rig, "NIR", low, mappings(4.0)["NIR"])
     assert error < 0.3
@@ -106,8 +121,7 @@ def test_a_known_layout_is_enough_for_a_height_that_nobody_has_seen() -> None:
 
 @pytest.mark.slow
 def test_a_band_whole_periods_away_does_not_carry_the_others() -> None:
-    rig = learn_rig(flight(), SIZE, {})
-    assert rig is not None
+    rig = usual_rig()
     known = observation(9.0, 1.0)
     wrong = geometry.compose(geometry.translation(40.0, 0.0), known.mappings["Blue"])
     spoiled = Observation(9.0, {**known.mappings, "Blue": wrong}, known.std_px)
@@ -119,9 +133,7 @@ def test_a_band_whole_periods_away_does_not_carry_the_others() -> None:
 @pytest.mark.slow
 def test_a_capture_without_evidence_lies_between_its_neighbours() -> None:
     """A drone that sinks steadily: the captures before and after say more than the flight's mean."""
-    sinking = [observation(10.0 * k, 0.5 * k) for k in range(9)]
-    rig = learn_rig(sinking, SIZE, {})
-    assert rig is not None
+    rig = sinking_rig()
     nothing = Observation(35.0, {}, {})
     prediction = predict_band(rig, "NIR", nothing)
     assert prediction.source == "neighbours"
@@ -134,14 +146,14 @@ def test_few_captures_are_no_rig() -> None:
 
 
 def test_written_and_read_it_is_the_same(tmp_path: Path) -> None:
-    rig = learn_rig(flight(), SIZE, {})
-    assert rig is not None
+    rig = usual_rig()
     field = DisplacementField(32.0, np.random.default_rng(0).normal(size=(31, 41, 2)))
-    rig = replace(rig, fields={"Red": field})
+    rig = replace(rig, fields={"Red": field}, extrapolation_px={"Red": 0.7})
     again = rig_from_json(rig_to_json(rig), {"Red": field.displacements_px})
     np.testing.assert_array_equal(again.mean["NIR"], rig.mean["NIR"])
     np.testing.assert_array_equal(again.fields["Red"].displacements_px, field.displacements_px)
-    for name in ("baselines", "baseline_std", "centres", "delays", "factors", "captures", "from_bands_px", "size_px"):
+    names = "baselines", "baseline_std", "centres", "delays", "factors", "captures", "from_bands_px", "size_px"
+    for name in (*names, "extrapolation_px"):
         assert getattr(again, name) == getattr(rig, name)
 
 
@@ -167,8 +179,7 @@ def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:
 
 
 def test_the_error_bar_holds_what_captures_left_out_missed() -> None:
-    rig = learn_rig(flight(), SIZE, {})
-    assert rig is not None
+    rig = usual_rig()
     worse = replace(rig, from_bands_px={**rig.from_bands_px, "NIR": 2.0})
     known = observation(9.0, 0.5, without=("NIR",))
     assert predict_band(rig, "NIR", known).std_px < 0.2
@@ -176,8 +187,7 @@ def test_the_error_bar_holds_what_captures_left_out_missed() -> None:
 
 
 def test_the_error_bar_grows_where_the_other_bands_of_a_capture_disagree() -> None:
-    rig = learn_rig(flight(), SIZE, {})
-    assert rig is not None
+    rig = usual_rig()
     alike, unlike = (observation(9.0, 0.5, without=("NIR",), noise=noise, seed=3) for noise in (0.0, 3.0))
     assert predict_band(rig, "NIR", alike).std_px < 0.2
     assert predict_band(rig, "NIR", unlike).std_px > 1
@@ -200,11 +210,18 @@ def two_headings() -> list[Observation]:
     return [passing(float(k), motion, float(rng.normal()), seed=k) for k, motion in enumerate(there)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("layout", [{}, BASELINES])
-def test_delays_are_told_from_baselines(layout: dict) -> None:
-    rig = learn_rig(two_headings(), SIZE, layout)
+@cache
+def headings_rig(*, known_layout: bool) -> Rig:
+    """The rig of `two_headings`, learned with the baselines of the tags or without."""
+    rig = learn_rig(two_headings(), SIZE, BASELINES if known_layout else {})
     assert rig is not None
+    return rig
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known_layout", [False, True])
+def test_delays_are_told_from_baselines(known_layout: bool) -> None:
+    rig = headings_rig(known_layout=known_layout)
     assert "motion" in rig.factors
     result, wanted = (np.array([d[name] for name in DELAYS]) for d in (rig.delays, DELAYS))
     assert abs(result @ wanted) / np.linalg.norm(wanted) > 0.99
@@ -215,8 +232,7 @@ def test_delays_are_told_from_baselines(layout: dict) -> None:
 
 @pytest.mark.slow
 def test_a_capture_without_evidence_on_the_other_heading_lies_where_its_speed_says() -> None:
-    rig = learn_rig(two_headings(), SIZE, BASELINES)
-    assert rig is not None
+    rig = headings_rig(known_layout=True)
     for moment, sign in ((7.5, -1), (7.5, 1)):  # at a turn, where the captures before and after disagree
         truth = passing(moment, (0.0, sign * 16.0))
         nothing = Observation(moment, {}, {}, motion=truth.motion)
@@ -245,8 +261,7 @@ def test_between_captures_that_differ_nothing_is_known_for_sure() -> None:
 
 
 def test_what_is_expected_of_a_band_of_large_pixels_is_told_in_px_of_the_reference() -> None:
-    rig = learn_rig(flight(), SIZE, {})
-    assert rig is not None
+    rig = usual_rig()
     mean = rig.mean["NIR"]
     coarse = replace(rig, mean={**rig.mean, "NIR": geometry.compose(np.diag([0.1, 0.1, 1.0]), mean)})
     one, other = (expected_corners(r, "NIR", r.mean["NIR"]) for r in (rig, coarse))
@@ -256,9 +271,7 @@ def test_what_is_expected_of_a_band_of_large_pixels_is_told_in_px_of_the_referen
 
 def test_a_capture_without_a_time_is_not_between_captures_in_time() -> None:
     """The drone sinks from the mean: time 0 would be its first capture, which is far from a capture of unknown time."""
-    sinking = [observation(10.0 * k, 0.5 * k) for k in range(9)]
-    rig = learn_rig(sinking, SIZE, {})
-    assert rig is not None
+    rig = sinking_rig()
     prediction = predict_band(rig, "NIR", Observation(None, {}, {}))
     assert prediction.source == "flight"
     np.testing.assert_array_equal(prediction.fixed_to_moving, rig.mean["NIR"])

@@ -33,7 +33,7 @@ def model() -> FlightModel:
     captures = tuple(CaptureFactors(float(k), None, (0.1, 0.2), (float(k), 0.0, 0.0, 0.0, 0.0)) for k in range(3))
     rig = Rig(
         (640, 480), {"Red": geometry.translation(3, 4)}, {"Red": (1.0, 0.0)}, {"Red": 0.5}, {"Red": 0.01},
-        {"Red": (0.0,) * 5}, ("distance",), captures, {"Red": MovingFilePx(0.1)}, {"Red": FIELD},
+        {"Red": (0.0,) * 5}, ("distance",), captures, {"Red": MovingFilePx(0.1)}, fields={"Red": FIELD},
     )  # fmt: skip
     mappings = {"Red": geometry.translation(3, 4), "NIR": geometry.translation(-1, 2)}
     return FlightModel(net, "Maker Model 1 [Green 640x480]", ("Red", "NIR"), mappings, "abc", rig)

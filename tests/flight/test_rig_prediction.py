@@ -56,6 +56,20 @@ def test_a_band_moves_along_its_baseline_with_the_other_band() -> None:
     assert distance_px(predicted.fixed_to_moving, geometry.translation(-12, 8 + 0.8 * 2.0), SIZE) < 0.01
 
 
+def test_a_band_of_which_no_capture_shows_a_quarter_has_the_error_of_the_lenses_too() -> None:
+    some = rig(capture(1.0), capture(-1.0), capture(0.0))
+    half = replace(some, extrapolation_px={"NIR": MovingFilePx(0.7)})
+    assert some.covers("NIR")
+    assert not half.covers("NIR")
+    assert not some.covers("Green")
+    known = showing(some, "Red", 2.0)
+    std_px, half_px = (predict_band(r, "NIR", known).std_px for r in (some, half))
+    assert half_px == pytest.approx(np.hypot(std_px, 0.7))
+    assert predict_band(half, "Red", showing(some, "NIR", 2.0)).std_px == pytest.approx(
+        predict_band(some, "Red", showing(some, "NIR", 2.0)).std_px
+    )
+
+
 def test_the_mean_square_of_few_captures_is_inflated() -> None:
     some = rig(capture(1.0), capture(-1.0), capture(2.0))
     error_px = predict_band(some, "Red", Observation(None, {}, {})).std_px

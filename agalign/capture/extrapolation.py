@@ -1,0 +1,75 @@
+"""Alignments where a part of the image shows nothing: the lenses are estimated too, and the error there is stated.
+
+A homography that fits half of an image misses the other half by what the lenses differ. No residual shows it there.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from agalign.capture.band_pair import BandPair
+from agalign.capture.verification import WarpedPair
+from agalign.errors import GeometryError
+from agalign.flight.rig import Rig
+from agalign.values import geometry
+from agalign.values.alignment import Alignment, Prediction
+from agalign.values.issues import Issue
+from agalign.values.pixel_units import FixedImagePx
+from agalign.verify.extrapolation_check import issues_of_extrapolation, points_in_frame
+from agalign.verify.lens_shapes import fit_with_lens
+
+
+def without_extrapolated(
+    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig | None = None
+) -> dict[str, Alignment[FixedImagePx]]:
+    """The alignments; those `aligned` that are extrapolated over a quarter of the image are `predicted` there.
+
+    A rig that was learned over the whole image makes this unnecessary, and georeferenced files have no lens.
+    """
+    checked = dict(result)
+    for pair in pairs:
+        alignment = result[pair.name]
+        if alignment.status != "aligned" or "geo" in pair.candidates or _is_covered(pair, rig):
+            continue
+        assert alignment.residual is not None
+        mapping = pair.mapping(alignment.fixed_to_moving, alignment.field)
+        in_frame_px = points_in_frame(mapping, pair.fixed.size_px, pair.moving.size_px)
+        issues = issues_of_extrapolation(alignment.residual, pair.fixed.size_px, in_frame_px)
+        if issues:
+            checked[pair.name] = _extrapolated(pair, alignment, issues)
+    return checked
+
+
+def _is_covered(pair: BandPair, rig: Rig | None) -> bool:
+    """True where the flight's rig shows the band's mapping over the whole image."""
+    return rig is not None and pair.has_rig_pixels and pair.is_known_to_a_rig and rig.covers(pair.name)
+
+
+def _extrapolated(
+    pair: BandPair, alignment: Alignment[FixedImagePx], issues: tuple[Issue, ...]
+) -> Alignment[FixedImagePx]:
+    """The maximum a posteriori estimate of homography and lens from the windows, as a prediction with its error."""
+    size_px = pair.fixed.size_px
+    # A field that was fitted to the windows is extrapolated as well: it is replaced.
+    start = replace(pair.mapping(alignment.fixed_to_moving), local=None)
+    fit = fit_with_lens(
+        start, WarpedPair.of(pair, start).residual, size_px, calibrated=pair.space == "undistorted"
+    )  # fmt: skip
+    try:
+        corrected = geometry.compose(
+            alignment.fixed_to_moving, geometry.moving_corners(fit.mean_px[:8], *size_px)
+        )  # fmt: skip
+    except GeometryError:
+        corrected = alignment.fixed_to_moving
+    mapping = pair.mapping(corrected, fit.field())
+    std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, size_px, pair.moving.size_px)))
+    up = np.r_[np.tile(pair.scales.fixed.inverse, 4), np.full(4, pair.scales.fixed.inverse.mean)]
+    prediction = Prediction(
+        pair.scales.between_files(corrected), "windows", pair.in_moving_file_px(std_px, corrected),
+        covariance_px2=fit.covariance_px2 * np.outer(up, up),
+    )  # fmt: skip
+    return replace(
+        alignment, status="predicted", issues=issues, fixed_to_moving=corrected, field=mapping.local, local=None,
+        residual=WarpedPair.of(pair, mapping).residual, prediction=prediction,
+    )  # fmt: skip

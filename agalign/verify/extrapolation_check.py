@@ -1,0 +1,68 @@
+"""Check that the windows show every quarter of the image: elsewhere the mapping is extrapolated."""
+
+import numpy as np
+
+from agalign.values import geometry
+from agalign.values.alignment import Residual
+from agalign.values.geometry import Points
+from agalign.values.issues import Issue, IssueKind, Remedy
+from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import FixedPx
+
+EXTRAPOLATED = IssueKind(
+    "extrapolated",
+    "the bands show no common structure at the {detail} of the image; the mapping is extrapolated there",
+    Remedy(
+        "a part of the image is saturated, masked or without texture, and no rig of the flight is known there",
+        "expose for the brightest band; or give --model OUT/models/… of a flight that shows the whole image. "
+        "--error-map writes the expected error of each pixel",
+    ),
+)
+"""Not in `CHECKS`: the result stays, as a prediction with the error of the extrapolation."""
+_INNER_SHARE = 1 / 8
+"""Windows nearer to an axis of the image than this share of its side do not show a quarter: from there, the mapping is
+extrapolated over most of it."""
+_MIN_WINDOWS = 2
+"""Measured windows in a quarter: a single one may be a wrong peak."""
+_MIN_SHARE_IN_FRAME = 0.5
+"""A quarter counts where the moving image covers this share of it: elsewhere there is nothing to align."""
+_LATTICE = 24, 18
+"""Columns and rows of the points by which that share is measured."""
+_QUARTERS = (("top left", -1, -1), ("top right", 1, -1), ("bottom right", 1, 1), ("bottom left", -1, 1))
+
+
+def points_in_frame(mapping: PixelMapping, size_px: tuple[int, int], moving_size_px: tuple[int, int]) -> Points:
+    """The points (n, 2) of a lattice over the reference that are mapped into the moving image (width, height each)."""
+    points = geometry.lattice(*size_px, *_LATTICE)
+    mapped = mapping(points)
+    return points[((mapped >= -0.5) & (mapped <= np.subtract(moving_size_px, 0.5))).all(axis=1)]
+
+
+def unseen_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_px: Points | None = None) -> list[str]:
+    """The quarters of an image (width, height) in which fewer than two of the windows with these centres (n, 2) are.
+
+    `in_frame_px` limits them to the part that the moving image covers; None is the whole image.
+    """
+    lattice = geometry.lattice(*size_px, *_LATTICE)
+    covered = lattice if in_frame_px is None else in_frame_px
+    return [
+        name
+        for name, *sides in _QUARTERS
+        if _count(covered, size_px, sides) >= _MIN_SHARE_IN_FRAME * _count(lattice, size_px, sides)
+        and _count(centres_px, size_px, sides) < _MIN_WINDOWS
+    ]
+
+
+def issues_of_extrapolation(
+    residual: Residual[FixedPx], size_px: tuple[int, int], in_frame_px: Points
+) -> tuple[Issue, ...]:
+    """One where the measured windows leave out a quarter of what the moving image covers."""
+    unseen = unseen_quarters(residual.measured_px, size_px, in_frame_px)
+    return (Issue(EXTRAPOLATED, float(len(unseen)), 0.0, " and ".join(unseen)),) if unseen else ()
+
+
+def _count(points_px: Points, size_px: tuple[int, int], sides: list[int]) -> int:
+    """How many points (n, 2) are in the outer part of the quarter on these sides (x, y) of the centre."""
+    size = np.array(size_px, dtype=np.float64)
+    from_centre = (points_px - (size - 1) / 2) / size * np.array(sides)
+    return int((from_centre > _INNER_SHARE).all(axis=1).sum())
