@@ -11,6 +11,7 @@ from agalign.batch.capture import CaptureOutcome, process_capture, quiet
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.align import align_pairs
 from agalign.capture.band_pair import BandPair, Candidates
+from agalign.capture.extrapolation import without_extrapolated
 from agalign.capture.verification import with_metrics
 from agalign.config import Settings
 from agalign.errors import InputError
@@ -52,8 +53,10 @@ def align(
         (H, W), False where pixels must not be used.
 
     Returns an Alignment. Its `fixed_to_moving` (3x3) maps a pixel of `fixed` to a pixel of `moving`: x right, y down,
-    (0, 0) the centre of the top-left pixel. Check its `status`: only `aligned` has passed verification; `seed_only` and
-    `failed` have the seed's homography and a `reason`.
+    (0, 0) the centre of the top-left pixel. Check its `status`: only `aligned` has passed verification. `predicted` is
+    extrapolated over a part of the image that shows nothing, with the error `prediction.std_px`; its `field` of lens
+    displacements comes before the homography. `seed_only` and `failed` have the seed's homography. All three have a
+    `reason`.
     Raises InputError for arrays that are not images, GeometryError for a seed that is not a homography.
     """
     settings = settings or Settings()
@@ -64,7 +67,8 @@ def align(
         candidates = {"user": geometry.normalised(seed)}
     known: dict[SeedKind, FixedImagePx] = {} if seed_std_px is None else {"user": FixedImagePx(seed_std_px)}
     pair = BandPair.of_images("moving", one, other, candidates, known)
-    return with_metrics(align_pairs([pair], settings, quiet)["moving"], pair)
+    result = without_extrapolated([pair], align_pairs([pair], settings, quiet))
+    return with_metrics(result["moving"], pair)
 
 
 def warp_onto(

@@ -16,10 +16,10 @@ from agalign.values.choices import (
     FamilyChoice,
     Interpolation,
     Layout,
-    LocalUse,
     RadiometryChoice,
     RasterFormat,
     Recipe,
+    ReliefUse,
     Resolution,
     SeedKind,
     Sharing,
@@ -81,12 +81,13 @@ class CheckSettings(Stage):
     """Largest standard error of a predicted band that counts as delivered, px of its file."""
 
 
-class LocalSettings(Stage):
-    """A smooth displacement field over the homography, for parallax over trees, terraces and buildings."""
+class ReliefSettings(Stage):
+    """Parallax beyond the homography, over trees, terraces, buildings and benches."""
 
-    use: LocalUse = "auto"
-    """`auto` fits a field where parallax may be the only reason against an alignment, and where no rig of a flight
-    knows the distortion that the lenses leave."""
+    use: ReliefUse = "auto"
+    """`auto` estimates one relief for all bands of a capture where its windows show parallax. A band that has no other
+    to be verified by gets a smooth displacement field, where parallax may be the only reason against it or where no rig
+    of a flight knows the distortion that the lenses leave."""
 
     @field_validator("use", mode="before")
     @classmethod
@@ -118,6 +119,10 @@ class WriteSettings(Stage):
     """The narrow bands at the panchromatic band's resolution, beside the others."""
     error_map: bool = False
     """A raster of the error to be expected at every pixel, beside them."""
+    relief_map: bool = False
+    """The confidence and the range of the relief in its raster, next to the parallax."""
+    fill_occluded: bool = False
+    """Interpolate pixels that nearer parts of the scene occlude in a band, instead of nodata."""
     radiometry: RadiometryChoice = "off"
     """Write float32 instead of raw numbers: radiance as the camera's own calibration has it, reflectance by the light
     sensor, or by a panel; auto is the last of these that every band can be given. Thermal bands are in degrees C then.
@@ -139,7 +144,7 @@ class Settings(Stage):
     joint: JointSettings = JointSettings()
     flight: FlightSettings = FlightSettings()
     check: CheckSettings = CheckSettings()
-    local: LocalSettings = LocalSettings()
+    relief: ReliefSettings = ReliefSettings()
     write: WriteSettings = WriteSettings()
 
     @property

@@ -6,12 +6,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 
-# Each worker has a core of its own; read when torch is loaded, which nothing above does.
+# Each worker has a core of its own. Torch, which nothing above loads, and the programs that tests start read the
+# variable; OpenCV and the libraries of numpy are loaded.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+threadpool_limits(1)
+cv2.setNumThreads(1)
 
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

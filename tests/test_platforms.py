@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from agalign.batch import workers
-from agalign.batch.workers import Task, done_by, own_processes
+from agalign.batch.workers import Task, done_in, own_processes
 from agalign.cameras.discover import discover
 from agalign.config import SeedSettings, Settings
 
@@ -37,5 +37,5 @@ def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeyp
     """As they do on Windows and macOS: nothing of this process is there in them."""
     monkeypatch.setattr(workers, "get_all_start_methods", lambda: ["spawn"])
     tasks = [Task(c, tmp_path, Settings(seed=SeedSettings(only=True)), None) for c in discover(flight).captures]
-    with own_processes(2, None) as submit:
-        assert [r.state for r in done_by(submit, tasks, 8)] == ["done"] * len(tasks)
+    with own_processes(2) as pool:
+        assert [r.state for r in done_in(pool, tasks)] == ["done"] * len(tasks)

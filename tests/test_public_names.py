@@ -16,7 +16,7 @@ FUNCTIONS = {
     "align", "align_capture", "align_folder", "discover", "open_capture", "open_flight", "warp_onto",
 }  # fmt: skip
 SETTINGS = {
-    "CheckSettings", "FlightSettings", "JointSettings", "LocalSettings", "SeedSettings", "Settings", "WriteSettings",
+    "CheckSettings", "FlightSettings", "JointSettings", "ReliefSettings", "SeedSettings", "Settings", "WriteSettings",
 }  # fmt: skip
 OPTIONS_AND_RESULTS = {
     "Alignment", "CaptureReport", "DiscoverOptions", "FolderScan", "Prediction", "Residual", "RunOptions", "Seed",
@@ -24,7 +24,7 @@ OPTIONS_AND_RESULTS = {
 UNITS = {"FixedFilePx", "FixedImagePx", "MovingFilePx"}
 ERRORS = {
     "AgalignError", "ConfigurationError", "GeometryError", "InputError", "NoContrastError", "NoSuchBandError",
-    "NotEnoughTextureError", "OutputError", "SidecarError", "UnreadableFileError",
+    "NotEnoughTextureError", "OutputError", "SidecarError", "UnreadableFileError", "WorkerError",
 }  # fmt: skip
 
 

@@ -52,7 +52,7 @@ ELSEWHERE = {
 }
 """Modules whose behaviour is also tested outside tests/<package>; those tests run after the package's own."""
 PRELOADED = (
-    "cv2", "defusedxml", "filelock", "jinja2", "numpy", "pebble", "PIL.Image", "pydantic", "pytest",
+    "cv2", "defusedxml", "filelock", "jinja2", "numpy", "PIL.Image", "pydantic", "pytest",
     "rasterio", "rich", "safetensors.torch", "scipy.ndimage", "scipy.optimize", "scipy.spatial", "skimage", "tifffile",
     "torch", "typer", "xarray",
 )  # fmt: skip

@@ -28,11 +28,14 @@ from agalign.method.joint import Results, refine_with
 from agalign.method.starter import start_from
 from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.pixels.raster import without_warnings
+from agalign.values import geometry
 from agalign.values.alignment import MIN_RETRIEVAL, JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
-from agalign.values.pixel_units import FixedFilePx
+from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.verify.displacement_field import common_field
+from agalign.verify.extrapolation_check import unseen_quarters
+from agalign.verify.lens_shapes import unmodelled_std_px
 
 _LOG = logging.getLogger(__name__)
 _NETWORK_CAPTURES = 3
@@ -59,7 +62,7 @@ def learn_flight(
     keep_freed_memory()
     fingerprint_now = learning_fingerprint(captures, settings)
     # Displacements of single captures are neither the network's nor the rig's.
-    plain = settings.model_copy(update={"local": settings.local.model_copy(update={"use": "never"})})
+    plain = settings.model_copy(update={"relief": settings.relief.model_copy(update={"use": "never"})})
     if start is not None and _still_holds(start, captures, plain, at_once):
         return replace(start, fingerprint=fingerprint_now)
     bands = flight_lenses(captures)
@@ -156,7 +159,29 @@ def _learn_rig(
     residuals = {band: [s.residuals[band] for s in shown if band in s.residuals] for band in rig.mean}
     with ThreadPoolExecutor(at_once) as pool:
         fields = list(pool.map(lambda of_band: common_field(of_band, size), residuals.values()))
-    return replace(rig, fields={b: field for b, field in zip(residuals, fields, strict=True) if field is not None})
+    extrapolation_px = _extrapolation_px(rig, residuals, calibrated=captures[0].reference.lens is not None)
+    return replace(
+        rig, extrapolation_px=extrapolation_px,
+        fields={
+            band: field
+            for band, field in zip(residuals, fields, strict=True)
+            if field is not None and band not in extrapolation_px
+        },
+    )  # fmt: skip
+
+
+def _extrapolation_px(
+    rig: Rig, residuals: Mapping[str, Sequence[Residual[FixedFilePx]]], *, calibrated: bool
+) -> dict[str, MovingFilePx]:
+    """What the lenses may leave in bands with a quarter of the image that no capture shows, px of their files."""
+    result: dict[str, MovingFilePx] = {}
+    for band, of_band in residuals.items():
+        centres_px = np.concatenate([r.measured_px for r in of_band])
+        if unseen_quarters(centres_px, rig.size_px):
+            ratio = abs(float(geometry.local_scale(rig.mean[band], *rig.size_px)[-1]))
+            std_px = unmodelled_std_px(centres_px, rig.size_px, calibrated=calibrated)
+            result[band] = MovingFilePx(std_px * ratio)
+    return result
 
 
 def _shown_by_enough(

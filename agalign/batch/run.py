@@ -78,8 +78,8 @@ def run_flight(
     A network is learnt for every camera and flight first and saved below OUT/models; `model` is one to start from.
     One capture's failure never stops the others, and no result depends on the order in which they are done. What the
     run was is told by OUT/agalign-run.json.
-    Raises OutputError where the output folder cannot be used, another run writes there or the disk is full, InputError
-    or ConfigurationError for `model`.
+    Raises OutputError where the output folder cannot be used, another run writes there or the disk is full, WorkerError
+    where no worker process can be started or they end one after another, InputError or ConfigurationError for `model`.
     """
     options, listener = options or RunOptions(), listener or Listener()
     _refuse_to_overwrite(flight, out, settings.write)

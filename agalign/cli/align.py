@@ -29,10 +29,10 @@ from agalign.values.choices import (
     FamilyChoice,
     Interpolation,
     Layout,
-    LocalUse,
     RadiometryChoice,
     RasterFormat,
     Recipe,
+    ReliefUse,
     Resolution,
     SeedChoice,
     Sharing,
@@ -76,7 +76,7 @@ _EXAMPLES = examples(
     ("agalign flight/", "into flight-aligned/, with what the images and their tags say"),
     ("agalign flight/ -o aligned/ --radiometry", "reflectance where the camera's tags allow it"),
     ("agalign flight/ -o aligned/ --layout bands", "single files with their tags, for photogrammetry"),
-    ("agalign orchard/ --local --error-map", "follow trees and terraces, and map what error is left"),
+    ("agalign orchard/ --relief --error-map", "follow trees and terraces; map the expected error"),
     ("agalign flight/ --model earlier/models/CAMERA.safetensors", "begin with what an earlier flight learnt"),
     ("agalign flight/ --retry-failed", "once more what fell short"),
 )
@@ -114,11 +114,11 @@ def align(
         FamilyChoice,
         of_alignment(help="Mapping to fit; auto is as rich as the images allow."),
     ] = "auto",
-    local: Annotated[
-        LocalUse,
+    relief: Annotated[
+        ReliefUse,
         of_alignment(
-            help="Follow parallax over trees and buildings by a smooth field over the homography: where it is needed, "
-            "wherever it helps, or not at all. --local alone is always."
+            help="Estimate one relief for all bands of a capture, over trees, buildings, benches: where windows show "
+            "parallax, always, or never. --relief alone is always."
         ),
     ] = "auto",
     accept_predicted: Annotated[
@@ -184,6 +184,14 @@ def align(
         ),
     ] = False,
     stac: Annotated[bool, of_output("--stac", help="A STAC item beside each capture's files.")] = False,
+    relief_map: Annotated[
+        bool,
+        of_output("--relief-map", help="Add confidence and range (m) to the raster of a capture's relief."),
+    ] = False,
+    fill_occluded: Annotated[
+        bool,
+        of_output("--fill-occluded", help="Interpolate what nearer parts of the scene occlude in a band; else nodata."),
+    ] = False,
     error_map: Annotated[
         bool,
         of_output("--error-map", help="A raster of the error to expect at every pixel, <capture>.error.tif."),
@@ -222,7 +230,7 @@ def align(
             CheckSettings,
             FlightSettings,
             JointSettings,
-            LocalSettings,
+            ReliefSettings,
             SeedSettings,
             Settings,
             WriteSettings,
@@ -238,10 +246,11 @@ def align(
             ),
             flight=FlightSettings(together=not each_alone),
             check=CheckSettings(accept_predicted_px=accept_predicted),
-            local=LocalSettings(use=local),
+            relief=ReliefSettings(use=relief),
             write=WriteSettings(
                 interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
                 radiometry=radiometry, panel_albedo=albedos(panel_albedo), stac=stac, error_map=error_map,
+                relief_map=relief_map, fill_occluded=fill_occluded,
                 pan_sharpen=pan_sharpen,
                 format=format, compression=compression,
             ),

@@ -36,7 +36,7 @@ from agalign.cli.terminal import (
     printed,
     shown,
 )
-from agalign.values.choices import LocalUse, RadiometryChoice
+from agalign.values.choices import RadiometryChoice, ReliefUse
 
 if TYPE_CHECKING:
     from agalign.products.index_rasters import IndexReport
@@ -202,7 +202,8 @@ def main() -> None:
     if arguments and arguments[0] not in _COMMANDS and not _is_root_option(arguments[0]):
         _refuse_misspelt(arguments[0])
         arguments = ["align", *arguments]
-    _give_value(arguments, "--local", get_args(LocalUse), "always")
+    _rename(arguments, "--local", "--relief")
+    _give_value(arguments, "--relief", get_args(ReliefUse), "always")
     _give_value(arguments, "--radiometry", get_args(RadiometryChoice), "auto")
     # Threads that spin while they wait cost a multiple of the time where another program wants the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -221,6 +222,16 @@ def _refuse_misspelt(first: str) -> None:
         terminal = Terminal(quiet=False, verbose=False, log_json=False)
         terminal.problem(f"'{first}' is no command and no folder; did you mean '{meant[0]}'?")
         raise SystemExit(EXIT_USAGE)
+
+
+def _rename(arguments: list[str], old: str, new: str) -> None:
+    """Replace a deprecated option by its successor, with a warning."""
+    for index, argument in enumerate(arguments):
+        name, equals, value = argument.partition("=")
+        if name == old:
+            arguments[index] = f"{new}{equals}{value}"
+            terminal = Terminal(quiet=False, verbose=False, log_json="--log-json" in arguments)
+            terminal.problem(f"{old} is deprecated; use {new}")
 
 
 def _give_value(arguments: list[str], option: str, values: Sequence[str], alone: str) -> None:

@@ -19,7 +19,7 @@ from agalign.cli.terminal import (
     of_output,
     of_running,
 )
-from agalign.values.choices import MAX_MOSAIC_PIXELS, Compression, Interpolation, LocalUse, RasterFormat
+from agalign.values.choices import MAX_MOSAIC_PIXELS, Compression, Interpolation, RasterFormat, ReliefUse
 
 
 def onto(
@@ -32,8 +32,8 @@ def onto(
         of_output("--out", "-o", help="Output folder; by default REFERENCE-aligned.", show_default=False),
     ] = None,
     band: Reference = None,
-    local: Annotated[
-        LocalUse, of_alignment(help="Follow what one homography leaves by a smooth field: where it helps, or never.")
+    relief: Annotated[
+        ReliefUse, of_alignment(help="Follow what one homography leaves by a smooth field: where it helps, or never.")
     ] = "auto",
     interpolation: Annotated[Interpolation, of_output(help="Resampling of the moving mosaics.")] = "lanczos",
     format: Annotated[RasterFormat, of_output(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
@@ -59,13 +59,13 @@ def onto(
         from agalign.batch import RunOptions
         from agalign.cameras.discover import FolderScan
         from agalign.cameras.mosaics import captures_onto
-        from agalign.config import FlightSettings, JointSettings, LocalSettings, Settings, WriteSettings
+        from agalign.config import FlightSettings, JointSettings, ReliefSettings, Settings, WriteSettings
 
         target = out or reference.absolute().parent / f"{reference.stem}-aligned"
         settings = Settings(
             joint=JointSettings(device=device, rng_seed=rng_seed),
             flight=FlightSettings(together=False),
-            local=LocalSettings(use=local),
+            relief=ReliefSettings(use=relief),
             write=WriteSettings(interpolation=interpolation, crop="none", format=format, compression=compression),
         )
         flight = FolderScan(reference.parent, tuple(captures_onto(reference, moving, band, max_pixels)), ())

@@ -15,7 +15,7 @@ from rich.table import Column, Table
 
 from agalign.cli.failures import explain
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, shown
-from agalign.errors import NoSuchBandError, OutputError
+from agalign.errors import NoSuchBandError, OutputError, WorkerError
 
 if TYPE_CHECKING:
     from agalign.batch import CaptureReport, RunOptions
@@ -121,7 +121,7 @@ def run(
     flight: "FolderScan", out: Path, settings: "Settings", terminal: Terminal, how: "RunOptions", *,
     dask: str | None = None, model: Path | None = None, each: "Callable[[CaptureReport], None]" = lambda _: None,
 ) -> RunTotals:  # fmt: skip
-    """Align the captures, saying how far it has come. Raises OutputError where nothing could be written."""
+    """Align the captures, saying how far it has come. Raises OutputError or WorkerError where nothing could be done."""
     from agalign.batch import Listener, run_flight
     from agalign.batch.workers import dask_executor
 
@@ -160,7 +160,7 @@ def run(
                 each(report)
                 show(totals, 0.0, report.label)
                 _print_report(report, terminal, totals.states.total(), len(flight.captures))
-        except OutputError as error:
+        except (OutputError, WorkerError) as error:
             if not totals.states:
                 raise
             terminal.problem(str(error))

@@ -36,7 +36,7 @@ _TIES, _TIES_OVER_RELIEF = (25, 19), (65, 49)
 _CAPTURES_A_FIELD = 4
 """Captures over one painted ground; a longer flight gets more grounds in turn, so that memory stays constant."""
 _WARMEST_C, _HEAT_NOISE_C = 50.0, 0.05
-_VIGNETTING = 0.35
+VIGNETTING = 0.35
 """Share of the light at the centre that the corners lack."""
 
 
@@ -110,7 +110,7 @@ def _write(
                 path = images / camera.file_name(band, number)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 there = replace(shot.pose, north_m=shot.pose.north_m + before)
-                camera.write_band(path, pixels, band, Exposure(there, number, size_px, _VIGNETTING, shot.shutter))
+                camera.write_band(path, pixels, band, Exposure(there, number, size_px, VIGNETTING, shot.shutter))
     return {
         camera.capture_name(number): _truth(shot, number, camera, size_px)
         for number, shot in enumerate(shots, start=before + 1)
@@ -193,18 +193,22 @@ def render(
     painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], rng: np.random.Generator,
     spoil: Spoil | None = None,
 ) -> NDArray[np.uint16]:  # fmt: skip
-    """What one camera records of the ground painted in its band: (height, width) uint16 with vignetting and noise, and
-    of heat hundredths of a kelvin.
+    """What one camera records of the ground painted in its band: (height, width) uint16, as `recorded` returns it."""
+    return recorded(view(painted, ground, band, pose, size_px), band, rng, spoil)
+
+
+def recorded(scene: Field, band: BandSpec, rng: np.random.Generator, spoil: Spoil | None = None) -> NDArray[np.uint16]:
+    """Return the sensor's values (height, width) for a view of reflectances, with vignetting and noise; for heat,
+    hundredths of a kelvin.
     """
-    width, height = band.size_px(size_px)
-    scene = view(painted, ground, band, pose, size_px)
     if band.sees == "heat":
         celsius = _WARMEST_C * (scene if spoil is None else spoil(scene, rng))
         celsius = celsius + rng.normal(0, _HEAT_NOISE_C, scene.shape)
         return np.asarray(np.rint(100 * (celsius + 273.15)).astype(np.uint16))
+    height, width = scene.shape
     y, x = np.arange(height), np.arange(width)
     radius2 = ((x - width / 2) ** 2)[None, :] + ((y - height / 2) ** 2)[:, None]
-    vignetting = 1 - _VIGNETTING * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
+    vignetting = 1 - VIGNETTING * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
     light = np.asarray(scene * band.exposure, np.float32)
     signal = np.clip((light if spoil is None else spoil(light, rng)) * vignetting, 0, 1)
     electrons = signal * 4000

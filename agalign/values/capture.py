@@ -96,6 +96,8 @@ class Band:
     parallax: tuple[float, float] | None = None
     """Direction in which its pixels move as the ground comes nearer, right and down, relative to the rig's other bands;
     in any unit."""
+    lens_offset_m: tuple[float, float] | None = None
+    """Position of the lens right of and below the rig's origin, metres; None where the tags do not give it."""
     one_lens: bool = False
     """The file's bands come through one lens and are aligned as one."""
     companion: bool = False

@@ -13,6 +13,8 @@ import tifffile
 
 import agalign
 from agalign.config import Settings, WriteSettings
+from agalign.products.preview import ReliefView, preview_bytes, write_preview
+from agalign.products.reduced_bands import ReducedBands
 from agalign.products.report import write_pages
 from agalign.synthetic import flight as synthetic
 
@@ -206,6 +208,36 @@ def test_what_is_laid_over_the_picture(page: Any, overlay: str) -> None:
     before = drawn(page)
     page.get_by_label("What lies over it", exact=True).select_option("none")
     assert np.abs(drawn(page) - before).mean() < 0.3, "residuals are those of after"
+
+
+def test_the_relief_over_the_picture(browser: Any, out: Path, tmp_path: Path) -> None:
+    """In its two colours, whether or not the sheet has a row of errors, with a legend."""
+    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+    black, bands = np.zeros((360, 480), np.uint8), [b["band"] for b in sidecar["bands"]]
+    views = ReducedBands(dict.fromkeys(bands, black), dict.fromkeys(bands, black), (480, 360))
+    relief = ReliefView(np.where(np.arange(480) < 240, -2.0, 6.0)[None].repeat(360, axis=0).astype(np.float32), (1, 2))
+    for name, errors in (("a", {}), ("b", {"NIR": np.ones((4, 5), np.float32)})):
+        part = write_preview(views, bands, errors, tmp_path / f"{name}.preview.jpg", preview_bytes(1), relief)
+        sidecar |= {"capture": name, "preview": part.model_dump(mode="json")}
+        (tmp_path / f"{name}.json").write_text(json.dumps(sidecar))
+    write_pages(tmp_path, pytest.fail)
+    page = browser.new_page(viewport={"width": 1100, "height": 900})
+    page.goto((tmp_path / "index.html").as_uri())
+    for name in "ab":
+        page.locator("#table tbody th a", has_text=name).click()
+        page.wait_for_function(
+            "label => document.querySelector('#capture-title').textContent.includes(label)", arg=name
+        )
+        page.get_by_label("What lies over it", exact=True).select_option("relief")
+        page.locator("#swipe").focus()
+        page.keyboard.press("Home")
+        image = drawn(page)  # blue, green, red
+        far, near = (np.median(image[100:, half], axis=(0, 1)) for half in (slice(50, 300), slice(-300, -50)))
+        assert far == pytest.approx((0.75 * 150, 0.75 * 35, 0.75 * 25), abs=8)
+        assert near == pytest.approx((0.75 * 45, 0.75 * 250, 0.75 * 205), abs=8)
+        note = page.locator("#over-note").inner_text()
+        assert all(text in note for text in ("-2.0 px", "2.0 px", "6.0 px", "1.00 to 2.00 m"))
+    page.close()
 
 
 def test_the_table_sorts_and_filters(page: Any) -> None:

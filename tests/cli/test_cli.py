@@ -19,6 +19,7 @@ import tifffile
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign as agalign_package
+from agalign.config import Settings
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel, save_model
 from agalign.flight.rig import Observation, Rig
@@ -398,16 +399,53 @@ def test_wrong_words_are_usage_errors(flight: Path, tmp_path: Path) -> None:
         assert "is not one of" in done.stderr
 
 
+@pytest.mark.parametrize("command", [[], ["align"], ["onto"]])
 @pytest.mark.parametrize(
     ("arguments", "use"),
-    [(["--local"], "always"), (["--local", "never"], "never"), (["--local", "-q"], "always"), ([], "auto")],
-)
-def test_local_was_a_flag_and_still_may_be(arguments: list[str], use: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    [
+        (["--relief"], "always"), (["--relief", "never"], "never"), (["--relief", "-q"], "always"), ([], "auto"),
+        (["--local"], "always"), (["--local", "never"], "never"), (["--local", "-q"], "always"),
+        (["--local=never"], "never"), (["--local=always", "-q"], "always"), (["--relief=never"], "never"),
+    ],
+)  # fmt: skip
+def test_relief_alone_is_always_and_local_is_its_old_name(
+    command: list[str], arguments: list[str], use: str, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     from agalign.cli import main
 
     seen: list[str] = []
     monkeypatch.setattr(main, "app", lambda args, prog_name: seen.extend(args))
-    monkeypatch.setattr(sys, "argv", ["agalign", "flight", *arguments])
+    monkeypatch.setattr(sys, "argv", ["agalign", *command, "flight", *arguments])
     main.main()
-    value = seen[seen.index("--local") + 1] if "--local" in seen else "auto"
+    assert not any(a.startswith("--local") for a in seen)
+    with_values = [a for argument in seen for a in argument.split("=")]
+    value = with_values[with_values.index("--relief") + 1] if "--relief" in with_values else "auto"
     assert value == use
+    was_old = any(a.startswith("--local") for a in arguments)
+    assert ("--local is deprecated; use --relief" in capsys.readouterr().err) == was_old
+
+
+@pytest.mark.parametrize(("arguments", "chosen"), [
+    (["--local"], ("always", False, False)), (["--local=never"], ("never", False, False)), ([], ("auto", False, False)),
+    (["--relief", "--relief-map", "--fill-occluded"], ("always", True, True)),
+])  # fmt: skip
+def test_options_of_relief_become_settings(
+    arguments: list[str], chosen: tuple[str, bool, bool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from agalign.cli import align, main
+
+    seen: list[Settings] = []
+
+    def run(_flight: object, _out: Path, settings: Settings, *_: object, **__: object) -> None:
+        seen.append(settings)
+        raise SystemExit(0)
+
+    monkeypatch.setattr(align, "run", run)
+    monkeypatch.setattr(align, "find_captures", lambda *_: None)
+    monkeypatch.setattr(align, "load_ahead", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["agalign", str(tmp_path), *arguments])
+    with pytest.raises(SystemExit):
+        main.main()
+    (settings,) = seen
+    assert (settings.relief.use, settings.write.relief_map, settings.write.fill_occluded) == chosen

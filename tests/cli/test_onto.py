@@ -40,7 +40,7 @@ def mosaics(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_mosaic_is_laid_on_the_grid_of_another(mosaics: Path, tmp_path: Path) -> None:
-    done = agalign("onto", mosaics / "spring.tif", mosaics / "summer.tif", "-o", tmp_path / "out", "--local", "never")
+    done = agalign("onto", mosaics / "spring.tif", mosaics / "summer.tif", "-o", tmp_path / "out", "--relief", "never")
     assert done.returncode == 0, done.stderr
     sidecar = json.loads((tmp_path / "out" / "summer.json").read_text())
     assert [b["band"] for b in sidecar["bands"]] == ["spring band_1", "band_1", "band_2"]

@@ -1,0 +1,161 @@
+"""What a run makes of a capture with depth, against the exact geometry: residuals, range, occlusions."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+from synthetic_flights.depth import BandTruth, Truth
+
+from agalign.pixels.raster import without_warnings
+
+Map = NDArray[np.float64]
+"""(height, width, 2): raw px of the moving image for each raw px of the reference."""
+Window = tuple[slice, slice]
+"""Rows and columns of the reference."""
+WHOLE: Window = (slice(None), slice(None))
+
+WRONG_PX = 1.0
+"""A band that is called `aligned` while more than a tenth of its pixels is farther off is wrong."""
+_TOLERANCE_PX = 1
+"""An occluded pixel counts as found, and a masked one as right, where the other is this near: truth is decided at
+pixel centres."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """One band of one capture by one method. Values are nan where nothing can be measured."""
+
+    method: str
+    kind: str
+    close: bool
+    scene: int
+    band: str
+    status: str
+    """`-` for a method that does not verify."""
+    median_px: float
+    p90_px: float
+    beyond_1_px: float
+    """Share of the pixels."""
+    wrong: bool
+    range_error: float = np.nan
+    """Median relative error of the relief's range."""
+    density: float = np.nan
+    """Share of the written pixels that have a range."""
+    precision: float = np.nan
+    recall: float = np.nan
+    """Of the pixels without data in the stack, against the occluded ones."""
+    seconds: float = np.nan
+    """Of the whole capture."""
+
+
+@dataclass(frozen=True)
+class Sidecar:
+    """What a run has written of a capture."""
+
+    path: Path
+    content: dict[str, Any]
+
+    @property
+    def window(self) -> Window:
+        """The written rows and columns of the reference."""
+        x0, y0, width, height = self.content["output"]["crop"]
+        return slice(y0, y0 + height), slice(x0, x0 + width)
+
+
+def read_sidecar(out: Path) -> Sidecar:
+    """The one sidecar below a run's output."""
+    for path in sorted(out.rglob("*.json")):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if str(content.get("schema", "")).startswith("agalign/1"):
+            return Sidecar(path, content)
+    raise FileNotFoundError(f"no sidecar below {out}")
+
+
+def mapping_of(sidecar: Sidecar, band: dict[str, Any]) -> Map | None:
+    """The mapping of a band at every pixel of the reference, as its sidecar has it: from `relief` and the raster that
+    it names, nan outside the written area, else from `grid`. None where it has neither.
+    """
+    relief, grid = band.get("relief"), band.get("grid")
+    if relief and relief["file"]:
+        plane_px, slope = (_interpolated(sidecar, relief["reference_px"], relief[k]) for k in ("plane_px", "slope"))
+        parallax_px = np.full(plane_px.shape[:2], np.nan)
+        parallax_px[sidecar.window] = _layer(sidecar.path.parent / relief["file"], "parallax")
+        return np.asarray(plane_px + parallax_px[..., None] * slope)
+    return _interpolated(sidecar, grid["reference_px"], grid["moving_px"]) if grid else None
+
+
+def _interpolated(sidecar: Sidecar, nodes_px: list[list[float]], values: list[list[float]]) -> Map:
+    """A cubic spline at every pixel of the reference, through values on a lattice of nodes, row by row."""
+    here, there = np.array(nodes_px, np.float64), np.array(values, np.float64)
+    x, y = np.unique(here[:, 0]), np.unique(here[:, 1])
+    columns, rows = (np.arange(sidecar.content["reference"][name]) for name in ("width", "height"))
+    lattice = there.reshape(len(y), len(x), 2)
+    return np.stack([RectBivariateSpline(y, x, lattice[..., k])(rows, columns) for k in (0, 1)], axis=-1)
+
+
+def _layer(path: Path, name: str) -> NDArray[np.float64] | None:
+    """(height, width) of a relief's raster, nan where it has no data; None where it has no such layer."""
+    with without_warnings(), rasterio.open(path) as dataset:
+        if name not in dataset.descriptions:
+            return None
+        return np.asarray(dataset.read(dataset.descriptions.index(name) + 1, masked=True).filled(np.nan), np.float64)
+
+
+def residuals(mapping: Map | None, truth: BandTruth, window: Window = WHOLE) -> tuple[float, float, float]:
+    """(median, 90th percentile, share beyond 1 px) of the distance to the truth, over pixels of a window that the band
+    shows and that did not move.
+    """
+    some = truth.scored[window]
+    if mapping is None or not some.any():
+        return np.nan, np.nan, np.nan
+    error_px = np.linalg.norm(mapping[window][some] - truth.moving_px[window][some], axis=-1)
+    # A pixel without a mapping is infinitely far off, which no interpolating quantile can express.
+    error_px = np.sort(np.where(np.isfinite(error_px), error_px, np.inf))
+    median, p90 = (float(error_px[int(share * (len(error_px) - 1))]) for share in (0.5, 0.9))
+    return median, p90, float((error_px > 1).mean())
+
+
+def is_wrong(status: str, p90_px: float) -> bool:
+    """Whether `aligned` is a false statement: the band is off, or does not show the scene."""
+    return status == "aligned" and not p90_px <= WRONG_PX
+
+
+def range_errors(sidecar: Sidecar, truth: Truth) -> tuple[float, float]:
+    """(median relative error, density) of the range in <capture>.relief.tif, which has it with --relief-map."""
+    relief = sidecar.path.with_suffix(".relief.tif")
+    range_m = _layer(relief, "range") if relief.is_file() else None
+    if range_m is None:
+        return np.nan, np.nan
+    expected = truth.range_m[sidecar.window]
+    some = np.isfinite(range_m) & (range_m > 0)
+    if not some.any():
+        return np.nan, 0.0
+    return float(np.median(np.abs(range_m[some] / expected[some] - 1))), float(some.mean())
+
+
+def occlusion_scores(sidecar: Sidecar, band: dict[str, Any], truth: BandTruth) -> tuple[float, float]:
+    """(precision, recall) of the pixels without data in the stack, where the truth is inside the moving image."""
+    place = band.get("place")
+    if place is None:
+        return np.nan, np.nan
+    with without_warnings(), rasterio.open(sidecar.path.parent / place["file"]) as dataset:
+        masked = dataset.read_masks(place["band_index"]) == 0
+    inside, hidden = truth.inside[sidecar.window], truth.hidden[sidecar.window]
+    masked &= inside
+    hidden = hidden & inside
+    return _share(masked, _grown(hidden)), _share(hidden, _grown(masked))
+
+
+def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    side = 2 * _TOLERANCE_PX + 1
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+
+
+def _share(some: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
+    return float(of[some].mean()) if some.any() else np.nan

@@ -1,0 +1,278 @@
+"""A synthetic capture of a scene with depth: what each lens sees, its files, and the exact truth per pixel.
+
+A point of a scene has one place in each band's image, found by projection, so the truth needs no image. Lenses have
+their own places, angles and distortion. A pixel is the mean of several rays, and each ray meets the nearest patch.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.synthetic.cameras import BANDS, REFERENCE
+from agalign.synthetic.flight import VIGNETTING, recorded
+from agalign.synthetic.ground import Field
+from agalign.synthetic.rig import BandSpec, CameraSpec, Exposure, Pose
+from agalign.synthetic.tags import MicaSenseCamera
+from synthetic_flights.materials import Textures, reflectances, sample
+from synthetic_flights.patches import Eye, Hits, Patch, boxes_of, hits_of, nearest
+
+Mask = NDArray[np.bool_]
+
+_SAMPLES = 4
+"""Rays along each side of a pixel: the position of an edge is right to 1/8 px even along the pixel axes."""
+_BLUR_PX = 0.45
+"""Standard deviation of the lens's blur, which keeps sharp edges from aliasing."""
+_SAME_SURFACE = 1e-6
+"""Relative difference of depth below which two hits are the same point."""
+_SUN = (0.35, -0.25, -0.90)
+"""Direction to the light: east, south, down."""
+_GLINT_POWER, _GLINT_SLOPE = 300.0, 0.05
+"""Sharpness of a mirror-like reflection, and the slope of a glossy surface's waves (standard deviation)."""
+_SEEN_THROUGH = 0.02
+"""A pixel that a hand covers by more than this share does not show the scene."""
+
+# Lens positions of a RedEdge-M, from the movement of its bands against Green (`docs/method.md`).
+_PLACES_M = {
+    "Blue": (-0.030, 0.0), "Green": (0.0, 0.0), "Red": (0.0, -0.021), "NIR": (-0.030, -0.021),
+    "Red edge": (-0.015, -0.0105),
+}  # fmt: skip
+CLOSE_RANGE = MicaSenseCamera("RedEdge-M", tuple(replace(b, baseline_m=_PLACES_M[b.name]) for b in BANDS), REFERENCE)
+
+
+@dataclass(frozen=True)
+class Hand:
+    """A large unsharp object just in front of one lens."""
+
+    centre: tuple[float, float]
+    """In shares of width and height."""
+    radius: float
+    """In shares of the width."""
+    reflectance: float
+
+    def cover(self, size_px: tuple[int, int]) -> Field:
+        """Share (height, width) of the light that it takes from each pixel."""
+        width, height = size_px
+        x, y = np.arange(width) / width - self.centre[0], (np.arange(height) / height - self.centre[1]) * height / width
+        distance = np.hypot(x[None, :], y[:, None])
+        # Fingers: the outline is not a circle.
+        angle = np.arctan2(y[:, None], x[None, :])
+        outline = self.radius * (1 + 0.25 * np.sin(5 * angle))
+        return np.asarray(np.clip((outline - distance) / (0.4 * self.radius) + 0.5, 0, 1), np.float32)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a rig sees at one capture. Band names are the keys of the exceptions."""
+
+    kind: str
+    patches: tuple[Patch, ...]
+    textures: Textures
+    pose: Pose
+    moved_m: Mapping[str, Mapping[int, tuple[float, float, float]]] = field(default_factory=dict)
+    """How far each group of patches is from its place when a band is exposed."""
+    poses: Mapping[str, Pose] = field(default_factory=dict)
+    """Bands exposed from elsewhere."""
+    others: Mapping[str, "Scene"] = field(default_factory=dict)
+    """Bands that see another scene."""
+    hands: Mapping[str, Hand] = field(default_factory=dict)
+
+    def eye(self, band: BandSpec, size_px: tuple[int, int]) -> Eye:
+        """The camera of a band."""
+        return Eye(band, self.poses.get(band.name, self.pose), size_px)
+
+    def at_exposure_of(self, band: BandSpec) -> tuple[Patch, ...]:
+        """The patches where a band finds them."""
+        by = self.moved_m.get(band.name, {})
+        return tuple(p.moved(by[p.group]) if p.group in by else p for p in self.patches)
+
+
+@dataclass(frozen=True)
+class BandTruth:
+    """The mapping reference -> moving band, for every pixel (height, width) of the reference."""
+
+    moving_px: Field
+    """(height, width, 2) raw px of the moving image; nan where the band shows another scene."""
+    hidden: Mask
+    """Occluded: something nearer hides the point from the band, or a hand does."""
+    inside: Mask
+    """The point is inside the moving image."""
+    moved: Mask
+    """The point moved between the exposures; `moving_px` follows it."""
+
+    @property
+    def visible(self) -> Mask:
+        """Where the band shows the reference's point."""
+        return self.inside & ~self.hidden
+
+    @property
+    def scored(self) -> Mask:
+        """Visible and not moved: where a mapping of the static scene can be measured."""
+        return self.visible & ~self.moved
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The geometry of a capture on the reference's raw pixels."""
+
+    kind: str
+    range_m: Field
+    """(height, width): depth along the reference's optical axis."""
+    bands: Mapping[str, BandTruth]
+
+    def write(self, path: Path) -> None:
+        """Write an .npz file that `read_truth` reads."""
+        arrays = {
+            f"{name}/{part}": getattr(truth, part)
+            for name, truth in self.bands.items()
+            for part in ("moving_px", "hidden", "inside", "moved")
+        }
+        np.savez(path, kind=np.array(self.kind), range_m=self.range_m, **arrays)
+
+
+def read_truth(path: Path) -> Truth:
+    """The truth that `Truth.write` has written."""
+    with np.load(path) as stored:
+        names = dict.fromkeys(key.split("/")[0] for key in stored if "/" in key)
+        bands = {
+            name: BandTruth(*(stored[f"{name}/{part}"] for part in ("moving_px", "hidden", "inside", "moved")))
+            for name in names
+        }
+        return Truth(str(stored["kind"]), stored["range_m"], bands)
+
+
+def view(scene: Scene, band: BandSpec, size_px: tuple[int, int]) -> Field:
+    """Reflectances (height, width) as a band sees them, without vignetting and noise."""
+    seen = scene.others.get(band.name, scene)
+    eye, patches = seen.eye(band, size_px), seen.at_exposure_of(band)
+    x, y = eye.rays(_SAMPLES)
+    depth, light = np.full(x.shape, np.inf, np.float32), np.zeros(x.shape, np.float32)
+    tiles = {name: (tile, tile.mean()) for name, tile in reflectances(seen.textures, band).items()}
+    for patch, box in zip(patches, boxes_of(patches, eye, _SAMPLES), strict=True):
+        for hits in hits_of(patch, eye, x, y, box):
+            left, top, right, bottom = hits.box
+            window = slice(top, bottom), slice(left, right)
+            closer = hits.depth_m < depth[window]
+            if closer.any():
+                shaded = _shaded(patch, hits, seen.textures, tiles, eye, (x[window], y[window]))
+                depth[window][closer] = hits.depth_m[closer]
+                light[window][closer] = shaded[closer]
+    mean = cv2.resize(cv2.GaussianBlur(light, (0, 0), _BLUR_PX * _SAMPLES), size_px, interpolation=cv2.INTER_AREA)
+    hand = scene.hands.get(band.name)
+    if hand is not None:
+        cover = hand.cover(size_px)
+        mean = mean * (1 - cover) + hand.reflectance * max(band.soil, band.crop) * cover
+    return np.asarray(mean, np.float32)
+
+
+def _shaded(
+    patch: Patch, hits: Hits, textures: Textures, tiles: Mapping[str, tuple[Field, np.float32]], eye: Eye,
+    rays: tuple[Field, Field],
+) -> Field:  # fmt: skip
+    """Reflectance times light at hits (height, width); misses have any value. `tiles` have their means."""
+    length_u, length_v = (float(np.linalg.norm(axis)) for axis in (patch.u_m, patch.v_m))
+    # Rays that miss a small patch would sample far away, or at infinity.
+    u, v = (np.clip(np.nan_to_num(at), -1, 1) for at in (hits.u, hits.v))
+    tile, mean = tiles[patch.material]
+    offset_u, offset_v = (t % (len(tile) * textures.texel_m) for t in patch.texture_m)
+    u_m, v_m = u * length_u + offset_u, v * length_v + offset_v
+    result = mean + (sample(tile, u_m, v_m, textures.texel_m) - mean) * np.float32(patch.contrast)
+    result *= np.float32(patch.shade)
+    if not patch.gloss:
+        return result
+    slopes = [sample(w, u_m, v_m, textures.texel_m) * np.float32(_GLINT_SLOPE) for w in textures.waves]
+    along, across = np.array(patch.u_m) / length_u, np.array(patch.v_m) / length_v
+    up = np.cross(along, across) * -np.sign(np.cross(along, across)[2])
+    normal = up - slopes[0][..., None] * along - slopes[1][..., None] * across
+    to_lens = -np.stack([*rays, np.ones_like(rays[0])], axis=-1) @ eye.attitude.T
+    half = to_lens / np.linalg.norm(to_lens, axis=-1, keepdims=True) + np.array(_SUN) / np.linalg.norm(_SUN)
+    cosine = (normal * half).sum(axis=-1) / np.linalg.norm(normal, axis=-1) / np.linalg.norm(half, axis=-1)
+    glint = patch.gloss * np.clip(cosine, 0, 1) ** _GLINT_POWER
+    return np.asarray(result + glint * max(eye.band.soil, eye.band.crop), np.float32)
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What the reference of a scene sees, for the truth of the other bands."""
+
+    scene: Scene
+    reference: BandSpec
+    size_px: tuple[int, int]
+
+    @cached_property
+    def eye(self) -> Eye:
+        return self.scene.eye(self.reference, self.size_px)
+
+    @cached_property
+    def seen(self) -> tuple[Field, NDArray[np.int32]]:
+        """(range in m, index of the patch) of each pixel."""
+        patches = self.scene.at_exposure_of(self.reference)
+        return nearest(patches, self.eye, *self.eye.rays(), boxes_of(patches, self.eye))
+
+    def band(self, band: BandSpec) -> BandTruth:
+        """The truth of one moving band."""
+        depth, index = self.seen
+        if band.name in self.scene.others:
+            nothing = np.zeros(depth.shape, bool)
+            return BandTruth(np.full((*depth.shape, 2), np.nan, np.float32), ~nothing, nothing, nothing)
+        x, y = self.eye.rays()
+        points = self.eye.to_world(np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None])
+        before, after = (np.array([p.centre_m for p in self.scene.at_exposure_of(b)]) for b in (self.reference, band))
+        by = after - before
+        points, moved = points + by[index], np.abs(by).max(axis=1)[index] > 0
+        eye = self.scene.eye(band, self.size_px)
+        there = eye.to_camera(points)
+        there_px = eye.project(there)
+        inside = ((there_px >= 0) & (there_px <= np.subtract(self.size_px, 1))).all(axis=-1)
+        hidden = self._hidden(eye, there)
+        hand = self.scene.hands.get(band.name)
+        if hand is not None:
+            cover = cv2.remap(hand.cover(self.size_px), there_px.astype(np.float32), None, cv2.INTER_LINEAR)
+            hidden |= cover > _SEEN_THROUGH
+        return BandTruth(there_px.astype(np.float32), hidden, inside, moved)
+
+    def _hidden(self, eye: Eye, there_m: Field) -> Mask:
+        """Where the ray from the lens of `eye` to a point (height, width, 3) in its axes meets something nearer."""
+        patches = self.scene.at_exposure_of(eye.band)
+        z = there_m[..., 2]
+        x, y = there_m[..., 0] / z, there_m[..., 1] / z
+        first = nearest(patches, eye, x, y, boxes_of(patches, self.eye, farther_px=self._reach_px(eye)))[0]
+        return np.asarray(first < z * (1 - _SAME_SURFACE))
+
+    def _reach_px(self, eye: Eye) -> float:
+        """Largest distance in the reference's image between a point and what hides it from another lens: the
+        difference of their disparities, and what moved between the exposures.
+        """
+        depth = self.seen[0]
+        focal_px = eye.band.lens(*self.size_px).fx_px
+        moved = [np.linalg.norm(by) for groups in self.scene.moved_m.values() for by in groups.values()]
+        baseline_m = float(np.linalg.norm(eye.place_m - self.eye.place_m)) + 2 * float(max(moved, default=0.0))
+        # A hiding patch may be nearer than anything that the reference sees.
+        return float(focal_px * baseline_m * (1 / (0.7 * depth.min()) - 1 / depth.max()))
+
+
+def truth_of(scene: Scene, size_px: tuple[int, int], camera: CameraSpec = CLOSE_RANGE) -> Truth:
+    """The exact geometry of a capture."""
+    reference = camera.bands[camera.reference]
+    geometry = Geometry(scene, reference, size_px)
+    bands = {b.name: geometry.band(b) for b in camera.bands if b is not reference}
+    return Truth(scene.kind, np.asarray(geometry.seen[0], np.float32), bands)
+
+
+def write_capture(
+    folder: Path, scene: Scene, number: int = 1, size_px: tuple[int, int] = (640, 480), rng_seed: int = 0,
+    camera: CameraSpec = CLOSE_RANGE,
+) -> Truth:  # fmt: skip
+    """Write a file per band below `folder`, as a RedEdge does, and return the truth."""
+    rng = np.random.default_rng(rng_seed)
+    images = folder / "0000SET" / "000"
+    images.mkdir(parents=True, exist_ok=True)
+    exposure = Exposure(scene.pose, number, size_px, VIGNETTING)
+    for band in camera.bands:
+        pixels = recorded(view(scene, band, size_px), band, rng)
+        camera.write_band(images / camera.file_name(band, number), pixels, band, exposure)
+    return truth_of(scene, size_px, camera)
