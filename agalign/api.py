@@ -25,6 +25,7 @@ from agalign.values.choices import Interpolation, SeedKind
 from agalign.values.image import Mask, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
+from agalign.values.processes import end_if_reimported
 
 _LOG = logging.getLogger(__name__)
 
@@ -120,6 +121,7 @@ def align_folder(
     """
     from agalign.products.report import write_pages
 
+    end_if_reimported()
     source, target = Path(folder), Path(out)
     result = discover(source, options or DiscoverOptions(skip=(target,)))
     start = None if model is None else Path(model)

@@ -60,10 +60,11 @@ def process_capture(
     progress(capture.reference.name, "writing", 0.0)
     context = _context(capture, paths, settings, alignments, None if model is None else model.rig, max_preview_bytes)
     discard_outputs(capture, out, settings.write)
-    shortcomings = _write_products(context)
-    sidecar = sidecar_of(context)
+    failures = _write_products(context)
+    sidecar = sidecar_of(context, list(failures))
     write_sidecar(paths.sidecar, sidecar)
-    return CaptureOutcome(sidecar, paths.sidecar, shortcomings)
+    # Once, where two products need the same file.
+    return CaptureOutcome(sidecar, paths.sidecar, tuple(dict.fromkeys(failures.values())))
 
 
 def _context(
@@ -78,9 +79,9 @@ def _context(
     return replace(context, layers=layers, grid=grid)
 
 
-def _write_products(context: ProductContext) -> tuple[str, ...]:
-    """Write what the settings ask for; return what failed and is not required. Raises as `Product.write` does."""
-    failures: dict[str, None] = {}
+def _write_products(context: ProductContext) -> dict[str, str]:
+    """Write what the settings ask for; {kind: why} of what failed and is not required. Raises as `Product.write`."""
+    failures: dict[str, str] = {}
     for product in PRODUCTS:
         if not product.is_enabled(context.write_settings) or (product.needs_layers and not context.layers):
             continue
@@ -89,8 +90,8 @@ def _write_products(context: ProductContext) -> tuple[str, ...]:
         except AgalignError as error:
             if product.is_required:
                 raise
-            failures[str(error)] = None  # once, where two products need the same file
-    return tuple(failures)
+            failures[product.kind] = str(error)
+    return failures
 
 
 def paths_written(capture: Capture, out: Path, settings: WriteSettings) -> list[Path]:

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from agalign.capture.align import align_pairs, verify_together
@@ -100,9 +99,9 @@ def _learn_network(
         learn(state, groups, net, at_once)
         with ThreadPoolExecutor(at_once) as pool:
             refined = iter(list(pool.map(lambda s: refine_with(net, s, settings.joint, progress), groups)))
-    except (AgalignError, cv2.error) as why_not:
+    except Exception as why_not:
         # What one capture does to the others' learning must not cost the flight: each is learned alone then.
-        _LOG.debug("the flight could not be learned from: %s", why_not)
+        _only_logged("the flight cannot be learned from", why_not)
         return None
     return net, [_Refined(one, one.in_order(refined)) for one in loaded]
 
@@ -131,7 +130,8 @@ def _still_holds(model: FlightModel, captures: Sequence[Capture], settings: Sett
             pairs, _ = read_pairs(capture, settings.seed, model)
             result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
             checked = with_predictions(pairs, result, rig, capture)
-        except (AgalignError, cv2.error):
+        except Exception as why_not:
+            _only_logged(f"{capture.label} is not aligned by the model", why_not)
             return 0, 0
         aligned = [checked[name] for name, a in result.items() if a.status == "aligned"]
         limit_px = settings.check.accept_predicted_px
@@ -194,8 +194,8 @@ def _shown_by_enough(
     def look_at(capture: Capture) -> "_Shown | None":
         try:
             return _shown(capture, settings, model, known.get(capture.label))
-        except (AgalignError, cv2.error) as why_not:
-            _LOG.debug("%s shows nothing of the rig: %s", capture.label, why_not)
+        except Exception as why_not:
+            _only_logged(f"{capture.label} shows nothing of the rig", why_not)
             return None
 
     result: list[_Shown] = []
@@ -316,12 +316,21 @@ def _read(capture: Capture, bands: Sequence[str], settings: Settings, start: Fli
     """
     try:
         pairs, _ = read_pairs(capture, settings.seed)
-    except AgalignError:
+        seeds_of = [(p, find_seed(p, settings.seed, start)) for p in pairs if p.has_rig_pixels]
+        result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
+        if not result:
+            return None
+        usable, seeds = [p for p, _ in result], [seed for _, seed in result]
+        return _Loaded(capture, image_groups(usable, seeds, [bands.index(p.name) + 1 for p in usable]), usable, seeds)
+    except Exception as why_not:
+        _only_logged(f"{capture.label} cannot be learned from", why_not)
         return None
-    result = [
-        (p, seed) for p in pairs if p.has_rig_pixels and isinstance(seed := find_seed(p, settings.seed, start), Seed)
-    ]
-    if not result:
-        return None
-    usable, seeds = [p for p, _ in result], [seed for _, seed in result]
-    return _Loaded(capture, image_groups(usable, seeds, [bands.index(p.name) + 1 for p in usable]), usable, seeds)
+
+
+def _only_logged(what: str, why_not: Exception) -> None:
+    """A capture that cannot be learned from costs the flight nothing, whatever is wrong with it: it is reported when it
+    is aligned. Raises MemoryError, which is the machine's.
+    """
+    if isinstance(why_not, MemoryError):
+        raise why_not
+    _LOG.debug("%s: %s", what, why_not, exc_info=not isinstance(why_not, AgalignError))

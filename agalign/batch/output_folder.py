@@ -1,5 +1,7 @@
 """The output folder of a run: made, held by one run at a time, and rid of what a killed one left."""
 
+import errno
+import logging
 import os
 import platform
 import shutil
@@ -14,6 +16,9 @@ from agalign.values.files import remove_partial_files
 
 _LOCK_FILE = ".agalign.lock"
 _MIN_FREE_BYTES = 1 << 20
+_NO_LOCKS = errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP
+"""What file systems without locks answer, as NFS without its lock daemon."""
+_LOG = logging.getLogger(__name__)
 
 
 def prepare_output(out: Path) -> None:
@@ -36,13 +41,16 @@ def locked(out: Path) -> Iterator[None]:
     """
     prepare_output(out)
     path = out / _LOCK_FILE
-    lock = FileLock(path, thread_local=False)
+    # A file that merely exists would keep everybody out after its owner was killed.
+    lock = FileLock(path, thread_local=False, fallback_to_soft=False)
     try:
         lock.acquire(blocking=False)
     except (Timeout, RuntimeError):
         raise OutputError(f"{out}: another run writes there{_lock_owner(path)}; wait for it, or choose -o") from None
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
+        if error.errno not in _NO_LOCKS:
+            raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
+        _LOG.warning("%s: its file system has no locks; make sure that no other run writes there", out)
     try:
         with suppress(OSError):  # a full disk is told by what needs it
             path.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")

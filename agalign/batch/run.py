@@ -261,7 +261,7 @@ def finished_before(capture: Capture, out: Path, settings: Settings) -> CaptureR
         return None
     if sidecar.settings != fingerprint(capture, settings):
         return None
-    return sidecar if _outputs_are_there(sidecar, path.parent) else None
+    return sidecar if not sidecar.not_written and _outputs_are_there(sidecar, path.parent) else None
 
 
 def _outputs_are_there(sidecar: CaptureResult, folder: Path) -> bool:

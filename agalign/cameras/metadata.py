@@ -29,6 +29,8 @@ _BELOW_SEA_LEVEL = (1, b"\x01")
 _MAX_TEXT_LENGTH = 200
 """Makes, models and serial numbers are shorter; a damaged tag may hold megabytes."""
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_MAX_NUMBER = 1e15
+"""Times in microseconds are below; larger numbers are damage, and their squares overflow."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,9 @@ class Tags:
         return next((text for name in names if (text := self.text(*name))), "")
 
     def numbers(self, namespace: str, name: str) -> tuple[float, ...]:
-        """The finite numbers in an XMP value, whether it is one text, a list in a text, or a sequence."""
+        """The numbers in an XMP value that can be true, whether it is one text, a list in a text, or a sequence."""
         numbers = (float(n) for n in _NUMBER.findall(self.text(namespace, name)))
-        return tuple(n for n in numbers if math.isfinite(n))
+        return tuple(n for n in numbers if abs(n) < _MAX_NUMBER)
 
     def number(self, namespace: str, name: str) -> float | None:
         """The first number in an XMP value."""

@@ -4,14 +4,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from agalign.cameras.base import reference_index
 from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.naming import with_unique_band_names, with_unique_capture_names
 from agalign.errors import InputError
-from agalign.pixels.raster import probe
+from agalign.pixels.raster import probe, transformed
+from agalign.values import geometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import MAX_MOSAIC_PIXELS
+
+_EARTH_RADIUS_KM = 6371.0
+"""Mean radius: distances are right to half a percent, which is enough to tell where a map is."""
 
 
 def captures_onto(
@@ -33,6 +40,29 @@ def captures_onto(
         captured_at = read_tags(path).captured_at
         captures.append(Capture(path.stem, Path(), tuple(with_unique_band_names(bands)), 0, captured_at=captured_at))
     return with_unique_capture_names(captures)
+
+
+def distance_km(fixed: Band, moving: Band) -> float:
+    """Distance between the centres of two georeferenced rasters on the ground; 0 where they may overlap.
+
+    Raises GeometryError where their coordinates cannot be transformed.
+    """
+    places = []
+    for band in (fixed, moving):
+        assert band.georeference is not None
+        width, height = band.size_px
+        corners = geometry.apply(band.georeference.transform, np.array([[width / 2, height / 2], [0.0, 0.0]]))
+        places.append(np.radians(transformed(corners, band.georeference.crs_wkt, "EPSG:4326")))
+    reach_km = sum(_great_circle_km(*place) for place in places)
+    apart_km = _great_circle_km(places[0][0], places[1][0])
+    return apart_km if apart_km > reach_km else 0.0
+
+
+def _great_circle_km(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Distance of two points (longitude, latitude), radians, by the haversine formula."""
+    half = np.sin((other - one) / 2) ** 2
+    share = half[1] + np.cos(one[1]) * np.cos(other[1]) * half[0]
+    return float(2 * _EARTH_RADIUS_KM * np.arcsin(np.sqrt(min(1.0, share))))
 
 
 def _georeferenced_bands(path: Path, max_pixels: int) -> tuple[Band, ...]:

@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
@@ -118,6 +119,7 @@ def report(
     """Rebuild the report and the summary from the sidecars."""
     terminal = Terminal(quiet=False, verbose=False, log_json=False)
     with exits(terminal):
+        from agalign.batch.output_folder import locked
         from agalign.errors import InputError
         from agalign.products.report import write_pages
         from agalign.products.sidecar import find_sidecars
@@ -125,7 +127,8 @@ def report(
         if not out.is_dir() or not find_sidecars(out):
             raise InputError(f"{out}: no sidecars there; give the output folder of a run")
         unreadable: list[str] = []
-        pages = write_pages(out, unreadable.append)
+        with locked(out):
+            pages = write_pages(out, unreadable.append)
         for text in unreadable:
             terminal.problem(text)
         explain(pages.failures, terminal)
@@ -136,6 +139,24 @@ def report(
         for path in (pages.report, pages.summary):
             terminal.result(shown(str(path)))
         raise typer.Exit(EXIT_PARTIAL if unreadable else EXIT_OK)
+
+
+@app.command()
+def verify(
+    out: Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)],
+) -> None:
+    """Check that the files of a run are what was written, by their checksums."""
+    terminal = Terminal(quiet=False, verbose=False, log_json=False)
+    with exits(terminal):
+        from agalign.products.verify_outputs import verify_outputs
+
+        captures = damaged = 0
+        for _, problems in verify_outputs(out):
+            captures, damaged = captures + 1, damaged + bool(problems)
+            for text in problems:
+                terminal.problem(text)
+        terminal.result(f"{captures - damaged} of {captures} captures are what was written")
+        raise typer.Exit(EXIT_PARTIAL if damaged else EXIT_OK)
 
 
 @app.command()
@@ -151,18 +172,20 @@ def ndvi(
     """Vegetation indices of aligned captures: a raster and a picture each."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
+        from agalign.batch.output_folder import locked
         from agalign.products.index_rasters import IndexReport, write_indices
         from agalign.products.indices import index_named
 
         chosen = [index_named(name) for name in index.split(",")]
         reports: list[IndexReport] = []
-        for result in write_indices(out, chosen):
-            reports.append(result)
-            if result.problem:
-                terminal.problem(f"{result.capture}: {result.problem}", capture=result.capture, index=result.index)
-            else:
-                text = f"{result.capture} {result.index}: median {result.median:.3f}"
-                terminal.event("index", text if verbose else "", **vars(result))
+        with locked(out) if out.is_dir() else nullcontext():
+            for result in write_indices(out, chosen):
+                reports.append(result)
+                if result.problem:
+                    terminal.problem(f"{result.capture}: {result.problem}", capture=result.capture, index=result.index)
+                else:
+                    text = f"{result.capture} {result.index}: median {result.median:.3f}"
+                    terminal.event("index", text if verbose else "", **vars(result))
         written = [r for r in reports if r.path is not None]
         if any(r.raw_numbers for r in written):
             terminal.problem(
@@ -199,6 +222,9 @@ _COMMANDS = {command.name or getattr(command.callback, "__name__", "") for comma
 def main() -> None:
     """Entry point: a first argument that is no command is the folder to align."""
     arguments = sys.argv[1:]
+    if arguments and not arguments[0]:
+        Terminal(quiet=False, verbose=False, log_json=False).problem("the name of the folder is empty")
+        raise SystemExit(EXIT_USAGE)
     if arguments and arguments[0] not in _COMMANDS and not _is_root_option(arguments[0]):
         _refuse_misspelt(arguments[0])
         arguments = ["align", *arguments]

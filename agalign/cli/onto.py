@@ -58,7 +58,7 @@ def onto(
     with exits(terminal):
         from agalign.batch import RunOptions
         from agalign.cameras.discover import FolderScan
-        from agalign.cameras.mosaics import captures_onto
+        from agalign.cameras.mosaics import captures_onto, distance_km
         from agalign.config import FlightSettings, JointSettings, ReliefSettings, Settings, WriteSettings
 
         target = out or reference.absolute().parent / f"{reference.stem}-aligned"
@@ -69,5 +69,12 @@ def onto(
             write=WriteSettings(interpolation=interpolation, crop="none", format=format, compression=compression),
         )
         flight = FolderScan(reference.parent, tuple(captures_onto(reference, moving, band, max_pixels)), ())
+        for capture in flight.captures:
+            apart_km = distance_km(capture.reference, capture.moving[0])
+            if apart_km:
+                path = capture.moving[0].path
+                terminal.problem(
+                    f"{path}: is {apart_km:,.1f} km away from the reference, by its coordinates", file=path
+                )
         totals = run(flight, target, settings, terminal, RunOptions(overwrite, jobs=jobs, align_panels=True))
         raise typer.Exit(conclude(totals, target, terminal))

@@ -6,6 +6,7 @@ the paper leaves as future work).
 
 import hashlib
 import json
+import os
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -22,12 +23,14 @@ from agalign.flight.rig import Rig
 from agalign.flight.rig_file import rig_from_json, rig_to_json
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import matching_network
-from agalign.values.files import complete_file
+from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
 
 _FORMAT = "agalign-model/1"
 _LONGEST_BYTES = 1 << 28
 _MAX_SIDES = 512
+_MAX_VALUE = 1e6
+"""Weights are below 100, and mappings are in px: larger numbers are no model's."""
 
 
 @dataclass(frozen=True)
@@ -102,18 +105,21 @@ def _read_model(path: Path) -> FlightModel:
 
 def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """(the facts, the tensors) of a file that is a model, and a complete one."""
-    if path.stat().st_size > _LONGEST_BYTES:
-        raise ValueError("it is too large for one")
+    with open_regular(path) as opened:
+        if os.fstat(opened.fileno()).st_size > _LONGEST_BYTES:
+            raise ValueError("it is too large for one")
     with safe_open(path, framework="pt") as file:
         facts = dict(file.metadata() or {})
         if facts.get("format") != _FORMAT:
             raise InputError(f"{path}: is no model of agalign; give a file of an earlier run's models folder")
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     digest = facts.pop("digest", None)
-    if digest is not None and digest != _digest(tensors, facts):
+    if digest is None:
+        raise ValueError("it has no checksum")
+    if digest != _digest(tensors, facts):
         raise ValueError("it is damaged")
-    if not all(torch.isfinite(t).all() for t in tensors.values()):
-        raise ValueError("its numbers are none")
+    if not all((t.abs() <= _MAX_VALUE).all() for t in tensors.values()):  # written so that nan does not pass
+        raise ValueError("it has numbers that no model has")
     return facts, tensors
 
 

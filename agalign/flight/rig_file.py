@@ -12,6 +12,7 @@ from safetensors import safe_open
 from agalign.errors import InputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.values.alignment import DisplacementField
+from agalign.values.files import open_regular
 
 
 def rig_to_json(rig: Rig) -> str:
@@ -39,6 +40,7 @@ def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
 def read_rig(path: Path) -> tuple[str, Rig | None]:
     """(camera, rig) of a model's file, None where too few captures showed a rig. Raises InputError, naming the file."""
     try:
+        open_regular(path).close()
         with safe_open(path, framework="np") as file:
             facts = dict(file.metadata() or {})
             names = [n for n in file.keys() if n.startswith("field.")]  # noqa: SIM118

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from rasterio import warp
 from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.errors import NotGeoreferencedWarning
+from rasterio.transform import Affine
+from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from agalign.errors import GeometryError, UnreadableFileError
@@ -22,7 +24,7 @@ from agalign.pixels.masks import data_mask, learnable, undeclared_fill
 from agalign.values import lens
 from agalign.values.capture import Band, Georeference
 from agalign.values.choices import MAX_PIXELS
-from agalign.values.image import Mask, Raster
+from agalign.values.image import Mask, Raster, reduced_size_px
 from agalign.values.pixel_units import PixelScale
 
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
@@ -89,13 +91,21 @@ def without_warnings() -> Iterator[None]:
 
 @contextmanager
 def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """A rasterio dataset of a TIFF or JPEG for reading. Raises UnreadableFileError, naming the file, where it is
-    neither or GDAL cannot read it.
+    """A rasterio dataset of a TIFF or JPEG for reading; rows of a south-up map are reversed, as is its transform.
+
+    Raises UnreadableFileError, naming the file, where it is neither or GDAL cannot read it.
     """
     driver = _driver_of(path)
     try:
         with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(path, driver=driver) as dataset:
-            yield dataset
+            if not _is_south_up(dataset):
+                yield dataset
+                return
+            with WarpedVRT(
+                dataset, transform=dataset.transform * Affine(1, 0, 0, 0, -1, dataset.height),
+                width=dataset.width, height=dataset.height, resampling=Resampling.nearest,
+            ) as north_up:  # fmt: skip
+                yield north_up
     except UnicodeEncodeError:
         raise UnreadableFileError(f"{path}: its name is not in this system's letters; set LC_ALL=C.UTF-8") from None
     except Exception as error:
@@ -104,6 +114,12 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
             raise
         text = why(error).replace(str(path), "").strip(" :'")
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
+
+
+def _is_south_up(dataset: rasterio.DatasetReader) -> bool:
+    """True where rows run the other way than in images: a mirror image, which no homography between images is."""
+    transform = dataset.transform
+    return dataset.crs is not None and not transform.is_identity and transform.determinant > 0
 
 
 def why(error: BaseException) -> str:
@@ -173,7 +189,7 @@ def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
     Invalid are nodata, masked and saturated pixels and constant fill that runs in from the border.
     """
     reduction = max(1.0, max(band.size_px) / longest_side_px)
-    shape = round(band.height_px / reduction), round(band.width_px / reduction)
+    shape = reduced_size_px(band.size_px, reduction)[::-1]
     with open_raster(band.path) as dataset:
         pixels = _reduced(dataset, band, shape) if reduction > 1 else dataset.read(band.band_index)
         valid = data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.band_index, shape)
@@ -213,7 +229,7 @@ def read_preview(
     """A window (x0, y0, width, height) of a band as (height, width) float32, perhaps resized; nodata as nan."""
     x0, y0, width, height = window_px
     reduction = max(1.0, max(width, height) / _PREVIEW_SIDE_PX)
-    out = size_px or (round(width / reduction), round(height / reduction))
+    out = size_px or reduced_size_px((width, height), reduction)
     with open_raster(path) as dataset:
         window = Window(x0, y0, width, height)
         resampling = Resampling.average if out[0] < width else Resampling.bilinear

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from agalign.pixels.resample import shrink
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
-from agalign.values.image import Raster
+from agalign.values.image import Raster, reduced_size_px
 
 _LOG = logging.getLogger(__name__)
 _Profile = NDArray[np.float64]
@@ -137,7 +137,7 @@ def _are_registered(images: Sequence[Raster]) -> bool:
     """True where the structure of the images agrees with the first one's at no shift."""
     width, height = images[0].size_px
     scale = min(1.0, _MAX_SIDE_PX / max(width, height))
-    size = round(width * scale), round(height * scale)
+    size = reduced_size_px((width, height), 1 / scale)
     fixed, *moving = (windowed_spectra(structure_field(shrink(image, size))) for image in images)
     for spectrum in moving:
         peak = find_peak(correlation_surfaces(fixed, spectrum), apart_px=max(size) // 16)

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -71,8 +71,8 @@ def is_delivered(band: BandPart, accept_predicted_px: float) -> bool:
     return band.status in ("reference", "aligned")
 
 
-def sidecar_of(context: ProductContext) -> Sidecar:
-    """Return the sidecar of a capture after all its products were written. Raises OutputError."""
+def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Sidecar:
+    """Return the sidecar of a capture after its products were written, but those `not_written`. Raises OutputError."""
     capture, reference = context.capture, context.capture.reference
     bands = [_band_part(context, band) for band in capture.bands]
     accept_predicted_px = context.settings.check.accept_predicted_px
@@ -99,6 +99,7 @@ def sidecar_of(context: ProductContext) -> Sidecar:
         preview=next((f.preview for f in context.written if f.preview is not None), None),
         accept_predicted_px=accept_predicted_px,
         products=[_product_part(file, context) for file in context.written],
+        not_written=list(not_written),
         settings=fingerprint(capture, context.settings),
     )
 
@@ -264,7 +265,7 @@ def _joint_part(joint: JointResult[FixedFilePx], *, accepted: bool) -> JointPart
 
 def _similarity_part(metrics: Mapping[str, float]) -> SimilarityPart:
     # Digits beyond the sixth depend on how many threads added them up.
-    return SimilarityPart(**{k: round(v, 6) if math.isfinite(v) else v for k, v in metrics.items()})
+    return SimilarityPart(**{k: round(v, 6) if math.isfinite(v) else None for k, v in metrics.items()})
 
 
 def _tile_parts(residual: Residual[FixedFilePx] | None) -> list[ResidualTile]:

@@ -27,7 +27,7 @@ from agalign.products.reduced_bands import Grey, ReducedBands
 from agalign.products.relief_map import relief_layers, relief_of
 from agalign.products.sidecar import PreviewPart, ReliefPreviewPart
 from agalign.values.files import complete_file
-from agalign.values.image import Tile
+from agalign.values.image import Tile, reduced_size_px
 
 ERROR_FULL_PX = 0.5
 _MAX_TILE_PX, _MIN_TILE_PX, _DETAIL_SHARE = 640, 96, 0.35
@@ -93,7 +93,7 @@ def relief_view(context: ProductContext) -> ReliefView | None:
     if relief is None:
         return None
     reduction = max(1.0, max(context.grid.width, context.grid.height) / _MAX_TILE_PX)
-    size_px = round(context.grid.width / reduction), round(context.grid.height / reduction)
+    size_px = reduced_size_px((context.grid.width, context.grid.height), reduction)
     layers = relief_layers(context.capture, context.usable, relief, context.grid, size_px)
     range_m = layers["range"][np.isfinite(layers["range"])]
     if range_m.size == 0:

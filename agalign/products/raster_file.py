@@ -26,6 +26,7 @@ from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_window, wh
 from agalign.pixels.resample import resample_tile, tiles
 from agalign.products.layout import Layer
 from agalign.products.nodata import Pixels, nodata_value, with_nodata
+from agalign.products.quiet_libtiff import without_libtiffs_lines
 from agalign.products.raster_tags import describe
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Georeference
@@ -62,7 +63,7 @@ def write_raster(
     compression = _compression(settings, all_bands=len(layers) == len(capture.bands))
     profile = _profile(capture.reference, len(layers), grid, dtype, nodata, compression)
     try:
-        with complete_file(path) as partial:
+        with complete_file(path) as partial, without_libtiffs_lines():
             with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT):
                 with rasterio.open(partial, "w", **profile) as dataset:
                     describe(dataset, capture, layers, settings)
@@ -71,6 +72,7 @@ def write_raster(
                 if capture.reference.overviews and settings.format == "gtiff":
                     with rasterio.open(partial, "r+") as dataset:
                         dataset.build_overviews(list(capture.reference.overviews), Resampling.average)
+                check_complete(partial)
                 if tags is not None:
                     add_directories(partial, tags.first, tags.exif, tags.gps)
                 if settings.format == "cog":
@@ -96,7 +98,7 @@ def write_layers(
     }  # fmt: skip
     profile |= {} if georeference is None else georeferenced(georeference, grid)
     try:
-        with complete_file(path) as partial:
+        with complete_file(path) as partial, without_libtiffs_lines():
             with (
                 without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
             ):  # fmt: skip

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import read_preview
 from agalign.values.capture import Band, Capture
-from agalign.values.image import OutputGrid
+from agalign.values.image import OutputGrid, reduced_size_px
 
 Grey = NDArray[np.uint8]
 """(height, width)"""
@@ -53,7 +53,7 @@ def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, i
 
 def _reduced(width: int, height: int) -> tuple[int, int]:
     reduction = max(1.0, max(width, height) / _MAX_SIDE_PX)
-    return round(width / reduction), round(height / reduction)
+    return reduced_size_px((width, height), reduction)
 
 
 def _grey(plane: NDArray[np.float32]) -> Grey:

@@ -27,7 +27,7 @@ RunState = Literal["running", "interrupted", "finished"]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", ser_json_inf_nan="null")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 class RefusalPart(_Part):

@@ -4,8 +4,10 @@ All pixel coordinates are x right, y down, (0, 0) the centre of the top-left pix
 the reference to a pixel of the moving band; `grid` samples the complete mapping between the raw pixels of the files.
 """
 
+import hashlib
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -13,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from agalign.errors import SidecarError
 from agalign.values.choices import CaptureStatus, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
-from agalign.values.files import is_inside, write_text
+from agalign.values.files import is_inside, open_regular, write_text
 from agalign.verify.checks import KINDS
 
 SCHEMA = "agalign/1"
@@ -39,7 +41,7 @@ Count = Annotated[int, Field(gt=0)]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", ser_json_inf_nan="null", populate_by_name=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, populate_by_name=True)
 
 
 class _Result(_Part):
@@ -329,8 +331,12 @@ class CaptureResult(_Result):
     """Standard error up to which `status` counts a predicted band as delivered, px; null in older sidecars."""
     products: list[ProductPart] = []
     """Every file that was written but the sidecar itself."""
+    not_written: list[str] = []
+    """Kinds of products that could not be written; another run with the same settings does the capture again."""
     settings: str
     """Fingerprint of the settings that made this; another run with the same need not do it again."""
+    checksum: str | None = None
+    """SHA-256 of this file's content as `content_checksum` has it; absent in sidecars of older versions."""
 
     @property
     def files(self) -> dict[str, int]:
@@ -357,8 +363,24 @@ class Sidecar(CaptureResult):
 
 
 def write_sidecar(path: Path, sidecar: Sidecar) -> None:
-    """Write at once or not at all. Raises OutputError."""
-    write_text(path, compact_lists(sidecar.model_dump_json(by_alias=True, indent=1)))
+    """Write at once or not at all, with its checksum. Raises OutputError."""
+    content = json.loads(sidecar.model_dump_json(by_alias=True))
+    whole = sidecar.model_copy(update={"checksum": content_checksum(content)})
+    write_text(path, compact_lists(whole.model_dump_json(by_alias=True, indent=1)))
+
+
+def content_checksum(content: Mapping[str, Any]) -> str:
+    """SHA-256 of a sidecar's parsed JSON: of its canonical form (sorted keys, no spaces) without `checksum` and without
+    every `seconds`, which no two runs have in common.
+    """
+    rest = _without_seconds({k: v for k, v in content.items() if k != "checksum"})
+    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _without_seconds(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_seconds(v) for k, v in value.items() if k != "seconds"}
+    return [_without_seconds(v) for v in value] if isinstance(value, list) else value
 
 
 def compact_lists(text: str) -> str:
@@ -382,10 +404,13 @@ Model = TypeVar("Model", bound=CaptureResult)
 
 def _read(path: Path, model: type[Model]) -> Model:
     try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise SidecarError(f"{path}: {size >> 20} MB are too many for a sidecar; delete it and run again")
-        return model.model_validate_json(path.read_bytes())
+        with open_regular(path) as file:
+            contents = file.read(_MAX_BYTES + 1)
+        if len(contents) > _MAX_BYTES:
+            raise SidecarError(
+                f"{path}: over {_MAX_BYTES >> 20} MB are too many for a sidecar; delete it and run again"
+            )
+        return model.model_validate_json(contents)
     except OSError as error:
         raise SidecarError(f"{path}: cannot be read ({error.strerror or error})") from None
     except ValidationError as error:
@@ -413,7 +438,7 @@ def find_sidecars(folder: Path) -> list[Path]:
         try:
             if not path.is_file():
                 continue
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 head = file.read(200)
         except OSError:
             result.append(path)

@@ -2,16 +2,22 @@
 
 import errno
 import os
+import platform
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from agalign.errors import OutputError
 
 RUN_FILE = "agalign-run.json"
 """What a run is, in its output folder: there before anything else is, so that the folder is known by it."""
+_LONGEST_HOST = 40
+"""Of the letters of a host's name: names of files have at most 255 bytes."""
 _PARTIAL = ".agalign-part-"
+"""Start of the names of files that are being written: host, process and a random part follow."""
 
 
 @contextmanager
@@ -36,7 +42,7 @@ def scratch_file(beside: Path) -> Iterator[Path]:
     another machine that sees the folder, takes; as a hidden file it is no image to be aligned. The folder is made.
     Raises OutputError for an OSError.
     """
-    scratch = beside.with_name(f"{_PARTIAL}{secrets.token_hex(8)}{beside.suffix}")
+    scratch = beside.with_name(f"{_PARTIAL}{_host()}-{os.getpid()}-{secrets.token_hex(8)}{beside.suffix}")
     try:
         beside.parent.mkdir(parents=True, exist_ok=True)
         yield scratch
@@ -53,13 +59,52 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8", newline="\n")
 
 
+def open_regular(path: Path) -> BufferedReader:
+    """The file, open for reading. Raises OSError, also for a pipe, a socket or a device: these may never answer."""
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "it is no regular file")
+    return open(descriptor, "rb")  # noqa: PTH123 - what was checked is what is read
+
+
 def remove_partial_files(folder: Path) -> None:
-    """What a killed process left of `scratch_file` below a folder. Nobody else may be writing there."""
-    for parent, _, names in os.walk(folder):
+    """What processes of this machine that have ended left of `scratch_file` below a folder, and what this one left.
+
+    The output folders of other runs in it, and files of processes that live or ran elsewhere, are left alone.
+    """
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [f for f in folders if not Path(parent, f, RUN_FILE).exists()]
         for name in names:
-            if name.startswith(_PARTIAL):
+            if name.startswith(_PARTIAL) and _is_left_over(name):
                 with suppress(OSError):
                     Path(parent, name).unlink()
+
+
+def _is_left_over(partial: str) -> bool:
+    host, _, rest = partial.removeprefix(_PARTIAL).partition("-")
+    process = rest.partition("-")[0]
+    if host != _host() or not process.isdigit():
+        return False
+    return int(process) == os.getpid() or not _is_alive(int(process))
+
+
+def _is_alive(process: int) -> bool:
+    """True for a process of this machine. Windows has no such question: its open files cannot be removed anyway."""
+    if os.name == "nt":
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _host() -> str:
+    """The name of this machine, of letters and digits."""
+    return "".join(c for c in platform.node() if c.isalnum())[:_LONGEST_HOST] or "host"
 
 
 def is_inside(name: str) -> bool:

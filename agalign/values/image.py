@@ -12,6 +12,11 @@ FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
+def reduced_size_px(size_px: tuple[int, int], reduction: float) -> tuple[int, int]:
+    """(width, height) of an image after a reduction: at least a pixel each, also of a line of 100,000 pixels."""
+    return max(1, round(size_px[0] / reduction)), max(1, round(size_px[1] / reduction))
+
+
 @dataclass(frozen=True)
 class Raster:
     """Pixels with their validity, as the estimation sees them."""

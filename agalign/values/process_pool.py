@@ -15,6 +15,7 @@ from multiprocessing.context import BaseContext
 from typing import Any, Generic, Self, TypeVar
 
 from agalign.errors import WorkerError
+from agalign.values.processes import REIMPORTED_EXIT_CODE
 from agalign.values.worker_process import ENDS_WITHIN_S, LOST_SERVER_EXIT_CODE, Worker, is_out_of_memory
 
 _MAX_DEATHS = 3
@@ -93,6 +94,12 @@ class _Place(Generic[A]):
         )
 
 
+_ADVICE = "close other programs, or try --jobs 1"
+_UNGUARDED = (
+    "the calling script runs again in each worker process; put its calls below a line 'if __name__ == \"__main__\":'"
+)
+
+
 class ProcessPool(Generic[A, R]):
     """A function done by worker processes, each argument in one of them. They start at once, in the background.
 
@@ -166,7 +173,7 @@ class ProcessPool(Generic[A, R]):
         """A worker could not be started; when none can, the run ends."""
         self._size -= 1
         if self._size == 0:
-            self._given_up = f"no worker process can be started ({problem}); close other programs, or try --jobs 1"
+            self._given_up = f"no worker process can be started ({problem}); {_ADVICE}"
 
     def _hand_over(self, timeout_s: float | None) -> Iterator[Outcome[A, R]]:
         """Give waiting tasks to idle workers, and replace those that are gone where there are tasks for them.
@@ -247,6 +254,9 @@ class ProcessPool(Generic[A, R]):
         code = worker.exit_code()
         self._end(place)
         by_signal = code is not None and (code < 0 or code == LOST_SERVER_EXIT_CODE)
+        if code == REIMPORTED_EXIT_CODE:
+            self._size, self._given_up = 0, _UNGUARDED
+            return []
         if not (worker.ready or by_signal):
             self._one_less(worker.problem or f"ended with exit code {code}")
             return []

@@ -5,7 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import parent_process, resource_tracker
+from multiprocessing import current_process, parent_process, resource_tracker
 
 
 def follow_parent() -> None:
@@ -20,6 +20,18 @@ def follow_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
+
+
+REIMPORTED_EXIT_CODE = 72
+"""Of a worker in which the calling script began to run again."""
+
+
+def end_if_reimported() -> None:
+    """End a worker process in which the calling script runs again: without `if __name__ == "__main__":` around its
+    calls, each worker that imports it would start workers of its own.
+    """
+    if getattr(current_process(), "_inheriting", False):  # as `multiprocessing` itself tells it
+        os._exit(REIMPORTED_EXIT_CODE)
 
 
 @contextmanager

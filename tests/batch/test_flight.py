@@ -343,6 +343,11 @@ def test_a_picture_that_fails_is_told_and_costs_no_more(
     assert [r.shortcomings for r in reports] == [("a.png: cannot be written",)] * 2
     assert not any(r.good for r in reports)
     assert all(r.result is not None and r.result.status == "ok" for r in reports)
+    assert [r.result.not_written for r in reports if r.result is not None] == [["picture"]] * 2
+    monkeypatch.undo()
+    again = list(run_flight(discover(flight), out_with_model, SETTINGS))
+    assert [(r.state, r.shortcomings) for r in again] == [("done", ())] * 2
+    assert len(list(out_with_model.rglob("*.png"))) == 2
 
 
 def test_a_forced_seed_is_for_the_captures_that_the_flight_is_learnt_from(flight: Path, tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -65,3 +66,28 @@ def test_bad_mosaics_are_told_in_a_line(mosaics: Path, tmp_path: Path) -> None:
         assert done.returncode == 1
         assert problem in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_south_up_mosaic_is_turned_when_it_is_read(mosaics: Path, tmp_path: Path) -> None:
+    """Rows from south to north are a mirror image, which no homography between images is."""
+    with rasterio.open(mosaics / "summer.tif") as source:
+        flipped = source.transform * Affine(1, 0, 0, 0, -1, source.height)
+        with rasterio.open(tmp_path / "south-up.tif", "w", **{**source.profile, "transform": flipped}) as target:
+            target.write(source.read()[:, ::-1])
+    for name, path in (("out", mosaics / "summer.tif"), ("turned", tmp_path / "south-up.tif")):
+        done = agalign("onto", mosaics / "spring.tif", path, "-o", tmp_path / name, "--relief", "never")
+        assert done.returncode == 0, done.stderr
+    with (
+        rasterio.open(tmp_path / "out" / "summer.tif") as one,
+        rasterio.open(tmp_path / "turned" / "south-up.tif") as two,
+    ):
+        np.testing.assert_array_equal(one.read(), two.read())
+
+
+def test_a_mosaic_of_another_place_is_told(mosaics: Path, tmp_path: Path) -> None:
+    with rasterio.open(mosaics / "summer.tif") as source:
+        away = {**source.profile, "transform": Affine.translation(0, 111_000) * source.transform}
+        with rasterio.open(tmp_path / "away.tif", "w", **away) as target:
+            target.write(source.read())
+    done = agalign("onto", mosaics / "spring.tif", tmp_path / "away.tif", "-o", tmp_path / "out", "--relief", "never")
+    assert re.search(r"away\.tif: is 11[01]\.\d km away from the reference", done.stderr)

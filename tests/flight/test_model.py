@@ -1,6 +1,7 @@
 """The file of a model: what is written is read back, and what is damaged is refused with the file's name."""
 
 import json
+import os
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 from safetensors import safe_open
 
 from agalign.errors import InputError
-from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.flight.model import FlightModel, _digest, load_model, save_model
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.flight.rig_file import read_rig
 from agalign.method.descriptor import Descriptor
@@ -108,12 +109,45 @@ def test_facts_that_no_model_has_are_refused(
     contents = path.read_bytes()
     (length,) = struct.unpack_from("<Q", contents)
     header = json.loads(contents[8 : 8 + length])
-    header["__metadata__"] |= change
-    del header["__metadata__"]["digest"]
+    facts = {k: v for k, v in (header["__metadata__"] | change).items() if k != "digest"}
+    with safe_open(path, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    header["__metadata__"] = facts | {"digest": _digest(tensors, facts)}
     text = json.dumps(header).encode()
     path.write_bytes(struct.pack("<Q", len(text)) + text + contents[8 + length :])
     with pytest.raises(InputError, match=said):
         load_model(path, cpu)
+
+
+def test_a_model_without_a_checksum_is_refused(model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    contents = path.read_bytes()
+    (length,) = struct.unpack_from("<Q", contents)
+    header = json.loads(contents[8 : 8 + length])
+    del header["__metadata__"]["digest"]
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + contents[8 + length :])
+    with pytest.raises(InputError, match="no checksum"):
+        load_model(path, cpu)
+
+
+def test_weights_beyond_all_reason_are_refused(model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    with torch.no_grad():
+        next(model.net.parameters()).mul_(1e30)
+    save_model(model, path)
+    with pytest.raises(InputError, match="numbers that no model has"):
+        load_model(path, cpu)
+
+
+def test_a_pipe_is_no_model(tmp_path: Path) -> None:
+    """Opened like a file, it would be waited for without end."""
+    os.mkfifo(tmp_path / "m.safetensors")
+    with pytest.raises(InputError, match="no regular file"):
+        load_model(tmp_path / "m.safetensors", cpu)
+    with pytest.raises(InputError, match="no regular file"):
+        read_rig(tmp_path / "m.safetensors")
 
 
 def test_numbers_that_are_not_finite_are_refused(model: FlightModel, tmp_path: Path) -> None:

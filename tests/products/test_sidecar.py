@@ -55,7 +55,7 @@ def context_of(capture: Capture, alignments: dict[str, Alignment]) -> ProductCon
 def test_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "sub" / "IMG_1.json"
     write_sidecar(path, example())
-    assert read_sidecar(path) == example()
+    assert read_sidecar(path).model_copy(update={"checksum": None}) == example()
     assert json.loads(path.read_text())["schema"] == "agalign/1"
     assert not list(path.parent.glob(".*"))
 
@@ -182,5 +182,5 @@ def test_a_result_is_the_sidecar_without_its_tables(tmp_path: Path) -> None:
     whole = example().model_copy(update={"bands": [band]})
     write_sidecar(path, whole)
     result = read_result(path)
-    assert result == whole.result()
+    assert result.model_copy(update={"checksum": None}) == whole.result()
     assert (result.bands[0].seconds, hasattr(result.bands[0], "grid")) == (1.5, False)

@@ -7,6 +7,8 @@ test_faults.py holds each fault to what is written here.
 
 import contextlib
 import ctypes
+import errno
+import fcntl
 import io
 import os
 import re
@@ -187,7 +189,7 @@ def run_outside(arguments: list[str], scene: Scene) -> tuple[int, str]:
             scene.watch(process)
         _, errors = process.communicate(timeout=200)
     _, left = psutil.wait_procs(scene.children, timeout=20)
-    return process.returncode, errors + "".join(f"agalign: left behind: {p}\n" for p in left)
+    return process.returncode, (errors or "") + "".join(f"agalign: left behind: {p}\n" for p in left)
 
 
 # ---- what is done to files
@@ -584,6 +586,70 @@ def asking(*arguments: str) -> Callable[[Scene], None]:
     return spoil
 
 
+def lines(scene: Scene) -> None:
+    for name in ("b_green.tif", "b_nir.tif"):
+        tifffile.imwrite(scene.file(name), np.random.default_rng(0).integers(0, 60000, (1, 100000), np.uint16))
+
+
+def sidecar_is_a_pipe(scene: Scene) -> None:
+    scene.out.mkdir()
+    os.mkfifo(scene.out / "b.json")
+
+
+def model_is_a_pipe(scene: Scene) -> None:
+    path = scene.folder.parent / "m.safetensors"
+    os.mkfifo(path)
+    scene.arguments = ["--model", str(path)]
+
+
+def endless_number(scene: Scene) -> None:
+    """In the sidecar of b, of which the report is to be made."""
+    run_inside([str(scene.folder), "-o", str(scene.out), "-j", "1"], Scene(scene.folder, scene.out))
+    path = scene.out / "b.json"
+    path.write_text(re.sub(r'"seconds": [0-9.]+', '"seconds": 1e309', path.read_text()))
+    scene.command = ["report", str(scene.out)]
+
+
+def without_streams(*numbers: int) -> Callable[[Scene], None]:
+    def spoil(scene: Scene) -> None:
+        scene.process = {"preexec_fn": lambda: [os.close(n) for n in numbers] and None}
+
+    return spoil
+
+
+def unread_errors(scene: Scene) -> None:
+    """As of `agalign ... 2>&1 | head -1`."""
+    make_more = [chr(code) for code in range(ord("c"), ord("f"))]
+    for number, name in enumerate(make_more, start=2):
+        write_capture(scene.folder, name, number)
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    scene.process = {"stderr": write_end}
+    scene.undo = lambda: os.close(write_end)
+    scene.watch = lambda _: None
+
+
+def long_temporary_folder(scene: Scene) -> None:
+    folder = scene.folder.parent / ("t" * 150)
+    folder.mkdir()
+    scene.process = {"env": {**os.environ, "TMPDIR": str(folder)}}
+    scene.arguments = ["-j", "2"]
+
+
+def no_locks(scene: Scene) -> None:
+    """As on NFS without its lock daemon."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    real, fcntl.flock = fcntl.flock, refuse
+
+    def undo() -> None:
+        fcntl.flock = real
+
+    scene.undo = undo
+
+
 def commanding(*command: str) -> Callable[[Scene], None]:
     def spoil(scene: Scene) -> None:
         scene.command = [part.format(folder=scene.folder, out=scene.out) for part in command]
@@ -718,6 +784,21 @@ FAULTS = (
     Fault("standard output full", standard_output_full, 1, "standard output|output: No space left", ("a", "b")),
     Fault("a random seed beyond 64 bits", asking("--rng-seed", "9" * 30), 2, "", ()),
     Fault("a device that computes nothing", asking("--device", "meta"), 2, "device 'meta' cannot be used", ()),
+    Fault("images of a line of 100,000 pixels", lines, 3, "^b nir: "),
+    Fault("a pipe where a sidecar belongs", sidecar_is_a_pipe, 0, "", ("a", "b")),
+    Fault("a pipe for a model", model_is_a_pipe, 1, r"m\.safetensors: .*no regular file", ()),
+    Fault("a number beyond all in a sidecar, for the report", endless_number, 3, r"b\.json: .*finite", ("a",)),
+    Fault("a number beyond all in an earlier sidecar", both(
+        endless_number, commanding("{folder}", "-o", "{out}", "-j", "1")), 0, "", ("a", "b")),
+    Fault("standard output closed", without_streams(1), 0, "", ("a", "b")),
+    Fault("all standard streams closed", without_streams(0, 1, 2), 0, "", ("a", "b")),
+    Fault("standard error that nobody reads", unread_errors, 0, "", ("a", "b", "c", "d", "e")),
+    Fault("a temporary folder with a name of 150 letters", long_temporary_folder, 0, "", ("a", "b")),
+    Fault("a file system without locks", no_locks, 0, "", ("a", "b")),
+    Fault("an empty name for the folder", commanding("", "-o", "{out}"), 2, "the name of the folder is empty", ()),
+    Fault("a focal length of 1e308 mm in the tags", xmp(
+        "<Camera:PerspectiveFocalLength>1e308</Camera:PerspectiveFocalLength>"
+        "<Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>"), 0, "", ("a", "b")),
     Fault("one of GDAL's virtual paths", commanding("/vsizip/flight.zip", "-o", "{out}"), 1, "virtual paths", ()),
 )  # fmt: skip
 

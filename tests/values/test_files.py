@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 from agalign.errors import OutputError
-from agalign.values.files import complete_file, is_inside, remove_partial_files, scratch_file, write_text
+from agalign.values.files import (
+    RUN_FILE,
+    complete_file,
+    is_inside,
+    open_regular,
+    remove_partial_files,
+    scratch_file,
+    write_text,
+)
 
 
 def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
@@ -101,3 +109,31 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
     (tmp_path / "sub" / "b.tif").write_text("whole")
     remove_partial_files(tmp_path)
     assert [p.name for p in (tmp_path / "sub").iterdir()] == ["b.tif"]
+
+
+def test_what_another_process_writes_stays(tmp_path: Path) -> None:
+    """Of this machine while it lives, and of other machines; and what another run in a folder below left."""
+    with scratch_file(tmp_path / "a.tif") as partial:
+        pass
+    own = str(os.getpid())
+    left = [partial.name.replace(own, str(os.getppid())), partial.name.replace("-part-", "-part-elsewhere")]
+    run = tmp_path / "another run"
+    run.mkdir()
+    (run / RUN_FILE).touch()
+    for path in (partial, *(tmp_path / name for name in left), run / partial.name):
+        path.write_text("half")
+    remove_partial_files(tmp_path)
+    assert sorted(p.name for p in tmp_path.glob(".agalign*")) == sorted(left)
+    assert (run / partial.name).exists()
+    remove_partial_files(run)
+    assert not (run / partial.name).exists()
+
+
+def test_only_regular_files_are_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, Path("/dev/null")):
+        with pytest.raises(OSError, match="no regular file"):
+            open_regular(path)
+    (tmp_path / "file").write_bytes(b"x")
+    with open_regular(tmp_path / "file") as file:
+        assert file.read() == b"x"
