@@ -11,7 +11,7 @@ import agalign
 flight = agalign.open_flight(sys.argv[1])
 print(flight)
 
-red, nir = flight["Red"].astype("float32"), flight["NIR"].astype("float32")
+red, nir = flight["Red"], flight["NIR"]
 ndvi = ((nir - red) / (nir + red)).where(nir + red > 0)
 median = ndvi.median(("y", "x"), skipna=True).compute()
 for capture in median.capture:

@@ -22,12 +22,13 @@ _COORDINATES = ("latitude", "longitude", "altitude_m")
 _CHUNKS = {"x": 1024, "y": 1024}
 
 
-def open_capture(path: str | Path, *, masked: bool = False) -> "xarray.Dataset":
+def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """The aligned bands of a capture by its sidecar, its stack or its STAC item, lazily (dask).
 
     Dimensions are y and x, at the centres of pixels: on the map where the capture lies on one (`.rio.crs`), else in px
-    of what was written. A variable is named after its band and has the attributes `wavelength_nm`, `units`, `status`
-    and, where nodata is declared, `_FillValue`; with `masked` such pixels are nan instead.
+    of what was written, with (0, 0) the centre of the top-left pixel. A variable is named after its band and has the
+    attributes `wavelength_nm`, `units` and `status`. Values are float32 with nan for nodata; with `masked=False` they
+    are the file's own, with its nodata value as `_FillValue`: differences of unsigned integers wrap around.
     Bands without pixels are left out. A capture with a relief has the variables `parallax` (px along a
     baseline of length 1, positive nearer) and, where they were asked for, `confidence` and `range` (m).
     Raises SidecarError, UnreadableFileError, and ConfigurationError where xarray is not installed.
@@ -38,12 +39,13 @@ def open_capture(path: str | Path, *, masked: bool = False) -> "xarray.Dataset":
     return _dataset(read_sidecar(sidecar_path), sidecar_path.parent, masked=masked)
 
 
-def open_flight(out: str | Path, *, masked: bool = False) -> "xarray.Dataset":
+def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """All captures below the output folder of a run, stacked along `capture`, lazily (dask).
 
     Coordinates of `capture` are its label, and `time`, `latitude`, `longitude` and `altitude_m` as far as the camera
-    wrote them. Bands are those that all captures have. Raises InputError where there is no run or its captures differ
-    in size (write with crop 'flight'), and what `open_capture` raises.
+    wrote them; `status` (capture, band) is that of each band in each capture. Bands are those that all captures have.
+    Raises InputError where there is no run or its captures differ in size (write with crop 'flight'), and what
+    `open_capture` raises.
     """
     xr = import_xarray()
     folder = Path(out)
@@ -52,11 +54,18 @@ def open_flight(out: str | Path, *, masked: bool = False) -> "xarray.Dataset":
     common = [name for name in opened[0].data_vars if all(name in one for one in opened)]
     # Each capture has its own position on the map: only their pixels can be stacked.
     plain = [_in_pixels(one[common]) for one in opened]
+    bands = [name for name in common if "status" in opened[0][name].attrs]
+    status = [[one[name].attrs["status"] for name in bands] for one in opened]
+    for one in plain:
+        for name in bands:
+            del one[name].attrs["status"]
     stacked = xr.concat(plain, dim="capture", join="override", combine_attrs="override", coords="minimal")
     stacked.attrs = {k: opened[0].attrs[k] for k in ("camera", "reference_band")}
     flight: xarray.Dataset = stacked.assign_coords(
         capture=[(p.parent / p.stem).relative_to(folder).as_posix() for p, _ in captures],
         time=("capture", [_moment(s) for _, s in captures]),
+        band=bands,
+        status=(("capture", "band"), status),
         **{name: ("capture", [_coordinate(s, name) for _, s in captures]) for name in _COORDINATES},
     )
     return flight
@@ -103,7 +112,7 @@ def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset
         name = band.place.file
         if name not in files:
             files[name] = _opened(folder, name, masked=masked)
-        result[band.band] = _variable(files[name], band, band.place.band_index, name)
+        result[band.band] = _variable(files[name], band, band.place.band_index, name, masked=masked)
     relief = next((b.relief.file for b in sidecar.bands if b.relief is not None and b.relief.file), None)
     if relief is not None:
         layers = _opened(folder, relief, masked=True)
@@ -117,7 +126,7 @@ def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset
         "captured_at": sidecar.captured_at, "camera": f"{sidecar.camera.make} {sidecar.camera.model}".strip(),
         "reference_band": sidecar.reference.band,
     }  # fmt: skip
-    return dataset
+    return dataset if dataset.rio.crs is not None else _in_pixels(dataset)
 
 
 def _opened(folder: Path, name: str, *, masked: bool) -> "xarray.DataArray":
@@ -133,10 +142,12 @@ def _opened(folder: Path, name: str, *, masked: bool) -> "xarray.DataArray":
     return opened
 
 
-def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str) -> "xarray.DataArray":
+def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str, *, masked: bool) -> "xarray.DataArray":
     if index > file.sizes["band"]:
         raise UnreadableFileError(f"{name}: has no band {index}, as its sidecar says; run again")
     one = file.isel(band=index - 1, drop=True)
+    if masked:
+        one = one.astype(np.float32)  # also of integers without nodata
     units = file.attrs.get("units")
     unit = units[index - 1] if isinstance(units, tuple) else units
     kept = {k: v for k, v in file.attrs.items() if k in ("_FillValue", "scale_factor", "add_offset")}
@@ -153,6 +164,6 @@ def _in_pixels(dataset: "xarray.Dataset") -> "xarray.Dataset":
 
 def _moment(sidecar: Sidecar) -> Any:
     try:
-        return np.datetime64(sidecar.captured_at.partition("+")[0].rstrip("Z"), "ns")
+        return np.datetime64(sidecar.captured_at.partition("+")[0].rstrip("Z"), "us")
     except ValueError:
-        return np.datetime64("NaT", "ns")
+        return np.datetime64("NaT", "us")

@@ -41,7 +41,7 @@ def test_a_capture_is_its_files(run: Path) -> None:
 
 def test_a_flight_is_read_when_it_is_asked_for(run: Path) -> None:
     flight = agalign.open_flight(run)
-    assert flight.sizes == {"capture": 2, "y": 360, "x": 480}
+    assert flight.sizes == {"capture": 2, "band": 5, "y": 360, "x": 480}
     assert flight.NIR.chunks is not None  # dask's: nothing was read
     assert list(flight.capture.values) == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
     assert str(flight.time.values[1]).startswith("2026-06-21T10:00:02")
@@ -50,6 +50,12 @@ def test_a_flight_is_read_when_it_is_asked_for(run: Path) -> None:
     np.testing.assert_array_equal(flight.Red.isel(capture=1).values, one.Red.values)
     ndvi = (flight.NIR - flight.Red) / (flight.NIR + flight.Red)
     assert 0 < float(ndvi.mean()) < 1
+    assert flight.NIR.dtype == np.float32
+    assert flight.status.dims == ("capture", "band")
+    assert set(flight.status.sel(band=["Red", "NIR"]).values.ravel()) <= {"seed_only", "aligned"}
+    assert "status" not in flight.NIR.attrs
+    # (0, 0) is the centre of the top-left pixel in both.
+    assert (float(one.x[0]), float(flight.x[0])) == (0.0, 0.0)
 
 
 def test_a_place_on_the_map_and_masked_pixels_follow(tmp_path: Path) -> None:
@@ -59,12 +65,14 @@ def test_a_place_on_the_map_and_masked_pixels_follow(tmp_path: Path) -> None:
         pixels[:40, :40] = 0
         write_band(tmp_path / "in" / f"f_{name}.tif", pixels, nodata=0, **place)
     agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=SEEDED)
-    raw = agalign.open_capture(tmp_path / "out" / "f.json")
+    raw = agalign.open_capture(tmp_path / "out" / "f.json", masked=False)
     assert raw.red.rio.crs.to_epsg() == 32631
     assert raw.red.dtype == np.uint16
     assert (raw.red.attrs["_FillValue"], raw.red.attrs["units"]) == (0, "count")
     assert float(raw.x[0]) == pytest.approx(5e5 + 0.05)
-    masked = agalign.open_capture(tmp_path / "out" / "f.json", masked=True)
+    masked = agalign.open_capture(tmp_path / "out" / "f.json")
+    assert masked.red.dtype == np.float32
+    assert float((masked.red - masked.green).min()) < 0  # integers would wrap around
     assert np.isnan(masked.red.values[:40, :40]).all()
 
 
