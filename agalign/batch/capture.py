@@ -61,8 +61,7 @@ def process_capture(
     context = _context(capture, paths, settings, alignments, None if model is None else model.rig, max_preview_bytes)
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
-    sidecar = sidecar_of(context, list(failures))
-    write_sidecar(paths.sidecar, sidecar)
+    sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures)))
     # Once, where two products need the same file.
     return CaptureOutcome(sidecar, paths.sidecar, tuple(dict.fromkeys(failures.values())))
 

@@ -362,11 +362,12 @@ class Sidecar(CaptureResult):
         return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude=short))
 
 
-def write_sidecar(path: Path, sidecar: Sidecar) -> None:
-    """Write at once or not at all, with its checksum. Raises OutputError."""
+def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
+    """Write at once or not at all; returned with its checksum. Raises OutputError."""
     content = json.loads(sidecar.model_dump_json(by_alias=True))
     whole = sidecar.model_copy(update={"checksum": content_checksum(content)})
     write_text(path, compact_lists(whole.model_dump_json(by_alias=True, indent=1)))
+    return whole
 
 
 def content_checksum(content: Mapping[str, Any]) -> str:

@@ -80,6 +80,21 @@ def test_the_reference_is_bit_identical_and_the_type_kept(tmp_path: Path, dtype:
         assert written.profile["tiled"]
 
 
+def test_red_green_and_blue_are_shown_as_such(tmp_path: Path) -> None:
+    """A viewer that goes by the bands' order would show near infra-red as red."""
+    capture = make_capture(tmp_path)
+    names = (("NIR", 840.0), ("Green", 560.0), ("Red", 668.0), ("Blue", 475.0))
+    some = [capture.bands[k % len(capture.bands)] for k in range(4)]
+    bands = [replace(b, name=n, wavelength_nm=w) for b, (n, w) in zip(some, names, strict=True)]
+    layers = [Layer(b, None, is_reference=True) for b in bands]
+    for chosen, colours in (
+        (layers, ["undefined", "green", "red", "blue"]), (layers[:2], ["gray", "undefined"]), (layers[:1], ["gray"]),
+    ):  # fmt: skip
+        write_raster(capture, chosen, CROP, tmp_path / "out.tif", WriteSettings())
+        with rasterio.open(tmp_path / "out.tif") as written:
+            assert [c.name for c in written.colorinterp] == colours
+
+
 def test_no_georeference_and_no_nodata_are_invented(tmp_path: Path) -> None:
     capture = make_capture(tmp_path)
     out = tmp_path / "out.tif"
