@@ -175,16 +175,18 @@ def run(
 
 
 def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
-    """False where they could not be written."""
+    """False where they could not be written, or lack a file that cannot be read."""
     from agalign.products.report import pages_exist, write_pages
 
+    problems: list[str] = []
     try:
         if changed or not pages_exist(out):
-            write_pages(out, terminal.problem)
+            write_pages(out, problems.append)
     except OutputError as error:
-        terminal.problem(str(error))
-        return False
-    return True
+        problems.append(str(error))
+    for problem in problems:
+        terminal.problem(problem)
+    return not problems
 
 
 @contextmanager

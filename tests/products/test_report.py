@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign.errors import InputError
+from agalign.errors import InputError, SidecarError
 from agalign.flight.rig_file import read_rig
-from agalign.products.report import pages_exist, write_pages
+from agalign.products.report import pages, pages_exist, write_pages
 from agalign.products.report.facts import CaptureEntry
 from agalign.products.report.rigs import CHART_HEIGHT, drifts_of, rig_views
 from agalign.synthetic import flight as synthetic
@@ -104,6 +104,20 @@ def test_pages_stand_until_a_sidecar_is_newer(out: Path) -> None:
     assert pages_exist(out)
     path = out / "0000SET" / "000" / "IMG_0001.json"
     path.write_bytes(path.read_bytes())
+    assert not pages_exist(out)
+    write_pages(out, pytest.fail)
+    assert pages_exist(out)
+
+
+def test_pages_without_an_unreadable_sidecar_are_written_again(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(path: Path) -> None:
+        raise SidecarError(f"{path.name}: cannot be read (Input/output error)")
+
+    problems: list[str] = []
+    with monkeypatch.context() as patched:
+        patched.setattr(pages, "read_sidecar", fails)
+        write_pages(out, problems.append)
+    assert "IMG_0001.json: cannot be read (Input/output error)" in problems
     assert not pages_exist(out)
     write_pages(out, pytest.fail)
     assert pages_exist(out)

@@ -3,8 +3,10 @@
 import base64
 import hashlib
 import json
+import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -40,18 +42,19 @@ class Pages:
 
 
 def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
-    """OUT/index.html and OUT/summary.csv from all sidecars below OUT; what cannot be read is told to `on_problem`.
+    """Write OUT/index.html and OUT/summary.csv from all sidecars below OUT; report unreadable files to `on_problem`.
 
-    Raises OutputError.
+    Pages that lack an unreadable file count as outdated in `pages_exist`. Raises OutputError.
     """
     rows: list[dict[str, object]] = []
+    unreadable: list[str] = []
     facts = Facts(out)
     for path in find_sidecars(out):
         folder = path.parent.relative_to(out).as_posix()
         try:
             sidecar = read_sidecar(path)
         except SidecarError as error:
-            on_problem(str(error))
+            unreadable.append(str(error))
             continue
         rows += summary_rows(folder, sidecar)
         facts.add(folder, sidecar)
@@ -60,17 +63,22 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     try:
         panels, run = read_panels(out), read_run_record(out)
     except SidecarError as error:
-        on_problem(str(error))
+        unreadable.append(str(error))
     rows += [row for panel in panels for row in panel_rows(panel)]
     write_summary(rows, out / SUMMARY_FILE)
     failures = facts.failures.groups()
     slowest = sorted(((c.label, c.seconds) for c in facts.entries), key=lambda c: -c[1])[:_SLOWEST]
-    write_text(out / REPORT_FILE, _page(out, facts, panels, run, on_problem))
+    write_text(out / REPORT_FILE, _page(out, facts, panels, run, unreadable.append))
+    if unreadable:
+        with suppress(OSError):
+            os.utime(out / REPORT_FILE, (0, 0))
+    for text in unreadable:
+        on_problem(text)
     return Pages(out / REPORT_FILE, out / SUMMARY_FILE, failures, tuple(slowest))
 
 
 def pages_exist(out: Path) -> bool:
-    """True where the pages of an earlier run are newer than all that they tell of."""
+    """True where the pages of an earlier run are complete and newer than all files that they describe."""
     try:
         written = min((out / name).stat().st_mtime_ns for name in (REPORT_FILE, SUMMARY_FILE))
         entries = [*find_sidecars(out), *([out / PANELS_FILE] if (out / PANELS_FILE).exists() else [])]
