@@ -1,0 +1,296 @@
+"""Let single system calls of a run fail, run the same command again, and compare with an undisturbed run.
+
+    python benchmarks/reliability/syscall_faults.py [--faults 200] [--markdown FILE]
+
+`strace` lists the calls of an undisturbed run that have a file or folder below the output folder as their argument.
+In each further run it makes one of them fail, drawn at random: `-P FILE -e inject=write:error=EIO:when=3`. A run is a
+fork of this process, which has already loaded the program and gives temporary files the same names in every run. Linux
+only. Without strace, or where the system does not allow tracing, nothing is measured.
+"""
+
+import argparse
+import os
+import random
+import re
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter, defaultdict
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+from kills import contents, differences, files, whole_sidecars
+from report import Section
+
+from agalign.cli import main as cli
+from agalign.products.report import SUMMARY_FILE
+from agalign.synthetic import flight as synthetic
+
+CAPTURES, SIZE_PX = 2, (240, 180)
+OPTIONS = ("--layout", "both", "--error-map", "--stac", "--bands", "green,red", "--relief", "never", "-j", "1", "-q")
+ERRORS = {
+    "write": ("EIO", "ENOSPC", "EINTR"),
+    "pwrite64": ("EIO", "ENOSPC", "EINTR"),
+    "fsync": ("EIO", "ENOSPC", "EINTR"),
+    "rename": ("EIO", "ENOSPC", "EACCES"),
+    "openat": ("EIO", "ENOSPC", "EINTR"),
+    "close": ("EIO", "ENOSPC", "EINTR"),
+}
+MAX_S = 60
+_CALL = re.compile(r'^(\d+)\s+(\w+)\((?:\d+<([^>]*)>|(?:AT_FDCWD[^,]*, )?"([^"]*)")')
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended, and what it printed to standard error."""
+
+    code: int | None
+    """None where it was still running after `MAX_S`."""
+    errors: str
+    trace: str
+
+    @property
+    def complaints(self) -> list[str]:
+        return [line for line in self.errors.splitlines() if line.startswith("agalign: ")]
+
+
+def arguments(flight: Path, out: Path) -> list[str]:
+    return ["agalign", str(flight), "-o", str(out), *OPTIONS]
+
+
+def run(argv: list[str], folder: Path, *tracing: str) -> Ending:
+    """Run the program in a fork of this process; with arguments of strace, traced by it."""
+    errors, trace, modules = folder / "errors.txt", folder / "trace.txt", folder / "modules.txt"
+    trace.write_text("")
+    gate, opener = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        _run_in_child(argv, errors, modules, gate, opener)
+    os.close(gate)
+    tracer = None
+    if tracing:
+        tracer = subprocess.Popen(
+            ["strace", "-f", "-y", *tracing, "-o", str(trace), "-p", str(pid)], stderr=subprocess.PIPE, text=True
+        )
+        if tracer.stderr is None or "attached" not in tracer.stderr.readline():
+            raise SystemExit("skipped: strace cannot trace a process here (ptrace is not allowed)")
+    os.write(opener, b"!")
+    os.close(opener)
+    code = _exit_code_of(pid)
+    if tracer is not None:
+        tracer.communicate()
+    return Ending(code, errors.read_text(errors="replace"), trace.read_text(errors="replace"))
+
+
+def _run_in_child(argv: list[str], errors: Path, modules: Path, gate: int, opener: int) -> None:
+    """What a process of its own would do from the first line of `main` on."""
+    code = 1
+    try:
+        os.setsid()
+        os.close(opener)
+        target = os.open(errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.dup2(target, 2)
+        numbers = count()
+        secrets.token_hex = lambda _bytes=None: f"{next(numbers):016x}"
+        os.read(gate, 1)
+        sys.argv = argv
+        cli.main()
+        code = 0
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        modules.write_text("\n".join(sys.modules))
+        os._exit(code)
+
+
+def load_modules_of_run(folder: Path) -> None:
+    """Import what the last run has imported: two threads import it, and the order of their calls is random."""
+    for name in (folder / "modules.txt").read_text().split():
+        with suppress(Exception):
+            import_module(name)
+
+
+def _exit_code_of(pid: int) -> int | None:
+    deadline_s = time.monotonic() + MAX_S
+    while time.monotonic() < deadline_s:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.01)
+    os.killpg(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    return None
+
+
+def calls_below(out: Path, trace: str) -> dict[str, Counter[str]]:
+    """How often each system call has each file or folder below `out` as its argument."""
+    result: dict[str, Counter[str]] = defaultdict(Counter)
+    for line in trace.splitlines():
+        match = _CALL.match(line)
+        if match is not None:
+            _, name, of_descriptor, path = match.groups()
+            if f"{of_descriptor or path}/".startswith(f"{out}/"):
+                result[name][of_descriptor or path] += 1
+    return result
+
+
+def what_failed(out: Path, trace: str) -> str:
+    """The kind of file that the failed call was for; empty where no call failed."""
+    for line in trace.splitlines():
+        match = _CALL.match(line)
+        if "(INJECTED)" in line and match is not None:
+            return re.sub(r"part-\w+", "part-*", os.path.relpath(match[3] or match[4], out))
+    return ""
+
+
+def plan(calls: dict[str, Counter[str]], faults: int, rng: random.Random) -> list[tuple[str, str, str, int]]:
+    """(call, error, path, number of the call) of each fault: pairs of call and error in turn, each with its files in
+    turn, as far as there are calls.
+    """
+    pairs = [(call, error) for call, errors in ERRORS.items() for error in errors if calls.get(call)]
+    waiting = {pair: _shuffled(calls[pair[0]], rng) for pair in pairs}
+    result: list[tuple[str, str, str, int]] = []
+    while len(result) < faults and any(waiting.values()):
+        result += [(*pair, *waiting[pair].pop()) for pair in pairs if waiting[pair]]
+    return result[:faults]
+
+
+def _shuffled(calls: Counter[str], rng: random.Random) -> list[tuple[str, int]]:
+    """(path, number from 1) of all calls in random order; the last ones are of different paths."""
+    result: list[tuple[str, int]] = []
+    numbers = {path: rng.sample(range(1, of_path + 1), of_path) for path, of_path in calls.items()}
+    while numbers:
+        paths = rng.sample(sorted(numbers), len(numbers))
+        result = [*((path, numbers[path].pop()) for path in paths), *result]
+        numbers = {path: left for path, left in numbers.items() if left}
+    return result
+
+
+def compared(out: Path, expected: dict[str, object]) -> Counter[str]:
+    """How many files are missing, left over, different; sizes and checksums of rasters with equal pixels may differ.
+
+    The report and the summary hold seconds, and are counted as different where the summary lacks a line.
+    """
+    result = differences(out, {name: value for name, value in expected.items() if Path(name).suffix != ".json"})
+    here, wanted = records(out), {name for name in expected if Path(name).suffix == ".json"}
+    result["left over"] -= len(here)
+    summary = out / SUMMARY_FILE
+    result["different"] += not summary.exists() or len(summary.read_text().splitlines()) != 1 + CAPTURES
+    result["missing"] += len(wanted - here.keys())
+    result["left over"] += len(here.keys() - wanted)
+    different = [name for name in wanted & here.keys() if here[name] != without_sizes(expected[name])]
+    result["different"] += len(different)
+    if different:
+        print("different:", *different)
+    return result
+
+
+def records(out: Path) -> dict[str, object]:
+    """The contents of the JSON files by name."""
+    return {name: without_sizes(contents(path)) for name, path in files(out).items() if path.suffix == ".json"}
+
+
+def without_sizes(value: object) -> object:
+    """A write that is done again may leave a gap in a TIFF."""
+    if isinstance(value, dict):
+        left_out = ("bytes", "sha256", "file:size", "file:checksum")
+        return {k: without_sizes(v) for k, v in value.items() if k not in left_out}
+    return [without_sizes(v) for v in value] if isinstance(value, list) else value
+
+
+def faults_of(ending: Ending, out: Path, expected: dict[str, object]) -> Counter[str]:
+    """What is wrong right after a run with a fault."""
+    result: Counter[str] = Counter()
+    if ending.code is None:
+        result["hung"] += 1
+        return result
+    result["torn"] = sum(whole_sidecars(out).values())
+    result["traceback"] = int("Traceback" in ending.errors or "please report" in ending.errors)
+    if ending.code == 0 and not ending.complaints:
+        result["unnoticed"] = sum(compared(out, expected).values())
+    elif ending.code not in (1, 3) or not ending.complaints:
+        result["bad exit"] = 1
+    if any(p.name.startswith(".agalign") for p in out.rglob("*")):
+        result["left over"] += 1
+    return result
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--faults", type=int, default=200)
+    options.add_argument("--rng-seed", type=int, default=0)
+    options.add_argument("--markdown", type=Path)
+    asked = options.parse_args()
+    if shutil.which("strace") is None or sys.platform != "linux":
+        raise SystemExit("skipped: strace is not installed (apt-get install strace)")
+    section, rng = Section("syscall faults", asked.markdown), random.Random(asked.rng_seed)
+    np.seterr(all="ignore")
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name).resolve()
+        flight, out = folder / "flight", folder / "out"
+        synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
+        argv = arguments(flight, out)
+        run(argv, folder)
+        load_modules_of_run(folder)
+        shutil.rmtree(out)
+        whole = run(argv, folder, "-e", "trace=" + ",".join(ERRORS))
+        if whole.code != 0 or whole.complaints:
+            raise SystemExit(f"the run without faults ended with {whole.code}: {whole.errors}")
+        expected = {name: contents(path) for name, path in files(out).items()}
+        calls = calls_below(out, whole.trace)
+        print({name: paths.total() for name, paths in calls.items()}, f"{len(expected)} files", flush=True)
+        rows: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+        for number, (call, error, path, at) in enumerate(plan(calls, asked.faults, rng), start=1):
+            shutil.rmtree(out, ignore_errors=True)
+            began = time.monotonic()
+            inject = f"inject={call}:error={error}:when={at}"
+            ending = run(argv, folder, "-P", path, "-e", f"trace={call}", "-e", inject)
+            here = faults_of(ending, out, expected)
+            again = run(argv, folder)
+            after = compared(out, expected)
+            after["bad exit"] = int(again.code != 0 or bool(again.complaints))
+            hit = what_failed(out, ending.trace)
+            row = rows[call, error]
+            row["runs"] += bool(hit)
+            row["refused"] += ending.code in (1, 3) and bool(ending.complaints)
+            row["as if nothing happened"] += ending.code == 0
+            row["lost"] += after["missing"] + after["bad exit"]
+            row["different"] += after["different"] + after["corrupt"]
+            row["left over"] += after["left over"]
+            row.update(here)
+            wrong = +(here + Counter({f"{k} afterwards": v for k, v in after.items()}))
+            print(
+                f"{number}: {call} {error} {at} ({hit or 'not reached'}): {ending.code} {ending.complaints[:1]} "
+                f"{time.monotonic() - began:.1f} s {dict(wrong) or ''}",
+                flush=True,
+            )
+            if wrong:
+                print(ending.errors, "\nafterwards:", again.code, again.errors, flush=True)
+        kinds = ("runs", "refused", "as if nothing happened", "traceback", "bad exit", "unnoticed", "torn", "lost",
+                 "different", "left over", "hung")  # fmt: skip
+        heads = ("call", "error", "runs", "refused with a line", "finished", *kinds[3:])
+        section.say(
+            f"{sum(r['runs'] for r in rows.values())} runs over {CAPTURES} captures of {SIZE_PX[0]} x {SIZE_PX[1]}, "
+            "one failed call each, followed by the same command without a fault."
+        )
+        section.table([heads, *((*pair, *(str(row[k]) for k in kinds)) for pair, row in rows.items())])
+
+
+if __name__ == "__main__":
+    main()
