@@ -1,5 +1,6 @@
 """A flight aligned from the command line: found, done with a progress line, told capture by capture, and summed up."""
 
+import re
 import threading
 import time
 from collections import Counter
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from agalign.products.sidecar import BandResult, CaptureResult
     from agalign.values.capture import Capture
 
+_MAX_LISTED_FILES = 10
+"""Of those with the same problem."""
 GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
 
 
@@ -37,8 +40,7 @@ def find_captures(
 
     flight = discover(folder, options)
     if not silent:
-        for problem in flight.problems:
-            terminal.problem(problem.text, file=problem.path)
+        print_problems(flight, terminal)
     if not flight.captures:
         if any(isinstance(p.error, NoSuchBandError) for p in flight.problems):
             raise NoSuchBandError(f"{folder}: no capture has a band '{options.reference}'")
@@ -54,6 +56,28 @@ def find_captures(
             bands=bands,
         )
     return flight
+
+
+def print_problems(flight: "FolderScan", terminal: Terminal) -> None:
+    """Print what is wrong with the files: at most `_MAX_LISTED_FILES` lines for each cause, and how many more it has.
+
+    With --log-json there is a line for each file.
+    """
+    counts: Counter[str] = Counter()
+    listed: dict[str, str] = {}
+    for problem in flight.problems:
+        # Sizes and numbers differ between files with the same cause.
+        cause = re.sub(r"\d+", "0", problem.text.replace(str(problem.path), "").replace(problem.path.name, ""))
+        counts[cause] += 1
+        if terminal.log_json or counts[cause] <= _MAX_LISTED_FILES:
+            terminal.problem(problem.text, file=problem.path)
+            listed[cause] = problem.path.name
+    for cause, count in counts.items():
+        if count > _MAX_LISTED_FILES and not terminal.log_json:
+            terminal.problem(
+                f"{flight.folder}: {count - _MAX_LISTED_FILES} more files with the same problem as {listed[cause]}; "
+                "'agalign info --json' lists all"
+            )
 
 
 def load_ahead() -> None:
