@@ -55,8 +55,13 @@ class WorkerError(AgalignError):
     """The worker processes cannot be started, or end one after another."""
 
 
+class MemoryLimitError(AgalignError):
+    """The system limits the memory of this process to less than the libraries need."""
+
+
 _SAID_OF_MEMORY = (
     "not enough memory", "can't allocate memory", "Cannot allocate memory", "bad_alloc", "Insufficient memory",
+    "can't start new thread", "could not create a primitive",
 )  # fmt: skip
 
 

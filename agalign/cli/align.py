@@ -37,6 +37,7 @@ from agalign.values.choices import (
     SeedChoice,
     Sharing,
 )
+from agalign.values.memory_limit import check_address_space
 
 FolderArgument = Annotated[
     Path, typer.Argument(help="Folder with the images, sub-folders included.", show_default=False)
@@ -224,6 +225,7 @@ def align(
     """Align every capture below FOLDER."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal, GOES_ON):
+        check_address_space()
         from agalign.batch import RunOptions
         from agalign.cameras.discover import DiscoverOptions
         from agalign.config import (

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from agalign.cli.terminal import LogJson, Quiet, RngSeed, Terminal, Verbose, exits
 from agalign.errors import ConfigurationError
+from agalign.values.memory_limit import check_address_space
 
 Pairs = Annotated[
     Path,
@@ -52,6 +53,7 @@ def evaluate(
     """Descriptors and homographies on pairs whose truth is known: the paper's protocol."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
+        check_address_space()
         from agalign.evaluation.image_pairs import find_pairs
         from agalign.evaluation.methods import method_named
         from agalign.evaluation.run import Starts, as_csv, error_table, evaluate, precision_table
@@ -90,6 +92,7 @@ def surface(
     """The training loss over misalignments of a pair (the paper's Fig. 2), as a picture."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
+        check_address_space()
         import numpy as np
 
         from agalign.config import JointSettings
@@ -131,6 +134,7 @@ def learn(
     """Learn one descriptor from pairs without labels: those that can be aligned teach it."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
+        check_address_space()
         from pydantic import ValidationError
 
         from agalign.config import JointSettings, Settings

@@ -38,6 +38,7 @@ from agalign.cli.terminal import (
     shown,
 )
 from agalign.values.choices import RadiometryChoice, ReliefUse
+from agalign.values.memory_limit import check_address_space
 
 if TYPE_CHECKING:
     from agalign.products.index_rasters import IndexReport
@@ -83,6 +84,7 @@ def demo(
     """Make a synthetic flight, align it, and compare the result with the known truth."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal, GOES_ON):
+        check_address_space()
         from agalign.batch import CaptureReport, RunOptions, prepare_output
         from agalign.cameras.discover import DiscoverOptions
         from agalign.config import JointSettings, Settings

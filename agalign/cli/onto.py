@@ -20,6 +20,7 @@ from agalign.cli.terminal import (
     of_running,
 )
 from agalign.values.choices import MAX_MOSAIC_PIXELS, Compression, Interpolation, RasterFormat, ReliefUse
+from agalign.values.memory_limit import check_address_space
 
 
 def onto(
@@ -56,6 +57,7 @@ def onto(
     """
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
+        check_address_space()
         from agalign.batch import RunOptions
         from agalign.cameras.discover import FolderScan
         from agalign.cameras.mosaics import captures_onto, distance_km

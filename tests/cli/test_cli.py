@@ -223,6 +223,19 @@ def test_a_full_disk_is_said_and_leaves_no_half_file(tmp_path: Path) -> None:
     assert not list((tmp_path / "out").glob(".*"))
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="limits of the address space are POSIX")
+def test_too_little_address_space_is_refused_before_libraries_are_loaded(tmp_path: Path) -> None:
+    import resource
+
+    write_pair(tmp_path / "in")
+    limits = 1_200_000_000, 1_200_000_000
+    done = agalign(
+        tmp_path / "in", "-o", tmp_path / "out", preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, limits)
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("agalign: the address space of this process is limited to 1.20 GB")
+
+
 def test_info(flight: Path) -> None:
     done = agalign("info", flight, "--json")
     assert done.returncode == 0

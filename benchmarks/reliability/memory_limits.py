@@ -1,0 +1,91 @@
+"""Limit the address space of a run, as `ulimit -v` does, from too little to load the libraries to enough.
+
+    python benchmarks/reliability/memory_limits.py [--from 1.0] [--to 2.0] [--step 0.05] [--markdown FILE]
+
+A run must finish, or end within a minute with a line that gives the reason. Linux only.
+"""
+
+import argparse
+import re
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from report import Section
+
+from agalign.synthetic import flight as synthetic
+
+CAPTURES, SIZE_PX = 4, (240, 180)
+MAX_S = 60
+
+
+def run_within(limit_gb: float, flight: Path, out: Path, *options: str) -> tuple[str, str, float]:
+    """(how it ended, its first line, seconds) of a run with so much address space."""
+    limit = int(limit_gb * 1e9)
+    began = time.monotonic()
+    command = [sys.executable, "-m", "agalign", str(flight), "-o", str(out), "--bands", "green,red", "-q", *options]
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace",
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)), start_new_session=True,
+    )  # fmt: skip
+    try:
+        _, errors = process.communicate(timeout=MAX_S)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        return f"not ended after {MAX_S} s", "", time.monotonic() - began
+    lines = errors.replace(f"{out}/", "").replace(f"{flight}/", "").splitlines()
+    line = next((line for line in lines if line.startswith("agalign: ")), lines[-1] if lines else "")
+    code = process.returncode
+    how = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
+    if "Traceback" in errors or "please report" in errors:
+        how += ", with a traceback or a request for a report"
+    elif code not in (0,) and not line.startswith("agalign: "):
+        how += ", without a reason"
+    return how, line.removeprefix("agalign: "), time.monotonic() - began
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--from", dest="first_gb", type=float, default=1.0)
+    options.add_argument("--to", dest="last_gb", type=float, default=2.0)
+    options.add_argument("--step", dest="step_gb", type=float, default=0.05)
+    options.add_argument("--jobs", type=int, nargs="+", default=[1, 2])
+    options.add_argument("--markdown", type=Path)
+    asked = options.parse_args()
+    section = Section("memory limits", asked.markdown)
+    rows: dict[tuple[int, str, str], list[tuple[float, float]]] = defaultdict(list)
+    with tempfile.TemporaryDirectory() as name:
+        flight = Path(name, "flight")
+        synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
+        for jobs in asked.jobs:
+            for step in range(round((asked.last_gb - asked.first_gb) / asked.step_gb) + 1):
+                limit_gb = asked.first_gb + step * asked.step_gb
+                # A time limit asks for worker processes; a flight of four captures is done in threads otherwise.
+                workers = ("-j", str(jobs)) if jobs == 1 else ("-j", str(jobs), "--timeout", "100")
+                how, line, seconds = run_within(limit_gb, flight, Path(name, f"out{jobs}-{step}"), *workers)
+                # The limit itself is in the line.
+                line = re.sub(r"limited to [0-9.]+ GB", "limited to … GB", line)
+                print(f"-j {jobs} {limit_gb:.2f} GB: {how}, {seconds:.1f} s: {line}", flush=True)
+                rows[jobs, how, line].append((limit_gb, seconds))
+    head = ("jobs", "limit, GB", "runs", "slowest, s", "how it ended", "first line")
+    table = [head]
+    for (jobs, how, line), seen in rows.items():
+        limits_gb, seconds_of = zip(*seen, strict=True)
+        table.append((str(jobs), _range(limits_gb), str(len(seen)), f"{max(seconds_of):.0f}", how, line))
+    section.table(table)
+
+
+def _range(limits_gb: Sequence[float]) -> str:
+    low, high = min(limits_gb), max(limits_gb)
+    return f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}"
+
+
+if __name__ == "__main__":
+    main()
