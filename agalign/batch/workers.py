@@ -3,6 +3,7 @@
 import logging
 import os
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
@@ -191,6 +192,8 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
                 )
                 address = stack.enter_context(cluster).scheduler_address
             client = Client(address, set_as_default=False, timeout=_DASK_ANSWERS_WITHIN_S)
+        except RuntimeError as error:
+            raise ConfigurationError(f"no Dask cluster can be started here ({error})") from None
         except (OSError, ValueError) as error:
             raise ConfigurationError(f"no Dask scheduler answers at {address} ({error})") from None
         yield _OnDask(stack.enter_context(client).get_executor(pure=False), timeout_s)
@@ -227,13 +230,22 @@ def start_worker(threads: int) -> None:
 def worker_context() -> BaseContext:
     """How processes are started: from one that has loaded this module, where the system bears that, else each anew.
 
-    On macOS a copy of a process that has loaded Apple's libraries may crash or hang.
+    On macOS a copy of a process that has loaded Apple's libraries may crash or hang. The fork server needs a socket in
+    a temporary folder, which a service account may not have.
     """
-    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods():
+    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not _has_temporary_folder():
         return get_context("spawn")
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])
     return context
+
+
+def _has_temporary_folder() -> bool:
+    try:
+        tempfile.gettempdir()
+    except OSError:
+        return False
+    return True
 
 
 @contextmanager

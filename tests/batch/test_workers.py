@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -137,3 +138,27 @@ def test_a_capture_that_takes_too_long_ends_its_process_on_a_cluster() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 75
     code = "from agalign.batch.workers import _within; print(_within(30, max, 1, 2))"
     assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60).stdout == b"2\n"
+
+
+def test_workers_start_without_a_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fork server needs one for its socket."""
+
+    def fails() -> str:
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "gettempdir", fails)
+    assert workers.worker_context().get_start_method() == "spawn"
+
+
+def test_a_dask_cluster_that_cannot_be_started_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed")
+
+    def fails(**_: object) -> None:
+        raise RuntimeError("Cluster failed to start: No usable temporary directory found")
+
+    monkeypatch.setattr(distributed, "LocalCluster", fails)
+    with (
+        pytest.raises(ConfigurationError, match=r"^no Dask cluster can be started here \(Cluster failed to start"),
+        dask_executor("local"),
+    ):
+        pass

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -208,10 +209,11 @@ def test_a_result_sent_before_the_kill_counts() -> None:
         assert next(outcomes).value() == 0.2
 
 
-def test_time_limits_do_not_run_on_the_clock_of_the_day(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock that is set forward in the middle of a task ends nothing."""
-    steps = iter(range(0, 10**9, 10**5))
-    monkeypatch.setattr(time, "time", lambda: next(steps))
+@pytest.mark.parametrize("step_s", [86_400, -86_400])
+def test_time_limits_do_not_run_on_the_clock_of_the_day(step_s: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that is set forward or back by a day in the middle of a task ends nothing."""
+    clock_s = count(2 * 10**9, step_s)
+    monkeypatch.setattr(time, "time", lambda: next(clock_s))
     with pool(tasks.sleep) as workers:
         assert [o.value() for o in workers.run([0.3, 0.3], timeout_s=30)] == [0.3, 0.3]
 
