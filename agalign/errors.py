@@ -52,7 +52,7 @@ class OutputError(AgalignError):
 
 
 class WorkerError(AgalignError):
-    """The worker processes cannot be started, or end one after another."""
+    """The worker processes cannot be started, or end one after another; or the cluster is lost."""
 
 
 class MemoryLimitError(AgalignError):

@@ -9,7 +9,7 @@ from typing import Protocol, Self
 
 from agalign.batch.capture import quiet
 from agalign.batch.report import CaptureReport
-from agalign.batch.workers import OnStart, Task, do_capture, done_by, done_in, own_processes
+from agalign.batch.workers import DaskExecutor, OnStart, Task, do_capture, done_by, done_in, own_processes
 from agalign.capture.align import PairProgress
 from agalign.pixels.raster import without_warnings
 from agalign.values.capture import Capture
@@ -100,8 +100,9 @@ class ExecutorRunner:
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
         """As `Runner` has it."""
         absolute = [task.absolute() for task in tasks]
+        loss = self._executor.loss if isinstance(self._executor, DaskExecutor) else str
         return done_by(
-            lambda task: self._executor.submit(do_capture, task), absolute, _MAX_WAITING_TASKS, self._timeout_s
+            lambda task: self._executor.submit(do_capture, task), absolute, _MAX_WAITING_TASKS, self._timeout_s, loss
         )
 
 

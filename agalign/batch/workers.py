@@ -25,11 +25,12 @@ from typing import Any
 
 import cv2
 
+from agalign._version import __version__
 from agalign.batch.capture import process_capture, quiet
 from agalign.batch.report import CaptureReport, StageClock
 from agalign.capture.align import PairProgress
 from agalign.config import Settings
-from agalign.errors import AgalignError, ConfigurationError
+from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
 from agalign.products.preview import preview_bytes
@@ -40,6 +41,8 @@ from agalign.values.processes import follow_parent
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 _LOG = logging.getLogger(__name__)
 _DASK_ANSWERS_WITHIN_S = 10
+_LOOKS_EVERY_S = 5.0
+"""How often the state of a cluster is checked while no task is done."""
 _GIVEN_UP_EXIT_CODE = 75
 _OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
 _CAPTURES_A_PROCESS = 500
@@ -94,19 +97,28 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
 
 
 def done_by(
-    submit: Submit, tasks: Sequence[Task], maximum: int, timeout_s: float | None = None
-) -> Iterator[CaptureReport]:
-    """Never more than `maximum` handed over at a time, so that a season's captures do not wait in memory."""
+    submit: Submit, tasks: Sequence[Task], maximum: int, timeout_s: float | None = None,
+    loss: Callable[[], str] = str,
+) -> Iterator[CaptureReport]:  # fmt: skip
+    """Never more than `maximum` handed over at a time, so that a season's captures do not wait in memory.
+
+    `loss` returns why no task can be done any more, or nothing. Raises WorkerError with that reason.
+    """
     futures: dict[Future[CaptureReport], Task] = {}
     remaining = iter(tasks)
     try:
         for task in islice(remaining, maximum):
             futures[_submitted(submit, task)] = task
         while futures:
-            done, _ = wait(futures, return_when=FIRST_COMPLETED)
+            done, _ = wait(futures, _LOOKS_EVERY_S, FIRST_COMPLETED)
+            if not done and (reason := loss()):  # futures of a lost cluster may never be done
+                raise WorkerError(reason)
             for future in done:
                 task = futures.pop(future)
-                yield _report_of(future.result, task, timeout_s)
+                report = _report_of(future.result, task, timeout_s)
+                if report.state == "error" and (reason := loss()):
+                    raise WorkerError(reason)
+                yield report
                 for following in islice(remaining, 1):
                     futures[_submitted(submit, following)] = following
     finally:
@@ -145,6 +157,8 @@ def _report_of(result: Callable[[], CaptureReport], task: Task, timeout_s: float
         problem = "the executor lost its processes (out of memory?); run again to do what is left"
     except MemoryError:
         problem = _OUT_OF_MEMORY
+    except AgalignError as error:
+        problem = str(error)
     except (Exception, CancelledError) as error:
         said = next(iter(str(error).splitlines()), type(error).__name__)
         if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
@@ -178,13 +192,15 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
     `address` is a scheduler's, such as tcp://host:8786, or `local` for so many worker processes here, 0 being one a
     core. What a lost worker was doing is done by another. A capture that takes longer than the timeout ends its worker,
     which its nanny replaces; the scheduler tries it on other workers, as often as its setting `allowed-failures` has
-    it, before it is given up. Raises ConfigurationError where Dask is not installed or the scheduler does not answer.
+    it, before it is given up. Raises ConfigurationError where Dask is not installed, the scheduler does not answer, or
+    a worker lacks this version of the package.
     """
     try:
         from distributed import Client, LocalCluster
     except ImportError:
         raise ConfigurationError("Dask is not installed; pip install 'agalign[dask]'") from None
     with ExitStack() as stack:
+        stack.enter_context(_quiet_dask())
         try:
             if address == LOCAL:
                 cluster = LocalCluster(
@@ -196,17 +212,65 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
             raise ConfigurationError(f"no Dask cluster can be started here ({error})") from None
         except (OSError, ValueError) as error:
             raise ConfigurationError(f"no Dask scheduler answers at {address} ({error})") from None
-        yield _OnDask(stack.enter_context(client).get_executor(pure=False), timeout_s)
+        _check_versions(stack.enter_context(client))
+        yield DaskExecutor(client, timeout_s)
 
 
-class _OnDask(Executor):
-    """Dask's executor, whose tasks end their worker where they take too long."""
+def _check_versions(client: Any) -> None:
+    """Raise ConfigurationError where a worker cannot load this version of the package.
 
-    def __init__(self, executor: Executor, timeout_s: float | None) -> None:
-        self._executor, self._timeout_s = executor, timeout_s
+    A worker without the package ends when it receives a task, and the run would wait for other workers.
+    """
+    # Workers without the package know the built-in functions only.
+    versions = client.run(eval, "__import__('agalign._version', fromlist=['_']).__version__", on_error="return")
+    for worker, version in sorted(versions.items()):
+        if isinstance(version, Exception):
+            problem = f"cannot load agalign ({version})"
+        elif version != __version__:
+            problem = f"has agalign {version}"
+        else:
+            continue
+        raise ConfigurationError(f"the Dask worker at {worker} {problem}; install agalign {__version__} there")
+
+
+@contextmanager
+def _quiet_dask() -> Iterator[None]:
+    """What Dask logs of a lost scheduler is a traceback; the run reports it in one line."""
+    loggers = [logging.getLogger(name) for name in ("distributed.client", "distributed.deploy.spec", "tornado")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+class DaskExecutor(Executor):
+    """The workers of a Dask cluster. A task that takes too long ends its worker."""
+
+    def __init__(self, client: Any, timeout_s: float | None) -> None:
+        self._client, self._executor, self._timeout_s = client, client.get_executor(pure=False), timeout_s
 
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
-        return self._executor.submit(_within, self._timeout_s, function, *arguments, **named)
+        return self._executor.submit(_within, self._timeout_s, _of_version, __version__, function, *arguments, **named)
+
+    def loss(self) -> str:
+        """Return why no task can be done any more; nothing while the scheduler answers."""
+        if self._client.status == "running":
+            return ""
+        return (
+            "the Dask scheduler does not answer any more; what is finished stays, and the same command goes on "
+            "from there"
+        )
+
+
+def _of_version(version: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Raise ConfigurationError on a worker of another version, which may have joined during the run."""
+    if version != __version__:
+        raise ConfigurationError(f"a Dask worker has agalign {__version__}; install agalign {version} there")
+    return function(*arguments, **named)
 
 
 def _within(timeout_s: float | None, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:

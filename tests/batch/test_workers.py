@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -15,10 +15,11 @@ import pytest
 
 import agalign
 from agalign.batch import RunOptions, dask_executor, run_flight, workers
-from agalign.batch.workers import Task, do_capture, done_by, done_in, own_processes
+from agalign.batch.report import CaptureReport
+from agalign.batch.workers import DaskExecutor, Task, do_capture, done_by, done_in, own_processes
 from agalign.cameras.discover import discover
 from agalign.config import SeedSettings, Settings
-from agalign.errors import ConfigurationError
+from agalign.errors import ConfigurationError, WorkerError
 from agalign.products.sidecar import CaptureResult
 
 from ..values.pool_tasks import signal_self
@@ -138,6 +139,60 @@ def test_a_capture_that_takes_too_long_ends_its_process_on_a_cluster() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 75
     code = "from agalign.batch.workers import _within; print(_within(30, max, 1, 2))"
     assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60).stdout == b"2\n"
+
+
+class Client:
+    """A Dask client with the answers of its workers."""
+
+    def __init__(self, versions: dict[str, object], status: str = "running") -> None:
+        self.versions, self.status = versions, status
+
+    def run(self, *_: object, **__: object) -> dict[str, object]:
+        return self.versions
+
+    def get_executor(self, **_: object) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(1)
+
+
+@pytest.mark.parametrize(
+    ("answer", "problem"),
+    [
+        ("0.0.9", "the Dask worker at tcp://b:1 has agalign 0.0.9; install agalign"),
+        (
+            ModuleNotFoundError("No module named 'agalign'"),
+            r"the Dask worker at tcp://b:1 cannot load agalign \(No mod",
+        ),
+    ],
+)
+def test_a_dask_worker_without_this_version_is_refused(answer: object, problem: str) -> None:
+    with pytest.raises(ConfigurationError, match=problem):
+        workers._check_versions(Client({"tcp://a:1": agalign.__version__, "tcp://b:1": answer}))
+    workers._check_versions(Client({"tcp://a:1": agalign.__version__}))
+
+
+def test_a_dask_worker_of_another_version_that_joins_later_does_nothing() -> None:
+    assert workers._of_version(agalign.__version__, max, 1, 2) == 2
+    with pytest.raises(ConfigurationError, match=r"^a Dask worker has agalign .*; install agalign 0\.0\.9 there$"):
+        workers._of_version("0.0.9", max, 1, 2)
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_lost_dask_scheduler_ends_the_run_in_one_line(
+    ends: bool, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Futures of a lost scheduler are cancelled, or never end."""
+    monkeypatch.setattr(workers, "_LOOKS_EVERY_S", 0.01)
+    executor = DaskExecutor(Client({}, "connecting"), None)
+
+    def submit(_: Task) -> "Future[CaptureReport]":
+        future: Future[CaptureReport] = Future()
+        if ends:
+            future.cancel()
+            future.set_running_or_notify_cancel()
+        return future
+
+    with pytest.raises(WorkerError, match=r"^the Dask scheduler does not answer any more; what is finished stays"):
+        list(done_by(submit, seeds_only(flight, tmp_path), 1, loss=executor.loss))
 
 
 def test_workers_start_without_a_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:
