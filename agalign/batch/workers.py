@@ -223,6 +223,8 @@ def _check_versions(client: Any) -> None:
     """
     # Workers without the package know the built-in functions only.
     versions = client.run(eval, "__import__('agalign._version', fromlist=['_']).__version__", on_error="return")
+    if not versions:
+        _LOG.warning("agalign: no worker is connected to the Dask scheduler; the run waits for one")
     for worker, version in sorted(versions.items()):
         if isinstance(version, Exception):
             problem = f"cannot load agalign ({version})"

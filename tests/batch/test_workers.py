@@ -170,6 +170,11 @@ def test_a_dask_worker_without_this_version_is_refused(answer: object, problem: 
     workers._check_versions(Client({"tcp://a:1": agalign.__version__}))
 
 
+def test_a_dask_scheduler_without_workers_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    workers._check_versions(Client({}))
+    assert caplog.messages == ["agalign: no worker is connected to the Dask scheduler; the run waits for one"]
+
+
 def test_a_dask_worker_of_another_version_that_joins_later_does_nothing() -> None:
     assert workers._of_version(agalign.__version__, max, 1, 2) == 2
     with pytest.raises(ConfigurationError, match=r"^a Dask worker has agalign .*; install agalign 0\.0\.9 there$"):
