@@ -153,6 +153,10 @@ def test_a_required_product_that_fails_costs_the_capture(align: Align, monkeypat
     monkeypatch.setattr(Histogram, "is_required", False)
     report = align()
     assert (report.state, report.shortcomings) == ("done", ("f.histogram.json: cannot be written",))
+    assert report.result is not None
+    assert report.result.not_written == ["histogram"]
+    monkeypatch.setattr(batch_capture, "PRODUCTS", PRODUCTS)
+    assert [align().state for _ in range(2)] == ["done", "kept"]
 
 
 def test_what_a_product_needs_is_checked_before_the_capture_is_aligned(
