@@ -20,7 +20,7 @@ from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, why, without_wa
 from agalign.products.drawing import with_text, write_png
 from agalign.products.fill_sidecar import is_delivered
 from agalign.products.indices import Index, bands_for, compute
-from agalign.products.raster_file import check_complete
+from agalign.products.raster_file import PixelChecksums, check_complete
 from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
 from agalign.values.files import complete_file
 from agalign.values.image import FloatImage
@@ -149,14 +149,16 @@ def _write_values(
     edges: NDArray[np.float64],
 ) -> None:  # fmt: skip
     """Write the raster and add its values to the histogram's counts. Raises OutputError."""
+    checksums = PixelChecksums()
     try:
         with ExitStack() as stack:
             dataset = _create(stack, partial, sources[0][0], index, raw=unit == _RAW)
             for window in _windows(dataset.width, dataset.height):
                 value = compute(index, [_physical(source, i, window) for source, i in sources])
                 counts += np.histogram(value[np.isfinite(value)].clip(*index.span), edges)[0]
-                dataset.write(value, 1, window=window)
+                checksums.write(dataset, value, 1, window)
         check_complete(partial)
+        checksums.check(partial)
     except (OSError, RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{target}: cannot be written ({why(error)})") from None
 

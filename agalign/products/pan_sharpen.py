@@ -30,7 +30,7 @@ from agalign.pixels.resample import tiles
 from agalign.products.layout import Layer, output_layers
 from agalign.products.nodata import with_nodata
 from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import GEOTIFF, check_complete, write_raster
+from agalign.products.raster_file import GEOTIFF, PixelChecksums, check_complete, write_raster
 from agalign.values.capture import Band, Capture
 from agalign.values.files import complete_file, scratch_file
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
@@ -123,8 +123,10 @@ def _write(sources: _Sources, path: Path, context: ProductContext, settings: Wri
             # Ratios are of light: what a sensor counts in the dark is none.
             dark = [_dark(layer.band, settings) for layer in layers]
             with complete_file(path) as partial:
-                _sharpen(unsharpened, partial, bands, pan, sources.is_seen, dark, max(grid.scale), nodata)
+                scale = max(grid.scale)
+                checksums = _sharpen(unsharpened, partial, bands, pan, sources.is_seen, dark, scale, nodata)
                 check_complete(partial)
+                checksums.check(partial)
     except RasterioError as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
 
@@ -152,8 +154,9 @@ def brovey_ratio(bands: Sequence[FloatImage], pan: FloatImage, weights: NDArray[
 def _sharpen(
     source: Path, target: Path, bands: Sequence[Band], pan: Sequence[Band], seen: Sequence[bool], dark: Sequence[float],
     scale: float, nodata: float | None,
-) -> None:  # fmt: skip
+) -> PixelChecksums:  # fmt: skip
     """From a file of the bands and, after them, the panchromatic's planes."""
+    checksums = PixelChecksums()
     with open_raster(source) as file, without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT):
         of_light = [k for k, is_seen in enumerate(seen) if is_seen]
         side = Tile(
@@ -172,7 +175,9 @@ def _sharpen(
                 ratio = brovey_ratio([planes[k] for k in of_light], planes[len(bands) :].mean(axis=0), weights)
                 for k, is_sharpened in enumerate(seen):
                     values = (planes[k] * ratio if is_sharpened else planes[k]) + np.float32(dark[k])
-                    written.write(_as(values, valid[k], file.dtypes[0], nodata), k + 1, window=_window(tile))
+                    pixels = _as(values, valid[k], file.dtypes[0], nodata)
+                    checksums.write(written, pixels, k + 1, _window(tile))
+    return checksums
 
 
 def _is_seen(band: Band, pan: Sequence[Band]) -> bool:

@@ -1,6 +1,7 @@
 """One aligned raster on the reference's pixel grid, a tiled GeoTIFF or COG: written, then checked to be complete."""
 
 import errno
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ _FILL_DISTANCE_PX = 100.0
 """From which occluded pixels are interpolated: GDAL's default, wider than any occlusion."""
 _COG_TILE_PX = 512
 """GDAL's default for a COG."""
+_INCOMPLETE = "the file came out incomplete; is the disk full?"
 
 
 def write_raster(
@@ -64,11 +66,12 @@ def write_raster(
     profile = _profile(capture.reference, len(layers), grid, dtype, nodata, compression)
     try:
         with complete_file(path) as partial, without_libtiffs_lines():
+            checksums = PixelChecksums()
             with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT):
                 with rasterio.open(partial, "w", **profile) as dataset:
                     describe(dataset, capture, layers, settings)
                     for index, layer in enumerate(layers, start=1):
-                        _write_layer(dataset, index, layer, grid, nodata, settings)
+                        _write_layer(dataset, index, layer, grid, nodata, settings, checksums)
                 if capture.reference.overviews and settings.format == "gtiff":
                     with rasterio.open(partial, "r+") as dataset:
                         dataset.build_overviews(list(capture.reference.overviews), Resampling.average)
@@ -78,6 +81,7 @@ def write_raster(
                 if settings.format == "cog":
                     _to_cog(partial, compression)
             check_complete(partial)
+            checksums.check(partial)
     except (RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
     return nodata
@@ -99,17 +103,19 @@ def write_layers(
     profile |= {} if georeference is None else georeferenced(georeference, grid)
     try:
         with complete_file(path) as partial, without_libtiffs_lines():
+            checksums = PixelChecksums()
             with (
                 without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
             ):  # fmt: skip
                 for index, (name, values) in enumerate(layers.items(), start=1):
-                    dataset.write(values, index)
+                    checksums.write(dataset, values, index, Window(0, 0, grid.width, grid.height))
                     dataset.set_band_description(index, name)
                     if units is not None:
                         dataset.set_band_unit(index, units[name])
                     if tags is not None:
                         dataset.update_tags(index, **tags[name])
             check_complete(partial)
+            checksums.check(partial)
     except (RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
 
@@ -128,7 +134,34 @@ def check_complete(path: Path) -> None:
     with tifffile.TiffFile(path) as tiff:
         segments = [s for page in tiff.pages for s in zip(page.dataoffsets, page.databytecounts, strict=True)]
     if not segments or any(count == 0 or offset + count > size for offset, count in segments):
-        raise OSError(errno.EIO, "the file came out incomplete; is the disk full?")
+        raise OSError(errno.EIO, _INCOMPLETE)
+
+
+class PixelChecksums:
+    """Checksums of pixels as they are written, and the comparison with the finished file.
+
+    GDAL keeps tiles in memory and writes the last ones when it closes a file. Where that write fails once, it reports
+    no error and fills the tile with zeros.
+    """
+
+    def __init__(self) -> None:
+        self._written: list[tuple[int, Window, int]] = []
+
+    def write(self, dataset: Any, pixels: Pixels, index: int, window: Window) -> None:
+        """Write the pixels of a band, from 1, into a window of an open dataset."""
+        dataset.write(pixels, index, window=window)
+        self._written.append((index, window, _checksum(pixels)))
+
+    def check(self, path: Path) -> None:
+        """Raise OSError where the file does not have the pixels that were written."""
+        with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(path) as dataset:
+            for index, window, checksum in self._written:
+                if _checksum(dataset.read(index, window=window)) != checksum:
+                    raise OSError(errno.EIO, _INCOMPLETE)
+
+
+def _checksum(pixels: Pixels) -> int:
+    return zlib.crc32(np.ascontiguousarray(pixels).data.cast("B"))
 
 
 def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any]:
@@ -141,8 +174,9 @@ def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any
 
 
 def _write_layer(
-    dataset: Any, index: int, layer: Layer, grid: OutputGrid, nodata: float | None, settings: WriteSettings
-) -> None:
+    dataset: Any, index: int, layer: Layer, grid: OutputGrid, nodata: float | None, settings: WriteSettings,
+    checksums: PixelChecksums,
+) -> None:  # fmt: skip
     dtype = np.dtype(dataset.dtypes[0])
     for tile in tiles(grid.tile, _WORK_TILE_PX):
         pixels, valid = _tile_of(layer, tile, settings)
@@ -151,7 +185,7 @@ def _write_layer(
         elif nodata is not None and not (valid.all() and layer.is_copied):
             pixels = with_nodata(pixels.astype(dtype, copy=False), valid, nodata)
         window = Window(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
-        dataset.write(pixels.astype(dtype, copy=False), index, window=window)
+        checksums.write(dataset, pixels.astype(dtype, copy=False), index, window)
 
 
 def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels | None, Mask]:
