@@ -24,7 +24,7 @@ OPTIONS_AND_RESULTS = {
 UNITS = {"FixedFilePx", "FixedImagePx", "MovingFilePx"}
 ERRORS = {
     "AgalignError", "ConfigurationError", "GeometryError", "InputError", "NoContrastError", "NoSuchBandError",
-    "NotEnoughTextureError", "OutputError", "SidecarError", "UnreadableFileError", "WorkerError",
+    "MemoryLimitError", "NotEnoughTextureError", "OutputError", "SidecarError", "UnreadableFileError", "WorkerError",
 }  # fmt: skip
 
 
