@@ -134,7 +134,11 @@ def fit_plane_parallax(
         baselines, parallax = baselines / longest, parallax * longest
         explained = np.einsum("nki,bi->nbk", design, corners) + parallax[:, None, None] * baselines
         misfits = np.where(windows.weights > 0, np.linalg.norm(shifts - explained, axis=2), np.nan)
-        weights = windows.weights * np.nan_to_num(cauchy_weights(misfits, _SPREADS * _spreads_px(misfits)))
+        spreads = _spreads_px(misfits)
+        weights = windows.weights * np.nan_to_num(cauchy_weights(misfits, _SPREADS * spreads))
+        # Inverse variances, of bands worse than the median: one that shows something else must not decide the parallax
+        # of the others.
+        weights *= np.minimum(1, (np.median(spreads) / spreads) ** 2)
     if layout is not None and np.sum(baselines * layout) < 0:
         baselines, parallax = -baselines, -parallax
     return PlaneParallax(baselines, corners, parallax, misfits)

@@ -71,6 +71,17 @@ def test_windows_that_some_bands_do_not_show() -> None:
     np.testing.assert_array_equal(np.isfinite(model.misfits_px), some.weights > 0)
 
 
+@pytest.mark.parametrize("layout", [BASELINES, None])
+def test_a_band_that_shows_something_else_does_not_decide_for_the_others(layout: np.ndarray | None) -> None:
+    windows = shifts(wrong=0.0)
+    windows.shifts_px[:, 0] = np.random.default_rng(2).uniform(-20, 20, (len(POINTS), 2))
+    model = fit_plane_parallax(windows, SIZE, layout)
+    assert model is not None
+    others = model.baselines[1:] / np.linalg.norm(model.baselines[1:], axis=1).max()
+    wanted = BASELINES[1:] * np.sign(np.sum(others * BASELINES[1:]))
+    np.testing.assert_allclose(others, wanted / np.linalg.norm(wanted, axis=1).max(), atol=0.03)
+
+
 def test_the_layout_may_be_wrong_but_for_its_sign() -> None:
     rough = BASELINES + np.random.default_rng(5).normal(0, 0.15, BASELINES.shape)
     assert_recovered(fit_plane_parallax(shifts(), SIZE, rough))
