@@ -37,10 +37,10 @@ class NotEnoughTextureError(AgalignError):
 
 
 class NoContrastError(AgalignError):
-    """No pixel of the reference has contrast enough to learn from."""
+    """No pixel of the reference has enough contrast to learn from."""
 
     def __str__(self) -> str:
-        return "no pixel of the reference band has contrast enough to learn from"
+        return "no pixel of the reference band has enough contrast to learn from"
 
 
 class SidecarError(InputError):

@@ -276,14 +276,12 @@ class Alignment(Generic[FixedPx]):
         if told is None or self.status == "aligned":
             return None
         if self.status == "predicted" and self.prediction is not None:
-            known = f"known to {self.prediction.std_px:.2f} px from {_SOURCES[self.prediction.source]}"
-            if self.prediction.source == "windows":
-                return f"{told}, {known}"
-            return f"{told}; the rig of the flight says where it lies, {known}"
+            source, std_px = _SOURCES[self.prediction.source], self.prediction.std_px
+            return f"{told}; predicted from {source}, standard error {std_px:.2f} px"
         if self.status == "seed_only":
-            return f"{told}; the {self.seed.kind} seed is used as it is"
+            return f"{told}; the {self.seed.kind} seed is used unchanged"
         if self.issues[-1].kind == SEED_DOES_NOT_FIT:
-            return f"{told}; the {self.seed.kind} seed is used as it is, {sentence(self.issues[-1])}"
+            return f"{told}; the {self.seed.kind} seed is used unchanged, {sentence(self.issues[-1])}"
         return told
 
     def __repr__(self) -> str:

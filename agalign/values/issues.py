@@ -54,24 +54,24 @@ def explanation(issues: Sequence[Issue]) -> str | None:
 # ---- remedies that kinds in several modules share
 
 TEXTURELESS = Remedy(
-    "too little in common to hold on to: water, fog, blur or noise in one of the bands",
-    "take part with all bands and the default reference, which hold most; where three captures of the flight have "
-    "texture its rig places such bands, and --model OUT/models/… of an earlier flight does so from the first on",
+    "too little common structure: water, fog, blur or noise in one of the bands",
+    "align all bands together, with the default reference; such bands are predicted once three captures of the flight "
+    "have texture, or with --model OUT/models/… of an earlier flight",
 )
 UNLIKE = Remedy(
-    "the bands do not show the same thing",
-    "look at the picture: did the scene move between the exposures, is one band blurred or of another place? --seed "
-    "match finds images that lie far apart; --model OUT/models/… brings what an earlier flight knows of the camera",
+    "the bands do not show the same scene",
+    "look at the picture: did the scene move between the exposures, is a band blurred or from another place? "
+    "--seed match finds images that are far apart; --model OUT/models/… uses the rig of an earlier flight",
 )
 MISSING_BAND = Remedy("a band is missing that other captures of this camera have", "copy the files from the card again")
 
 # ---- kinds of issues that reading, seeding and estimation report; a check defines its own
 
 _BLANK = Remedy(
-    "a band shows nothing: all its pixels are one value, or invalid",
-    "look at the file: a covered lens, a dead sensor or wrong exposure; --bands leaves a band out",
+    "a band is blank: its pixels are constant or invalid",
+    "look at the file: covered lens, defective sensor or wrong exposure; --bands leaves a band out",
 )
-_ASKED = Remedy("only the first guess was asked for", "leave --seed and --only-seed out")
+_ASKED = Remedy("only the seed was requested", "omit --seed and --only-seed")
 
 UNREADABLE = IssueKind(
     "unreadable", "{detail}",
@@ -79,20 +79,20 @@ UNREADABLE = IssueKind(
 )  # fmt: skip
 BLANK_REFERENCE = IssueKind("blank_reference", "the reference band is constant or all invalid", _BLANK)
 BLANK_MOVING = IssueKind("blank_moving", "the moving band is constant or all invalid", _BLANK)
-NO_SUCH_SEED = IssueKind("no_such_seed", "there is no {detail} seed for it; leave --seed out", _ASKED)
-SEED_ASKED_FOR = IssueKind("seed_asked_for", "only the seed was asked for", _ASKED)
+NO_SUCH_SEED = IssueKind("no_such_seed", "it has no {detail} seed; omit --seed", _ASKED)
+SEED_ASKED_FOR = IssueKind("seed_asked_for", "only the seed was requested", _ASKED)
 NO_CONTRAST = IssueKind(
-    "no_contrast", "no pixel of the reference band has contrast enough to learn from", TEXTURELESS
+    "no_contrast", "no pixel of the reference band has enough contrast to learn from", TEXTURELESS
 )  # fmt: skip
 FEW_KEYPOINTS = IssueKind(
-    "few_keypoints", "only {value:.0f} keypoints lie on the common valid area", TEXTURELESS
+    "few_keypoints", "only {value:.0f} keypoints are in the common valid area", TEXTURELESS
 )  # fmt: skip
 NOT_INVERTIBLE = IssueKind(
-    "not_invertible", "the optimisation ended in a mapping that cannot be inverted", UNLIKE
+    "not_invertible", "the optimisation diverged to a mapping that cannot be inverted", UNLIKE
 )  # fmt: skip
-CORNERS_UNKNOWN = IssueKind("corners_unknown", "the patches do not say where the corners lie", TEXTURELESS)
+CORNERS_UNKNOWN = IssueKind("corners_unknown", "the patches do not determine the corners", TEXTURELESS)
 RETRIEVAL = IssueKind(
-    "retrieval", "descriptors do not tell held-out patches apart (retrieval {value:.2f})", TEXTURELESS
+    "retrieval", "the descriptors do not distinguish held-out patches (retrieval {value:.2f})", TEXTURELESS
 )  # fmt: skip
 """Reported by the descriptor check, and by the estimation where it gives up early."""
 SEED_DOES_NOT_FIT = IssueKind("seed_does_not_fit", "but it does not fit either", UNLIKE)

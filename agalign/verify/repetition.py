@@ -13,9 +13,9 @@ from agalign.verify.check import Check, Evidence
 
 REPEATS = IssueKind(
     "repeats",
-    "the scene repeats: {value:.0f} px away it fits nearly as well, and nothing says which place is right",
+    "the scene repeats: a shift of {value:.0f} px fits nearly as well, and no prior information decides",
     Remedy(
-        "the scene repeats, and nothing says which place is the right one",
+        "the scene repeats, and no prior information decides which shift is right",
         "keep the camera's metadata in the files (no --ignore-metadata), or give --model OUT/models/… of an earlier "
         "flight",
     ),

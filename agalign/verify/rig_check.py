@@ -7,10 +7,10 @@ from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
 UNEXPECTED_PX = IssueKind(
-    "unexpected_px", "it lies {value:.1f} px from where the rig of the flight has it",
+    "unexpected_px", "it is {value:.1f} px from the position that the rig of the flight predicts",
     Remedy(
-        "it lies elsewhere than the rig of the flight has it",
-        "if a lens was knocked or changed, align without --model; else look at the picture",
+        "the result contradicts the rig of the flight",
+        "if a lens was replaced or moved, align without --model; otherwise look at the picture",
     ),
 )  # fmt: skip
 MAX_UNEXPECTED_PX = 3.0

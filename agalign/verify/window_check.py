@@ -13,14 +13,17 @@ from agalign.values.issues import TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
 from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
-_RELIEF = Remedy("a part of the image lies apart: trees, buildings or terraces near the camera", "--relief follows it")
-FEW_WINDOWS = IssueKind("few_windows", "too little structure in common to check the result", TEXTURELESS)
-COVERAGE = IssueKind("coverage", "the structures agree in only {value:.0%} of the windows", UNLIKE)
+_RELIEF = Remedy(
+    "parallax (trees, buildings or terraces near the camera), or motion between the exposures",
+    "fly higher, or slower; --relief never must not be set, and --bands leaves a band out",
+)
+FEW_WINDOWS = IssueKind("few_windows", "too little common structure to verify the result", TEXTURELESS)
+COVERAGE = IssueKind("coverage", "a shift can be measured in only {value:.0%} of the windows", UNLIKE)
 CLOSE_WINDOWS = IssueKind(
-    "close_windows", "the structures lie within {detail} in only {value:.0%} of the windows", _RELIEF
+    "close_windows", "only {value:.0%} of the windows are aligned to {detail}", _RELIEF
 )  # fmt: skip
-CLUSTER = IssueKind("cluster", "{value:.0%} of the windows, beside each other, lie apart", _RELIEF)
-RESIDUAL_PX = IssueKind("residual_px", "the structures still lie {value:.1f} px apart", UNLIKE)
+CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", _RELIEF)
+RESIDUAL_PX = IssueKind("residual_px", "the median residual shift is {value:.1f} px", UNLIKE)
 
 _MIN_WINDOWS = 4
 """Windows with structure without which nothing can be verified: fewer leave a corner of the image unseen."""

@@ -302,7 +302,7 @@ def test_names_are_never_more_than_names(page: Any) -> None:
 def test_in_words_and_in_numbers(page: Any) -> None:
     look_at(page, "IMG_0002")
     words = page.locator(".words").inner_text()
-    assert "fit for indices of single plants" in words
+    assert "suitable for indices of single plants" in words
     assert "NIR is lost" in words
     assert "→" in page.locator("#capture table").inner_text()
 

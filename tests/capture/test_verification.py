@@ -66,7 +66,7 @@ def test_a_doubted_result_leaves_the_seed_and_its_windows(pair: BandPair) -> Non
 def test_no_result_at_all_is_told_in_its_own_words(pair: BandPair) -> None:
     result = verified(pair, SEED, Issue(FEW_KEYPOINTS, 3, 16), SETTINGS)
     assert result.status == "seed_only"
-    assert result.reason == "only 3 keypoints lie on the common valid area; the rig seed is used as it is"
+    assert result.reason == "only 3 keypoints are in the common valid area; the rig seed is used unchanged"
 
 
 def test_an_unrelated_image_is_failed_seed_or_not() -> None:

@@ -807,28 +807,28 @@ function words(capture) {
  * @param {Pair} pair @param {string} reference
  */
 function sentence(pair, reference) {
-  const lay = pair.apart_px === null || pair.apart_px < 0.05 ? "" : `lay ${fixed(pair.apart_px, pair.apart_px < 10 ? 1 : 0)} px beside ${reference} and `;
+  const lay = pair.apart_px === null || pair.apart_px < 0.05 ? "" : `had an offset of ${fixed(pair.apart_px, pair.apart_px < 10 ? 1 : 0)} px from ${reference} and `;
   if (pair.status === "aligned") {
     const left = pair.residual_px;
-    if (left === null) return `${lay}is aligned; no window could measure what is left.`;
-    const use = left <= 0.5 ? "fit for indices of single plants" : left <= 1 ? "fit for indices of rows and plots; edges of single leaves may be off" : "fit for averages over an area";
-    const most = pair.residual_p95_px === null ? "" : `, and 95 % within ${fixed(pair.residual_p95_px)} px`;
-    const seen = pair.occluded === null ? "" : ` It follows the relief of the capture; ${percent(pair.occluded)} of the image is occluded in it.`;
-    return `${lay}is aligned: half of its windows now lie within ${fixed(left)} px${most}; ${use}.${seen}`;
+    if (left === null) return `${lay}is aligned; no window could measure a residual.`;
+    const use = left <= 0.5 ? "suitable for indices of single plants" : left <= 1 ? "suitable for indices of rows and plots, not of single leaves" : "suitable for averages over an area";
+    const most = pair.residual_p95_px === null ? "" : `, 95 % ${fixed(pair.residual_p95_px)} px`;
+    const seen = pair.occluded === null ? "" : ` The relief of the capture is corrected; ${percent(pair.occluded)} of its image is occluded.`;
+    return `${lay}is aligned: median residual ${fixed(left)} px${most}; ${use}.${seen}`;
   }
   if (pair.status === "predicted") {
     const std = pair.prediction?.std_px ?? Infinity;
-    const use = std <= 1 ? "fit for indices, within that" : "too far off for indices";
-    const how = pair.prediction?.from === "windows" ? "is extrapolated over a part of the image" : "is placed by the rig of the flight";
-    return `${lay}${how}, to ±${fixed(std)} px (${use}): ${pair.reason ?? "no reason on record"}.`;
+    const use = std <= 1 ? "suitable for indices within that error" : "not suitable for indices";
+    const how = pair.prediction?.from === "windows" ? "is predicted by its windows" : "is predicted by the rig of the flight";
+    return `${lay}${how}, standard error ${fixed(std)} px (${use}): ${pair.reason ?? "no reason on record"}.`;
   }
-  if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason on record"}. It lies at its first guess; leave it out of indices.`;
-  return `is lost: ${pair.reason ?? "no reason on record"}. Nothing is written of it.`;
+  if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason on record"}. Only its seed is applied; exclude it from indices.`;
+  return `failed: ${pair.reason ?? "no reason on record"}. Nothing of it is written.`;
 }
 
 /** @param {Capture} capture */
 function numbers(capture) {
-  const heads = ["Band", "Status", "Start", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Mattes MI", "NMI", "NCC", "Gradients", "SSIM", "Local field, 95 %", "Relief, occluded", "Seconds"];
+  const heads = ["Band", "Status", "Seed", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Mattes MI", "NMI", "NCC", "Gradients", "SSIM", "Local field, 95 %", "Relief, occluded", "Seconds"];
   const body = moving(capture).map((pair) => {
     /** @param {string} name @param {number} [digits] */
     const change = (name, digits = 3) => {
