@@ -1,4 +1,4 @@
-"""What fell short in a run, on the terminal: once for each cause, with what to try."""
+"""What went wrong in a run, on the terminal: once for each cause, with what to try."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING

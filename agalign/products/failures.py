@@ -1,4 +1,4 @@
-"""What fell short in a run, told once for each cause, with what to try."""
+"""The problems of a run, each cause once, with what to try."""
 
 from dataclasses import dataclass, field
 

@@ -92,7 +92,7 @@ def look_at(page: Any, label: str) -> None:
 def test_what_fell_short_stands_first(page: Any) -> None:
     """And is shown without being asked for."""
     first = page.locator("section h2").first
-    assert first.inner_text() == "What fell short"
+    assert first.inner_text() == "Problems"
     assert "IMG_0002" in page.locator("#capture-title").inner_text()
     assert page.locator(".short").count() >= 2
     assert "What to try" in page.locator(".short p").first.inner_text()

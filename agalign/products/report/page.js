@@ -457,8 +457,8 @@ function viewTools(capture) {
   if (capture.preview?.error_full_px) overlays.push(["error", "error to be expected"]);
   if (capture.preview?.relief) overlays.push(["relief", "relief of all bands"]);
   line.append(
-    choice("Over it", overlays, look.overlay, (value) => { look.overlay = value; paint(); }, "What lies over it"),
-    choice("of", moving(capture).map((b) => [b.band, b.band]), look.overlayBand, (value) => { look.overlayBand = value; paint(); }, "Band of what lies over it"),
+    choice("Overlay", overlays, look.overlay, (value) => { look.overlay = value; paint(); }, "Overlay"),
+    choice("of", moving(capture).map((b) => [b.band, b.band]), look.overlayBand, (value) => { look.overlayBand = value; paint(); }, "Band of the overlay"),
   );
   return line;
 }
