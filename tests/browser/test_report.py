@@ -200,13 +200,13 @@ def test_what_is_laid_over_the_picture(page: Any, overlay: str) -> None:
     page.locator("#swipe").focus()
     page.keyboard.press("Home")
     bare = drawn(page)
-    page.get_by_label("What lies over it", exact=True).select_option(overlay)
+    page.get_by_label("Overlay", exact=True).select_option(overlay)
     # The errors of this flight are small: what is laid over it for them is faint.
     assert (np.abs(drawn(page) - bare).max(axis=2) > (5 if overlay == "error" else 40)).sum() > 400
     page.locator("#swipe").focus()
     page.keyboard.press("End")
     before = drawn(page)
-    page.get_by_label("What lies over it", exact=True).select_option("none")
+    page.get_by_label("Overlay", exact=True).select_option("none")
     assert np.abs(drawn(page) - before).mean() < 0.3, "residuals are those of after"
 
 
@@ -228,7 +228,7 @@ def test_the_relief_over_the_picture(browser: Any, out: Path, tmp_path: Path) ->
         page.wait_for_function(
             "label => document.querySelector('#capture-title').textContent.includes(label)", arg=name
         )
-        page.get_by_label("What lies over it", exact=True).select_option("relief")
+        page.get_by_label("Overlay", exact=True).select_option("relief")
         page.locator("#swipe").focus()
         page.keyboard.press("Home")
         image = drawn(page)  # blue, green, red
@@ -290,8 +290,8 @@ def test_next_and_previous_follow_the_table(page: Any) -> None:
 def test_names_are_never_more_than_names(page: Any) -> None:
     look_at(page, "a'b&c")
     for overlay in ("vectors", "error"):
-        page.get_by_label("What lies over it", exact=True).select_option(overlay)
-    page.get_by_label("Band of what lies over it").select_option(HOSTILE)
+        page.get_by_label("Overlay", exact=True).select_option(overlay)
+    page.get_by_label("Band of the overlay").select_option(HOSTILE)
     assert HOSTILE in page.locator("#capture").inner_text()
     page.locator("details").evaluate_all("all => all.forEach((d) => { d.open = true; })")
     assert any(HOSTILE in text for text in page.locator(".short").all_inner_texts())
@@ -303,7 +303,7 @@ def test_in_words_and_in_numbers(page: Any) -> None:
     look_at(page, "IMG_0002")
     words = page.locator(".words").inner_text()
     assert "suitable for indices of single plants" in words
-    assert "NIR is lost" in words
+    assert "NIR failed" in words
     assert "→" in page.locator("#capture table").inner_text()
 
 
