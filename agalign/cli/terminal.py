@@ -48,6 +48,15 @@ def in_json(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
+class _Console(Console):
+    """A stream whose reader may go, as with `| head -1`: nothing more is printed, and the work goes on."""
+
+    def on_broken_pipe(self) -> None:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self.file.fileno())
+        os.close(nowhere)
+
+
 class Terminal:
     """How the program speaks: results to standard output, progress and complaints to standard error."""
 
@@ -55,17 +64,17 @@ class Terminal:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
         self._stopped_by: int | None = None
         # Lines in a file or a pipe are not wrapped to a terminal's width.
-        self.out = Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-        self.err = Console(stderr=True, highlight=False, emoji=False, soft_wrap=not sys.stderr.isatty())
+        self.out = _Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
+        self.err = _Console(stderr=True, highlight=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 
     def event(self, kind: str, text: str = "", /, **fields: Any) -> None:
         """One line of progress: JSON with --log-json, else the text unless --quiet."""
         if self.log_json:
-            print(
-                json.dumps({"event": kind, **{k: in_json(v) for k, v in fields.items()}}, default=str),
-                file=sys.stderr,
-                flush=True,
-            )
+            line = json.dumps({"event": kind, **{k: in_json(v) for k, v in fields.items()}}, default=str)
+            try:
+                print(line, file=sys.stderr, flush=True)
+            except BrokenPipeError:
+                self.err.on_broken_pipe()
         elif text and not self.quiet:
             self.err.print(shown(text))
 

@@ -237,7 +237,7 @@ def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
     assert after.lens.cx_px == pytest.approx(2 * (before.lens.cx_px + 0.5) - 0.5 - 40, abs=1e-3)
 
 
-@pytest.mark.parametrize("centre", [("1e30", "1e30"), ("nan", "0"), ("99999", "99999")])
+@pytest.mark.parametrize("centre", [("1e14", "1e14"), ("nan", "0"), ("99999", "99999")])
 def test_a_centre_of_vignetting_that_lies_nowhere_is_left_out(tmp_path: Path, centre: tuple[str, str]) -> None:
     values = {(CAMERA, "VignettingCenter"): centre, (CAMERA, "VignettingPolynomial"): ("1e-4",)}
     path = tmp_path / "IMG_0001_2.tif"

@@ -629,6 +629,10 @@ def unread_errors(scene: Scene) -> None:
     scene.watch = lambda _: None
 
 
+def asking_too(*options: str) -> Callable[[Scene], None]:
+    return lambda scene: scene.arguments.extend(options)
+
+
 def long_temporary_folder(scene: Scene) -> None:
     folder = scene.folder.parent / ("t" * 150)
     folder.mkdir()
@@ -792,7 +796,8 @@ FAULTS = (
         endless_number, commanding("{folder}", "-o", "{out}", "-j", "1")), 0, "", ("a", "b")),
     Fault("standard output closed", without_streams(1), 0, "", ("a", "b")),
     Fault("all standard streams closed", without_streams(0, 1, 2), 0, "", ("a", "b")),
-    Fault("standard error that nobody reads", unread_errors, 0, "", ("a", "b", "c", "d", "e")),
+    Fault("standard error that nobody reads", unread_errors, 0, "", tuple("abcde")),
+    Fault("JSON lines that nobody reads", both(unread_errors, asking_too("--log-json")), 0, "", tuple("abcde")),
     Fault("a temporary folder with a name of 150 letters", long_temporary_folder, 0, "", ("a", "b")),
     Fault("a file system without locks", no_locks, 0, "", ("a", "b")),
     Fault("an empty name for the folder", commanding("", "-o", "{out}"), 2, "the name of the folder is empty", ()),
