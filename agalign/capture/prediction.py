@@ -65,7 +65,9 @@ def _with_prediction(
             return replace(alignment, prediction=prediction)
         alignment = replace(alignment, issues=issues)
     if alignment.prediction is not None and alignment.prediction.std_px <= prediction.std_px:
-        return alignment
+        by_windows = pair.scales.between_files(alignment.fixed_to_moving)
+        if distance_px(by_windows, prediction.fixed_to_moving, rig.size_px) <= MAX_UNEXPECTED_PX:
+            return alignment
     predicted = as_predicted(alignment, pair, prediction)
     assert predicted.residual is not None
     rotated = find_rotated(pair, predicted.fixed_to_moving, predicted.residual)

@@ -14,12 +14,15 @@ import agalign
 from agalign.batch import CaptureReport
 from agalign.batch.learn import learn_flight
 from agalign.cameras.discover import discover
-from agalign.capture.align import align_capture_bands
+from agalign.capture.align import align_capture_bands, align_pairs
+from agalign.capture.band_pair import read_pairs
+from agalign.capture.prediction import with_predictions
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
 from agalign.products.fill_sidecar import capture_status
 from agalign.synthetic import make_flight
 from agalign.values import geometry
+from agalign.values.alignment import Prediction
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 Run = tuple[Path, dict[str, CaptureReport]]
@@ -128,6 +131,28 @@ def test_an_alignment_where_the_rig_cannot_be_is_not_believed(five: Path, model:
     assert result["NIR"].issues[0].code == "unexpected_px"
     assert result["NIR"].issues[0].value == pytest.approx(25, abs=3)
     assert result["Red"].status == "aligned"
+
+
+@pytest.mark.parametrize(
+    ("std_px", "away_px", "source"), [(0.001, 0.0, "windows"), (50.0, 0.0, "bands"), (0.001, 40.0, "bands")]
+)
+def test_what_windows_predict_stays_where_it_is_better_and_agrees(
+    five: Path, model: FlightModel, std_px: float, away_px: float, source: str
+) -> None:
+    """A displacement field with many windows off by more than a pixel is predicted, too; the rig knows no relief."""
+    capture = discover(five).captures[0]
+    settings = Settings()
+    pairs, _ = read_pairs(capture, settings.seed, model)
+    result = align_pairs(pairs, settings, lambda *_: None, model)
+    nir = result["NIR"]
+    matrix = geometry.compose(geometry.translation(away_px, 0), nir.fixed_to_moving)
+    of_windows = replace(
+        nir, status="predicted", fixed_to_moving=matrix, prediction=Prediction(matrix, "windows", std_px)
+    )
+    assert model.rig is not None
+    checked = with_predictions(pairs, {**result, "NIR": of_windows}, model.rig, capture)["NIR"]
+    assert checked.prediction is not None
+    assert (checked.status, checked.prediction.source) == ("predicted", source)
 
 
 def test_a_band_that_shows_itself_turned_is_not_placed_by_the_rig(
