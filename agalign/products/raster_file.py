@@ -11,7 +11,7 @@ import numpy as np
 import rasterio
 import tifffile
 from numpy.typing import NDArray
-from rasterio.enums import Resampling
+from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import RasterioError
 from rasterio.fill import fillnodata
 from rasterio.shutil import copy as copy_dataset
@@ -25,6 +25,7 @@ from agalign.errors import OutputError
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_window, why, without_warnings
 from agalign.pixels.resample import resample_tile, tiles
+from agalign.products.indices import Role, role_of
 from agalign.products.layout import Layer
 from agalign.products.nodata import Pixels, nodata_value, with_nodata
 from agalign.products.quiet_libtiff import without_libtiffs_lines
@@ -46,6 +47,10 @@ _FILL_DISTANCE_PX = 100.0
 _COG_TILE_PX = 512
 """GDAL's default for a COG."""
 _INCOMPLETE = "the file came out incomplete; is the disk full?"
+
+_COLOURS: Mapping[Role, ColorInterp] = {
+    "red": ColorInterp.red, "green": ColorInterp.green, "blue": ColorInterp.blue,
+}  # fmt: skip
 
 
 def write_raster(
@@ -70,6 +75,8 @@ def write_raster(
             with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT):
                 with rasterio.open(partial, "w", **profile) as dataset:
                     describe(dataset, capture, layers, settings)
+                    if len(layers) > 1:
+                        dataset.colorinterp = _colours(layers)
                     for index, layer in enumerate(layers, start=1):
                         _write_layer(dataset, index, layer, grid, nodata, settings, checksums)
                 if capture.reference.overviews and settings.format == "gtiff":
@@ -85,6 +92,18 @@ def write_raster(
     except (RasterioError, tifffile.TiffFileError) as error:
         raise OutputError(f"{path}: cannot be written ({why(error)})") from None
     return nodata
+
+
+def _colours(layers: Sequence[Layer]) -> list[ColorInterp]:
+    """Red, green and blue where all three are there, of the first band of each: viewers show them as such."""
+    roles = [None if b.companion else role_of(b.name, b.wavelength_nm) for b in (layer.band for layer in layers)]
+    result = [ColorInterp.gray, *[ColorInterp.undefined] * (len(layers) - 1)]
+    if not set(_COLOURS) <= set(roles):
+        return result
+    result[0] = ColorInterp.undefined
+    for role, colour in _COLOURS.items():
+        result[roles.index(role)] = colour
+    return result
 
 
 def write_layers(

@@ -3,10 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rasterio.enums import ColorInterp
-
 from agalign.config import WriteSettings
-from agalign.products.indices import Role, role_of
 from agalign.products.layout import Layer
 from agalign.values.capture import Band, Capture, Quantity
 
@@ -15,9 +12,6 @@ UNITS: Mapping[Quantity, str] = {
     "temperature": "degC",
 }  # fmt: skip
 """As UDUNITS spells them."""
-_COLOURS: Mapping[Role, ColorInterp] = {
-    "red": ColorInterp.red, "green": ColorInterp.green, "blue": ColorInterp.blue,
-}  # fmt: skip
 
 
 def describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings: WriteSettings) -> None:
@@ -38,20 +32,6 @@ def describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings: 
     for index, layer in enumerate(layers, start=1):
         dataset.set_band_description(index, layer.band.name)
         _describe_wavelength(dataset, index, layer.band)
-    if len(layers) > 1:
-        dataset.colorinterp = _colours(layers)
-
-
-def _colours(layers: Sequence[Layer]) -> list[ColorInterp]:
-    """Red, green and blue where all three are there, of the first band of each: viewers show them as such."""
-    roles = [None if b.companion else role_of(b.name, b.wavelength_nm) for b in (layer.band for layer in layers)]
-    result = [ColorInterp.gray, *[ColorInterp.undefined] * (len(layers) - 1)]
-    if not set(_COLOURS) <= set(roles):
-        return result
-    result[0] = ColorInterp.undefined
-    for role, colour in _COLOURS.items():
-        result[roles.index(role)] = colour
-    return result
 
 
 def _radiometry(layers: Sequence[Layer]) -> dict[str, str]:
