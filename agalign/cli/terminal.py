@@ -49,7 +49,7 @@ def in_json(value: Any) -> Any:
 
 
 class _Console(Console):
-    """A stream whose reader may go, as with `| head -1`: nothing more is printed, and the work goes on."""
+    """A console that ignores a closed pipe (`| head -1`): the run continues without printing."""
 
     def on_broken_pipe(self) -> None:
         nowhere = os.open(os.devnull, os.O_WRONLY)
