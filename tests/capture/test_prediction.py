@@ -116,7 +116,7 @@ def test_a_capture_over_water_costs_little_and_is_written(run: Run) -> None:
     (nir,) = [r for r in rows if r["capture"] == "IMG_0003" and r["band"] == "NIR"]
     assert (nir["status"], nir["prediction_from"]) == ("predicted", "bands")
     assert float(nir["prediction_std_px"]) > 0
-    assert "predicted by the rig" in (out / "index.html").read_text()
+    assert "; predicted from " in (out / "index.html").read_text()
 
 
 def test_an_alignment_where_the_rig_cannot_be_is_not_believed(five: Path, model: FlightModel) -> None:
