@@ -16,9 +16,9 @@ class CaptureReport:
     """What became of one capture."""
 
     label: str
-    state: Literal["done", "kept", "error", "panel"]
-    """`kept` means that an earlier run's result with the same settings was there, and `panel` that it shows a
-    calibration panel and takes no part.
+    state: Literal["done", "kept", "error", "panel", "sky"]
+    """`kept`: an earlier run's result with the same settings was there. `panel` and `sky`: the capture shows a
+    calibration panel or the sky, and is left out.
     """
     result: CaptureResult | None = None
     """What its sidecar says, without the long tables."""
@@ -27,6 +27,8 @@ class CaptureReport:
     error: str | None = None
     panel: str | None = None
     """What the calibration panel is, in words."""
+    sky: str | None = None
+    """Why the capture counts as one of the sky, in words."""
     shortcomings: tuple[str, ...] = ()
     """What was not written though the capture is done, and why."""
     seconds: float = 0.0
@@ -45,7 +47,7 @@ class CaptureReport:
         enough, none is missing, and all is written.
         """
         done = self.result is not None and self.result.status == "ok" and not self.shortcomings
-        return self.state == "panel" or done
+        return self.state in ("panel", "sky") or done
 
     @property
     def problems(self) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from agalign.flight.fingerprint import fingerprint
 from agalign.flight.groups import flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panels import PanelReading, read_panel, reflectance_factors, with_height, with_panels
+from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
 from agalign.products.panels import write_panels
@@ -30,6 +31,7 @@ from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths
 from agalign.products.run_record import RunState, Tally, begun, problem_of, write_run_record
 from agalign.products.sidecar import CaptureResult, read_result
+from agalign.products.sky import write_sky
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
 
@@ -46,7 +48,7 @@ class RunOptions:
     jobs: int = 1
     """Captures at a time, in as many processes; few captures are done one after another. 0 is one for each core."""
     align_panels: bool = False
-    """Captures of calibration panels are aligned like any other."""
+    """Align captures of calibration panels and of the sky like any other."""
     executor: Executor | None = None
     """Where the captures are done instead: any executor whose workers see the same folders (`dask_executor` is one)."""
     retry_failed: bool = False
@@ -132,7 +134,11 @@ def _reports(
     flight: FolderScan, out: Path, settings: Settings, options: RunOptions, listener: Listener,
     known: FlightModel | None,
 ) -> Iterator[CaptureReport]:  # fmt: skip
-    panels, captures = _panels(flight.captures, settings.write, options)
+    sky, captures = _sky(flight.captures, options)
+    for left_out, told in zip(sky, write_sky(sky, out), strict=True):
+        discard_outputs(left_out.capture, out, settings.write)
+        yield CaptureReport(left_out.capture.label, "sky", sky=told.sentence)
+    panels, captures = _panels(captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
         discard_outputs(reading.capture, out, settings.write)
         yield CaptureReport(reading.capture.label, "panel", panel=part.sentence)
@@ -172,6 +178,11 @@ def _kept(capture: Capture, out: Path, settings: Settings, options: RunOptions) 
     """The result of an earlier run; None where the capture is to be done (again)."""
     earlier = None if options.overwrite else finished_before(capture, out, settings)
     return None if earlier is None or (options.retry_failed and earlier.status != "ok") else earlier
+
+
+def _sky(captures: Sequence[Capture], options: RunOptions) -> tuple[list[SkyCapture], list[Capture]]:
+    """(the captures of the sky, the other captures)."""
+    return ([], list(captures)) if options.align_panels else sky_captures(captures)
 
 
 def _panels(

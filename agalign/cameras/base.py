@@ -3,6 +3,7 @@
 A new camera is one module with one subclass of `Camera`, listed in `known_cameras`, and one entry in the vendors' test.
 """
 
+import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -64,6 +65,11 @@ class Camera(ABC):
         """The camera's orientation and height; None where the tags do not hold them."""
         return None
 
+    def elevation_deg(self, tags: Tags) -> float | None:
+        """Angle of the optical axis above the horizon, -90 straight down; None where the tags do not give it."""
+        pose = self.pose(tags)
+        return None if pose is None else elevation_of(pose.pitch_deg, pose.roll_deg)
+
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Speed of the ground through the image, right and down, in focal lengths per second; None where the tags do
         not hold it.
@@ -73,6 +79,12 @@ class Camera(ABC):
     def capture_folder(self, path: Path) -> Path:
         """The folder of the capture that a file belongs to."""
         return path.parent
+
+
+def elevation_of(pitch_deg: float, roll_deg: float) -> float:
+    """Return the elevation of the optical axis, degrees, after these rotations of a camera that looks straight down."""
+    towards_nadir = math.cos(math.radians(pitch_deg)) * math.cos(math.radians(roll_deg))
+    return -math.degrees(math.asin(towards_nadir))
 
 
 def default_reference(bands: Sequence[Band]) -> int:

@@ -93,6 +93,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         position=tags.position,
         pose=camera.pose(tags),
         motion=camera.motion(tags),
+        elevation_deg=camera.elevation_deg(tags),
     )
 
 

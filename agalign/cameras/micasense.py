@@ -10,7 +10,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import Camera, band_of, is_thermal, max_value, rays_to_rig, rotation
+from agalign.cameras.base import Camera, band_of, elevation_of, is_thermal, max_value, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, rational
 from agalign.cameras.pix4d import (
     BAND_NAME,
@@ -85,6 +85,13 @@ class MicaSense(Camera):
         """From the camera's tags, else with the yaw of the light sensor, which is on the same aircraft."""
         yaw, focal_px = tags.number(_DLS, "Yaw"), focal_length_px(tags)
         return pose_of(tags) or (None if yaw is None else Pose(math.degrees(yaw), focal_length_px=focal_px))
+
+    def elevation_deg(self, tags: Tags) -> float | None:
+        """From the camera's tags, else from the light sensor, which looks up where the camera looks down."""
+        if pose_of(tags) is not None:
+            return super().elevation_deg(tags)
+        pitch, roll = tags.number(_DLS, "Pitch"), tags.number(_DLS, "Roll")
+        return None if pitch is None or roll is None else elevation_of(math.degrees(pitch), math.degrees(roll))
 
     def capture_name(self, path: Path) -> str:
         return re.sub(r"_\d+$", "", path.stem)

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from agalign.values.capture import Band, Capture
 from agalign.values.files import RUN_FILE
 
-_NAMES_OF_THE_RUN = {"panels", Path(RUN_FILE).stem, "summary", "index"}
+_NAMES_OF_THE_RUN = {"panels", "sky", Path(RUN_FILE).stem, "summary", "index"}
 """Files at the top of an output folder that are not of a capture, without suffix."""
 
 

@@ -98,7 +98,7 @@ def align(
     ignore_metadata: IgnoreMetadata = False,
     align_panels: Annotated[
         bool,
-        of_input("--align-panels", help="Align captures of calibration panels too, as any other."),
+        of_input("--align-panels", help="Align captures of calibration panels and of the sky too, like any other."),
     ] = False,
     max_pixels: Annotated[
         int,

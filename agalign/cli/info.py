@@ -54,10 +54,14 @@ def info(
             raise typer.Exit(EXIT_OK)
         from agalign.cameras.discover import DiscoverOptions
         from agalign.flight.panels import with_panels
+        from agalign.flight.sky import sky_captures
 
         options = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
         flight = find_captures(folder, options, terminal, silent=as_json)
-        rows = [_facts(c) for c in with_panels(flight.captures)]
+        sky, others = sky_captures(flight.captures)
+        left_out = {s.capture.label: list(s.cues) for s in sky}
+        in_order = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
+        rows = [_facts(in_order[c.label]) | {"sky": left_out.get(c.label, [])} for c in flight.captures]
         if as_json:
             problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
             typer.echo(json.dumps({"folder": str(folder), "captures": rows, "problems": problems}, indent=1))
@@ -67,7 +71,7 @@ def info(
 
 
 def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:
-    """The captures of a folder as a table, its calibration panels, and a line of totals."""
+    """Print the captures of a folder as a table, the calibration panels and sky captures, and a line of totals."""
     table = Table("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
     for row in rows:
         bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
@@ -78,6 +82,8 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
     for row in rows:
         if row["panel"] is not None:
             terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip()))
+        if row["sky"]:
+            terminal.result(shown(f"{row['label']}: shows the sky ({', '.join(row['sky'])}); not aligned"))
     terminal.result(f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {problems} problems")
 
 

@@ -248,7 +248,7 @@ class _Pace:
 
     def of(self, states: Counter[str]) -> str:
         """As text, empty while nothing is known."""
-        done = states.total() - states["kept"] - states["panel"]
+        done = states.total() - states["kept"] - states["panel"] - states["sky"]
         if done == 0:
             self.since = time.monotonic()
             return ""
@@ -264,6 +264,9 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
     place = f"[{number}/{count}] {report.label}"
     if report.panel is not None:
         terminal.event("panel", f"{place}: {report.panel}", capture=report.label, panel=report.panel)
+        return
+    if report.sky is not None:
+        terminal.event("sky", f"{place}: {report.sky}", capture=report.label, sky=report.sky)
         return
     for text in report.problems:
         terminal.problem(f"{report.label}: {text}", capture=report.label)
@@ -315,8 +318,9 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     for made, count in totals.radiometry.items():
         terminal.result(shown(f"Written as {made}: {count} captures"))
     terminal.result(shown(f"Report: {out / 'index.html'}"))
-    if totals.states and set(totals.states) == {"panel"}:
-        terminal.problem("all captures show calibration panels; --align-panels aligns them like any other")
+    if totals.states and set(totals.states) <= {"panel", "sky"}:
+        what = " or the sky" if totals.states["sky"] else ""
+        terminal.problem(f"all captures show calibration panels{what}; --align-panels aligns them like any other")
         return EXIT_NOTHING
     if not totals.useful:
         terminal.problem("no band pair could be aligned" if totals.bands else "no capture could be processed")

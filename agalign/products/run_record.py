@@ -60,7 +60,7 @@ class RunPart(_Part):
     machine: dict[str, str | int]
     settings: dict[str, Any]
     captures: dict[str, int]
-    """How many were found, and how many are done, kept, panel, error."""
+    """How many were found, and how many are done, kept, panel, sky, error."""
     pairs: dict[str, int]
     """How many band pairs have which status."""
     stage_seconds: dict[str, float]

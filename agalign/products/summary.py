@@ -1,4 +1,4 @@
-"""OUT/summary.csv: one row per band pair of a run, and one for each band of a calibration panel."""
+"""OUT/summary.csv: one row per band pair of a run, and one for each band of a calibration panel or of the sky."""
 
 import csv
 import io
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from agalign.products.panels import PanelPart
 from agalign.products.sidecar import BandPart, Sidecar
+from agalign.products.sky import SkyPart
 from agalign.values.files import write_text
 from agalign.values.text import harmless
 
@@ -30,6 +31,12 @@ def panel_rows(panel: PanelPart) -> list[dict[str, object]]:
     """A row for each band of a capture that shows a calibration panel."""
     facts = {"folder": panel.folder, "capture": panel.capture, "status": "panel", "reason": panel.sentence}
     return [{**facts, "band": band.band} for band in panel.bands]
+
+
+def sky_rows(sky: SkyPart) -> list[dict[str, object]]:
+    """Return a row for each band of a capture of the sky."""
+    facts = {"folder": sky.folder, "capture": sky.capture, "status": "sky", "reason": sky.sentence}
+    return [{**facts, "band": band.band} for band in sky.bands]
 
 
 def write_summary(rows: Iterable[Mapping[str, object]], path: Path) -> None:

@@ -173,6 +173,8 @@ class Capture:
     motion: tuple[float, float] | None = None
     """How fast the ground passes through the image, right and down, focal lengths a second, as far as the tags tell."""
     missing_bands: tuple[str, ...] = ()
+    elevation_deg: float | None = None
+    """Angle of the optical axis above the horizon: -90 straight down; None where the tags do not give it."""
 
     @property
     def reference(self) -> Band:

@@ -23,7 +23,8 @@ from agalign.products.report.facts import Facts
 from agalign.products.report.rigs import drifts_of, rig_views
 from agalign.products.run_record import RunPart, read_run_record
 from agalign.products.sidecar import find_sidecars, read_sidecar
-from agalign.products.summary import panel_rows, summary_rows, write_summary
+from agalign.products.sky import SKY_FILE, SkyPart, read_sky
+from agalign.products.summary import panel_rows, sky_rows, summary_rows, write_summary
 from agalign.values.files import write_text
 
 REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
@@ -59,16 +60,18 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         rows += summary_rows(folder, sidecar)
         facts.add(folder, sidecar)
     panels: list[PanelPart] = []
+    sky: list[SkyPart] = []
     run: RunPart | None = None
     try:
-        panels, run = read_panels(out), read_run_record(out)
+        panels, sky, run = read_panels(out), read_sky(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
     rows += [row for panel in panels for row in panel_rows(panel)]
+    rows += [row for part in sky for row in sky_rows(part)]
     write_summary(rows, out / SUMMARY_FILE)
     failures = facts.failures.groups()
     slowest = sorted(((c.label, c.seconds) for c in facts.entries), key=lambda c: -c[1])[:_SLOWEST]
-    write_text(out / REPORT_FILE, _page(out, facts, panels, run, unreadable.append))
+    write_text(out / REPORT_FILE, _page(out, facts, panels, sky, run, unreadable.append))
     if unreadable:
         with suppress(OSError):
             os.utime(out / REPORT_FILE, (0, 0))
@@ -81,15 +84,16 @@ def pages_exist(out: Path) -> bool:
     """True where the pages of an earlier run are complete and newer than all files that they describe."""
     try:
         written = min((out / name).stat().st_mtime_ns for name in (REPORT_FILE, SUMMARY_FILE))
-        entries = [*find_sidecars(out), *([out / PANELS_FILE] if (out / PANELS_FILE).exists() else [])]
+        entries = [*find_sidecars(out), *(out / f for f in (PANELS_FILE, SKY_FILE) if (out / f).exists())]
         return all(path.stat().st_mtime_ns < written for path in entries)
     except OSError:
         return False
 
 
 def _page(
-    out: Path, facts: Facts, panels: Sequence[PanelPart], run: RunPart | None, on_problem: Callable[[str], None]
-) -> str:
+    out: Path, facts: Facts, panels: Sequence[PanelPart], sky: Sequence[SkyPart], run: RunPart | None,
+    on_problem: Callable[[str], None],
+) -> str:  # fmt: skip
     environment = Environment(
         loader=PackageLoader("agalign.products.report", "."),
         autoescape=select_autoescape(["j2"]),
@@ -118,6 +122,7 @@ def _page(
         rigs=rig_views(out, on_problem),
         drifts=drifts_of(facts.entries),
         panels=panels,
+        sky=sky,
         mapped=sum(c.position is not None for c in facts.entries),
     )
 

@@ -1,0 +1,89 @@
+"""Captures of the sky, which surveys of water quality take to correct for its reflection."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from agalign.cameras.base import is_thermal
+from agalign.errors import AgalignError
+from agalign.pixels.radiometry import calibrated
+from agalign.pixels.raster import open_raster, read_for_alignment, read_window, without_warnings
+from agalign.pixels.sky import LOOK_PX, MAX_SKY_TEXTURE, relative_texture
+from agalign.values.capture import Band, Capture
+
+_MIN_ELEVATION_DEG = 20.0
+"""An aircraft that banks does not turn its camera above the horizon; half the field of view is 20 degrees."""
+_MIN_UNSATURATED = 0.5
+_MIN_CUES = 2
+_NAMED = re.compile(r"(?:^|[-_. ])sky(?:$|[-_. ])", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class SkyCapture:
+    """A capture of the sky."""
+
+    capture: Capture
+    cues: tuple[str, ...]
+    """The reasons for which it counts as one, in words."""
+
+
+def sky_cues(capture: Capture) -> tuple[str, ...]:
+    """Return the reasons to take a capture for one of the sky: none unless two independent ones agree.
+
+    They are: the tags point the camera above the horizon; a folder or the file is named `sky`; no band has texture.
+    Pixels are read only where one of the first two holds. The last one alone also holds for fog and calm water.
+    """
+    cues = []
+    if capture.elevation_deg is not None and capture.elevation_deg > _MIN_ELEVATION_DEG:
+        cues.append(f"its tags point the camera {capture.elevation_deg:.0f} degrees above the horizon")
+    if any(_NAMED.search(part) for part in (*capture.folder.parts, capture.name)):
+        cues.append("its folder or name contains 'sky'")
+    if cues and _is_without_texture(capture):
+        cues.append("no band has texture")
+    return tuple(cues) if len(cues) >= _MIN_CUES else ()
+
+
+def sky_captures(captures: Iterable[Capture]) -> tuple[list[SkyCapture], list[Capture]]:
+    """Return (the captures of the sky, the other captures), both in their order."""
+    sky: list[SkyCapture] = []
+    others: list[Capture] = []
+    with without_warnings():
+        for capture in captures:
+            cues = sky_cues(capture)
+            if cues:
+                sky.append(SkyCapture(capture, cues))
+            else:
+                others.append(capture)
+    return sky, others
+
+
+def sky_radiance(band: Band) -> float | None:
+    """Return the median radiance of a band, W / m^2 / sr / nm; None without the camera's calibration, or where half of
+    the band is saturated. Raises UnreadableFileError.
+    """
+    if band.radiometry is None or band.radiometry.quantity != "radiance":
+        return None
+    with open_raster(band.path) as source:
+        pixels, valid = read_window(source, band, 0, 0, band.width_px, band.height_px)
+    if band.saturation_value is not None:
+        valid &= pixels.astype(np.float64) < band.saturation_value
+    if valid.mean() < _MIN_UNSATURATED:
+        return None
+    return float(np.median(calibrated(pixels, band.radiometry, 0, 0)[valid]))
+
+
+def _is_without_texture(capture: Capture) -> bool:
+    """True where every band that sees sunlight is smooth; a thermal band sees too little of the sky."""
+    bands = [b for b in capture.bands if not is_thermal(b) and not b.companion]
+    return bool(bands) and all(_is_smooth(b) for b in bands)
+
+
+def _is_smooth(band: Band) -> bool:
+    try:
+        image = read_for_alignment(band, LOOK_PX)
+    except AgalignError:
+        return False
+    texture = relative_texture(image, 0.0 if band.radiometry is None else band.radiometry.black_level)
+    return texture is not None and texture <= MAX_SKY_TEXTURE
