@@ -15,7 +15,7 @@ from agalign.cameras import rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.micasense import MicaSense
-from agalign.config import SeedSettings, Settings
+from agalign.config import FlightSettings, SeedSettings, Settings
 from agalign.flight.panels import read_panel, with_panels
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, probe
@@ -182,3 +182,25 @@ def test_a_sentera_s_cameras_are_laid_on_each_other(real_data: Path, tmp_path: P
         assert band.status == "predicted"
         assert band.prediction.std_px < 1.5
         assert np.linalg.norm(there[middle] - here[middle] - (-533, -85)) < 3
+
+
+def test_a_scene_with_a_panel_is_aligned_to_its_thermal_band(real_data: Path, tmp_path: Path) -> None:
+    """The blue band has lost its tags and a margin; the panel in the scene does not exclude it."""
+    settings = Settings(flight=FlightSettings(together=False))
+    (report,) = agalign.align_folder(real_data / "captures/altum_blue_lwir", tmp_path, settings=settings)
+    sidecar = report.sidecar
+    assert sidecar is not None
+    (thermal,) = (b for b in sidecar.bands if b.status != "reference")
+    assert (report.state, sidecar.status, thermal.band, thermal.status) == ("done", "ok", "LWIR", "predicted")
+    assert thermal.prediction is not None
+    assert thermal.prediction.std_px < 1.0
+    # Corners of the panel's grey square and of its label, read off both images by eye to half a px of the thermal band.
+    assert thermal.grid is not None
+    mapping = CloughTocher2DInterpolator(thermal.grid.reference_px, thermal.grid.moving_px)
+    assert (tmp_path / "panels.json").exists()
+    by_eye = {
+        (439.2, 947.7): (44.6, 80.0), (633.8, 1144.6): (58.6, 93.7),
+        (174.6, 969.0): (26.5, 80.7), (368.5, 1263.8): (40.0, 101.1),
+    }  # fmt: skip
+    for blue, lwir in by_eye.items():
+        assert np.linalg.norm(mapping(*blue) - lwir) < 1.5

@@ -140,6 +140,8 @@ def _reports(
         yield CaptureReport(left_out.capture.label, "sky", sky=told.sentence)
     panels, captures = _panels(captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
+        if not reading.capture.is_of_a_panel:
+            continue
         discard_outputs(reading.capture, out, settings.write)
         yield CaptureReport(reading.capture.label, "panel", panel=part.sentence)
     left: list[tuple[Sequence[Capture], str, list[Capture]]] = []
@@ -188,13 +190,13 @@ def _sky(captures: Sequence[Capture], options: RunOptions) -> tuple[list[SkyCapt
 def _panels(
     captures: Sequence[Capture], settings: WriteSettings, options: RunOptions
 ) -> tuple[list[PanelReading], list[Capture]]:
-    """(what the captures of calibration panels say, the other captures)."""
+    """(the readings of calibration panels, the captures to align: a scene that contains a panel is one of them)."""
     if options.align_panels:
         return [], list(captures)
     albedos = dict(settings.panel_albedo)
     seen = with_panels(captures, by_look=bool(albedos))
     panels = [read_panel(c, albedos) for c in seen if c.panel is not None]
-    return panels, [c for c in seen if c.panel is None]
+    return panels, [c for c in seen if not c.is_of_a_panel]
 
 
 def _cores(options: RunOptions, settings: Settings) -> int:

@@ -9,11 +9,13 @@ from pathlib import Path
 from agalign.cameras import camera_of
 from agalign.cameras.base import listed, reference_index
 from agalign.cameras.folder_walk import natural_order
+from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import Tags
 from agalign.cameras.naming import with_unique_band_names
 from agalign.cameras.read_files import ImageFile
 from agalign.cameras.scan import DiscoverOptions, Problem
 from agalign.errors import InputError
+from agalign.pixels.raster import TIFF_SUFFIXES
 from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.choices import BandOrder
 
@@ -34,6 +36,7 @@ def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
         key = file.path.name if file.is_whole_capture else file.camera.capture_key(file.path, file.tags)
         groups[file.camera.name, str(file.camera.capture_folder(file.path)), key].append(file)
     _add_files_without_id(groups)
+    _add_files_without_tags(groups)
     return [sorted(group, key=lambda f: f.bands[0].companion) for group in groups.values()]
 
 
@@ -49,6 +52,44 @@ def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
         if with_id is not None and not groups[key][0].is_whole_capture:
             groups[with_id].extend(groups.pop(key))
             groups[with_id].sort(key=lambda f: natural_order(f.path.name))
+
+
+def _add_files_without_tags(groups: dict[_GroupKey, list[ImageFile]]) -> None:
+    """Add single bands whose tags another program removed to the group that has tags and the same file name."""
+    tagged: dict[tuple[str, str], list[_GroupKey]] = defaultdict(list)
+    for key, group in groups.items():
+        if key[0] != Generic.name:
+            for name in {f.camera.capture_name(f.path) for f in group if not f.is_whole_capture}:
+                tagged[key[1], name].append(key)
+    for key in [k for k in groups if k[0] == Generic.name]:
+        left = []
+        for file in groups[key]:
+            with_tags = _group_for(file, key[1], tagged, groups)
+            if with_tags is None:
+                left.append(file)
+            else:
+                band = file.bands[0]
+                named = replace(band, name=f"band_{band.name}") if band.name.isdecimal() else band
+                with_tags.append(replace(file, camera=with_tags[0].camera, bands=(named,)))
+                with_tags.sort(key=lambda f: natural_order(f.path.name))
+        if left:
+            groups[key] = left
+        else:
+            del groups[key]
+
+
+def _group_for(
+    file: ImageFile, folder: str, tagged: Mapping[tuple[str, str], list[_GroupKey]],
+    groups: Mapping[_GroupKey, list[ImageFile]],
+) -> list[ImageFile] | None:  # fmt: skip
+    """The only group in the folder that a single band without tags belongs to by its name."""
+    if file.tags.make or file.tags.xmp or len(file.bands) != 1 or file.path.suffix.lower() not in TIFF_SUFFIXES:
+        return None
+    keys = {
+        key for (where, name), keys in tagged.items() if where == folder
+        for key in keys if groups[key][0].camera.capture_name(file.path) == name != file.path.stem
+    }  # fmt: skip
+    return groups[keys.pop()] if len(keys) == 1 else None
 
 
 def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
@@ -99,7 +140,9 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
 
 def _tags_of(reference: Band, files: Sequence[ImageFile]) -> Tags:
     """The tags that describe the capture: the reference's, else the first file's where the reference's are damaged."""
-    return next((f.tags for f in files if f.path == reference.path and f.tags != Tags()), files[0].tags)
+    with_tags = [f for f in files if f.tags != Tags()]
+    first = with_tags[0].tags if with_tags else files[0].tags
+    return next((f.tags for f in with_tags if f.path == reference.path), first)
 
 
 def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Band]:

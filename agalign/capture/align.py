@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.coarse_estimate import predicted_if_coarse
 from agalign.capture.extrapolation import without_extrapolated
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
@@ -191,7 +192,7 @@ class _PairAligner:
         for pair, _ in starts:
             if pair.name in self.result:
                 with self.timer.measure([pair.name]):
-                    self.result[pair.name] = by_windows(pair, self.result[pair.name])
+                    self.result[pair.name] = predicted_if_coarse(pair, by_windows(pair, self.result[pair.name]))
 
     def _attempt(self, starts: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
         with self.timer.measure([pair.name for pair, _ in starts]):

@@ -17,7 +17,7 @@ from agalign.values.alignment import Alignment, Prediction
 from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.extrapolation_check import issues_of_extrapolation, points_in_frame
-from agalign.verify.lens_shapes import fit_with_lens
+from agalign.verify.lens_shapes import LensFit, fit_with_lens
 
 
 def without_extrapolated(
@@ -56,6 +56,12 @@ def _extrapolated(
     fit = fit_with_lens(
         start, WarpedPair.of(pair, start).residual, size_px, calibrated=pair.space == "undistorted"
     )  # fmt: skip
+    return with_fit(pair, replace(alignment, issues=issues), fit)
+
+
+def with_fit(pair: BandPair, alignment: Alignment[FixedImagePx], fit: LensFit) -> Alignment[FixedImagePx]:
+    """An alignment as `predicted` by its homography after the correction of a fit, with the error of that fit."""
+    size_px = pair.fixed.size_px
     try:
         corrected = geometry.compose(
             alignment.fixed_to_moving, geometry.moving_corners(fit.mean_px[:8], *size_px)
@@ -70,6 +76,6 @@ def _extrapolated(
         covariance_px2=fit.covariance_px2 * np.outer(up, up),
     )  # fmt: skip
     return replace(
-        alignment, status="predicted", issues=issues, fixed_to_moving=corrected, field=mapping.local, local=None,
+        alignment, status="predicted", fixed_to_moving=corrected, field=mapping.local, local=None,
         residual=WarpedPair.of(pair, mapping).residual, prediction=prediction,
     )  # fmt: skip

@@ -84,6 +84,11 @@ class Reference:
         return FixedWindows(self.grey.valid, self.structure)
 
     @cached_property
+    def overlapping_windows(self) -> FixedWindows:
+        """The same, each overlapping the next by a half: of an image with few pixels more of them show something."""
+        return FixedWindows(self.grey.valid, self.structure, self.windows.side, self.windows.side // 2)
+
+    @cached_property
     def small_windows(self) -> FixedWindows:
         """Windows for images with valid areas that are too small for those."""
         return FixedWindows(self.grey.valid, self.structure, _SMALL_WINDOW_PX)

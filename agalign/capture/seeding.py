@@ -1,6 +1,6 @@
 """The seed of a pair: candidates from tags, flight and landmarks are scored on the images, and the best one is kept."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -46,6 +46,11 @@ _MIN_WINDOWS = 12
 """Windows that correct a match: fewer than for an estimate, as they must agree better with the corrected one."""
 _MAX_ROTATION_DEGREES, _MAX_SCALE_CHANGE = 1.0, 0.02
 """Difference of a band from its rig that temperature and mounting explain."""
+_FROM_TAGS: Set[SeedKind] = frozenset({"rig", "centre", "geo", "model", "user"})
+"""Candidates whose scale is known."""
+_SCALES = tuple(1.02**k for k in range(-18, 19) if k)
+"""Scales relative to the overlay of the two images, 0.7 to 1.4: 2 % away from the right one, the correlation peak of a
+thermal and a blue image falls to three quarters."""
 _MAX_KEYPOINTS = 1000
 """Matching all keypoints of a full image by learnt descriptors, the last resort, takes seconds."""
 
@@ -69,6 +74,8 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
     is_given = force is not None or pair.is_known_to_a_rig or "user" in pair.candidates
     if best.score >= _CERTAIN_SIGMA or is_given:
         return best
+    if not best.trusted and not _FROM_TAGS & pair.candidates.keys():
+        best = max((best, *_at_other_scales(pair)), key=lambda seed: seed.score)
     residual = _residual_under(pair, best.fixed_to_moving)
     # A peak at the mapping of the tags verifies the middle of the image; the windows verify the corners.
     if best.trusted and pair.is_expected(best.fixed_to_moving) and seed_fits(residual):
@@ -198,6 +205,19 @@ def first_candidate(pair: BandPair) -> Seed:
     """The candidate of highest trust, without a score."""
     kind, matrix = next(iter(pair.candidates.items()))
     return Seed(kind, matrix, 0.0)
+
+
+def _at_other_scales(pair: BandPair) -> Iterator[Seed]:
+    """The trusted ones among the seeds that overlay the images at other scales.
+
+    Without tags the two fields of view are unknown: a thermal camera's may be a fifth wider than that of the others.
+    """
+    overlay, middle = pair.candidates["identity"], (np.array(pair.fixed.size_px) - 1) / 2
+    for scale in _SCALES:
+        about_middle = geometry.compose(
+            geometry.translation(*middle), np.diag([scale, scale, 1.0]), geometry.translation(*-middle)
+        )
+        yield from (s for s in _scored(pair, "structure", geometry.compose(overlay, about_middle)) if s.trusted)
 
 
 def _unshifted(pair: BandPair, fixed_to_moving: Matrix) -> Seed:

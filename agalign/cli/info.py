@@ -81,7 +81,8 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
     terminal.result(table)
     for row in rows:
         if row["panel"] is not None:
-            terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip()))
+            where = " in a scene that is aligned" if row["panel_in_scene"] else ""
+            terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip() + where))
         if row["sky"]:
             terminal.result(shown(f"{row['label']}: shows the sky ({', '.join(row['sky'])}); not aligned"))
     terminal.result(f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {problems} problems")
@@ -143,4 +144,5 @@ def _facts(capture: "Capture") -> dict[str, Any]:
         "seeds": [kind for kind in ("rig", "geo") if kind in offered] + ["structure", "identity"],
         "missing_bands": list(capture.missing_bands),
         "panel": None if capture.panel is None else capture.panel.serial,
+        "panel_in_scene": capture.panel is not None and capture.panel.in_scene,
     }

@@ -49,7 +49,7 @@ class BandReading:
 
 @dataclass(frozen=True)
 class PanelReading:
-    """A capture of a panel."""
+    """A capture that shows a panel."""
 
     capture: Capture
     bands: tuple[BandReading, ...]
@@ -101,7 +101,7 @@ def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
         return capture
     panels = [
         r.capture.position.altitude_m for _, r in _of_the_same_outing(readings, time_s)
-        if r.capture.position is not None and r.capture.position.altitude_m is not None
+        if r.capture.is_of_a_panel and r.capture.position is not None and r.capture.position.altitude_m is not None
     ]  # fmt: skip
     height_m = position.altitude_m - min(panels) + _PANEL_HEIGHT_M if panels else 0.0
     return replace(capture, pose=replace(pose, height_m=height_m)) if height_m > _MIN_HEIGHT_M else capture
@@ -144,20 +144,23 @@ def _panels_at(end: Sequence[Capture], by_look: bool) -> list[Capture]:
 
 
 def _looked_at(capture: Capture, by_look: bool) -> Capture:
-    if _seen(capture.reference, without_code=by_look) is None:
+    sight = _seen(capture.reference, without_code=by_look)
+    if sight is None:
         return capture
     sights = [_seen(b, without_code=True) for b in capture.bands]
+    in_scene = sight.in_scene
     # A code that one band shows plainly is the others' too.
     code = next((s.code for s in sights if s is not None and s.code), "")
     bands = (
-        replace(b, panel=None if s is None else _panel(s, b, code)) for b, s in zip(capture.bands, sights, strict=True)
+        replace(b, panel=None if s is None else _panel(s, b, code, in_scene=in_scene))
+        for b, s in zip(capture.bands, sights, strict=True)
     )
     return replace(capture, bands=tuple(bands))
 
 
-def _panel(sight: PanelSight, band: Band, code: str) -> Panel:
+def _panel(sight: PanelSight, band: Band, code: str, *, in_scene: bool) -> Panel:
     serial, _, _ = code.partition("_")
-    return Panel("QR code" if code else "look", serial, albedo_of(code, band.wavelength_nm), sight.area_px)
+    return Panel("QR code" if code else "look", serial, albedo_of(code, band.wavelength_nm), sight.area_px, in_scene)
 
 
 def _seen(band: Band, *, without_code: bool) -> PanelSight | None:

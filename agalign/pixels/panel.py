@@ -29,6 +29,10 @@ _CODE_REACH = 3.0
 """How far their middles lie apart at most, in sides of the code."""
 _SHARE_OF_IMAGE = 0.004, 0.3
 """Of a panel without a code."""
+_MIN_FILLED = 0.02
+"""Share of the image that a panel fills from a metre above it: 0.03 on a RedEdge-M."""
+_MAX_OFF_CENTRE = 1 / 6
+"""Of a panel that the camera is aimed at: its centre is in the middle third of the image."""
 _MAX_SPREAD = 0.06
 """Standard deviation within the area, beside its mean."""
 _MIN_CONTRAST = 1.5
@@ -49,6 +53,8 @@ class PanelSight:
     """What its QR code says; empty where there is none."""
     area_px: tuple[tuple[float, float], ...]
     """(x, y) of the corners of an area well within it; none where only the code was found."""
+    in_scene: bool = False
+    """The panel is small and away from the middle: the camera was aimed at something else."""
 
 
 def find_panel(image: Raster, *, without_code: bool = False) -> PanelSight | None:
@@ -63,9 +69,16 @@ def find_panel(image: Raster, *, without_code: bool = False) -> PanelSight | Non
     shown = np.asarray(cv2.GaussianBlur(shown, (0, 0), _SMOOTHING_PX), np.uint8)  # a dark panel's noise is no structure
     largest = _largest_panel(shown, at)
     if largest is None:
-        return PanelSight(code, ()) if code else None
+        return None if at is None else PanelSight(code, (), _is_in_scene(at, shown))
     area = PixelScale(scale, scale).inverse.positions(_shrunk(largest))
-    return PanelSight(code, tuple((float(x), float(y)) for x, y in area))
+    return PanelSight(code, tuple((float(x), float(y)) for x, y in area), _is_in_scene(largest, shown))
+
+
+def _is_in_scene(square: Corners, shown: NDArray[np.uint8]) -> bool:
+    """True where a panel, or its code, is small and its centre outside the middle of the image."""
+    size = np.array(shown.shape[::-1], np.float64)
+    off_centre = np.abs((square.mean(axis=0) - (size - 1) / 2) / size).max()
+    return bool(off_centre > _MAX_OFF_CENTRE and _area(square) < _MIN_FILLED * shown.size)
 
 
 def _largest_panel(shown: NDArray[np.uint8], code: Corners | None) -> Corners | None:

@@ -54,6 +54,8 @@ class PanelPart(_Part):
     seen_by: PanelSource
     serial: str
     picture: str
+    in_scene: bool = False
+    """The capture shows a scene that contains the panel, and is aligned."""
     bands: list[PanelBandPart]
 
     @property
@@ -64,7 +66,8 @@ class PanelPart(_Part):
             f"reflectance {' to '.join(albedos[:: max(len(albedos) - 1, 1)])}" if albedos else "reflectance not known"
         )
         name = f"calibration panel {self.serial}".strip()
-        return f"{name} ({known}; seen by its {self.seen_by}): kept out of the alignment"
+        what = "part of a scene that is aligned" if self.in_scene else "kept out of the alignment"
+        return f"{name} ({known}; seen by its {self.seen_by}): {what}"
 
 
 class Panels(_Part):
@@ -94,6 +97,7 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
             PanelPart(
                 folder=capture.folder.as_posix(), capture=capture.name, captured_at=capture.captured_at,
                 seen_by=reading.panel.seen_by, serial=reading.panel.serial, picture=picture.relative_to(out).as_posix(),
+                in_scene=reading.panel.in_scene,
                 bands=[_band_part(b) for b in reading.bands],
             )
         )  # fmt: skip

@@ -28,7 +28,9 @@ def summary_rows(folder: str, sidecar: Sidecar) -> list[dict[str, object]]:
 
 
 def panel_rows(panel: PanelPart) -> list[dict[str, object]]:
-    """A row for each band of a capture that shows a calibration panel."""
+    """Return a row for each band of a capture of a panel; none for a scene that contains one, which is aligned."""
+    if panel.in_scene:
+        return []
     facts = {"folder": panel.folder, "capture": panel.capture, "status": "panel", "reason": panel.sentence}
     return [{**facts, "band": band.band} for band in panel.bands]
 

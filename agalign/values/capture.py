@@ -67,6 +67,8 @@ class Panel:
     """Its reflectance in the band, 0 to 1, where that is known."""
     corners_px: tuple[tuple[float, float], ...] = ()
     """Of an area within it, raw pixels of the file; none where it was not found."""
+    in_scene: bool = False
+    """The camera was not aimed at it: the image shows a scene that contains a panel."""
 
 
 @dataclass(frozen=True)
@@ -205,8 +207,13 @@ class Capture:
 
     @property
     def panel(self) -> Panel | None:
-        """The calibration panel that it was taken of, as the first band that shows it has it."""
+        """The calibration panel in it, as the first band that shows it has it."""
         return next((b.panel for b in self.bands if b.panel is not None), None)
+
+    @property
+    def is_of_a_panel(self) -> bool:
+        """True for a capture that was taken of a calibration panel; False where a scene contains one."""
+        return self.panel is not None and not self.panel.in_scene
 
     @property
     def time_s(self) -> float | None:

@@ -81,6 +81,10 @@ class LensFit:
         square = np.einsum("nki,ij,nkj->n", design, self.covariance_px2, design).mean()
         return float(np.sqrt(square + self.spread_px**2))
 
+    def misfits_px(self, points_px: Points, shifts_px: Array) -> Array:
+        """(n, 2): what the fit leaves of shifts (n, 2) at points (n, 2)."""
+        return np.asarray(shifts_px - over_corners_and_lens(points_px, self.size_px) @ self.mean_px)
+
     def field(self) -> DisplacementField:
         """The lens shapes as displacements of raw pixels of the reference."""
         columns, rows = (int(np.ceil(n / _LATTICE_PX)) + 1 for n in self.size_px)

@@ -20,7 +20,7 @@ REPEATS = IssueKind(
         "flight",
     ),
 )
-_MAX_ALIAS_PEAK = 0.75
+MAX_ALIAS_PEAK = 0.75
 """Height of the next correlation peak over that of the result, from which the scene counts as repetitive."""
 _SAME_PX = 3
 """Radius of a correlation peak, px of the reduced images: anything nearer is its own flank."""
@@ -42,7 +42,7 @@ def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     if images is None:
         return
     alias = alias_peak(*images.reduced_spectra())
-    if alias.share <= _MAX_ALIAS_PEAK:
+    if alias.share <= MAX_ALIAS_PEAK:
         return
     x_px, y_px = (shift / scale for shift, scale in zip(alias.shift_px, images.reduced_scale, strict=True))
     if not images.is_expected() or images.is_expected((x_px, y_px)):

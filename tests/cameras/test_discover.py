@@ -86,6 +86,28 @@ def test_bands_alone_in_their_folder_are_named_by_it(tmp_path: Path) -> None:
     assert capture.label == "plot 7/plot 7"
 
 
+def test_a_band_without_tags_joins_the_capture_of_its_name(flight: Path, tmp_path: Path) -> None:
+    """Editing a file often removes its tags: the others of the capture still have theirs."""
+    shutil.copytree(flight / "0000SET" / "000", tmp_path / "in")
+    write(tmp_path / "in" / "IMG_0001_1.tif")
+    write(tmp_path / "in" / "IMG_0009_1.tif")
+    result = discover(tmp_path / "in")
+    first = result.captures[0]
+    assert [(c.name, len(c.bands)) for c in result.captures] == [("IMG_0001", 5), ("IMG_0002", 5)]
+    assert [b.name for b in first.bands] == ["band_1", "Green", "Red", "NIR", "Red edge"]
+    assert (first.camera.make, first.reference.name) == ("MicaSense", "Green")
+    assert first.bands[0].lens is None
+    assert [p.path.name for p in result.problems] == ["IMG_0009_1.tif"]
+
+
+def test_the_capture_has_the_tags_of_the_only_file_that_has_some(flight: Path, tmp_path: Path) -> None:
+    shutil.copy(flight / "0000SET" / "000" / "IMG_0001_4.tif", tmp_path)
+    write(tmp_path / "IMG_0001_1.tif")
+    (result,) = discover(tmp_path).captures
+    assert (result.name, [b.name for b in result.bands]) == ("IMG_0001", ["band_1", "NIR"])
+    assert (result.camera.make, result.capture_id) == ("MicaSense", "synthetic00000000001")
+
+
 def test_a_multiband_file_is_a_capture(tmp_path: Path) -> None:
     write(tmp_path / "stack.tif", bands=4)
     (capture,) = discover(tmp_path).captures

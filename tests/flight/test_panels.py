@@ -68,12 +68,15 @@ def test_between_panels_the_light_is_linear_in_time_and_beyond_them_as_the_neare
 
 def test_a_panel_on_the_ground_tells_how_high_the_others_are() -> None:
     band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
-    ground = PanelReading(capture(band, position=Position(52.0, 5.0, 93.0)), ())
+    held = replace(band, panel=Panel("look"))
+    ground = PanelReading(capture(held, position=Position(52.0, 5.0, 93.0)), ())
     high = capture(band, position=Position(52.0, 5.0, 112.0), pose=Pose(30.0))
     result = with_height(high, [ground])
     assert result.pose is not None
     assert result.pose.height_m == pytest.approx(20.0)
     assert with_height(high, []) == high
+    in_scene = replace(band, panel=Panel("QR code", in_scene=True))
+    assert with_height(high, [PanelReading(capture(in_scene, position=Position(52.0, 5.0, 93.0)), ())]) == high
     told = replace(high, pose=Pose(30.0, height_m=25.0))
     assert with_height(told, [ground]) == told
     assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
@@ -125,7 +128,8 @@ def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
 
 def test_without_a_time_no_panel_is_at_the_height_of_the_ground() -> None:
     band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
-    ground = PanelReading(capture(band, "1970-01-01T01:00:00", position=Position(52.0, 5.0, 93.0)), ())
+    held = replace(band, panel=Panel("look"))
+    ground = PanelReading(capture(held, "1970-01-01T01:00:00", position=Position(52.0, 5.0, 93.0)), ())
     high = capture(band, "", position=Position(52.0, 5.0, 112.0), pose=Pose(30.0))
     assert with_height(high, [ground]) == high
     undated = replace(ground, capture=replace(ground.capture, captured_at=""))

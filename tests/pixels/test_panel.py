@@ -47,6 +47,22 @@ def test_a_square_without_a_code_counts_only_where_asked_for(panel: np.ndarray) 
     assert panel[inside(result.area_px, panel.shape)].mean() == pytest.approx(0.51, abs=0.005)
 
 
+@pytest.mark.parametrize(("at", "in_scene"), [((0, 0), True), ((540, 405), True), ((270, 200), False)])
+def test_a_panel_away_from_the_middle_of_a_wider_image_is_part_of_a_scene(
+    panel: np.ndarray, at: tuple[int, int], in_scene: bool
+) -> None:
+    held = find_panel(raster(panel))
+    assert held is not None
+    assert not held.in_scene
+    scene = np.full((1125, 1500), 0.08)
+    x, y = at
+    scene[y : y + SIZE[1], x : x + SIZE[0]] = panel
+    result = find_panel(raster(scene))
+    assert result is not None
+    assert result.code == PANEL_CODE
+    assert result.in_scene is in_scene
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("without_code", [False, True])
 def test_a_field_shows_no_panel(without_code: bool) -> None:
