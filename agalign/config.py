@@ -115,6 +115,8 @@ class WriteSettings(Stage):
     """The reference's own pixels, or as many more as the finest band has."""
     stac: bool = False
     """A STAC item beside each capture's files."""
+    indices: tuple[str, ...] = ()
+    """Names of the spectral indices to write of each capture, such as ndvi and ndre."""
     pan_sharpen: bool = False
     """The narrow bands at the panchromatic band's resolution, beside the others."""
     error_map: bool = False

@@ -11,7 +11,7 @@ from agalign.errors import AgalignError, ConfigurationError, InputError, Sidecar
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
 from agalign.products.fill_sidecar import sidecar_of
-from agalign.products.indices import INDICES
+from agalign.products.index_rasters import outdated_rasters
 from agalign.products.layout import output_layers
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths, ProductContext
@@ -117,10 +117,7 @@ def discard_outputs(capture: Capture, out: Path, settings: WriteSettings) -> Non
     old = paths_written(capture, out, settings)
     with suppress(SidecarError):
         old += [paths.folder / name for name in read_result(paths.sidecar).files]
-    for name in INDICES:
-        # Unless a capture has that name.
-        if not paths.file(f"_{name}.json").exists():
-            old += [paths.file(f"_{name}{suffix}") for suffix in (".tif", ".png")]
+        old += outdated_rasters(paths.file(""))
     for path in old:
         with suppress(OSError):
             path.unlink(missing_ok=True)

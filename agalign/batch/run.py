@@ -26,6 +26,7 @@ from agalign.flight.panels import PanelReading, read_panel, reflectance_factors,
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
+from agalign.products.index_product import check_indices
 from agalign.products.panels import write_panels
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths
@@ -84,6 +85,7 @@ def run_flight(
     where no worker process can be started or they end one after another, InputError or ConfigurationError for `model`.
     """
     options, listener = options or RunOptions(), listener or Listener()
+    check_indices(flight.captures, settings.write)
     _refuse_to_overwrite(flight, out, settings.write)
     known = None if model is None else _given_model(model, flight, settings)
     if known is not None:

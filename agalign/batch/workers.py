@@ -2,8 +2,6 @@
 
 import logging
 import os
-import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
@@ -18,10 +16,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
-from multiprocessing import get_all_start_methods, get_context
-from multiprocessing.context import BaseContext
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 
@@ -36,7 +32,7 @@ from agalign.method.device import choose_device, keep_freed_memory, limit_thread
 from agalign.products.preview import preview_bytes
 from agalign.values.capture import Capture
 from agalign.values.process_pool import Outcome, ProcessPool, WorkerDiedError
-from agalign.values.processes import follow_parent
+from agalign.values.processes import follow_parent, threads_of_children, worker_context
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 _LOG = logging.getLogger(__name__)
@@ -66,7 +62,9 @@ class Task:
         return replace(self, capture=replace(self.capture, bands=bands), out=self.out.absolute(), model=model)
 
 
-Submit = Callable[[Task], "Future[CaptureReport]"]
+T = TypeVar("T")
+R = TypeVar("R")
+Submit = Callable[[T], Future[R]]
 CapturePool = ProcessPool[Task, CaptureReport]
 OnStart = Callable[[Capture], None]
 
@@ -97,14 +95,23 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
 
 
 def done_by(
-    submit: Submit, tasks: Sequence[Task], maximum: int, timeout_s: float | None = None,
+    submit: Submit[Task, CaptureReport], tasks: Sequence[Task], maximum: int, timeout_s: float | None = None,
     loss: Callable[[], str] = str,
 ) -> Iterator[CaptureReport]:  # fmt: skip
-    """Never more than `maximum` handed over at a time, so that a season's captures do not wait in memory.
+    """The report of each task, as an executor does them. Raises WorkerError as `finished_by` does."""
+    for task, result in finished_by(submit, tasks, maximum, loss):
+        yield _report_of(result, task, timeout_s)
 
-    `loss` returns why no task can be done any more, or nothing. Raises WorkerError with that reason.
+
+def finished_by(
+    submit: Submit[T, R], tasks: Sequence[T], maximum: int, loss: Callable[[], str] = str
+) -> Iterator[tuple[T, Callable[[], R]]]:
+    """Each task and what returns or raises its result, as an executor does them.
+
+    Never more than `maximum` are handed over at a time, so that a season's captures do not wait in memory. `loss`
+    returns why no task can be done any more, or nothing. Raises WorkerError with that reason.
     """
-    futures: dict[Future[CaptureReport], Task] = {}
+    futures: dict[Future[R], T] = {}
     remaining = iter(tasks)
     try:
         for task in islice(remaining, maximum):
@@ -115,10 +122,9 @@ def done_by(
                 raise WorkerError(reason)
             for future in done:
                 task = futures.pop(future)
-                report = _report_of(future.result, task, timeout_s)
-                if report.state == "error" and (reason := loss()):
+                if (future.cancelled() or future.exception() is not None) and (reason := loss()):
                     raise WorkerError(reason)
-                yield report
+                yield task, future.result
                 for following in islice(remaining, 1):
                     futures[_submitted(submit, following)] = following
     finally:
@@ -126,12 +132,12 @@ def done_by(
             future.cancel()
 
 
-def _submitted(submit: Submit, task: Task) -> "Future[CaptureReport]":
+def _submitted(submit: Submit[T, R], task: T) -> "Future[R]":
     """The future of a task; an executor that lost its processes refuses it, which is this task's outcome."""
     try:
         return submit(task)
     except BrokenExecutor as error:
-        refused: Future[CaptureReport] = Future()
+        refused: Future[R] = Future()
         refused.set_exception(error)
         return refused
 
@@ -146,9 +152,14 @@ def done_in(pool: CapturePool, tasks: Sequence[Task], timeout_s: float | None = 
 
 
 def _report_of(result: Callable[[], CaptureReport], task: Task, timeout_s: float | None) -> CaptureReport:
-    label = task.capture.label
+    report, problem = result_or_problem(result, timeout_s)
+    return CaptureReport(task.capture.label, "error", error=problem) if report is None else report
+
+
+def result_or_problem(result: Callable[[], R], timeout_s: float | None = None) -> tuple[R | None, str]:
+    """What a task returned, or None and one line that says what became of it."""
     try:
-        return result()
+        return result(), ""
     except TimeoutError:
         problem = f"given up after {timeout_s or 0:g} s, as --timeout asks"
     except WorkerDiedError as error:
@@ -165,17 +176,18 @@ def _report_of(result: Callable[[], CaptureReport], task: Task, timeout_s: float
             problem = f"the cluster lost it ({said}); run again to do what is left"
         else:
             problem = f"agalign failed on it ({type(error).__name__}: {said}); please report this"
-    return CaptureReport(label, "error", error=problem)
+    return None, problem
 
 
 @contextmanager
 def own_processes(jobs: int) -> Iterator[CapturePool]:
     """So many processes of our own, which load what they need while the caller does something else."""
     threads = max(1, (os.cpu_count() or 1) // jobs)
+    context = worker_context(__name__)
     with (
         threads_of_children(threads),
         ProcessPool(
-            do_capture, jobs, worker_context(), start_worker, (threads,), max_tasks_per_worker=_CAPTURES_A_PROCESS
+            do_capture, jobs, context, start_worker, (threads,), max_tasks_per_worker=_CAPTURES_A_PROCESS
         ) as pool,
     ):
         yield pool
@@ -291,45 +303,6 @@ def start_worker(threads: int) -> None:
     """What a worker process does first."""
     follow_parent()
     limit_threads(threads)
-
-
-def worker_context() -> BaseContext:
-    """How processes are started: from one that has loaded this module, where the system bears that, else each anew.
-
-    On macOS a copy of a process that has loaded Apple's libraries may crash or hang. The fork server needs a socket in
-    a temporary folder, which a service account may not have.
-    """
-    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not _has_temporary_folder():
-        return get_context("spawn")
-    context = get_context("forkserver")
-    context.set_forkserver_preload([__name__])
-    return context
-
-
-def _has_temporary_folder() -> bool:
-    try:
-        tempfile.gettempdir()
-    except OSError:
-        return False
-    return True
-
-
-@contextmanager
-def threads_of_children(count: int) -> Iterator[None]:
-    """Libraries read these once, when they are loaded: threads of several processes that wait for each other's cores
-    take twice the time.
-    """
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, str(count)))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def stamp(path: Path) -> int:

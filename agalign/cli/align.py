@@ -184,6 +184,13 @@ def align(
             "<capture>.pan.tif.",
         ),
     ] = False,
+    index: Annotated[
+        str | None,
+        of_output(
+            show_default=False,
+            help="Also write spectral indices, names separated by commas: ndvi, ndre …; 'agalign indices' adds others.",
+        ),
+    ] = None,
     stac: Annotated[bool, of_output("--stac", help="A STAC item beside each capture's files.")] = False,
     relief_map: Annotated[
         bool,
@@ -251,7 +258,8 @@ def align(
             relief=ReliefSettings(use=relief),
             write=WriteSettings(
                 interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
-                radiometry=radiometry, panel_albedo=albedos(panel_albedo), stac=stac, error_map=error_map,
+                radiometry=radiometry, panel_albedo=albedos(panel_albedo), stac=stac,
+                indices=tuple(name.lower() for name in band_names(index)), error_map=error_map,
                 relief_map=relief_map, fill_occluded=fill_occluded,
                 pan_sharpen=pan_sharpen,
                 format=format, compression=compression,

@@ -19,6 +19,7 @@ _LIBRARIES = ("torch", "numpy", "opencv-python-headless", "rasterio", "tifffile"
 EXTRAS = {
     "dask": "captures on the workers of a Dask cluster (--dask)",
     "evaluate": "elastix beside the learnt descriptors (agalign evaluate)",
+    "indices": "more spectral indices by name (agalign indices --index)",
     "stac": "STAC items and collections (--stac)",
     "xarray": "a flight as one lazily read Dataset (agalign.open_flight)",
 }

@@ -4,10 +4,9 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import Annotated, get_args
 
 import typer
 from rich.table import Table
@@ -16,13 +15,13 @@ from agalign._version import __version__
 from agalign.cli import align as cli_align
 from agalign.cli import doctor as cli_doctor
 from agalign.cli import evaluate as cli_evaluate
+from agalign.cli import indices as cli_indices
 from agalign.cli import info as cli_info
 from agalign.cli.align import Jobs
 from agalign.cli.failures import explain
 from agalign.cli.onto import onto
 from agalign.cli.run import GOES_ON, conclude, find_captures, run
 from agalign.cli.terminal import (
-    EXIT_NOTHING,
     EXIT_OK,
     EXIT_PARTIAL,
     EXIT_USAGE,
@@ -39,9 +38,6 @@ from agalign.cli.terminal import (
 )
 from agalign.values.choices import RadiometryChoice, ReliefUse
 from agalign.values.memory_limit import check_address_space
-
-if TYPE_CHECKING:
-    from agalign.products.index_rasters import IndexReport
 
 _EXAMPLES = examples(
     ("agalign demo", "a synthetic flight, aligned and compared with its truth"),
@@ -161,60 +157,7 @@ def verify(
         raise typer.Exit(EXIT_PARTIAL if damaged else EXIT_OK)
 
 
-@app.command()
-def ndvi(
-    out: Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)],
-    index: Annotated[
-        str, typer.Option(help="Names separated by commas: ndvi, ndre, gndvi, ndwi, savi, evi …")
-    ] = "ndvi",
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    log_json: LogJson = False,
-) -> None:
-    """Vegetation indices of aligned captures: a raster and a picture each."""
-    terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(terminal):
-        from agalign.batch.output_folder import locked
-        from agalign.products.index_rasters import IndexReport, write_indices
-        from agalign.products.indices import index_named
-
-        chosen = [index_named(name) for name in index.split(",")]
-        reports: list[IndexReport] = []
-        with locked(out) if out.is_dir() else nullcontext():
-            for result in write_indices(out, chosen):
-                reports.append(result)
-                if result.problem:
-                    terminal.problem(f"{result.capture}: {result.problem}", capture=result.capture, index=result.index)
-                else:
-                    text = f"{result.capture} {result.index}: median {result.median:.3f}"
-                    terminal.event("index", text if verbose else "", **vars(result))
-        written = [r for r in reports if r.path is not None]
-        if any(r.raw_numbers for r in written):
-            terminal.problem(
-                "the bands are raw numbers, not reflectance: their indices compare places within a capture, not "
-                "captures or cameras; align with --radiometry where the camera's tags allow it"
-            )
-        if written:
-            terminal.result(_index_table([one.name for one in chosen], reports))
-            terminal.result(shown(f"Rasters and pictures beside each capture: {written[0].path}, …"))
-        raise typer.Exit(EXIT_NOTHING if not written else EXIT_OK if len(written) == len(reports) else EXIT_PARTIAL)
-
-
-def _index_table(names: Sequence[str], reports: "Sequence[IndexReport]") -> Table:
-    """A row per index: the medians of its captures."""
-    from statistics import median
-
-    written = [r for r in reports if r.path is not None]
-    table = Table("Index", title=f"{len(written)} of {len(reports)} written; medians of captures")
-    for name in ("Captures", "Median", "Lowest", "Highest"):
-        table.add_column(name, justify="right")
-    for name in names:
-        values = [r.median for r in written if r.index == name]
-        if values:
-            table.add_row(name, str(len(values)), *(f"{v:.3f}" for v in (median(values), min(values), max(values))))
-    return table
-
-
+cli_indices.register(app)
 app.command()(onto)
 cli_doctor.register(app)
 cli_evaluate.register(app)

@@ -17,6 +17,7 @@ from agalign.products.product import ProductContext, WrittenFile
 from agalign.products.relief_map import ReliefMap
 from agalign.products.sidecar import (
     BandPart,
+    BandResult,
     CameraPart,
     FilePart,
     GridPart,
@@ -64,7 +65,7 @@ def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> Cap
     return "failed" if all(b.status == "failed" for b in moving) else "degraded"
 
 
-def is_delivered(band: BandPart, accept_predicted_px: float) -> bool:
+def is_delivered(band: BandResult, accept_predicted_px: float) -> bool:
     """True for a band that is aligned, or predicted this well."""
     if band.status == "predicted" and band.prediction is not None:
         return band.prediction.std_px <= accept_predicted_px

@@ -1,48 +1,64 @@
-"""Vegetation indices of the captures below an output folder: a float32 raster and a picture each."""
+"""Spectral indices of a capture: a float32 raster and a picture of each, with their statistics."""
 
+import hashlib
+import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import rasterio
 import tifffile
 from numpy.typing import NDArray
+from rasterio.enums import MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
+from agalign._version import __version__
 from agalign.errors import AgalignError, InputError, OutputError
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, why, without_warnings
-from agalign.products.drawing import with_text, write_png
 from agalign.products.fill_sidecar import is_delivered
+from agalign.products.index_picture import picture_size, write_picture
 from agalign.products.indices import Index, bands_for, compute
 from agalign.products.raster_file import PixelChecksums, check_complete
-from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
+from agalign.products.sidecar import CaptureResult, find_sidecars, read_result
 from agalign.values.files import complete_file
 from agalign.values.image import FloatImage
 
+RAW = "raw numbers"
 _TILE_PX = 256
 _WORK_PX = 2048
-_BINS, _BARS = 1200, 120
-"""Of the values, and of the picture's histogram."""
-_PICTURE_PX = 720
-_COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
-"""Water, soil, and the greens, red green blue, over an index's span."""
-_NODATA_COLOUR = (225, 225, 225)
-_RAW = "raw numbers"
 _OLD_ACCEPT_PREDICTED_PX = 1.0
 """For sidecars that do not state the limit of their run: the default of `--accept-predicted`."""
 _MAX_REFLECTANCE = 2.0
 """Glints and specular leaves exceed 1; raw numbers of any sensor exceed this."""
 _SAMPLE_PX = 512
 """Longer side of the sample by which unnamed numbers are told apart."""
+_MAX_STATISTICS_PX = 4_000_000
+"""Percentiles of larger rasters are those of every second, third … pixel."""
+_MIN_SPAN = 1e-3
+_STATISTICS = "INDEX_STATISTICS"
 
 Source = tuple[rasterio.DatasetReader, int]
 """A file and the index of a band in it."""
+
+
+@dataclass(frozen=True)
+class IndexStatistics:
+    """The values of an index raster; nan where no pixel is valid."""
+
+    median: float = math.nan
+    p5: float = math.nan
+    p95: float = math.nan
+    valid_share: float = 0.0
+    unit: str = ""
+    """Of the bands: reflectance, radiance, or raw numbers."""
+    low: float = math.nan
+    """The span of values that the picture shows,"""
+    high: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -51,69 +67,214 @@ class IndexReport:
 
     capture: str
     index: str
-    path: Path | None
-    median: float
-    raw_numbers: bool
-    """The bands hold neither reflectance nor radiance."""
+    path: Path | None = None
+    """None where it could not be written."""
+    statistics: IndexStatistics = IndexStatistics()
+    problem: str = ""
+    kept: bool = False
+    """An earlier command wrote it, of the same bands by the same formula."""
+
+    @property
+    def median(self) -> float:
+        """Of the valid pixels."""
+        return self.statistics.median
+
+    @property
+    def raw_numbers(self) -> bool:
+        """True where the bands are neither reflectance nor radiance."""
+        return self.statistics.unit == RAW
+
+
+@dataclass(frozen=True)
+class IndexBand:
+    """An aligned band: where its pixels are, or why there are none to be used."""
+
+    name: str
+    wavelength_nm: float | None
+    file: Path
+    band_index: int
+    sha256: str = ""
+    """Of the file, where it is known."""
     problem: str = ""
 
 
+@dataclass
+class _Raster:
+    """An index that is being written."""
+
+    index: Index
+    bands: Sequence[IndexBand]
+    target: Path
+    unit: str
+    made_from: str
+    checksums: PixelChecksums = field(default_factory=PixelChecksums)
+    samples: list[NDArray[np.float32]] = field(default_factory=list)
+    valid_px: int = 0
+    dataset: Any = None
+
+
 def write_indices(out: Path, indices: Sequence[Index]) -> Iterator[IndexReport]:
-    """Write OUT/<folder>/<capture>_<index>.tif and .png for every capture of a run.
+    """Write OUT/<folder>/<capture>_<index>.tif and .png for every capture of a run, one after another.
 
     A capture that lacks a band, or whose band is not aligned, is reported and stops no other. Raises InputError where
     there is no run.
     """
+    for path in run_sidecars(out):
+        label = path.relative_to(out).with_suffix("").as_posix()
+        yield from write_capture_indices(path, indices, path.with_suffix(""), label)
+
+
+def run_sidecars(out: Path) -> list[Path]:
+    """Return the sidecars below the output folder of a run. Raises InputError where there are none."""
     sidecars = find_sidecars(out) if out.is_dir() else []
     if not sidecars:
         raise InputError(f"{out}: no sidecars there; give the output folder of a run")
-    for path in sidecars:
-        label = (path.parent.relative_to(out) / path.stem).as_posix()
-        for index in indices:
-            try:
-                sidecar = read_sidecar(path)
-                yield write_index(sidecar, path, index, label)
-            except AgalignError as error:
-                yield IndexReport(label, index.name, None, math.nan, False, str(error))
+    return sidecars
 
 
-def write_index(sidecar: Sidecar, path: Path, index: Index, label: str = "") -> IndexReport:
-    """Write one index of the capture whose sidecar is at `path`.
+def write_capture_indices(
+    sidecar: Path, indices: Sequence[Index], base: Path, label: str, *, overwrite: bool = True
+) -> list[IndexReport]:
+    """Write indices of the capture with this sidecar as `base`_<index>.tif; every problem is in the reports.
 
-    Raises InputError where a band is missing, not aligned, or not in the unit that the index needs; OutputError.
+    Without `overwrite`, rasters that an earlier command wrote of the same bands by the same formula are kept.
     """
-    parts = sidecar.bands
-    chosen = [parts[i] for i in bands_for(index, [p.band for p in parts], [p.wavelength_nm for p in parts])]
-    _need_delivered(chosen, index, sidecar.accept_predicted_px)
-    target = path.with_name(f"{path.stem}_{index.name}.tif")
-    counts, edges = np.zeros(_BINS, np.int64), np.linspace(*index.span, _BINS + 1)
-    with ExitStack() as stack:
-        sources = [_open(stack, path, part) for part in chosen]
-        unit = _unit(index, sources)
-        with complete_file(target) as partial:
-            _write_values(partial, target, index, sources, unit, counts, edges)
-    _write_picture(target, index, counts, raw=unit == _RAW)
-    middle = np.searchsorted(np.cumsum(counts), counts.sum() / 2)
-    median = float(edges[middle : middle + 2].mean()) if counts.any() else math.nan
-    return IndexReport(label, index.name, target, median, unit == _RAW)
+    try:
+        return write_rasters(bands_of(read_result(sidecar), sidecar.parent), indices, base, label, overwrite=overwrite)
+    except AgalignError as error:
+        return [IndexReport(label, index.name, problem=str(error)) for index in indices]
 
 
-def _need_delivered(parts: Sequence[BandPart], index: Index, accept_predicted_px: float | None) -> None:
-    """Raise InputError for a band that the run did not count as delivered, or that has no pixels."""
-    limit_px = _OLD_ACCEPT_PREDICTED_PX if accept_predicted_px is None else accept_predicted_px
-    for part in parts:
+def bands_of(sidecar: CaptureResult, folder: Path) -> list[IndexBand]:
+    """Return the bands of a capture with the files in the folder of its sidecar."""
+    given = sidecar.accept_predicted_px
+    limit_px = _OLD_ACCEPT_PREDICTED_PX if given is None else given
+    sums = {part.file: part.sha256 for part in sidecar.products}
+    result = []
+    for part in sidecar.bands:
+        problem = ""
         if not is_delivered(part, limit_px) or part.place is None:
             known = "" if part.prediction is None else f" to {part.prediction.std_px:.1f} px, not {limit_px:g}"
-            raise InputError(f"{index.name} is left out: {part.band} is {part.status}{known} ({part.reason})")
+            problem = f"{part.band} is {part.status}{known} ({part.reason})"
+        file, number = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
+        result.append(IndexBand(part.band, part.wavelength_nm, folder / file, number, sums.get(file, ""), problem))
+    return result
 
 
-def _open(stack: ExitStack, sidecar: Path, part: BandPart) -> Source:
-    assert part.place is not None
-    path, index = sidecar.parent / part.place.file, part.place.band_index
-    source = stack.enter_context(open_raster(path))
-    if index > source.count:
-        raise InputError(f"{path}: has no band {index}, as its sidecar says; run again")
-    return source, index
+def write_rasters(
+    bands: Sequence[IndexBand], indices: Sequence[Index], base: Path, label: str, *, overwrite: bool = True
+) -> list[IndexReport]:
+    """Write `base`_<index>.tif and .png of a capture's bands, each complete or not at all.
+
+    An index whose bands are missing, not aligned, or not in the unit that it needs has a report with the problem.
+    Raises OutputError, or InputError for a file that cannot be read.
+    """
+    reports: dict[str, IndexReport] = {}
+    rasters: list[_Raster] = []
+    with ExitStack() as stack:
+        files: dict[Path, rasterio.DatasetReader] = {}
+        for index in indices:
+            target = base.with_name(f"{base.name}_{index.name}.tif")
+            try:
+                chosen = _chosen(bands, index)
+                made_from = _made_from(index, chosen)
+                known = None if overwrite else _finished_before(target, made_from)
+                if known is not None:
+                    reports[index.name] = IndexReport(label, index.name, target, known, kept=True)
+                    continue
+                unit = _unit(index, [_source(stack, files, band) for band in chosen])
+            except InputError as error:
+                reports[index.name] = IndexReport(label, index.name, problem=str(error))
+                continue
+            rasters.append(_Raster(index, chosen, target, unit, made_from))
+        if rasters:
+            statistics = _write(rasters, files)
+            for raster, one in zip(rasters, statistics, strict=True):
+                reports[raster.index.name] = IndexReport(label, raster.index.name, raster.target, one)
+    return [reports[index.name] for index in indices]
+
+
+def unit_of(bands: Sequence[IndexBand]) -> str:
+    """Return what the numbers of the first band with pixels are; empty where there is none. Raises InputError."""
+    for band in bands:
+        if not band.problem:
+            with ExitStack() as stack:
+                source, number = _source(stack, {}, band)
+                return _units_of(source, number)[0]
+    return ""
+
+
+def is_index_raster(path: Path) -> bool:
+    """True for a file that `write_rasters` wrote."""
+    try:
+        with open_raster(path) as source:
+            return _STATISTICS in source.tags()
+    except AgalignError:
+        return False
+
+
+def read_statistics(path: Path) -> IndexStatistics | None:
+    """Return the statistics of an index raster by its tags; None where it is none, or cannot be read."""
+    try:
+        with open_raster(path) as source:
+            return _statistics_in(source.tags())
+    except AgalignError:
+        return None
+
+
+def _chosen(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]:
+    """The bands of an index. Raises InputError for one that is missing or not delivered."""
+    chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
+    for band in chosen:
+        if band.problem:
+            raise InputError(f"{index.name} is left out: {band.problem}")
+    return chosen
+
+
+def _made_from(index: Index, bands: Sequence[IndexBand]) -> str:
+    """Sixteen digits of all that an index raster depends on."""
+    sources = [(b.sha256 or _state(b.file), b.band_index) for b in bands]
+    facts = json.dumps([__version__, index.formula, index.constants, index.span, sources])
+    return hashlib.sha256(facts.encode()).hexdigest()[:16]
+
+
+def _state(path: Path) -> list[int]:
+    try:
+        state = path.stat()
+    except OSError:
+        return []
+    return [state.st_size, state.st_mtime_ns]
+
+
+def _finished_before(target: Path, made_from: str) -> IndexStatistics | None:
+    """The statistics of a complete raster with its picture that an earlier command made of the same; else None."""
+    if not target.is_file() or not target.with_suffix(".png").is_file():
+        return None
+    try:
+        check_complete(target)
+        with open_raster(target) as source:
+            tags = source.tags()
+    except (AgalignError, OSError, tifffile.TiffFileError):
+        return None
+    return _statistics_in(tags) if tags.get("INDEX_MADE_FROM") == made_from else None
+
+
+def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
+    try:
+        known: dict[str, Any] = json.loads(tags[_STATISTICS])
+        unit = str(known.pop("unit"))
+        return IndexStatistics(unit=unit, **{k: math.nan if v is None else float(v) for k, v in known.items()})
+    except (KeyError, ValueError, TypeError):
+        return None
+
+
+def _source(stack: ExitStack, files: dict[Path, rasterio.DatasetReader], band: IndexBand) -> Source:
+    if band.file not in files:
+        files[band.file] = stack.enter_context(open_raster(band.file))
+    source = files[band.file]
+    if band.band_index > source.count:
+        raise InputError(f"{band.file}: has no band {band.band_index}, as its sidecar says; run again")
+    return source, band.band_index
 
 
 def _unit(index: Index, sources: Sequence[Source]) -> str:
@@ -134,43 +295,90 @@ def _units_of(source: rasterio.DatasetReader, index: int) -> list[str]:
         return str(said).split(" and ")
     whole = np.dtype(source.dtypes[index - 1]).kind in "ui"
     if whole and source.scales[index - 1] == 1.0:
-        return [_RAW]
+        return [RAW]
     reduction = max(1.0, max(source.width, source.height) / _SAMPLE_PX)
     some = Window(0, 0, source.width, source.height)
     shape = max(1, round(source.height / reduction)), max(1, round(source.width / reduction))
     values = _physical(source, index, some, shape)
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 0.0)
-    return ["reflectance"] if low >= -_MAX_REFLECTANCE and high <= _MAX_REFLECTANCE else [_RAW]
+    return ["reflectance"] if low >= -_MAX_REFLECTANCE and high <= _MAX_REFLECTANCE else [RAW]
 
 
-def _write_values(
-    partial: Path, target: Path, index: Index, sources: Sequence[Source], unit: str, counts: NDArray[np.int64],
-    edges: NDArray[np.float64],
-) -> None:  # fmt: skip
-    """Write the raster and add its values to the histogram's counts. Raises OutputError."""
-    checksums = PixelChecksums()
+def _write(rasters: Sequence[_Raster], files: Mapping[Path, rasterio.DatasetReader]) -> list[IndexStatistics]:
+    """Write rasters and pictures; each band is read once. Raises OutputError, InputError for a band."""
+    first = rasters[0]
+    like = files[first.bands[0].file]
+    step = max(1, math.ceil(math.sqrt(like.width * like.height / _MAX_STATISTICS_PX)))
     try:
-        with ExitStack() as stack:
-            dataset = _create(stack, partial, sources[0][0], index, raw=unit == _RAW)
-            for window in _windows(dataset.width, dataset.height):
-                value = compute(index, [_physical(source, i, window) for source, i in sources])
-                counts += np.histogram(value[np.isfinite(value)].clip(*index.span), edges)[0]
-                checksums.write(dataset, value, 1, window)
-        check_complete(partial)
-        checksums.check(partial)
+        with ExitStack() as done:
+            partials = [done.enter_context(complete_file(raster.target)) for raster in rasters]
+            with ExitStack() as stack:
+                for raster, partial in zip(rasters, partials, strict=True):
+                    raster.dataset = _create(stack, partial, like, raster)
+                for window in _windows(like.width, like.height):
+                    _write_window(rasters, files, window, step)
+                statistics = [_statistics(raster, like.width * like.height) for raster in rasters]
+                for raster, one in zip(rasters, statistics, strict=True):
+                    known = {k: v if isinstance(v, str) or math.isfinite(v) else None for k, v in vars(one).items()}
+                    raster.dataset.update_tags(**{_STATISTICS: json.dumps(known)})
+            for raster, partial in zip(rasters, partials, strict=True):
+                check_complete(partial)
+                raster.checksums.check(partial)
     except (OSError, RasterioError, tifffile.TiffFileError) as error:
-        raise OutputError(f"{target}: cannot be written ({why(error)})") from None
+        raise OutputError(f"{first.target}: cannot be written ({why(error)})") from None
+    for raster, one in zip(rasters, statistics, strict=True):
+        _draw(raster, one)
+    return statistics
+
+
+def _write_window(
+    rasters: Sequence[_Raster], files: Mapping[Path, rasterio.DatasetReader], window: Window, step: int
+) -> None:
+    read: dict[tuple[Path, int], FloatImage] = {}
+    for raster in rasters:
+        for band in raster.bands:
+            key = band.file, band.band_index
+            if key not in read:
+                read[key] = _physical(files[band.file], band.band_index, window)
+        value = compute(raster.index, [read[b.file, b.band_index] for b in raster.bands])
+        raster.checksums.write(raster.dataset, value, 1, window)
+        valid = np.isfinite(value)
+        raster.valid_px += int(np.count_nonzero(valid))
+        raster.samples.append(value[::step, ::step][valid[::step, ::step]])
+
+
+def _statistics(raster: _Raster, pixels: int) -> IndexStatistics:
+    values = np.concatenate(raster.samples)
+    raster.samples = [values]
+    if not values.size:
+        return IndexStatistics(unit=raster.unit, low=0.0, high=1.0)
+    low, p5, median, p95, high = (round(float(v), 6) for v in np.percentile(values, (2, 5, 50, 95, 98)))
+    if raster.index.span is not None and raster.unit != RAW:
+        low, high = raster.index.span
+    return IndexStatistics(
+        median, p5, p95, round(raster.valid_px / pixels, 6), raster.unit, low, max(high, low + _MIN_SPAN)
+    )
 
 
 def _physical(
     source: rasterio.DatasetReader, index: int, window: Window, shape: tuple[int, int] | None = None
 ) -> FloatImage:
-    """Scaled as the file says, nan where it says nothing is known; of (height, width) `shape` where one is given."""
-    pixels = source.read(index, window=window, out_shape=shape).astype(np.float32)
-    valid = source.read_masks(index, window=window, out_shape=shape) > 0
-    scaled = pixels * np.float32(source.scales[index - 1]) + np.float32(source.offsets[index - 1])
-    return np.where(valid, scaled, np.float32(np.nan))
+    """Scaled as the file says, nan where it says nothing is known; of (height, width) `shape` where one is given.
+
+    Raises InputError where it cannot be read.
+    """
+    scale, offset, nodata = source.scales[index - 1], source.offsets[index - 1], source.nodatavals[index - 1]
+    try:
+        pixels = source.read(index, window=window, out_shape=shape).astype(np.float32)
+        known_by_nan = nodata is not None and math.isnan(nodata)
+        masked = MaskFlags.all_valid not in source.mask_flag_enums[index - 1] and not known_by_nan
+        valid = source.read_masks(index, window=window, out_shape=shape) > 0 if masked else None
+    except RasterioError as error:
+        raise InputError(f"{source.name}: cannot be read ({why(error)}); run again") from None
+    if scale != 1.0 or offset != 0.0:
+        pixels = pixels * np.float32(scale) + np.float32(offset)
+    return pixels if valid is None else np.where(valid, pixels, np.float32(np.nan))
 
 
 def _windows(width: int, height: int) -> Iterator[Window]:
@@ -179,7 +387,7 @@ def _windows(width: int, height: int) -> Iterator[Window]:
             yield Window(x, y, min(_WORK_PX, width - x), min(_WORK_PX, height - y))
 
 
-def _create(stack: ExitStack, path: Path, like: rasterio.DatasetReader, index: Index, *, raw: bool) -> Any:
+def _create(stack: ExitStack, path: Path, like: rasterio.DatasetReader, raster: _Raster) -> Any:
     profile: dict[str, Any] = {
         "driver": "GTiff", "width": like.width, "height": like.height, "count": 1, "dtype": "float32",
         "nodata": math.nan, "tiled": True, "blockxsize": _TILE_PX, "blockysize": _TILE_PX, "compress": "deflate",
@@ -190,46 +398,38 @@ def _create(stack: ExitStack, path: Path, like: rasterio.DatasetReader, index: I
     stack.enter_context(rasterio.Env(**GDAL_ENVIRONMENT))
     stack.enter_context(without_warnings())
     dataset = stack.enter_context(rasterio.open(path, "w", **profile))
+    index = raster.index
     dataset.set_band_description(1, index.name)
     kept = {k: v for k, v in like.tags().items() if k in ("CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY")}
     kept |= {"TIFFTAG_SOFTWARE": "agalign", "INDEX": index.name, "INDEX_SOURCE": index.source}
-    dataset.update_tags(**kept, **({"INPUT": "raw numbers, not reflectance"} if raw else {}))
+    kept |= {"INDEX_FORMULA": _written_out(index), "INDEX_MADE_FROM": raster.made_from}
+    dataset.update_tags(**kept, **({"INPUT": "raw numbers, not reflectance"} if raster.unit == RAW else {}))
     return dataset
 
 
-# ---- the picture
+def _written_out(index: Index) -> str:
+    constants = ", ".join(f"{name} = {value:g}" for name, value in index.constants)
+    return f"{index.formula} with {constants}" if constants else index.formula
 
 
-def _write_picture(raster: Path, index: Index, counts: NDArray[np.int64], *, raw: bool) -> None:
-    """The index in colours over its histogram, whose bars are coloured alike."""
-    with open_raster(raster) as source:
-        scale = min(1.0, _PICTURE_PX / max(source.width, source.height))
-        shape = max(1, round(source.height * scale)), max(1, round(source.width * scale))
-        values = source.read(1, out_shape=shape)
-    width, margin, bars = max(shape[1], 360), 24, 90
-    counts = counts.reshape(_BARS, -1).sum(axis=1)
-    sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
-    sheet[: shape[0], : shape[1]] = _coloured(values, index)
-    base = shape[0] + margin + bars
-    edges = np.linspace(margin, width - margin, len(counts) + 1).round().astype(int)
-    centres = np.linspace(*index.span, 2 * len(counts) + 1)[1::2]
-    colours = _coloured(centres[None], index)[0]
-    # The outermost bins also hold what lies beyond the span.
-    heights = (bars * counts / max(int(counts[1:-1].max(initial=1)), 1)).clip(0, bars).round().astype(int)
-    for left, right, height, colour in zip(edges, edges[1:], heights.tolist(), colours.tolist(), strict=False):
-        cv2.rectangle(sheet, (int(left), base - height), (int(right) - 1, base), colour, -1)
-    for value in np.linspace(*index.span, 5):
-        at = round(margin + (value - index.span[0]) / (index.span[1] - index.span[0]) * (width - 2 * margin))
-        sheet = with_text(sheet, f"{value:.2f}", (at, base + 18), anchor="ms")
-    title = f"{index.name.upper()} of {raster.stem.removesuffix(f'_{index.name}')}"
-    sheet = with_text(sheet, f"{title}, of raw numbers" if raw else title, (margin, shape[0] + 18), 16)
-    write_png(sheet, raster.with_suffix(".png"))
+def _draw(raster: _Raster, statistics: IndexStatistics) -> None:
+    with open_raster(raster.target) as source:
+        width, height = picture_size(source.width, source.height)
+        values = source.read(1, out_shape=(height, width))
+    is_raw = raster.unit == RAW
+    name = raster.target.stem.removesuffix(f"_{raster.index.name}")
+    title = f"{raster.index.name.upper()} of {name}" + (": raw numbers, not reflectance" if is_raw else "")
+    span = statistics.low, statistics.high
+    write_picture(values, raster.samples[0], span, title, raster.target.with_suffix(".png"), neutral=is_raw)
 
 
-def _coloured(values: NDArray[np.floating[Any]], index: Index) -> NDArray[np.uint8]:
-    """(H, W) values as (H, W, 3) red, green, blue."""
-    share = np.clip((values - index.span[0]) / (index.span[1] - index.span[0]), 0, 1)
-    stops = np.linspace(0, 1, len(_COLOURS))
-    result = np.stack([np.interp(np.nan_to_num(share), stops, channel) for channel in _COLOURS.T], axis=-1)
-    result[~np.isfinite(values)] = _NODATA_COLOUR
-    return np.asarray(result.round(), np.uint8)
+def outdated_rasters(base: Path) -> Iterator[Path]:
+    """Yield the index rasters of a capture, `base`_<index>.tif, and their pictures."""
+    for path in base.parent.glob(f"{_escaped(base.name)}_*.tif"):
+        # Another capture may have such a name.
+        if not path.with_suffix(".json").exists() and is_index_raster(path):
+            yield from (path, path.with_suffix(".png"))
+
+
+def _escaped(name: str) -> str:
+    return "".join(f"[{c}]" if c in "*?[" else c for c in name)

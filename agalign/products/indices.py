@@ -1,12 +1,18 @@
-"""Vegetation indices from the bands of a capture, found by their wavelengths or names."""
+"""Spectral indices of the bands of a capture, which are found by their wavelengths or names."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from agalign.errors import ConfigurationError, InputError
+from agalign.products.formula import evaluate, symbols_of
 from agalign.values.image import FloatImage
 
 Role = Literal["blue", "green", "red", "red edge", "nir"]
@@ -26,51 +32,124 @@ _NOT_NARROW = ("pan", "rgb", "lwir", "thermal")
 """Bands of these names lie within a role's wavelengths by accident."""
 
 
+_LETTERS: dict[str, Role] = {
+    "B": "blue", "G": "green", "R": "red", "RE": "red edge", "RE1": "red edge", "N": "nir",
+}  # fmt: skip
+"""The names of bands in formulas, as in the catalogue Awesome Spectral Indices."""
+_CATALOGUE, _CONSTANTS = "spyndex/data/spectral-indices-dict.json", "spyndex/data/constants.json"
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
+_PROBE_SCALE = 1000.0
+
+
 @dataclass(frozen=True)
 class Index:
-    """A vegetation index of reflectances."""
+    """A spectral index of reflectances."""
 
     name: str
-    roles: tuple[Role, ...]
-    formula: Callable[..., FloatImage]
-    """Of the bands in the order of `roles`; division by zero may give anything that is not finite."""
-    span: tuple[float, float]
-    """Values between which a picture shows it."""
-    any_unit: bool = True
-    """False where constants in the formula make sense for reflectance only."""
+    formula: str
+    """Of the letters B, G, R, RE and N, and of `constants`."""
+    span: tuple[float, float] | None = None
+    """Values between which a picture shows it; None for the 2nd and 98th percentile of its values."""
     source: str = ""
+    constants: tuple[tuple[str, float], ...] = ()
+    any_unit: bool = True
+    """False where the formula applies to reflectance only."""
 
+    @cached_property
+    def symbols(self) -> tuple[str, ...]:
+        """The bands in the formula, in their order."""
+        return tuple(s for s in symbols_of(self.formula) if s not in dict(self.constants))
 
-def _difference(a: FloatImage, b: FloatImage) -> FloatImage:
-    return np.asarray((a - b) / (a + b))
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        """What the bands of `symbols` are."""
+        return tuple(_LETTERS[s.upper()] for s in self.symbols)
 
 
 _ALL = (
-    Index("ndvi", ("nir", "red"), _difference, (-0.2, 1.0), source="Rouse et al. 1974"),
-    Index("ndre", ("nir", "red edge"), _difference, (-0.2, 0.8), source="Gitelson and Merzlyak 1994"),
-    Index("gndvi", ("nir", "green"), _difference, (-0.2, 1.0), source="Gitelson et al. 1996"),
-    Index("ndwi", ("green", "nir"), _difference, (-1.0, 0.5), source="McFeeters 1996"),
-    Index("cire", ("nir", "red edge"), lambda n, e: n / e - 1, (0.0, 4.0), source="Gitelson et al. 2003"),
-    Index("cig", ("nir", "green"), lambda n, g: n / g - 1, (0.0, 10.0), source="Gitelson et al. 2003"),
-    Index("vari", ("green", "red", "blue"), lambda g, r, b: (g - r) / (g + r - b), (-0.5, 0.5),
-          source="Gitelson et al. 2002"),
-    Index("savi", ("nir", "red"), lambda n, r: 1.5 * (n - r) / (n + r + 0.5), (-0.2, 1.0), False, "Huete 1988"),
-    Index("osavi", ("nir", "red"), lambda n, r: 1.16 * (n - r) / (n + r + 0.16), (-0.2, 1.0), False,
-          "Rondeaux et al. 1996"),
-    Index("msavi", ("nir", "red"), lambda n, r: (2 * n + 1 - np.sqrt((2 * n + 1) ** 2 - 8 * (n - r))) / 2, (-0.2, 1.0),
-          False, "Qi et al. 1994"),
-    Index("evi", ("nir", "red", "blue"), lambda n, r, b: 2.5 * (n - r) / (n + 6 * r - 7.5 * b + 1), (-0.2, 1.0), False,
-          "Huete et al. 2002"),
+    Index("ndvi", "(N - R) / (N + R)", (-0.2, 1.0), "Rouse et al. 1974"),
+    Index("ndre", "(N - RE) / (N + RE)", (-0.2, 0.8), "Gitelson and Merzlyak 1994"),
+    Index("gndvi", "(N - G) / (N + G)", (-0.2, 1.0), "Gitelson et al. 1996"),
+    Index("ndwi", "(G - N) / (G + N)", (-1.0, 0.5), "McFeeters 1996"),
+    Index("cire", "N / RE - 1", (0.0, 4.0), "Gitelson et al. 2003"),
+    Index("cig", "N / G - 1", (0.0, 10.0), "Gitelson et al. 2003"),
+    Index("vari", "(G - R) / (G + R - B)", (-0.5, 0.5), "Gitelson et al. 2002"),
+    Index("savi", "1.5 * (N - R) / (N + R + 0.5)", (-0.2, 1.0), "Huete 1988", any_unit=False),
+    Index("osavi", "1.16 * (N - R) / (N + R + 0.16)", (-0.2, 1.0), "Rondeaux et al. 1996", any_unit=False),
+    Index("msavi", "(2 * N + 1 - sqrt((2 * N + 1) ** 2 - 8 * (N - R))) / 2", (-0.2, 1.0), "Qi et al. 1994",
+          any_unit=False),
+    Index("evi", "2.5 * (N - R) / (N + 6 * R - 7.5 * B + 1)", (-0.2, 1.0), "Huete et al. 2002", any_unit=False),
 )  # fmt: skip
 INDICES: Mapping[str, Index] = {index.name: index for index in _ALL}
 
 
 def index_named(name: str) -> Index:
-    """Raises ConfigurationError for a name that there is not."""
+    """Return an index by name: one of `INDICES`, or of the catalogue of spyndex where that is installed.
+
+    Raises ConfigurationError for an unknown name, or for an index of bands that drone cameras do not have.
+    """
+    wanted = name.strip().lower()
+    if wanted in INDICES:
+        return INDICES[wanted]
+    catalogue = _catalogue()
+    if wanted in catalogue:
+        return _of_catalogue(wanted, catalogue[wanted])
+    more = "or a name in spyndex" if catalogue else "or install more with pip install 'agalign[indices]'"
+    raise ConfigurationError(f"unknown index '{name}'; choose from {', '.join(INDICES)}, {more}")
+
+
+def index_of_formula(text: str) -> Index:
+    """Return the index of a text 'name=(N-R)/(N+R)', or of a formula alone, which is named 'formula'.
+
+    Raises ConfigurationError.
+    """
+    name, equals, formula = text.partition("=")
+    name, formula = (name.strip().lower(), formula) if equals else ("formula", text)
+    if not _NAME.fullmatch(name) or (name in INDICES):
+        raise ConfigurationError(f"'{name}' cannot name a formula; use letters, digits and _, and no index's name")
+    index = Index(name, formula.strip(), source="formula of the user")
+    _check_bands(index)
+    return index
+
+
+def _catalogue() -> Mapping[str, Any]:
+    """The indices of spyndex by name in lower case; empty where it is not installed. Its code is not executed."""
+    return {name.lower(): entry for name, entry in _data_of_spyndex(_CATALOGUE, "SpectralIndices").items()}
+
+
+@cache
+def _data_of_spyndex(file: str, key: str) -> Mapping[str, Any]:
     try:
-        return INDICES[name.strip().lower()]
-    except KeyError:
-        raise ConfigurationError(f"'{name}' is no index; there are {', '.join(INDICES)}") from None
+        path = Path(str(metadata.distribution("spyndex").locate_file(file)))
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (metadata.PackageNotFoundError, OSError, ValueError):
+        return {}
+    found: Mapping[str, Any] = data.get(key, data)
+    return found
+
+
+def _of_catalogue(name: str, entry: Mapping[str, Any]) -> Index:
+    formula = str(entry["formula"])
+    known = {k: v.get("default") for k, v in _data_of_spyndex(_CONSTANTS, "").items()}
+    constants = tuple((s, float(known[s])) for s in symbols_of(formula) if known.get(s) is not None)
+    index = Index(name, formula, source=str(entry.get("reference", "")), constants=constants)
+    _check_bands(index)
+    return replace(index, any_unit=_is_of_any_unit(index))
+
+
+def _check_bands(index: Index) -> None:
+    """Raise ConfigurationError where the formula has no band, or has other names than those of bands."""
+    unknown = [s for s in index.symbols if s.upper() not in _LETTERS]
+    if unknown or not index.symbols:
+        used = ", ".join(unknown) or "no band"
+        raise ConfigurationError(f"index '{index.name}', {index.formula}, uses {used}; the bands are B, G, R, RE and N")
+
+
+def _is_of_any_unit(index: Index) -> bool:
+    """True where the value stays the same when all bands are multiplied by one number."""
+    bands = [np.array([0.1 * k, 0.5 / k], np.float32) for k in range(1, len(index.symbols) + 1)]
+    scaled = [b * np.float32(_PROBE_SCALE) for b in bands]
+    return bool(np.allclose(compute(index, bands), compute(index, scaled), rtol=1e-4, equal_nan=True))
 
 
 def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float | None]) -> list[int]:
@@ -106,6 +185,7 @@ def role_of(name: str, wavelength_nm: float | None) -> Role | None:
 
 def compute(index: Index, bands: Sequence[FloatImage]) -> FloatImage:
     """The index of reflectances (H, W), nan where a band is nan or the formula divides by zero."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        value = index.formula(*bands)
-    return np.where(np.isfinite(value), value, np.float32(np.nan)).astype(np.float32)
+    values: dict[str, FloatImage] = dict(zip(index.symbols, bands, strict=True))
+    values |= {name: np.asarray(number, np.float32) for name, number in index.constants}
+    value = evaluate(index.formula, values)
+    return np.where(np.isfinite(value), value, np.float32(np.nan))

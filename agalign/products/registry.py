@@ -2,6 +2,7 @@
 
 from agalign.products.band_files import BandFiles
 from agalign.products.error_map import ErrorMap
+from agalign.products.index_product import IndexRasters
 from agalign.products.pan_sharpen import PanSharpened
 from agalign.products.picture import BeforeAfterPicture
 from agalign.products.preview import Preview
@@ -16,6 +17,7 @@ PRODUCTS: tuple[Product, ...] = (
     PanSharpened(),
     ReliefMap(),
     ErrorMap(),
+    IndexRasters(),
     BeforeAfterPicture(),
     Preview(),
     # Last: its assets are the files of those before it.

@@ -9,7 +9,7 @@ from agalign.products.panels import PanelPart
 from agalign.products.sidecar import BandPart, Sidecar
 from agalign.products.sky import SkyPart
 from agalign.values.files import write_text
-from agalign.values.text import harmless
+from agalign.values.text import without_formula
 
 SUMMARY_COLUMNS = (
     "folder", "capture", "band", "wavelength_nm", "status", "reason", "seed", "retrieval", "corner_std_px",
@@ -19,7 +19,6 @@ SUMMARY_COLUMNS = (
     "nmi_after", "ncc_before", "ncc_after", "gradient_correlation_before", "gradient_correlation_after",
     "structure_ssim_before", "structure_ssim_after", "seconds",
 )  # fmt: skip
-_FORMULA = ("=", "+", "-", "@")
 
 
 def summary_rows(folder: str, sidecar: Sidecar) -> list[dict[str, object]]:
@@ -46,7 +45,7 @@ def write_summary(rows: Iterable[Mapping[str, object]], path: Path) -> None:
     table = io.StringIO()
     writer = csv.DictWriter(table, SUMMARY_COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows({k: _no_formula(v) for k, v in row.items()} for row in rows)
+    writer.writerows({k: without_formula(v) for k, v in row.items()} for row in rows)
     write_text(path, table.getvalue())
 
 
@@ -77,14 +76,6 @@ def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:
         for name in ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim"):
             row |= {f"{name}_before": _short(before[name]), f"{name}_after": _short(after[name])}
     return row
-
-
-def _no_formula(value: object) -> object:
-    """A text that a spreadsheet would calculate, as a text: the names in it are a camera's or a card's."""
-    if not isinstance(value, str):
-        return value
-    text = harmless(value)
-    return f"'{text}" if text.startswith(_FORMULA) else text
 
 
 def _short(value: float | None) -> float | None:

@@ -2,10 +2,13 @@
 
 import os
 import signal
+import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import current_process, parent_process, resource_tracker
+from multiprocessing import current_process, get_all_start_methods, get_context, parent_process, resource_tracker
+from multiprocessing.context import BaseContext
 
 
 def follow_parent() -> None:
@@ -47,3 +50,42 @@ def without_interrupt_key() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def worker_context(preload: str) -> BaseContext:
+    """How processes are started: from one that has loaded the module `preload`, where the system allows, else anew.
+
+    On macOS a copy of a process that has loaded Apple's libraries may crash or hang. The fork server needs a socket in
+    a temporary folder, which a service account may not have.
+    """
+    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not _has_temporary_folder():
+        return get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload([preload])
+    return context
+
+
+def _has_temporary_folder() -> bool:
+    try:
+        tempfile.gettempdir()
+    except OSError:
+        return False
+    return True
+
+
+@contextmanager
+def threads_of_children(count: int) -> Iterator[None]:
+    """Libraries read these once, when they are loaded: threads of several processes that wait for each other's cores
+    take twice the time.
+    """
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, str(count)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

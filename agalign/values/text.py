@@ -2,6 +2,8 @@
 
 import unicodedata
 
+_FORMULA = ("=", "+", "-", "@")
+
 
 def harmless(text: str) -> str:
     r"""The text on one line, with what a terminal would act on (escape sequences, turns of the writing's direction)
@@ -15,6 +17,14 @@ def harmless(text: str) -> str:
 def without_controls(text: str) -> str:
     """The text without control characters, as a tag is meant that has some."""
     return text if text.isprintable() else "".join(c for c in text if unicodedata.category(c) not in ("Cc", "Cs"))
+
+
+def without_formula(value: object) -> object:
+    """A value for a table: a text that a spreadsheet would calculate is quoted, as names come from cards."""
+    if not isinstance(value, str):
+        return value
+    text = harmless(value)
+    return f"'{text}" if text.startswith(_FORMULA) else text
 
 
 def _written_out(character: str) -> str:

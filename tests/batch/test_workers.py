@@ -207,7 +207,7 @@ def test_workers_start_without_a_temporary_folder(monkeypatch: pytest.MonkeyPatc
         raise FileNotFoundError("No usable temporary directory found")
 
     monkeypatch.setattr(tempfile, "gettempdir", fails)
-    assert workers.worker_context().get_start_method() == "spawn"
+    assert workers.worker_context(workers.__name__).get_start_method() == "spawn"
 
 
 def test_a_dask_cluster_that_cannot_be_started_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

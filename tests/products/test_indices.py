@@ -26,7 +26,7 @@ def test_a_missing_band_is_named() -> None:
 
 def test_an_unknown_index_is_a_usage_error() -> None:
     assert index_named(" NDVI ").name == "ndvi"
-    with pytest.raises(ConfigurationError, match="'abc' is no index; there are ndvi"):
+    with pytest.raises(ConfigurationError, match="unknown index 'abc'; choose from ndvi"):
         index_named("abc")
 
 

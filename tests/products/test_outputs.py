@@ -12,6 +12,7 @@ import tifffile
 
 import agalign
 from agalign.batch import RunOptions
+from agalign.batch.index_run import do_indices, index_tasks
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.tag_seeds import geo_seed
 from agalign.config import CheckSettings, JointSettings, ReliefSettings, SeedSettings, Settings, WriteSettings
@@ -20,6 +21,7 @@ from agalign.products.band_files import band_file_names
 from agalign.products.index_rasters import write_indices
 from agalign.products.indices import INDICES
 from agalign.products.layout import output_layers
+from agalign.products.verify_outputs import verify_outputs
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
@@ -144,7 +146,7 @@ def calibrated_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic capture in `in`, and aligned in `out`, as reflectance and with an error map."""
     folder = tmp_path_factory.mktemp("calibrated")
     synthetic.make_flight(folder / "in", 1, (480, 360), rng_seed=3)
-    settings = Settings(write=WriteSettings(radiometry="auto", error_map=True))
+    settings = Settings(write=WriteSettings(radiometry="auto", error_map=True, indices=("ndvi", "savi")))
     (report,) = agalign.align_folder(folder / "in", folder / "out", settings=settings)
     assert report.good
     return folder
@@ -177,6 +179,36 @@ def test_ndvi_of_the_synthetic_flight_is_its_truth(calibrated: Path) -> None:
     assert result.path.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_indices_of_the_same_pass_are_outputs_of_the_run(calibrated: Path) -> None:
+    out = calibrated / "out"
+    sidecar = json.loads(next(out.rglob("IMG_0001.json")).read_text())
+    written = [p["file"] for p in sidecar["products"] if p["kind"] == "index"]
+    assert written == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png", "IMG_0001_savi.tif", "IMG_0001_savi.png"]
+    table = (out / "indices.csv").read_text().splitlines()
+    assert [line.split(",")[5] for line in table] == ["index", "ndvi", "savi"]
+    (task,) = index_tasks(out, [INDICES["ndvi"]], out)
+    (report,) = do_indices(task).reports
+    assert report.kept, "the command does not replace them: their checksums are in the sidecar"
+    assert [problems for _, problems in verify_outputs(out)] == [[]]
+    agalign.align_folder(calibrated / "in", out, settings=ONLY_SEED)
+    assert not list(out.rglob("*_ndvi.*"))
+
+
+@pytest.mark.parametrize(
+    ("index", "problem"),
+    [
+        ("xyz", "unknown index 'xyz'"), ("ndre", "no capture has them all; there are green"),
+        ("savi", "needs reflectance; add --radiometry"),
+    ],
+)  # fmt: skip
+def test_an_index_that_no_capture_can_have_is_refused_first(
+    aligned_capture: Path, tmp_path: Path, index: str, problem: str
+) -> None:
+    settings = Settings(write=WriteSettings(indices=(index,)))
+    with pytest.raises(ConfigurationError, match=problem):
+        agalign.align_folder(aligned_capture, tmp_path / "out", settings=settings)
+
+
 def test_an_index_of_bands_that_are_not_aligned_is_left_out(aligned_capture: Path, tmp_path: Path) -> None:
     agalign.align_folder(aligned_capture, tmp_path / "out", settings=ONLY_SEED)
     (result,) = write_indices(tmp_path / "out", [INDICES["ndvi"]])
@@ -192,10 +224,13 @@ def test_indices_go_with_the_stack_that_they_were_made_of(aligned_capture: Path,
     """An index of raw numbers must not stand beside reflectance."""
     out = tmp_path / "out"
     agalign.align_folder(aligned_capture, out, settings=ONLY_SEED)
-    for name in ("field_ndvi.tif", "field_ndvi.png", "field_notes.tif"):
+    write_band(out / "field_mine.tif", np.zeros((8, 8), np.float32))
+    with rasterio.open(out / "field_mine.tif", "r+") as dataset:
+        dataset.update_tags(INDEX_STATISTICS="{}")
+    for name in ("field_mine.png", "field_notes.tif"):
         (out / name).write_bytes(b"x")
     agalign.align_folder(aligned_capture, out, settings=ONLY_SEED)
-    assert (out / "field_ndvi.tif").exists(), "nothing was written anew"
+    assert (out / "field_mine.tif").exists(), "nothing was written anew"
     agalign.align_folder(aligned_capture, out, settings=ONLY_SEED, run=RunOptions(overwrite=True))
     assert {p.name for p in out.glob("field_*")} == {"field_notes.tif"}
 

@@ -1,5 +1,6 @@
 """What the page knows of each capture, short enough for a thousand of them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,8 @@ from urllib.parse import quote
 import numpy as np
 
 from agalign.products.failures import FailureGroups
+from agalign.products.index_rasters import RAW
+from agalign.products.index_table import IndexRow
 from agalign.products.sidecar import (
     BandPart,
     BandResult,
@@ -94,6 +97,19 @@ class Facts:
         self.entries.append(entry)
         self._captures.append(self._capture(base, sidecar, entry, pairs))
 
+    def add_indices(self, rows: Sequence[IndexRow]) -> None:
+        """Add the spectral indices of captures that were added before."""
+        by_label = {c["label"]: c["indices"] for c in self._captures}
+        for row in rows:
+            label = row.capture if row.folder == "." else f"{row.folder}/{row.capture}"
+            if row.file and label in by_label:
+                known = row.statistics
+                by_label[label].append({
+                    "name": row.index, "median": _finite(known.median), "p5": _finite(known.p5),
+                    "p95": _finite(known.p95), "valid": known.valid_share, "span": (known.low, known.high),
+                    "raw": known.unit == RAW, "file": quote(row.file), "picture": quote(f"{row.file[:-4]}.png"),
+                })  # fmt: skip
+
     @property
     def residuals_px(self) -> list[float]:
         """Of the pairs that are aligned, sorted."""
@@ -142,7 +158,7 @@ class Facts:
                 **preview.model_dump(exclude={"file"}), "file": quote(f"{base}{preview.file}"),
                 "detail": [round(v, 5) for v in preview.detail],
             },
-            "bands": pairs,
+            "bands": pairs, "indices": [],
         }  # fmt: skip
 
     def _pair(self, band: BandPart, sidecar: Sidecar) -> dict[str, Any]:
@@ -186,6 +202,10 @@ def _camera(result: CaptureResult) -> str:
 
 def _residual_px(band: BandResult) -> float | None:
     return band.metrics.after.residual_px if band.status == "aligned" and band.metrics else None
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
 
 
 def _rounded(value: float | None) -> float | None:

@@ -1,4 +1,4 @@
-"""OUT/index.html and OUT/summary.csv."""
+"""OUT/index.html, OUT/summary.csv and OUT/indices.csv."""
 
 import base64
 import hashlib
@@ -18,6 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from agalign._version import __version__
 from agalign.errors import SidecarError
 from agalign.products.failures import FailureGroup
+from agalign.products.index_table import IndexRow, rows_of_run, update_table
 from agalign.products.panels import PANELS_FILE, PanelPart, read_panels
 from agalign.products.report.facts import Facts
 from agalign.products.report.rigs import drifts_of, rig_views
@@ -48,6 +49,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     Pages that lack an unreadable file count as outdated in `pages_exist`. Raises OutputError.
     """
     rows: list[dict[str, object]] = []
+    indices: list[IndexRow] = []
     unreadable: list[str] = []
     facts = Facts(out)
     for path in find_sidecars(out):
@@ -58,6 +60,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
             unreadable.append(str(error))
             continue
         rows += summary_rows(folder, sidecar)
+        indices += rows_of_run(sidecar, folder, out)
         facts.add(folder, sidecar)
     panels: list[PanelPart] = []
     sky: list[SkyPart] = []
@@ -69,6 +72,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     rows += [row for panel in panels for row in panel_rows(panel)]
     rows += [row for part in sky for row in sky_rows(part)]
     write_summary(rows, out / SUMMARY_FILE)
+    facts.add_indices(update_table(out, indices))
     failures = facts.failures.groups()
     slowest = sorted(((c.label, c.seconds) for c in facts.entries), key=lambda c: -c[1])[:_SLOWEST]
     write_text(out / REPORT_FILE, _page(out, facts, panels, sky, run, unreadable.append))

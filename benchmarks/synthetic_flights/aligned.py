@@ -1,0 +1,70 @@
+"""The output folder of a run, with stacks and sidecars of aligned captures, made without aligning any."""
+
+from pathlib import Path
+
+import numpy as np
+import rasterio
+
+from agalign.products.sidecar import (
+    BandPart,
+    CameraPart,
+    OutputPart,
+    PlacePart,
+    PositionPart,
+    ProductPart,
+    ReferencePart,
+    Sidecar,
+    write_sidecar,
+)
+
+BANDS = {"Green": 560.0, "Red": 668.0, "NIR": 842.0, "Red edge": 717.0}
+_FULL = 40000
+"""Of a raw number."""
+
+
+def make_aligned(
+    folder: Path, captures: int, size_px: tuple[int, int] = (160, 120), *, raw: bool = False, rng_seed: int = 0
+) -> None:
+    """Write captures of a field of rows below `folder`/0000SET, as reflectance or as raw numbers."""
+    rng = np.random.default_rng(rng_seed)
+    width, height = size_px
+    crop = (np.sin(np.arange(width) / 3) > 0) * np.ones((height, 1))
+    target = folder / "0000SET"
+    target.mkdir(parents=True)
+    profile = {"driver": "GTiff", "width": width, "height": height, "count": len(BANDS), "compress": "zstd"}
+    profile |= {"dtype": "uint16"} if raw else {"dtype": "float32", "nodata": np.nan}
+    for number in range(1, captures + 1):
+        cover = (crop + rng.normal(0, 0.05, crop.shape)).clip(0, 1)
+        levels = {"Green": (0.12, 0.1), "Red": (0.2, 0.05), "NIR": (0.3, 0.52), "Red edge": (0.24, 0.3)}
+        name = f"IMG_{number:04d}"
+        with rasterio.open(target / f"{name}.tif", "w", **profile) as dataset:
+            for index, (low, high) in enumerate(levels.values(), start=1):
+                values = low + (high - low) * cover
+                dataset.write((values * _FULL).astype(np.uint16) if raw else values.astype(np.float32), index)
+            dataset.descriptions = tuple(levels)
+            if not raw:
+                dataset.update_tags(RADIOMETRY="reflectance")
+        write_sidecar(target / f"{name}.json", _sidecar(name, number, size_px, raw=raw))
+
+
+def _sidecar(name: str, number: int, size_px: tuple[int, int], *, raw: bool) -> Sidecar:
+    width, height = size_px
+    bands = [
+        BandPart(
+            band=band, wavelength_nm=nm, file=f"{name}_{index}.tif", band_index=1,
+            status="reference" if index == 1 else "aligned", reason=None, seconds=0.1,
+            place=PlacePart(file=f"{name}.tif", band_index=index),
+        )
+        for index, (band, nm) in enumerate(BANDS.items(), start=1)
+    ]  # fmt: skip
+    return Sidecar(
+        schema="agalign/1", agalign="0", capture=name, capture_id="", flight_id="", status="ok", missing_bands=[],
+        captured_at=f"2026-06-21T10:{number // 60 % 60:02d}:{number % 60:02d}",
+        position=PositionPart(latitude=52.0, longitude=5.0 + 1e-4 * number, altitude_m=60.0),
+        camera=CameraPart(make="MicaSense", model="RedEdge-M", serial="1"),
+        reference=ReferencePart(band="Green", file=f"{name}_1.tif", band_index=1, width=width, height=height),
+        bands=bands, settings="",
+        output=OutputPart(file=f"{name}.tif", bytes=None, radiometry=None if raw else "reflectance by light sensor",
+                          crop=(0, 0, width, height), nodata=None if raw else "nan"),
+        products=[ProductPart(kind="stack", file=f"{name}.tif", bytes=1, sha256=f"{number:064x}")],
+    )  # fmt: skip

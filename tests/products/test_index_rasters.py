@@ -1,0 +1,177 @@
+import csv
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from synthetic_flights.aligned import make_aligned
+
+from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run
+from agalign.errors import ConfigurationError
+from agalign.products.formula import evaluate, symbols_of
+from agalign.products.index_rasters import RAW, IndexReport, write_indices
+from agalign.products.index_table import read_table
+from agalign.products.indices import INDICES, Index, index_named, index_of_formula
+from agalign.products.report import write_pages
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+NDVI, NDRE = INDICES["ndvi"], INDICES["ndre"]
+
+
+def run(out: Path, *indices: Index, target: Path | None = None, **options: object) -> list[IndexReport]:
+    tasks = index_tasks(out, indices or (NDVI,), target or out, overwrite=bool(options.pop("overwrite", False)))
+    return [r for done in run_indices(tasks, IndexOptions(jobs=1, **options)) for r in done.reports]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os').system('true')", "N.real", "(lambda: N)()", "N if R else B", "[N][0]", "N; R", "N @ R",
+        "'a'*N", "sqrt(N, R)", "open(N)", "N < R", "f'{N}'", "1e40*N", "N and R", "", "(" * 200, "N" * 400,
+        "-" * 290 + "(",
+    ],
+)  # fmt: skip
+def test_a_formula_is_arithmetic_and_nothing_else(text: str) -> None:
+    with pytest.raises(ConfigurationError):
+        symbols_of(text)
+
+
+def test_a_formula_has_the_value_of_its_arithmetic() -> None:
+    n, r = np.float32([[0.5, 0.0, 0.2]]), np.float32([[0.1, 0.0, -0.2]])
+    value = evaluate("-(N - R)^2 / (N + R) + sqrt(4) * 1.5e0", {"N": n, "R": r})
+    assert value.dtype == np.float32
+    assert value[0, 0] == pytest.approx(-(0.4**2) / 0.6 + 3, rel=1e-6)
+    assert not np.isfinite(value[0, 1:]).any()
+    assert np.isinf(evaluate("9**9**9 + 0*N", {"N": n})).all(), "and takes no time"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("Q+N", "uses Q; the bands are B, G, R, RE and N"), ("1+1", "uses no band"), ("ndvi=N/R", "'ndvi' cannot name"),
+        ("../x=N/R", "'../x' cannot name"), ("N+", "is not a formula"),
+    ],
+)  # fmt: skip
+def test_a_formula_that_is_none_is_a_usage_error(text: str, problem: str) -> None:
+    with pytest.raises(ConfigurationError, match=problem):
+        index_of_formula(text)
+
+
+def test_the_catalogue_gives_names_and_constants() -> None:
+    pytest.importorskip("spyndex")
+    wdrvi = index_named("WDRVI")
+    assert (wdrvi.symbols, wdrvi.constants, wdrvi.any_unit) == (("N", "R"), (("alpha", 0.1),), True)
+    assert not index_named("evi2").any_unit
+    with pytest.raises(ConfigurationError, match="uses S1"):
+        index_named("ndbi")
+
+
+def test_values_statistics_and_tags_of_a_raster(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
+    mine = index_of_formula("mine = (N-RE)/(N+RE)")
+    ndvi, ndre, by_formula = write_indices(tmp_path, [NDVI, NDRE, mine])
+    with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif") as stack:
+        _, red, nir, _ = stack.read().astype(float)
+    truth = (nir - red) / (nir + red)
+    assert ndvi.path is not None
+    with rasterio.open(ndvi.path) as dataset:
+        np.testing.assert_allclose(dataset.read(1), truth, rtol=1e-5)
+        tags = dataset.tags()
+    known = ndvi.statistics
+    assert [known.p5, known.median, known.p95] == pytest.approx(np.percentile(truth, (5, 50, 95)), abs=1e-5)
+    assert (known.valid_share, known.unit, known.low, known.high) == (1.0, "reflectance", -0.2, 1.0)
+    assert json.loads(tags["INDEX_STATISTICS"])["median"] == known.median
+    assert tags["INDEX_FORMULA"] == "(N - R) / (N + R)"
+    assert "INPUT" not in tags
+    assert by_formula.median == ndre.median
+
+
+def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> None:
+    import cv2
+
+    for name, raw in (("raw", True), ("reflectance", False)):
+        make_aligned(tmp_path / name, 1, raw=raw)
+    assert [unit_of_run(index_tasks(tmp_path / n, [NDVI], tmp_path / n)) for n in ("raw", "reflectance")] == [
+        RAW, "reflectance",
+    ]  # fmt: skip
+    (of_raw,), (of_reflectance,) = (write_indices(tmp_path / n, [NDVI]) for n in ("raw", "reflectance"))
+    assert of_raw.path is not None
+    assert of_reflectance.path is not None
+    with rasterio.open(of_raw.path) as dataset:
+        assert dataset.tags()["INPUT"] == "raw numbers, not reflectance"
+        low, high = np.percentile(dataset.read(1), (2, 98))
+    assert (of_raw.statistics.low, of_raw.statistics.high) == pytest.approx((low, high), abs=1e-4)
+    grey, colour = (
+        cv2.imread(str(r.path.with_suffix(".png")))[:120, :160].astype(int) for r in (of_raw, of_reflectance)
+    )
+    assert np.ptp(grey, axis=2).max() == 0
+    assert np.ptp(colour, axis=2).max() > 50
+    assert np.ptp(grey) > 150, "stretched over all greys"
+
+
+def test_only_what_is_new_is_calculated(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 3)
+    assert [r.kept for r in run(tmp_path)] == [False] * 3
+    rasters = sorted(tmp_path.rglob("*_ndvi.tif"))
+    before = [p.stat().st_mtime_ns for p in rasters]
+    assert [r.kept for r in run(tmp_path, NDVI, NDRE)] == [True, False] * 3
+    assert [p.stat().st_mtime_ns for p in rasters] == before
+    os.truncate(rasters[0], rasters[0].stat().st_size - 300)
+    rasters[1].with_suffix(".png").unlink()
+    sidecar = rasters[2].with_name("IMG_0003.json")
+    sidecar.write_text(sidecar.read_text().replace(f"{3:064x}", f"{9:064x}"))  # another stack
+    assert [r.kept for r in run(tmp_path)] == [False] * 3
+    assert [r.kept for r in run(tmp_path)] == [True] * 3
+    changed = index_of_formula("x=N/R"), index_of_formula("x=N/G")
+    assert [r.kept for index in changed for r in run(tmp_path, index)] == [False] * 6
+    assert [r.kept for r in run(tmp_path, changed[1], overwrite=True)] == [False] * 3
+
+
+def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
+    make_aligned(tmp_path / "out", 2)
+    target = tmp_path / "indices"
+    run(tmp_path / "out", NDVI, target=target)
+    run(tmp_path / "out", NDRE, target=target)
+    rows = list(csv.DictReader((target / "indices.csv").read_text().splitlines()))
+    assert [(r["capture"], r["index"]) for r in rows] == [
+        ("IMG_0001", "ndre"), ("IMG_0001", "ndvi"), ("IMG_0002", "ndre"), ("IMG_0002", "ndvi"),
+    ]  # fmt: skip
+    assert [(r["latitude"], r["valid_share"], r["input"]) for r in rows] == [("52.0", "1.0", "reflectance")] * 4
+    assert float(rows[1]["p5"]) < float(rows[1]["median"]) < float(rows[1]["p95"])
+    assert not list((tmp_path / "out").rglob("*ndvi*"))
+    (target / rows[0]["file"]).unlink()
+    assert len(read_table(target)) == 3
+
+
+def test_one_damaged_stack_costs_only_its_own_indices(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 2)
+    os.truncate(tmp_path / "0000SET" / "IMG_0001.tif", 3000)
+    bad, good = run(tmp_path)
+    assert "IMG_0001.tif" in bad.problem
+    assert good.path is not None
+
+
+@pytest.mark.slow
+def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 20)
+    serial = {r.capture: r.statistics for r in run(tmp_path, target=tmp_path / "a")}
+    tasks = index_tasks(tmp_path, [NDVI], tmp_path / "b")
+    parallel = {r.capture: r.statistics for d in run_indices(tasks, IndexOptions(jobs=2)) for r in d.reports}
+    assert parallel == serial
+    one, other = (tmp_path / n / "0000SET" / "IMG_0007_ndvi.tif" for n in "ab")
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_the_report_knows_the_indices(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 2)
+    run(tmp_path, NDVI, NDRE)
+    write_pages(tmp_path, pytest.fail)
+    page = (tmp_path / "index.html").read_text()
+    facts = json.loads(page.split('id="facts">')[1].split("</script>")[0])
+    names = [[i["name"] for i in c["indices"]] for c in facts["captures"]]
+    assert names == [["ndre", "ndvi"]] * 2
+    ndvi = facts["captures"][0]["indices"][1]
+    assert ndvi["span"] == [-0.2, 1.0]
+    assert ndvi["picture"] == "0000SET/IMG_0001_ndvi.png"
