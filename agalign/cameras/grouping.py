@@ -26,7 +26,9 @@ _NAMELESS = "capture"
 
 _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""
-_CameraModel = tuple[str, ...]
+_CameraKey = tuple[str, ...]
+_BETWEEN_SERIALS = "+"
+"""Between the serial numbers of the halves of a dual camera."""
 
 
 def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
@@ -127,7 +129,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         folder=_relative_folder(first.camera.capture_folder(first.path), folder),
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),
-        camera=CameraIdentity(tags.make, tags.model, "+".join(serials)),
+        camera=CameraIdentity(tags.make, tags.model, _BETWEEN_SERIALS.join(serials)),
         capture_id=tags.first_text(camera.capture_ids),
         flight_id=tags.first_text(camera.flight_ids),
         captured_at=tags.captured_at,
@@ -176,35 +178,69 @@ def _relative_folder(capture_folder: Path, folder: Path) -> Path:
 
 
 def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
-    """The captures, each with the names of the bands that at least half of its camera model's captures have and it
-    lacks. A multiband file is complete.
+    """The captures, each with the names of the bands that at least half of its camera's captures have and it lacks. A
+    multiband file is complete. A capture of a dual camera that lacks all files of one half has the serial numbers of
+    both.
     """
-    usual = _usual_bands([c for c in captures if _has_a_file_per_band(c)])
+    cameras = _cameras(captures)
+    usual = _usual_bands([(c, k) for c, k in zip(captures, cameras, strict=True) if _has_a_file_per_band(c)])
+    serials: dict[_CameraKey, set[str]] = defaultdict(set)
+    for capture, camera in zip(captures, cameras, strict=True):
+        serials[camera].add(capture.camera.serial)
     result = []
-    for capture in captures:
+    for capture, camera in zip(captures, cameras, strict=True):
         own = {b.name for b in capture.bands}
-        expected = usual[_camera_model(capture)] if _has_a_file_per_band(capture) else ()
+        expected = usual[camera] if _has_a_file_per_band(capture) else ()
         missing = tuple(name for name in expected if name not in own)
-        result.append(replace(capture, missing_bands=missing) if missing else capture)
+        identity = replace(capture.camera, serial=_whole_serial(capture.camera.serial, serials[camera]))
+        result.append(replace(capture, missing_bands=missing, camera=identity))
     return result
 
 
-def _usual_bands(captures: Sequence[Capture]) -> Mapping[_CameraModel, list[str]]:
-    """Names of the bands that at least half of a model's captures have: rarer ones come from damaged tags."""
-    members = Counter(map(_camera_model, captures))
-    counts: dict[_CameraModel, Counter[str]] = defaultdict(Counter)
-    for capture in captures:
-        counts[_camera_model(capture)].update(b.name for b in capture.bands)
-    return {m: [name for name, n in names.items() if 2 * n >= members[m]] for m, names in counts.items()}
+def _usual_bands(captures: Sequence[tuple[Capture, _CameraKey]]) -> Mapping[_CameraKey, list[str]]:
+    """Names of the bands that at least half of a camera's captures have: rarer ones come from damaged tags."""
+    members = Counter(camera for _, camera in captures)
+    counts: dict[_CameraKey, Counter[str]] = defaultdict(Counter)
+    for capture, camera in captures:
+        counts[camera].update(b.name for b in capture.bands)
+    return {k: [name for name, n in names.items() if 2 * n >= members[k]] for k, names in counts.items()}
 
 
 def _has_a_file_per_band(capture: Capture) -> bool:
     return len({b.path for b in capture.bands}) > 1
 
 
-def _camera_model(capture: Capture) -> _CameraModel:
-    """Make and model, or the folder where no tag names a model. Not the serial numbers: a dual camera that lost all
-    bands of one half lacks one of them.
+def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:
+    """The camera of each capture: make, model and serial numbers, or the folder where no tag names a model.
+
+    Captures of one model that share a serial number are of one camera: a dual camera has two, and a capture that lost
+    all files of one half has one of them. Without a serial number it is of the only camera of its model.
     """
+    cameras: dict[tuple[str, str], list[set[str]]] = defaultdict(list)
+    for capture in captures:
+        own = _serials(capture.camera)
+        same_model = cameras[capture.camera.make, capture.camera.model]
+        sharing = [known for known in same_model if known & own]
+        if own:
+            same_model[:] = [known for known in same_model if not known & own] + [own.union(*sharing)]
+    return [_camera_of(c, cameras[c.camera.make, c.camera.model]) for c in captures]
+
+
+def _camera_of(capture: Capture, same_model: Sequence[set[str]]) -> _CameraKey:
     camera = capture.camera
-    return (camera.make, camera.model) if camera.model else (capture.folder.as_posix(),)
+    if not camera.model:
+        return (capture.folder.as_posix(),)
+    own = _serials(camera)
+    known = [serials for serials in same_model if serials & own or (not own and len(same_model) == 1)]
+    return (camera.make, camera.model, *sorted(known[0] if known else own))
+
+
+def _serials(camera: CameraIdentity) -> set[str]:
+    return set(camera.serial.split(_BETWEEN_SERIALS)) - {""}
+
+
+def _whole_serial(serial: str, of_camera: set[str]) -> str:
+    """The serial numbers of all halves of a camera, where a single text of its captures has them and `serial` not."""
+    own = set(serial.split(_BETWEEN_SERIALS))
+    larger = [text for text in of_camera if own < set(text.split(_BETWEEN_SERIALS))]
+    return larger[0] if len(larger) == 1 else serial
