@@ -287,4 +287,4 @@ def _rows(matrix: Matrix) -> Matrix3x3:
 
 
 def _points(points_px: NDArray[np.float64]) -> list[tuple[float, float]]:
-    return [(round(x, 4), round(y, 4)) for x, y in points_px.tolist()]
+    return [(x, y) for x, y in np.round(points_px, 4).tolist()]

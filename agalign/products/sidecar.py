@@ -364,30 +364,35 @@ class Sidecar(CaptureResult):
 
 def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
     """Write at once or not at all; returned with its checksum. Raises OutputError."""
-    content = json.loads(sidecar.model_dump_json(by_alias=True))
-    whole = sidecar.model_copy(update={"checksum": content_checksum(content)})
+    checksum = content_checksum(sidecar.model_dump_json(by_alias=True))
+    whole = sidecar.model_copy(update={"checksum": checksum})
     write_text(path, compact_lists(whole.model_dump_json(by_alias=True, indent=1)))
     return whole
 
 
-def content_checksum(content: Mapping[str, Any]) -> str:
-    """SHA-256 of a sidecar's parsed JSON: of its canonical form (sorted keys, no spaces) without `checksum` and without
-    every `seconds`, which no two runs have in common.
+def content_checksum(text: str | bytes) -> str:
+    """SHA-256 of a sidecar's JSON: of its canonical form (sorted keys, no spaces) without `checksum` and without every
+    `seconds`, which differ from run to run.
     """
-    rest = _without_seconds({k: v for k, v in content.items() if k != "checksum"})
-    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    content = json.loads(text, object_hook=_without_seconds)
+    content.pop("checksum", None)
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def _without_seconds(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _without_seconds(v) for k, v in value.items() if k != "seconds"}
-    return [_without_seconds(v) for v in value] if isinstance(value, list) else value
+def _without_seconds(part: dict[str, Any]) -> dict[str, Any]:
+    part.pop("seconds", None)
+    return part
+
+
+_LIST_ELEMENT = r"(?=[-0-9ntf])"
+"""Begins a line of indented JSON that is a number, null, true or false in a list: names and texts begin with a quote."""
 
 
 def compact_lists(text: str) -> str:
-    """Lists of numbers on one line: a matrix reads as a matrix, and the file is a third of the size."""
-    innermost = re.compile(r"\[[^\[\]{}\"]*\]")
-    return innermost.sub(lambda match: " ".join(match.group().split()).replace("[ ", "[").replace(" ]", "]"), text)
+    """Indented JSON with lists of numbers on one line: a matrix reads as a matrix, and the file is a third of the size."""
+    text = re.sub(r"\[\n +" + _LIST_ELEMENT, "[", text)
+    text = re.sub(r",\n +" + _LIST_ELEMENT, ", ", text)
+    return re.sub(r"(?<=[0-9le])\n *\]", "]", text)
 
 
 def read_sidecar(path: Path) -> Sidecar:
