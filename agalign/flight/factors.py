@@ -54,12 +54,16 @@ def solve_factors(differences: Array, designs: Array, weights: Array, mask: Arra
     x = (designs * mask).reshape(len(designs), 6, FACTORS)
     y = differences.reshape(*differences.shape[:2], 6)
     prior = np.diag(1 / np.square(FACTOR_STD_PX))
+    captures, bands = weights.shape
+    squares = (x.transpose(0, 2, 1) @ x).reshape(bands, FACTORS * FACTORS)
+    products = (y[:, :, None] @ x)[:, :, 0]
+    rows = x.reshape(bands * 6, FACTORS)
     robust = np.ones_like(weights)
     for _ in range(_REWEIGHTINGS):
         w = weights * robust
-        covariance = np.linalg.inv(np.einsum("cb,bif,big->cfg", w, x, x) + prior)
-        result = np.einsum("cfg,cg->cf", covariance, np.einsum("cbi,big->cg", w[:, :, None] * y, x))
-        squared_px2 = ((y - np.einsum("bif,cf->cbi", x, result)) ** 2).sum(axis=2)
+        covariance = np.linalg.inv((w @ squares).reshape(captures, FACTORS, FACTORS) + prior)
+        result = (covariance @ (w[:, None] @ products)[:, 0, :, None])[..., 0]
+        squared_px2 = ((y - (result @ rows.T).reshape(y.shape)) ** 2).sum(axis=2)
         robust = cauchy_weights(np.sqrt(squared_px2), _OUTLIER_PX)
     return result, covariance * np.outer(mask, mask)
 

@@ -34,8 +34,10 @@ _SETS_IN_MOTION: tuple[tuple[Factor, ...], ...] = (
 """Where the tags have the ground's motion: to and fro along one line it looks like another distance."""
 _LAYOUT_STD = 0.015
 """Standard error of a camera model's layout of lenses, in lengths of all baselines together."""
-_ROUNDS = 20
-"""Of alternating least squares, after which it has converged."""
+_MAX_ROUNDS = 20
+"""Of alternating least squares."""
+_CONVERGED_PX, _CONVERGED = 1e-4, 1e-5
+"""Changes of the means, px, and of the baselines, of length 1 together, below which a round is the last."""
 _MAX_FOLDS = 12
 """Of the cross-validation: more take longer and change little."""
 _MAX_ERROR_SHARE = 0.9
@@ -137,7 +139,8 @@ class _Table:
         t, delay = self._first(weights, factors)
         offset = np.zeros((len(self.bands), 2, 3))
         pull = 0.0 if self.prior is None else 1 / _LAYOUT_STD**2
-        for _ in range(_ROUNDS):
+        for _ in range(_MAX_ROUNDS):
+            before = offset, t
             designs = np.stack([factor_design(a, d) for a, d in zip(t, delay, strict=True)])
             result, _ = solve_factors(self.differences - offset, designs, weights, counts)
             # The mean is at the typical factors, even of a flight that was low here and there.
@@ -145,14 +148,14 @@ class _Table:
             # Captures far from typical factors are off by errors of the baselines: they count less for the means.
             trust = cauchy_weights(np.linalg.norm(result[:, :3], axis=1), MIN_STD_PX / _LAYOUT_STD)
             target = t if self.prior is None else self._without_delays(self.prior, delay, counts)
-            each = [
-                _fit_band(self.differences[:, j], weights[:, j] * trust, result, target[j], delay[j], pull)
-                for j in range(len(self.bands))
-            ]
-            offset = np.stack([o for o, _, _ in each])
+            offset, moved, later = _fit_bands(
+                self.differences, weights * trust[:, None], result, target, delay, pull
+            )
             if "motion" in factors:
-                delay = _unit(np.array([d for _, _, d in each]))
-            t = self._without_delays(np.stack([v for _, v, _ in each]), delay, counts)
+                delay = _unit(later)
+            t = self._without_delays(moved, delay, counts)
+            if np.abs(offset - before[0]).max() < _CONVERGED_PX and np.abs(t - before[1]).max() < _CONVERGED:
+                break
         total = np.maximum(weights.sum(axis=0), 1e-12)
         centre = np.einsum("ij,ik->jk", weights, result) / total[:, None]
         information = np.einsum("ij,ijk->j", weights, (result[:, None, :3] - centre[None, :, :3]) ** 2)
@@ -216,25 +219,27 @@ class _Table:
         return self._without_delays(t, delay, counts), delay
 
 
-def _fit_band(
-    differences: Array, weights: Array, factors: Array, t: Array, delay: float, pull: float
-) -> tuple[Array, Array, float]:
-    """(offset (2, 3), t (2,), delay) of one band: a linear regression of its differences (captures, 2, 3) on the
-    factors (captures, 5), with t pulled to the given one.
+def _fit_bands(
+    differences: Array, weights: Array, factors: Array, t: Array, delay: Array, pull: float
+) -> tuple[Array, Array, Array]:
+    """(offsets (bands, 2, 3), t (bands, 2), delays (bands,)) by a linear regression of each band's differences
+    (captures, bands, 2, 3), with weights (captures, bands), on the factors (captures, 5), with t (bands, 2) and the
+    delays (bands,) pulled to the given ones.
     """
-    count = len(differences)
-    design = np.zeros((count, 2, 3, 9))
+    captures, bands = weights.shape
+    design = np.zeros((captures, 2, 3, 9))
     design[:, (0, 0, 0, 1, 1, 1), (0, 1, 2, 0, 1, 2), range(6)] = 1.0
     design[:, 0, :, 6] = design[:, 1, :, 7] = factors[:, :3]
     design[:, :, 0, 8] = factors[:, 3:]
-    x = design.reshape(count, 6, 9)
+    x = design.reshape(captures, 6, 9)
     # A baseline or a delay that the factors do not determine stays as it was.
     ridge = np.array([1e-9] * 6 + [pull + 1e-6] * 2 + [1e-6])
-    normal = np.einsum("c,cif,cig->fg", weights, x, x) + np.diag(ridge)
-    y = differences.reshape(count, 6)
-    wanted = np.einsum("c,cif,ci->f", weights, x, y) + ridge * np.array([0.0] * 6 + [*t, delay])
-    result = np.linalg.solve(normal, wanted)
-    return result[:6].reshape(2, 3), result[6:8], float(result[8])
+    squares = (x.transpose(0, 2, 1) @ x).reshape(captures, 81)
+    normal = (weights.T @ squares).reshape(bands, 9, 9) + np.diag(ridge)
+    weighted = (weights[..., None] * differences.reshape(captures, bands, 6)).transpose(1, 0, 2).reshape(bands, -1)
+    wanted = weighted @ x.reshape(captures * 6, 9) + ridge * np.column_stack([np.zeros((bands, 6)), t, delay])
+    result = np.linalg.solve(normal, wanted[..., None])[..., 0]
+    return result[:, :6].reshape(bands, 2, 3), result[:, 6:8], result[:, 8]
 
 
 def _unit(vectors: Array) -> Array:
