@@ -22,7 +22,7 @@ from agalign.flight.model import FlightModel
 from agalign.flight.rig import MIN_CAPTURES, Observation, Rig
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
-from agalign.method.fast import learn
+from agalign.method.fast import DEFAULT_SCHEDULE, learn
 from agalign.method.joint import Results, refine_with
 from agalign.method.starter import start_from
 from agalign.method.state import ImageGroup, JointState, Progress
@@ -95,15 +95,37 @@ def _learn_network(
         # A model of this camera may have bands that the flight lacks: weights go to the bands of the same names.
         sides = [0, *(start.side(band) or len(start.bands) for band in bands)] if start.camera else None
         start_from(net, start.net.state_dict(), sides)
-    try:
-        learn(state, groups, net, at_once)
+    def refined() -> list[Results]:
         with ThreadPoolExecutor(at_once) as pool:
-            refined = iter(list(pool.map(lambda s: refine_with(net, s, settings.joint, progress), groups)))
+            return list(pool.map(lambda group: refine_with(net, group, settings.joint, progress), groups))
+
+    try:
+        # The network that learning would start from is often good enough.
+        results = refined() if net.learnt and all(all(group.trusted) for group in groups) else []
+        if not results or not all(map(_is_good_enough, results)):
+            for group, of_group in zip(groups, results, strict=False):
+                _move_to(group, of_group)
+            learn(state, groups, net, at_once)
+            results = refined()
     except Exception as why_not:
         # What one capture does to the others' learning must not cost the flight: each is learned alone then.
         _only_logged("the flight cannot be learned from", why_not)
         return None
-    return net, [_Refined(one, one.in_order(refined)) for one in loaded]
+    in_turn = iter(results)
+    return net, [_Refined(one, one.in_order(in_turn)) for one in loaded]
+
+
+def _is_good_enough(results: Results) -> bool:
+    """True where a network needs no learning for a capture of which these are the results."""
+    enough = DEFAULT_SCHEDULE.enough_retrieval
+    return all(isinstance(result, JointResult) and result.retrieval > enough for result in results)
+
+
+def _move_to(group: ImageGroup, results: Results) -> None:
+    """Start the pairs of a group whose patches a network could tell apart where it has moved them."""
+    for band, result in enumerate(results):
+        if isinstance(result, JointResult) and result.retrieval >= MIN_RETRIEVAL:
+            group.mappings[band] = result.fixed_to_moving
 
 
 def _recognised(refined: Sequence["_Refined"]) -> dict[str, list[Matrix]]:
