@@ -30,13 +30,15 @@ TEST_KEYPOINTS = 256
 """Held-out keypoints among which retrieval is measured: chance is then 0.004, and a share is known to 0.03."""
 REST_PX = 0.5
 """psi is at rest when a step moves no corner by more than this, px of the level."""
-_FINAL_PATCHES, _FIRST_PATCHES_AT_FULL = 400, 200
-"""Patches in a Gauss-Newton step at full resolution, and while psi is not at rest."""
+PATCHES, FLIGHT_PATCHES = 400, 256
+"""Patches in a Gauss-Newton step at full resolution: of a capture alone, and of one whose flight's rig takes part in
+the estimate. Half as many serve while psi is not at rest."""
 _FINAL_OCTAVES = 0.3
 """Range of their scales: small patches place themselves more exactly."""
 _FINAL_STEPS = 10
-_FINAL_REST_PX = 0.03
-"""psi has converged when a step moves no corner by more than this, px: less than the systematic error."""
+_FINAL_REST_PX = 0.06
+"""psi has converged when a step moves no corner by more than this, px: steps shrink by more than half, so that less
+than the systematic error remains."""
 _SYSTEMATIC_STD_PX = 0.035
 """Added in quadrature to the standard deviations along x and y: what the curvature cannot see, such as a bias between
 two modalities. Measured on synthetic flights."""
@@ -134,7 +136,7 @@ class Solver:
         ratio, so every second one is lengthened by what the steps to come would add (Aitken 1926). A step of infinite
         length moves nothing and is the last: the patches do not determine where the corners are mapped to.
         """
-        h, some, before = start, reference_patches.head(_FIRST_PATCHES_AT_FULL), math.inf
+        h, some, before = start, reference_patches.head(len(reference_patches.f) // 2), math.inf
         for _ in range(_FINAL_STEPS):
             step = self.step(band, h, some)
             if not math.isfinite(step.length_px):
@@ -215,15 +217,15 @@ def _losses_moved(band: MovingBand, homography: Tensor, keypoints: Keypoints, f:
 
 @torch.no_grad()
 def refine(
-    state: JointState, net: Descriptor, group: ImageGroup, *, move: bool = True
+    state: JointState, net: Descriptor, group: ImageGroup, *, move: bool = True, patches: int = PATCHES
 ) -> list[JointResult[FixedImagePx] | Issue]:
     """Refine every psi of a capture at full resolution with theta frozen; an issue is why a pair has no result.
 
-    Without `move` psi stays as it is: only its retrieval and uncertainty are measured. Raises NoContrastError.
+    A step uses up to `patches`. Without `move` psi stays as it is: only its retrieval and uncertainty are measured. Raises NoContrastError.
     """
     level = state.level(group, 1.0, range(len(group.moving)))
     h = [level.homography(matrix, b) for b, matrix in enumerate(group.mappings)]
-    p, _ = state.sampler.draw(level, level.anywhere, h, _FINAL_PATCHES, _FINAL_OCTAVES)
+    p, _ = state.sampler.draw(level, level.anywhere, h, patches, _FINAL_OCTAVES)
     test, _ = state.sampler.draw(level, level.held_out, h, TEST_KEYPOINTS, _FINAL_OCTAVES)
     if len(p) < MIN_KEYPOINTS:
         return [Issue(FEW_KEYPOINTS, len(p), MIN_KEYPOINTS)] * len(h)
