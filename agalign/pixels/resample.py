@@ -72,8 +72,9 @@ def resample_tile(
         pixels, valid = read_window(dataset, band, int(x0), int(y0), int(x1 - x0), int(y1 - y0))
     if radiometry is not None:
         pixels = calibrated(pixels, radiometry, int(x0), int(y0))
+    positions -= (x0, y0)
     resampled, whole = resample(
-        pixels, valid, positions - (x0, y0), (band.width_px - x0, band.height_px - y0), (-x0, -y0), interpolation
+        pixels, valid, positions, (band.width_px - x0, band.height_px - y0), (-x0, -y0), interpolation
     )
     return resampled, whole & ~mapping.hidden(tile)
 
@@ -91,12 +92,12 @@ def resample(
     `sensor_start` (x, y) is the whole image's first pixel in the window's px, `sensor_end` one past its last pixel.
     Returns (H, W) of the pixels' type, integers rounded and clipped, and the mask of valid pixels.
     """
-    map_xy = positions.astype(np.float32)
+    map_xy = positions.astype(np.float32, copy=False)
     everything = bool(valid.all())
     source = _for_remap(pixels if everything else _filled(pixels, valid), interpolation)
     sampled = cv2.remap(source, map_xy, None, _FLAGS[interpolation], borderMode=cv2.BORDER_REPLICATE)
     half = 0.5 if interpolation == "nearest" else 0.0
-    inside = _between(positions, np.subtract(sensor_start, half), np.subtract(sensor_end, 1 - half))
+    inside = _between(map_xy, np.subtract(sensor_start, half), np.subtract(sensor_end, 1 - half))
     if not everything:
         flag = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
         weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)

@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,8 +60,10 @@ def _reduced(width: int, height: int) -> tuple[int, int]:
 def _grey(plane: NDArray[np.float32]) -> Grey:
     """Each by its own limits: what is written may be reflectance of what the files have as numbers."""
     low, high = _limits(plane)
-    scaled = (plane - low) * np.float32(255.0 / (high - low))
-    return np.asarray(np.nan_to_num(scaled, copy=False).clip(0, 255).astype(np.uint8))
+    scaled = np.subtract(plane, np.float32(low))
+    scaled *= np.float32(255.0 / (high - low))
+    cv2.patchNaNs(scaled, 0.0)
+    return np.asarray(np.clip(scaled, 0, 255, out=scaled).astype(np.uint8))
 
 
 def _limits(plane: NDArray[np.float32]) -> tuple[float, float]:

@@ -35,7 +35,8 @@ class FixedSimilarity:
         step = max(1, int((fixed.pixels.size / _ENOUGH_PIXELS) ** 0.5))
         self.lattice = np.s_[step // 2 :: step, step // 2 :: step]
         self.gradient = _Gradient.of(fixed.pixels, self.lattice)
-        self.bins = fixed_bins(fixed.pixels[self.lattice], _range(fixed.pixels, fixed.valid))
+        self.sampled = fixed.pixels[self.lattice].ravel()
+        self.bins = fixed_bins(self.sampled, _range(fixed.pixels, fixed.valid))
 
     def to(self, moving: Raster) -> dict[str, float]:
         """All similarity metrics over the pixels that are valid in both.
@@ -46,23 +47,29 @@ class FixedSimilarity:
         al. 2004, 11 px Gaussian window) of the standardised ones: contrast reversal lowers neither.
         """
         both = self.fixed.valid & moving.valid
-        overlap = float(both.mean())
-        valid = both[self.lattice]
-        if np.count_nonzero(valid) < _MIN_PIXELS:
+        overlap = float(np.count_nonzero(both) / both.size)
+        valid = _rows_of(both[self.lattice])
+        if len(valid) < _MIN_PIXELS:
             return {"overlap": overlap}
-        one, other = (r.pixels[self.lattice][valid] for r in (self.fixed, moving))
+        one, other = self.sampled[valid], moving.pixels[self.lattice].ravel()[valid]
         joint = joint_histogram(self.bins[valid], other, _range(moving.pixels, both))
         gradient = _Gradient.of(moving.pixels, self.lattice)
-        inside = _eroded(both, 3)[self.lattice]
+        inside = _rows_of(_eroded(both, 3)[self.lattice])
         gradients = self.gradient.sampled[inside], gradient.sampled[inside]
+        within_windows = _rows_of(_eroded(both, _SSIM_WINDOW_PX)[self.lattice])
         return {
             "mattes_mi": -mutual_information(joint),
             "nmi": normalised_mutual_information(joint),
             "ncc": correlation(one, other),
-            "gradient_correlation": correlation(*gradients) if inside.any() else 0.0,
-            "structure_ssim": _ssim(self.gradient, gradient, valid, _eroded(both, _SSIM_WINDOW_PX)[self.lattice]),
+            "gradient_correlation": correlation(*gradients) if len(inside) else 0.0,
+            "structure_ssim": _ssim(self.gradient, gradient, valid, within_windows),
             "overlap": overlap,
         }  # fmt: skip
+
+
+def _rows_of(mask: Mask) -> NDArray[np.intp]:
+    """Where a mask is True, (n,) rows of flattened arrays of its shape: picking by them is quicker than by the mask."""
+    return np.flatnonzero(mask)
 
 
 def _eroded(valid: Mask, side_px: int) -> Mask:
@@ -147,33 +154,34 @@ def correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
 
 @dataclass(frozen=True)
 class _Gradient:
-    """An image's gradient magnitude; on the lattice, its local mean and variance too."""
+    """An image's gradient magnitude, (height, width); the rest (n,) on the pixels of a lattice, row by row."""
 
     lattice: tuple[slice, slice]
     magnitude: FloatImage
-    sampled: FloatImage
-    local_mean: FloatImage
-    local_variance: FloatImage
+    sampled: NDArray[np.float32]
+    local_mean: NDArray[np.float32]
+    local_variance: NDArray[np.float32]
 
     @classmethod
     def of(cls, image: FloatImage, lattice: tuple[slice, slice]) -> "_Gradient":
         gx, gy = (cv2.Sobel(image, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
         magnitude = gradient_magnitude(gx, gy)
-        mean, square = (_blur(x)[lattice] for x in (magnitude, magnitude * magnitude))
-        return cls(lattice, magnitude, magnitude[lattice], mean, square - mean * mean)
+        mean, square = (_blur(x)[lattice].ravel() for x in (magnitude, magnitude * magnitude))
+        return cls(lattice, magnitude, magnitude[lattice].ravel(), mean, square - mean * mean)
 
 
-def _ssim(one: _Gradient, other: _Gradient, valid: Mask, inside: Mask) -> float:
-    """SSIM of the two magnitudes, each brought to mean 0 and standard deviation 1 over the `valid` pixels, where its
-    windows lie `inside` both images; the standardised images' local moments follow from those of the images.
+def _ssim(one: _Gradient, other: _Gradient, valid: NDArray[np.intp], inside: NDArray[np.intp]) -> float:
+    """SSIM of the two magnitudes, each brought to mean 0 and standard deviation 1 over the `valid` pixels of the
+    lattice, where its windows lie `inside` both images; the standardised images' local moments follow from those of
+    the images.
     """
-    if not inside.any():
+    if not len(inside):
         return 0.0
     (mean_a, by_a), (mean_b, by_b) = (_standard(g.sampled[valid]) for g in (one, other))
     if not by_a * by_b:  # an image without edges has no structure
         return 0.0
     a, b = (g.local_mean[inside] for g in (one, other))
-    product = _blur(one.magnitude * other.magnitude)[one.lattice][inside]
+    product = _blur(one.magnitude * other.magnitude)[one.lattice].ravel()[inside]
     covariance = (by_a * by_b) * (product - a * b)
     a, b = by_a * (a - mean_a), by_b * (b - mean_b)
     variances = by_a**2 * one.local_variance[inside] + by_b**2 * other.local_variance[inside]
