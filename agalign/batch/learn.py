@@ -95,6 +95,7 @@ def _learn_network(
         # A model of this camera may have bands that the flight lacks: weights go to the bands of the same names.
         sides = [0, *(start.side(band) or len(start.bands) for band in bands)] if start.camera else None
         start_from(net, start.net.state_dict(), sides)
+
     def refined() -> list[Results]:
         with ThreadPoolExecutor(at_once) as pool:
             return list(pool.map(lambda group: refine_with(net, group, settings.joint, progress), groups))

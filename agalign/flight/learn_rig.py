@@ -148,9 +148,7 @@ class _Table:
             # Captures far from typical factors are off by errors of the baselines: they count less for the means.
             trust = cauchy_weights(np.linalg.norm(result[:, :3], axis=1), MIN_STD_PX / _LAYOUT_STD)
             target = t if self.prior is None else self._without_delays(self.prior, delay, counts)
-            offset, moved, later = _fit_bands(
-                self.differences, weights * trust[:, None], result, target, delay, pull
-            )
+            offset, moved, later = _fit_bands(self.differences, weights * trust[:, None], result, target, delay, pull)
             if "motion" in factors:
                 delay = _unit(later)
             t = self._without_delays(moved, delay, counts)

@@ -221,7 +221,8 @@ def refine(
 ) -> list[JointResult[FixedImagePx] | Issue]:
     """Refine every psi of a capture at full resolution with theta frozen; an issue is why a pair has no result.
 
-    A step uses up to `patches`. Without `move` psi stays as it is: only its retrieval and uncertainty are measured. Raises NoContrastError.
+    A step uses up to `patches`. Without `move` psi stays as it is: only its retrieval and uncertainty are measured.
+    Raises NoContrastError.
     """
     level = state.level(group, 1.0, range(len(group.moving)))
     h = [level.homography(matrix, b) for b, matrix in enumerate(group.mappings)]

@@ -105,7 +105,7 @@ def resample(
     return _as_type(sampled, pixels.dtype), np.asarray(inside)
 
 
-def _between(positions: Points, minimum: Points, maximum: Points) -> Mask:
+def _between(positions: NDArray[np.floating], minimum: Points, maximum: Points) -> Mask:
     """(H, W) True where positions (H, W, 2) are within a rectangle, its border included."""
     return np.asarray(cv2.inRange(positions, tuple(map(float, minimum)), tuple(map(float, maximum))) != 0)
 

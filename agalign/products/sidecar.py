@@ -7,7 +7,7 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -385,11 +385,11 @@ def _without_seconds(part: dict[str, Any]) -> dict[str, Any]:
 
 
 _LIST_ELEMENT = r"(?=[-0-9ntf])"
-"""Begins a line of indented JSON that is a number, null, true or false in a list: names and texts begin with a quote."""
+"""A line of indented JSON that is a number, null, true or false in a list: names and texts begin with a quote."""
 
 
 def compact_lists(text: str) -> str:
-    """Indented JSON with lists of numbers on one line: a matrix reads as a matrix, and the file is a third of the size."""
+    """Indented JSON with each list of numbers on one line: legible matrices, and a third of the size."""
     text = re.sub(r"\[\n +" + _LIST_ELEMENT, "[", text)
     text = re.sub(r",\n +" + _LIST_ELEMENT, ", ", text)
     return re.sub(r"(?<=[0-9le])\n *\]", "]", text)
