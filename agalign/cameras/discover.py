@@ -32,7 +32,7 @@ def discover(
     if not paths and problems:
         raise problems[0].error
     if not paths:
-        raise InputError(f"{folder}: no .tif, .tiff, .jpg or .jpeg file in it or below it")
+        raise InputError(f"{folder}: no .tif, .tiff, .jpg, .jpeg or .png file in it or below it")
     files = _read(paths, options, progress, problems)
     captures: list[Capture] = []
     for group in group_files(files):

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from agalign.cameras.scan import Problem
 from agalign.errors import InputError
-from agalign.pixels.raster import JPEG_SUFFIXES, TIFF_SUFFIXES
+from agalign.pixels.raster import PICTURE_SUFFIXES, TIFF_SUFFIXES
 from agalign.values.files import RUN_FILE
 
-_SUFFIXES = TIFF_SUFFIXES | JPEG_SUFFIXES
+_SUFFIXES = TIFF_SUFFIXES | PICTURE_SUFFIXES
 _SYSTEM_FOLDERS = {"lost+found", "System Volume Information", "$RECYCLE.BIN"}
 """Operating systems create these on a memory card."""
 

@@ -8,7 +8,7 @@ from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import BAND_NAME, CAMERA
 from agalign.errors import ConfigurationError
-from agalign.pixels.raster import JPEG_SUFFIXES, RasterInfo
+from agalign.pixels.raster import JPEG_SUFFIXES, PICTURE_SUFFIXES, RasterInfo
 from agalign.values.capture import Band
 
 _BAND_WORDS = (
@@ -22,6 +22,8 @@ _SUFFIX = re.compile(
 )
 
 
+_SPECTRAL = re.compile(rf"(?!rgb|vis|ms)(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|re|[bgrn]", re.IGNORECASE)
+"""Names of single bands, which no photograph has."""
 _DATE = re.compile(r"(?:19|20)\d\d([-_.])\d{1,2}\1\d{1,2}$")
 """At a name's end: its last number is a day, not a band."""
 
@@ -38,8 +40,8 @@ class Generic(Camera):
         return True
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        if path.suffix.lower() in JPEG_SUFFIXES:
-            return colour_bands(path, info)
+        if path.suffix.lower() in PICTURE_SUFFIXES:
+            return self._picture_bands(path, info)
         own_name = tags.text(*BAND_NAME) or self.split(path)[1]
         indexes = info.band_indexes
         file_wavelength_nm = tags.number(CAMERA, "CentralWavelength") or _wavelength_in(own_name)
@@ -49,6 +51,16 @@ class Generic(Camera):
             wavelength_nm = info.wavelengths_nm[i - 1] or file_wavelength_nm
             result.append(replace(band_of(path, info, name, i), wavelength_nm=wavelength_nm))
         return tuple(result)
+
+    def _picture_bands(self, path: Path, info: RasterInfo) -> tuple[Band, ...]:
+        """The band that a picture is by its name, else the colours of a photograph; no other PNG takes part.
+
+        Numbers count pictures and not their bands. A grey picture may be stored with three equal channels.
+        """
+        name = self.split(path)[1]
+        if name and (self._patterns or _SPECTRAL.fullmatch(name)):
+            return (replace(band_of(path, info, name), wavelength_nm=_wavelength_in(name)),)
+        return colour_bands(path, info) if path.suffix.lower() in JPEG_SUFFIXES else ()
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         return self.split(path)[0]

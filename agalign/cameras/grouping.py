@@ -39,6 +39,7 @@ def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
         groups[file.camera.name, str(file.camera.capture_folder(file.path)), key].append(file)
     _add_files_without_id(groups)
     _add_files_without_tags(groups)
+    _drop_copies(groups)
     return [sorted(group, key=lambda f: f.bands[0].companion) for group in groups.values()]
 
 
@@ -78,6 +79,27 @@ def _add_files_without_tags(groups: dict[_GroupKey, list[ImageFile]]) -> None:
             groups[key] = left
         else:
             del groups[key]
+
+
+def _drop_copies(groups: dict[_GroupKey, list[ImageFile]]) -> None:
+    """Drop pictures of single bands where the capture has TIFFs, or where they are no capture next to others: programs
+    leave quick looks among the images.
+    """
+    for key, group in list(groups.items()):
+        groups[key] = [f for f in group if not _is_picture_band(f)] if any(_is_tiff(f) for f in group) else group
+    alone = {k for k, group in groups.items() if len(group) == 1 and _is_picture_band(group[0])}
+    if len(alone) < len(groups):
+        for key in alone:
+            del groups[key]
+
+
+def _is_tiff(file: ImageFile) -> bool:
+    return file.path.suffix.lower() in TIFF_SUFFIXES
+
+
+def _is_picture_band(file: ImageFile) -> bool:
+    """True for a band by its name in a format of photographs."""
+    return file.camera.name == Generic.name and not _is_tiff(file) and not file.bands[0].companion
 
 
 def _group_for(

@@ -13,6 +13,7 @@ from PIL import ExifTags, Image
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, check_directories
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
+from agalign.pixels.raster import JPEG_SUFFIXES, PNG_SUFFIXES
 from agalign.values.capture import Position
 from agalign.values.text import without_controls
 
@@ -92,8 +93,13 @@ def rational(value: Any) -> float | None:
 
 
 def read_tags(path: Path) -> Tags:
-    """The tags of a TIFF's first page or of a JPEG. Raises UnreadableFileError where it is neither or is cut short."""
-    kind, read = ("JPEG", _jpeg_values) if path.suffix.lower() in (".jpg", ".jpeg") else ("TIFF", _tiff_values)
+    """The tags of a TIFF's first page or of a JPEG; none of a PNG.
+
+    Raises UnreadableFileError where the file is none of these or is cut short.
+    """
+    if path.suffix.lower() in PNG_SUFFIXES:
+        return Tags()
+    kind, read = ("JPEG", _jpeg_values) if path.suffix.lower() in JPEG_SUFFIXES else ("TIFF", _tiff_values)
     try:
         values = read(path)
     except Exception as error:  # a damaged file makes readers fail in any way: struct.error, KeyError, MemoryError …

@@ -52,3 +52,12 @@ class FolderScan:
     folder: Path
     captures: tuple[Capture, ...]
     problems: tuple[Problem, ...]
+
+    @property
+    def eight_bit(self) -> tuple[Capture, ...]:
+        """The captures with a file per band and at most 256 levels in each band."""
+        return tuple(
+            c for c in self.captures
+            if len({b.path for b in c.bands}) > 1 and all(b.dtype == "uint8" for b in c.bands)
+            and not any(b.one_lens for b in c.bands)
+        )  # fmt: skip

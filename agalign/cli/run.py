@@ -55,7 +55,16 @@ def find_captures(
             captures=len(flight.captures),
             bands=bands,
         )
+        if flight.eight_bit:
+            terminal.event("eight_bit", _eight_bit_note(flight), captures=len(flight.eight_bit))
     return flight
+
+
+def _eight_bit_note(flight: "FolderScan") -> str:
+    return (
+        f"{len(flight.eight_bit)} of {len(flight.captures)} captures have 8 bits per band: 256 levels, and the tone "
+        "curve of a picture, limit radiometry and indices; export 16-bit TIFFs where the camera has them"
+    )
 
 
 def print_problems(flight: "FolderScan", terminal: Terminal) -> None:

@@ -31,6 +31,9 @@ TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 _READ_WHOLE_PX = 1 << 26
 """Images up to this are decoded as a whole before they are averaged: 128 MB in 16 bits."""
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
+PNG_SUFFIXES = frozenset({".png"})
+PICTURE_SUFFIXES = JPEG_SUFFIXES | PNG_SUFFIXES
+"""Photographs, or bands that a program has exported, most often in 8 bits."""
 _BLOCK_CACHE_BYTES = 256 * 2**20
 """rasterio takes an integer as bytes. GDAL's default is 5 % of the machine's memory, which every worker would take."""
 GDAL_ENVIRONMENT = {
@@ -42,6 +45,7 @@ a description of other files or of a server.
 """
 _DRIVERS = {
     b"II*\0": "GTiff", b"MM\0*": "GTiff", b"II+\0": "GTiff", b"MM\0+": "GTiff", b"\xff\xd8\xff": "JPEG",
+    b"\x89PNG": "PNG",
 }  # fmt: skip
 """By the first bytes of a file: of GDAL's other drivers some execute code or contact servers, whatever the file's name.
 """
@@ -91,7 +95,7 @@ def without_warnings() -> Iterator[None]:
 
 @contextmanager
 def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """A rasterio dataset of a TIFF or JPEG for reading; rows of a south-up map are reversed, as is its transform.
+    """A rasterio dataset of a TIFF, JPEG or PNG for reading; rows of a south-up map are reversed, as is its transform.
 
     Raises UnreadableFileError, naming the file, where it is neither or GDAL cannot read it.
     """
@@ -131,7 +135,7 @@ def why(error: BaseException) -> str:
 
 def _driver_of(path: Path) -> str:
     """The GDAL driver of a file by its first bytes. Raises UnreadableFileError where the path is not a file, cannot be
-    read, or is neither a TIFF nor a JPEG.
+    read, or is not a TIFF, JPEG or PNG.
     """
     try:
         # Opening something else, such as a pipe, would wait forever.
@@ -145,7 +149,7 @@ def _driver_of(path: Path) -> str:
     for magic, driver in _DRIVERS.items():
         if head.startswith(magic):
             return driver
-    what = "is empty" if not head else "is neither a TIFF nor a JPEG"
+    what = "is empty" if not head else "is not a TIFF, JPEG or PNG"
     raise UnreadableFileError(f"{path}: {what}; copy it from the card again")
 
 

@@ -6,6 +6,7 @@ import pytest
 import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from agalign.cameras import metadata
 from agalign.cameras.discover import DiscoverOptions, discover
@@ -106,6 +107,53 @@ def test_the_capture_has_the_tags_of_the_only_file_that_has_some(flight: Path, t
     (result,) = discover(tmp_path).captures
     assert (result.name, [b.name for b in result.bands]) == ("IMG_0001", ["band_1", "NIR"])
     assert (result.camera.make, result.capture_id) == ("MicaSense", "synthetic00000000001")
+
+
+def write_picture(path: Path, channels: int = 1) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    grey = np.random.default_rng(0).integers(1, 255, (64, 80), dtype=np.uint8)
+    Image.fromarray(grey if channels == 1 else np.stack([grey] * channels, axis=-1)).save(path)
+
+
+@pytest.mark.parametrize(("suffix", "channels"), [("jpg", 1), ("JPEG", 3), ("png", 1), ("png", 3)])
+def test_pictures_one_a_band_by_name_are_a_capture(tmp_path: Path, suffix: str, channels: int) -> None:
+    for plot in (1, 2):
+        for band in ("red", "nir", "550nm"):
+            write_picture(tmp_path / f"plot_{plot}_{band}.{suffix}", channels)
+        write_picture(tmp_path / f"plot_{plot}_rgb.{suffix}", 3)
+    result = discover(tmp_path)
+    assert [(c.name, [b.name for b in c.bands]) for c in result.captures] == [
+        ("plot_1", ["550nm", "nir", "red"]), ("plot_2", ["550nm", "nir", "red"]),
+    ]  # fmt: skip
+    assert result.captures[0].reference.wavelength_nm == 550
+    assert result.eight_bit == result.captures
+    assert result.problems == ()
+
+
+def test_quick_looks_among_tiffs_take_no_part(tmp_path: Path) -> None:
+    for band in ("red", "nir"):
+        write(tmp_path / f"a_{band}.tif")
+        write_picture(tmp_path / f"a_{band}.jpg")
+    write_picture(tmp_path / "map_red.png")
+    write_picture(tmp_path / "chart.png")
+    write_picture(tmp_path / "photo_1.jpg", 3)
+    write_picture(tmp_path / "photo_2.jpg", 3)
+    result = discover(tmp_path)
+    assert [(c.name, [b.name for b in c.bands]) for c in result.captures] == [("a", ["nir", "red"])]
+    assert (result.problems, result.eight_bit) == ((), ())
+
+
+def test_a_pattern_names_the_bands_of_pictures(tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_picture(tmp_path / f"a_{number}.png")
+    assert labels(tmp_path, pattern="{capture}_{band}.png") == ["a"]
+
+
+def test_one_band_of_a_picture_has_no_companion(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a_red.png")
+    result = discover(tmp_path)
+    assert result.captures == ()
+    assert [p.path.name for p in result.problems] == ["a_red.png"]
 
 
 def test_a_multiband_file_is_a_capture(tmp_path: Path) -> None:

@@ -705,7 +705,7 @@ _OUTSIDE = '<!DOCTYPE l [<!ENTITY a SYSTEM "file:///etc/passwd">]>' + _PACKET.fo
 FAULTS = (
     Fault("a TIFF cut short", edited(lambda data: data[: len(data) // 2]), 3, r"b_nir\.tif: .*copy it from the card"),
     Fault("half of a TIFF zeros", edited(lambda data: data[:2000] + bytes(len(data) - 2000)), 3, r"^b nir: "),
-    Fault("wrong magic", edited(lambda data: b"XX" + data[2:]), 3, "b_nir.tif: is neither a TIFF nor a JPEG"),
+    Fault("wrong magic", edited(lambda data: b"XX" + data[2:]), 3, "b_nir.tif: is not a TIFF, JPEG or PNG"),
     Fault("no bytes at all", edited(lambda _: b""), 3, "b_nir.tif: is empty"),
     Fault("a text named .tif", extra("c_nir.tif", b"hello"), 3, "c_nir.tif: is neither", ("a", "b")),
     Fault("a folder named .tif", lambda s: (s.folder / "c_nir.tif").mkdir(), 0, "", ("a", "b")),
