@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from agalign.cli.run import GOES_ON, conclude, find_captures, load_ahead, run
 from agalign.cli.terminal import (
+    GOES_ON,
     LogJson,
     Quiet,
     RngSeed,
@@ -235,6 +235,7 @@ def align(
         check_address_space()
         from agalign.batch import RunOptions
         from agalign.cameras.discover import DiscoverOptions
+        from agalign.cli.run import conclude, find_captures, load_ahead, run
         from agalign.config import (
             CheckSettings,
             FlightSettings,

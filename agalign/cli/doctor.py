@@ -5,12 +5,10 @@ import os
 import platform
 import shutil
 import sys
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from agalign._version import __version__
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, Terminal, exits, shown
@@ -63,6 +61,8 @@ def _machine() -> dict[str, Any]:
 
 
 def _version(distribution: str) -> str | None:
+    from importlib import metadata
+
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
@@ -106,6 +106,8 @@ def _extras() -> list[dict[str, Any]]:
 
 def _needs(extra: str) -> list[str]:
     """Distributions that an extra asks for, by the package's own metadata."""
+    from importlib import metadata
+
     asked = [r for r in metadata.requires("agalign") or [] if f"extra == '{extra}'" in r.replace('"', "'")]
     return ["".join(c if c.isalnum() or c in "-_." else " " for c in r).split()[0] for r in asked]
 
@@ -124,6 +126,8 @@ def _problems(facts: dict[str, Any]) -> list[str]:
 
 
 def _show(facts: dict[str, Any], terminal: Terminal) -> None:
+    from rich.table import Table
+
     machine, disk = facts["machine"], facts["disk"]
     table = Table("This machine", "", show_lines=False)
     for name, value in machine.items():

@@ -1,14 +1,16 @@
 """The commands around the paper's experiments: evaluate, surface, and learn."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
 from agalign.cli.terminal import LogJson, Quiet, RngSeed, Terminal, Verbose, exits
 from agalign.errors import ConfigurationError
 from agalign.values.memory_limit import check_address_space
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 Pairs = Annotated[
     Path,
@@ -167,7 +169,9 @@ def _shares(text: str) -> tuple[float, ...]:
         raise ConfigurationError(f"'{text}' is no list of per cents, such as 0,5,10") from None
 
 
-def _table(title: str, rows: list[list[str]]) -> Table:
+def _table(title: str, rows: list[list[str]]) -> "Table":
+    from rich.table import Table
+
     table = Table(*rows[0], title=title)
     for row in rows[1:]:
         table.add_row(*row)

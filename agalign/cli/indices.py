@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from agalign.cli.align import Dask, Jobs
 from agalign.cli.terminal import (
@@ -27,6 +26,8 @@ from agalign.cli.terminal import (
 )
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from agalign.products.index_rasters import IndexReport
     from agalign.products.indices import Index
 
@@ -184,9 +185,11 @@ def _progress(terminal: Terminal, captures: int) -> Iterator[Callable[[str], Non
         yield lambda label: progress.update(task, advance=1, description=shown(label))
 
 
-def _table(names: Sequence[str], reports: "Sequence[IndexReport]") -> Table:
+def _table(names: Sequence[str], reports: "Sequence[IndexReport]") -> "Table":
     """A row per index: the medians of its captures."""
     from statistics import median
+
+    from rich.table import Table
 
     written = [r for r in reports if r.path is not None]
     table = Table("Index", title=f"{len(written)} of {len(reports)} written; medians of captures")

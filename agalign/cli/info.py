@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from agalign.cli.align import (
     BandNames,
@@ -17,7 +16,6 @@ from agalign.cli.align import (
     WithRgb,
     band_names,
 )
-from agalign.cli.run import find_captures
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, exits, in_json, shown
 
 if TYPE_CHECKING:
@@ -53,6 +51,7 @@ def info(
             _show_model(folder, terminal, as_json=as_json)
             raise typer.Exit(EXIT_OK)
         from agalign.cameras.discover import DiscoverOptions
+        from agalign.cli.run import find_captures
         from agalign.flight.panels import with_panels
         from agalign.flight.sky import sky_captures
 
@@ -72,6 +71,8 @@ def info(
 
 def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:
     """Print the captures of a folder as a table, the calibration panels and sky captures, and a line of totals."""
+    from rich.table import Table
+
     table = Table("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
     for row in rows:
         bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
@@ -90,6 +91,8 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
 
 def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     """What a model knows of its camera. Raises InputError where it is none."""
+    from rich.table import Table
+
     from agalign.flight.model import load_model
     from agalign.flight.rig_prediction import band_summaries
     from agalign.method.device import choose_device

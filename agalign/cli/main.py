@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, get_args
 
 import typer
-from rich.table import Table
 
 from agalign._version import __version__
 from agalign.cli import align as cli_align
@@ -18,13 +17,13 @@ from agalign.cli import evaluate as cli_evaluate
 from agalign.cli import indices as cli_indices
 from agalign.cli import info as cli_info
 from agalign.cli.align import Jobs
-from agalign.cli.failures import explain
 from agalign.cli.onto import onto
-from agalign.cli.run import GOES_ON, conclude, find_captures, run
+from agalign.cli.root import RootGroup
 from agalign.cli.terminal import (
     EXIT_OK,
     EXIT_PARTIAL,
     EXIT_USAGE,
+    GOES_ON,
     LogJson,
     Quiet,
     RngSeed,
@@ -47,6 +46,7 @@ _EXAMPLES = examples(
     ("agalign doctor", "what this machine has"),
 )
 app = typer.Typer(
+    cls=RootGroup,
     name="agalign",
     help="Co-register the bands of multispectral drone cameras. 'agalign FOLDER' aligns everything below FOLDER.",
     epilog=_EXAMPLES,
@@ -78,11 +78,14 @@ def demo(
     log_json: LogJson = False,
 ) -> None:
     """Make a synthetic flight, align it, and compare the result with the known truth."""
+    from rich.table import Table
+
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal, GOES_ON):
         check_address_space()
         from agalign.batch import CaptureReport, RunOptions, prepare_output
         from agalign.cameras.discover import DiscoverOptions
+        from agalign.cli.run import conclude, find_captures, run
         from agalign.config import JointSettings, Settings
         from agalign.synthetic.score import make_flight, score_against_truth
 
@@ -115,9 +118,12 @@ def report(
     out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.", show_default=False)],
 ) -> None:
     """Rebuild the report and the summary from the sidecars."""
+    from rich.table import Table
+
     terminal = Terminal(quiet=False, verbose=False, log_json=False)
     with exits(terminal):
         from agalign.batch.output_folder import locked
+        from agalign.cli.failures import explain
         from agalign.errors import InputError
         from agalign.products.report import write_pages
         from agalign.products.sidecar import find_sidecars

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from agalign.cli.align import Jobs, Reference
-from agalign.cli.run import conclude, run
 from agalign.cli.terminal import (
     LogJson,
     Quiet,
@@ -61,6 +60,7 @@ def onto(
         from agalign.batch import RunOptions
         from agalign.cameras.discover import FolderScan
         from agalign.cameras.mosaics import captures_onto, distance_km
+        from agalign.cli.run import conclude, run
         from agalign.config import FlightSettings, JointSettings, ReliefSettings, Settings, WriteSettings
 
         target = out or reference.absolute().parent / f"{reference.stem}-aligned"

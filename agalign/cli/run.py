@@ -11,7 +11,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
 from agalign.cli.failures import explain
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 
 _MAX_LISTED_FILES = 10
 """Of those with the same problem."""
-GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
 
 
 def find_captures(
@@ -230,6 +228,8 @@ def _progress(terminal: Terminal, captures: int) -> Iterator[Callable[[RunTotals
     if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
         yield lambda _outcome, _share, _text: None
         return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
     columns = (
         BarColumn(bar_width=20), TextColumn("{task.fields[done]} of {task.total} captures"),
         TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),

@@ -11,20 +11,22 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from agalign.errors import AgalignError, ConfigurationError, is_want_of_memory
 from agalign.values.choices import MAX_RNG_SEED
 from agalign.values.text import harmless
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
 EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL = 0, 1, 2, 3
 _SIGNALLED = 128
 """What shells add to the number of the signal that ended a program: 130 for the interrupt key, 143 for a request."""
 _PLAIN_WIDTH = 160
+GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
 _OUT_OF_MEMORY = "out of memory; close other programs or try a smaller image"
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 """As far as the system has them."""
@@ -40,6 +42,8 @@ class Stopped(KeyboardInterrupt):
 
 def shown(text: str) -> str:
     """A text from outside as rich prints it: no markup, nothing that a terminal acts on."""
+    from rich.markup import escape
+
     return escape(harmless(text))
 
 
@@ -48,13 +52,17 @@ def in_json(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-class _Console(Console):
+def _console(**options: Any) -> "Console":
     """A console that ignores a closed pipe (`| head -1`): the run continues without printing."""
+    from rich.console import Console
 
-    def on_broken_pipe(self) -> None:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, self.file.fileno())
-        os.close(nowhere)
+    class Unbroken(Console):
+        def on_broken_pipe(self) -> None:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self.file.fileno())
+            os.close(nowhere)
+
+    return Unbroken(highlight=False, emoji=False, **options)
 
 
 class Terminal:
@@ -64,8 +72,8 @@ class Terminal:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
         self._stopped_by: int | None = None
         # Lines in a file or a pipe are not wrapped to a terminal's width.
-        self.out = _Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-        self.err = _Console(stderr=True, highlight=False, emoji=False, soft_wrap=not sys.stderr.isatty())
+        self.out = _console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
+        self.err = _console(stderr=True, soft_wrap=not sys.stderr.isatty())
 
     def event(self, kind: str, text: str = "", /, **fields: Any) -> None:
         """One line of progress: JSON with --log-json, else the text unless --quiet."""
@@ -132,7 +140,8 @@ of_running = partial(typer.Option, rich_help_panel="Running")
 
 def examples(*lines: tuple[str, str]) -> str:
     """Commands and what they do, as the end of a help text."""
-    return "\n\n".join(["Examples:", *(f"[bold]{escape(command)}[/]  {escape(what)}" for command, what in lines)])
+    quoted = [(command.replace("[", r"\["), what.replace("[", r"\[")) for command, what in lines]
+    return "\n\n".join(["Examples:", *(f"[bold]{command}[/]  {what}" for command, what in quoted)])
 
 
 RngSeed = Annotated[
@@ -157,6 +166,8 @@ def exits(terminal: Terminal, on_interrupt: str = "interrupted") -> Iterator[Non
             raise
         with suppress(OSError):  # of a full disk, the terminal's too
             if terminal.verbose and code == EXIT_NOTHING and not isinstance(error, AgalignError):
+                from rich.markup import escape
+
                 terminal.err.print(escape(traceback.format_exc()))
             terminal.problem(text)
         raise typer.Exit(code) from None
