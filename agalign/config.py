@@ -121,6 +121,8 @@ class WriteSettings(Stage):
     """The narrow bands at the panchromatic band's resolution, beside the others."""
     error_map: bool = False
     """A raster of the error to be expected at every pixel, beside them."""
+    tie_points: bool = False
+    """The windows in which each band was measured, as CSV and GeoJSON."""
     relief_map: bool = False
     """The confidence and the range of the relief in its raster, next to the parallax."""
     fill_occluded: bool = False

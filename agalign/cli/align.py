@@ -204,6 +204,13 @@ def align(
         bool,
         of_output("--error-map", help="A raster of the error to expect at every pixel, <capture>.error.tif."),
     ] = False,
+    tie_points: Annotated[
+        bool,
+        of_output(
+            "--tie-points",
+            help="Measured tie points of each band with residual and weight: <capture>.ties.csv and .ties.geojson.",
+        ),
+    ] = False,
     format: Annotated[RasterFormat, of_output(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
     compression: Annotated[
         Compression,
@@ -260,7 +267,7 @@ def align(
             write=WriteSettings(
                 interpolation=interpolation, crop=crop, undistort=undistort, resolution=resolution, layout=layout,
                 radiometry=radiometry, panel_albedo=albedos(panel_albedo), stac=stac,
-                indices=tuple(name.lower() for name in band_names(index)), error_map=error_map,
+                indices=tuple(name.lower() for name in band_names(index)), error_map=error_map, tie_points=tie_points,
                 relief_map=relief_map, fill_occluded=fill_occluded,
                 pan_sharpen=pan_sharpen,
                 format=format, compression=compression,

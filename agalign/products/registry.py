@@ -10,6 +10,7 @@ from agalign.products.product import Product
 from agalign.products.relief_map import ReliefMap
 from agalign.products.stac import StacItem
 from agalign.products.stack import Stack
+from agalign.products.tie_points import TiePoints
 
 PRODUCTS: tuple[Product, ...] = (
     BandFiles(),
@@ -17,6 +18,7 @@ PRODUCTS: tuple[Product, ...] = (
     PanSharpened(),
     ReliefMap(),
     ErrorMap(),
+    TiePoints(),
     IndexRasters(),
     BeforeAfterPicture(),
     Preview(),

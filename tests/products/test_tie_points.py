@@ -1,0 +1,58 @@
+"""Tie points are measured: they match the truth even where the alignment that they are measured under does not."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.interpolate import CloughTocher2DInterpolator
+
+import agalign
+from agalign.cameras.discover import DiscoverOptions
+from agalign.config import SeedSettings, Settings, WriteSettings
+from agalign.products.tie_points import TiePoint, _geojson
+from agalign.values.capture import Georeference
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+BY_TAGS = Settings(seed=SeedSettings(only=True, force="rig"), write=WriteSettings(tie_points=True))
+
+
+@pytest.mark.slow
+def test_tie_points_match_the_truth_where_the_alignment_is_off(flight: Path, tmp_path: Path) -> None:
+    bands = ("Green", "Red", "NIR")
+    (report, *_) = agalign.align_folder(flight, tmp_path, settings=BY_TAGS, options=DiscoverOptions(bands=bands))
+    assert report.path is not None
+    truth = json.loads((flight / "truth.json").read_text())[report.path.stem]["bands"]
+    rows = list(csv.DictReader(report.path.with_suffix(".ties.csv").read_text().splitlines()))
+    assert report.sidecar is not None
+    for band in report.sidecar.bands:
+        own = [r for r in rows if r["band"] == band.band]
+        if band.status == "reference":
+            assert own == []
+            continue
+        assert len(own) > 8
+        ties = np.array(truth[band.file]["ties"])
+        known = CloughTocher2DInterpolator(ties[:, :2], ties[:, 2:])
+        reference, moving = (
+            np.array([[float(r[f"{side}_{axis}_px"]) for axis in "xy"] for r in own])
+            for side in ("reference", "moving")
+        )
+        assert np.nanmedian(np.linalg.norm(known(reference) - moving, axis=1)) < 0.3
+        # By its tags alone the band is off by more than that.
+        assert np.median([float(r["residual_px"]) for r in own]) > 0.6
+        assert np.median([float(r["weight"]) for r in own]) == pytest.approx(1.0, abs=1e-3)
+    features = json.loads(report.path.with_suffix(".ties.geojson").read_text())["features"]
+    assert [f["properties"]["band"] for f in features] == [r["band"] for r in rows]
+    x, y = features[0]["geometry"]["coordinates"]
+    assert (x, y) == (float(rows[0]["reference_x_px"]) + 0.5, -float(rows[0]["reference_y_px"]) - 0.5)
+
+
+def test_points_of_a_georeferenced_image_are_in_degrees() -> None:
+    transform = np.array([[10.0, 0.0, 500_000.0], [0.0, -10.0, 5_000_000.0], [0.0, 0.0, 1.0]])
+    point = TiePoint("NIR", "aligned", (9.5, 19.5), (9.6, 19.4), 0.14, 1.0)
+    result = json.loads(_geojson([point], Georeference(transform, "EPSG:32633")))
+    assert result["coordinates_in"] == "EPSG:4326"
+    # 100 m east of the central meridian, 15 degrees east, and 200 m south of 5,000 km north.
+    assert result["features"][0]["geometry"]["coordinates"] == pytest.approx([15.00127, 45.15169], abs=1e-4)
+    assert json.loads(_geojson([], None))["features"] == []
