@@ -46,6 +46,8 @@ FINE = FieldScale(window_px=32, lattice_px=24, verification_px=32)
 
 _MAX_WINDOWS = 4000
 """In larger images the windows are farther apart: it bounds the time, and a field is smooth."""
+_MIN_LATTICE_SHARE = 0.75
+"""Spacing of the nodes relative to that of the windows, at least: more nodes would follow nothing that was measured."""
 _SMOOTHNESS = (0.3, 1.0, 4.0, 16.0, 64.0)
 """Weights of the field's second differences relative to the shift of one window; cross-validation chooses."""
 _PULL = 0.003
@@ -88,8 +90,9 @@ class DisplacementEstimator:
         default all over the image.
         """
         self._valid, self._structure, self._verification_px = valid, structure, scale.verification_px
-        self.size_px, self.lattice_px = (valid.shape[1], valid.shape[0]), scale.lattice_px
         step_px = max(scale.window_px // 2, round((valid.size / _MAX_WINDOWS) ** 0.5))
+        self.size_px = valid.shape[1], valid.shape[0]
+        self.lattice_px = max(scale.lattice_px, round(_MIN_LATTICE_SHARE * step_px))
         self.windows = windows or FixedWindows(valid, structure, scale.window_px, step_px)
 
     @cached_property
@@ -317,8 +320,10 @@ def fitted_field(shifts: Shifts, smoothness: float, lattice_px: int, size_px: tu
     The normal equations couple nodes at most two rows apart, so they are solved as a banded matrix, which is filled
     directly: with sparse matrices, their construction took most of the time of an alignment.
     """
-    columns, rows = (int(np.ceil(n / lattice_px)) + 1 for n in size_px)
-    nodes, weights = _interpolation(shifts.centres_px / lattice_px, columns, rows)
+    # The nodes are numbered along the shorter side of the image: the time grows with the square of their number there.
+    columns, rows = (int(np.ceil(n / lattice_px)) + 1 for n in sorted(size_px))
+    order = np.argsort(size_px, kind="stable")
+    nodes, weights = _interpolation(shifts.centres_px[:, order] / lattice_px, columns, rows)
     penalty = smoothness * _bending(columns, rows)
     penalty[0] += _PULL
     first, second = np.triu_indices(len(nodes))
@@ -333,7 +338,8 @@ def fitted_field(shifts: Shifts, smoothness: float, lattice_px: int, size_px: tu
         off = np.linalg.norm(shifts.shifts_px - fitted, axis=1)
         spread = max(MAD_TO_STD * float(np.median(off)), _MIN_SPREAD_PX)
         trust = shifts.trust * cauchy_weights(off, _OUTLIER_SPREADS * spread)
-    return DisplacementField(float(lattice_px), field.reshape(rows, columns, 2))
+    lattice = field.reshape(rows, columns, 2)
+    return DisplacementField(float(lattice_px), lattice if order[0] == 0 else lattice.transpose(1, 0, 2).copy())
 
 
 def _interpolation(points: Points, columns: int, rows: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
