@@ -45,8 +45,9 @@ _MIN_MODEL_STD_PX = 1.0
 """Captures of a flight differ by as much in height and tilt, whatever the rig's own errors."""
 _PLAINLY_REDUCED = 0.7
 """Scale of the images relative to their files below which the files are worth another look."""
-_LONGEST_SIDE_PX = 4096
-"""Larger images are reduced to this for estimation: it bounds memory and time; `full_resolution` refines the result."""
+_LONGEST_SIDE_PX = 2700
+"""Larger images are reduced to this for estimation: it bounds memory and time; `full_resolution` refines the result.
+The bands of most cameras have fewer pixels (2592 on the Mavic 3M)."""
 _COARSE_RATIO = 0.4
 """A moving band with fewer pixels than this for each pixel of the reference, along a line of the ground, is coarse: the
 reference is reduced for it."""
@@ -98,6 +99,13 @@ class BandPair:
     def is_reduced(self) -> bool:
         """True where the files have enough more pixels than the images for a refinement on them."""
         return min(*self.scales.moving, *(() if self.is_coarse else self.scales.fixed)) < _PLAINLY_REDUCED
+
+    @property
+    def file_px(self) -> float:
+        """Length of a pixel of the reference's file, px of the fixed image; 1 where a coarse band decides what can be
+        resolved.
+        """
+        return 1.0 if self.is_coarse else min(self.scales.fixed)
 
     @property
     def reach_px(self) -> FixedImagePx:

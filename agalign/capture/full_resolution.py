@@ -16,8 +16,8 @@ from agalign.capture.verification import without_result
 from agalign.errors import GeometryError, UnreadableFileError
 from agalign.flight.factors import distance_px
 from agalign.pixels.masks import learnable
-from agalign.pixels.raster import open_raster, read_window
-from agalign.pixels.resample import resample_tile
+from agalign.pixels.raster import OpenRaster, open_raster, read_window
+from agalign.pixels.resample import resample_tile_of
 from agalign.pixels.structure import structure_field
 from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Band
@@ -49,7 +49,8 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[Fixed
     moving file with an unreadable tile makes the alignment `failed`: its pixels could not be written either.
     Raises UnreadableFileError for the reference.
     """
-    tiles = [_FixedTile.read(reference, cell, tile) for cell, tile in _tiles(reference, alignment).items()]
+    with open_raster(reference.path) as source:
+        tiles = [_FixedTile.read(source, reference, *of_cell) for of_cell in _tiles(reference, alignment).items()]
     try:
         refined = _refined(alignment, moving, mapping_of(reference, moving, alignment), tiles, reference.size_px)
     except UnreadableFileError as error:
@@ -68,10 +69,8 @@ class _FixedTile:
     windows: FixedWindows
 
     @classmethod
-    def read(cls, reference: Band, cell: tuple[int, int], tile: Tile) -> "_FixedTile":
-        """Raises UnreadableFileError."""
-        with open_raster(reference.path) as source:
-            pixels, valid = read_window(source, reference, tile.x0, tile.y0, tile.width, tile.height)
+    def read(cls, source: OpenRaster, reference: Band, cell: tuple[int, int], tile: Tile) -> "_FixedTile":
+        pixels, valid = read_window(source, reference, tile.x0, tile.y0, tile.width, tile.height)
         fixed = _raster(pixels, valid, reference)
         return cls(cell, tile, FixedWindows(fixed.valid, structure_field(fixed)))
 
@@ -80,9 +79,9 @@ class _FixedTile:
         """True for the black fields of the chessboard; the white ones verify."""
         return sum(self.cell) % 2 == 0
 
-    def residual(self, moving: Band, mapping: PixelMapping) -> Residual[FixedFilePx]:
-        """The residual of its windows, px of the reference's file. Raises UnreadableFileError for the moving file."""
-        warped = _raster(*resample_tile(moving, mapping, self.tile, "lanczos"), moving)
+    def residual(self, source: OpenRaster, moving: Band, mapping: PixelMapping) -> Residual[FixedFilePx]:
+        """The residual of its windows, px of the reference's file; `source` is the moving file."""
+        warped = _raster(*resample_tile_of(source, moving, mapping, self.tile, "lanczos"), moving)
         in_tile = self.windows.residuals(warped)
         centres_px = in_tile.centres_px + np.array([self.tile.x0, self.tile.y0])
         return Residual[FixedFilePx].of(centres_px, in_tile.shifts_px, in_tile.peaks_sigma)
@@ -169,8 +168,11 @@ def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
 
 
 def _residual(moving: Band, mapping: PixelMapping, tiles: Sequence[_FixedTile]) -> Residual[FixedFilePx]:
-    """The residual of the windows of all tiles, px of the reference's file."""
-    parts = [tile.residual(moving, mapping) for tile in tiles]
+    """The residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError for the moving
+    file.
+    """
+    with open_raster(moving.path) as source:
+        parts = [tile.residual(source, moving, mapping) for tile in tiles]
     if not parts:
         return Residual[FixedFilePx].of(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
     return Residual[FixedFilePx].of(

@@ -59,7 +59,9 @@ def _with_prediction(
     if pair.name in known.mappings and alignment.joint is not None and alignment.residual is not None:
         off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
         prediction = replace(prediction, off_px=off_px)
-        evidence = Evidence(alignment.joint, alignment.residual, pair.fixed.size_px, prediction=prediction)
+        evidence = Evidence(
+            alignment.joint, alignment.residual, pair.fixed.size_px, prediction=prediction, file_px=pair.file_px
+        )
         issues = issues_of(evidence)
         if not issues:
             return replace(alignment, prediction=prediction)

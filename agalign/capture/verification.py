@@ -81,7 +81,8 @@ class WarpedPair:
 
     def issues(self, joint: JointResult[FixedImagePx]) -> tuple[Issue, ...]:
         """Of the result that this mapping is from."""
-        return issues_of(Evidence(joint, self.residual, self.pair.fixed.size_px, images=self))
+        file_px = self.pair.file_px
+        return issues_of(Evidence(joint, self.residual, self.pair.fixed.size_px, images=self, file_px=file_px))
 
 
 def _residual_of(pair: BandPair, mapping: PixelMapping, warped: Raster) -> Residual[FixedImagePx]:

@@ -45,7 +45,7 @@ def by_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[
     warped_pair, fit = fitted
     held_out = _some(warped_pair.residual, is_for_fit=False)
     joint = _joint(alignment, warped_pair, fit)
-    if issues_of(Evidence(joint, held_out, pair.fixed.size_px, images=warped_pair)):
+    if issues_of(Evidence(joint, held_out, pair.fixed.size_px, images=warped_pair, file_px=pair.file_px)):
         return alignment
     return replace(
         alignment, fixed_to_moving=joint.fixed_to_moving, status="aligned", issues=(), joint=joint, residual=held_out,

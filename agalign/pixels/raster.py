@@ -93,6 +93,10 @@ def without_warnings() -> Iterator[None]:
         yield
 
 
+OpenRaster = rasterio.DatasetReader
+"""A file as `open_raster` gives it."""
+
+
 @contextmanager
 def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
     """A rasterio dataset of a TIFF, JPEG or PNG for reading; rows of a south-up map are reversed, as is its transform.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import open_raster, read_window
+from agalign.pixels.raster import OpenRaster, open_raster, read_window
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import Interpolation
@@ -54,7 +54,17 @@ def resample_tile(
     integers rounded and clipped; calibrated with `radiometry` it is float32.
 
     A pixel is valid where it is inside the moving image, not occluded there, and no invalid pixel contributes to it.
+    Raises UnreadableFileError.
     """
+    with open_raster(band.path) as dataset:
+        return resample_tile_of(dataset, band, mapping, tile, interpolation, radiometry)
+
+
+def resample_tile_of(
+    dataset: OpenRaster, band: Band, mapping: PixelMapping, tile: Tile, interpolation: Interpolation,
+    radiometry: Radiometry | None = None,
+) -> tuple[NDArray[np.generic], Mask]:  # fmt: skip
+    """`resample_tile` of a file that is open: what GDAL has decoded for one tile serves the next."""
     positions = mapping.positions(tile)
     shape = tile.height, tile.width
     # Without parallax the mapping is smooth: a coarse sample of it, edges included, gives its extent to a pixel.
@@ -68,8 +78,7 @@ def resample_tile(
     if x1 - x0 < 1 or y1 - y0 < 1:
         dtype = np.dtype(band.dtype if radiometry is None else np.float32)
         return np.zeros(shape, dtype), np.zeros(shape, dtype=bool)
-    with open_raster(band.path) as dataset:
-        pixels, valid = read_window(dataset, band, int(x0), int(y0), int(x1 - x0), int(y1 - y0))
+    pixels, valid = read_window(dataset, band, int(x0), int(y0), int(x1 - x0), int(y1 - y0))
     if radiometry is not None:
         pixels = calibrated(pixels, radiometry, int(x0), int(y0))
     positions -= (x0, y0)

@@ -37,6 +37,8 @@ class Evidence(Generic[FixedPx]):
     """None leaves out the checks that need pixels."""
     prediction: Prediction | None = None
     """With `off_px`, how far the result is from it; None without a rig."""
+    file_px: float = 1.0
+    """Length of a pixel of the reference's file on this grid: residual shifts are limited in px of the file."""
 
 
 @dataclass(frozen=True)

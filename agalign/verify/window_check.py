@@ -50,15 +50,16 @@ def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     # Each is written so that nan does not pass.
     if not residual.coverage >= _MIN_COVERAGE:
         yield Issue(COVERAGE, residual.coverage, _MIN_COVERAGE)
-    yield from _issues_of_outliers(residual)
-    if not residual.median_px <= _MAX_MEDIAN_PX:
-        yield Issue(RESIDUAL_PX, residual.median_px, _MAX_MEDIAN_PX)
+    yield from _issues_of_outliers(residual, evidence.file_px)
+    median_px = residual.median_px / evidence.file_px
+    if not median_px <= _MAX_MEDIAN_PX:
+        yield Issue(RESIDUAL_PX, median_px, _MAX_MEDIAN_PX)
 
 
-def _issues_of_outliers(residual: Residual[FixedPx]) -> Iterator[Issue]:
+def _issues_of_outliers(residual: Residual[FixedPx], file_px: float) -> Iterator[Issue]:
     measured = np.isfinite(residual.shifts_px[:, 0])
     count = max(int(measured.sum()), 1)
-    off = measured & (np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _CLOSE_PX)
+    off = measured & (np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _CLOSE_PX * file_px)
     close = 1 - float(off.sum()) / count
     if not close >= _MIN_CLOSE:
         yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE, f"{_CLOSE_PX:g} px")

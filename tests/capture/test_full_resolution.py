@@ -76,14 +76,14 @@ def test_a_result_of_reduced_images_is_refined_on_the_files(capture: Capture, mo
 def test_a_band_with_an_unreadable_tile_fails_and_stops_no_other(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    resample_tile = full_resolution.resample_tile
+    resample_tile_of = full_resolution.resample_tile_of
 
-    def unreadable(band: Any, *rest: Any) -> Any:
+    def unreadable(source: Any, band: Any, *rest: Any) -> Any:
         if band.name == "nir":
             raise UnreadableFileError(f"{band.path}: cannot be read (tile 7); copy it from the card again")
-        return resample_tile(band, *rest)
+        return resample_tile_of(source, band, *rest)
 
-    monkeypatch.setattr(full_resolution, "resample_tile", unreadable)
+    monkeypatch.setattr(full_resolution, "resample_tile_of", unreadable)
     result = align_reduced(capture, monkeypatch, 400)
     assert {name: a.status for name, a in result.items()} == {"nir": "failed", "red": "aligned"}
     assert "field_nir.tif: cannot be read (tile 7)" in (result["nir"].reason or "")

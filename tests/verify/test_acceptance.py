@@ -166,6 +166,12 @@ def test_nine_in_ten_windows_must_be_close() -> None:
     assert (issue.value, issue.limit, issue.detail) == (pytest.approx(0.89), 0.9, "1 px")
 
 
+def test_the_limit_is_a_pixel_of_the_file_where_the_images_are_reduced() -> None:
+    within = Evidence(GOOD_JOINT, shifted(11, 0.7), SIZE)
+    assert issues_of(within) == ()
+    assert [issue.code for issue in issues_of(replace(within, file_px=0.65))] == ["close_windows"]
+
+
 @pytest.mark.parametrize(("total", "allowed"), [(100, 4), (125, 4), (150, 5), (200, 7)])
 def test_the_windows_of_a_cluster_are_counted(total: int, allowed: int) -> None:
     """Five adjacent windows, or a twenty-fifth of those measured where that is more."""
