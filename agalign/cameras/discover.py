@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from agalign.cameras.folder_walk import check_folder, image_files
+from agalign.cameras.folder_walk import IMAGE_KINDS, check_folder, image_files, is_chosen, other_files
 from agalign.cameras.grouping import capture_of, group_files, pattern_clashes, with_missing_bands
 from agalign.cameras.naming import band_file_owners, with_unique_capture_names
 from agalign.cameras.read_files import ImageFile, read_files
@@ -14,6 +14,8 @@ from agalign.values.capture import Capture
 
 __all__ = ["DiscoverOptions", "FolderScan", "Problem", "discover"]
 
+_MAX_SUFFIXES = 5
+"""Kinds of other files that a message names."""
 Progress = Callable[[int, int], None]
 """Called with (files read, files in all)."""
 
@@ -28,11 +30,16 @@ def discover(
     """
     folder, options = Path(folder), options or DiscoverOptions()
     check_folder(folder)
-    paths, problems = image_files(folder, options.skip)
+    there, problems = image_files(folder, options.skip)
+    paths = [p for p in there if is_chosen(p.relative_to(folder), options.include, options.exclude)]
     if not paths and problems:
         raise problems[0].error
+    if there and not paths:
+        raise InputError(f"{folder}: has {len(there)} images, and --include and --exclude leave none")
     if not paths:
-        raise InputError(f"{folder}: no .tif, .tiff, .jpg, .jpeg or .png file in it or below it")
+        others = ", ".join(f"{count} {suffix}" for suffix, count in other_files(folder).most_common(_MAX_SUFFIXES))
+        only = f"; there are only {others}" if others else ""
+        raise InputError(f"{folder}: no {IMAGE_KINDS} file in it or below it{only}")
     files = _read(paths, options, progress, problems)
     captures: list[Capture] = []
     for group in group_files(files):

@@ -2,7 +2,9 @@
 
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from agalign.cameras.scan import Problem
@@ -11,6 +13,9 @@ from agalign.pixels.raster import PICTURE_SUFFIXES, TIFF_SUFFIXES
 from agalign.values.files import RUN_FILE
 
 _SUFFIXES = TIFF_SUFFIXES | PICTURE_SUFFIXES
+IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+"""Of a network, such as s3://bucket or https://host, of which a path keeps one slash; drives have one letter."""
 _SYSTEM_FOLDERS = {"lost+found", "System Volume Information", "$RECYCLE.BIN"}
 """Operating systems create these on a memory card."""
 
@@ -19,6 +24,9 @@ def check_folder(folder: Path) -> None:
     """Raises InputError where `folder` is not a folder that can be listed."""
     if folder.as_posix().startswith("/vsi"):
         raise InputError(f"{folder}: is one of GDAL's virtual paths; mount or unpack it, and give the folder")
+    if _ADDRESS.match(folder.as_posix()):
+        address = folder.as_posix().replace(":/", "://", 1)
+        raise InputError(f"{address}: only local folders can be read; mount it or copy the images, and give the folder")
     try:
         if folder.is_dir():
             return
@@ -44,6 +52,27 @@ def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Pr
         images = [n for n in names if Path(n).suffix.lower() in _SUFFIXES and not n.startswith(".")]
         result.extend(here / n for n in sorted(images, key=natural_order))
     return result, problems
+
+
+def is_chosen(path: Path, include: Sequence[str], exclude: Sequence[str]) -> bool:
+    """True for a path, relative to the input folder, that a glob of `include` matches, if any, and none of `exclude`.
+
+    A glob is compared with the whole path and with the file's name; * matches / too.
+    """
+
+    def matches(globs: Sequence[str]) -> bool:
+        return any(fnmatchcase(name, glob) for name in (path.as_posix(), path.name) for glob in globs)
+
+    return (not include or matches(include)) and not matches(exclude)
+
+
+def other_files(folder: Path) -> Counter[str]:
+    """How many files below a folder are not images that can be read, by their suffix in lower case."""
+    suffixes: Counter[str] = Counter()
+    for _, folders, names in os.walk(folder):
+        folders[:] = [d for d in folders if not d.startswith(".")]
+        suffixes.update(Path(n).suffix.lower() or "no suffix" for n in names if not n.startswith("."))
+    return Counter({s: n for s, n in suffixes.items() if s not in _SUFFIXES})
 
 
 def natural_order(name: str) -> list[tuple[bool, int, str]]:

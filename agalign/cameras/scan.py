@@ -30,6 +30,10 @@ class DiscoverOptions:
     """Larger images are refused before their pixels are read."""
     jobs: int = 1
     """Processes that read the files' tags where there are many files; the calling script must be importable then."""
+    include: tuple[str, ...] = ()
+    """Globs of the files to use, by path below the folder or by name; empty for all."""
+    exclude: tuple[str, ...] = ()
+    """Globs of the files to leave out."""
 
 
 @dataclass(frozen=True)

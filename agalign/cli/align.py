@@ -10,12 +10,12 @@ from agalign.cli.terminal import (
     GOES_ON,
     LogJson,
     Quiet,
-    RngSeed,
     Terminal,
     Verbose,
     examples,
     exits,
     of_alignment,
+    of_expert,
     of_input,
     of_output,
     of_running,
@@ -23,6 +23,7 @@ from agalign.cli.terminal import (
 from agalign.errors import ConfigurationError
 from agalign.values.choices import (
     MAX_PIXELS,
+    MAX_RNG_SEED,
     BandOrder,
     Compression,
     Crop,
@@ -96,6 +97,14 @@ def align(
     with_rgb: WithRgb = False,
     pattern: Pattern = None,
     ignore_metadata: IgnoreMetadata = False,
+    include: Annotated[
+        list[str] | None,
+        of_input(show_default=False, help="Only files that this glob matches, by path or name; repeatable."),
+    ] = None,
+    exclude: Annotated[
+        list[str] | None,
+        of_input(show_default=False, help="No files that this glob matches, as '*/test/*'; repeatable."),
+    ] = None,
     align_panels: Annotated[
         bool,
         of_input("--align-panels", help="Align captures of calibration panels and of the sky too, like any other."),
@@ -109,12 +118,6 @@ def align(
         bool,
         of_alignment("--only-seed", help="Stop at the coarse alignment; learn nothing."),
     ] = False,
-    recipe: Annotated[Recipe, of_alignment(help="How to optimise: fast, or step by step as published.")] = "fast",
-    sharing: Annotated[Sharing, of_alignment(help="What the descriptor's two sides share.")] = "pseudo-siamese",
-    model_family: Annotated[
-        FamilyChoice,
-        of_alignment(help="Mapping to fit; auto is as rich as the images allow."),
-    ] = "auto",
     relief: Annotated[
         ReliefUse,
         of_alignment(
@@ -134,10 +137,6 @@ def align(
         Path | None,
         of_alignment(help="Start from what an earlier flight of the same camera learnt: OUT/models/…."),
     ] = None,
-    each_alone: Annotated[
-        bool,
-        of_alignment("--each-alone", help="Learn every capture by itself instead of once a flight."),
-    ] = False,
     out: Annotated[
         Path | None,
         of_output("-o", "--out", help="Output folder; by default FOLDER with '-aligned' added."),
@@ -217,7 +216,6 @@ def align(
         of_output(help="Lossless; auto is zstd for stacks and deflate for single bands."),
     ] = "auto",
     device: Annotated[str, of_running(help="auto, cpu, cuda, cuda:1 …")] = "auto",
-    rng_seed: RngSeed = 0,
     jobs: Jobs = 0,
     dask: Dask = None,
     overwrite: Annotated[
@@ -235,6 +233,20 @@ def align(
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
+    recipe: Annotated[Recipe, of_expert(help="How to optimise: fast, or step by step as published.")] = "fast",
+    sharing: Annotated[Sharing, of_expert(help="What the descriptor's two sides share.")] = "pseudo-siamese",
+    model_family: Annotated[
+        FamilyChoice,
+        of_expert(help="Mapping to fit; auto is as rich as the images allow."),
+    ] = "auto",
+    each_alone: Annotated[
+        bool,
+        of_expert("--each-alone", help="Learn every capture by itself instead of once a flight."),
+    ] = False,
+    rng_seed: Annotated[
+        int,
+        of_expert(min=0, max=MAX_RNG_SEED, help="Seed of all random numbers; the same seed gives the same result."),
+    ] = 0,
 ) -> None:
     """Align every capture below FOLDER."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
@@ -275,7 +287,7 @@ def align(
         )  # fmt: skip
         options = DiscoverOptions(
             pattern, reference, ignore_metadata, with_rgb, band_names(bands), order, (target,), max_pixels,
-            jobs or os.cpu_count() or 1,
+            jobs or os.cpu_count() or 1, tuple(include or ()), tuple(exclude or ()),
         )  # fmt: skip
         if stac:
             need_stac()

@@ -1,6 +1,7 @@
 """The command that shows what was found: the captures of a folder, or what a model knows of its camera."""
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,10 +18,18 @@ from agalign.cli.align import (
     band_names,
 )
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, exits, in_json, shown
+from agalign.errors import UnreadableFileError
+from agalign.values.text import counted
 
 if TYPE_CHECKING:
+    from agalign.cameras.discover import FolderScan
     from agalign.values.capture import Capture
 
+_NO_BAND = (
+    "a colour photograph or a part of no capture; name files '<capture>_<band>.tif', give --pattern, or use "
+    "--with-rgb for photographs next to the bands of a capture"
+)
+_MAX_REASONS = 10
 _MODEL_SUFFIX = ".safetensors"
 
 
@@ -52,19 +61,32 @@ def info(
             raise typer.Exit(EXIT_OK)
         from agalign.cameras.discover import DiscoverOptions
         from agalign.cli.run import find_captures
+        from agalign.flight.overview import camera_overviews
         from agalign.flight.panels import with_panels
         from agalign.flight.sky import sky_captures
 
         options = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
-        flight = find_captures(folder, options, terminal, silent=as_json)
+        flight = find_captures(folder, options, terminal, silent=as_json, required=False)
+        if not flight.captures and not as_json:
+            _show_unused(flight, terminal)
+            raise typer.Exit(EXIT_NOTHING)
         sky, others = sky_captures(flight.captures)
         left_out = {s.capture.label: list(s.cues) for s in sky}
         in_order = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
-        rows = [_facts(in_order[c.label]) | {"sky": left_out.get(c.label, [])} for c in flight.captures]
+        unreadable = _unreadable_files(flight)
+        rows = [
+            _facts(in_order[c.label])
+            | {"sky": left_out.get(c.label, []), "unreadable_files": [p.name for p in unreadable.get(c.label, [])]}
+            for c in flight.captures
+        ]
+        cameras = camera_overviews(flight.captures)
         if as_json:
             problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
-            typer.echo(json.dumps({"folder": str(folder), "captures": rows, "problems": problems}, indent=1))
+            typer.echo(json.dumps({"folder": str(folder), "cameras": [vars(c) for c in cameras], "captures": rows,
+                                   "problems": problems}, indent=1))  # fmt: skip
         else:
+            for camera in cameras:
+                terminal.result(shown(camera.text))
             _show_captures(rows, len(flight.problems), terminal)
         raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
 
@@ -78,7 +100,7 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
         bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
         size = "{width} x {height}".format(**row["bands"][0])
         cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
-        table.add_row(*(shown(c) for c in cells), shown(", ".join(row["missing_bands"])))
+        table.add_row(*(shown(c) for c in cells), shown(", ".join(_missing(row))))
     terminal.result(table)
     for row in rows:
         if row["panel"] is not None:
@@ -86,7 +108,43 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
             terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip() + where))
         if row["sky"]:
             terminal.result(shown(f"{row['label']}: shows the sky ({', '.join(row['sky'])}); not aligned"))
-    terminal.result(f"{len(rows)} captures, {sum(len(r['bands']) for r in rows)} bands, {problems} problems")
+    bands = sum(len(r["bands"]) for r in rows)
+    parts = counted(len(rows), "capture"), counted(bands, "band"), counted(problems, "problem")
+    terminal.result(", ".join(parts))
+
+
+def _missing(row: dict[str, Any]) -> list[str]:
+    return [*row["missing_bands"], *(f"{name} (unreadable)" for name in row["unreadable_files"])]
+
+
+def _unreadable_files(flight: "FolderScan") -> dict[str, list[Path]]:
+    """The files that cannot be read of each capture, by its label: those whose name begins as the capture's does."""
+    result: dict[str, list[Path]] = {}
+    for problem in flight.problems:
+        if not isinstance(problem.error, UnreadableFileError):
+            continue
+        near = [c for c in flight.captures if c.reference.path.parent == problem.path.parent]
+        mine = [c for c in near if problem.path.name.startswith(c.name)]
+        if mine:
+            label = max(mine, key=lambda c: len(c.name)).label
+            result.setdefault(label, []).append(problem.path)
+    return result
+
+
+def _show_unused(flight: "FolderScan", terminal: Terminal) -> None:
+    """Print what a folder without captures contains, and why none of it is used."""
+    from agalign.cameras.folder_walk import IMAGE_KINDS, image_files, other_files
+
+    reasons: Counter[tuple[str, str]] = Counter()
+    known = {p.path: p.text.removeprefix(f"{p.path}: ") for p in flight.problems}
+    images, _ = image_files(flight.folder, ())
+    for path in images:
+        reasons[path.suffix.lower(), known.get(path, _NO_BAND)] += 1
+    for suffix, number in other_files(flight.folder).items():
+        reasons[suffix, f"not an image that agalign reads ({IMAGE_KINDS})"] += number
+    terminal.problem(f"{flight.folder}: no capture of two or more bands in it")
+    for (kind, reason), total in reasons.most_common(_MAX_REASONS):
+        terminal.result(shown(f"{counted(total, kind + ' file')}: {reason}"))
 
 
 def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:

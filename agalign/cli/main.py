@@ -177,6 +177,7 @@ def main() -> None:
         Terminal(quiet=False, verbose=False, log_json=False).problem("the name of the folder is empty")
         raise SystemExit(EXIT_USAGE)
     if arguments and arguments[0] not in _COMMANDS and not _is_root_option(arguments[0]):
+        _refuse_files(arguments)
         _refuse_misspelt(arguments[0])
         arguments = ["align", *arguments]
     _rename(arguments, "--local", "--relief")
@@ -198,6 +199,15 @@ def _refuse_misspelt(first: str) -> None:
     if meant and not Path(first).exists():
         terminal = Terminal(quiet=False, verbose=False, log_json=False)
         terminal.problem(f"'{first}' is no command and no folder; did you mean '{meant[0]}'?")
+        raise SystemExit(EXIT_USAGE)
+
+
+def _refuse_files(arguments: Sequence[str]) -> None:
+    """A glob such as flight/*.tif is expanded by the shell. Raises SystemExit."""
+    files = [Path(a) for a in arguments if not a.startswith("-") and Path(a).is_file()]
+    if len(files) > 1 and Path(arguments[0]) == files[0]:
+        terminal = Terminal(quiet=False, verbose=False, log_json=False)
+        terminal.problem(f"{files[0]}, …: give the folder of the images, not the files: agalign {files[0].parent}")
         raise SystemExit(EXIT_USAGE)
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from agalign.cli.align import Jobs, Reference
+from agalign.cli.align import Jobs
 from agalign.cli.terminal import (
     LogJson,
     Quiet,
@@ -31,7 +31,10 @@ def onto(
         Path | None,
         of_output("--out", "-o", help="Output folder; by default REFERENCE-aligned.", show_default=False),
     ] = None,
-    band: Reference = None,
+    band: Annotated[
+        str | None,
+        of_input("--reference", "--band", show_default=False, help="Name of the reference's band; by default green."),
+    ] = None,
     relief: Annotated[
         ReliefUse, of_alignment(help="Follow what one homography leaves by a smooth field: where it helps, or never.")
     ] = "auto",

@@ -1,14 +1,46 @@
-"""The list of commands that `agalign --help` prints, in plain text: typer's panels take as long to load as all else."""
+"""The commands as a group: their list in plain text, as typer's panels take as long to load as all else, and wrong
+arguments in one line.
+"""
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
+import typer
 from typer.core import TyperGroup
 
+from agalign.cli.terminal import EXIT_USAGE
+
+_UsageError: Any = typer.BadParameter.__mro__[1]
+"""Of typer or of click, wherever typer takes it from."""
+_REWORDED = (
+    (r"Value error, ", ""),
+    (r"Input should be a valid integer.*", "give a whole number"),
+    (r"Input should be a valid number.*", "give a number"),
+    (r"Input should be greater than or equal to (\S+)", r"give \1 or more"),
+    (r"Input should be less than or equal to (\S+)", r"give \1 or less"),
+    (r"Input should be ", "give "),
+    (r"'(\w[\w-]*)'(?=[,.])", r"\1"),
+    (r" is not one of ", " is unknown; choose from "),
+    (r"\.$", ""),
+)
+"""What libraries call wrong values, and in words of the command line."""
 _PANEL = "rich_help_panel"
 
 
 class RootGroup(TyperGroup):
     """The commands by panel, without colours; the commands' own help has typer's look."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the options before the command."""
+        with _in_one_line(ctx):
+            return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Parse the arguments of the command, and run it."""
+        with _in_one_line(ctx):
+            return super().invoke(ctx)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the usage, the options, a section of commands for each panel, and the examples."""
@@ -35,3 +67,27 @@ class RootGroup(TyperGroup):
                 title = panel if isinstance(panel, str) else "Commands"
                 panels.setdefault(title, []).append((name, command.get_short_help_str(limit=100)))
         return panels
+
+
+@contextmanager
+def _in_one_line(ctx: Any) -> Iterator[None]:
+    """Print what is wrong with arguments in one line, and exit with code 2."""
+    try:
+        yield
+    except _UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            raise
+        where = (error.ctx or ctx).command_path
+        typer.echo(f"agalign: {_reworded(error)}; '{where} --help' lists the options", err=True)
+        raise typer.Exit(EXIT_USAGE) from None
+
+
+def _reworded(error: Any) -> str:
+    param = getattr(error, "param", None)
+    if type(error).__name__ == "MissingParameter" and param is not None:
+        return f"{param.name} is missing"
+    text = str(error.message)
+    for pattern, words in _REWORDED:
+        text = re.sub(pattern, words, text)
+    name = "" if param is None else f"{max(param.opts, key=len)}: " if param.opts else f"{param.name}: "
+    return f"{name}{text[:1].lower()}{text[1:]}"

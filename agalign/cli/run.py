@@ -16,6 +16,7 @@ from rich.table import Column, Table
 from agalign.cli.failures import explain
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, shown
 from agalign.errors import NoSuchBandError, OutputError, WorkerError
+from agalign.values.text import counted
 
 if TYPE_CHECKING:
     from agalign.batch import CaptureReport, RunOptions
@@ -30,26 +31,29 @@ _MAX_LISTED_FILES = 10
 
 
 def find_captures(
-    folder: Path, options: "DiscoverOptions", terminal: Terminal, *, silent: bool = False
+    folder: Path, options: "DiscoverOptions", terminal: Terminal, *, silent: bool = False, required: bool = True
 ) -> "FolderScan":
-    """The captures below a folder; what is wrong with its files is said. Raises where there is none."""
+    """The captures below a folder; prints what is wrong with its files. Raises where there is none, if `required`."""
     from agalign.cameras.discover import discover
     from agalign.errors import InputError
 
     flight = discover(folder, options)
     if not silent:
         print_problems(flight, terminal)
+    if not flight.captures and not required:
+        return flight
     if not flight.captures:
         if any(isinstance(p.error, NoSuchBandError) for p in flight.problems):
             raise NoSuchBandError(f"{folder}: no capture has a band '{options.reference}'")
         raise InputError(
-            f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' shows what was found"
+            f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' lists its files, and why each "
+            "kind is not used"
         )
     bands = sum(len(c.bands) for c in flight.captures)
     if not silent:
         terminal.event(
             "found",
-            f"{len(flight.captures)} captures, {bands} bands in {folder}",
+            f"{counted(len(flight.captures), 'capture')}, {counted(bands, 'band')} in {folder}",
             captures=len(flight.captures),
             bands=bands,
         )
@@ -60,7 +64,7 @@ def find_captures(
 
 def _eight_bit_note(flight: "FolderScan") -> str:
     return (
-        f"{len(flight.eight_bit)} of {len(flight.captures)} captures have 8 bits per band: 256 levels, and the tone "
+        f"{counted(len(flight.eight_bit), 'capture')} with 8 bits per band: 256 levels, and the tone "
         "curve of a picture, limit radiometry and indices; export 16-bit TIFFs where the camera has them"
     )
 
@@ -325,7 +329,7 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
         terminal.result(_table(totals))
     explain(totals.failures.groups(), terminal)
     for made, count in totals.radiometry.items():
-        terminal.result(shown(f"Written as {made}: {count} captures"))
+        terminal.result(shown(f"Written as {made}: {counted(count, 'capture')}"))
     terminal.result(shown(f"Report: {out / 'index.html'}"))
     if totals.states and set(totals.states) <= {"panel", "sky"}:
         what = " or the sky" if totals.states["sky"] else ""

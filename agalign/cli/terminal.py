@@ -135,6 +135,7 @@ of_input = partial(typer.Option, rich_help_panel="Input")
 of_alignment = partial(typer.Option, rich_help_panel="Alignment")
 of_output = partial(typer.Option, rich_help_panel="Output")
 of_running = partial(typer.Option, rich_help_panel="Running")
+of_expert = partial(typer.Option, rich_help_panel="Expert")
 """An option in the panel of the help that it belongs to."""
 
 

@@ -22,6 +22,13 @@ def choose_device(name: str) -> torch.device:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
+    except RuntimeError:
+        raise ConfigurationError(f"unknown device '{name}'; use auto, cpu, cuda, cuda:1 or mps") from None
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ConfigurationError(
+            f"device '{name}' cannot be used: no CUDA device, or PyTorch without CUDA; 'agalign doctor' lists devices"
+        )
+    try:
         if device.type == "meta":
             raise RuntimeError("it holds no numbers")
         torch.empty(1, device=device)

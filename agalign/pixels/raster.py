@@ -147,6 +147,8 @@ def _driver_of(path: Path) -> str:
             raise UnreadableFileError(f"{path}: is no file; take it out of the folder")
         with path.open("rb") as file:
             head = file.read(4)
+    except FileNotFoundError:
+        raise UnreadableFileError(f"{path}: does not exist") from None
     except (OSError, ValueError) as error:
         text = getattr(error, "strerror", None) or error
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None

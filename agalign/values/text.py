@@ -5,6 +5,11 @@ import unicodedata
 _FORMULA = ("=", "+", "-", "@")
 
 
+def counted(number: int, what: str) -> str:
+    """A number of things: 1 capture, 2 captures."""
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
 def harmless(text: str) -> str:
     r"""The text on one line, with what a terminal would act on (escape sequences, turns of the writing's direction)
     written out: `\x1b`.

@@ -60,7 +60,7 @@ def test_bad_mosaics_are_told_in_a_line(mosaics: Path, tmp_path: Path) -> None:
     for moving, problem in (
         (tmp_path / "nowhere.tif", "has no coordinates"),
         (mosaics / "spring.tif", "is the reference itself"),
-        (tmp_path / "missing.tif", "No such file"),
+        (tmp_path / "missing.tif", "does not exist"),
     ):
         done = agalign("onto", mosaics / "spring.tif", moving, "-o", tmp_path / "out")
         assert done.returncode == 1

@@ -718,7 +718,7 @@ FAULTS = (
     Fault("an input that may only be read", read_only, 0, "", ("a", "b")),
     Fault("an output that may not be written", out_is_read_only, 1, "out: no permission to write there", ()),
     Fault("an output that is a file", lambda s: s.out.write_text("x") and None, 1, "out: is a file", ()),
-    Fault("a file that vanishes during the run", vanishing, 3, r"b_nir\.tif: cannot be read \(No such file"),
+    Fault("a file that vanishes during the run", vanishing, 3, r"b_nir\.tif: does not exist"),
     Fault("the disk full", full_disk, 3, "the disk is full|cannot be written", ("a",)),
     Fault("a worker killed by SIGKILL", when_begun(kill_worker, "-j", "2", "--timeout", "100"), 0, "", ALL),
     Fault("both workers killed by SIGKILL", when_begun(kill_all_workers, "-j", "2"), 0, "", ALL),

@@ -1,0 +1,152 @@
+"""What is printed of wrong arguments and of folders that cannot be used: one line, in the words of the command line."""
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.cli import main
+from agalign.cli.main import app
+from agalign.errors import ConfigurationError, InputError
+from agalign.flight.overview import camera_overviews
+from agalign.method.device import choose_device
+from agalign.synthetic import flight as synthetic
+
+from ..conftest import textured_image
+
+
+def write_bands(folder: Path, suffix: str = ".tif", capture: str = "IMG_0001") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    image = (textured_image(160, 120, 1) * 30 + 128).clip(0, 255).astype(np.uint8)
+    for band in ("red", "green", "nir"):
+        cv2.imwrite(str(folder / f"{capture}_{band}{suffix}"), image)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["align", "x", "--jobs", "many"], "--jobs: give a whole number; 'agalign align --help' lists the options"),
+        (["align", "x", "--jobs", "-1"], "--jobs: give 0 or more"),
+        (["align", "x", "--accept-predicted", "much"], "--accept-predicted: give a number"),
+        (["align", "x", "--seed", "rigg"], "--seed: 'rigg' is unknown; choose from auto, rig, geo, structure"),
+        (["align", "x", "--crop", "[red]"], "--crop: '[red]' is unknown; choose from flight, common, none"),
+        (["align", "x", "--nope"], "no such option: --nope"), (["align"], "folder is missing"),
+        (["--nope"], "no such option: --nope"), (["align", "x", "y"], "got unexpected extra argument(s) (y)"),
+    ],
+)  # fmt: skip
+def test_wrong_arguments_are_one_line_in_plain_words(arguments: list[str], line: str) -> None:
+    done = CliRunner().invoke(app, arguments, prog_name="agalign")
+    assert done.exit_code == 2
+    assert done.stdout == ""
+    (only,) = done.stderr.splitlines()
+    assert only.startswith(f"agalign: {line}")
+    assert "nput should" not in only
+    assert "Value error" not in only
+
+
+@pytest.mark.parametrize(
+    ("device", "said"), [("gpu", "unknown device 'gpu'; use auto, cpu, cuda"), ("cuda", "no CUDA device")]
+)
+def test_devices_are_named_without_pytorch_s_words(device: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ConfigurationError, match=said) as raised:
+        choose_device(device)
+    assert "Torch not compiled" not in str(raised.value)
+    assert "ipu" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "address", ["s3://bucket/flight", "https://example.org/flight", "gs://bucket", "file:///data/flight"]
+)
+def test_an_address_is_not_taken_for_a_folder(address: str) -> None:
+    with pytest.raises(InputError, match=r"://.*: only local folders can be read; mount it or copy the images"):
+        discover(address)
+
+
+def test_files_of_a_glob_lead_to_their_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bands(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["agalign", *map(str, sorted(tmp_path.glob("*.tif"))), "-o", "out"])
+    with pytest.raises(SystemExit) as ended:
+        main.main()
+    assert ended.value.code == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"give the folder of the images, not the files: agalign {tmp_path}" in said
+
+
+def test_a_missing_mosaic_does_not_exist(tmp_path: Path) -> None:
+    for option in ("--reference", "--band"):
+        done = CliRunner().invoke(app, ["onto", str(tmp_path / "no.tif"), str(tmp_path / "b.tif"), option, "red"])
+        assert done.exit_code == 1
+        assert done.stderr.splitlines() == [f"agalign: {tmp_path / 'no.tif'}: does not exist"]
+
+
+def test_a_folder_without_captures_is_described(tmp_path: Path) -> None:
+    image = np.full((60, 80), 7, np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.jpg"), np.dstack([image] * 3))
+    cv2.imwrite(str(tmp_path / "single_red.tif"), image)
+    for name in ("a.raw", "b.raw", "notes.txt"):
+        (tmp_path / name).touch()
+    done = CliRunner().invoke(app, ["info", str(tmp_path)])
+    assert done.exit_code == 1
+    said = " ".join(done.stdout.split())
+    assert "2 .raw files: not an image that agalign reads" in said
+    assert "1 .txt file: not" in said
+    assert "1 .jpg file: a colour photograph" in said
+    assert "1 .tif file: a band with no companion" in said
+    assert "agalign info" not in done.output
+
+
+def test_a_folder_without_images_names_what_there_is(tmp_path: Path) -> None:
+    for name in ("a.cr2", "b.CR2", "c.txt"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=r"no \.tif, .* file in it or below it; there are only 2 \.cr2, 1 \.txt"):
+        discover(tmp_path)
+
+
+def test_an_unreadable_file_is_shown_as_missing(tmp_path: Path) -> None:
+    write_bands(tmp_path)
+    (tmp_path / "IMG_0001_nir.tif").write_bytes(b"II*\0broken")
+    done = CliRunner().invoke(app, ["info", str(tmp_path)])
+    assert done.exit_code == 3
+    assert "IMG_0001_nir.tif (unreadable)" in done.stdout
+    assert "1 capture, 2 bands, 1 problem" in done.stdout
+    (capture,) = json.loads(CliRunner().invoke(app, ["info", str(tmp_path), "--json"]).stdout)["captures"]
+    assert capture["unreadable_files"] == ["IMG_0001_nir.tif"]
+
+
+def test_info_begins_with_the_cameras(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path, captures=2, size_px=(160, 120))
+    (camera,) = camera_overviews(discover(tmp_path).captures)
+    assert (camera.captures, camera.size_px, camera.radiometry) == (2, (160, 120), ("camera", "sun"))
+    done = CliRunner().invoke(app, ["info", str(tmp_path)])
+    first = done.stdout.splitlines()[0]
+    assert first.startswith("MicaSense RedEdge-M (SY01-0000001-AG")
+    assert "2 captures of 5 bands, 160 x 120 px" in first
+    assert json.loads(CliRunner().invoke(app, ["info", str(tmp_path), "--json"]).stdout)["cameras"][0]["captures"] == 2
+
+
+def test_globs_choose_files(tmp_path: Path) -> None:
+    write_bands(tmp_path / "a" / "test")
+    write_bands(tmp_path / "b")
+    chosen = discover(tmp_path, DiscoverOptions(exclude=("*/test/*", "*_red.*")))
+    assert [c.label for c in chosen.captures] == ["b/IMG_0001"]
+    assert [b.name for b in chosen.captures[0].bands] == ["green", "nir"]
+    chosen = discover(tmp_path, DiscoverOptions(include=("a/*",)))
+    assert [c.label for c in chosen.captures] == ["a/test/IMG_0001"]
+    with pytest.raises(InputError, match="has 6 images, and --include and --exclude leave none"):
+        discover(tmp_path, DiscoverOptions(include=("*.jpg",)))
+
+
+def test_expert_options_are_a_panel_at_the_end() -> None:
+    lines = CliRunner().invoke(app, ["align", "--help"], env={"COLUMNS": "160"}).stdout.splitlines()
+    panels = [line.split("─ ")[1].split(" ─")[0] for line in lines if line.startswith("╭")]
+    assert panels[-1] == "Expert"
+    expert = "\n".join(lines[max(i for i, line in enumerate(lines) if "Expert" in line) :])
+    assert all(o in expert for o in ("--sharing", "--recipe", "--rng-seed", "--model-family", "--each-alone"))
