@@ -14,6 +14,7 @@ from agalign._version import __version__
 from agalign.cli import align as cli_align
 from agalign.cli import doctor as cli_doctor
 from agalign.cli import evaluate as cli_evaluate
+from agalign.cli import export as cli_export
 from agalign.cli import indices as cli_indices
 from agalign.cli import info as cli_info
 from agalign.cli.align import Jobs
@@ -164,6 +165,7 @@ def verify(
 
 
 cli_indices.register(app)
+cli_export.register(app)
 app.command()(onto)
 cli_doctor.register(app)
 cli_evaluate.register(app)

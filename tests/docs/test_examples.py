@@ -71,6 +71,3 @@ def test_two_dates(desk: Path, tmp_path: Path) -> None:
         assert (change.shape, change.transform) == (first.shape, first.transform)
         assert np.isfinite(change.read(1)).mean() > 0.8
 
-
-def test_for_opendronemap(desk: Path, tmp_path: Path) -> None:
-    assert "15 files in" in run("for_opendronemap.py", desk / "flight", tmp_path / "project")

@@ -1,0 +1,204 @@
+"""The mappings of a run as matrices, for scripts that warp the original images themselves.
+
+MicaSense's notebooks undistort each band with OpenCV's optimal new camera matrix, then warp it with
+`cv2.warpPerspective(..., flags=cv2.WARP_INVERSE_MAP)`. With K and N the old and the new camera matrix of a band, and H
+the mapping between undistorted pixels, their matrix is N_band K_band^-1 H K_reference N_reference^-1.
+"""
+
+import csv
+import io
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.cameras import known_cameras
+from agalign.cameras.folder_walk import natural_order
+from agalign.cameras.read_files import ImageFile, read_file
+from agalign.cameras.scan import DiscoverOptions
+from agalign.errors import ConfigurationError, InputError
+from agalign.products.run_record import read_run_record
+from agalign.products.sidecar import BandPart, Sidecar
+from agalign.values import geometry, lens
+from agalign.values.files import complete_file, write_text
+from agalign.values.geometry import Matrix, Points
+from agalign.values.lens import Lens
+
+
+@dataclass(frozen=True)
+class AlignedCapture:
+    """A capture of a run: its sidecar, where that is, and the folder below the run's output."""
+
+    sidecar: Sidecar
+    path: Path
+    folder: Path
+
+    @property
+    def label(self) -> str:
+        """The capture's name below the output folder."""
+        return (self.folder / self.sidecar.capture).as_posix()
+
+    @property
+    def flat_name(self) -> str:
+        """The same as a part of a file name: names of captures repeat in the folders of a memory card."""
+        return "_".join((*self.folder.parts, self.sidecar.capture))
+
+
+_TABLE = "matrices.csv"
+
+
+def write_opencv(captures: Sequence[AlignedCapture], target: Path) -> tuple[list[Path], list[str]]:
+    """Write <capture>.npz for each capture, and a table of what a matrix leaves out. Raises OutputError."""
+    files, rows = [], []
+    for capture in captures:
+        bands, name = _in_order(capture.sidecar), capture.flat_name
+        arrays: dict[str, NDArray[np.generic]] = {"bands": np.array([b.band for b in bands])}
+        matrices, errors_px = [], []
+        for k, band in enumerate(bands):
+            points_px, mapped_px = _grid(band)
+            matrix = geometry.fit_homography(points_px, mapped_px) if len(points_px) else geometry.identity()
+            error_px = _max_distance_px(geometry.apply(matrix, points_px), mapped_px)
+            matrices.append(matrix)
+            errors_px.append(error_px)
+            arrays |= {f"grid_reference_px_{k}": points_px, f"grid_moving_px_{k}": mapped_px}
+            rows.append((name, band.band, band.status, error_px))
+        arrays |= {"matrices": np.stack(matrices), "max_error_px": np.array(errors_px)}
+        files.append(_write_npz(target / f"{name}.npz", arrays))
+    return [*files, _write_table(rows, target)], [
+        "OpenCV: <capture>.npz holds `bands`, and `matrices` (n, 3, 3) from raw pixels of the reference to a band's:",
+        "  cv2.warpPerspective(band, matrices[k], (width, height), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP)",
+        "`max_error_px` is the largest distance from the complete mapping, which includes lenses and relief. That is",
+        "sampled in `grid_reference_px_k` and `grid_moving_px_k` (n, 2). (0, 0) is the centre of a pixel.",
+        *_deviations(rows),
+    ]  # fmt: skip
+
+
+def write_micasense(
+    captures: Sequence[AlignedCapture], out: Path, target: Path, source: Path | None
+) -> tuple[list[Path], list[str]]:
+    """Write <capture>_warp_matrices.npy for each capture, and <serial>_warp_matrices_opencv.npy for each camera.
+
+    Raises InputError where the original images cannot be read, ConfigurationError for other cameras, OutputError.
+    """
+    run = read_run_record(out)
+    folder = source or (None if run is None else Path(run.input))
+    if folder is None:
+        raise InputError(f"{out}: does not name the folder of the images; give it with --source")
+    files, rows = [], []
+    by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
+    first = captures[0].sidecar.reference
+    for capture in captures:
+        bands, name = _in_order(capture.sidecar), capture.flat_name
+        images = [_original(folder / capture.folder / band.file) for band in bands]
+        reference = next(i for i, b in zip(images, bands, strict=True) if b.status == "reference")
+        matrices = []
+        for band, image in zip(bands, images, strict=True):
+            matrix, error_px = _in_notebook_px(band, reference, image)
+            matrices.append(matrix)
+            rows.append((name, band.band, band.status, error_px))
+        stacked = np.stack(matrices)
+        by_camera[images[0].tags.serial or "camera"].append(stacked)
+        files.append(_write_npy(target / f"{name}_warp_matrices.npy", stacked))
+    for serial, of_camera in by_camera.items():
+        typical = _most_typical([m for m in of_camera if m.shape == of_camera[0].shape], (first.width, first.height))
+        files.append(_write_npy(target / f"{serial}_warp_matrices_opencv.npy", typical))
+    return [*files, _write_table(rows, target)], [
+        "MicaSense imageprocessing: put <serial>_warp_matrices_opencv.npy next to the notebook; it loads that file.",
+        "It is of the most typical capture: for one capture use its own <capture>_warp_matrices.npy,",
+        "  warp_matrices = [m.astype('float32') for m in numpy.load(FILE)]",
+        f"Match index: the place of {first.band} among the bands; warp mode: cv2.MOTION_HOMOGRAPHY.",
+        "Relief and the lenses' displacement fields are not in a matrix; matrices.csv has the largest distance.",
+        *_deviations(rows),
+    ]
+
+
+def _in_order(sidecar: Sidecar) -> list[BandPart]:
+    """The bands as the camera counts them."""
+    return sorted(sidecar.bands, key=lambda b: (natural_order(b.file), b.band_index))
+
+
+def _grid(band: BandPart) -> tuple[Points, Points]:
+    """((n, 2) raw pixels of the reference, those of the band); none of the reference itself."""
+    if band.grid is None:
+        return np.empty((0, 2)), np.empty((0, 2))
+    return np.array(band.grid.reference_px), np.array(band.grid.moving_px)
+
+
+def _original(path: Path) -> ImageFile:
+    if not path.is_file():
+        raise InputError(f"{path}: the image is not there; give the folder of the flight's images with --source")
+    return read_file(path, known_cameras(), DiscoverOptions())
+
+
+def _in_notebook_px(band: BandPart, reference: ImageFile, image: ImageFile) -> tuple[Matrix, float]:
+    """(the matrix between the pixels that the notebooks warp, its largest distance from the complete mapping, px)."""
+    of_reference, of_band = _lens(reference), _lens(image)
+    before, after = (_new_matrix(r, i) for r, i in ((of_reference, reference), (of_band, image)))
+    points_px, mapped_px = _grid(band)
+    straight, mapped = lens.undistort(of_reference, points_px), lens.undistort(of_band, mapped_px)
+    known = band.homography
+    if not len(points_px):
+        matrix = geometry.identity()
+    elif known is not None and known.space == "undistorted":
+        matrix = np.array(known.fixed_to_moving)
+    else:
+        matrix = geometry.fit_homography(straight, mapped)
+    error_px = _max_distance_px(geometry.apply(matrix, straight), mapped)
+    to_new, from_new = after @ np.linalg.inv(of_band.matrix), of_reference.matrix @ np.linalg.inv(before)
+    return geometry.compose(to_new, matrix, from_new), error_px
+
+
+def _lens(image: ImageFile) -> Lens:
+    result = image.bands[0].lens if image.bands else None
+    if image.camera.name != "MicaSense" or result is None:
+        raise ConfigurationError(f"{image.path}: no lens tags of a MicaSense camera; use --for opencv")
+    return result
+
+
+def _new_matrix(of_band: Lens, image: ImageFile) -> Matrix:
+    size_px = image.bands[0].size_px
+    k1, k2, p1, p2, k3 = (*of_band.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    new, _ = cv2.getOptimalNewCameraMatrix(of_band.matrix, np.array([k1, k2, p1, p2, k3]), size_px, 1)
+    return np.asarray(new, np.float64)
+
+
+def _most_typical(of_camera: Sequence[NDArray[np.float64]], size_px: tuple[int, int]) -> NDArray[np.float64]:
+    """The matrices (bands, 3, 3) of the capture whose corners are nearest to the median."""
+    corners_px = geometry.corners(*size_px)
+    mapped = np.array([[geometry.apply(m, corners_px) for m in matrices] for matrices in of_camera])
+    distances_px = np.linalg.norm(mapped - np.median(mapped, axis=0), axis=-1)
+    return of_camera[int(distances_px.mean(axis=(1, 2)).argmin())]
+
+
+def _max_distance_px(points_px: Points, others_px: Points) -> float:
+    return float(np.linalg.norm(points_px - others_px, axis=1).max()) if len(points_px) else 0.0
+
+
+def _deviations(rows: Sequence[tuple[str, str, str, float]]) -> list[str]:
+    largest = max(rows, key=lambda row: row[3])
+    return [f"Largest distance from the complete mapping: {largest[3]:.2f} px ({largest[0]} {largest[1]})."]
+
+
+def _write_table(rows: Sequence[tuple[str, str, str, float]], target: Path) -> Path:
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(("capture", "band", "status", "max_error_px"))
+    writer.writerows((name, band, status, f"{error_px:.4f}") for name, band, status, error_px in rows)
+    write_text(target / _TABLE, table.getvalue())
+    return target / _TABLE
+
+
+def _write_npy(path: Path, matrices: NDArray[np.float64]) -> Path:
+    with complete_file(path) as partial, partial.open("wb") as file:
+        np.save(file, matrices)
+    return path
+
+
+def _write_npz(path: Path, arrays: dict[str, NDArray[np.generic]]) -> Path:
+    with complete_file(path) as partial, partial.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+    return path
