@@ -70,4 +70,3 @@ def test_two_dates(desk: Path, tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "change.tif") as change, rasterio.open(desk / "spring.tif") as first:
         assert (change.shape, change.transform) == (first.shape, first.transform)
         assert np.isfinite(change.read(1)).mean() > 0.8
-
