@@ -9,13 +9,11 @@ from bands.score import AS_IT_IS, Score, Scored, markdown, summary
 
 
 def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
-    """An overview; as it is, set by set; the variants with the sets pooled; and the memory that each method took."""
+    """An overview; unmodified images by set; each variant with the sets pooled; and the memory of each method."""
     groups: dict[str, list[Score]] = {}
-    for score in summary([s for s in scored if s.variant == AS_IT_IS]):
-        groups.setdefault(score.set, []).append(score)
     for score in summary([s for s in scored if s.variant != AS_IT_IS], "all sets"):
         groups.setdefault(score.variant, []).append(score)
-    parts = [overview(scored), *(f"### {title}\n\n{markdown(scores)}\n" for title, scores in groups.items())]
+    parts = [overview(scored), by_set(scored), *(f"### {title}\n\n{markdown(scores)}\n" for title, scores in groups.items())]
     memory = "; ".join(f"{name} {value:.1f}" for name, value in gigabytes.items())
     return "\n".join([*parts, f"Largest process, GB: {memory}.\n"])
 
@@ -29,6 +27,28 @@ def overview(scored: Sequence[Scored]) -> str:
         cells = [_overview_cell(scores.get((method, v)), pairs[v]) for v in variants]
         lines.append(f"| {method} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def by_set(scored: Sequence[Scored]) -> str:
+    """Methods by sets, unmodified images: median error of the claims in px, and wrong claims."""
+    scores = summary([s for s in scored if s.variant == AS_IT_IS])
+    pairs: dict[str, int] = {}
+    for score in scores:
+        pairs[score.set] = max(score.pairs, pairs.get(score.set, 0))
+    lines = ["| method | " + " | ".join(f"{name} ({n})" for name, n in pairs.items()) + " |"]
+    lines.append("|---" * (1 + len(pairs)) + "|")
+    for method in dict.fromkeys(score.method for score in scores):
+        own = {score.set: score for score in scores if score.method == method}
+        cells = [_set_cell(own.get(name)) for name in pairs]
+        lines.append(f"| {method} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _set_cell(score: Score | None) -> str:
+    if score is None:
+        return "-"
+    median = "-" if np.isnan(score.median_px) else f"{score.median_px:.3f}"
+    return f"{median} / **{score.wrong_claims}**"
 
 
 def _overview_cell(score: Score | None, pairs: int) -> str:

@@ -88,7 +88,7 @@ def main() -> None:
             f"a cluster: {alone_s:.0f} s)."
         )
         kinds = ("missing", "left over", "corrupt", "different")
-        section.table([("beside the run without a cluster", "files"), *((k, str(result[k])) for k in kinds)])
+        section.table([("compared with a run without a cluster", "files"), *((k, str(result[k])) for k in kinds)])
 
 
 if __name__ == "__main__":

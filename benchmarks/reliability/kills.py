@@ -149,7 +149,7 @@ def main() -> None:
             f"{asked.kills - result['bad exit codes']} exit codes 0."
         )
         kinds = ("torn sidecars", "torn captures", "missing", "left over", "corrupt", "different")
-        section.table([("after the kill / after going on", "files"), *((k, str(result[k])) for k in kinds)])
+        section.table([("after the kill, and after resuming", "files"), *((k, str(result[k])) for k in kinds)])
 
 
 if __name__ == "__main__":

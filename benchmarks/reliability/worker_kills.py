@@ -107,7 +107,7 @@ def run_tiny(kills: int, rng: random.Random) -> Counter[str]:
                     seen[outcome.number] += 1
                     number, _, data, size = given[outcome.number]
                     if isinstance(outcome.error, WorkerDiedError):
-                        result["told as killed"] += 1
+                        result["reported as killed"] += 1
                         result["wrong"] += str(outcome.error) != "signal 9"
                     else:
                         result["wrong"] += outcome.result != (number, zlib.crc32(data), bytes(size))
@@ -154,7 +154,7 @@ def disturbed(command: list[str], out: Path, expected: dict[str, object], rng: r
         result["kills"] += killer.stop()
     told = set(re.findall(r"agalign: (\S+): its worker process was killed \(signal 9", said))
     finished = {p.relative_to(out).with_suffix("").as_posix() for p in out.rglob("IMG_*.json")}
-    result["told as killed"] = len(told)
+    result["reported as killed"] = len(told)
     if "worker processes one after another ended" in said:
         result["runs ended with a reason"] += 1
     else:
@@ -186,7 +186,7 @@ def what_it_said(process: "subprocess.Popen[str]", result: Counter[str]) -> str:
 
 
 def row(name: str, result: Counter[str]) -> tuple[str, ...]:
-    also = ("runs", "tasks", "kills", "told as killed", "runs ended with a reason", *KINDS)
+    also = ("runs", "tasks", "kills", "reported as killed", "runs ended with a reason", *KINDS)
     return (name, *(str(result[kind]) for kind in also))
 
 
@@ -208,7 +208,7 @@ def main() -> None:
             real += one
             print({k: v for k, v in one.items() if v}, flush=True)
     section = Section("worker kills", asked.markdown)
-    heads = ("", "runs", "tasks", "kills", "told as killed", "ended with a reason", *KINDS)
+    heads = ("", "runs", "tasks", "kills", "reported as killed", "ended with a reason", *KINDS)
     section.table([heads, row("tiny tasks, 8 workers", tiny), row(f"flights of {CAPTURES} captures, 2 workers", real)])
     if any(counts[kind] for counts in (tiny, real) for kind in KINDS):
         raise SystemExit("something was lost, hung, wrong or left over")

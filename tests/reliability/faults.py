@@ -815,7 +815,7 @@ def main() -> None:
     from report import Section
 
     document = Path(sys.argv[2]) if sys.argv[1:2] == ["--markdown"] else None
-    rows = [("fault", "exit code", "what is said first", "captures finished")]
+    rows = [("fault", "exit code", "first message", "captures finished")]
     failed = []
     for fault in FAULTS:
         with tempfile.TemporaryDirectory() as folder:
