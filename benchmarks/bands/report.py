@@ -13,7 +13,11 @@ def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
     groups: dict[str, list[Score]] = {}
     for score in summary([s for s in scored if s.variant != AS_IT_IS], "all sets"):
         groups.setdefault(score.variant, []).append(score)
-    parts = [overview(scored), by_set(scored), *(f"### {title}\n\n{markdown(scores)}\n" for title, scores in groups.items())]
+    parts = [
+        overview(scored),
+        by_set(scored),
+        *(f"### {title}\n\n{markdown(scores)}\n" for title, scores in groups.items()),
+    ]
     memory = "; ".join(f"{name} {value:.1f}" for name, value in gigabytes.items())
     return "\n".join([*parts, f"Largest process, GB: {memory}.\n"])
 
