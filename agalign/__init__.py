@@ -13,7 +13,7 @@ from agalign._version import __version__
 
 if TYPE_CHECKING:
     from agalign.api import align, align_capture, align_folder, warp_onto
-    from agalign.batch import CaptureReport, RunOptions
+    from agalign.batch import CaptureReport, FlightReports, RunOptions
     from agalign.cameras.discover import DiscoverOptions, FolderScan, discover
     from agalign.config import (
         CheckSettings,
@@ -51,6 +51,7 @@ __all__ = [
     "DiscoverOptions",
     "FixedFilePx",
     "FixedImagePx",
+    "FlightReports",
     "FlightSettings",
     "FolderScan",
     "GeometryError",
@@ -85,7 +86,7 @@ __all__ = [
 
 _OTHER_MODULES = {
     "agalign.api": ("align", "align_capture", "align_folder", "warp_onto"),
-    "agalign.batch": ("CaptureReport", "RunOptions"),
+    "agalign.batch": ("CaptureReport", "FlightReports", "RunOptions"),
     "agalign.cameras.discover": ("DiscoverOptions", "FolderScan", "discover"),
     "agalign.products.dataset": ("open_capture", "open_flight"),
     "agalign.values.alignment": ("Alignment", "Prediction", "Residual", "Seed"),

@@ -1,12 +1,13 @@
 """The Python API: arrays, one capture, a folder."""
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agalign.batch import CaptureReport, RunOptions, run_flight
+from agalign.batch import CaptureReport, FlightReports, RunOptions, run_flight
 from agalign.batch.capture import CaptureOutcome, process_capture, quiet
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.align import align_pairs
@@ -27,6 +28,8 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.values.processes import end_if_reimported
 
+Progress = Callable[[CaptureReport, int, int], object]
+"""Called with the report of a capture, how many captures are finished, and how many there are."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -111,11 +114,14 @@ def align_folder(
     options: DiscoverOptions | None = None,
     run: RunOptions | None = None,
     model: str | Path | None = None,
-) -> list[CaptureReport]:
+    progress: Progress | None = None,
+) -> FlightReports:
     """Align every capture below `folder` into `out` and write the summary and the report.
 
     `run` sets the number of captures at a time, or the executor; with several processes the calling script must be
     importable (`if __name__ == "__main__":`). `model` is a file from the `models` folder of an earlier run.
+    `progress` is called after each capture; the logger `agalign` has a line for each at the level INFO.
+    Returns the reports in the order in which the captures were finished.
     Raises InputError if the folder does not exist, OutputError where `out` cannot be written, ConfigurationError
     for a model of another camera.
     """
@@ -125,6 +131,11 @@ def align_folder(
     source, target = Path(folder), Path(out)
     result = discover(source, options or DiscoverOptions(skip=(target,)))
     start = None if model is None else Path(model)
-    reports = list(run_flight(result, target, settings or Settings(), run, model=start))
+    reports = FlightReports()
+    for report in run_flight(result, target, settings or Settings(), run, model=start):
+        reports.append(report)
+        _LOG.info("%d of %d: %s: %s", len(reports), len(result.captures), report.label, report.summary)
+        if progress is not None:
+            progress(report, len(reports), len(result.captures))
     write_pages(target, _LOG.warning)
     return reports

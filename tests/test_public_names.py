@@ -19,7 +19,8 @@ SETTINGS = {
     "CheckSettings", "FlightSettings", "JointSettings", "ReliefSettings", "SeedSettings", "Settings", "WriteSettings",
 }  # fmt: skip
 OPTIONS_AND_RESULTS = {
-    "Alignment", "CaptureReport", "DiscoverOptions", "FolderScan", "Prediction", "Residual", "RunOptions", "Seed",
+    "Alignment", "CaptureReport", "DiscoverOptions", "FlightReports", "FolderScan", "Prediction", "Residual",
+    "RunOptions", "Seed",
 }  # fmt: skip
 UNITS = {"FixedFilePx", "FixedImagePx", "MovingFilePx"}
 ERRORS = {

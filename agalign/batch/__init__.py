@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from agalign.batch.output_folder import prepare_output
-    from agalign.batch.report import CaptureReport
+    from agalign.batch.report import CaptureReport, FlightReports
     from agalign.batch.run import Listener, RunOptions, run_flight
     from agalign.batch.workers import dask_executor
 
-__all__ = ["CaptureReport", "Listener", "RunOptions", "dask_executor", "prepare_output", "run_flight"]
+__all__ = ["CaptureReport", "FlightReports", "Listener", "RunOptions", "dask_executor", "prepare_output", "run_flight"]
 
 _MODULES = {
-    "CaptureReport": "report", "Listener": "run", "RunOptions": "run", "dask_executor": "workers",
-    "prepare_output": "output_folder", "run_flight": "run",
+    "CaptureReport": "report", "FlightReports": "report", "Listener": "run", "RunOptions": "run",
+    "dask_executor": "workers", "prepare_output": "output_folder", "run_flight": "run",
 }  # fmt: skip
 
 

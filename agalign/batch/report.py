@@ -1,14 +1,19 @@
 """The report of one capture, and the clock that measures its stages."""
 
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import Literal
 
 from agalign.capture.align import PairProgress
-from agalign.products.sidecar import CaptureResult, Sidecar, read_sidecar
+from agalign.products.sidecar import BandResult, CaptureResult, Sidecar, read_sidecar
+from agalign.values.text import counted
+
+_MAX_ROWS = 20
+"""Captures that a notebook shows."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +60,44 @@ class CaptureReport:
         return self.shortcomings if self.error is None else (self.error, *self.shortcomings)
 
     @property
+    def summary(self) -> str:
+        """The state and how many bands have which status, or what went wrong."""
+        if self.result is None:
+            return f"{self.state}: {self.error or self.panel or self.sky}"
+        statuses = Counter(b.status for b in self.result.bands if b.status != "reference")
+        return f"{self.state}, " + ", ".join(f"{number} {status}" for status, number in statuses.items())
+
+    def _row(self) -> str:
+        return f"<tr><td>{escape(self.label)}</td><td>{self.state}</td><td>{escape(self.summary)}</td></tr>"
+
+    def _repr_html_(self) -> str:
+        """A short table for notebooks."""
+        if self.result is None:
+            return f"<p><b>{escape(self.label)}</b>: {escape(self.summary)}</p>"
+        rows = "".join(
+            f"<tr><td>{escape(b.band)}</td><td>{b.status}</td><td>{_residual(b)}</td>"
+            f"<td>{escape(b.reason or '')}</td></tr>"
+            for b in self.result.bands
+        )
+        head = "<tr><th>band</th><th>status</th><th>residual, px</th><th>reason</th></tr>"
+        return f"<p><b>{escape(self.label)}</b>: {self.result.status}</p><table>{head}{rows}</table>"
+
+    @property
     def useful(self) -> bool:
         """True where at least one band pair is aligned or predicted."""
         return self.result is not None and any(b.status in ("aligned", "predicted") for b in self.result.bands)
+
+
+class FlightReports(list[CaptureReport]):
+    """The reports of a run, which a notebook shows as a table."""
+
+    def _repr_html_(self) -> str:
+        counts = Counter(report.state for report in self)
+        total = ", ".join(f"{number} {state}" for state, number in counts.items())
+        head = "<tr><th>capture</th><th>state</th><th>bands</th></tr>"
+        rows = "".join(report._row() for report in self[:_MAX_ROWS])
+        more = f"<p>and {len(self) - _MAX_ROWS} more</p>" if len(self) > _MAX_ROWS else ""
+        return f"<p>{counted(len(self), 'capture')}: {total}</p><table>{head}{rows}</table>{more}"
 
 
 class StageClock:
@@ -91,3 +131,8 @@ class StageClock:
         if self._current is not None:
             self._seconds[self._current] += now - self._since
         self._since = now
+
+
+def _residual(band: BandResult) -> str:
+    residual_px = band.metrics.after.residual_px if band.metrics else None
+    return "" if residual_px is None else f"{residual_px:.3f}"

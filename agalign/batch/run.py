@@ -172,6 +172,24 @@ def _reports(
         write_collections(captures, out)
 
 
+def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None) -> dict[str, str]:
+    """Return what `run_flight` would do with each capture, by its label, and write nothing.
+
+    Raises ConfigurationError as `run_flight` does.
+    """
+    options = options or RunOptions()
+    check_indices(flight.captures, settings.write)
+    _refuse_to_overwrite(flight, out, settings.write)
+    sky, captures = _sky(flight.captures, options)
+    panels, captures = _panels(captures, settings.write, options)
+    states = {s.capture.label: "left out as sky" for s in sky}
+    states |= {p.capture.label: "read as calibration panels" for p in panels if p.capture.is_of_a_panel}
+    for raw in captures:
+        kept = _kept(_calibrated(raw, panels, settings.write), out, settings, options)
+        states[raw.label] = "to be aligned" if kept is None else "kept from an earlier run"
+    return {c.label: states[c.label] for c in flight.captures}
+
+
 def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
     """The capture with the radiometry to be written, and its height above the ground where a panel shows it."""
     capture = with_radiometry(capture, settings.radiometry, reflectance_factors(capture, panels))

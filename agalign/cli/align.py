@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from agalign.cli.config_file import load_config
 from agalign.cli.terminal import (
     GOES_ON,
     LogJson,
@@ -230,6 +231,16 @@ def align(
         float | None,
         of_running(min=1, help="Seconds after which a capture is given up; by default never."),
     ] = None,
+    dry_run: Annotated[bool, of_running("--dry-run", help="Print what would be done, and write nothing.")] = False,
+    config: Annotated[  # noqa: ARG001 - its callback does all
+        Path | None,
+        of_running(
+            is_eager=True,
+            callback=load_config,
+            show_default=False,
+            help="TOML file with values of these options; 'agalign info --options' prints one.",
+        ),
+    ] = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
@@ -254,7 +265,7 @@ def align(
         check_address_space()
         from agalign.batch import RunOptions
         from agalign.cameras.discover import DiscoverOptions
-        from agalign.cli.run import conclude, find_captures, load_ahead, run
+        from agalign.cli.run import conclude, find_captures, load_ahead, print_plan, run
         from agalign.config import (
             CheckSettings,
             FlightSettings,
@@ -294,6 +305,8 @@ def align(
         load_ahead()
         flight = find_captures(folder, options, terminal)
         how = RunOptions(overwrite, jobs, align_panels, retry_failed=retry_failed, timeout_s=timeout)
+        if dry_run:
+            raise typer.Exit(print_plan(flight, target, settings, how, terminal))
         totals = run(flight, target, settings, terminal, how, dask=dask, model=model)
         raise typer.Exit(conclude(totals, target, terminal))
 

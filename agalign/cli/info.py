@@ -17,8 +17,9 @@ from agalign.cli.align import (
     WithRgb,
     band_names,
 )
+from agalign.cli.config_file import config_text
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, exits, in_json, shown
-from agalign.errors import UnreadableFileError
+from agalign.errors import ConfigurationError, UnreadableFileError
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
@@ -39,12 +40,13 @@ def register(app: typer.Typer) -> None:
 
 
 def info(
+    ctx: typer.Context,
     folder: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
             help="Folder with the images, or a model that a run wrote (OUT/models/….safetensors).", show_default=False
         ),
-    ],
+    ] = None,
     pattern: Pattern = None,
     reference: Reference = None,
     bands: BandNames = None,
@@ -52,10 +54,18 @@ def info(
     with_rgb: WithRgb = False,
     ignore_metadata: IgnoreMetadata = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+    options: Annotated[
+        bool, typer.Option("--options", help="Print a file of all options of 'agalign align', for its --config.")
+    ] = False,
 ) -> None:
     """Show what was found: cameras, captures, bands, seeds, and what is missing; of a model, the rig that it knows."""
     terminal = Terminal(quiet=False, verbose=False, log_json=False)
     with exits(terminal):
+        if options:
+            typer.echo(config_text(_align_command(ctx)))
+            raise typer.Exit(EXIT_OK)
+        if folder is None:
+            raise ConfigurationError("give a folder with images, a model, or --options")
         if folder.is_file() and folder.suffix == _MODEL_SUFFIX:
             _show_model(folder, terminal, as_json=as_json)
             raise typer.Exit(EXIT_OK)
@@ -65,8 +75,8 @@ def info(
         from agalign.flight.panels import with_panels
         from agalign.flight.sky import sky_captures
 
-        options = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
-        flight = find_captures(folder, options, terminal, silent=as_json, required=False)
+        wanted = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
+        flight = find_captures(folder, wanted, terminal, silent=as_json, required=False)
         if not flight.captures and not as_json:
             _show_unused(flight, terminal)
             raise typer.Exit(EXIT_NOTHING)
@@ -91,6 +101,11 @@ def info(
         raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
 
 
+def _align_command(ctx: typer.Context) -> Any:
+    assert ctx.parent is not None
+    return ctx.parent.command.get_command(ctx.parent, "align")  # type: ignore[attr-defined]
+
+
 def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:
     """Print the captures of a folder as a table, the calibration panels and sky captures, and a line of totals."""
     from rich.table import Table
@@ -108,8 +123,8 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
             terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip() + where))
         if row["sky"]:
             terminal.result(shown(f"{row['label']}: shows the sky ({', '.join(row['sky'])}); not aligned"))
-    bands = sum(len(r["bands"]) for r in rows)
-    parts = counted(len(rows), "capture"), counted(bands, "band"), counted(problems, "problem")
+    in_all = sum(len(r["bands"]) for r in rows)
+    parts = counted(len(rows), "capture"), counted(in_all, "band"), counted(problems, "problem")
     terminal.result(", ".join(parts))
 
 

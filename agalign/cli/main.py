@@ -1,5 +1,6 @@
 """The command line: parses, calls the library, prints."""
 
+import json
 import logging
 import os
 import sys
@@ -117,6 +118,7 @@ cli_info.register(app)
 @app.command()
 def report(
     out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.", show_default=False)],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the facts of the report as JSON.")] = False,
 ) -> None:
     """Rebuild the report and the summary from the sidecars."""
     from rich.table import Table
@@ -136,6 +138,9 @@ def report(
             pages = write_pages(out, unreadable.append)
         for text in unreadable:
             terminal.problem(text)
+        if as_json:
+            typer.echo(json.dumps(pages.facts, indent=1))
+            raise typer.Exit(EXIT_PARTIAL if unreadable else EXIT_OK)
         explain(pages.failures, terminal)
         table = Table("Slowest", "Seconds")
         for label, seconds in pages.slowest:

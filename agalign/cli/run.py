@@ -91,6 +91,22 @@ def print_problems(flight: "FolderScan", terminal: Terminal) -> None:
             )
 
 
+def print_plan(flight: "FolderScan", out: Path, settings: "Settings", how: "RunOptions", terminal: Terminal) -> int:
+    """Print what a run would do with each capture, without doing it; return the exit code."""
+    from agalign.batch.run import plan_run
+    from agalign.flight.overview import camera_overviews
+
+    states = plan_run(flight, out, settings, how)
+    for camera in camera_overviews(flight.captures):
+        terminal.result(shown(camera.text))
+    counts = Counter(states.values())
+    for label, state in states.items():
+        terminal.event("plan", f"{label}: {state}" if terminal.verbose else "", capture=label, state=state)
+    text = ", ".join(f"{counted(number, 'capture')} {state}" for state, number in counts.items())
+    terminal.result(shown(f"Into {out}: {text}; nothing was written"))
+    return EXIT_PARTIAL if flight.problems else EXIT_OK
+
+
 def load_ahead() -> None:
     """Begin to load what takes two seconds to load, torch among it, while the files are looked at."""
 

@@ -1,6 +1,7 @@
 """Every example runs as it stands, on a synthetic flight."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -37,6 +38,55 @@ def test_every_example_is_tested() -> None:
     examples = {path.name for path in (ROOT / "examples").glob("*.py")}
     assert examples
     assert {name for name in examples if f'run("{name}"' in here} == examples
+
+
+def test_the_notebook(tmp_path: Path) -> None:
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    notebook = nbformat.read(ROOT / "examples" / "flight.ipynb", as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells), "outputs are not kept in the repository"
+    nbclient.NotebookClient(notebook, timeout=60, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    text = "".join(o.get("text", "") + o.get("data", {}).get("text/plain", "") for o in outputs)
+    assert "2 of 2: 0000SET/000/IMG_000" in text
+    assert sum("image/png" in o.get("data", {}) for o in outputs) == 3
+    tables = [o["data"]["text/html"] for o in outputs if "text/html" in o.get("data", {})]
+    assert "2 captures: 2 done" in tables[0]
+    medians = [float(v) for v in re.findall(r"IMG_000\d +(-?[\d.]+)", text)]
+    assert len(medians) == 2
+    assert all(0.1 < v < 0.9 for v in medians)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="shell scripts")
+@pytest.mark.parametrize(("code", "ends", "listed"), [(0, 0, False), (3, 0, True), (1, 1, False), (2, 2, False)])
+def test_many_flights_go_on_after_exit_code_3(tmp_path: Path, code: int, ends: int, listed: bool) -> None:
+    """In SLURM's script, with make, and in the container of a Kubernetes job."""
+    for name in ("one", "two"):
+        (tmp_path / "flights" / name).mkdir(parents=True)
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "agalign").write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/calls\nexit {code}\n')
+    (tmp_path / "bin" / "agalign").chmod(0o755)
+    environment = os.environ | {
+        "PATH": f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}", "FLIGHTS": str(tmp_path / "flights"),
+        "OUT": str(tmp_path / "out"), "SLURM_ARRAY_TASK_ID": "2",
+    }  # fmt: skip
+
+    def exit_code(*command: str) -> int:
+        return subprocess.run(command, env=environment, capture_output=True, check=False).returncode
+
+    (tmp_path / "out").mkdir()
+    assert exit_code("bash", str(ROOT / "examples" / "slurm.sh")) == ends
+    assert "flights/two/ -o" in (tmp_path / "calls").read_text()
+    incomplete = tmp_path / "out" / "incomplete.txt"
+    assert (incomplete.read_text() if incomplete.exists() else "") == ("two\n" if listed else "")
+    make = exit_code("make", "-f", str(ROOT / "examples" / "flights.mk"), f"FLIGHTS={tmp_path / 'flights'}",
+                     f"OUT={tmp_path / 'made'}")  # fmt: skip
+    assert (make == 0) == (ends == 0)
+    assert len(list((tmp_path / "made").glob("*.done"))) == (2 if ends == 0 else 0)
+    yaml = pytest.importorskip("yaml")
+    job = yaml.safe_load((ROOT / "examples" / "kubernetes-job.yaml").read_text(encoding="utf-8"))
+    (container,) = job["spec"]["template"]["spec"]["containers"]
+    assert exit_code(*container["command"], *container["args"]) == ends
 
 
 def test_two_arrays() -> None:

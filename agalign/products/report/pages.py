@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
@@ -39,6 +39,8 @@ class Pages:
     report: Path
     summary: Path
     failures: Sequence[FailureGroup]
+    facts: Mapping[str, Any]
+    """What the page shows, schema `agalign-report/1`."""
     slowest: tuple[tuple[str, float], ...]
     """Labels of the captures that took longest, with their seconds."""
 
@@ -81,7 +83,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
             os.utime(out / REPORT_FILE, (0, 0))
     for text in unreadable:
         on_problem(text)
-    return Pages(out / REPORT_FILE, out / SUMMARY_FILE, failures, tuple(slowest))
+    return Pages(out / REPORT_FILE, out / SUMMARY_FILE, failures, facts.as_json(), tuple(slowest))
 
 
 def pages_exist(out: Path) -> bool:

@@ -1,0 +1,20 @@
+# Many flights on one machine: each folder below FLIGHTS that is new or was not finished. A second call goes on.
+#
+#     make -f examples/flights.mk FLIGHTS=season OUT=aligned
+#
+FLIGHTS ?= flights
+OUT ?= aligned
+OPTIONS ?= --radiometry auto --index ndvi
+
+DONE := $(patsubst $(FLIGHTS)/%/,$(OUT)/%.done,$(sort $(wildcard $(FLIGHTS)/*/)))
+
+all: $(DONE)
+
+# Exit code 3 is a finished flight in which some bands are not aligned: its name is kept, and make goes on.
+$(OUT)/%.done: $(FLIGHTS)/%/
+	@mkdir -p $(OUT)
+	agalign $< -o $(OUT)/$* $(OPTIONS); code=$$?; \
+	if [ $$code -eq 3 ]; then echo $* >> $(OUT)/incomplete.txt; elif [ $$code -ne 0 ]; then exit $$code; fi
+	@touch $@
+
+.PHONY: all

@@ -1,0 +1,23 @@
+#!/usr/bin/env bash
+# Many flights on a SLURM cluster: a task for each folder below FLIGHTS, results below OUT.
+#
+#     sbatch --array=1-"$(ls -d "$FLIGHTS"/*/ | wc -l)" examples/slurm.sh
+#
+#SBATCH --cpus-per-task=4
+#SBATCH --mem=12G
+#SBATCH --time=04:00:00
+#SBATCH --requeue
+set -uo pipefail
+: "${FLIGHTS:?folder with a folder for each flight}" "${OUT:?folder for the results}"
+
+flight=$(ls -d "$FLIGHTS"/*/ | sed -n "${SLURM_ARRAY_TASK_ID:?start it with sbatch --array}p")
+name=$(basename "$flight")
+agalign "$flight" -o "$OUT/$name" --jobs "${SLURM_CPUS_PER_TASK:-1}" --radiometry auto --index ndvi
+code=$?
+
+case $code in
+    0) ;;
+    3) echo "$name" >> "$OUT/incomplete.txt" ;;  # finished; some bands are not aligned: OUT/<flight>/index.html says why
+    143) exec scontrol requeue "$SLURM_JOB_ID" ;;  # stopped at the time limit: the same command goes on from there
+    *) exit "$code" ;;  # 1: nothing could be processed, 2: wrong options
+esac
