@@ -24,6 +24,7 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import DEFAULT_SCHEDULE, learn
 from agalign.method.joint import Results, refine_with
+from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.starter import start_from
 from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.pixels.raster import without_warnings
@@ -96,9 +97,11 @@ def _learn_network(
         sides = [0, *(start.side(band) or len(start.bands) for band in bands)] if start.camera else None
         start_from(net, start.net.state_dict(), sides)
 
+    patches = FLIGHT_PATCHES if len(loaded) >= MIN_CAPTURES else PATCHES
+
     def refined() -> list[Results]:
         with ThreadPoolExecutor(at_once) as pool:
-            return list(pool.map(lambda group: refine_with(net, group, settings.joint, progress), groups))
+            return list(pool.map(lambda group: refine_with(net, group, settings.joint, progress, patches), groups))
 
     try:
         # The network that learning would start from is often good enough.

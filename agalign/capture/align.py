@@ -19,6 +19,7 @@ from agalign.config import Settings
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
 from agalign.method.joint import Results, align_from_scratch, refine_with
+from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
@@ -173,7 +174,10 @@ class _PairAligner:
             return
         known = [s for s in starts if model.side(s[0].name) is not None]
         sides = [model.side(pair.name) or 0 for pair, _ in known]
-        self._attempt(known, sides, lambda group, report: refine_with(model.net, group, self.settings.joint, report))
+        patches = PATCHES if model.rig is None else FLIGHT_PATCHES
+        self._attempt(
+            known, sides, lambda group, report: refine_with(model.net, group, self.settings.joint, report, patches)
+        )
 
     def worth_learning(self, pairs: Sequence[BandPair], capture: Capture) -> set[str]:
         """The bands that are worth learning from scratch: without a rig, all."""

@@ -144,11 +144,9 @@ class _GroupAtLevel:
     """True once held-out patches could be retrieved, so that psi could move."""
     retrieved: list[float] = field(init=False)
     """Share of the held-out patches that were retrieved at the last test."""
-    at_rest: list[bool] = field(init=False)
-    """True where the last step on psi was short, or none could be taken."""
 
     def __post_init__(self) -> None:
-        self.converged, self.distinguished, self.at_rest = ([False] * len(self.which) for _ in range(3))
+        self.converged, self.distinguished = ([False] * len(self.which) for _ in range(2))
         self.retrieved = [0.0] * len(self.which)
         self.h = [self.level.homography(self.group.mappings[b], i) for i, b in enumerate(self.which)]
 
@@ -199,8 +197,8 @@ def _converges(at_level: Sequence[_GroupAtLevel], move_psi: _MovePsi) -> bool:
         remaining = [g for g, converged in zip(remaining, move_psi(remaining), strict=True) if not converged]
         if not remaining:
             return True
-        needs_learning = not all(g.needs_only_steps for g in remaining)
-        if needs_learning and (update >= _FIRST_UPDATES or all(all(g.at_rest) for g in remaining)):
+        cannot_move = update > 1 and not all(all(g.distinguished) for g in remaining)
+        if cannot_move or (update >= _FIRST_UPDATES and not all(g.needs_only_steps for g in remaining)):
             return False
     return False
 
@@ -278,13 +276,12 @@ def _move_psi(at: _GroupAtLevel) -> bool:
     solver = Solver(state.family)
     for i, band in enumerate(at.bands):
         retrieved, _ = held_out_retrieval(band, at.h[i], test, f_test)
-        at.retrieved[i], at.at_rest[i] = retrieved, True
+        at.retrieved[i] = retrieved
         if retrieved < MIN_RETRIEVAL:
             continue
         at.distinguished[i] = True
         with suppress(NotEnoughTextureError):
             step = solver.step(band, at.h[i], reference_patches)
             at.h[i] = moved(at.h[i], step)
-            at.at_rest[i] = step.length_px < REST_PX
             at.converged[i] |= retrieved > at.schedule.enough_retrieval and step.length_px < REST_PX
     return all(at.converged)

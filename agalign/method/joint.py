@@ -20,7 +20,7 @@ from agalign.errors import GeometryError, NoContrastError, NotEnoughTextureError
 from agalign.method.descriptor import Descriptor
 from agalign.method.fast import DEFAULT_SCHEDULE, Schedule, learn
 from agalign.method.paper import DEFAULT_TRAINING, Training, align_by_paper
-from agalign.method.refine import FLIGHT_PATCHES, refine
+from agalign.method.refine import PATCHES, refine
 from agalign.method.state import ImageGroup, JointState, Progress, ThetaStart
 from agalign.values.alignment import JointResult
 from agalign.values.issues import FEW_KEYPOINTS, NO_CONTRAST, NOT_INVERTIBLE, Issue
@@ -51,10 +51,12 @@ def align_from_scratch(
     return [r if isinstance(r, Issue) else replace(r, loss=loss, iterations=steps) for r in results]
 
 
-def refine_with(net: Descriptor, group: ImageGroup, settings: JointSettings, progress: Progress) -> Results:
+def refine_with(
+    net: Descriptor, group: ImageGroup, settings: JointSettings, progress: Progress, patches: int = PATCHES
+) -> Results:
     """Every psi of a capture with the flight's theta frozen."""
     try:
-        results = refine(JointState(settings, progress), net, group, patches=FLIGHT_PATCHES)
+        results = refine(JointState(settings, progress), net, group, patches=patches)
     except NoContrastError:
         return [Issue(NO_CONTRAST)] * len(group.moving)
     return [r if isinstance(r, Issue) else replace(r, recipe="flight") for r in results]
