@@ -31,8 +31,8 @@ TEST_KEYPOINTS = 256
 REST_PX = 0.5
 """psi is at rest when a step moves no corner by more than this, px of the level."""
 PATCHES, FLIGHT_PATCHES = 400, 256
-"""Patches in a Gauss-Newton step at full resolution: of a capture alone, and of one of a flight, where the rig takes part
-in the estimate. Half as many serve while psi is not at rest."""
+"""Patches in a Gauss-Newton step at full resolution: of a capture alone, and of one of a flight, where the rig takes
+part in the estimate. Half as many serve while psi is not at rest."""
 _FINAL_OCTAVES = 0.3
 """Range of their scales: small patches place themselves more exactly."""
 _FINAL_STEPS = 10
