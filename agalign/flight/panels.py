@@ -145,7 +145,8 @@ def _panels_at(end: Sequence[Capture], by_look: bool) -> list[Capture]:
 
 def _looked_at(capture: Capture, by_look: bool) -> Capture:
     sight = _seen(capture.reference, without_code=by_look)
-    if sight is None:
+    # A small square away from the middle is a roof or a sheet unless a code says otherwise.
+    if sight is None or (sight.in_scene and not sight.code):
         return capture
     sights = [_seen(b, without_code=True) for b in capture.bands]
     in_scene = sight.in_scene

@@ -299,6 +299,8 @@ def test_info_of_what_is_no_model_is_one_line(tmp_path: Path) -> None:
         (["nowhere"], 1, "nowhere"),
         (["info", "nowhere"], 1, "nowhere"),
         (["report", "nowhere"], 1, "nowhere"),
+        (["export", "nowhere", "--for", "odm"], 1, "nowhere: no sidecars there"),
+        (["export", "nowhere", "--for", "excel"], 2, "excel"),
         (["align", "{flight}", "-o", "{tmp}/o", "--reference", "SWIR"], 2, "SWIR"),
         (["align", "{flight}", "-o", "{tmp}/o", "--device", "abacus"], 2, "abacus"),
         (["align", "{flight}", "-o", "{tmp}/o", "--pattern", "x"], 2, "pattern"),

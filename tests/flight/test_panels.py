@@ -8,6 +8,7 @@ from synthetic_flights.panel import make_flight_between_panels
 
 from agalign.cameras.discover import discover
 from agalign.flight.panels import BandReading, PanelReading, read_panel, reflectance_factors, with_height, with_panels
+from agalign.pixels.panel import PanelSight
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Radiometry
 
 AREA = ((20.0, 10.0), (39.0, 10.0), (39.0, 29.0), (20.0, 29.0))
@@ -144,3 +145,21 @@ def test_one_unknown_time_leaves_the_captures_of_a_flight_in_their_order(monkeyp
     monkeypatch.setattr("agalign.flight.panels._looked_at", lambda one, _by_look: looked.append(one.name) or one)
     with_panels(flight)
     assert sorted(map(int, looked)) == [0, 1, 2, 17, 18, 19]
+
+
+@pytest.mark.parametrize(
+    ("code", "in_scene", "expected"),
+    [
+        ("RP04", False, (True, True)),
+        ("RP04", True, (True, False)),
+        ("", False, (True, True)),
+        ("", True, (False, False)),
+    ],
+)
+def test_a_square_in_a_scene_is_a_panel_by_its_code_alone(
+    monkeypatch: pytest.MonkeyPatch, code: str, in_scene: bool, expected: tuple[bool, bool]
+) -> None:
+    """A roof looks like a panel too. Only a capture of a panel is left out."""
+    monkeypatch.setattr("agalign.flight.panels._seen", lambda *_, **__: PanelSight(code, AREA, in_scene))
+    (result,) = with_panels([capture(Band("Green", Path("x.tif"), 1, 64, 48, "uint16"))], by_look=True)
+    assert (result.panel is not None, result.is_of_a_panel) == expected

@@ -3,6 +3,8 @@
 import csv
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +54,17 @@ def test_the_sky_is_left_out_and_named(with_sky: Path, tmp_path: Path) -> None:
     again = agalign.align_folder(with_sky, out, settings=ONLY_SEED, run=RunOptions(align_panels=True))
     assert {r.label: r.state for r in again} == {"sky/S1": "done", "IMG_0001": "kept"}
     assert not (out / SKY_FILE).exists()
+
+
+@pytest.mark.slow
+def test_info_names_the_sky(with_sky: Path) -> None:
+    command = [sys.executable, "-m", "agalign", "info", str(with_sky)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    (line,) = (line for line in done.stdout.splitlines() if line.startswith("sky/S1: "))
+    assert line == "sky/S1: shows the sky (its folder or name contains 'sky', no band has texture); not aligned"
+    rows = json.loads(subprocess.run([*command, "--json"], capture_output=True, text=True, check=False).stdout)
+    assert {row["label"]: bool(row["sky"]) for row in rows["captures"]} == {"IMG_0001": False, "sky/S1": True}
 
 
 def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:
