@@ -51,13 +51,15 @@ Pattern = Annotated[
 Reference = Annotated[str | None, of_input(help="Name of the reference band; by default green.")]
 Jobs = Annotated[
     int,
-    of_running("--jobs", "-j", min=0, show_default=False, help="Captures at a time; by default one a core."),
+    of_running(
+        "--jobs", "-j", min=0, show_default=False, help="Captures processed at the same time; by default one per core."
+    ),
 ]
 Dask = Annotated[
     str | None,
     of_running(
-        help="Scheduler of a Dask cluster that does the captures, tcp://host:8786; it sees the same folders. "
-        "'local' starts worker processes here."
+        help="Address of a Dask scheduler whose workers process the captures, tcp://host:8786; they need the same "
+        "folders. 'local' starts worker processes here."
     ),
 ]
 IgnoreMetadata = Annotated[bool, of_input("--ignore-metadata", help="Use no lens or rig tags.")]
@@ -67,7 +69,7 @@ BandNames = Annotated[
 ]
 Order = Annotated[
     BandOrder,
-    of_input(help="Of the bands: as the camera counts them, by wavelength, or by name."),
+    of_input(help="Order of the bands: as numbered by the camera, by wavelength, or by name."),
 ]
 WithRgb = Annotated[
     bool,
@@ -100,43 +102,44 @@ def align(
     ignore_metadata: IgnoreMetadata = False,
     include: Annotated[
         list[str] | None,
-        of_input(show_default=False, help="Only files that this glob matches, by path or name; repeatable."),
+        of_input(show_default=False, help="Use only files whose path or name matches this glob; repeatable."),
     ] = None,
     exclude: Annotated[
         list[str] | None,
-        of_input(show_default=False, help="No files that this glob matches, as '*/test/*'; repeatable."),
+        of_input(show_default=False, help="Ignore files that match this glob, such as '*/test/*'; repeatable."),
     ] = None,
     align_panels: Annotated[
         bool,
-        of_input("--align-panels", help="Align captures of calibration panels and of the sky too, like any other."),
+        of_input("--align-panels", help="Align captures of calibration panels and of the sky too."),
     ] = False,
     max_pixels: Annotated[
         int,
-        of_input(min=1, help="Images that declare more are refused before anything is read."),
+        of_input(min=1, help="Refuse images with more pixels, before anything is read."),
     ] = MAX_PIXELS,
-    seed: Annotated[SeedChoice, of_alignment(help="Start from this kind of coarse alignment only.")] = "auto",
+    seed: Annotated[
+        SeedChoice, of_alignment(help="Use only this kind of initial alignment; by default the best of all.")
+    ] = "auto",
     only_seed: Annotated[
         bool,
-        of_alignment("--only-seed", help="Stop at the coarse alignment; learn nothing."),
+        of_alignment("--only-seed", help="Stop after the initial alignment; learn nothing."),
     ] = False,
     relief: Annotated[
         ReliefUse,
         of_alignment(
-            help="Estimate one relief for all bands of a capture, over trees, buildings, benches: where windows show "
-            "parallax, always, or never. --relief alone is always."
+            help="Correct parallax (trees, terraces, buildings, close range) by one relief for all bands of a capture: "
+            "if windows show parallax, always, or never. --relief alone is always."
         ),
     ] = "auto",
     accept_predicted: Annotated[
         float,
         of_alignment(
             min=0,
-            help="A band whose own image cannot say where it lies counts as delivered where the flight's rig "
-            "predicts it this well, px.",
+            help="Count a band that is predicted by the rig of the flight as delivered up to this standard error, px.",
         ),
     ] = 1.0,
     model: Annotated[
         Path | None,
-        of_alignment(help="Start from what an earlier flight of the same camera learnt: OUT/models/…."),
+        of_alignment(help="Reuse the network and rig of an earlier flight of the same camera: OUT/models/…."),
     ] = None,
     out: Annotated[
         Path | None,
@@ -146,8 +149,8 @@ def align(
     crop: Annotated[
         Crop,
         of_output(
-            help="Cut to the area all bands share, alike for all captures of a flight or for each by itself, or keep "
-            "the reference's frame."
+            help="Crop to the area that all bands share, the same for all captures of a flight or per capture, or keep "
+            "the frame of the reference."
         ),
     ] = "flight",
     undistort: Annotated[
@@ -156,17 +159,18 @@ def align(
     ] = False,
     resolution: Annotated[
         Resolution,
-        of_output(help="Of the output: the reference's, or the finest band's on the reference's frame."),
+        of_output(help="Pixel size of the output: that of the reference, or of the finest band."),
     ] = "reference",
     layout: Annotated[
         Layout,
-        of_output(help="A stack of all bands, a file for each input file with its tags, or both."),
+        of_output(help="One stack per capture, one file per input file with its tags, or both."),
     ] = "stack",
     radiometry: Annotated[
         RadiometryChoice,
         of_output(
             help="Write float32: radiance by the camera's calibration, reflectance by its light sensor or by a panel; "
-            "thermal bands in degrees C. --radiometry alone is auto: the last of these that all bands can be given."
+            "thermal bands in degrees C. --radiometry alone is auto: "
+            "by panel if available for all bands, else by light sensor, else radiance."
         ),
     ] = "off",
     panel_albedo: Annotated[
@@ -180,8 +184,8 @@ def align(
         bool,
         of_output(
             "--pan-sharpen",
-            help="The bands at the panchromatic's resolution too, or at the colour photograph's with --with-rgb: "
-            "<capture>.pan.tif.",
+            help="Also write the bands at the resolution of the panchromatic band, or of the colour photograph with "
+            "--with-rgb: <capture>.pan.tif.",
         ),
     ] = False,
     index: Annotated[
@@ -191,24 +195,29 @@ def align(
             help="Also write spectral indices, names separated by commas: ndvi, ndre …; 'agalign indices' adds others.",
         ),
     ] = None,
-    stac: Annotated[bool, of_output("--stac", help="A STAC item beside each capture's files.")] = False,
+    stac: Annotated[
+        bool, of_output("--stac", help="Write a STAC item per capture and a collection per flight.")
+    ] = False,
     relief_map: Annotated[
         bool,
         of_output("--relief-map", help="Add confidence and range (m) to the raster of a capture's relief."),
     ] = False,
     fill_occluded: Annotated[
         bool,
-        of_output("--fill-occluded", help="Interpolate what nearer parts of the scene occlude in a band; else nodata."),
+        of_output(
+            "--fill-occluded", help="Interpolate pixels that are occluded in a band; by default they are nodata."
+        ),
     ] = False,
     error_map: Annotated[
         bool,
-        of_output("--error-map", help="A raster of the error to expect at every pixel, <capture>.error.tif."),
+        of_output("--error-map", help="Write a raster of the expected error at every pixel, <capture>.error.tif."),
     ] = False,
     tie_points: Annotated[
         bool,
         of_output(
             "--tie-points",
-            help="Measured tie points of each band with residual and weight: <capture>.ties.csv and .ties.geojson.",
+            help="Write the measured tie points of each band with residual and weight: <capture>.ties.csv "
+            "and .ties.geojson.",
         ),
     ] = False,
     format: Annotated[RasterFormat, of_output(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
@@ -216,20 +225,20 @@ def align(
         Compression,
         of_output(help="Lossless; auto is zstd for stacks and deflate for single bands."),
     ] = "auto",
-    device: Annotated[str, of_running(help="auto, cpu, cuda, cuda:1 …")] = "auto",
+    device: Annotated[str, of_running(help="Torch device: auto, cpu, cuda, cuda:1 …")] = "auto",
     jobs: Jobs = 0,
     dask: Dask = None,
     overwrite: Annotated[
         bool,
-        of_running("--overwrite", help="Do captures again that an earlier run finished."),
+        of_running("--overwrite", help="Process finished captures again."),
     ] = False,
     retry_failed: Annotated[
         bool,
-        of_running("--retry-failed", help="Do those of them again in which a band is not aligned, or missing."),
+        of_running("--retry-failed", help="Process captures again in which a band is not aligned or missing."),
     ] = False,
     timeout: Annotated[
         float | None,
-        of_running(min=1, help="Seconds after which a capture is given up; by default never."),
+        of_running(min=1, help="Seconds after which a capture is abandoned; by default unlimited."),
     ] = None,
     dry_run: Annotated[bool, of_running("--dry-run", help="Print what would be done, and write nothing.")] = False,
     config: Annotated[  # noqa: ARG001 - its callback does all
@@ -244,15 +253,17 @@ def align(
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
-    recipe: Annotated[Recipe, of_expert(help="How to optimise: fast, or step by step as published.")] = "fast",
-    sharing: Annotated[Sharing, of_expert(help="What the descriptor's two sides share.")] = "pseudo-siamese",
+    recipe: Annotated[Recipe, of_expert(help="Algorithm: fast, or the published one step by step.")] = "fast",
+    sharing: Annotated[
+        Sharing, of_expert(help="Layers shared by the descriptors of both bands: all, all but the first, or none.")
+    ] = "pseudo-siamese",
     model_family: Annotated[
         FamilyChoice,
-        of_expert(help="Mapping to fit; auto is as rich as the images allow."),
+        of_expert(help="Mapping to fit; auto is the richest one that the images determine."),
     ] = "auto",
     each_alone: Annotated[
         bool,
-        of_expert("--each-alone", help="Learn every capture by itself instead of once a flight."),
+        of_expert("--each-alone", help="Learn a network per capture instead of one per flight."),
     ] = False,
     rng_seed: Annotated[
         int,

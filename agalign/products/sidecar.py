@@ -41,62 +41,87 @@ Count = Annotated[int, Field(gt=0)]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, populate_by_name=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, populate_by_name=True, use_attribute_docstrings=True)
 
 
 class _Result(_Part):
-    """Read from what holds more."""
+    """Ignores fields that it does not have."""
 
     model_config = ConfigDict(extra="ignore")
 
 
 class CameraPart(_Part):
-    """What made the images."""
+    """Camera that took the capture, from its tags."""
 
     make: str
+    """Manufacturer."""
     model: str
+    """Model."""
     serial: str
+    """Serial numbers, joined by `+` if there are several."""
 
 
 class PositionPart(_Part):
-    """Where the camera was: WGS 84, degrees, and metres as the camera has them."""
+    """GPS position of the reference band."""
 
     latitude: float
+    """Degrees, WGS 84."""
     longitude: float
+    """Degrees, WGS 84."""
     altitude_m: float | None
+    """Altitude as the camera writes it, m."""
 
 
 class ReferencePart(_Part):
-    """The band whose pixel grid everything is aligned to."""
+    """Reference band: all bands are aligned to its pixel grid."""
 
     band: str
+    """Name of the band."""
     file: str
+    """Image file."""
     band_index: Count
+    """Band in that file, from 1."""
     width: Count
+    """Width of the file, px."""
     height: Count
+    """Height of the file, px."""
 
 
 class HomographyPart(_Part):
-    """A homography and the pixels it is between: `undistorted` ones where lens models are known."""
+    """Homography between reference and moving band."""
 
     fixed_to_moving: Matrix3x3
+    """3 x 3, maps a pixel of the reference to a pixel of the moving band."""
     space: Space
+    """`pixel`: between raw pixels of the files. `undistorted`: between the pixels that both cameras would have without
+    lens distortion (same focal length and principal point).
+    """
 
 
 class SeedPart(_Part):
-    """Where the optimisation started, in the same space as the homography."""
+    """Initial alignment, in the same space as the homography."""
 
     kind: SeedKind
+    """`user`; `match` (learned descriptors matched); `model` (median mapping of the flight); `rig` (camera tags);
+    `centre` (optical centres of DJI); `geo` (geotransforms); `structure` (phase correlation); `identity`.
+    """
     fixed_to_moving: Matrix3x3
+    """3 x 3, as in `homography`."""
     peak_sigma: float
+    """Height of its correlation peak above the surface, standard deviations."""
     runner_up_sigma: float
+    """Height above the second peak, standard deviations."""
 
 
 class GridPart(_Part):
-    """The complete mapping, sampled: raw pixel of the reference file -> raw pixel of the moving file."""
+    """The complete mapping, lenses included, sampled: 17 x 13 points, 65 x 49 with a displacement field or if lens
+    models differ. With a `relief`, use that instead.
+    """
 
     reference_px: list[PointPx]
+    """Raw pixels of the reference file, row by row."""
     moving_px: list[PointPx]
+    """The corresponding raw pixels of the band's file."""
 
 
 def _known_kind(code: str) -> str:
@@ -106,237 +131,316 @@ def _known_kind(code: str) -> str:
 
 
 class IssuePart(_Part):
-    """One thing that speaks against an alignment: what was measured, and what it should have been."""
+    """A reason against accepting the alignment."""
 
     kind: Annotated[str, AfterValidator(_known_kind), Field(json_schema_extra={"enum": list(KINDS)})]
+    """Code of the reason."""
     value: float | None
+    """Measured value."""
     limit: float | None
+    """Limit that it exceeds or misses."""
 
 
 class JointPart(_Part):
-    """How the joint optimisation ended."""
+    """Result of the joint optimisation of descriptor and mapping."""
 
     accepted: bool = True
-    """False where the result was doubted: the homography is the seed's then, and this describes what was rejected."""
+    """False if the result was rejected: `homography` and `grid` are then those of the seed or the prediction."""
     loss: float | None
+    """Final loss; null if nothing was learned."""
     retrieval: float
+    """Share of held-out patches whose nearest descriptor in the other band is their own."""
     chance: float
+    """Retrieval expected by chance."""
     iterations: int
+    """Steps; 0 if nothing was learned."""
     levels: list[float]
+    """Scales of the images used; 1 is full resolution."""
     recipe: str
+    """`flight` (frozen network of the flight), `fast` (learned on this capture), `paper`, or `windows` (phase-
+    correlation windows alone).
+    """
     model_family: ModelFamily
+    """Mapping that was fitted."""
     last_step_px: float
+    """Largest movement of a corner in the last step, px."""
     corner_std_px: float
-    """Root mean square distance of the least certain corner from where it is mapped to."""
+    """Root mean square error of the least certain corner, px of the reference."""
     corner_std_xy_px: list[PointPx]
-    """Standard deviations along x and y at the corners of the reference, clockwise from the top left."""
+    """Standard errors along x and y at the corners of the reference, clockwise from the top left, px of the reference.
+    """
 
 
 class SimilarityPart(_Part):
-    """Similarity on the common valid area; `mattes_mi` has elastix's sign (lower is better)."""
+    """Similarity on the common valid area."""
 
     mattes_mi: float | None = None
+    """Negative mutual information by Mattes, nats, 32 bins, as in elastix: lower is better."""
     nmi: float | None = None
+    """Normalised mutual information, 1 to 2: higher is better."""
     ncc: float | None = None
+    """Normalised cross-correlation; negative if contrast is reversed."""
     gradient_correlation: float | None = None
+    """Correlation of gradient magnitudes: higher is better."""
     structure_ssim: float | None = None
+    """SSIM of the structure images: higher is better."""
     overlap: float | None = None
+    """Share of the image in which both bands are valid."""
     residual_px: float | None = None
-    """Median length of the local structure shifts, px."""
+    """Median length of the local shifts of the windows, px; after alignment only."""
     residual_p95_px: float | None = None
+    """Their 95th percentile, px."""
     residual_coverage: float | None = None
+    """Share of windows with structure in which a shift was measured."""
 
 
 class ResidualTile(_Part):
-    """The local shift that one window shows after alignment; null where none could be measured."""
+    """Local shift of one window after alignment."""
 
     centre_px: PointPx
+    """Centre of the window, px of the reference."""
     shift_px: tuple[float | None, float | None]
+    """Shift along x and y, px; null if none could be measured."""
 
 
 class MetricsResult(_Result):
-    """Before: the files as they are. After: as written."""
+    """Similarity before and after alignment."""
 
     before: SimilarityPart
+    """Files as they are."""
     after: SimilarityPart
+    """Bands as written."""
 
 
 class MetricsPart(MetricsResult):
-    """The same with the shifts that windows show."""
+    """Similarity before and after alignment, with local shifts."""
 
     model_config = ConfigDict(extra="forbid")
 
     tiles: list[ResidualTile]
+    """Local shifts of the windows; with recipe `windows`, of those left out of the fit."""
 
 
 class LocalPart(_Part):
-    """What a local field of displacements gains: 95th percentile of the shifts of windows left out of its fit, px."""
+    """Displacement field of this band alone: p95 shift of windows left out of its fit."""
 
     applied: bool
+    """Whether the field was used."""
     before_p95_px: float | None
+    """Without the field, px."""
     after_p95_px: float | None
+    """With the field, px."""
 
 
 class ReliefPart(_Part):
-    """How the relief of the capture displaces a band. At a pixel x of the reference with the parallax z in `file`, the
-    moving pixel is plane_px(x) + z slope(x), both interpolated by cubic splines between their nodes.
+    """Displacement of this band by the relief of the capture: a pixel x of the reference with parallax z maps to
+    plane_px(x) + z slope(x), both interpolated by cubic splines between their nodes.
     """
 
     file: RelativeFile | None
-    """The raster with the parallax, on the grid of the aligned files; null where nothing was written."""
+    """Raster with the parallax, on the grid of the aligned files; null if nothing was written."""
     baseline: PointPx
-    """Displacement in undistorted px of the reference for a px of parallax; the longest baseline has length 1."""
+    """Displacement per px of parallax, undistorted px of the reference; the longest baseline of the capture has length
+    1.
+    """
     occluded: float
-    """Share of the reference's pixels that nearer parts of the scene occlude in this band."""
+    """Share of the reference pixels that are occluded in this band."""
     reference_px: list[PointPx]
+    """17 x 13 nodes on the reference file, row by row."""
     plane_px: list[PointPx]
     """Where the reference plane maps the nodes, raw px of the moving file."""
     slope: list[PointPx]
-    """Px of the moving file for a px of parallax, at the nodes."""
+    """Px of the moving file per px of parallax, at the nodes."""
 
 
 class PredictionPart(_Part):
-    """Where the flight's rig has the band: from the capture's other bands, from the captures before and after, or from
-    the flight's mean; or the mapping extrapolated from the windows in a part of the image. `std_px` is the root mean
-    square error to be expected; `off_px` how far from there the band's own image has it, null where it does not show
-    it. Both are in px of the band's own file.
-    """
+    """Position of the band predicted without its own image, or extrapolated from a part of it."""
 
     source: Annotated[PredictionSource, Field(alias="from")]
+    """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (extrapolated
+    from the windows of a part of the image).
+    """
     std_px: float
+    """Standard error over the image (root mean square), px of the band's own file."""
     off_px: float | None
+    """Distance of the image's own alignment from the prediction, px of the band's own file; null if there is none."""
 
 
 class PlacePart(_Part):
-    """The file with a band's aligned pixels, relative to the sidecar's folder, and the band's index there, from 1."""
+    """Where the aligned pixels of the band are."""
 
     file: RelativeFile
+    """File, relative to the folder of the sidecar."""
     band_index: Count
+    """Band in that file, from 1."""
 
 
 class BandResult(_Result):
-    """What became of one band of the capture."""
+    """Result of one band."""
 
     band: str
+    """Name of the band."""
     wavelength_nm: float | None
+    """Centre wavelength, nm."""
     file: str
+    """Image file."""
     band_index: int
+    """Band in that file, from 1."""
     status: PairStatus
+    """`reference`, `aligned`, `predicted`, `seed_only` or `failed`."""
     reason: str | None
+    """Why the band is not aligned, in words."""
     issues: list[IssuePart] = Field(default=[], alias="doubts")
-    """Everything that speaks against it; the first is the one that `reason` tells."""
+    """All reasons against accepting the alignment; `reason` is the first in words."""
     homography: HomographyPart | None = None
+    """Mapping without lenses and displacements."""
     seed: SeedPart | None = None
+    """Initial alignment."""
     joint: JointPart | None = None
+    """Result of the optimisation."""
     metrics: MetricsResult | None = None
+    """Similarity before and after."""
     local: LocalPart | None = None
-    """A smooth displacement field of this band alone."""
+    """Displacement field of this band alone, if one was tried."""
     prediction: PredictionPart | None = None
+    """Prediction by the rig of the flight, or by extrapolation."""
     place: PlacePart | None = None
+    """Where the aligned pixels are."""
     seconds: float
+    """Processing time of the band pair."""
 
 
 class BandPart(BandResult):
-    """The same with the mapping and the shifts of windows, which are long."""
+    """Result of one band, with its complete mapping."""
 
     model_config = ConfigDict(extra="forbid")
 
     metrics: MetricsPart | None = None
+    """Similarity before and after, and local shifts."""
     grid: GridPart | None = None
+    """The complete mapping, sampled."""
     relief: ReliefPart | None = None
-    """The relief that this band shares with the others of its capture."""
+    """Displacement by the relief that all bands of the capture share; null if none is used."""
 
 
 class FilePart(_Part):
-    """A file of single bands, relative to the sidecar's folder."""
+    """File of a single band."""
 
     file: RelativeFile
+    """Relative to the folder of the sidecar."""
     bytes: int
+    """Size."""
     nodata: float | str | None = None
+    """Nodata value; `"nan"` for NaN."""
 
 
 class OutputPart(_Part):
-    """The stack, relative to the sidecar's folder; null where only single bands were written.
-
-    `nodata` is the stack's, or what the files of single bands have in common; null where they differ.
-    `crop` is x0, y0, width, height on the reference's pixel grid, which has `scale` (x, y) times as many pixels along
-    its sides as the reference's file.
-    """
+    """Written rasters."""
 
     file: RelativeFile | None
+    """The stack, relative to the folder of the sidecar; null with `--layout bands`."""
     bytes: int | None
+    """Size of the stack; null with `--layout bands`."""
     band_files: list[FilePart] = []
+    """Files of single bands."""
     radiometry: str | None = None
-    """What was made of raw numbers, and by what, such as "reflectance by light sensor"; null for raw numbers."""
+    """Conversion of raw numbers, such as `reflectance by panel`; null for raw numbers."""
     crop: tuple[int, int, int, int]
+    """x0, y0, width, height on the reference grid, multiplied by `scale`."""
     scale: tuple[float, float] = (1.0, 1.0)
+    """Output pixels per reference pixel along x and y."""
     nodata: float | str | None
+    """Nodata value of the stack, or common to the single bands; null if they differ; `"nan"` for NaN. 0 if no valid
+    pixel is 0, else a value that does not occur.
+    """
 
 
 class ProductPart(_Part):
-    """A file that was written for the capture, whatever its kind: `stack`, `band`, `picture`, `error_map` …"""
+    """A file written for the capture."""
 
     kind: str
+    """`stack`, `band`, `pan_sharpened`, `relief`, `error_map`, `tie_points`, `picture`, `preview` or `stac_item`."""
     file: RelativeFile
+    """Relative to the folder of the sidecar."""
     bytes: int
+    """Size."""
     sha256: str
+    """Checksum, as `sha256sum` prints it."""
 
 
 class ReliefPreviewPart(_Part):
-    """The relief on the sheet, a picture in the first column of the last row."""
+    """Picture of the relief in the preview: first column, last row."""
 
     parallax_px: tuple[float, float]
-    """What is black and what is white, the nearest, there."""
+    """Parallax shown as black and as white (nearest), px."""
     range_m: tuple[float, float] | None
-    """The nearest and the farthest of the scene, 1st and 99th percentile; null where the range is unknown."""
+    """1st and 99th percentile of the range, m; null if unknown."""
 
 
 class PreviewPart(_Part):
-    """A sheet of small grey pictures of all bands, from which the report composes its views: a column for each band
-    of `bands`, in their order, and rows of the unaligned raw files, of what was written, of a detail of either, and
-    of the expected error where that was written, white for `error_full_px`. The last row has the relief where one
-    displaces the bands.
+    """Preview image of all bands for the report: a column for each of `bands`, and rows of raw files, of what was
+    written, of a detail of either, of the expected error, and of the relief.
     """
 
     file: RelativeFile
+    """Relative to the folder of the sidecar."""
     tile_px: tuple[Count, Count]
-    """(width, height) of a picture in rows 0, 1, 4 and 5, and of a detail in rows 2 and 3,"""
+    """Width and height of a picture in rows 0, 1, 4 and 5."""
     detail_px: tuple[Count, Count]
+    """Width and height of a detail in rows 2 and 3."""
     detail: tuple[float, float, float, float]
-    """x0, y0, width, height of the detail as shares of the picture's sides."""
+    """x0, y0, width, height of the detail, as shares of the image."""
     error_full_px: float | None = None
+    """Expected error shown as white, px."""
     relief: ReliefPreviewPart | None = None
+    """Picture of the relief."""
 
 
 class CaptureResult(_Result):
-    """What became of one capture. `status` is ok where every moving band is aligned, or predicted as well as was asked
-    for.
-    """
+    """Result of one capture."""
 
     schema_: Annotated[Literal["agalign/1"], Field(alias="schema")] = "agalign/1"
+    """Version of this format."""
     agalign: str
+    """Version of the program."""
     capture: RelativeFile
+    """Common part of the file names."""
     capture_id: str
+    """Capture id in the tags."""
     flight_id: str
+    """Flight id in the tags."""
     captured_at: str
+    """Time in the tags, ISO 8601."""
     position: PositionPart | None = None
+    """GPS position."""
     camera: CameraPart
+    """Camera."""
     status: CaptureStatus
+    """`ok`: every moving band is aligned, or predicted within `accept_predicted_px`, and none is missing. `failed`: no
+    moving band is usable. Else `degraded`.
+    """
     missing_bands: list[str]
+    """Bands that other captures of this camera have."""
     reference: ReferencePart
+    """Reference band."""
     bands: Sequence[BandResult]
+    """One entry per band, the reference included."""
     output: OutputPart | None
+    """Written rasters; null if no moving band is usable."""
     preview: PreviewPart | None = None
+    """Preview image."""
     accept_predicted_px: float | None = None
-    """Standard error up to which `status` counts a predicted band as delivered, px; null in older sidecars."""
+    """Standard error up to which a predicted band counts as delivered, px; null in older sidecars."""
     products: list[ProductPart] = []
-    """Every file that was written but the sidecar itself."""
+    """All files written for the capture except the sidecar."""
     not_written: list[str] = []
-    """Kinds of products that could not be written; another run with the same settings does the capture again."""
+    """Kinds of products that could not be written; the next run repeats the capture."""
     settings: str
-    """Fingerprint of the settings that made this; another run with the same need not do it again."""
+    """Fingerprint of options, input files and version; a run with the same fingerprint skips the capture."""
     checksum: str | None = None
-    """SHA-256 of this file's content as `content_checksum` has it; absent in sidecars of older versions."""
+    """SHA-256 of the content as canonical JSON (sorted keys, no spaces) without `checksum` and `seconds`; `agalign
+    verify OUT` compares it.
+    """
 
     @property
     def files(self) -> dict[str, int]:
@@ -350,11 +454,12 @@ class CaptureResult(_Result):
 
 
 class Sidecar(CaptureResult):
-    """One capture, as its sidecar has it."""
+    """One capture, as its sidecar describes it."""
 
     model_config = ConfigDict(extra="forbid")
 
     bands: list[BandPart]
+    """One entry per band, the reference included."""
 
     def result(self) -> CaptureResult:
         """The same without its bands' long tables, of which a season has no need at once."""

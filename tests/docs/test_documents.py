@@ -120,9 +120,9 @@ def test_options_in_the_documents_exist() -> None:
         assert named <= known, page
 
 
-def test_the_table_of_doubts_is_the_programs() -> None:
+def test_generated_tables_are_current() -> None:
     done = subprocess.run(
-        [sys.executable, "tools/issues.py", "--check"], cwd=ROOT, capture_output=True, text=True, check=False,
+        [sys.executable, "tools/pages.py", "--check"], cwd=ROOT, capture_output=True, text=True, check=False,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
