@@ -48,7 +48,6 @@ RUN = {
     "--jobs": "jobs", "--dask": "executor", "--timeout": "timeout_s", "--overwrite": "overwrite",
     "--retry-failed": "retry_failed", "--align-panels": "align_panels",
 }  # fmt: skip
-COMMAND_LINE_ONLY = ("--model", "--quiet", "--verbose", "--log-json")
 
 
 def options(names: dict[str, str], owner: object) -> str:
@@ -60,7 +59,8 @@ def options(names: dict[str, str], owner: object) -> str:
         opposite = " (opposite)" if option == "--each-alone" else ""
         rows.append((f"`{option}`", f"`{name}`{opposite}", kind, f"`{attrgetter(name)(owner)}`", text))
     if isinstance(owner, agalign.RunOptions):
-        for option in COMMAND_LINE_ONLY:
+        command_line_only = of_command.keys() - {*SETTINGS, *DISCOVER, *RUN, "--out"}
+        for option in [o for o in of_command if o in command_line_only]:
             kind, text = of_command[option]
             rows.append((f"`{option}`", "argument `model`" if option == "--model" else "", kind, "", text))
     return table(rows)
