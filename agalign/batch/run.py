@@ -57,6 +57,8 @@ class RunOptions:
     timeout_s: float | None = None
     """After which a capture is given up; it has a process then, whose end ends whatever it hangs in. Not for an
     `executor`, which has its own (`dask_executor`)."""
+    command: str = ""
+    """The command line that asked for the run, for its record and report."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def run_flight(
     if known is not None:
         used = settings.flight.model_copy(update={"start": known.fingerprint})
         settings = settings.model_copy(update={"flight": used})
-    with locked(out), _recorded(flight, out, settings) as tally:
+    with locked(out), _recorded(flight, out, settings, options.command) as tally:
         for report in _reports(flight, out, settings, options, _with_seconds(listener, tally), known):
             tally.add(report.label, report.state, report.result, report.problems)
             if report.state == "done":
@@ -104,12 +106,12 @@ def run_flight(
 
 
 @contextmanager
-def _recorded(flight: FolderScan, out: Path, settings: Settings) -> Iterator[Tally]:
+def _recorded(flight: FolderScan, out: Path, settings: Settings, command: str) -> Iterator[Tally]:
     """A tally that is written at the beginning and at the end of a run, however it ends."""
     tally, began = Tally(), time.monotonic()
     tally.captures["found"] = len(flight.captures)
     tally.problems += [problem_of(str(p.path), p.text) for p in flight.problems]
-    run = begun(flight.folder, settings)
+    run = begun(flight.folder, settings, flight.captures, command)
 
     def write(state: RunState) -> None:
         write_run_record(out, run, tally, state, time.monotonic() - began)

@@ -13,6 +13,7 @@ from agalign.cli.terminal import (
     Quiet,
     Terminal,
     Verbose,
+    command_line,
     examples,
     exits,
     of_alignment,
@@ -315,7 +316,9 @@ def align(
             need_stac()
         load_ahead()
         flight = find_captures(folder, options, terminal)
-        how = RunOptions(overwrite, jobs, align_panels, retry_failed=retry_failed, timeout_s=timeout)
+        how = RunOptions(
+            overwrite, jobs, align_panels, retry_failed=retry_failed, timeout_s=timeout, command=command_line()
+        )
         if dry_run:
             raise typer.Exit(print_plan(flight, target, settings, how, terminal))
         totals = run(flight, target, settings, terminal, how, dask=dask, model=model)

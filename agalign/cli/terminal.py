@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -38,6 +39,11 @@ class Stopped(KeyboardInterrupt):
     def __init__(self, number: int) -> None:
         super().__init__(number)
         self.number = number
+
+
+def command_line() -> str:
+    """What the user typed, as a shell would take it."""
+    return shlex.join(["agalign", *sys.argv[1:]])
 
 
 def shown(text: str) -> str:

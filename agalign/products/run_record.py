@@ -3,8 +3,8 @@
 import os
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -15,7 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
+from agalign.flight.overview import camera_overviews
 from agalign.products.sidecar import CaptureResult, compact_lists
+from agalign.values.capture import Capture
 from agalign.values.files import RUN_FILE, write_text
 from agalign.values.text import harmless
 
@@ -46,6 +48,22 @@ class ProblemPart(_Part):
     problem: str
 
 
+class CameraOverviewPart(_Part):
+    """The captures of one camera, as `agalign info` begins with them."""
+
+    camera: str
+    serial: str
+    captures: int
+    bands: list[str]
+    size_px: tuple[int, int]
+    first_at: str
+    last_at: str
+    height_m: float | None
+    altitude_m: tuple[float, float] | None
+    gsd_m: float | None
+    radiometry: list[str]
+
+
 class RunPart(_Part):
     """One run. `running` is also what a run that was killed has left."""
 
@@ -56,6 +74,9 @@ class RunPart(_Part):
     """ISO 8601, UTC."""
     seconds: float
     input: str
+    command: str = ""
+    """The command line; empty for a run from Python."""
+    cameras: list[CameraOverviewPart] = []
     versions: dict[str, str]
     machine: dict[str, str | int]
     settings: dict[str, Any]
@@ -100,11 +121,13 @@ class Tally:
                 self.refused.append(refusal)
 
 
-def begun(folder: Path, settings: Settings) -> RunPart:
+def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:
     """A run that has just begun."""
+    cameras = [CameraOverviewPart.model_validate(asdict(o)) for o in camera_overviews(captures)]
     return RunPart(
         state="running", started_at=datetime.now(UTC).isoformat(timespec="seconds"), seconds=0.0,
-        input=harmless(str(folder)), versions=_versions(), machine=_machine(settings),
+        input=harmless(str(folder)), command=harmless(command), cameras=cameras, versions=_versions(),
+        machine=_machine(settings),
         settings=settings.model_dump(mode="json"), captures={}, pairs={}, stage_seconds={}, capture_seconds={},
         refused=[], problems=[],
     )  # fmt: skip

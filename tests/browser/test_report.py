@@ -37,7 +37,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
         file.filehandle.seek(file.pages[0].dataoffsets[0])  # type: ignore[union-attr]
         file.filehandle.write(np.full((360, 480), 9, np.uint16).tobytes())
     out = folder / "out"
-    agalign.align_folder(folder / "in", out, settings=Settings(write=WriteSettings(error_map=True)))
+    agalign.align_folder(folder / "in", out, settings=Settings(write=WriteSettings(error_map=True, indices=("ndvi",))))
     sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
     sidecar |= {"capture": "a'b&c\"d", "missing_bands": [HOSTILE], "status": "degraded", "position": None}
     sidecar["camera"]["model"] = HOSTILE
@@ -187,7 +187,11 @@ def test_blinking_and_the_keys_of_the_picture(page: Any) -> None:
     assert np.abs(drawn(page) - near).mean() > 3
     page.keyboard.press("0")
     assert np.abs(drawn(page) - second).mean() < 1
+    assert page.locator("#swipe").is_hidden()
+    page.get_by_role("button", name="Swipe").click()
+    assert page.locator("#swipe").is_visible()
     page.get_by_role("button", name="Blink").click()
+    assert page.locator("#swipe").is_hidden()
     seen = {page.locator("canvas").get_attribute("data-blinking")}
     page.wait_for_timeout(900)
     seen.add(page.locator("canvas").get_attribute("data-blinking"))
@@ -208,6 +212,82 @@ def test_what_is_laid_over_the_picture(page: Any, overlay: str) -> None:
     before = drawn(page)
     page.get_by_label("Overlay", exact=True).select_option("none")
     assert np.abs(drawn(page) - before).mean() < 0.3, "residuals are those of after"
+
+
+def test_cells_of_the_heat_map_leave_no_seams(page: Any) -> None:
+    look_at(page, "IMG_0001")
+    page.locator("#swipe").focus()
+    page.keyboard.press("Home")
+    for channel in ("Red", "Green", "Blue"):
+        page.get_by_label(f"{channel} channel").select_option("Blue")
+    grey = drawn(page)
+    page.get_by_label("Overlay", exact=True).select_option("heat")
+    # Of the picture, whose colours add up to a quarter, nothing else may show: no line twice as dark, none bare.
+    cells = (drawn(page) - 0.25 * grey)[80:-20, 20:-60]
+    saturation = np.ptp(cells, axis=2)
+    lines = np.concatenate([np.median(saturation, axis=0), np.median(saturation, axis=1)])
+    assert lines.min() > 0.5 * np.median(lines)
+    assert lines.max() < 1.1 * np.median(lines)
+
+
+def test_an_index_over_the_picture_and_on_the_map(page: Any) -> None:
+    look_at(page, "IMG_0001")
+    page.locator("#swipe").focus()
+    page.keyboard.press("Home")
+    bare = drawn(page)
+    page.get_by_label("Overlay", exact=True).select_option("index:ndvi")
+    page.wait_for_timeout(300)
+    shown = drawn(page)
+    assert (np.abs(shown - bare).max(axis=2) > 40).mean() > 0.3
+    note = page.locator("#over-note").inner_text()
+    assert "raw numbers, not reflectance" in note
+    assert "-0." in note
+    assert np.ptp(shown[60:], axis=2).mean() < 0.5 * np.ptp(bare[60:], axis=2).mean(), "neutral greys"
+    row = page.locator("#indices tbody tr").inner_text().split("\t")
+    assert row[0] == "NDVI"
+    assert float(row[2]) < float(row[1]) < float(row[3])
+    dots = page.locator("#map circle")
+    before = dots.nth(0).get_attribute("fill")
+    page.locator("#map-colour").select_option("index:ndvi")
+    assert dots.nth(0).get_attribute("fill") != before
+    assert row[1] in page.locator("#map-legend").inner_text()
+    look_at(page, "IMG_0002")  # without NIR there is no index
+    assert page.get_by_label("Overlay", exact=True).input_value() == "none"
+
+
+def test_the_wheel_zooms_and_lets_the_page_scroll_when_all_is_seen(page: Any) -> None:
+    look_at(page, "IMG_0001")
+    page.locator("canvas").scroll_into_view_if_needed()
+    whole = drawn(page)
+    box = page.locator("canvas").bounding_box()
+    page.mouse.move(box["x"] + 300, box["y"] + 200)
+    for _ in range(4):
+        page.mouse.wheel(0, -100)
+    assert np.abs(drawn(page) - whole).mean() > 3
+    for _ in range(6):
+        page.mouse.wheel(0, 100)
+        page.wait_for_timeout(30)
+    page.wait_for_timeout(300)
+    assert page.locator("canvas").bounding_box()["y"] < box["y"], "the rest of the wheel scrolls"
+
+
+def test_the_map_is_saved_as_geojson(page: Any) -> None:
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save as GeoJSON").click()
+    data = json.loads(Path(download.value.path()).read_text())
+    features = {f["properties"]["capture"]: f for f in data["features"]}
+    assert sorted(features) == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
+    first = features["0000SET/000/IMG_0001"]
+    assert first["geometry"]["coordinates"][:2] == pytest.approx([5, 52], abs=0.01)
+    assert first["properties"]["status"] == "ok"
+    assert -1 < first["properties"]["ndvi_median"] < 1
+
+
+def test_the_run_and_the_axes_of_its_charts(page: Any) -> None:
+    run = page.locator("section", has=page.locator("#run-title")).inner_text()
+    assert 'write.indices = ["ndvi"]' in run
+    assert "write.error_map = true" in run
+    assert "2 captures, 5 bands" in run
 
 
 def test_the_relief_over_the_picture(browser: Any, out: Path, tmp_path: Path) -> None:
@@ -245,7 +325,7 @@ def test_the_table_sorts_and_filters(page: Any) -> None:
         return page.locator("#table tbody th").all_inner_texts()
 
     def residuals() -> list[float]:
-        cells = page.locator("#table tbody tr td:nth-child(5)").all_inner_texts()
+        cells = page.locator("#table tbody tr td:nth-child(3)").all_inner_texts()
         return [float(text) for text in cells if text[0].isdigit()]
 
     assert len(labels()) == 3
@@ -345,9 +425,19 @@ def test_it_prints_and_fits_a_telephone(browser: Any, out: Path) -> None:
     page = browser.new_page(viewport={"width": 390, "height": 800})
     page.goto((out / "index.html").as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    heads = page.locator("#table thead th").all_inner_texts()
+    assert [head.split(" ")[0] for head in heads[:3]] == ["Capture", "Status", "Largest"]
+    status = page.locator("#table tbody td").nth(1).bounding_box()
+    assert status["x"] + status["width"] <= 390, "the residual is seen without scrolling"
     page.emulate_media(media="print")
+    page.wait_for_timeout(200)
     assert not page.locator("#find").is_visible()
     assert page.locator("canvas").is_visible()
+    assert page.locator("details.short:not([open])").count() == 0
+    assert not any("IMG_0001" in label for label in page.locator("#table tbody th").all_inner_texts())
+    page.emulate_media(media="screen")
+    page.wait_for_timeout(200)
+    assert page.locator("#table tbody th").count() == 3
     page.close()
 
 

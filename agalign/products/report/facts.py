@@ -107,7 +107,8 @@ class Facts:
                 by_label[label].append({
                     "name": row.index, "median": _finite(known.median), "p5": _finite(known.p5),
                     "p95": _finite(known.p95), "valid": known.valid_share, "span": (known.low, known.high),
-                    "raw": known.unit == RAW, "file": quote(row.file), "picture": quote(f"{row.file[:-4]}.png"),
+                    "unit": known.unit, "raw": known.unit == RAW,
+                    "file": quote(row.file), "picture": quote(f"{row.file[:-4]}.png"),
                 })  # fmt: skip
 
     @property

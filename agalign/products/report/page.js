@@ -14,6 +14,8 @@
  *   residual_px: number | null, residual_p95_px: number | null, coverage: number | null, retrieval: number | null,
  *   corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
  *   prediction: Prediction | null, local: Local | null, occluded: number | null, lattice: number, shifts: (number | null)[]}} Pair
+ * @typedef {{name: string, median: number | null, p5: number | null, p95: number | null, valid: number,
+ *   span: [number, number], unit: string, raw: boolean, file: string, picture: string}} Index
  * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
  *   detail: [number, number, number, number], error_full_px: number | null,
  *   relief: {parallax_px: [number, number], range_m: [number, number] | null} | null}} Preview
@@ -21,7 +23,7 @@
  *   radiometry: string | null, altitude_m: number | null, missing: string[], reference: string, seconds: number,
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
  *   relief: string | null,
- *   picture: string | null, preview: Preview | null, bands: Pair[]}} Capture
+ *   picture: string | null, preview: Preview | null, bands: Pair[], indices: Index[]}} Capture
  * @typedef {{schema: string, captures: Capture[], shift_step_px: number, lattices: number[][]}} Facts
  * @typedef {{column: number, colour: string, inverted?: boolean}} Channel
  * @typedef {"before" | "after"} When
@@ -109,11 +111,11 @@ function address(capture) {
 /** @type {{title: string, numeric: boolean, value: (c: Capture) => string | number | null, cell: (c: Capture) => Node | string}[]} */
 const columns = [
   { title: "Capture", numeric: false, value: (c) => c.label, cell: (c) => el("a", { href: address(c) }, c.label) },
-  { title: "Taken", numeric: false, value: (c) => c.captured_at, cell: (c) => c.captured_at.slice(0, 19).replace("T", " ") },
   { title: "Status", numeric: false, value: (c) => ["failed", "degraded", "ok"].indexOf(c.status), cell: (c) => badge(c.status) },
-  { title: "Bands", numeric: true, value: (c) => moving(c).filter((b) => b.status === "aligned").length / Math.max(1, moving(c).length + c.missing.length), cell: chips },
   { title: "Largest residual, px", numeric: true, value: (c) => worst(c, "residual_px"), cell: (c) => fixed(worst(c, "residual_px"), 3) },
+  { title: "Bands", numeric: true, value: (c) => moving(c).filter((b) => b.status === "aligned").length / Math.max(1, moving(c).length + c.missing.length), cell: chips },
   { title: "Corner error, px", numeric: true, value: (c) => worst(c, "corner_std_px"), cell: (c) => fixed(worst(c, "corner_std_px"), 3) },
+  { title: "Taken", numeric: false, value: (c) => c.captured_at, cell: (c) => c.captured_at.slice(0, 19).replace("T", " ") },
   { title: "Seconds", numeric: true, value: (c) => c.seconds, cell: (c) => c.seconds.toFixed(1) },
 ];
 const table = { sorted: 0, up: true, /** @type {Map<Capture, HTMLTableRowElement>} */ rows: new Map() };
@@ -192,6 +194,10 @@ function tableBody() {
 
 const MAP = { width: 900, height: 420, few: 230, margin: 34 };
 const ONE_PLACE_M = 0.5;
+const INDEX_STOPS = [[38, 70, 148], [120, 74, 40], [214, 190, 120], [250, 245, 170], [90, 180, 80], [0, 90, 40]];
+const NEUTRAL_STOPS = [[20, 20, 20], [245, 245, 245]];
+const MISSING_COLOUR = "#c9a";
+const RAW_NOTE = "Of raw numbers, not reflectance: values of different captures are not comparable.";
 const STATUS_COLOURS = { ok: "#2f9e61", degraded: "#d98a1b", failed: "#d43c3c" };
 /** @type {Map<Capture, Element>} */
 const dots = new Map();
@@ -230,6 +236,7 @@ function drawMap() {
   drawn.append(...scaleBar(scale, width, height));
   place.replaceChildren(drawn);
   const colour = byId("map-colour");
+  for (const name of indexNames()) colour.append(el("option", { value: `index:${name}` }, `median ${name.toUpperCase()}`));
   colour.addEventListener("change", colourMap);
   colourMap();
 }
@@ -256,6 +263,10 @@ function colourMap() {
     legend.replaceChildren(...present.map((s) => el("span", { class: "key", style: `--key:${colourOf(s)}` }, s)));
     return;
   }
+  if (what.startsWith("index:")) {
+    colourByIndex(what.slice(6), legend);
+    return;
+  }
   const values = [...dots.keys()].flatMap((c) => worst(c, /** @type {"residual_px"} */ (what)) ?? []).sort((a, b) => a - b);
   const full = Math.max(values[Math.floor(0.98 * (values.length - 1))] ?? 1, 0.05);
   for (const [c, dot] of dots) {
@@ -264,6 +275,65 @@ function colourMap() {
   }
   const steps = [0, 0.5, 1].map((s) => el("span", { class: "key", style: `--key:${ramp(s)}` }, `${(s * full).toFixed(2)} px${s === 1 ? " and more" : ""}`));
   legend.replaceChildren(...steps, el("span", { class: "key", style: `--key:${STATUS_COLOURS.failed}` }, "no band aligned"));
+}
+
+/**
+ * From the lowest to the highest median of the captures.
+ * @param {string} name @param {HTMLElement} legend
+ */
+function colourByIndex(name, legend) {
+  /** @param {Capture} c */
+  const of = (c) => c.indices.find((i) => i.name === name);
+  const known = [...dots.keys()].flatMap((c) => of(c)?.median ?? []);
+  const [low, high] = [Math.min(...known), Math.max(...known)];
+  const raw = captures.some((c) => of(c)?.raw);
+  for (const [c, dot] of dots) {
+    const value = of(c)?.median ?? null;
+    set(dot, { fill: value === null ? MISSING_COLOUR : medianColour((value - low) / (high - low || 1), raw) });
+  }
+  const steps = known.length ? [0, 0.5, 1].map((s) => el("span", { class: "key", style: `--key:${medianColour(s, raw)}` }, (low + s * (high - low)).toFixed(3))) : [];
+  legend.replaceChildren(...steps, el("span", { class: "key", style: `--key:${MISSING_COLOUR}` }, "no value"), raw ? RAW_NOTE : "");
+}
+
+/** The names of all indices, of whichever captures have them. */
+function indexNames() {
+  return [...new Set(captures.flatMap((c) => c.indices.map((i) => i.name)))];
+}
+
+/**
+ * As agalign/products/index_picture.py has them.
+ * @param {number} share @param {boolean} raw
+ */
+function indexColour(share, raw) {
+  const stops = raw ? NEUTRAL_STOPS : INDEX_STOPS;
+  const at = Math.min(1, Math.max(0, share)) * (stops.length - 1);
+  const k = Math.min(stops.length - 2, Math.floor(at));
+  return `rgb(${stops[k].map((v, i) => Math.round(v + (at - k) * (stops[k + 1][i] - v))).join(" ")})`;
+}
+
+/**
+ * Without the blue of water, as the lowest median of a flight is no water.
+ * @param {number} share @param {boolean} raw
+ */
+function medianColour(share, raw) {
+  return indexColour(raw ? share : 0.2 + 0.8 * share, raw);
+}
+
+/** What the map shows, as a file for a GIS. */
+function saveMap() {
+  const features = captures.filter((c) => c.position !== null).map((c) => ({
+    type: "Feature",
+    geometry: { type: "Point", coordinates: [c.position?.[1], c.position?.[0], ...(c.altitude_m === null ? [] : [c.altitude_m])] },
+    properties: {
+      capture: c.label, captured_at: c.captured_at, camera: c.camera, status: c.status, stack: c.stack,
+      residual_px: worst(c, "residual_px"), corner_std_px: worst(c, "corner_std_px"),
+      ...Object.fromEntries(c.indices.map((i) => [`${i.name}_median`, i.median])),
+    },
+  }));
+  const text = JSON.stringify({ type: "FeatureCollection", features });
+  const link = el("a", { href: URL.createObjectURL(new Blob([text], { type: "application/geo+json" })), download: "captures.geojson" });
+  link.click();
+  window.setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
 /** @param {string} status */
@@ -286,6 +356,8 @@ const LARGEST_ZOOM = 40;
 const FULL_PX = 0.5; // a residual's colour and arrow are full
 const FAR = [25, 35, 150]; // colours of the relief; between them the lightness grows with the parallax
 const NEAR = [205, 250, 45];
+const INDEX_OPACITY = 0.9;
+const INDEX_PICTURE_PX = 720; // longer side of the image in the picture of an index, whose histogram is below it
 const RELIEF_OPACITY = 0.75; // edges of the picture show through
 /** @type {Record<string, string>} */
 const NOTES = {
@@ -310,6 +382,7 @@ const look = {
   zoom: 1, x: 0, y: 0,
   overlay: "none", overlayBand: "",
   /** @type {Record<string, HTMLCanvasElement>} */ composed: {},
+  /** @type {Record<string, HTMLImageElement>} */ indices: {},
 };
 /** @type {HTMLCanvasElement} */
 const stage = el("canvas", { tabindex: 0, role: "img", "aria-label": "The composite before and after" });
@@ -324,6 +397,8 @@ function show(capture) {
   look.capture = capture;
   look.sheet = null;
   look.composed = {};
+  look.indices = {};
+  if (look.overlay.startsWith("index:") && !indexOf(capture)) look.overlay = "none";
   const names = capture.bands.map((b) => b.band);
   if (look.bands === null || look.bands.some((b) => !names.includes(b))) look.bands = presets(capture)[0].bands;
   if (!names.includes(look.overlayBand)) look.overlayBand = moving(capture)[0]?.band ?? "";
@@ -333,7 +408,7 @@ function show(capture) {
   dot?.parentNode?.append(dot); // nothing lies over it
   const place = byId("capture");
   place.hidden = false;
-  place.replaceChildren(...heading(capture), ...pictures(capture), words(capture), numbers(capture));
+  place.replaceChildren(...heading(capture), ...pictures(capture), ...indexTable(capture), words(capture), numbers(capture));
   paint();
 }
 
@@ -387,12 +462,12 @@ function pictures(capture) {
   sheet.addEventListener("error", () => { if (look.capture === capture) byId("tag-right").textContent = "the preview is not there"; });
   sheet.src = capture.preview.file;
   const frame = el("div", { class: "stage" }, stage, el("span", { class: "tag left", id: "tag-left" }), el("span", { class: "tag right", id: "tag-right" }));
-  const swipe = el("input", { type: "range", id: "swipe", min: 0, max: 1000, value: Math.round(look.split * 1000), "aria-label": "How much of the picture is before: the rest is after" });
+  const swipe = el("input", { type: "range", id: "swipe", min: 0, max: 1000, value: Math.round(look.split * 1000), hidden: look.mode !== "swipe", "aria-label": "How much of the picture is before: the rest is after" });
   swipe.addEventListener("input", () => {
     look.split = Number(swipe.value) / 1000;
     setMode("swipe");
   });
-  return [compositeTools(capture), viewTools(capture), el("div", { id: "viewer" }, frame, swipe), el("p", { class: "soft", id: "over-note" }), el("p", { class: "soft hint" }, "Drag the line, or drag the picture. The thin frame is the detail, which is shown at full resolution. On the picture the keys + and − zoom, arrows move, 0 shows all, the space bar changes between before and after.")];
+  return [compositeTools(capture), viewTools(capture), el("div", { id: "viewer" }, frame, swipe), el("p", { class: "soft", id: "over-note" }), el("p", { class: "soft hint" }, "Drag the line, or drag the picture; the wheel zooms. The thin frame is the detail, which is shown at full resolution. On the picture the keys + and − zoom, arrows move, 0 shows all, the space bar changes between before and after.")];
 }
 
 /**
@@ -456,6 +531,7 @@ function viewTools(capture) {
   const overlays = [["none", "nothing"], ["vectors", "residual vectors"], ["heat", "residual heat map"]];
   if (capture.preview?.error_full_px) overlays.push(["error", "error to be expected"]);
   if (capture.preview?.relief) overlays.push(["relief", "relief of all bands"]);
+  for (const index of capture.indices) overlays.push([`index:${index.name}`, index.name.toUpperCase()]);
   line.append(
     choice("Overlay", overlays, look.overlay, (value) => { look.overlay = value; paint(); }, "Overlay"),
     choice("of", moving(capture).map((b) => [b.band, b.band]), look.overlayBand, (value) => { look.overlayBand = value; paint(); }, "Band of the overlay"),
@@ -467,6 +543,7 @@ function viewTools(capture) {
 function setMode(mode) {
   look.mode = mode;
   window.clearInterval(look.timer);
+  byId("swipe").hidden = mode !== "swipe";
   if (mode === "blink") look.timer = window.setInterval(flip, BLINK_MS);
   document.querySelectorAll("#view-tools [data-mode]").forEach((b) => set(b, { "aria-pressed": String(b.getAttribute("data-mode") === mode) }));
   paint();
@@ -616,6 +693,12 @@ function legend(preview) {
   /** @param {string} colour @param {string} text */
   const key = (colour, text) => el("span", { class: "key", style: `--key:${colour}` }, text);
   if (["vectors", "heat"].includes(look.overlay)) return [0, 0.5, 1].map((share) => key(ramp(share), `${(share * FULL_PX).toFixed(2)} px`));
+  const index = look.capture ? indexOf(look.capture) : undefined;
+  if (index) {
+    const [low, high] = index.span;
+    const steps = [0, 0.2, 0.4, 0.6, 0.8, 1].map((s) => key(indexColour(s, index.raw), (low + s * (high - low)).toFixed(2)));
+    return [...steps, el("span", {}, index.raw ? RAW_NOTE : `${index.name.toUpperCase()} of ${index.unit}.`)];
+  }
   if (look.overlay !== "relief" || !preview.relief) return [];
   const [low, high] = preview.relief.parallax_px;
   const keys = [0, 0.5, 1].map((share) => key(reliefColour(share), `${(low + share * (high - low)).toFixed(1)} px`));
@@ -662,6 +745,10 @@ function picture(pen, capture, when, origin, from, width) {
 function over(pen, capture, at) {
   const column = capture.bands.findIndex((b) => b.band === look.overlayBand);
   const pair = capture.bands[column];
+  if (look.overlay.startsWith("index:")) {
+    overIndex(pen, capture, at);
+    return;
+  }
   if (!pair || look.overlay === "none") return;
   if (look.overlay === "error" || look.overlay === "relief") {
     const made = look.overlay === "relief" ? relief(capture) : capture.preview?.error_full_px ? composed(4, [{ column, colour: "#ff5a1f" }]) : null;
@@ -673,6 +760,10 @@ function over(pen, capture, at) {
     return;
   }
   const lattice = facts.lattices[pair.lattice];
+  if (look.overlay === "heat") {
+    overHeat(pen, capture, pair, at);
+    return;
+  }
   const [x0, y0, width, height] = capture.crop;
   const [sx, sy] = capture.scale;
   const apart = 0.5 * nearest(lattice);
@@ -682,14 +773,75 @@ function over(pen, capture, at) {
     const [x, y] = at((sx * (lattice[i] + 0.5) - x0) / width, (sy * (lattice[i + 1] + 0.5) - y0) / height);
     const shift = dx === null || dy === null ? null : [dx * facts.shift_step_px, dy * facts.shift_step_px];
     pen.fillStyle = shift === null ? "#bbb" : ramp(Math.hypot(...shift) / FULL_PX);
-    if (look.overlay === "heat") {
-      if (shift === null) continue;
-      pen.globalAlpha = 0.75;
-      pen.fillRect(x - cell[0], y - cell[1], 2 * cell[0], 2 * cell[1]);
-      continue;
-    }
     arrow(pen, x, y, shift === null ? [0, 0] : shift.map((v, k) => 1.6 * cell[k] * v / Math.max(FULL_PX, Math.hypot(...shift))));
   }
+}
+
+/** @param {Capture} capture The index that the overlay shows. */
+function indexOf(capture) {
+  return capture.indices.find((i) => `index:${i.name}` === look.overlay);
+}
+
+/**
+ * The image of an index, loaded when it is first shown.
+ * @param {CanvasRenderingContext2D} pen @param {Capture} capture @param {(u: number, v: number) => [number, number]} at
+ */
+function overIndex(pen, capture, at) {
+  const index = indexOf(capture);
+  if (!index) return;
+  if (!(index.name in look.indices)) {
+    const image = new Image();
+    image.addEventListener("load", () => { if (look.capture === capture) paint(); });
+    image.src = index.picture;
+    look.indices[index.name] = image;
+  }
+  const image = look.indices[index.name];
+  if (!image.complete || !image.naturalWidth) return;
+  const [, , width, height] = capture.crop;
+  const scale = Math.min(1, INDEX_PICTURE_PX / Math.max(width, height));
+  const [x, y] = at(0, 0);
+  const [right, bottom] = at(1, 1);
+  pen.globalAlpha = INDEX_OPACITY;
+  pen.drawImage(image, 0, 0, Math.max(1, Math.round(width * scale)), Math.max(1, Math.round(height * scale)), x, y, right - x, bottom - y);
+}
+
+/**
+ * A cell for each window, up to the middle between it and the next one, on whole pixels: cells neither overlap nor part.
+ * @param {CanvasRenderingContext2D} pen @param {Capture} capture @param {Pair} pair
+ * @param {(u: number, v: number) => [number, number]} at
+ */
+function overHeat(pen, capture, pair, at) {
+  const lattice = facts.lattices[pair.lattice];
+  const [x0, y0, width, height] = capture.crop;
+  const [sx, sy] = capture.scale;
+  const columns = edges(lattice.filter((_, i) => i % 2 === 0));
+  const rows = edges(lattice.filter((_, i) => i % 2 === 1));
+  /** @param {number} px */
+  const toX = (px) => Math.round(at((sx * (px + 0.5) - x0) / width, 0)[0]);
+  /** @param {number} px */
+  const toY = (px) => Math.round(at(0, (sy * (px + 0.5) - y0) / height)[1]);
+  pen.globalAlpha = 0.75;
+  for (let i = 0; i < lattice.length; i += 2) {
+    const [dx, dy] = [pair.shifts[i], pair.shifts[i + 1]];
+    const [column, line] = [columns.get(lattice[i]), rows.get(lattice[i + 1])];
+    if (dx === null || dy === null || !column || !line) continue;
+    const [left, right, top, bottom] = [toX(column[0]), toX(column[1]), toY(line[0]), toY(line[1])];
+    pen.fillStyle = ramp(Math.hypot(dx, dy) * facts.shift_step_px / FULL_PX);
+    pen.fillRect(left, top, right - left, bottom - top);
+  }
+}
+
+/**
+ * By the place of each window along an axis, where its cell begins and ends.
+ * @param {number[]} places @returns {Map<number, [number, number]>}
+ */
+function edges(places) {
+  const sorted = [...new Set(places)].sort((a, b) => a - b);
+  const steps = sorted.slice(1).map((v, i) => v - sorted[i]).sort((a, b) => a - b);
+  const half = (steps[Math.floor(steps.length / 2)] ?? 64) / 2;
+  /** @param {number} from @param {number | undefined} to @param {number} sign */
+  const edge = (from, to, sign) => (to === undefined || Math.abs(to - from) > 3 * half ? from + sign * half : (from + to) / 2);
+  return new Map(sorted.map((v, i) => [v, [edge(v, sorted[i - 1], -1), edge(v, sorted[i + 1], 1)]]));
 }
 
 /**
@@ -778,10 +930,11 @@ function listenToStage() {
     zoomBy(2, ((event.clientX - box.left) / box.width * (look.mode === "side" ? 2 : 1)) % 1, (event.clientY - box.top) / box.height);
   });
   stage.addEventListener("wheel", (event) => {
-    if (!event.ctrlKey && !event.metaKey) return; // the page scrolls
+    if (event.deltaY > 0 && look.zoom === 1) return; // all is seen: the page scrolls
     event.preventDefault();
     const box = stage.getBoundingClientRect();
-    zoomBy(event.deltaY < 0 ? 1.2 : 1 / 1.2, (event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
+    const across = ((event.clientX - box.left) / box.width * (look.mode === "side" ? 2 : 1)) % 1;
+    zoomBy(event.deltaY < 0 ? 1.2 : 1 / 1.2, across, (event.clientY - box.top) / box.height);
   }, { passive: false });
   stage.addEventListener("keydown", (event) => {
     const act = keys[event.key];
@@ -793,6 +946,17 @@ function listenToStage() {
 }
 
 // ---- a capture in words and in numbers
+
+/** @param {Capture} capture */
+function indexTable(capture) {
+  if (!capture.indices.length) return [];
+  const head = el("tr", {}, ...["Index", "Median", "5th percentile", "95th percentile", "Valid pixels", "Of"].map((text, i) => el("th", { scope: "col", class: i > 0 && i < 5 ? "n" : "" }, text)));
+  const body = capture.indices.map((index) => {
+    const cells = [fixed(index.median, 3), fixed(index.p5, 3), fixed(index.p95, 3), percent(index.valid)];
+    return el("tr", {}, el("th", { scope: "row" }, el("a", { href: index.file }, index.name.toUpperCase())), ...cells.map((text) => el("td", { class: "n" }, text)), el("td", {}, index.unit));
+  });
+  return [el("div", { class: "scroll", id: "indices" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...body)))];
+}
 
 /** @param {Capture} capture */
 function words(capture) {
@@ -857,9 +1021,26 @@ function follow() {
   byId("capture").focus({ preventScroll: true });
 }
 
+/**
+ * On paper: what failed, with its reasons; the table has the captures that are not ok, or all where all are.
+ * @param {boolean} paper
+ */
+function forPaper(paper) {
+  document.querySelectorAll("details.short").forEach((one) => {
+    const details = /** @type {HTMLDetailsElement} */ (one);
+    if (paper) details.dataset["was"] = String(details.open);
+    details.open = paper || details.dataset["was"] === "true";
+  });
+  const failed = captures.filter((c) => c.status !== "ok");
+  if (!paper) tableBody();
+  else if (failed.length) byId("table").querySelector("tbody")?.replaceChildren(...failed.map(row));
+}
+
 tableHead();
 tableBody();
 drawMap();
+document.getElementById("map-save")?.addEventListener("click", saveMap);
+window.matchMedia("print").addEventListener("change", (event) => forPaper(event.matches));
 listenToStage();
 byId("find").addEventListener("input", tableBody);
 byId("only").addEventListener("change", tableBody);

@@ -16,6 +16,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from agalign._version import __version__
+from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.failures import FailureGroup
 from agalign.products.index_table import IndexRow, rows_of_run, update_table
@@ -123,6 +124,8 @@ def _page(
         seconds=_Seconds.of(facts, run),
         failures=facts.failures.groups(),
         problems=[] if run is None else run.problems,
+        settings=_changed_settings(run),
+        run=run,
         unfinished=run is not None and run.state == "interrupted",
         bands=facts.by_band(),
         rigs=rig_views(out, on_problem),
@@ -131,6 +134,19 @@ def _page(
         sky=sky,
         mapped=sum(c.position is not None for c in facts.entries),
     )
+
+
+def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
+    """The settings of a run that are not the defaults, by their Python names."""
+    if run is None:
+        return []
+    defaults = Settings().model_dump(mode="json")
+    return [
+        (f"{stage}.{name}", json.dumps(value, ensure_ascii=False))
+        for stage, values in run.settings.items() if isinstance(values, dict)
+        for name, value in values.items()
+        if value != defaults.get(stage, {}).get(name) and (stage, name) != ("flight", "start")
+    ]  # fmt: skip
 
 
 def _own(name: str) -> str:

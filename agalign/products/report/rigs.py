@@ -67,9 +67,13 @@ class Drift:
 
     camera: str
     full_px: float
-    """What the chart's upper and lower edges stand for."""
+    """The largest distance; 0.92 of the way from the middle to the edges of the chart."""
     captures: int
     lines: tuple[Line, ...]
+    first: str
+    """Label of the first capture,"""
+    last: str
+    """and of the last."""
 
 
 def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
@@ -141,7 +145,7 @@ def _drift(camera: str, captures: Sequence[CaptureEntry], names: Sequence[str]) 
     lines = tuple(
         Line(name, hue_of(number, len(names)), _runs(along[name], full, step)) for number, name in enumerate(names)
     )
-    return Drift(camera, full, len(captures), lines)
+    return Drift(camera, full, len(captures), lines, captures[0].label, captures[-1].label)
 
 
 def _along(offsets: Sequence[tuple[float, float] | None]) -> list[float | None]:
