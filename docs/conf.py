@@ -7,9 +7,12 @@ copyright = "the agalign authors"
 version = release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 myst_heading_anchors = 3
-# Pages lead to files of the repository too, which are no pages; a test holds that they are there.
+# Pages link to files of the repository that are not part of the site; a test checks that they exist.
 suppress_warnings = ["myst.xref_missing"]
 autodoc_typehints = "description"
 exclude_patterns = ["_build"]
+autodoc_member_order = "bysource"
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["doors.css"]
 html_title = f"agalign {__version__}"
