@@ -1,4 +1,4 @@
-# Many flights on one machine: each folder below FLIGHTS that is new or was not finished. A second call goes on.
+# Many flights on one machine: each folder below FLIGHTS that is new or was not finished. A second call resumes.
 #
 #     make -f examples/flights.mk FLIGHTS=season OUT=aligned
 #
@@ -10,7 +10,7 @@ DONE := $(patsubst $(FLIGHTS)/%/,$(OUT)/%.done,$(sort $(wildcard $(FLIGHTS)/*/))
 
 all: $(DONE)
 
-# Exit code 3 is a finished flight in which some bands are not aligned: its name is kept, and make goes on.
+# Exit code 3 is a finished flight in which some bands are not aligned: its name is kept, and make continues.
 $(OUT)/%.done: $(FLIGHTS)/%/
 	@mkdir -p $(OUT)
 	agalign $< -o $(OUT)/$* $(OPTIONS); code=$$?; \

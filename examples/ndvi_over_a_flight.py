@@ -18,6 +18,6 @@ for capture in median.capture:
     here = median.sel(capture=capture)
     print(f"{capture.item()}: {float(here):.3f} at {float(here.latitude):.6f}, {float(here.longitude):.6f}")
 
-# One capture by itself lies on the map where it has a map: .rio is rioxarray's.
+# A single capture is georeferenced if its file is: .rio is rioxarray's.
 one = agalign.open_capture(f"{sys.argv[1]}/{flight.capture.values[0]}.json")
 print(one["NIR"].attrs, one.rio.crs)

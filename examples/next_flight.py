@@ -1,4 +1,4 @@
-"""What one flight has learnt of its camera, used for the next flight of the same camera: nothing is learnt again.
+"""Reuse the network and rig of one flight for the next flight of the same camera, without learning again.
 
 python examples/next_flight.py FIRST SECOND OUT
 """

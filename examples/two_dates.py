@@ -1,4 +1,4 @@
-"""How a field changed between two mosaics: the later one is laid on the earlier one's pixels, then they are subtracted.
+"""Change between two mosaics: the later one is aligned to the earlier one, then they are subtracted.
 
 python examples/two_dates.py EARLIER.tif LATER.tif CHANGE.tif
 """
@@ -22,9 +22,9 @@ with tempfile.TemporaryDirectory() as folder:
     (report,) = run_flight(pair, Path(folder), settings)
     moving = report.sidecar.bands[1]
     if moving.status != "aligned":
-        sys.exit(f"{later} cannot be laid on {earlier}: {moving.reason}")
+        sys.exit(f"{later} cannot be aligned to {earlier}: {moving.reason}")
     apart_px = np.subtract(moving.grid.moving_px, moving.grid.reference_px)
-    print(f"they lay {np.hypot(*np.median(apart_px, axis=0)):.1f} px apart")
+    print(f"offset before alignment: {np.hypot(*np.median(apart_px, axis=0)):.1f} px")
     with rasterio.open(report.path.with_suffix(".tif")) as both:
         change = both.read(moving.place.band_index, masked=True).astype("float32") - both.read(1, masked=True)
         profile = both.profile | {"count": 1, "dtype": "float32", "nodata": np.nan}

@@ -161,11 +161,13 @@ def result_or_problem(result: Callable[[], R], timeout_s: float | None = None) -
     try:
         return result(), ""
     except TimeoutError:
-        problem = f"given up after {timeout_s or 0:g} s, as --timeout asks"
+        problem = f"stopped after {timeout_s or 0:g} s (--timeout)"
     except WorkerDiedError as error:
-        problem = f"its worker process was killed ({error}; out of memory?); run again to do what is left"
+        problem = (
+            f"its worker process was killed ({error}; out of memory?); run again to process the remaining captures"
+        )
     except BrokenExecutor:
-        problem = "the executor lost its processes (out of memory?); run again to do what is left"
+        problem = "the executor lost its processes (out of memory?); run again to process the remaining captures"
     except MemoryError:
         problem = _OUT_OF_MEMORY
     except AgalignError as error:
@@ -173,7 +175,7 @@ def result_or_problem(result: Callable[[], R], timeout_s: float | None = None) -
     except (Exception, CancelledError) as error:
         said = next(iter(str(error).splitlines()), type(error).__name__)
         if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
-            problem = f"the cluster lost it ({said}); run again to do what is left"
+            problem = f"the cluster lost it ({said}); run again to process the remaining captures"
         else:
             problem = f"agalign failed on it ({type(error).__name__}: {said}); please report this"
     return None, problem
@@ -275,8 +277,8 @@ class DaskExecutor(Executor):
         if self._client.status == "running":
             return ""
         return (
-            "the Dask scheduler does not answer any more; what is finished stays, and the same command goes on "
-            "from there"
+            "the Dask scheduler does not answer any more; finished captures are kept, and the same command resumes "
+            "the run"
         )
 
 

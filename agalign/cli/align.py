@@ -59,7 +59,7 @@ Jobs = Annotated[
 Dask = Annotated[
     str | None,
     of_running(
-        help="Address of a Dask scheduler whose workers process the captures, tcp://host:8786; they need the same "
+        help="Address of a Dask scheduler, tcp://host:8786: its workers process the captures and need the same "
         "folders. 'local' starts worker processes here."
     ),
 ]
@@ -103,7 +103,7 @@ def align(
     ignore_metadata: IgnoreMetadata = False,
     include: Annotated[
         list[str] | None,
-        of_input(show_default=False, help="Use only files whose path or name matches this glob; repeatable."),
+        of_input(show_default=False, help="Use only files that match this glob by path or name; repeatable."),
     ] = None,
     exclude: Annotated[
         list[str] | None,

@@ -36,7 +36,7 @@ _EXAMPLES = examples(
     ("agalign indices aligned/ --index ndvi,ndre,savi -o indices/", "three indices, into another folder"),
     ("agalign indices aligned/ --formula 'mine=(N-RE)/(N+RE)'", "a formula of the bands B, G, R, RE and N"),
 )
-_GOES_ON = "interrupted; what is written stays, and the same command goes on from there"
+_GOES_ON = "interrupted; written indices are kept, and the same command resumes the run"
 _RAW_NUMBERS = (
     "the bands are raw numbers, not reflectance: their indices are not comparable between captures or cameras, and are "
     "far from the indices of reflectance; align with --radiometry auto where the camera's tags allow it"

@@ -27,7 +27,7 @@ EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL = 0, 1, 2, 3
 _SIGNALLED = 128
 """What shells add to the number of the signal that ended a program: 130 for the interrupt key, 143 for a request."""
 _PLAIN_WIDTH = 160
-GOES_ON = "interrupted; what is finished stays, and the same command goes on from there"
+GOES_ON = "interrupted; finished captures are kept, and the same command resumes the run"
 _OUT_OF_MEMORY = "out of memory; close other programs or try a smaller image"
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 """As far as the system has them."""

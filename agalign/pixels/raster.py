@@ -144,7 +144,7 @@ def _driver_of(path: Path) -> str:
     try:
         # Opening something else, such as a pipe, would wait forever.
         if not stat.S_ISREG(path.stat().st_mode):
-            raise UnreadableFileError(f"{path}: is no file; take it out of the folder")
+            raise UnreadableFileError(f"{path}: is not a regular file; remove it from the folder")
         with path.open("rb") as file:
             head = file.read(4)
     except FileNotFoundError:

@@ -149,7 +149,7 @@ class JointPart(_Part):
     loss: float | None
     """Final loss; null if nothing was learned."""
     retrieval: float
-    """Share of held-out patches whose nearest descriptor in the other band is their own."""
+    """Share of held-out patches with their true counterpart as nearest descriptor in the other band."""
     chance: float
     """Retrieval expected by chance."""
     iterations: int

@@ -267,7 +267,7 @@ class ProcessPool(Generic[A, R]):
         if self._deaths >= _MAX_DEATHS:
             self._given_up = (
                 f"{_MAX_DEATHS} worker processes one after another ended before they finished anything (the last by "
-                f"{error}; out of memory?); what is finished stays; try again with fewer --jobs"
+                f"{error}; out of memory?); finished captures are kept; try again with fewer --jobs"
             )
         if task is None:
             return []

@@ -93,8 +93,9 @@ def test_a_process_killed_twice_costs_its_capture(flight: Path, tmp_path: Path) 
         reports = {r.label: r for r in done_in(pool, [deadly, *tasks[1:]])}
     lost = reports.pop(capture.capture.label)
     assert (lost.state, lost.error) == (
-        "error", "its worker process was killed (signal 9; out of memory?); run again to do what is left",
-    )  # fmt: skip
+        "error",
+        "its worker process was killed (signal 9; out of memory?); run again to process the remaining captures",
+    )
     assert [r.state for r in reports.values()] == ["done"] * (len(tasks) - 1)
 
 
@@ -103,7 +104,7 @@ def test_a_stopped_process_is_told_as_late(flight: Path, tmp_path: Path) -> None
     deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", 1, signal.SIGSTOP))
     with own_processes(1) as pool:
         reports = {r.label: r for r in done_in(pool, [deadly, *tasks[1:]], timeout_s=10)}
-    assert reports.pop(capture.capture.label).error == "given up after 10 s, as --timeout asks"
+    assert reports.pop(capture.capture.label).error == "stopped after 10 s (--timeout)"
     assert [r.state for r in reports.values()] == ["done"] * (len(tasks) - 1)
 
 
@@ -114,7 +115,7 @@ def test_an_executor_that_loses_its_processes_costs_the_captures(flight: Path, t
     with ProcessPoolExecutor(1, get_context("spawn")) as executor:
         reports = list(done_by(lambda task: executor.submit(do_capture, task), [deadly, capture, capture], 1))
     assert {r.error for r in reports} == {
-        "the executor lost its processes (out of memory?); run again to do what is left"
+        "the executor lost its processes (out of memory?); run again to process the remaining captures"
     }
 
 
@@ -196,7 +197,7 @@ def test_a_lost_dask_scheduler_ends_the_run_in_one_line(
             future.set_running_or_notify_cancel()
         return future
 
-    with pytest.raises(WorkerError, match=r"^the Dask scheduler does not answer any more; what is finished stays"):
+    with pytest.raises(WorkerError, match=r"^the Dask scheduler does not answer any more; finished captures are kept"):
         list(done_by(submit, seeds_only(flight, tmp_path), 1, loss=executor.loss))
 
 

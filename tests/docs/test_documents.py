@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+import agalign
+
 from ..conftest import REAL_DATA
 from .blocks import PAGES, ROOT, Block, blocks_of, commands_of, program
 
@@ -137,4 +139,6 @@ def test_the_site_is_built(tmp_path: Path) -> None:
         capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "fixed_to_moving" in (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
+    page = (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
+    described = set(re.findall(r'descname"><span class="pre">(\w+)<', page))
+    assert set(agalign.__all__) - {"__version__"} <= described

@@ -21,7 +21,7 @@ DISCOURAGED = re.compile(
     re.IGNORECASE | re.VERBOSE,
 )
 MAX_IN_DOCUMENTS = 5
-MAX_IN_PACKAGE = 9999
+MAX_IN_PACKAGE = 270
 
 
 def count(paths: list[Path]) -> tuple[int, str]:

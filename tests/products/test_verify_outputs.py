@@ -48,7 +48,7 @@ def test_missing_and_strange_files_are_named(out: Path) -> None:
     (out / "IMG_1.tif").unlink()
     assert problems(out) == ["IMG_1.tif: cannot be read (No such file or directory); run again"]
     os.mkfifo(out / "IMG_1.tif")
-    assert problems(out) == ["IMG_1.tif: cannot be read (it is no regular file); run again"]
+    assert problems(out) == ["IMG_1.tif: cannot be read (it is not a regular file); run again"]
 
 
 def test_a_sidecar_that_cannot_be_read_stops_no_other(out: Path) -> None:

@@ -132,7 +132,7 @@ def test_what_another_process_writes_stays(tmp_path: Path) -> None:
 def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path, Path("/dev/null")):
-        with pytest.raises(OSError, match="no regular file"):
+        with pytest.raises(OSError, match="not a regular file"):
             open_regular(path)
     (tmp_path / "file").write_bytes(b"x")
     with open_regular(tmp_path / "file") as file:
