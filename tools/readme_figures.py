@@ -1,8 +1,10 @@
-"""The pictures of the README, made by the demo: before and after, and the report in a browser.
+"""The pictures of the README: before and after of the demo and of a real capture, and the report in a browser.
 
-    python tools/readme_figures.py [DEMO]        # a demo that was run before, else one is run
+    python tools/readme_figures.py [DEMO [ALIGNED]]
 
-Writes docs/figures/demo.jpg and report.jpg; the second wants playwright and a Chromium.
+DEMO is the output of an earlier `agalign demo`, else one is run. ALIGNED is the output of a run on the row crop
+(`DATA/flights/rededge_m_rowcrop`). Writes demo.jpg, report.jpg and, with ALIGNED, row-crop.jpg to docs/figures; the
+report wants playwright and a Chromium.
 """
 
 import shutil
@@ -26,6 +28,9 @@ def main() -> None:
         aligned = demo / "aligned"
         picture = Image.open(aligned / "0000SET" / "000" / "IMG_0001.png").convert("RGB")
         smaller(picture).save(FIGURES / "demo.jpg", quality=78, optimize=True)
+        if len(sys.argv) > 2:
+            real = Image.open(Path(sys.argv[2]) / "IMG_0009.png").convert("RGB")
+            smaller(real).save(FIGURES / "row-crop.jpg", quality=78, optimize=True)
         with sync_playwright() as playwright:
             path = shutil.which("chromium") or shutil.which("google-chrome")
             browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])

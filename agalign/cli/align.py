@@ -9,6 +9,7 @@ import typer
 from agalign.cli.config_file import load_config
 from agalign.cli.terminal import (
     GOES_ON,
+    RAW_NUMBERS,
     LogJson,
     Quiet,
     Terminal,
@@ -319,6 +320,8 @@ def align(
         how = RunOptions(
             overwrite, jobs, align_panels, retry_failed=retry_failed, timeout_s=timeout, command=command_line()
         )
+        if index and radiometry == "off" and any(b.dtype[0] in "ui" for c in flight.captures for b in c.bands):
+            terminal.problem(RAW_NUMBERS)
         if dry_run:
             raise typer.Exit(print_plan(flight, target, settings, how, terminal))
         totals = run(flight, target, settings, terminal, how, dask=dask, model=model)

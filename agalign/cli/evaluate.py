@@ -91,7 +91,7 @@ def surface(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
-    """The training loss over misalignments of a pair (the paper's Fig. 2), as a picture."""
+    """Draw the training loss over misalignments of a pair, as in the second figure of the paper."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
         check_address_space()

@@ -14,6 +14,7 @@ from agalign.cli.terminal import (
     EXIT_NOTHING,
     EXIT_OK,
     EXIT_PARTIAL,
+    RAW_NUMBERS,
     LogJson,
     Quiet,
     Terminal,
@@ -37,10 +38,6 @@ _EXAMPLES = examples(
     ("agalign indices aligned/ --formula 'mine=(N-RE)/(N+RE)'", "a formula of the bands B, G, R, RE and N"),
 )
 _GOES_ON = "interrupted; written indices are kept, and the same command resumes the run"
-_RAW_NUMBERS = (
-    "the bands are raw numbers, not reflectance: their indices are not comparable between captures or cameras, and are "
-    "far from the indices of reflectance; align with --radiometry auto where the camera's tags allow it"
-)
 
 
 def register(app: typer.Typer) -> None:
@@ -78,7 +75,7 @@ def indices(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:  # fmt: skip
-    """Spectral indices of aligned captures: a raster and a picture each, and their statistics in indices.csv."""
+    """Calculate spectral indices of aligned captures: rasters, pictures and a table of statistics."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal, _GOES_ON):
         from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run
@@ -91,7 +88,7 @@ def indices(
         tasks = index_tasks(out, chosen, folder, overwrite=overwrite)
         announced = unit_of_run(tasks) == RAW
         if announced:
-            terminal.problem(_RAW_NUMBERS)
+            terminal.problem(RAW_NUMBERS)
         with locked(folder), _cluster(dask, jobs) as executor, _progress(terminal, len(tasks)) as show:
             reports: list[IndexReport] = []
             for done in run_indices(tasks, IndexOptions(overwrite, jobs, executor)):
@@ -104,7 +101,7 @@ def indices(
                 _rebuild_report(out, terminal)
         written = [r for r in reports if r.path is not None]
         if any(r.raw_numbers for r in written) and not announced:
-            terminal.problem(_RAW_NUMBERS)
+            terminal.problem(RAW_NUMBERS)
         if as_json:
             typer.echo(json.dumps({"folder": str(folder), "indices": [_facts(r) for r in reports]}, indent=1))
         elif written:

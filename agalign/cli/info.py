@@ -58,7 +58,7 @@ def info(
         bool, typer.Option("--options", help="Print a file of all options of 'agalign align', for its --config.")
     ] = False,
 ) -> None:
-    """Show what was found: cameras, captures, bands, seeds, and what is missing; of a model, the rig that it knows."""
+    """Show the cameras, captures and bands of a folder, and what is missing; or the rig of a model."""
     terminal = Terminal(quiet=False, verbose=False, log_json=False)
     with exits(terminal):
         if options:

@@ -28,6 +28,10 @@ _SIGNALLED = 128
 """What shells add to the number of the signal that ended a program: 130 for the interrupt key, 143 for a request."""
 _PLAIN_WIDTH = 160
 GOES_ON = "interrupted; finished captures are kept, and the same command resumes the run"
+RAW_NUMBERS = (
+    "the bands are raw numbers, not reflectance: their indices are not comparable between captures or cameras, and are "
+    "far from the indices of reflectance; align with --radiometry auto where the camera's tags allow it"
+)
 _OUT_OF_MEMORY = "out of memory; close other programs or try a smaller image"
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 """As far as the system has them."""

@@ -8,6 +8,7 @@ from synthetic_flights.aligned import make_aligned
 from typer.testing import CliRunner
 
 from agalign.cli.main import app
+from agalign.synthetic import flight as synthetic
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -56,3 +57,12 @@ def test_wrong_indices_are_usage_errors_of_one_line(tmp_path: Path, options: lis
     assert done.exit_code == 2
     (line,) = done.stderr.splitlines()
     assert problem in line
+
+
+def test_a_run_announces_indices_of_raw_numbers_too(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path / "in", captures=1, size_px=(160, 120))
+    said = [
+        CliRunner().invoke(app, ["align", str(tmp_path / "in"), "--index", "ndvi", "--dry-run", *options]).stderr
+        for options in ([], ["--radiometry", "auto"])
+    ]
+    assert ["raw numbers, not reflectance" in text for text in said] == [True, False]
