@@ -113,6 +113,12 @@ class WriteSettings(Stage):
     """One file a capture, one for each of its files, or both."""
     resolution: Resolution = "reference"
     """The reference's own pixels, or as many more as the finest band has."""
+    georeference: bool = False
+    """Give rasters of single captures an approximate georeference, by position, altitude, yaw and focal length."""
+    ground_elevation_m: float | None = None
+    """Of the ground, in the altitudes of the camera's GPS: for heights where neither tags nor a panel give them."""
+    qa: bool = False
+    """A raster of quality flags next to them."""
     stac: bool = False
     """A STAC item beside each capture's files."""
     indices: tuple[str, ...] = ()

@@ -36,7 +36,8 @@ SETTINGS = {
     "--resolution": "write.resolution", "--layout": "write.layout", "--radiometry": "write.radiometry",
     "--panel-albedo": "write.panel_albedo", "--index": "write.indices", "--pan-sharpen": "write.pan_sharpen",
     "--error-map": "write.error_map", "--relief-map": "write.relief_map", "--fill-occluded": "write.fill_occluded",
-    "--tie-points": "write.tie_points", "--stac": "write.stac", "--format": "write.format",
+    "--tie-points": "write.tie_points", "--qa": "write.qa", "--georeference": "write.georeference",
+    "--ground-elevation": "write.ground_elevation_m", "--stac": "write.stac", "--format": "write.format",
     "--compression": "write.compression",
 }  # fmt: skip
 DISCOVER = {

@@ -46,6 +46,8 @@ class IndexTask:
     """The folder that the indices are written below: `out`, unless another one was given."""
     indices: tuple[Index, ...]
     overwrite: bool
+    mask_qa: bool = False
+    """Leave out the pixels that the quality raster flags as unusable."""
 
     @property
     def folder(self) -> Path:
@@ -66,9 +68,11 @@ class CaptureIndices:
     rows: Sequence[IndexRow] = ()
 
 
-def index_tasks(out: Path, indices: Sequence[Index], target: Path, *, overwrite: bool = False) -> list[IndexTask]:
+def index_tasks(
+    out: Path, indices: Sequence[Index], target: Path, *, overwrite: bool = False, mask_qa: bool = False
+) -> list[IndexTask]:
     """Return a task for each capture of a run. Raises InputError where there is no run."""
-    return [IndexTask(out, path, target, tuple(indices), overwrite) for path in run_sidecars(out)]
+    return [IndexTask(out, path, target, tuple(indices), overwrite, mask_qa) for path in run_sidecars(out)]
 
 
 def unit_of_run(tasks: Sequence[IndexTask]) -> str:
@@ -105,7 +109,7 @@ def do_indices(task: IndexTask) -> CaptureIndices:
     except AgalignError as error:
         return _failed(task, str(error))
     try:
-        bands = bands_of(sidecar, task.sidecar.parent)
+        bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
         reports = write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)
     except AgalignError as error:
         reports = list(_failed(task, str(error)).reports)

@@ -26,6 +26,8 @@ from agalign.flight.panels import PanelReading, read_panel, reflectance_factors,
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
+from agalign.products.flight_map import FlightMap
+from agalign.products.footprint import above_elevation, with_approximate_georeference
 from agalign.products.index_product import check_indices
 from agalign.products.panels import write_panels
 from agalign.products.preview import preview_bytes
@@ -139,25 +141,30 @@ def _reports(
     known: FlightModel | None,
 ) -> Iterator[CaptureReport]:  # fmt: skip
     sky, captures = _sky(flight.captures, options)
+    on_map = FlightMap(out)
     for left_out, told in zip(sky, write_sky(sky, out), strict=True):
         discard_outputs(left_out.capture, out, settings.write)
+        on_map.add(left_out.capture, "sky")
         yield CaptureReport(left_out.capture.label, "sky", sky=told.sentence)
     panels, captures = _panels(captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
         if not reading.capture.is_of_a_panel:
             continue
         discard_outputs(reading.capture, out, settings.write)
+        on_map.add(reading.capture, "panel")
         yield CaptureReport(reading.capture.label, "panel", panel=part.sentence)
     left: list[tuple[Sequence[Capture], str, list[Capture]]] = []
+    captures = [_calibrated(capture, panels, settings.write) for capture in captures]
+    _need_georeference(captures, settings.write)
     groups = flights_of(captures)
     for group, name in zip(groups, model_names(groups), strict=True):
         mine = []
-        for raw in group:
-            capture = _calibrated(raw, panels, settings.write)
+        for capture in group:
             kept = _kept(capture, out, settings, options)
             if kept is None:
                 mine.append(capture)
             else:
+                on_map.add(capture, kept.status, kept)
                 yield CaptureReport(capture.label, "kept", kept, CapturePaths.of(capture, out).sidecar)
         if mine:
             left.append((group, name, mine))
@@ -169,7 +176,12 @@ def _reports(
         for whole, name, mine in left:
             path = _learn(whole, out / "models" / name, settings, listener, known, min(_MAX_THREADS, cores))
             tasks += [Task(c, out, settings, path, preview_bytes(len(flight.captures))) for c in mine]
-        yield from runner.reports(tasks)
+        by_label = {c.label: c for c in captures}
+        for report in runner.reports(tasks):
+            status = "failed" if report.result is None else report.result.status
+            on_map.add(by_label[report.label], status, report.result)
+            yield report
+    on_map.write()
     if settings.write.stac:
         write_collections(captures, out)
 
@@ -193,9 +205,23 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
 
 
 def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
-    """The capture with the radiometry to be written, and its height above the ground where a panel shows it."""
+    """The capture with the radiometry to be written, its height above the ground where the ground's elevation or a
+    panel shows it, and the georeference that this allows where it was asked for.
+    """
     capture = with_radiometry(capture, settings.radiometry, reflectance_factors(capture, panels))
-    return with_height(capture, panels)
+    if settings.ground_elevation_m is not None:
+        capture = above_elevation(capture, settings.ground_elevation_m)
+    capture = with_height(capture, panels)
+    return with_approximate_georeference(capture) if settings.georeference else capture
+
+
+def _need_georeference(captures: Sequence[Capture], settings: WriteSettings) -> None:
+    """Raise ConfigurationError where an approximate georeference was asked for and no capture can have one."""
+    if settings.georeference and captures and all(c.reference.georeference is None for c in captures):
+        raise ConfigurationError(
+            "--georeference: no capture has position, altitude, yaw and focal length in its tags, and a height above "
+            "the ground; where only the height is missing, give --ground-elevation"
+        )
 
 
 def _kept(capture: Capture, out: Path, settings: Settings, options: RunOptions) -> CaptureResult | None:

@@ -197,6 +197,25 @@ def align(
             help="Also write spectral indices, names separated by commas: ndvi, ndre …; 'agalign indices' adds others.",
         ),
     ] = None,
+    georeference: Annotated[
+        bool,
+        of_output(
+            "--georeference",
+            help="Give the rasters an approximate georeference from GPS, altitude and yaw; tags state how accurate.",
+        ),
+    ] = False,
+    ground_elevation: Annotated[
+        float | None,
+        of_output(
+            show_default=False,
+            help="Elevation of the ground, m, as the camera's GPS measures altitude: for footprints where the tags "
+            "contain no height above ground.",
+        ),
+    ] = None,
+    qa: Annotated[
+        bool,
+        of_output("--qa", help="Write a raster of quality flags (saturated, occluded, glint …), <capture>.qa.tif."),
+    ] = False,
     stac: Annotated[
         bool, of_output("--stac", help="Write a STAC item per capture and a collection per flight.")
     ] = False,
@@ -305,7 +324,7 @@ def align(
                 radiometry=radiometry, panel_albedo=albedos(panel_albedo), stac=stac,
                 indices=tuple(name.lower() for name in band_names(index)), error_map=error_map, tie_points=tie_points,
                 relief_map=relief_map, fill_occluded=fill_occluded,
-                pan_sharpen=pan_sharpen,
+                pan_sharpen=pan_sharpen, georeference=georeference, ground_elevation_m=ground_elevation, qa=qa,
                 format=format, compression=compression,
             ),
         )  # fmt: skip

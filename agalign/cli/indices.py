@@ -65,6 +65,10 @@ def indices(
         Path | None,
         of_output("-o", "--out", help="Folder for the rasters; by default next to the stacks.", show_default=False),
     ] = None,
+    mask_qa: Annotated[
+        bool,
+        of_output("--mask-qa", help="Leave out saturated, occluded, glint … pixels; the run needs --qa."),
+    ] = False,
     jobs: Jobs = 0,
     dask: Dask = None,
     overwrite: Annotated[
@@ -85,7 +89,7 @@ def indices(
 
         chosen = chosen_indices(index, formula or [])
         folder = target or out
-        tasks = index_tasks(out, chosen, folder, overwrite=overwrite)
+        tasks = index_tasks(out, chosen, folder, overwrite=overwrite, mask_qa=mask_qa)
         announced = unit_of_run(tasks) == RAW
         if announced:
             terminal.problem(RAW_NUMBERS)

@@ -104,7 +104,9 @@ def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
         if r.capture.is_of_a_panel and r.capture.position is not None and r.capture.position.altitude_m is not None
     ]  # fmt: skip
     height_m = position.altitude_m - min(panels) + _PANEL_HEIGHT_M if panels else 0.0
-    return replace(capture, pose=replace(pose, height_m=height_m)) if height_m > _MIN_HEIGHT_M else capture
+    if height_m <= _MIN_HEIGHT_M:
+        return capture
+    return replace(capture, pose=replace(pose, height_m=height_m, height_from="panel"))
 
 
 def _of_the_same_outing(readings: Iterable[PanelReading], time_s: float) -> list[tuple[float, PanelReading]]:

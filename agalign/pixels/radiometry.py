@@ -70,14 +70,22 @@ def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mappin
 def _chosen(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: float | None) -> Radiometry | None:
     if of_camera is None or not of_camera.is_of_light or choice == "camera":
         return of_camera
-    told: tuple[float, Quantity] | None = of_camera.by_sun
-    if choice == "panel":
-        told = None if by_panel is None else (by_panel, "reflectance")
-    if told is None:
+    if choice == "sun":
+        return to_reflectance(of_camera)
+    return None if by_panel is None else _reflectance(of_camera, by_panel, "reflectance", "panel")
+
+
+def to_reflectance(radiometry: Radiometry) -> Radiometry | None:
+    """What gives reflectance: the radiometry itself where it does, else with the light sensor; None for neither."""
+    if radiometry.quantity in ("reflectance", "relative reflectance"):
+        return radiometry
+    if not radiometry.is_of_light or radiometry.by_sun is None:
         return None
-    factor, quantity = told
-    source: RadiometrySource = "panel" if choice == "panel" else "light sensor"
-    return replace(of_camera, gain=of_camera.gain * factor, quantity=quantity, source=source, by_sun=None)
+    return _reflectance(radiometry, *radiometry.by_sun, "light sensor")
+
+
+def _reflectance(radiance: Radiometry, factor: float, quantity: Quantity, source: RadiometrySource) -> Radiometry:
+    return replace(radiance, gain=radiance.gain * factor, quantity=quantity, source=source, by_sun=None)
 
 
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:

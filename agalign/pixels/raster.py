@@ -260,6 +260,11 @@ def crs_code(crs_wkt: str) -> str | None:
     return None if authority is None else ":".join(authority)
 
 
+def crs_wkt(code: str) -> str:
+    """WKT of a coordinate reference system such as EPSG:32613."""
+    return str(rasterio.CRS.from_user_input(code).to_wkt())
+
+
 def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDArray[np.float64]:
     """(n, 2) map positions, x or longitude first, in another coordinate reference system (WKT or EPSG:number).
 

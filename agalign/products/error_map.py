@@ -13,7 +13,7 @@ from agalign.products.raster_file import GEOTIFF, write_layers
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
-from agalign.values.image import OutputGrid
+from agalign.values.image import OutputGrid, Tile
 from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.expected_error import expected_error_px
 
@@ -64,10 +64,16 @@ def error_lattice_px(
     return np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
 
 
-def _error_px(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
-    """(height, width): linear between the nodes of a lattice."""
-    nodes = error_lattice_px(alignment, size_px, grid)
+def error_on_tile(nodes: NDArray[np.float32], grid: OutputGrid, tile: Tile) -> NDArray[np.float32]:
+    """Return the expected error (height, width) on a tile of a grid, linear between the nodes of `error_lattice_px`."""
     rows, columns = nodes.shape
     at_x, at_y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in ((columns, grid.width), (rows, grid.height)))
-    result = cv2.remap(nodes, *np.meshgrid(at_x, at_y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    x0, y0 = tile.x0 - grid.x0, tile.y0 - grid.y0
+    crossings = np.meshgrid(at_x[x0 : x0 + tile.width], at_y[y0 : y0 + tile.height])
+    return np.asarray(cv2.remap(nodes, *crossings, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+
+
+def _error_px(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
+    """(height, width): linear between the nodes of a lattice."""
+    result = error_on_tile(error_lattice_px(alignment, size_px, grid), grid, grid.tile)
     return np.asarray(np.round(result / _STEP_PX) * _STEP_PX, np.float32)

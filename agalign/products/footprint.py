@@ -1,19 +1,28 @@
 """Where a capture is on the ground: by its georeference, or by the camera's position, height and direction."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.errors import GeometryError
-from agalign.pixels.raster import transformed
+from agalign.pixels.raster import crs_wkt, transformed
 from agalign.values import geometry
-from agalign.values.capture import Capture, Position
+from agalign.values.capture import Capture, Georeference, HeightSource, Position
 from agalign.values.image import OutputGrid
 
 _WGS84 = "EPSG:4326"
 _MAX_TILT_DEG = 45.0
 """A camera that looks farther aside has no useful footprint, and often a wrong tag."""
+_MAX_ASSUMED_HEIGHT_M = 120.0
+"""Most countries allow drones no more above the ground."""
+_MIN_HEIGHT_M = 1.0
+_POSITION_ERROR_M, _HEADING_ERROR_DEG, _TILT_ERROR_DEG, _UNKNOWN_TILT_DEG = 3.0, 5.0, 2.0, 7.0
+"""1 sigma: of a GPS receiver without corrections, of a compass in an aircraft, of a gimbal or an attitude sensor, and
+of a camera that is fixed to an aircraft of unknown attitude."""
+_HEIGHT_ERROR_M, _ASSUMED_HEIGHT_ERROR = 5.0, 0.5
+"""1 sigma: of a barometer over uneven ground, and the share of an assumed height."""
 
 
 def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
@@ -57,6 +66,82 @@ def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.flo
     ahead_m, aside_m = pose.height_m * ahead / below, pose.height_m * aside / below
     east = aside_m * np.cos(heading) + ahead_m * np.sin(heading)
     return np.stack([east, ahead_m * np.cos(heading) - aside_m * np.sin(heading)], axis=-1)
+
+
+def above_elevation(capture: Capture, ground_elevation_m: float) -> Capture:
+    """The capture with its height above ground of a known elevation, where neither tags nor a panel give a height."""
+    height_m = _altitude_m(capture) - ground_elevation_m
+    return _with_height(capture, height_m, "ground elevation")
+
+
+def with_assumed_height(capture: Capture) -> Capture:
+    """The capture with the largest height above the ground that is likely, where none is known: the altitude above sea
+    level, at most what most countries allow.
+    """
+    return _with_height(capture, min(_altitude_m(capture), _MAX_ASSUMED_HEIGHT_M), "assumed")
+
+
+def with_approximate_georeference(capture: Capture) -> Capture:
+    """The capture with an affine georeference of its reference in UTM, where it has none and its height is known.
+
+    The terrain is taken as a horizontal plane, lens distortion is neglected, and `accuracy_m` is set.
+    """
+    reference, position = capture.reference, capture.position
+    width, height = reference.size_px
+    corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+    offsets_m = ground_m(capture, corners - 0.5)
+    if reference.georeference is not None or offsets_m is None or position is None:
+        return capture
+    zone = min(int((position.longitude + 180) // 6), 59) + 1
+    crs = crs_wkt(f"EPSG:{(32600 if position.latitude >= 0 else 32700) + zone}")
+    try:
+        on_map = transformed(offsets_m, _local_crs(position), crs)
+    except GeometryError:
+        return capture
+    design = np.column_stack([corners, np.ones(4)])
+    affine, *_ = np.linalg.lstsq(design, on_map - on_map[0], rcond=None)
+    off_m = float(np.abs(design @ affine - (on_map - on_map[0])).max())
+    transform = np.vstack([affine.T, [0.0, 0.0, 1.0]])
+    transform[:2, 2] += on_map[0]
+    accuracy_m = accuracy_of_footprint_m(capture)
+    assert accuracy_m is not None
+    georeference = Georeference(transform, crs, round(math.hypot(accuracy_m, off_m), 1))
+    bands = tuple(replace(b, georeference=georeference) if b is reference else b for b in capture.bands)
+    return replace(capture, bands=bands)
+
+
+def accuracy_of_footprint_m(capture: Capture) -> float | None:
+    """Return the expected error (1 sigma, metres) of the farthest corner of a footprint that `ground_m` gives: of the
+    camera's position, heading, tilt and height. None where `ground_m` gives none.
+    """
+    width, height = capture.reference.size_px
+    offsets_m = ground_m(capture, np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width, height], [-0.5, height]]))
+    pose = capture.pose
+    if offsets_m is None or pose is None or pose.height_m is None:
+        return None
+    reach_m = float(np.linalg.norm(offsets_m, axis=1).max())
+    slope = reach_m / pose.height_m
+    tilt_deg = _TILT_ERROR_DEG if pose.pitch_deg or pose.roll_deg else _UNKNOWN_TILT_DEG
+    of_height_m = _ASSUMED_HEIGHT_ERROR * pose.height_m if pose.height_from == "assumed" else _HEIGHT_ERROR_M
+    errors_m = (
+        _POSITION_ERROR_M,
+        math.radians(_HEADING_ERROR_DEG) * reach_m,
+        math.radians(tilt_deg) * pose.height_m * (1 + slope**2),
+        of_height_m * slope,
+    )
+    return round(math.hypot(*errors_m), 1)
+
+
+def _altitude_m(capture: Capture) -> float:
+    position = capture.position
+    return math.nan if position is None or position.altitude_m is None else position.altitude_m
+
+
+def _with_height(capture: Capture, height_m: float, source: HeightSource) -> Capture:
+    pose = capture.pose
+    if pose is None or pose.height_m is not None or not height_m > _MIN_HEIGHT_M:
+        return capture
+    return replace(capture, pose=replace(pose, height_m=height_m, height_from=source))
 
 
 def _local_crs(position: Position) -> str:

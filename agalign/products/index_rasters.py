@@ -27,6 +27,7 @@ from agalign.products.raster_file import PixelChecksums, check_complete
 from agalign.products.sidecar import CaptureResult, find_sidecars, read_result
 from agalign.values.files import complete_file
 from agalign.values.image import FloatImage
+from agalign.values.quality import UNUSABLE
 
 RAW = "raw numbers"
 _TILE_PX = 256
@@ -41,6 +42,9 @@ _MAX_STATISTICS_PX = 4_000_000
 """Percentiles of larger rasters are those of every second, third … pixel."""
 _MIN_SPAN = 1e-3
 _STATISTICS = "INDEX_STATISTICS"
+_KEPT_TAGS = (
+    "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M",
+)  # fmt: skip
 
 Source = tuple[rasterio.DatasetReader, int]
 """A file and the index of a band in it."""
@@ -96,6 +100,8 @@ class IndexBand:
     sha256: str = ""
     """Of the file, where it is known."""
     problem: str = ""
+    quality: tuple[Path, int, str] | None = None
+    """The quality raster whose flagged pixels are left out, the index of the band's layer, and the file's checksum."""
 
 
 @dataclass
@@ -145,19 +151,28 @@ def write_capture_indices(
         return [IndexReport(label, index.name, problem=str(error)) for index in indices]
 
 
-def bands_of(sidecar: CaptureResult, folder: Path) -> list[IndexBand]:
-    """Return the bands of a capture with the files in the folder of its sidecar."""
+def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> list[IndexBand]:
+    """Return the bands of a capture with the files in the folder of its sidecar, and with `mask_qa` those of their
+    quality flags. Raises InputError where they were not written.
+    """
+    flags = next((part for part in sidecar.products if part.kind == "qa"), None)
+    if mask_qa and flags is None:
+        raise InputError(f"{sidecar.capture}: has no quality raster, which --mask-qa needs; align with --qa")
     given = sidecar.accept_predicted_px
     limit_px = _OLD_ACCEPT_PREDICTED_PX if given is None else given
     sums = {part.file: part.sha256 for part in sidecar.products}
     result = []
-    for part in sidecar.bands:
+    # Layers of the quality raster: all bands together, then each band.
+    for layer, part in enumerate(sidecar.bands, start=2):
         problem = ""
         if not is_delivered(part, limit_px) or part.place is None:
             known = "" if part.prediction is None else f" to {part.prediction.std_px:.1f} px, not {limit_px:g}"
             problem = f"{part.band} is {part.status}{known} ({part.reason})"
         file, number = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
-        result.append(IndexBand(part.band, part.wavelength_nm, folder / file, number, sums.get(file, ""), problem))
+        quality = (folder / flags.file, layer, flags.sha256) if mask_qa and flags is not None else None
+        result.append(
+            IndexBand(part.band, part.wavelength_nm, folder / file, number, sums.get(file, ""), problem, quality)
+        )
     return result
 
 
@@ -183,6 +198,9 @@ def write_rasters(
                     reports[index.name] = IndexReport(label, index.name, target, known, kept=True)
                     continue
                 unit = _unit(index, [_source(stack, files, band) for band in chosen])
+                for band in chosen:
+                    if band.quality is not None:
+                        _open(stack, files, *band.quality[:2])
             except InputError as error:
                 reports[index.name] = IndexReport(label, index.name, problem=str(error))
                 continue
@@ -234,7 +252,8 @@ def _chosen(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]:
 def _made_from(index: Index, bands: Sequence[IndexBand]) -> str:
     """Sixteen digits of all that an index raster depends on."""
     sources = [(b.sha256 or _state(b.file), b.band_index) for b in bands]
-    facts = json.dumps([__version__, index.formula, index.constants, index.span, sources])
+    masks = [(b.quality[2], b.quality[1]) for b in bands if b.quality is not None]
+    facts = json.dumps([__version__, index.formula, index.constants, index.span, sources, *([masks] if masks else [])])
     return hashlib.sha256(facts.encode()).hexdigest()[:16]
 
 
@@ -269,12 +288,15 @@ def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
 
 
 def _source(stack: ExitStack, files: dict[Path, rasterio.DatasetReader], band: IndexBand) -> Source:
-    if band.file not in files:
-        files[band.file] = stack.enter_context(open_raster(band.file))
-    source = files[band.file]
-    if band.band_index > source.count:
-        raise InputError(f"{band.file}: has no band {band.band_index}, as its sidecar says; run again")
-    return source, band.band_index
+    return _open(stack, files, band.file, band.band_index)
+
+
+def _open(stack: ExitStack, files: dict[Path, rasterio.DatasetReader], path: Path, number: int) -> Source:
+    if path not in files:
+        files[path] = stack.enter_context(open_raster(path))
+    if number > files[path].count:
+        raise InputError(f"{path}: has no band {number}, as its sidecar says; run again")
+    return files[path], number
 
 
 def _unit(index: Index, sources: Sequence[Source]) -> str:
@@ -341,6 +363,9 @@ def _write_window(
             key = band.file, band.band_index
             if key not in read:
                 read[key] = _physical(files[band.file], band.band_index, window)
+                if band.quality is not None:
+                    flags = _flags(files[band.quality[0]], band.quality[1], window)
+                    read[key][flags & np.uint16(UNUSABLE.value) != 0] = np.nan
         value = compute(raster.index, [read[b.file, b.band_index] for b in raster.bands])
         raster.checksums.write(raster.dataset, value, 1, window)
         valid = np.isfinite(value)
@@ -381,6 +406,14 @@ def _physical(
     return pixels if valid is None else np.where(valid, pixels, np.float32(np.nan))
 
 
+def _flags(source: rasterio.DatasetReader, index: int, window: Window) -> NDArray[np.uint16]:
+    """Raises InputError where they cannot be read."""
+    try:
+        return np.asarray(source.read(index, window=window), np.uint16)
+    except RasterioError as error:
+        raise InputError(f"{source.name}: cannot be read ({why(error)}); run again") from None
+
+
 def _windows(width: int, height: int) -> Iterator[Window]:
     for y in range(0, height, _WORK_PX):
         for x in range(0, width, _WORK_PX):
@@ -400,7 +433,7 @@ def _create(stack: ExitStack, path: Path, like: rasterio.DatasetReader, raster: 
     dataset = stack.enter_context(rasterio.open(path, "w", **profile))
     index = raster.index
     dataset.set_band_description(1, index.name)
-    kept = {k: v for k, v in like.tags().items() if k in ("CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY")}
+    kept = {k: v for k, v in like.tags().items() if k in _KEPT_TAGS}
     kept |= {"TIFFTAG_SOFTWARE": "agalign", "INDEX": index.name, "INDEX_SOURCE": index.source}
     kept |= {"INDEX_FORMULA": _written_out(index), "INDEX_MADE_FROM": raster.made_from}
     dataset.update_tags(**kept, **({"INPUT": "raw numbers, not reflectance"} if raster.unit == RAW else {}))

@@ -2,7 +2,7 @@
 
 import errno
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from agalign.products.indices import Role, role_of
 from agalign.products.layout import Layer
 from agalign.products.nodata import Pixels, nodata_value, with_nodata
 from agalign.products.quiet_libtiff import without_libtiffs_lines
-from agalign.products.raster_tags import describe
+from agalign.products.raster_tags import describe, georeference_tags
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.files import complete_file
@@ -126,6 +126,7 @@ def write_layers(
             with (
                 without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
             ):  # fmt: skip
+                dataset.update_tags(**georeference_tags(georeference))
                 for index, (name, values) in enumerate(layers.items(), start=1):
                     checksums.write(dataset, values, index, Window(0, 0, grid.width, grid.height))
                     dataset.set_band_description(index, name)
@@ -133,6 +134,40 @@ def write_layers(
                         dataset.set_band_unit(index, units[name])
                     if tags is not None:
                         dataset.update_tags(index, **tags[name])
+            check_complete(partial)
+            checksums.check(partial)
+    except (RasterioError, tifffile.TiffFileError) as error:
+        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
+
+
+def write_flags(
+    path: Path, names: Sequence[str], grid: OutputGrid, georeference: Georeference | None, tags: Mapping[str, str],
+    flags_on: Callable[[Tile], Sequence[NDArray[np.uint16]]],
+) -> None:  # fmt: skip
+    """Write uint16 layers with these names, complete or not at all; `flags_on` returns them (height, width) on a tile
+    of the grid. They have no nodata value: 0 is a pixel without any flag.
+
+    Raises OutputError.
+    """
+    profile: dict[str, Any] = {
+        "driver": "GTiff", "width": grid.width, "height": grid.height, "count": len(names), "dtype": "uint16",
+        "tiled": True, "blockxsize": _TILE_PX, "blockysize": _TILE_PX, "compress": "deflate", "interleave": "band",
+        "bigtiff": "if_safer",
+    }  # fmt: skip
+    profile |= {} if georeference is None else georeferenced(georeference, grid)
+    try:
+        with complete_file(path) as partial, without_libtiffs_lines():
+            checksums = PixelChecksums()
+            with (
+                without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
+            ):  # fmt: skip
+                dataset.update_tags(**tags, **georeference_tags(georeference))
+                for index, name in enumerate(names, start=1):
+                    dataset.set_band_description(index, name)
+                for tile in tiles(grid.tile, _WORK_TILE_PX):
+                    window = Window(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
+                    for index, flags in enumerate(flags_on(tile), start=1):
+                        checksums.write(dataset, flags, index, window)
             check_complete(partial)
             checksums.check(partial)
     except (RasterioError, tifffile.TiffFileError) as error:

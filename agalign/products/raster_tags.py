@@ -5,7 +5,7 @@ from typing import Any
 
 from agalign.config import WriteSettings
 from agalign.products.layout import Layer
-from agalign.values.capture import Band, Capture, Quantity
+from agalign.values.capture import Band, Capture, Georeference, Quantity
 
 UNITS: Mapping[Quantity, str] = {
     "radiance": "W m-2 sr-1 nm-1", "relative radiance": "", "reflectance": "1", "relative reflectance": "1",
@@ -17,13 +17,17 @@ UNITS: Mapping[Quantity, str] = {
 def describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings: WriteSettings) -> None:
     """Set tags, units, scales and descriptions of an open rasterio dataset whose bands are these layers."""
     raw = settings.radiometry == "off"
-    facts = {
-        "TIFFTAG_SOFTWARE": "agalign",
-        "TIFFTAG_DATETIME": capture.captured_at[:19].replace("-", ":").replace("T", " "),
-        "CAPTURE_ID": capture.capture_id,
-        "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
-        "REFERENCE_BAND": capture.reference.name,
-    } | ({} if raw else _radiometry(layers))
+    facts = (
+        {
+            "TIFFTAG_SOFTWARE": "agalign",
+            "TIFFTAG_DATETIME": capture.captured_at[:19].replace("-", ":").replace("T", " "),
+            "CAPTURE_ID": capture.capture_id,
+            "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
+            "REFERENCE_BAND": capture.reference.name,
+        }
+        | ({} if raw else _radiometry(layers))
+        | georeference_tags(capture.reference.georeference)
+    )
     dataset.update_tags(**{k: v for k, v in facts.items() if v})
     if raw:
         _describe_scales(dataset, layers)
@@ -32,6 +36,16 @@ def describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings: 
     for index, layer in enumerate(layers, start=1):
         dataset.set_band_description(index, layer.band.name)
         _describe_wavelength(dataset, index, layer.band)
+
+
+def georeference_tags(georeference: Georeference | None) -> dict[str, str]:
+    """Mark a georeference that was calculated from the camera's pose as approximate; empty for a file's own."""
+    if georeference is None or georeference.accuracy_m is None:
+        return {}
+    return {
+        "GEOREFERENCE": "approximate, from GPS position, altitude, yaw and focal length; no ground control",
+        "GEOREFERENCE_ACCURACY_M": f"{georeference.accuracy_m:g}",
+    }
 
 
 def _radiometry(layers: Sequence[Layer]) -> dict[str, str]:

@@ -7,6 +7,7 @@ from agalign.products.pan_sharpen import PanSharpened
 from agalign.products.picture import BeforeAfterPicture
 from agalign.products.preview import Preview
 from agalign.products.product import Product
+from agalign.products.quality_raster import QualityRaster
 from agalign.products.relief_map import ReliefMap
 from agalign.products.stac import StacItem
 from agalign.products.stack import Stack
@@ -18,6 +19,7 @@ PRODUCTS: tuple[Product, ...] = (
     PanSharpened(),
     ReliefMap(),
     ErrorMap(),
+    QualityRaster(),
     TiePoints(),
     IndexRasters(),
     BeforeAfterPicture(),

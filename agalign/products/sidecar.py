@@ -359,7 +359,8 @@ class ProductPart(_Part):
     """A file written for the capture."""
 
     kind: str
-    """`stack`, `band`, `pan_sharpened`, `relief`, `error_map`, `tie_points`, `picture`, `preview` or `stac_item`."""
+    """`stack`, `band`, `pan_sharpened`, `relief`, `error_map`, `qa`, `tie_points`, `index`, `picture`,
+    `preview` or `stac_item`."""
     file: RelativeFile
     """Relative to the folder of the sidecar."""
     bytes: int

@@ -18,6 +18,8 @@ class Georeference:
 
     transform: Matrix
     crs_wkt: str
+    accuracy_m: float | None = None
+    """Expected error (1 sigma, metres) where it was calculated from the camera's pose; None for a file's own."""
 
 
 Quantity = Literal["radiance", "relative radiance", "reflectance", "relative reflectance", "temperature"]
@@ -132,6 +134,9 @@ class Position:
     altitude_m: float | None = None
 
 
+HeightSource = Literal["tags", "panel", "ground elevation", "assumed"]
+
+
 @dataclass(frozen=True)
 class Pose:
     """How the camera hung when a capture was taken."""
@@ -146,6 +151,8 @@ class Pose:
     """Above the ground."""
     focal_length_px: float | None = None
     """Of the reference."""
+    height_from: HeightSource = "tags"
+    """What `height_m` was derived from."""
 
 
 @dataclass(frozen=True)

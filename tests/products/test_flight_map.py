@@ -1,0 +1,145 @@
+"""The map of a flight: footprints against geometry that is known by other means."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from synthetic_flights.panel import make_flight_between_panels
+
+import agalign
+from agalign.config import SeedSettings, Settings, WriteSettings
+from agalign.errors import ConfigurationError
+from agalign.products.flight_map import FlightMap
+from agalign.products.footprint import (
+    above_elevation,
+    accuracy_of_footprint_m,
+    ground_m,
+    with_approximate_georeference,
+    with_assumed_height,
+)
+from agalign.values import geometry
+from agalign.values.capture import Band, Capture, Pose, Position
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+SEEDED = Settings(seed=SeedSettings(only=True))
+M_PER_DEGREE = 111_250.0  # of latitude, at 52 degrees
+
+
+def capture(pose: Pose | None, altitude_m: float | None = 130.0) -> Capture:
+    band = Band("Green", Path("a_1.tif"), 1, 1200, 800, "uint16")
+    position = Position(52.0, 5.0, altitude_m)
+    return Capture("a", Path("one"), (band,), 0, position=position, pose=pose)
+
+
+def test_the_footprint_of_a_camera_that_looks_down_has_the_size_of_its_field_of_view(tmp_path: Path) -> None:
+    known = capture(Pose(0.0, height_m=50.0, focal_length_px=1000.0))
+    on_map = FlightMap(tmp_path)
+    on_map.add(known, "failed")
+    path = on_map.write()
+    assert path is not None
+    (feature,) = json.loads(path.read_text())["features"]
+    ring = np.array(feature["geometry"]["coordinates"][0])
+    north_m, east_m = np.ptp(ring[:, 1]) * M_PER_DEGREE, np.ptp(ring[:, 0]) * M_PER_DEGREE * math.cos(math.radians(52))
+    assert (east_m, north_m) == pytest.approx((60.0, 40.0), rel=0.01)
+    area = np.sum(ring[:-1, 0] * ring[1:, 1] - ring[1:, 0] * ring[:-1, 1])
+    assert area > 0  # counter-clockwise, as RFC 7946 has outer rings
+    facts = feature["properties"]
+    assert (facts["status"], facts["height_m"], facts["height_from"]) == ("failed", 50.0, "tags")
+    assert facts["stack"] is None
+
+
+def test_an_unknown_height_is_assumed_and_marked(tmp_path: Path) -> None:
+    unknown = capture(Pose(0.0, focal_length_px=1000.0))
+    on_map = FlightMap(tmp_path)
+    on_map.add(unknown, "ok")
+    path = on_map.write()
+    assert path is not None
+    (feature,) = json.loads(path.read_text())["features"]
+    assert feature["geometry"]["type"] == "Polygon"
+    assert (feature["properties"]["height_m"], feature["properties"]["height_from"]) == (120.0, "assumed")
+    by_tags = replace(unknown, pose=Pose(0.0, focal_length_px=1000.0, height_m=120.0))
+    accuracy_m = accuracy_of_footprint_m(by_tags)
+    assert accuracy_m is not None
+    assert feature["properties"]["accuracy_m"] > 2 * accuracy_m
+    assert with_assumed_height(capture(Pose(0.0, focal_length_px=1000.0), 40.0)).pose.height_m == 40.0  # type: ignore[union-attr]
+
+
+def test_captures_without_a_footprint_are_points_or_left_without_a_place(tmp_path: Path) -> None:
+    on_map = FlightMap(tmp_path)
+    on_map.add(replace(capture(None), position=None), "ok")
+    assert on_map.write() is None
+    on_map.add(replace(capture(None), name="b"), "sky")
+    path = on_map.write()
+    assert path is not None
+    first, second = json.loads(path.read_text())["features"]
+    assert first["geometry"] is None
+    assert second["geometry"] == {"type": "Point", "coordinates": [5.0, 52.0]}
+
+
+def test_the_elevation_of_the_ground_gives_the_height_that_tags_lack() -> None:
+    pose = Pose(10.0, focal_length_px=1000.0)
+    result = above_elevation(capture(pose), 100.0).pose
+    assert result is not None
+    assert (result.height_m, result.height_from) == (30.0, "ground elevation")
+    assert above_elevation(capture(replace(pose, height_m=7.0)), 100.0).pose == replace(pose, height_m=7.0)
+    assert above_elevation(capture(pose), 131.0).pose == pose  # below the ground
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 37.0, 200.0])
+def test_the_approximate_georeference_maps_pixels_to_where_the_camera_sees_them(heading_deg: float) -> None:
+    known = capture(Pose(heading_deg, height_m=50.0, focal_length_px=1000.0))
+    georeference = with_approximate_georeference(known).reference.georeference
+    assert georeference is not None
+    assert "32631" in georeference.crs_wkt
+    assert georeference.accuracy_m is not None
+    points_px = np.array([[0.0, 0.0], [1199.0, 0.0], [300.0, 700.0]])
+    expected = ground_m(known, points_px)
+    assert expected is not None
+    on_map = geometry.apply(georeference.transform, points_px + 0.5)
+    # UTM north differs from true north by the meridian convergence, at 5 degrees east of zone 31 1.6 degrees.
+    turn = math.radians(2.0 * math.sin(math.radians(52.0)))
+    turned = (expected - expected[0]) @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+    assert on_map - on_map[0] == pytest.approx(turned, abs=0.1)
+
+
+def test_without_a_height_there_is_no_approximate_georeference() -> None:
+    assert with_approximate_georeference(capture(Pose(0.0, focal_length_px=1000.0))).reference.georeference is None
+
+
+@pytest.mark.slow
+def test_a_run_writes_the_map_and_georeferenced_rasters_that_agree(tmp_path: Path) -> None:
+    make_flight_between_panels(tmp_path / "in", 2, (640, 480))
+    write = WriteSettings(georeference=True)
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=SEEDED.model_copy(update={"write": write}))
+    features = json.loads((tmp_path / "out" / "flight.geojson").read_text())["features"]
+    by_status = {f["properties"]["status"] for f in features}
+    assert "panel" in by_status
+    (feature, *_) = [f for f in features if f["properties"]["stack"]]
+    assert feature["properties"]["height_from"] == "panel"
+    with rasterio.open(tmp_path / "out" / feature["properties"]["stack"]) as stack:
+        assert stack.crs.to_epsg() == 32631
+        assert float(stack.tags()["GEOREFERENCE_ACCURACY_M"]) == feature["properties"]["accuracy_m"]
+        lon, lat = np.array(feature["geometry"]["coordinates"][0]).T
+        corners = rasterio.warp.transform("EPSG:4326", stack.crs, lon, lat)
+        size = stack.width, stack.height
+        px = np.array([~stack.transform * (x, y) for x, y in zip(*corners, strict=True)])
+    assert px.max(axis=0) == pytest.approx(size, abs=2)
+    assert px.min(axis=0) == pytest.approx((0, 0), abs=2)
+
+
+@pytest.mark.slow
+def test_a_georeference_that_no_capture_can_have_is_refused_before_anything_is_done(
+    flight: Path, tmp_path: Path
+) -> None:
+    settings = SEEDED.model_copy(update={"write": WriteSettings(georeference=True)})
+    with pytest.raises(ConfigurationError, match="--ground-elevation"):
+        agalign.align_folder(flight, tmp_path, settings=settings)
+    known = SEEDED.model_copy(update={"write": WriteSettings(georeference=True, ground_elevation_m=0.0)})
+    (report, *_) = agalign.align_folder(flight, tmp_path, settings=known)
+    assert report.good or report.useful or report.result is not None
+    features = json.loads((tmp_path / "flight.geojson").read_text())["features"]
+    assert {f["properties"]["height_from"] for f in features} == {"ground elevation"}

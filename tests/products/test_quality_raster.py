@@ -1,0 +1,179 @@
+"""Quality flags, each where the pixels are known to have it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+import agalign
+from agalign.config import SeedSettings, Settings, WriteSettings
+from agalign.errors import InputError
+from agalign.pixels.sun_glint import sun_glint
+from agalign.products.index_rasters import bands_of, write_rasters
+from agalign.products.indices import index_named, index_of_formula
+from agalign.products.layout import Layer
+from agalign.products.quality_raster import _flags
+from agalign.products.sidecar import read_result
+from agalign.values import geometry
+from agalign.values.capture import Band
+from agalign.values.image import OutputGrid
+from agalign.values.mapping import PixelMapping
+from agalign.values.quality import MEANINGS, UNUSABLE, Quality
+
+from .test_outputs import write_band
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+GRID = OutputGrid(4, 2, 60, 40)
+
+
+def band(path: Path) -> Band:
+    pixels = np.full((60, 80), 1000, np.uint16)
+    pixels[10:14, 20:24] = 65535
+    pixels[30:33, 40:42] = 7
+    write_band(path, pixels)
+    return Band("NIR", path, 1, 80, 60, "uint16", nodata=7.0, saturation_value=65535.0)
+
+
+def flags_of(layer: Layer, nodes: dict[str, np.ndarray] | None = None, *, is_predicted: bool = False) -> np.ndarray:
+    return _flags(layer, GRID.tile, GRID, nodes or {}, is_predicted=is_predicted)
+
+
+def test_flags_of_a_moved_band_are_where_its_pixels_are(tmp_path: Path) -> None:
+    moved = Layer(band(tmp_path / "a.tif"), PixelMapping(geometry.translation(-10.5, 0.0)))
+    flags = flags_of(moved)
+    x = np.arange(4, 64) - 10.5  # columns of the file
+    assert ((flags & Quality.OUTSIDE) > 0).all(axis=0).tolist() == (x < 0).tolist()
+    rows, columns = np.nonzero(flags & Quality.SATURATED)
+    # Half a pixel between two columns: both contribute.
+    assert (rows.min() + 2, rows.max() + 2) == (10, 13)
+    assert (x[columns.min()], x[columns.max()]) == (19.5, 23.5)
+    rows, columns = np.nonzero(flags & Quality.NODATA)
+    assert (rows.min() + 2, rows.max() + 2, x[columns.min()], x[columns.max()]) == (30, 32, 39.5, 41.5)
+    assert np.count_nonzero(flags & ~np.uint16(Quality.OUTSIDE)) == 4 * 5 + 3 * 3
+
+
+def test_flags_of_the_reference_are_those_of_its_own_pixels(tmp_path: Path) -> None:
+    flags = flags_of(Layer(band(tmp_path / "a.tif"), None, is_reference=True))
+    assert (flags[8:12, 16:20] == Quality.SATURATED).all()
+    assert (flags[28:31, 36:38] == Quality.NODATA).all()
+    assert np.count_nonzero(flags) == 16 + 6
+
+
+def test_expected_errors_and_predictions_are_flagged_and_an_unknown_error_is_a_large_one(tmp_path: Path) -> None:
+    layer = Layer(band(tmp_path / "a.tif"), PixelMapping(geometry.identity()))
+    nodes = {"NIR": np.array([[0.0, 2.0], [0.0, 2.0]], np.float32)}
+    flags = flags_of(layer, nodes, is_predicted=True)
+    assert (flags & Quality.PREDICTED > 0).all()
+    expected_px = np.linspace(0, 2, 60)
+    assert ((flags & Quality.ERROR_OVER_HALF_PX) > 0)[5].tolist() == (expected_px > 0.5).tolist()
+    assert ((flags & Quality.ERROR_OVER_1_PX) > 0)[5].tolist() == (expected_px > 1).tolist()
+    unknown = flags_of(layer, {"NIR": np.full((2, 2), np.nan, np.float32)})
+    assert (unknown & Quality.ERROR_OVER_1_PX > 0).all()
+    failed = flags_of(Layer(layer.band, None))
+    assert (failed == Quality.MISSING).all()
+    assert not UNUSABLE & Quality.PREDICTED
+    assert UNUSABLE & Quality.MISSING
+
+
+def water(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    green = rng.normal(0.05, 0.002, (160, 160)).astype(np.float32)
+    return green, rng.normal(0.01, 0.002, (160, 160)).astype(np.float32)
+
+
+def test_glint_is_found_on_water_and_not_on_vegetation_or_bare_soil() -> None:
+    rng = np.random.default_rng(0)
+    green, nir = water(rng)
+    assert np.count_nonzero(sun_glint(green, nir)) == 0
+    glint = rng.random(green.shape) < 0.05
+    assert np.array_equal(sun_glint(green + 0.3 * glint, nir + 0.3 * glint), glint)
+    # As much light of the water as of the surface: not yet.
+    assert not sun_glint(green + 0.02 * glint, nir + 0.02 * glint).any()
+    shore = nir.copy()
+    shore[:, 100:] = 0.4  # vegetation
+    assert not sun_glint(green, shore).any()
+    soil = np.full_like(green, 0.2), np.full_like(green, 0.3)
+    assert not sun_glint(soil[0] + 0.3 * glint, soil[1] + 0.3 * glint).any()
+
+
+def test_glint_is_found_where_no_pixel_around_is_free_of_it() -> None:
+    green, nir = water(np.random.default_rng(0))
+    green = np.tile(green, (2, 2))
+    nir = np.tile(nir, (2, 2))
+    centre = np.zeros_like(green, dtype=bool)
+    centre[60:260, 60:260] = True
+    assert np.array_equal(sun_glint(green + 0.3 * centre, nir + 0.3 * centre), centre)
+    # The same without any water around may be concrete.
+    assert not sun_glint(green + 0.5, nir + 0.55).any()
+
+
+def test_glint_of_unknown_pixels_and_of_tiny_images_is_none() -> None:
+    green, nir = water(np.random.default_rng(0))
+    nir[:80] = np.nan
+    assert not sun_glint(green, nir)[:80].any()
+    assert not sun_glint(np.full_like(green, np.nan), nir).any()
+    assert sun_glint(green[:20, :20], nir[:20, :20]).shape == (20, 20)
+
+
+@pytest.mark.slow
+def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(flight: Path, tmp_path: Path) -> None:
+    settings = Settings(seed=SeedSettings(only=True), write=WriteSettings(qa=True, crop="none"))
+    (report, *_) = agalign.align_folder(flight, tmp_path, settings=settings)
+    assert report.sidecar is not None
+    assert report.path is not None
+    assert [p.file for p in report.sidecar.products if p.kind == "qa"] == [f"{report.path.stem}.qa.tif"]
+    with (
+        rasterio.open(report.path.with_suffix(".qa.tif")) as raster,
+        rasterio.open(report.path.with_suffix(".tif")) as stack,
+    ):
+        assert raster.descriptions == ("all bands", *stack.descriptions)
+        assert raster.shape == stack.shape
+        tags = raster.tags()
+        masks = [int(m) for m in tags["flag_masks"].split(", ")]
+        assert tags["flag_meanings"].split() == MEANINGS.split() == [str(Quality(m).name).lower() for m in masks]
+        assert tags["SUN_GLINT"]
+        flags, pixels = raster.read(), stack.read()
+    assert np.array_equal(flags[0], np.bitwise_or.reduce(flags[1:]))
+    # Whatever is outside is nodata in the stack, and the reverse.
+    no_value = flags[1:] & np.uint16(Quality.OUTSIDE | Quality.NODATA | Quality.OCCLUDED | Quality.MISSING) > 0
+    assert no_value.any()
+    assert np.array_equal(pixels == stack.nodata, no_value)
+    sidecar = json.loads(report.path.read_text())
+    assert sidecar["schema"] == "agalign/1"
+
+
+def test_meanings_are_in_the_order_of_the_bits() -> None:
+    assert [int(f) for f in Quality] == [1 << i for i in range(len(Quality))]
+
+
+@pytest.mark.slow
+def test_indices_leave_out_what_the_flags_of_their_own_bands_say(flight: Path, tmp_path: Path) -> None:
+    settings = Settings(seed=SeedSettings(only=True), write=WriteSettings(qa=True))
+    (report, *_) = agalign.align_folder(flight, tmp_path, settings=settings)
+    assert report.path is not None
+    sidecar = read_result(report.path)
+    plain = [replace(b, problem="") for b in bands_of(sidecar, report.path.parent)]
+    masked = [replace(b, problem="") for b in bands_of(sidecar, report.path.parent, mask_qa=True)]
+    path = report.path.with_suffix(".qa.tif")
+    with rasterio.open(path, "r+") as raster:
+        flags = np.zeros(raster.shape, np.uint16)
+        flags[10:20, 30:50] = Quality.SATURATED
+        flags[40:50, 30:50] = Quality.PREDICTED
+        for index, name in enumerate(raster.descriptions, start=1):
+            raster.write(flags if name == "NIR" else np.zeros_like(flags), index)
+    (ndvi,) = write_rasters(plain, [index_named("ndvi")], tmp_path / "plain", "a")
+    (left,) = write_rasters(masked, [index_named("ndvi")], tmp_path / "masked", "a", overwrite=False)
+    (green,) = write_rasters(masked, [index_of_formula("green=(G-R)/(G+R)")], tmp_path / "masked", "a")
+    values, kept, without_nir = (rasterio.open(r.path).read(1) for r in (ndvi, left, green))
+    expected = values.copy()
+    expected[10:20, 30:50] = np.nan
+    assert np.array_equal(kept, expected, equal_nan=True)
+    assert np.isfinite(without_nir[10:20, 30:50]).all()
+    # The same bands without the mask are another raster, which is not taken for this one.
+    (again,) = write_rasters(plain, [index_named("ndvi")], tmp_path / "masked", "a", overwrite=False)
+    assert not again.kept
+    path.unlink()
+    with pytest.raises(InputError, match="--qa"):
+        bands_of(sidecar.model_copy(update={"products": []}), report.path.parent, mask_qa=True)
