@@ -14,5 +14,5 @@ exclude_patterns = ["_build"]
 autodoc_member_order = "bysource"
 html_theme = "furo"
 html_static_path = ["_static"]
-html_css_files = ["doors.css"]
+html_css_files = ["site.css"]
 html_title = f"agalign {__version__}"
