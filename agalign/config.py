@@ -120,13 +120,13 @@ class WriteSettings(Stage):
     qa: bool = False
     """A raster of quality flags next to them."""
     stac: bool = False
-    """A STAC item beside each capture's files."""
+    """A STAC item for each capture."""
     indices: tuple[str, ...] = ()
     """Names of the spectral indices to write of each capture, such as ndvi and ndre."""
     pan_sharpen: bool = False
-    """The narrow bands at the panchromatic band's resolution, beside the others."""
+    """The narrow bands at the panchromatic band's resolution, in addition to the others."""
     error_map: bool = False
-    """A raster of the error to be expected at every pixel, beside them."""
+    """A raster of the expected error at every pixel."""
     tie_points: bool = False
     """The windows in which each band was measured, as CSV and GeoJSON."""
     relief_map: bool = False

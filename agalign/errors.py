@@ -6,7 +6,7 @@ class AgalignError(Exception):
 
 
 class InputError(AgalignError):
-    """A file, folder or array cannot be used. The text names it and says what to do."""
+    """A file, folder or array cannot be used. The text names it and the remedy."""
 
 
 class UnreadableFileError(InputError):

@@ -186,7 +186,7 @@ def rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
 
 
 def rays_to_rig(lens: Lens | None, camera_to_rig: Matrix) -> Matrix | None:
-    """to_rig of a band whose camera is rotated by R: R K^-1; None without a lens or where K is singular."""
+    """to_rig of a band with a camera rotated by R: R K^-1; None without a lens or where K is singular."""
     try:
         return None if lens is None else np.asarray(camera_to_rig @ geometry.invert(lens.matrix))
     except GeometryError:

@@ -15,7 +15,7 @@ from agalign.values.files import RUN_FILE
 _SUFFIXES = TIFF_SUFFIXES | PICTURE_SUFFIXES
 IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
 _ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
-"""Of a network, such as s3://bucket or https://host, of which a path keeps one slash; drives have one letter."""
+"""Network address such as s3://bucket or https://host (a path keeps one slash of two); drives have one letter."""
 _SYSTEM_FOLDERS = {"lost+found", "System Volume Information", "$RECYCLE.BIN"}
 """Operating systems create these on a memory card."""
 

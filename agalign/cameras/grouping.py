@@ -44,7 +44,7 @@ def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
 
 
 def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Add files whose damaged tags lost the capture's id to the group that has the id and the same file name."""
+    """Add files without a capture id, because of damaged tags, to the group that has the id and the same file name."""
     by_name: dict[_GroupKey, _GroupKey] = {}
     for key, group in groups.items():
         names = {f.camera.capture_name(f.path) for f in group}
@@ -58,7 +58,7 @@ def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
 
 
 def _add_files_without_tags(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Add single bands whose tags another program removed to the group that has tags and the same file name."""
+    """Add single bands without tags, removed by another program, to the group that has tags and the same file name."""
     tagged: dict[tuple[str, str], list[_GroupKey]] = defaultdict(list)
     for key, group in groups.items():
         if key[0] != Generic.name:
@@ -125,7 +125,7 @@ def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
             if first.setdefault(name, file.path) != file.path:
                 text = (
                     f"{file.path}: is band '{name}' of one capture with {first[name].name} by the pattern "
-                    f"'{pattern}'; give one that tells them apart"
+                    f"'{pattern}'; give one that distinguishes them"
                 )
                 result.append(Problem(file.path, InputError(text)))
     return result

@@ -1,4 +1,4 @@
-"""MAPIR: LATTICE arrays, a file a camera, and Survey3, whose three bands share one lens.
+"""MAPIR: LATTICE arrays, one file per camera, and Survey3, which has three bands and one lens.
 
 `capture_<serial>_<sequence>_<date>_<time>_<fraction>.tiff`: what follows the serial number is the capture. The model
 `LATT-<sensor>-<lens>-F<filter>` holds the wavelength. There are no rig tags.

@@ -2,7 +2,7 @@
 
 Between undistorted pixels H(reference -> band) = K_band R_band^T R_reference K_reference^-1 with
 R(a, b, c) = Rx(a) Ry(b) Rz(c) from Camera:RigRelatives in degrees. The residual is a shift by parallax, larger between
-the two cameras of a dual, whose baseline is longer.
+the two cameras of a dual, which have a longer baseline.
 """
 
 import math

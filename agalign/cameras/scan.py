@@ -13,7 +13,7 @@ class DiscoverOptions:
     """What to look for."""
 
     pattern: str | None = None
-    """File names as '{capture}_{band}.tif', for files whose names follow no known scheme."""
+    """File names as '{capture}_{band}.tif', for file names of no known scheme."""
     reference: str | None = None
     """Name of the reference band; None is the camera's default."""
     ignore_metadata: bool = False
@@ -45,7 +45,7 @@ class Problem:
 
     @property
     def text(self) -> str:
-        """One line that names the file and says what to do."""
+        """One line with the file and the remedy."""
         return str(self.error)
 
 

@@ -63,7 +63,7 @@ class Sentera(Camera):
 
 
 def _channel_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-    """The bands of a photograph whose folder or model names the filter of its lens, else red, green and blue."""
+    """The bands of a photograph by the filter that its folder or model names, else red, green and blue."""
     kind = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), None)
     if kind is None:
         # The Double 4K's colour camera is one of its two, not a companion that is left out by default.
@@ -76,7 +76,7 @@ def _channel_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]
 
 
 def _listed_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-    """The bands of a photograph whose tags list them, channel by channel: one without a wavelength holds none."""
+    """The bands of a photograph as its tags list them, channel by channel; one without a wavelength is not a band."""
     names = tags.xmp.get(BAND_NAME, ())
     wavelengths, widths = (tags.numbers(CAMERA, name) for name in ("CentralWavelength", "WavelengthFWHM"))
     if not len(names) == len(wavelengths) == len(info.dtypes):

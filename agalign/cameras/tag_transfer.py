@@ -37,7 +37,7 @@ _DENSITIES = {41486, 41487}
 _GEOMETRIC_EXIF = _DENSITIES | {37386, 41488, 41989}
 _EXIF_SIZES = (40962, 40963)
 _EXIF_OF_THE_CAPTURE = _GEOMETRIC_EXIF | {36864, 36867, 36868, 36880, 36881, 36882, 37520, 37521, 37522, 42033, 42036}
-"""Of a stack, whose bands were exposed differently: version, times, body and lens."""
+"""For a stack, with bands of different exposure: version, times, body and lens."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
 def band_tags(
     source: Path, reference: Band, grid: OutputGrid, from_source: FromSource, *, radiometry: bool = False
 ) -> TransferredTags:
-    """For a file whose aligned bands came from `source`.
+    """For a file with aligned bands from `source`.
 
     With `radiometry` black level, vignetting and exposure have been taken out of the pixels.
     """

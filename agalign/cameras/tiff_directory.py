@@ -12,12 +12,12 @@ from typing import BinaryIO
 from PIL import Image
 
 EXIF, GPS = 34665, 34853
-"""Tags whose value is the place of a directory."""
+"""Tags with the offset of a directory as value."""
 XMP = 700
 _SIZE = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 """Bytes of a value of each type."""
 _NUMBER_SIZE = {**_SIZE, 5: 4, 10: 4}
-"""Bytes of the numbers whose byte order is swapped: a rational is two numbers."""
+"""Bytes of the numbers to swap: a rational is two numbers."""
 _RATIONAL, _SIGNED_RATIONAL = 5, 10
 _MAX_BYTES = 1 << 25
 """Of the tags of one file: cameras write a few thousand. Its pixels are elsewhere."""
@@ -118,7 +118,7 @@ def check_directories(path: Path) -> None:
 def add_directories(path: Path, first: Mapping[int, Entry], exif: Directory, gps: Directory) -> None:
     """Give a finished TIFF these entries in its first directory, and these Exif and GPS directories.
 
-    The first directory is written anew at the file's end; pixels stay where they are.
+    The first directory is rewritten at the end of the file; pixels stay where they are.
     """
     with path.open("r+b") as file:
         layout, at, pointer_at = _header(file)

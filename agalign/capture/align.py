@@ -162,7 +162,7 @@ class _PairAligner:
         return starts
 
     def keep_seeds(self, starts: Sequence[Start]) -> None:
-        """Nothing but the seeds was requested."""
+        """Only the seeds were requested."""
         for pair, seed in starts:
             with self.timer.measure([pair.name]):
                 self.result[pair.name] = verified(pair, seed, Issue(SEED_ASKED_FOR), self.settings)

@@ -119,7 +119,7 @@ def _refined(
 ) -> Alignment[FixedFilePx] | None:
     """The alignment moved to the fit of half of the tiles, with its uncertainty and the residual of the other half.
 
-    None where that half does not confirm it, or any check speaks against it. Raises UnreadableFileError.
+    None where that half does not confirm it, or any check rejects it. Raises UnreadableFileError.
     """
     fitted = _fitted(moving, start, [t for t in tiles if t.is_for_fit], size_px)
     if fitted is None or alignment.joint is None:

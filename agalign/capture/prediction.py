@@ -41,8 +41,8 @@ def with_predictions(
 ) -> dict[str, Alignment[FixedImagePx]]:
     """Each alignment with the rig's prediction, in px of the files; bands that are not aligned take its mapping.
 
-    A band whose result the rig rules out is not aligned either: in a repetitive scene the images agree whole periods
-    away. A band whose image is evidently rotated or scaled does not belong to this rig, and keeps its result.
+    A result that the rig contradicts is not aligned either: in a repetitive scene the images agree whole periods
+    away. A band with an evidently rotated or scaled image does not belong to this rig, and keeps its result.
     """
     known = observed([p for p in pairs if p.has_rig_pixels], result, capture)
     checked = dict(result)

@@ -47,7 +47,7 @@ _MIN_WINDOWS = 12
 _MAX_ROTATION_DEGREES, _MAX_SCALE_CHANGE = 1.0, 0.02
 """Difference of a band from its rig that temperature and mounting explain."""
 _FROM_TAGS: Set[SeedKind] = frozenset({"rig", "centre", "geo", "model", "user"})
-"""Candidates whose scale is known."""
+"""Candidates of known scale."""
 _SCALES = tuple(1.02**k for k in range(-18, 19) if k)
 """Scales relative to the overlay of the two images, 0.7 to 1.4: 2 % away from the right one, the correlation peak of a
 thermal and a blue image falls to three quarters."""

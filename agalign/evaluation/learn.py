@@ -53,7 +53,7 @@ def learn_descriptor(
     pairs: Sequence[BandPair], settings: Settings, *, steps_a_pair: int = 200,
     on_pair: Callable[[Lesson], None] = lambda _: None,
 ) -> FlightModel:  # fmt: skip
-    """One network for all pairs, whose fixed images have the same channels, and whose moving images have.
+    """One network for all pairs; their fixed images have the same channels, and so do their moving images.
 
     Raises InputError where no pair can be aligned or their channels differ.
     """

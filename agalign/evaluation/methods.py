@@ -252,7 +252,7 @@ def _elastix(task: PairTask) -> Outcome:
 def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -> Matrix | None:
     """fixed_to_moving of two single-band images by elastix's affine registration, Mattes mutual information.
 
-    None where it gives up, as it does where too many samples leave the image. Its own number of levels by default.
+    None where it fails, as it does where too many samples leave the image. Its own number of levels by default.
     """
     itk = importlib.import_module("itk")
     parameters = itk.ParameterObject.New()

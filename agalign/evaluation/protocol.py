@@ -21,8 +21,8 @@ def grey_patches(raster: Raster, grid: Tensor) -> Tensor:
 
 
 def average_precision(f: Tensor, f_prime: Tensor) -> float:
-    """Share of descriptors (N, D) of the first image whose exact L2 nearest neighbour among those of the second
-    (N, D) is their own.
+    """Share of descriptors (N, D) of the first image with their own counterpart as exact L2 nearest neighbour among
+    those of the second (N, D).
     """
     if len(f) == 0:
         return math.nan

@@ -27,7 +27,7 @@ def loss_surface(
     """Mean loss a keypoint at the end of training with psi held at the truth moved by (x, y), for all pairs of offsets.
 
     (n, n), rows along y; nan where too few keypoints remain. Each is learnt from the same random weights by recipe
-    paper, at the resolution whose longer side is at most `longer_side_px`. Offsets are px of the full resolution.
+    paper, at the resolution with a longer side of at most `longer_side_px`. Offsets are px of the full resolution.
     """
     scale = min(1.0, longer_side_px / max(fixed.size_px))
     result = np.full((len(offsets_px), len(offsets_px)), np.nan)

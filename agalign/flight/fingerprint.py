@@ -31,7 +31,7 @@ def fingerprint(capture: Capture, *stages: Stage) -> str:
 
 
 def hashed(*facts: Fact) -> str:
-    """Sixteen digits of the facts, whatever numpy is told of printing."""
+    """Sixteen digits of the facts, independent of numpy's print options."""
     return hashlib.sha256(b"".join(map(_canonical, facts))).hexdigest()[:16]
 
 

@@ -1,7 +1,7 @@
-"""What a flight has learnt, and the file that holds it: one network, and the mappings that it found.
+"""The learned model of a flight (network, mappings and rig) and its file.
 
-The captures of a flight share their cameras, so what tells the bands' patches apart on a few of them does on all (what
-the paper leaves as future work).
+The captures of a flight share their camera, so one network, trained on a few of them, works for all (the paper's future
+work).
 """
 
 import hashlib
@@ -47,7 +47,7 @@ class FlightModel:
     fingerprint: str
     """Of what it was learnt from, and how."""
     rig: Rig | None = None
-    """What the flight knows of the camera's geometry; None where too few captures said something of it."""
+    """Geometry of the camera; None if too few captures determine it."""
 
     def side(self, band: str) -> int | None:
         """The network's side for a moving band; None where it knows none of that name."""
@@ -59,7 +59,7 @@ class FlightModel:
 
 
 def save_model(model: FlightModel, path: Path) -> None:
-    """Write a model, complete or not at all; the same model is the same bytes. Raises OutputError."""
+    """Write a model atomically; the same model is the same bytes. Raises OutputError."""
     tensors = {f"theta.{k}": v.detach().cpu().contiguous() for k, v in model.net.state_dict().items()}
     tensors |= {f"mapping.{k}": torch.tensor(m) for k, m in model.mappings.items()}
     if model.rig is not None:
@@ -111,7 +111,7 @@ def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]
     with safe_open(path, framework="pt") as file:
         facts = dict(file.metadata() or {})
         if facts.get("format") != _FORMAT:
-            raise InputError(f"{path}: is no model of agalign; give a file of an earlier run's models folder")
+            raise InputError(f"{path}: is not a model of agalign; give a file of an earlier run's models folder")
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     digest = facts.pop("digest", None)
     if digest is None:
@@ -129,7 +129,7 @@ def _below(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.
 
 
 def _digest(tensors: Mapping[str, torch.Tensor], facts: Mapping[str, str]) -> str:
-    """Of the contents: a flipped bit in a weight is no fault that anything else would see."""
+    """Of the contents: nothing else would detect a flipped bit in a weight."""
     result = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
         result.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())

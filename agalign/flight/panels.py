@@ -21,7 +21,7 @@ _AT_EITHER_END = 3
 _READERS = 4
 _LOOK_PX = 1600
 _SAME_OUTING_S = 6 * 3600.0
-"""A panel tells nothing of another day's light."""
+"""A panel is not valid for the illumination of another day."""
 _MAX_SATURATED = 0.01
 _PANEL_HEIGHT_M, _MIN_HEIGHT_M = 1.0, 3.0
 """At which the camera is held over a panel; and what errors of altitudes come to."""
@@ -37,7 +37,7 @@ class BandReading:
     radiance: float | None
     """Mean over its area, in the unit of the camera's own calibration."""
     problem: str = ""
-    """Why it tells nothing."""
+    """Why it cannot be used."""
 
     @property
     def factor(self) -> float | None:
@@ -62,8 +62,8 @@ class PanelReading:
 
 
 def with_panels(captures: Sequence[Capture], *, by_look: bool = False) -> list[Capture]:
-    """The captures, of which those show a panel that the tags say, and among the first and last of each flight those
-    whose images show one with its QR code, or `by_look` without one.
+    """The captures, with the panel of those that show one: by their tags or, for the first and last of each flight, by
+    its QR code, or with `by_look` by its appearance.
     """
     ends = [end for flight in flights_of(captures) for end in _from_either_end(flight)]
     with without_warnings(), ThreadPoolExecutor(_READERS) as pool:
@@ -136,8 +136,8 @@ def _panels_at(end: Sequence[Capture], by_look: bool) -> list[Capture]:
     without = 0
     for capture in end:
         # Mosaics show none, and are long to read.
-        told = capture.panel is not None or capture.reference.georeference is not None
-        seen = capture if told else _looked_at(capture, by_look)
+        known = capture.panel is not None or capture.reference.georeference is not None
+        seen = capture if known else _looked_at(capture, by_look)
         result += [] if seen.panel is None else [seen]
         without = 0 if seen.panel is not None else without + 1
         if without == _AT_EITHER_END:
@@ -183,7 +183,7 @@ def _seen(band: Band, *, without_code: bool) -> PanelSight | None:
 def _read(band: Band, albedos: Albedos) -> BandReading:
     panel = band.panel
     if panel is not None and not panel.corners_px:
-        # Firmware that knows its panel does not always say where it is.
+        # Firmware that recognises a panel does not always write its position.
         sight = _seen(band, without_code=True)
         panel = panel if sight is None else replace(panel, corners_px=sight.area_px)
         band = replace(band, panel=panel)

@@ -233,7 +233,7 @@ def regressed_on_motion(capture: CaptureFactors, others: Sequence[CaptureFactors
     if capture.motion is None or len(known) < MIN_CAPTURES:
         return None
     x = np.array([(1.0, *c.motion) for c in known if c.motion is not None])
-    # Captures of one speed show nothing of other speeds: the smallest slope that fits.
+    # Captures of one speed do not determine other speeds: the smallest slope that fits.
     scale = np.maximum(np.abs(x).max(axis=0), 1e-12)
     slope = np.linalg.lstsq(x / scale, np.array([c.factors[3:] for c in known]), rcond=1e-3)[0]
     in_time = interpolated_in_time(capture, others) or _TYPICAL

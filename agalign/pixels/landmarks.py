@@ -1,5 +1,5 @@
-"""SIFT landmarks of an image, and a homography that those of two images agree on: where nothing is known of how one
-lies to the other, turned, scaled or far apart (Lowe 2004; Arandjelovic & Zisserman 2012 for the descriptors' root).
+"""SIFT landmarks of two images and their homography, for images that are rotated, scaled or far apart (Lowe 2004;
+square root of the descriptors: Arandjelovic & Zisserman 2012).
 """
 
 from dataclasses import dataclass
@@ -56,8 +56,8 @@ def landmarks(raster: Raster, view: LandmarkInput) -> Landmarks:
     if view == "edges":
         smooth = cv2.GaussianBlur(np.where(valid, looked_at, 0).astype(np.float32), (0, 0), _EDGES_SMOOTHED_PX)
         looked_at = np.sqrt(gradient_magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))))
-        beside = np.ones((_BESIDE_INVALID_PX, _BESIDE_INVALID_PX), np.uint8)
-        valid = cv2.erode(valid.astype(np.uint8), beside, borderValue=1) > 0
+        margin = np.ones((_BESIDE_INVALID_PX, _BESIDE_INVALID_PX), np.uint8)
+        valid = cv2.erode(valid.astype(np.uint8), margin, borderValue=1) > 0
     result, described = cv2.SIFT.create(nfeatures=_MOST).detectAndCompute(eight_bit(looked_at, valid), valid.view("u1"))
     if described is None:
         return Landmarks(np.empty((0, 2)), np.empty((0, 128), np.float32))

@@ -10,7 +10,7 @@ from agalign.values.image import Mask, Raster
 _MIN_SIDE_PX = 48
 """Smaller images hold too few patches to learn from."""
 _MAX_CHANNELS = 16
-"""Tells (H, W, C) from (C, H, W): images have more rows than this."""
+"""Distinguishes (H, W, C) from (C, H, W): images have more rows than this."""
 _MAX_SENSOR_BYTES = 2
 """Sensors count in 8 or 16 bits; the largest value of a wider type is not saturation."""
 _USUAL_FILLS = (-9999.0, -99999.0, -32767.0, -32768.0)
@@ -37,7 +37,7 @@ def data_mask(pixels: NDArray[np.generic], nodata: float | None) -> Mask:
 def undeclared_fill(pixels: ArrayLike) -> Mask:
     """(height, width), True where zeros (or the type's largest value) run in from the image's border.
 
-    Images that were warped before are filled this way, and few of their files say so.
+    Images that were warped before are filled this way, usually without metadata about it.
     """
     values = np.asarray(pixels)
     fill = np.zeros(values.shape, dtype=bool)
@@ -55,7 +55,7 @@ def undeclared_fill(pixels: ArrayLike) -> Mask:
 
 
 def learnable(valid: Mask, pixels: ArrayLike, saturation_value: float | None) -> Mask:
-    """The valid pixels whose value says something: not in a saturated area, and not next to one.
+    """The valid pixels with a usable value: not in a saturated area, and not next to one.
 
     Glints narrower than an area's least width stay: their outlines are structure like any other.
     """
@@ -71,7 +71,7 @@ def learnable(valid: Mask, pixels: ArrayLike, saturation_value: float | None) ->
 
 def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     """An array (H, W), (H, W, C) or (C, H, W) as the estimation sees it: without constant fill at its border, and for
-    integers without saturated areas. Raises InputError, with `name`, for what is no image.
+    integers without saturated areas. Raises InputError, with `name`, if it is not an image.
     """
     planes = _planes(np.asarray(image), name)
     measured = planes.dtype.kind in "ui" and planes.dtype.itemsize <= _MAX_SENSOR_BYTES
@@ -89,7 +89,7 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
 
 
 def _planes(array: NDArray[np.generic], name: str) -> NDArray[np.generic]:
-    """(C, H, W) from (H, W), (H, W, C) or (C, H, W). Raises InputError, with `name`, where the array is no image."""
+    """(C, H, W) from (H, W), (H, W, C) or (C, H, W). Raises InputError, with `name`, if the array is not an image."""
     if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
         raise InputError(
             f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"

@@ -1,4 +1,4 @@
-"""A calibration panel by its look: a homogeneous bright square, and the QR code that makers print beside it."""
+"""A calibration panel by its look: a homogeneous bright square, and the QR code printed next to it."""
 
 import re
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ _LEVEL_PERCENTILES = 5.0, 99.5
 _CORNER_TOLERANCE = 0.04
 """Distance from a quadrilateral at which a contour counts as one, as a share of its length."""
 _INNER = 0.5
-"""Side of the area that is measured beside the panel's,"""
+"""Side of the measured area, relative to that of the panel."""
 _RING = 1.15, 1.4
-"""and of the ring around it that it is compared with."""
+"""Inner and outer side of the ring around it for comparison, relative to that of the panel."""
 _CODE_AREAS = 0.3, 6.0
-"""Of the panel, beside its code's."""
+"""Area of the panel, relative to that of its code."""
 _CODE_REACH = 3.0
-"""How far their middles lie apart at most, in sides of the code."""
+"""Maximum distance between their centres, in sides of the code."""
 _SHARE_OF_IMAGE = 0.004, 0.3
 """Of a panel without a code."""
 _MIN_FILLED = 0.02
@@ -34,9 +34,9 @@ _MIN_FILLED = 0.02
 _MAX_OFF_CENTRE = 1 / 6
 """Of a panel that the camera is aimed at: its centre is in the middle third of the image."""
 _MAX_SPREAD = 0.06
-"""Standard deviation within the area, beside its mean."""
+"""Standard deviation within the area, relative to its mean."""
 _MIN_CONTRAST = 1.5
-"""How much brighter it is than what lies around it."""
+"""How much brighter it is than its surroundings."""
 _MAX_SLANT, _MAX_TAPER = 1.4, 1.15
 """Longest side over shortest, and either side over the one across."""
 _ALBEDO_IN_CODE = re.compile(r"_(\d{4})(\d{3})(\d{4})(\d{3})$")
@@ -90,7 +90,7 @@ def _largest_panel(shown: NDArray[np.uint8], code: Corners | None) -> Corners | 
 
 
 def albedo_of(code: str, wavelength_nm: float | None) -> float | None:
-    """What a panel's code says of its reflectance, 0 to 1: RP04-…_04005111000507 is 51.1 % at 400 nm and 50.7 % at
+    """Reflectance in the code of a panel, 0 to 1: RP04-…_04005111000507 is 51.1 % at 400 nm and 50.7 % at
     1000 nm, with a straight line between them, as the cameras' firmware takes it too.
     """
     result = _ALBEDO_IN_CODE.search(code)
@@ -103,7 +103,7 @@ def albedo_of(code: str, wavelength_nm: float | None) -> float | None:
 
 
 def inside(corners_px: ArrayLike, shape: tuple[int, int]) -> Mask:
-    """(height, width): the pixels of an area, whose corners are (n, 2)."""
+    """(height, width): the pixels of an area with corners (n, 2)."""
     mask = np.zeros(shape, np.uint8)
     cv2.fillPoly(mask, [np.round(np.asarray(corners_px)).astype(np.int32)], 1)
     return mask.astype(bool)
@@ -121,7 +121,7 @@ def _shown(image: Raster) -> tuple[NDArray[np.uint8], float]:
 
 
 def _code(shown: NDArray[np.uint8]) -> tuple[str, Corners | None]:
-    """(text, corners) of a QR code; a text that was decoded is no mistake, a mere outline often is."""
+    """(text, corners) of a QR code; a decoded text is reliable, an outline alone often is not."""
     try:
         text, at, _ = cv2.QRCodeDetector().detectAndDecode(shown)
     except cv2.error:  # some outlines that are no codes make it divide by nothing

@@ -5,7 +5,7 @@
 
 y is the row and r the distance from the vignetting's centre, px of the band's own file. Vignetting multiplies by
 1 / (1 + k1 r + ... + k6 r^6) with MicaSense and by 1 + k1 r + ... + k6 r^6 with DJI. Reflectance is radiance times
-what the light sensor says of the sun, or times what a panel of known reflectance says. Temperatures are temperatures
+the irradiance of the light sensor, or times the factor from a panel of known reflectance. Temperatures are temperatures
 whatever is chosen.
 """
 
@@ -51,11 +51,11 @@ def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
 
 
 def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, float]) -> Capture:
-    """The capture with, of every band, what turns its numbers into what was chosen; None where it cannot be had.
+    """The capture with the conversion of each band's numbers to the chosen quantity; None where it is not available.
 
-    `by_panel` is, of bands that a panel was seen in, what radiance is to be multiplied by for reflectance. `auto` is by
-    panel where all bands can be, else by the sun where all can be, else by the camera alone; a colour photograph, of
-    which nothing is known, stands in nobody's way.
+    `by_panel` has the factor from radiance to reflectance for each band that a panel was measured in. `auto` is by
+    panel if available for all bands, else by light sensor, else by the camera's calibration; a colour photograph does
+    not count.
     """
     if choice == "off":
         return capture
@@ -89,7 +89,7 @@ def _reflectance(radiance: Radiometry, factor: float, quantity: Quantity, source
 
 
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:
-    """(H, W) float32 of raw pixels whose top left one is (x0, y0) of the file."""
+    """(H, W) float32 of raw pixels; the top left one is (x0, y0) of the file."""
     height, width = pixels.shape
     x, y = np.arange(x0, x0 + width, dtype=np.float64), np.arange(y0, y0 + height, dtype=np.float64)
     signal = (pixels.astype(np.float64) - radiometry.black_level) * (radiometry.gain / radiometry.full_scale)

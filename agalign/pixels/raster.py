@@ -52,7 +52,7 @@ _DRIVERS = {
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
 _PREVIEW_SIDE_PX = 2048
-"""Longest side of a preview whose size is not given: more than a page shows."""
+"""Default for the longest side of a preview: more than a page shows."""
 _MAX_MICROMETRES = 20.0
 """Wavelengths below this without a unit are in micrometres: thermal bands end at 14 um, and none is below 100 nm."""
 

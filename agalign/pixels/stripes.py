@@ -36,7 +36,7 @@ _DRIFT_PX = 15.0
 """Integrated differences drift; slower than this (1 sigma), the pattern stays in the image. Of 15, 40 and 80 px, this
 leaves the smallest residual of white stripes."""
 _REGISTERED_PX = 0.5
-"""Bands whose structure agrees at so small a shift, all of them, are co-registered."""
+"""If the structure of all bands agrees at so small a shift, they are co-registered."""
 _REGISTERED_SIGMA = 12.0
 """Unrelated structures reach 8."""
 _MAX_SIDE_PX = 1280

@@ -59,7 +59,7 @@ class Peak:
     """A shift between two structure fields."""
 
     shift_px: tuple[float, float]
-    """(dx, dy): what lies at p in the first field lies at p + shift in the second."""
+    """(dx, dy): p in the first field corresponds to p + shift in the second."""
     sigma: float
     """Height above the surface's mean, in standard deviations of the surface."""
     runner_up_sigma: float
@@ -90,7 +90,7 @@ def correlation_surfaces(fixed: Field, moving: Field) -> NDArray[np.float32]:
 
 
 def whitened_cross_spectra(fixed: Field, moving: Field) -> Field:
-    """The cross spectrum of which `correlation_surfaces` are the inverse transform."""
+    """The cross spectrum; `correlation_surfaces` are its inverse transform."""
     cross = np.conj(fixed)
     cross *= moving
     power = cross.real**2 + cross.imag**2

@@ -134,7 +134,7 @@ def _relief(rng: np.random.Generator, tree: Field, metre: float, relief_m: float
 def _parcels(rng: np.random.Generator, side: int, count: int) -> tuple[NDArray[np.int64], Field]:
     """Index of each pixel's parcel, and its distance in px from the parcel's edge: a Voronoi division.
 
-    Worked out on every fourth pixel; the tracks along the edges hide the steps.
+    Computed on every fourth pixel; the tracks along the edges hide the steps.
     """
     small = side // 4 + 1
     axis = np.arange(small, dtype=np.float32) * 4

@@ -54,7 +54,7 @@ class JointResult(Generic[FixedPx]):
     fixed_to_moving: Matrix
     loss: float
     retrieval: float
-    """Share of held-out patches whose nearest descriptor in the other image is the right one."""
+    """Share of held-out patches with the right one as nearest descriptor in the other image."""
     chance: float
     """The retrieval that guessing would give."""
     iterations: int
@@ -106,7 +106,7 @@ class Residual(Generic[FixedPx]):
     def of(
         cls, centres_px: NDArray[np.float64], shifts_px: NDArray[np.float64], peaks_sigma: NDArray[np.float64]
     ) -> "Residual[FixedPx]":
-        """The statistics of shifts (n, 2), whose peaks (n,) stand out by so many standard deviations."""
+        """The statistics of shifts (n, 2); peaks (n,) are their correlation peaks in standard deviations."""
         measured = np.isfinite(shifts_px[:, 0])
         length = np.linalg.norm(shifts_px[measured], axis=1)
         median, p95 = np.percentile(length, (50, 95)) if len(length) else (np.inf, np.inf)
@@ -239,7 +239,7 @@ class Alignment(Generic[FixedPx]):
     space: Space
     status: PairStatus
     issues: tuple[Issue, ...]
-    """What speaks against it, the plainest first; none where it is `aligned`."""
+    """Reasons against accepting it, the most important first; empty if it is `aligned`."""
     seed: Seed
     joint: JointResult[FixedPx] | None
     residual: Residual[FixedPx] | None
@@ -253,7 +253,7 @@ class Alignment(Generic[FixedPx]):
     parallax: Parallax | None = None
     """The capture's relief, which displaces undistorted px of the reference along the band's baseline."""
     prediction: Prediction | None = None
-    """What the flight's rig says of it; None without a rig."""
+    """Prediction by the rig of the flight; None without a rig."""
 
     def in_file_px(self: "Alignment[FixedImagePx]", scales: "PairScales") -> "Alignment[FixedFilePx]":
         """The same between the files of the two bands."""
@@ -272,17 +272,17 @@ class Alignment(Generic[FixedPx]):
     @property
     def reason(self) -> str | None:
         """Why it is not aligned, in words; None where it is."""
-        told = explanation(self.issues)
-        if told is None or self.status == "aligned":
+        text = explanation(self.issues)
+        if text is None or self.status == "aligned":
             return None
         if self.status == "predicted" and self.prediction is not None:
             source, std_px = _SOURCES[self.prediction.source], self.prediction.std_px
-            return f"{told}; predicted from {source}, standard error {std_px:.2f} px"
+            return f"{text}; predicted from {source}, standard error {std_px:.2f} px"
         if self.status == "seed_only":
-            return f"{told}; the {self.seed.kind} seed is used unchanged"
+            return f"{text}; the {self.seed.kind} seed is used unchanged"
         if self.issues[-1].kind == SEED_DOES_NOT_FIT:
-            return f"{told}; the {self.seed.kind} seed is used unchanged, {sentence(self.issues[-1])}"
-        return told
+            return f"{text}; the {self.seed.kind} seed is used unchanged, {sentence(self.issues[-1])}"
+        return text
 
     def __repr__(self) -> str:
         """One line without the arrays."""

@@ -12,7 +12,7 @@ from agalign.values.lens import Lens
 
 @dataclass(frozen=True)
 class Georeference:
-    """Where a raster lies: `transform` maps (column, row, 1) with (0, 0) the CORNER of the top-left pixel,
+    """Georeference of a raster: `transform` maps (column, row, 1) with (0, 0) the CORNER of the top-left pixel,
     as GDAL and rasterio have it, to map units of `crs_wkt`.
     """
 
@@ -75,7 +75,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Band:
-    """One band of a capture: where its pixels are and what the camera says of them."""
+    """One band of a capture: where its pixels are, and its metadata."""
 
     name: str
     path: Path
@@ -86,7 +86,7 @@ class Band:
     dtype: str
     nodata: float | None = None
     has_mask: bool = False
-    """True where the file has a mask or an alpha band beside the pixels."""
+    """True if the file has a mask or an alpha band."""
     wavelength_nm: float | None = None
     bandwidth_nm: float | None = None
     saturation_value: float | None = None
@@ -105,10 +105,10 @@ class Band:
     one_lens: bool = False
     """The file's bands come through one lens and are aligned as one."""
     companion: bool = False
-    """Of a colour photograph beside the capture: takes part only where asked for."""
+    """Part of a colour photograph: used only on request."""
     georeference: Georeference | None = None
     scale_offset: tuple[float, float] = (1.0, 0.0)
-    """What the file says that its numbers are to be multiplied by, and what to be added then."""
+    """Factor for the numbers of the file, and offset to add then."""
     overviews: tuple[int, ...] = ()
     """Reductions at which the file holds the band too."""
     radiometry: Radiometry | None = None
@@ -146,7 +146,7 @@ class Pose:
     pitch_deg: float = 0.0
     """By how much it looked ahead of straight down."""
     roll_deg: float = 0.0
-    """By how much it looked to the left of that, as an aircraft does whose right side is down."""
+    """How far it looked to the left of that: positive if the right side of the aircraft is down."""
     height_m: float | None = None
     """Above the ground."""
     focal_length_px: float | None = None
@@ -166,7 +166,7 @@ class CameraIdentity:
 
 @dataclass(frozen=True)
 class Capture:
-    """All bands of one moment, of which one is the reference."""
+    """All bands of one moment; one of them is the reference."""
 
     name: str
     folder: Path

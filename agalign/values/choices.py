@@ -4,7 +4,7 @@ from typing import Literal
 
 MAX_RNG_SEED = 2**63 - 1
 MAX_PIXELS = 250_000_000
-"""Of one image, unless told otherwise: more than any camera has."""
+"""Default limit for one image: more than any camera has."""
 MAX_MOSAIC_PIXELS = 20_000_000_000
 SeedKind = Literal["user", "match", "model", "rig", "centre", "geo", "structure", "identity"]
 """`centre` is by the optical centres that DJI writes, where `rig` is by its calibrated homographies."""

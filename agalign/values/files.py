@@ -22,7 +22,7 @@ _PARTIAL = ".agalign-part-"
 
 @contextmanager
 def complete_file(path: Path) -> Iterator[Path]:
-    """A path to write to beside `path`, which takes that name where the block ends well and goes where it does not.
+    """A path to write to next to `path`: renamed to it if the block succeeds, else removed.
 
     What was written has reached the disk before it takes the name: where the power fails, either the old file is there
     or the whole new one. Raises OutputError for an OSError.
@@ -35,26 +35,26 @@ def complete_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def scratch_file(beside: Path) -> Iterator[Path]:
-    """A path to write to beside another, which is gone when the block ends.
+def scratch_file(neighbour: Path) -> Iterator[Path]:
+    """A path to write to next to another; it is removed when the block ends.
 
     It has the same suffix, by which some libraries choose a format, and a name that no other process, here or on
-    another machine that sees the folder, takes; as a hidden file it is no image to be aligned. The folder is made.
+    another machine that sees the folder, takes; being hidden, it is not taken for an image. The folder is made.
     Raises OutputError for an OSError.
     """
-    scratch = beside.with_name(f"{_PARTIAL}{_host()}-{os.getpid()}-{secrets.token_hex(8)}{beside.suffix}")
+    scratch = neighbour.with_name(f"{_PARTIAL}{_host()}-{os.getpid()}-{secrets.token_hex(8)}{neighbour.suffix}")
     try:
-        beside.parent.mkdir(parents=True, exist_ok=True)
+        neighbour.parent.mkdir(parents=True, exist_ok=True)
         yield scratch
     except OSError as error:
-        raise OutputError(f"{beside}: cannot be written ({error.strerror or error})") from None
+        raise OutputError(f"{neighbour}: cannot be written ({error.strerror or error})") from None
     finally:
         with suppress(OSError):
             scratch.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, complete or not at all, the same on every system. Raises OutputError."""
+    """Write a text file atomically, the same on every system. Raises OutputError."""
     with complete_file(path) as partial:
         partial.write_text(text, encoding="utf-8", newline="\n")
 
@@ -123,7 +123,7 @@ def _to_disk(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if not (folder and error.errno in (errno.EINVAL, errno.ENOTSUP)):  # as some network drives say of a folder
+        if not (folder and error.errno in (errno.EINVAL, errno.ENOTSUP)):  # as some network drives report for a folder
             raise
     finally:
         os.close(descriptor)

@@ -94,9 +94,9 @@ CORNERS_UNKNOWN = IssueKind("corners_unknown", "the patches do not determine the
 RETRIEVAL = IssueKind(
     "retrieval", "the descriptors do not distinguish held-out patches (retrieval {value:.2f})", TEXTURELESS
 )  # fmt: skip
-"""Reported by the descriptor check, and by the estimation where it gives up early."""
+"""Reported by the descriptor check, and by an estimation that stops early."""
 SEED_DOES_NOT_FIT = IssueKind("seed_does_not_fit", "but it does not fit either", UNLIKE)
-"""Added to the issues of a result whose seed cannot be used in its place."""
+"""Added to the issues of a result if its seed cannot be used instead."""
 
 KINDS = (
     UNREADABLE, BLANK_REFERENCE, BLANK_MOVING, NO_SUCH_SEED, SEED_ASKED_FOR, NO_CONTRAST, FEW_KEYPOINTS, NOT_INVERTIBLE,

@@ -81,7 +81,7 @@ class PixelMapping:
         )
 
     def positions(self, tile: Tile, dtype: DTypeLike = np.float64) -> Points:
-        """Where each pixel of a tile lies in the moving image, (height, width, 2) raw px."""
+        """Position of each pixel of a tile in the moving image, (height, width, 2) raw px."""
         return self.at_crossings(_along(tile.x0, tile.width), _along(tile.y0, tile.height), dtype)
 
     def at_crossings(self, x_px: Points, y_px: Points, dtype: DTypeLike = np.float64) -> Points:
@@ -138,7 +138,7 @@ def _along(start: int, length: int) -> Points:
 
 
 def mapping_of(reference: Band, moving: Band, alignment: Alignment[FixedFilePx]) -> PixelMapping:
-    """The complete mapping between the raw pixels of two files, of which an alignment was found."""
+    """The complete mapping between the raw pixels of two aligned files."""
     local, parallax = alignment.field, alignment.parallax
     if alignment.space == "pixel":
         return PixelMapping(alignment.fixed_to_moving, local=local, parallax=parallax)

@@ -1,7 +1,7 @@
 """Tasks done by worker processes that share no lock: none that is killed or stopped can hold up another.
 
 No library does this: concurrent.futures, loky, multiprocess, billiard, mpire and pebble have their workers share a
-queue or a lock, and most give up all workers when one is killed.
+queue or a lock, and most stop all workers when one is killed.
 """
 
 import pickle

@@ -12,7 +12,7 @@ from multiprocessing.context import BaseContext
 
 
 def follow_parent() -> None:
-    """In a new process: it does not outlive the one that started it, however that ended; nobody would tell it to."""
+    """In a new process: it ends with the process that started it, however that ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     if parent is None:
@@ -33,7 +33,7 @@ def end_if_reimported() -> None:
     """End a worker process in which the calling script runs again: without `if __name__ == "__main__":` around its
     calls, each worker that imports it would start workers of its own.
     """
-    if getattr(current_process(), "_inheriting", False):  # as `multiprocessing` itself tells it
+    if getattr(current_process(), "_inheriting", False):  # the test that `multiprocessing` itself uses
         os._exit(REIMPORTED_EXIT_CODE)
 
 
@@ -53,7 +53,8 @@ def without_interrupt_key() -> Iterator[None]:
 
 
 def worker_context(preload: str) -> BaseContext:
-    """How processes are started: from one that has loaded the module `preload`, where the system allows, else anew.
+    """How processes are started: forked from one that has loaded the module `preload`, where the system allows, else as
+    new interpreters.
 
     On macOS a copy of a process that has loaded Apple's libraries may crash or hang. The fork server needs a socket in
     a temporary folder, which a service account may not have.

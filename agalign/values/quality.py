@@ -29,4 +29,4 @@ class Quality(IntFlag):
 MEANINGS = " ".join(str(flag.name).lower() for flag in Quality)
 """Names of the flags from the lowest bit, as the CF conventions have them in `flag_meanings`."""
 UNUSABLE = Quality(sum(Quality)) & ~(Quality.PREDICTED | Quality.ERROR_OVER_HALF_PX)
-"""Flags whose pixels `agalign indices --mask-qa` leaves out."""
+"""Flags of pixels that `agalign indices --mask-qa` leaves out."""

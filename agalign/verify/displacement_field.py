@@ -71,7 +71,7 @@ _MIN_CAPTURES, _COMMON_FOLDS = 3, 4
 _COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
 """As `_SMOOTHNESS`, relative to one window of each capture, for the field that the lenses cause."""
 _MIN_COMMON_GAIN_SIGMA, _MAX_COMMON_P95_GROWTH = 2.5, 1.05
-"""Less strict than within one capture: whole captures that are left out share nothing but their lenses."""
+"""Less strict than within one capture: whole captures that are left out share only their lenses."""
 _ITSELF_PX = 1.0
 """Two windows of one grid that are nearer are the same."""
 _ALL_FOLDS = range(16)

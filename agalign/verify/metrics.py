@@ -90,7 +90,7 @@ def joint_histogram(
     """Elastix's joint density of two samples (n,): (32, 32), sums to 1, fixed along rows.
 
     `bins` are the `fixed_bins` of the fixed sample, `limits` the moving image's smallest and largest values. Each range
-    is widened by 1 % on both sides. The fixed kernel is of order 0 (a box), the moving one the cubic B-spline, whose
+    is widened by 1 % on both sides. The fixed kernel is of order 0 (a box), the moving one the cubic B-spline; its
     support costs the moving axis a bin of padding at either end (Klein et al. 2010; Mattes 2003).
     """
     moving_fine = (_bin_position(moving, limits, padding=1) * _FINE).astype(np.int32)

@@ -21,7 +21,7 @@ _WINDOW_PX = 112
 _MIN_WINDOW_PX = 32
 """Smaller windows of small images have no reliable peak."""
 _MIN_STRENGTH = 0.05
-"""Mean structure, of at most 1, below which a window shows nothing but noise."""
+"""Mean structure, of at most 1, below which a window shows only noise."""
 _MIN_PEAK_SIGMA = 7.0
 """Correlation peak, in standard deviations of its surface, from which a shift counts: lower peaks are chance."""
 _FIELD_PX = 128

@@ -96,7 +96,7 @@ def test_a_model_that_was_changed_is_damaged(model: FlightModel, tmp_path: Path,
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"format": "other/1"}, "is no model of agalign"),
+        ({"format": "other/1"}, "is not a model of agalign"),
         ({"channels": "[1]"}, "a network for images of"),
         ({"channels": "[0, 1, 1]"}, "a network for images of"),
     ],
