@@ -27,6 +27,8 @@ class CameraOverview:
     """The lowest and the highest, as the camera writes them: above the sea or an ellipsoid."""
     gsd_m: float | None
     """Median ground sample distance of the reference."""
+    gsd_per_height: float | None
+    """Ground sample distance for each metre of height, by the lens of the reference."""
     radiometry: tuple[RadiometryChoice, ...]
     """What `--radiometry` can be for the captures, without what only a panel gives."""
 
@@ -39,7 +41,10 @@ class CameraOverview:
         if self.gsd_m is not None and self.height_m is not None:
             parts.append(f"GSD {100 * self.gsd_m:.1f} cm from {self.height_m:.0f} m above the ground")
         elif self.altitude_m is not None:
-            parts.append("altitude {:.0f} to {:.0f} m, height above the ground unknown".format(*self.altitude_m))
+            low, high = (f"{a:.0f}" for a in self.altitude_m)
+            parts.append(f"altitude {low if low == high else f'{low} to {high}'} m, height above the ground unknown")
+        if self.gsd_m is None and self.gsd_per_height is not None:
+            parts.append(f"GSD {1e4 * self.gsd_per_height:.1f} cm at a height of 100 m")
         kinds = {"camera": "radiance by calibration", "sun": "reflectance by light sensor"}
         parts.append(f"radiometry: {', '.join(kinds[r] for r in self.radiometry) or 'none in the tags'}")
         return ", ".join(parts)
@@ -68,8 +73,15 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
         height_m=median(heights_m) if heights_m else None,
         altitude_m=(min(altitudes_m), max(altitudes_m)) if altitudes_m else None,
         gsd_m=median(gsds_m) if gsds_m else None,
+        gsd_per_height=_gsd_per_height(captures[0]),
         radiometry=tuple(choice for choice in choices if all(_can_be(c, choice) for c in captures)),
     )  # fmt: skip
+
+
+def _gsd_per_height(capture: Capture) -> float | None:
+    lens, pose = capture.reference.lens, capture.pose
+    focal_px = lens.fx_px if lens is not None else None if pose is None else pose.focal_length_px
+    return 1 / focal_px if focal_px else None
 
 
 def _can_be(capture: Capture, choice: RadiometryChoice) -> bool:

@@ -61,6 +61,7 @@ class CameraOverviewPart(_Part):
     height_m: float | None
     altitude_m: tuple[float, float] | None
     gsd_m: float | None
+    gsd_per_height: float | None = None
     radiometry: list[str]
 
 

@@ -129,6 +129,11 @@ def test_info_begins_with_the_cameras(tmp_path: Path) -> None:
     first = done.stdout.splitlines()[0]
     assert first.startswith("MicaSense RedEdge-M (SY01-0000001-AG")
     assert "2 captures of 5 bands, 160 x 120 px" in first
+    assert camera.gsd_per_height is not None
+    lens = discover(tmp_path).captures[0].reference.lens
+    assert lens is not None
+    assert camera.gsd_per_height * lens.fx_px == pytest.approx(1)
+    assert f"GSD {1e4 / lens.fx_px:.1f} cm at a height of 100 m" in " ".join(done.stdout.split())
     assert json.loads(CliRunner().invoke(app, ["info", str(tmp_path), "--json"]).stdout)["cameras"][0]["captures"] == 2
 
 
