@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from agalign.batch import workers
 from agalign.batch.workers import Task, done_in, own_processes
 from agalign.cameras.discover import discover
 from agalign.config import SeedSettings, Settings
+from agalign.values import processes
 
 ENCODINGS_SAID = """
 import sys, warnings
@@ -35,7 +35,7 @@ def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path
 @pytest.mark.slow
 def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As they do on Windows and macOS: nothing of this process is there in them."""
-    monkeypatch.setattr(workers, "get_all_start_methods", lambda: ["spawn"])
+    monkeypatch.setattr(processes, "get_all_start_methods", lambda: ["spawn"])
     tasks = [Task(c, tmp_path, Settings(seed=SeedSettings(only=True)), None) for c in discover(flight).captures]
     with own_processes(2) as pool:
         assert [r.state for r in done_in(pool, tasks)] == ["done"] * len(tasks)
