@@ -239,7 +239,7 @@ def test_a_fault_while_learning_costs_the_flights_network_and_nothing_else(
     def faulty(*_: object) -> object:
         raise fault
 
-    monkeypatch.setattr(batch_learn, "learn", faulty)
+    monkeypatch.setattr(batch_learn, "refine_with", faulty)
     reports = list(run_flight(discover(flight, TWO_PAIRS), tmp_path, SETTINGS))
     assert [r.good for r in reports] == [True, True]
     assert {b.joint.recipe for r in reports for b in r.sidecar.bands if b.joint} == {"fast"}
