@@ -45,7 +45,7 @@ def process_capture(
     """Align a capture and write its products and sidecar; a band that cannot be aligned does not stop the others.
 
     Its bands' radiometry is what was chosen for them (`with_radiometry`). With the flight's `model` only what it cannot
-    align is learnt anew. Its preview has at most about `max_preview_bytes`.
+    align is learned from scratch. Its preview has at most about `max_preview_bytes`.
     Raises UnreadableFileError where the reference itself cannot be read, InputError or ConfigurationError where the
     capture or the installation lacks what a product needs, and OutputError.
     """

@@ -120,13 +120,13 @@ def _learn_network(
 
 
 def _is_good_enough(results: Results) -> bool:
-    """True where a network needs no learning for a capture of which these are the results."""
+    """True where a network needs no learning for a capture with these results."""
     enough = DEFAULT_SCHEDULE.enough_retrieval
     return all(isinstance(result, JointResult) and result.retrieval > enough for result in results)
 
 
 def _move_to(group: ImageGroup, results: Results) -> None:
-    """Start the pairs of a group whose patches a network could tell apart where it has moved them."""
+    """Start the pairs of a group with distinguishable patches where the network has moved them."""
     for band, result in enumerate(results):
         if isinstance(result, JointResult) and result.retrieval >= MIN_RETRIEVAL:
             group.mappings[band] = result.fixed_to_moving
@@ -221,7 +221,7 @@ def _shown_by_enough(
         try:
             return _shown(capture, settings, model, known.get(capture.label))
         except Exception as why_not:
-            _only_logged(f"{capture.label} shows nothing of the rig", why_not)
+            _only_logged(f"{capture.label} does not determine the rig", why_not)
             return None
 
     result: list[_Shown] = []
@@ -294,7 +294,7 @@ class _Refined:
 
 @dataclass(frozen=True)
 class _Shown:
-    """What a capture says of the rig: its mappings, and the shifts that its windows still show."""
+    """Observation of the rig by one capture: its mappings, and the residual shifts of its windows."""
 
     observation: Observation
     residuals: dict[str, Residual[FixedFilePx]]
@@ -318,8 +318,8 @@ def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Ref
 def _load(
     captures: Sequence[Capture], bands: Sequence[str], settings: Settings, start: FlightModel | None
 ) -> list[_Loaded]:
-    """Of each stretch of the flight, one capture: the first of three whose bands plainly show the same, else the one
-    that shows it best. Water and fog teach nothing.
+    """Of each stretch of the flight, one capture: the first of three with bands that plainly show the same, else the
+    one that shows it best. Water and fog teach nothing.
     """
     loaded = []
     for stretch in np.array_split(np.arange(len(captures)), min(_NETWORK_CAPTURES, len(captures))):

@@ -37,7 +37,7 @@ def prepare_output(out: Path) -> None:
 def locked(out: Path) -> Iterator[None]:
     """The output folder, made and for this run alone. Raises OutputError, also where another run holds it.
 
-    The system lets go of the lock of a process that ends, however it does: one that was killed keeps nobody out.
+    The system lets go of the lock of a process that ends, however it does: one that was killed does not block others.
     """
     prepare_output(out)
     path = out / _LOCK_FILE
@@ -52,7 +52,7 @@ def locked(out: Path) -> Iterator[None]:
             raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
         _LOG.warning("%s: its file system has no locks; make sure that no other run writes there", out)
     try:
-        with suppress(OSError):  # a full disk is told by what needs it
+        with suppress(OSError):  # a full disk is reported by what needs it
             path.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
         remove_partial_files(out)
         yield

@@ -53,11 +53,11 @@ class RunOptions:
     align_panels: bool = False
     """Align captures of calibration panels and of the sky like any other."""
     executor: Executor | None = None
-    """Where the captures are done instead: any executor whose workers see the same folders (`dask_executor` is one)."""
+    """Processes the captures instead: any executor with workers that see the same folders (`dask_executor` is one)."""
     retry_failed: bool = False
     """Do those captures again that an earlier run finished in which a band is not aligned, or missing."""
     timeout_s: float | None = None
-    """After which a capture is given up; it has a process then, whose end ends whatever it hangs in. Not for an
+    """After which a capture is stopped; it has a process of its own then, which is killed. Not for an
     `executor`, which has its own (`dask_executor`)."""
     command: str = ""
     """The command line that asked for the run, for its record and report."""
@@ -65,15 +65,15 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Listener:
-    """What a run tells while it runs."""
+    """Events of a run."""
 
     on_start: Callable[[Capture], None] = quiet
     on_pair: PairProgress = quiet
     """Of captures in this process only."""
     on_learning: Callable[[str, float], None] = quiet
-    """The camera whose network is learnt, and the share that is behind."""
+    """Camera of the network that is being learned, and the share that is done."""
     on_learnt: Callable[[str, float], None] = quiet
-    """The camera whose network was learnt, and the seconds that it took."""
+    """Camera of the network that was learned, and the seconds that it took."""
 
 
 def run_flight(
@@ -84,7 +84,7 @@ def run_flight(
 
     A network is learnt for every camera and flight first and saved below OUT/models; `model` is one to start from.
     One capture's failure never stops the others, and no result depends on the order in which they are done. What the
-    run was is told by OUT/agalign-run.json.
+    run was is in OUT/agalign-run.json.
     Raises OutputError where the output folder cannot be used, another run writes there or the disk is full, WorkerError
     where no worker process can be started or they end one after another, InputError or ConfigurationError for `model`.
     """
@@ -104,7 +104,7 @@ def run_flight(
                 tally.stage_seconds[stage] += seconds
             yield report
             if report.problems and is_full(out):
-                raise OutputError(f"{out}: the disk is full; make room, and the same command goes on from here")
+                raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
 
 
 @contextmanager
@@ -142,10 +142,10 @@ def _reports(
 ) -> Iterator[CaptureReport]:  # fmt: skip
     sky, captures = _sky(flight.captures, options)
     on_map = FlightMap(out)
-    for left_out, told in zip(sky, write_sky(sky, out), strict=True):
+    for left_out, facts in zip(sky, write_sky(sky, out), strict=True):
         discard_outputs(left_out.capture, out, settings.write)
         on_map.add(left_out.capture, "sky")
-        yield CaptureReport(left_out.capture.label, "sky", sky=told.sentence)
+        yield CaptureReport(left_out.capture.label, "sky", sky=facts.sentence)
     panels, captures = _panels(captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
         if not reading.capture.is_of_a_panel:
@@ -314,7 +314,7 @@ def _refuse_to_overwrite(flight: FolderScan, out: Path, settings: WriteSettings)
 
 
 def finished_before(capture: Capture, out: Path, settings: Settings) -> CaptureResult | None:
-    """What the sidecar says of an earlier run with the same settings and bands whose outputs are still there."""
+    """Result of an earlier run with the same settings and bands, if its outputs still exist."""
     path = CapturePaths.of(capture, out).sidecar
     try:
         sidecar = read_result(path)

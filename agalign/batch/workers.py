@@ -157,7 +157,7 @@ def _report_of(result: Callable[[], CaptureReport], task: Task, timeout_s: float
 
 
 def result_or_problem(result: Callable[[], R], timeout_s: float | None = None) -> tuple[R | None, str]:
-    """What a task returned, or None and one line that says what became of it."""
+    """Result of a task, or None and one line about its failure."""
     try:
         return result(), ""
     except TimeoutError:
@@ -206,7 +206,7 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
     `address` is a scheduler's, such as tcp://host:8786, or `local` for so many worker processes here, 0 being one a
     core. What a lost worker was doing is done by another. A capture that takes longer than the timeout ends its worker,
     which its nanny replaces; the scheduler tries it on other workers, as often as its setting `allowed-failures` has
-    it, before it is given up. Raises ConfigurationError where Dask is not installed, the scheduler does not answer, or
+    it, before it is abandoned. Raises ConfigurationError where Dask is not installed, the scheduler does not answer, or
     a worker lacks this version of the package.
     """
     try:
@@ -308,7 +308,7 @@ def start_worker(threads: int) -> None:
 
 
 def stamp(path: Path) -> int:
-    """Workers live longer than runs: a model that was learnt anew has the same path and another stamp."""
+    """Workers live longer than runs: a model that was learned again has the same path and another stamp."""
     with suppress(OSError):
         return path.stat().st_mtime_ns
     return 0

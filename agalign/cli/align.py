@@ -85,7 +85,7 @@ _EXAMPLES = examples(
     ("agalign flight/ -o aligned/ --layout bands", "single files with their tags, for photogrammetry"),
     ("agalign orchard/ --relief --error-map", "follow trees and terraces; map the expected error"),
     ("agalign flight/ --model earlier/models/CAMERA.safetensors", "begin with what an earlier flight learnt"),
-    ("agalign flight/ --retry-failed", "once more what fell short"),
+    ("agalign flight/ --retry-failed", "process captures again that did not align"),
 )
 
 
@@ -348,7 +348,7 @@ def align(
 
 
 def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
-    """(band in lower case, reflectance) of a list 'Blue=0.51,NIR=0.49', or of one number for all, whose name is empty.
+    """(band in lower case, reflectance) of a list 'Blue=0.51,NIR=0.49', or of one number for all, with an empty name.
 
     Raises ConfigurationError.
     """
@@ -360,7 +360,7 @@ def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
         except ValueError:
             value = 0.0
         if not 0 < value <= 1:
-            raise ConfigurationError(f"--panel-albedo {text}: '{part}' is no reflectance between 0 and 1")
+            raise ConfigurationError(f"--panel-albedo {text}: '{part}' is not a reflectance between 0 and 1")
         result.append((name.strip().lower(), value))
     return tuple(result)
 

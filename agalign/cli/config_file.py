@@ -1,4 +1,4 @@
-"""Options from a file: `--config agalign.toml`, whose keys are the options' names without the dashes."""
+"""Options from a file: `--config agalign.toml`, with the options' names as keys without the dashes."""
 
 from difflib import get_close_matches
 from pathlib import Path
@@ -13,7 +13,7 @@ _NEVER = {"help", "config", "dry-run"}
 def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     """Take the file's values as the defaults of the command's options: what the command line says comes first.
 
-    Raises BadParameter for a file that is no TOML, and for a key that is no option.
+    Raises BadParameter for a file that is not TOML, and for an unknown key.
     """
     if path is None:
         return None

@@ -1,4 +1,4 @@
-"""The command that says what this machine has for the program, and what it lacks."""
+"""The command that checks this machine for what the program needs."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, Terminal, exits, shown
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless", "rasterio", "tifffile", "scikit-image", "pydantic")
 EXTRAS = {
     "dask": "captures on the workers of a Dask cluster (--dask)",
-    "evaluate": "elastix beside the learnt descriptors (agalign evaluate)",
+    "evaluate": "elastix in comparison with learned descriptors (agalign evaluate)",
     "indices": "more spectral indices by name (agalign indices --index)",
     "stac": "STAC items and collections (--stac)",
     "xarray": "a flight as one lazily read Dataset (agalign.open_flight)",
@@ -34,7 +34,7 @@ def doctor(
     folder: Annotated[Path, typer.Argument(help="Where aligned files would be written.")] = Path(),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
-    """Say what this machine has: versions, devices, threads, memory, disk, and what extras would add."""
+    """Check this machine: versions, devices, threads, memory, disk, and what extras would add."""
     terminal = Terminal(quiet=False, verbose=False, log_json=False)
     with exits(terminal):
         facts = {"machine": _machine(), "disk": _disk(folder), "devices": _devices(), "extras": _extras()}

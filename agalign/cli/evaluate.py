@@ -52,7 +52,7 @@ def evaluate(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
-    """Descriptors and homographies on pairs whose truth is known: the paper's protocol."""
+    """Descriptors and homographies on pairs with ground truth: the paper's protocol."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
         check_address_space()
@@ -103,7 +103,7 @@ def surface(
         from agalign.method.paper import Training
 
         if out.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
-            raise ConfigurationError(f"{out}: is no name of a picture, such as loss-surface.png")
+            raise ConfigurationError(f"{out}: is not the name of a picture, such as loss-surface.png")
         known = [p for p in find_pairs(pairs) if p.fixed_to_moving is not None]
         if number > len(known):
             raise ConfigurationError(f"{pairs}: has {len(known)} pairs with a homography, not {number}")
@@ -166,7 +166,7 @@ def _shares(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) / 100 for part in text.split(","))
     except ValueError:
-        raise ConfigurationError(f"'{text}' is no list of per cents, such as 0,5,10") from None
+        raise ConfigurationError(f"'{text}' is not a list of percentages, such as 0,5,10") from None
 
 
 def _table(title: str, rows: list[list[str]]) -> "Table":

@@ -1,4 +1,4 @@
-"""What went wrong in a run, on the terminal: once for each cause, with what to try."""
+"""What went wrong in a run, on the terminal: once for each cause, with the remedy."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ _MAX_NAMED = 3
 
 
 def explain(failures: "Sequence[FailureGroup]", terminal: Terminal) -> None:
-    """The gravest first: how many bands, why, of which captures, and what to do."""
+    """The gravest first: how many bands, why, in what captures, and the remedy."""
     for short in failures:
         status, first = short.status.replace("_", " "), short.bands[0]
         if len(short.bands) == 1:

@@ -1,4 +1,4 @@
-"""The command that shows what was found: the captures of a folder, or what a model knows of its camera."""
+"""The command that shows what was found: the captures of a folder, or what a model contains."""
 
 import json
 from collections import Counter
@@ -133,7 +133,7 @@ def _missing(row: dict[str, Any]) -> list[str]:
 
 
 def _unreadable_files(flight: "FolderScan") -> dict[str, list[Path]]:
-    """The files that cannot be read of each capture, by its label: those whose name begins as the capture's does."""
+    """The files that cannot be read of each capture, by its label: those with a name that begins like the capture's."""
     result: dict[str, list[Path]] = {}
     for problem in flight.problems:
         if not isinstance(problem.error, UnreadableFileError):
@@ -163,7 +163,7 @@ def _show_unused(flight: "FolderScan", terminal: Terminal) -> None:
 
 
 def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
-    """What a model knows of its camera. Raises InputError where it is none."""
+    """Contents of a model. Raises InputError where it is none."""
     from rich.table import Table
 
     from agalign.flight.model import load_model
@@ -182,7 +182,7 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     if not rows:
         terminal.result("no rig: too few captures said something of it")
         return
-    table = Table("Band", title="The rig: where each band lies, and how far off it is where only predicted (rms, px)")
+    table = Table("Band", title="The rig: offset of each band, and error of its prediction (RMS, px)")
     for name in ("Offset of the middle", "Baseline", "By bands", "By neighbours", "By the flight", "Lens field up to"):
         table.add_column(name, justify="right")
     for row in rows:

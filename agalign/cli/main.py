@@ -178,7 +178,7 @@ _COMMANDS = {command.name or getattr(command.callback, "__name__", "") for comma
 
 
 def main() -> None:
-    """Entry point: a first argument that is no command is the folder to align."""
+    """Entry point: a first argument that is not a command is the folder to align."""
     arguments = sys.argv[1:]
     if arguments and not arguments[0]:
         Terminal(quiet=False, verbose=False, log_json=False).problem("the name of the folder is empty")
@@ -192,7 +192,7 @@ def main() -> None:
     _give_value(arguments, "--radiometry", get_args(RadiometryChoice), "auto")
     # Threads that spin while they wait cost a multiple of the time where another program wants the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # The matrices here are small: a second BLAS thread does nothing but spin.
+    # The matrices here are small: a second BLAS thread only spins.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.getLogger("rasterio").setLevel(logging.CRITICAL)
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
@@ -201,11 +201,11 @@ def main() -> None:
 
 
 def _refuse_misspelt(first: str) -> None:
-    """A word that is nearly a command is no folder that is missing. Raises SystemExit."""
+    """A word that is nearly a command is a typing error, not a missing folder. Raises SystemExit."""
     meant = get_close_matches(first, _COMMANDS, 1, cutoff=0.7)
     if meant and not Path(first).exists():
         terminal = Terminal(quiet=False, verbose=False, log_json=False)
-        terminal.problem(f"'{first}' is no command and no folder; did you mean '{meant[0]}'?")
+        terminal.problem(f"'{first}' is neither a command nor a folder; did you mean '{meant[0]}'?")
         raise SystemExit(EXIT_USAGE)
 
 

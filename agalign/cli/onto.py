@@ -1,4 +1,4 @@
-"""`agalign onto`: georeferenced mosaics of other dates or sensors, laid on the grid of one of them."""
+"""`agalign onto`: georeferenced mosaics of other dates or sensors, aligned to the grid of one of them."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,9 +23,7 @@ from agalign.values.memory_limit import check_address_space
 
 
 def onto(
-    reference: Annotated[
-        Path, typer.Argument(help="The mosaic on whose grid the others are laid.", show_default=False)
-    ],
+    reference: Annotated[Path, typer.Argument(help="The mosaic with the output grid.", show_default=False)],
     moving: Annotated[list[Path], typer.Argument(help="Mosaics of other dates or sensors.", show_default=False)],
     out: Annotated[
         Path | None,
@@ -52,7 +50,7 @@ def onto(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
-    """Lay georeferenced mosaics of other dates or sensors on the grid of REFERENCE.
+    """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.
 
     Grids, resolutions and coordinate reference systems may differ. Written are, for each MOVING, a raster on the
     reference's pixels that holds the band it was compared with and the moving mosaic's bands, and a sidecar.

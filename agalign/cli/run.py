@@ -1,4 +1,4 @@
-"""A flight aligned from the command line: found, done with a progress line, told capture by capture, and summed up."""
+"""A flight aligned from the command line, with a progress line, reports of captures and a summary."""
 
 import re
 import threading
@@ -111,7 +111,7 @@ def load_ahead() -> None:
     """Begin to load what takes two seconds to load, torch among it, while the files are looked at."""
 
     def load() -> None:
-        with suppress(Exception):  # told by whoever needs it
+        with suppress(Exception):  # reported by what needs it
             import_module("agalign.batch")
 
     threading.Thread(target=load, daemon=True).start()
@@ -243,7 +243,7 @@ def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
 @contextmanager
 def _progress(terminal: Terminal, captures: int) -> Iterator[Callable[[RunTotals, float, str], None]]:
     """One line for the whole flight on a terminal, nothing elsewhere: there each capture prints a plain line. It is
-    told what is done, the share of the capture that is worked on, and what is done to which.
+    given what is done, the share of the capture that is worked on, and what is done to which.
     """
     if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
         yield lambda _outcome, _share, _text: None

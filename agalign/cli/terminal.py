@@ -58,7 +58,7 @@ def shown(text: str) -> str:
 
 
 def in_json(value: Any) -> Any:
-    """A field's value; JSON has no nan and no infinity, which are told in words."""
+    """A field's value; JSON has no nan and no infinity, which become words."""
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -51,7 +51,7 @@ def distance(f: Tensor, f_prime: Tensor) -> Tensor:
 
 
 def retrieval(f: Tensor, f_prime: Tensor, allowed: Tensor) -> float:
-    """Share of rows of `f` (N, D) whose nearest row of `f_prime` (N, D) is their own, averaged over both directions.
+    """Share of rows of `f` (N, D) with their own as nearest row of `f_prime` (N, D), averaged over both directions.
 
     Pairs that are not `allowed` (N, N) do not compete; the diagonal always does. Chance is about 1 / N.
     """

@@ -35,7 +35,7 @@ def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:
 
 
 def visible_in_both(keypoints: Keypoints, fixed_to_moving: Matrix, fixed: Raster, moving: Raster) -> Keypoints:
-    """The keypoints whose patches are inside both images."""
+    """The keypoints with patches inside both images."""
     grid = patch_positions(keypoints)
     there = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
     inside = torch.ones(len(keypoints), dtype=torch.bool)

@@ -57,7 +57,7 @@ _FIRST_UPDATES = 5
 """Steps on psi before the first on weights that are not random; twice as many where those suffice."""
 _STEPS_BETWEEN_UPDATES = 10
 _HOPELESS_STEPS = 30
-"""Steps after which a level is given up where no held-out patches could be retrieved."""
+"""Steps after which a level is abandoned where no held-out patches could be retrieved."""
 _PATCHES = 300
 """Patches in a Gauss-Newton step: the cost of a step grows with them, its error falls with their square root."""
 
@@ -169,7 +169,7 @@ class _GroupAtLevel:
 
 
 _MovePsi = Callable[[Sequence[_GroupAtLevel]], list[bool]]
-"""One step on each psi of some groups; True for each group whose psi have all converged."""
+"""One step on each psi of some groups; True for each group in which all psi have converged."""
 
 
 @torch.no_grad()
@@ -206,7 +206,7 @@ def _converges(at_level: Sequence[_GroupAtLevel], move_psi: _MovePsi) -> bool:
 def _train(
     state: JointState, net: Descriptor, at_level: Sequence[_GroupAtLevel], schedule: Schedule, move_psi: _MovePsi
 ) -> tuple[int, float]:
-    """Theta by Adam, one group a step; every few steps each psi whose held-out patches are retrieved by Gauss-Newton.
+    """Theta by Adam, one group a step; every few steps Gauss-Newton on each psi with retrieved held-out patches.
 
     Returns the number of steps and the last loss.
     """
@@ -231,7 +231,7 @@ def _train(
 
 
 def _loss(at: _GroupAtLevel) -> Tensor | None:
-    """The in-batch loss of one capture's pairs on keypoints that are drawn anew; None where none can be drawn."""
+    """The in-batch loss of one capture's pairs on newly drawn keypoints; None where none can be drawn."""
     state, level = at.state, at.level
     p, inside = state.sampler.draw(level, level.trainable, at.h, BATCH, _OCTAVES)
     rows = [inside[:, i].nonzero()[:, 0] for i in range(len(at.h))]
@@ -265,7 +265,7 @@ def in_batch_loss(f: Tensor, f_prime: Tensor, allowed: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _move_psi(at: _GroupAtLevel) -> bool:
-    """One step on each psi of a capture whose held-out patches are retrieved; True where all have converged."""
+    """One step on each psi of a capture with held-out patches that are retrieved; True where all have converged."""
     state, level = at.state, at.level
     test, _ = state.sampler.draw(level, level.held_out, at.h, TEST_KEYPOINTS, _OCTAVES)
     p, _ = state.sampler.draw(level, level.anywhere, at.h, _PATCHES, _OCTAVES)

@@ -19,7 +19,7 @@ from agalign.values.choices import ModelFamily
 _REWEIGHTINGS = 4
 _DAMPING = 1e-4
 _CELL_PX = 48
-"""Patches whose centres share a cell of this side overlap: the covariance takes them as one observation."""
+"""Patches with centres in one cell of this side overlap: the covariance takes them as one observation."""
 _RICH_ENOUGH_STD_PX = 0.5
 """A model family is rich enough while its least certain corner is known this well, px of the level: beyond it a simpler
 family has the smaller error."""
@@ -115,7 +115,8 @@ def solve(
 ) -> Step:  # fmt: skip
     """The step that the patches agree on, cut to `max_step_px`.
 
-    With `family` None the richest family is taken whose corners have a standard error of at most `rich_enough_std_px`.
+    With `family` None the richest family is taken that gives the corners a standard error of at most
+    `rich_enough_std_px`.
     """
     families = FAMILIES if family is None else (family,)
     step = richest = _solve_family(equations, families[0], max_step_px)

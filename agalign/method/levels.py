@@ -78,7 +78,7 @@ class Pool:
     xy: Tensor
     """(M, 2) undistorted positions."""
     reach_px: Tensor
-    """(M,) how far a patch around each may reach; infinity where nothing but the image bounds it."""
+    """(M,) how far a patch around each may reach; infinity where only the image bounds it."""
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -93,7 +93,7 @@ class Level:
     trainable: Pool
     """Positions with contrast enough from which theta is learnt."""
     held_out: Pool
-    """The same in cells of the image of which theta never sees a pixel: patches around the ones share none with patches
+    """The same in cells of the image that theta never sees: patches around the ones share none with patches
     around the others."""
     anywhere: Pool
     """Both together, their patches unbounded."""
@@ -185,7 +185,7 @@ class Sampler:
         self, level: Level, pool: Pool, homographies: Sequence[Tensor], count: int, octaves: float,
         spacing_px: float = 1.0,
     ) -> tuple[Keypoints, Tensor]:  # fmt: skip
-        """Up to `count` keypoints of I from `pool` whose patches lie in the valid area of I and of some I', and in
+        """Up to `count` keypoints of I from `pool` with patches in the valid area of I and of some I', and in
         which I' they do, (N, bands) bool. Those that lie in the most come first.
 
         Orientation is uniform in [0, 2 pi], log2 of the scale in units of `spacing_px` uniform in [0, octaves]

@@ -86,7 +86,7 @@ def _turned(keypoints: Keypoints, angle: float) -> Keypoints:
 
 
 def _mutual_nearest(f: Tensor, f_prime: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Rows of `f` (N, D) and keypoints of `f_prime` (k count, D), of which each is the other's nearest."""
+    """Rows of `f` (N, D) and keypoints of `f_prime` (k count, D) that are mutual nearest neighbours."""
     d = torch.cdist(f, f_prime).reshape(len(f), -1, count).amin(dim=1)
     forth, back = d.argmin(dim=1), d.argmin(dim=0)
     rows = (back[forth] == torch.arange(len(f), device=f.device)).nonzero()[:, 0]

@@ -72,7 +72,7 @@ def align_by_paper(
 ) -> tuple[Descriptor, JointResult[FixedImagePx] | Issue]:
     """The network and the result for a group of one moving image.
 
-    Coarse to fine: theta starts anew at each level, psi is handed on. Raises NotEnoughTextureError, NoContrastError,
+    Coarse to fine: theta is reinitialised at each level, psi is kept. Raises NotEnoughTextureError, NoContrastError,
     and GeometryError where psi ends in no homography.
     """
     channels = group.fixed.channels, group.moving[0].channels

@@ -27,7 +27,7 @@ from agalign.values.pixel_units import FixedImagePx
 
 MIN_KEYPOINTS = 16
 TEST_KEYPOINTS = 256
-"""Held-out keypoints among which retrieval is measured: chance is then 0.004, and a share is known to 0.03."""
+"""Held-out keypoints among which retrieval is measured: chance is then 0.004, the standard error of a share 0.03."""
 REST_PX = 0.5
 """psi is at rest when a step moves no corner by more than this, px of the level."""
 PATCHES, FLIGHT_PATCHES = 400, 256
@@ -63,7 +63,7 @@ class MovingBand:
     side: int
 
     def sees(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
-        """(M,) rows of the keypoints of I whose patches lie in both images."""
+        """(M,) rows of the keypoints of I with patches in both images."""
         return footprints_inside(self.level, self.index, keypoints, homography).nonzero()[:, 0]
 
     def patches(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
@@ -152,14 +152,14 @@ class Solver:
 
 
 def moved(homography: Tensor, step: Step, times: float = 1.0) -> Tensor:
-    """H <- H @ change, (3, 3) float32; psi, in which the change is linear, so many times as far."""
+    """H <- H @ change, (3, 3) float32; psi, in which the change is linear, scaled by a factor."""
     unmoved = torch.eye(3, dtype=step.change.dtype, device=step.change.device)
     return (exact(homography) @ (unmoved + times * (step.change - unmoved))).to(homography)
 
 
 @torch.no_grad()
 def held_out_retrieval(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor) -> tuple[float, float]:
-    """(share of the keypoints that are visible in both images whose nearest descriptor in I' is their own, chance).
+    """(share of the keypoints visible in both images with their own as nearest descriptor in I', chance).
 
     `f` (N, 256) are the descriptors of the reference.
     """

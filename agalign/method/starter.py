@@ -1,6 +1,6 @@
 """The network that recipe fast starts from: learnt by the same method on synthetic flights (tools/learn_starter.py).
 
-It is one siamese network. A pseudo-siamese one takes its first layer on every side and goes on from there.
+It is one siamese network. A pseudo-siamese one takes its first layer on every side and is trained further.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,8 +20,8 @@ _FILE = "starter.safetensors"
 def start_from(net: Descriptor, weights: Mapping[str, Tensor], sides: Sequence[int] | None = None) -> None:
     """Give a network the weights of another, as its state_dict has them.
 
-    `sides` says which of the other's sides each side takes; by default the one of the same number. Where the other has
-    not so many, its last one serves. A first layer of other channels takes them together: what describes a grey image
+    `sides` maps each side to the side of the other that it takes; by default the one of the same number. Where the other
+    has fewer, its last one is used. A first layer of other channels takes them together: what describes a grey image
     then describes three equal ones.
     """
     state = net.state_dict()

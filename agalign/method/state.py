@@ -34,7 +34,7 @@ class ImageGroup:
     trusted: Sequence[bool]
     """True for a seed that is good to a few pixels: recipe fast then skips the coarse levels."""
     reach_px: Sequence[float] = ()
-    """Largest distance of each result from its mapping, px of `fixed`; empty where there is no limit."""
+    """Largest distance of each result from its mapping, px of `fixed`; empty if unlimited."""
     dropped: dict[int, float] = field(default_factory=dict)
     """{moving image: held-out retrieval} where the descriptors could not distinguish patches at some level: they are
     neither learnt nor refined any more."""

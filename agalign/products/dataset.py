@@ -25,8 +25,8 @@ _CHUNKS = {"x": 1024, "y": 1024}
 def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """The aligned bands of a capture by its sidecar, its stack or its STAC item, lazily (dask).
 
-    Dimensions are y and x, at the centres of pixels: on the map where the capture lies on one (`.rio.crs`), else in px
-    of what was written, with (0, 0) the centre of the top-left pixel. A variable is named after its band and has the
+    Dimensions are y and x, at the centres of pixels: map coordinates if the capture is georeferenced (`.rio.crs`), else
+    px of what was written, with (0, 0) the centre of the top-left pixel. A variable is named after its band and has the
     attributes `wavelength_nm`, `units` and `status`. Values are float32 with nan for nodata; with `masked=False` they
     are the file's own, with its nodata value as `_FillValue`: differences of unsigned integers wrap around.
     Bands without pixels are left out. A capture with a relief has the variables `parallax` (px along a
@@ -135,7 +135,7 @@ def _opened(folder: Path, name: str, *, masked: bool) -> "xarray.DataArray":
     path = folder / name
     try:
         with without_warnings():
-            # Whatever the file says of itself: other drivers may open other files.
+            # Other drivers may open other files.
             opened: xarray.DataArray = rioxarray.open_rasterio(path, chunks=_CHUNKS, masked=masked, driver="GTiff")
     except OSError as error:
         raise UnreadableFileError(f"{path}: cannot be read ({error}); run again") from None

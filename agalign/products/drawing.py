@@ -16,7 +16,7 @@ _INK = 40, 40, 40
 
 
 def write_png(image: Picture, path: Path) -> None:
-    """Complete or not at all. Raises OutputError."""
+    """Write atomically. Raises OutputError."""
     with complete_file(path) as partial:
         encoded, data = cv2.imencode(".png", image[..., ::-1])
         if not encoded:
@@ -28,7 +28,7 @@ def with_text(
     image: Picture, text: str, at_px: tuple[float, float], size_px: float = 14, anchor: str = "ls",
     ink: tuple[int, int, int] = _INK,
 ) -> Picture:  # fmt: skip
-    """The picture with a line of text; `anchor` is Pillow's, the left end of the baseline unless told."""
+    """The picture with a line of text; `anchor` is Pillow's, by default the left end of the baseline."""
     drawn = Image.fromarray(image)
     ImageDraw.Draw(drawn).text(at_px, text, ink, ImageFont.load_default(size_px), anchor)
     return np.asarray(drawn)

@@ -44,7 +44,7 @@ def write_error_map(
     capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], grid: OutputGrid, path: Path
 ) -> None:
     """Write (bands, height, width) float32, px of the reference's file, on the grid of the capture's aligned files,
-    complete or not at all. Raises OutputError.
+    atomically. Raises OutputError.
     """
     size_px, georeference = capture.reference.size_px, capture.reference.georeference
     layers = {name: _error_px(alignment, size_px, grid) for name, alignment in alignments.items()}

@@ -167,7 +167,7 @@ def _new_matrix(of_band: Lens, image: ImageFile) -> Matrix:
 
 
 def _most_typical(of_camera: Sequence[NDArray[np.float64]], size_px: tuple[int, int]) -> NDArray[np.float64]:
-    """The matrices (bands, 3, 3) of the capture whose corners are nearest to the median."""
+    """The matrices (bands, 3, 3) of the capture with corners nearest to the median."""
     corners_px = geometry.corners(*size_px)
     mapped = np.array([[geometry.apply(m, corners_px) for m in matrices] for matrices in of_camera])
     distances_px = np.linalg.norm(mapped - np.median(mapped, axis=0), axis=-1)

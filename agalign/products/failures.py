@@ -1,4 +1,4 @@
-"""The problems of a run, each cause once, with what to try."""
+"""The problems of a run, each cause once, with its remedy."""
 
 from dataclasses import dataclass, field
 
@@ -24,7 +24,7 @@ class UnalignedBand:
 
 @dataclass
 class FailureGroup:
-    """The bands of a run that fell short by one cause to one status."""
+    """The bands of a run with one status for one cause."""
 
     status: str
     remedy: Remedy
@@ -32,7 +32,7 @@ class FailureGroup:
 
     @property
     def advice(self) -> str:
-        """What to try, where something must be tried."""
+        """The remedy, if something must be done."""
         if self.status != "predicted":
             return self.remedy.advice
         usable = "those known to a px or better may be used, as indices do (prediction in the sidecar)"
@@ -67,5 +67,5 @@ class FailureGroups:
 
 
 def _remedy_of(band: BandResult) -> Remedy:
-    """The first doubt is the one that the reason tells."""
+    """The first issue is the one in `reason`."""
     return KINDS[band.issues[0].kind].remedy if band.issues else _UNTOLD

@@ -54,7 +54,7 @@ _GRID = 17, 13
 _FINE_GRID = 65, 49
 """The same where local displacements or a lens curve it."""
 _MAX_CURVATURE_PX = 0.2
-"""A coarse grid whose bilinear interpolation is off by more than this is not enough."""
+"""A coarse grid is not sufficient if its bilinear interpolation is off by more than this."""
 
 
 def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:

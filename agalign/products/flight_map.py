@@ -57,7 +57,7 @@ class FlightMap:
         }
 
     def write(self) -> Path | None:
-        """Write the map, complete or not at all; None where no capture has a place. Raises OutputError."""
+        """Write the map atomically; None where no capture has a place. Raises OutputError."""
         features = [self._features[label] for label in sorted(self._features)]
         if not any(f["geometry"] for f in features):
             return None

@@ -15,7 +15,7 @@ _PICTURE_PX = 720
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Water, soil, and the greens, as red, green, blue over the span of an index of reflectance."""
 _NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
-"""For raw numbers, of which no colour of soil or vegetation is true."""
+"""For raw numbers: colours of soil or vegetation would be wrong."""
 _NODATA_COLOUR = (225, 190, 215)
 
 

@@ -31,9 +31,9 @@ class IndexRasters(Product):
         return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
-        """Write the indices whose bands the capture has and that are delivered.
+        """Write the indices of bands that the capture has and that are delivered.
 
-        Raises InputError for one whose bands are in the wrong unit, OutputError.
+        Raises InputError for one with bands in the wrong unit, OutputError.
         """
         bands = _bands(context)
         indices = [index_named(name) for name in context.write_settings.indices]

@@ -37,7 +37,7 @@ _OLD_ACCEPT_PREDICTED_PX = 1.0
 _MAX_REFLECTANCE = 2.0
 """Glints and specular leaves exceed 1; raw numbers of any sensor exceed this."""
 _SAMPLE_PX = 512
-"""Longer side of the sample by which unnamed numbers are told apart."""
+"""Longer side of the sample by which unnamed numbers are distinguished."""
 _MAX_STATISTICS_PX = 4_000_000
 """Percentiles of larger rasters are those of every second, third … pixel."""
 _MIN_SPAN = 1e-3
@@ -101,7 +101,7 @@ class IndexBand:
     """Of the file, where it is known."""
     problem: str = ""
     quality: tuple[Path, int, str] | None = None
-    """The quality raster whose flagged pixels are left out, the index of the band's layer, and the file's checksum."""
+    """The quality raster with flagged pixels to leave out, the index of the band's layer, and the file's checksum."""
 
 
 @dataclass
@@ -122,8 +122,8 @@ class _Raster:
 def write_indices(out: Path, indices: Sequence[Index]) -> Iterator[IndexReport]:
     """Write OUT/<folder>/<capture>_<index>.tif and .png for every capture of a run, one after another.
 
-    A capture that lacks a band, or whose band is not aligned, is reported and stops no other. Raises InputError where
-    there is no run.
+    A capture that lacks a band, or has a band that is not aligned, is reported and stops no other. Raises InputError
+    where there is no run.
     """
     for path in run_sidecars(out):
         label = path.relative_to(out).with_suffix("").as_posix()
@@ -179,9 +179,9 @@ def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> 
 def write_rasters(
     bands: Sequence[IndexBand], indices: Sequence[Index], base: Path, label: str, *, overwrite: bool = True
 ) -> list[IndexReport]:
-    """Write `base`_<index>.tif and .png of a capture's bands, each complete or not at all.
+    """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
 
-    An index whose bands are missing, not aligned, or not in the unit that it needs has a report with the problem.
+    An index with bands that are missing, not aligned, or not in the unit that it needs has a report with the problem.
     Raises OutputError, or InputError for a file that cannot be read.
     """
     reports: dict[str, IndexReport] = {}
@@ -311,7 +311,7 @@ def _unit(index: Index, sources: Sequence[Source]) -> str:
 
 
 def _units_of(source: rasterio.DatasetReader, index: int) -> list[str]:
-    """Without a word of radiometry numbers are reflectance where most of them, scaled as the file says, can be."""
+    """Without radiometry tags, numbers are reflectance where most of them, scaled as the file says, can be."""
     said = source.tags(index).get("QUANTITY") or source.tags().get("RADIOMETRY")
     if said:
         return str(said).split(" and ")

@@ -69,7 +69,7 @@ def rows_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexRow
 
 
 def read_table(out: Path) -> list[IndexRow]:
-    """Return the rows of OUT/indices.csv whose rasters are still there; none where there is no table."""
+    """Return the rows of OUT/indices.csv with rasters that still exist; empty without a table."""
     try:
         text = (out / INDICES_FILE).read_text(encoding="utf-8")
         rows = [_row(line) for line in csv.DictReader(io.StringIO(text))]

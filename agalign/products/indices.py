@@ -155,7 +155,7 @@ def _is_of_any_unit(index: Index) -> bool:
 def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float | None]) -> list[int]:
     """Which of some bands are the index's, by wavelength where one is known, else by name.
 
-    Raises InputError that says which is missing.
+    Raises InputError that names the missing one.
     """
     result = []
     narrow = [not name.lower().startswith(_NOT_NARROW) for name in names]

@@ -48,7 +48,7 @@ class Layer:
 def output_layers(
     capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], settings: WriteSettings, rig: Rig | None = None
 ) -> tuple[list[Layer], OutputGrid]:
-    """The layers of a capture, whose usable moving bands have these alignments, and the grid they are written on.
+    """The layers of a capture with these alignments of its usable moving bands, and the grid they are written on.
 
     With the flight's `rig` the grid is that of all its captures: one flight, one geometry.
     """

@@ -60,7 +60,7 @@ def _has_invalid_pixels(layers: Sequence[Layer], grid: OutputGrid) -> bool:
 def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any]) -> float:
     """0; where copied bands contain zeros, the largest value, or else the first that they do not contain.
 
-    Copied pixels never change, except for a type whose values they all contain: then 0.
+    Copied pixels never change, except if they contain all values of the type: then 0.
     """
     copied = [_values_in(layer.band, grid.tile) for layer in layers if layer.is_copied]
     limits = np.iinfo(str(dtype))

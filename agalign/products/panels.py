@@ -42,7 +42,7 @@ class PanelBandPart(_Part):
     """Mean over the area, in the unit of the camera's own calibration."""
     reflectance_per_radiance: float | None
     problem: str | None
-    """Why the band tells nothing."""
+    """Why the band cannot be used."""
 
 
 class PanelPart(_Part):
@@ -78,7 +78,7 @@ class Panels(_Part):
 
 
 def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]:
-    """OUT/panels.json and <capture>.panel.png beside where the capture's files would be; where there is none, neither
+    """OUT/panels.json and <capture>.panel.png where the capture's files would be; where there is none, neither
     of an earlier run is left.
 
     Raises OutputError.
@@ -127,7 +127,7 @@ def _band_part(reading: BandReading) -> PanelBandPart:
 
 
 def _sheet(reading: PanelReading) -> Picture:
-    """Every band beside the next, with the area that was read."""
+    """All bands side by side, with the area that was read."""
     tiles = [_tile(b) for b in reading.bands]
     height = max(t.shape[0] for t in tiles)
     gap = np.full((height, _GAP_PX, 3), 255, np.uint8)

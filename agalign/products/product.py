@@ -59,7 +59,7 @@ class WrittenFile:
     asset: StacAsset | None = None
     """None for a file that the STAC item leaves out."""
     bands: tuple[str, ...] = ()
-    """The bands whose aligned pixels it contains, in the order of the file."""
+    """The bands with aligned pixels in it, in the order of the file."""
     nodata: float | None = None
     """The value that it declares."""
     preview: PreviewPart | None = None
@@ -145,7 +145,7 @@ class Product(ABC):
 
     @abstractmethod
     def write(self, context: ProductContext) -> list[WrittenFile]:
-        """Write its files, each complete or not at all, and return them; none where nothing can be made.
+        """Write its files, each atomically, and return them; none where nothing can be made.
 
         Raises OutputError, or UnreadableFileError for an input.
         """

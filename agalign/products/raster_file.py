@@ -57,7 +57,7 @@ def write_raster(
     capture: Capture, layers: Sequence[Layer], grid: OutputGrid, path: Path, settings: WriteSettings,
     tags: TransferredTags | None = None,
 ) -> float | None:  # fmt: skip
-    """Write layers as the bands of one file, complete or not at all; return its nodata value.
+    """Write layers as the bands of one file atomically; return its nodata value.
 
     The type is the layers' where all share it, else the smallest that holds them all; float32 after radiometry. A
     nodata value is declared only where some pixel needs it; valid moving pixels that happen to equal it change by
@@ -110,7 +110,7 @@ def write_layers(
     path: Path, layers: Mapping[str, NDArray[np.float32]], grid: OutputGrid, georeference: Georeference | None,
     units: Mapping[str, str] | None = None, tags: Mapping[str, Mapping[str, str]] | None = None,
 ) -> None:  # fmt: skip
-    """Write float32 layers (height, width) by name, with their units and tags, complete or not at all; nan is nodata.
+    """Write float32 layers (height, width) by name, with their units and tags atomically; nan is nodata.
 
     Raises OutputError.
     """
@@ -144,7 +144,7 @@ def write_flags(
     path: Path, names: Sequence[str], grid: OutputGrid, georeference: Georeference | None, tags: Mapping[str, str],
     flags_on: Callable[[Tile], Sequence[NDArray[np.uint16]]],
 ) -> None:  # fmt: skip
-    """Write uint16 layers with these names, complete or not at all; `flags_on` returns them (height, width) on a tile
+    """Write uint16 layers with these names atomically; `flags_on` returns them (height, width) on a tile
     of the grid. They have no nodata value: 0 is a pixel without any flag.
 
     Raises OutputError.

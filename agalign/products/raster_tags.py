@@ -15,7 +15,7 @@ UNITS: Mapping[Quantity, str] = {
 
 
 def describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings: WriteSettings) -> None:
-    """Set tags, units, scales and descriptions of an open rasterio dataset whose bands are these layers."""
+    """Set tags, units, scales and descriptions of an open rasterio dataset with these layers as bands."""
     raw = settings.radiometry == "off"
     facts = (
         {

@@ -33,12 +33,12 @@ class ReducedBands:
 
 
 def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> ReducedBands:
-    """Views of a capture whose bands were written to `places` on a grid. Raises UnreadableFileError."""
+    """Views of a capture with bands written to `places` on a grid. Raises UnreadableFileError."""
     size_px = _reduced(grid.width, grid.height)
     whole = 0, 0, grid.width, grid.height
     before = {}
     for band in capture.bands:
-        with suppress(UnreadableFileError):  # its pair has failed, and says so
+        with suppress(UnreadableFileError):  # its pair has failed with a reason
             before[band.name] = _grey(_before(band, capture.reference, grid, size_px))
     after = {name: _grey(read_preview(*place, whole, size_px)) for name, place in places.items()}
     return ReducedBands(before, after, size_px)

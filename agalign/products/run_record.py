@@ -94,7 +94,7 @@ class RunPart(_Part):
 
 
 def problem_of(what: str, text: str) -> ProblemPart:
-    """Names of files may hold what is no letter; those are written out."""
+    """Names of files may contain characters that are not printable; those are escaped."""
     return ProblemPart(of=harmless(what), problem=harmless(text))
 
 

@@ -463,13 +463,13 @@ class Sidecar(CaptureResult):
     """One entry per band, the reference included."""
 
     def result(self) -> CaptureResult:
-        """The same without its bands' long tables, of which a season has no need at once."""
+        """The same without the long tables of its bands, which need too much memory for a season."""
         short: dict[str, Any] = {"bands": {"__all__": {"grid": True, "relief": True, "metrics": {"tiles"}}}}
         return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude=short))
 
 
 def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
-    """Write at once or not at all; returned with its checksum. Raises OutputError."""
+    """Write atomically; returned with its checksum. Raises OutputError."""
     checksum = content_checksum(sidecar.model_dump_json(by_alias=True))
     whole = sidecar.model_copy(update={"checksum": checksum})
     write_text(path, compact_lists(whole.model_dump_json(by_alias=True, indent=1)))

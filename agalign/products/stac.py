@@ -39,7 +39,7 @@ _COMMON_NAMES = {"blue": "blue", "green": "green", "red": "red", "red edge": "re
 
 
 class StacItem(Product):
-    """The item of a capture, whose assets are the files of the products before it."""
+    """The item of a capture, with the files of the products before it as assets."""
 
     kind = "stac_item"
     suffix = ".stac.json"
@@ -81,7 +81,7 @@ def write_collections(captures: Sequence[Capture], out: Path) -> list[Path]:
 
 
 def _write_collection(capture: Capture, items: Sequence[Path], out: Path) -> Path:
-    """Write the collection of a flight, of which `capture` is one."""
+    """Write the collection of the flight of `capture`."""
     import pystac
 
     target = out / _collection_file(capture)
@@ -110,7 +110,7 @@ def _read_item(path: Path) -> "pystac.Item":
 def _collection_id(capture: Capture) -> str:
     """Of the capture's flight: its id or camera in words, and a checksum that no other flight has.
 
-    It depends on nothing but the capture: a capture of another run, or alone, finds the same collection.
+    It depends only on the capture: a capture of another run, or alone, finds the same collection.
     """
     camera = f"{capture.camera.model} {capture.camera.serial}".strip()
     name = re.sub(r"[^\w.-]+", "_", capture.flight_id or camera or "flight")

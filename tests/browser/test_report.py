@@ -95,7 +95,7 @@ def test_what_fell_short_stands_first(page: Any) -> None:
     assert first.inner_text() == "Problems"
     assert "IMG_0002" in page.locator("#capture-title").inner_text()
     assert page.locator(".short").count() >= 2
-    assert "What to try" in page.locator(".short p").first.inner_text()
+    assert "Remedy" in page.locator(".short p").first.inner_text()
 
 
 def test_only_the_capture_that_is_looked_at_is_loaded(browser: Any, out: Path) -> None:

@@ -21,7 +21,7 @@ DISCOURAGED = re.compile(
     re.IGNORECASE | re.VERBOSE,
 )
 MAX_IN_DOCUMENTS = 5
-MAX_IN_PACKAGE = 160
+MAX_IN_PACKAGE = 30
 
 
 def count(paths: list[Path]) -> tuple[int, str]:

@@ -1,4 +1,4 @@
-"""What the page knows of each capture, short enough for a thousand of them."""
+"""Data of the page about each capture, short enough for a thousand of them."""
 
 import math
 from collections.abc import Sequence
@@ -26,9 +26,9 @@ from agalign.products.sidecar import (
 
 SCHEMA = "agalign-report/1"
 _SHIFT_STEP_PX = 0.01
-"""Shifts of windows are told in whole numbers of this."""
+"""Shifts of windows are written in whole numbers of this."""
 _LIKE_SCALES = 0.1
-"""Of two bands whose scales differ by more than this share a displacement says nothing."""
+"""Displacements between bands are not meaningful if their scales differ by more than this share."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class CaptureEntry:
     seconds: float
     """What its alignment took."""
     offsets_px: dict[str, tuple[float, float]]
-    """Where the middle of the reference lies in each band beside its own middle; of bands that were delivered."""
+    """Offset of the centre of the reference from that of each delivered band."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +57,14 @@ class BandRow:
     apart_px: float | None
     """Medians over captures: how far the raw files lie apart,"""
     residual_px: float | None
-    """and what is left of that, with the worst capture's."""
+    """Residual after alignment, with that of the worst capture."""
     worst_px: float | None
     seconds: float
 
 
 @dataclass
 class Facts:
-    """What is told of the captures below an output folder, as they are added."""
+    """Data about the captures below an output folder, as they are added."""
 
     out: Path
     entries: list[CaptureEntry] = field(default_factory=list)

@@ -2,7 +2,7 @@
 "use strict";
 /**
  * What moves on the report: the map, the table, and the capture that is looked at. Everything that is shown comes from
- * the facts in the page itself; the only files that are loaded are the previews beside the rasters, one as it is looked
+ * the facts in the page itself; the only files that are loaded are the previews next to the rasters, one as it is looked
  * at. Canvases are drawn on and never read, which a page from a file may not do.
  */
 
@@ -357,18 +357,18 @@ const FULL_PX = 0.5; // a residual's colour and arrow are full
 const FAR = [25, 35, 150]; // colours of the relief; between them the lightness grows with the parallax
 const NEAR = [205, 250, 45];
 const INDEX_OPACITY = 0.9;
-const INDEX_PICTURE_PX = 720; // longer side of the image in the picture of an index, whose histogram is below it
+const INDEX_PICTURE_PX = 720; // longer side of the image in the picture of an index; the histogram is below it
 const RELIEF_OPACITY = 0.75; // edges of the picture show through
 /** @type {Record<string, string>} */
 const NOTES = {
-  vectors: `What is left of the shift in each window; an arrow of ${FULL_PX} px reaches most of the way to the next window. Grey: none could be measured.`,
-  heat: `What is left of the shift in each window, full at ${FULL_PX} px.`,
+  vectors: `Residual shift of each window; an arrow of ${FULL_PX} px reaches most of the way to the next window. Grey: none could be measured.`,
+  heat: `Residual shift of each window, full at ${FULL_PX} px.`,
   error: "The error to be expected at every pixel, as far as it is known: the more orange, the larger, full at 0.5 px.",
   relief: "Parallax relative to the plane that most of the scene is on: the lighter, the nearer.",
 };
 const BLINK_MS = 700;
 const SCREEN_SHARE = 78; // of its height, at most, for a picture
-const CLOSE_ENOUGH = 1.5; // as wide as the small picture has pixels, the detail is laid over it
+const CLOSE_ENOUGH = 1.5; // as wide as the small picture has pixels, the detail is drawn over it
 
 /** What is looked at, and how; it stays from capture to capture. */
 const look = {
@@ -405,7 +405,7 @@ function show(capture) {
   table.rows.get(capture)?.classList.add("open");
   const dot = dots.get(capture);
   dot?.classList.add("open");
-  dot?.parentNode?.append(dot); // nothing lies over it
+  dot?.parentNode?.append(dot); // drawn on top
   const place = byId("capture");
   place.hidden = false;
   place.replaceChildren(...heading(capture), ...pictures(capture), ...indexTable(capture), words(capture), numbers(capture));
@@ -597,7 +597,7 @@ function showDetail() {
 }
 
 /**
- * Where a picture lies on the sheet: x, y, width, height. Rows are those of agalign/products/preview.py.
+ * Place of a picture on the sheet: x, y, width, height. Rows are those of agalign/products/preview.py.
  * @param {Preview} preview @param {number} column @param {number} line @returns {[number, number, number, number]}
  */
 function onSheet(preview, column, line) {
@@ -712,7 +712,7 @@ function inMetres(range_m) {
 }
 
 /**
- * One picture, and what is laid over it, within a strip of the canvas.
+ * One picture and its overlays, within a strip of the canvas.
  * @param {CanvasRenderingContext2D} pen @param {Capture} capture @param {When} when
  * @param {number} origin Where the picture's frame begins. @param {number} from @param {number} width Of the strip.
  */
@@ -845,7 +845,7 @@ function edges(places) {
 }
 
 /**
- * The relief in its colours, which stands on the last row of the sheet; null where there is none.
+ * The relief in its colours, in the last row of the sheet; null where there is none.
  * @param {Capture} capture
  */
 function relief(capture) {
@@ -971,23 +971,23 @@ function words(capture) {
  * @param {Pair} pair @param {string} reference
  */
 function sentence(pair, reference) {
-  const lay = pair.apart_px === null || pair.apart_px < 0.05 ? "" : `had an offset of ${fixed(pair.apart_px, pair.apart_px < 10 ? 1 : 0)} px from ${reference} and `;
+  const offset = pair.apart_px === null || pair.apart_px < 0.05 ? "" : `had an offset of ${fixed(pair.apart_px, pair.apart_px < 10 ? 1 : 0)} px from ${reference} and `;
   if (pair.status === "aligned") {
     const left = pair.residual_px;
-    if (left === null) return `${lay}is aligned; no window could measure a residual.`;
+    if (left === null) return `${offset}is aligned; no window could measure a residual.`;
     const use = left <= 0.5 ? "suitable for indices of single plants" : left <= 1 ? "suitable for indices of rows and plots, not of single leaves" : "suitable for averages over an area";
     const most = pair.residual_p95_px === null ? "" : `, 95 % ${fixed(pair.residual_p95_px)} px`;
     const seen = pair.occluded === null ? "" : ` The relief of the capture is corrected; ${percent(pair.occluded)} of its image is occluded.`;
-    return `${lay}is aligned: median residual ${fixed(left)} px${most}; ${use}.${seen}`;
+    return `${offset}is aligned: median residual ${fixed(left)} px${most}; ${use}.${seen}`;
   }
   if (pair.status === "predicted") {
     const std = pair.prediction?.std_px ?? Infinity;
     const use = std <= 1 ? "suitable for indices within that error" : "not suitable for indices";
     const how = pair.prediction?.from === "windows" ? "is predicted by its windows" : "is predicted by the rig of the flight";
-    return `${lay}${how}, standard error ${fixed(std)} px (${use}): ${pair.reason ?? "no reason on record"}.`;
+    return `${offset}${how}, standard error ${fixed(std)} px (${use}): ${pair.reason ?? "no reason on record"}.`;
   }
   if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason on record"}. Only its seed is applied; exclude it from indices.`;
-  return `failed: ${pair.reason ?? "no reason on record"}. Nothing of it is written.`;
+  return `failed: ${pair.reason ?? "no reason on record"}. It is nodata in the output.`;
 }
 
 /** @param {Capture} capture */

@@ -35,7 +35,7 @@ _SLOWEST = 5
 
 @dataclass(frozen=True)
 class Pages:
-    """What tells of a run as a whole."""
+    """Documents about a run as a whole."""
 
     report: Path
     summary: Path

@@ -1,4 +1,4 @@
-"""Drawings of what a flight knows of its camera, in the units of their SVGs."""
+"""Drawings of the rig of a flight, in the units of their SVGs."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ _MAX_POINTS = 400
 
 @dataclass(frozen=True)
 class BandView:
-    """A band of a rig: where its lens stands beside the reference's, and what it does that its model does not say."""
+    """A band of a rig: position of its lens relative to the reference's, and residuals of the lens model."""
 
     name: str
     hue: float
@@ -77,7 +77,7 @@ class Drift:
 
 
 def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
-    """Of the models below OUT/models; what cannot be read is told to `on_problem`."""
+    """Of the models below OUT/models; what cannot be read is reported to `on_problem`."""
     views = []
     for path in sorted((out / "models").glob("*.safetensors")):
         try:
@@ -136,7 +136,7 @@ def drifts_of(captures: Sequence[CaptureEntry]) -> list[Drift]:
 
 def _drift(camera: str, captures: Sequence[CaptureEntry], names: Sequence[str]) -> Drift:
     along = {name: _along([c.offsets_px.get(name) for c in captures]) for name in names}
-    # Which end of a direction is up is nobody's: all as the first band goes.
+    # The sign of a direction is arbitrary: the same for all as for the first band.
     first = along[names[0]]
     along = {name: values if _together(first, values) else [None if v is None else -v for v in values]
              for name, values in along.items()}  # fmt: skip
