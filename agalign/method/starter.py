@@ -20,8 +20,8 @@ _FILE = "starter.safetensors"
 def start_from(net: Descriptor, weights: Mapping[str, Tensor], sides: Sequence[int] | None = None) -> None:
     """Give a network the weights of another, as its state_dict has them.
 
-    `sides` maps each side to the side of the other that it takes; by default the one with its number. Where the other has
-    fewer, its last one is used. A first layer of other channels takes them together: what describes a grey image
+    `sides` maps each side to the side of the other that it takes; by default the one with its number. Where the other
+    has fewer, its last one is used. A first layer of other channels takes them together: what describes a grey image
     then describes three equal ones.
     """
     state = net.state_dict()
