@@ -90,6 +90,7 @@ def indices(
         chosen = chosen_indices(index, formula or [])
         folder = target or out
         tasks = index_tasks(out, chosen, folder, overwrite=overwrite, mask_qa=mask_qa)
+        terminal.event("found", captures=len(tasks), indices=len(chosen))
         announced = unit_of_run(tasks) == RAW
         if announced:
             terminal.problem(RAW_NUMBERS)

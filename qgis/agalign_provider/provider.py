@@ -1,0 +1,51 @@
+"""The provider of the algorithms, with the setting that names the executable."""
+
+from processing.core.ProcessingConfig import ProcessingConfig, Setting
+from qgis.core import QgsProcessingProvider
+
+from .algorithms import AlignFlight, AlignOnto, InspectFolder, SpectralIndices
+
+EXECUTABLE_SETTING = "AGALIGN_EXECUTABLE"
+
+
+def executable_setting():
+    """The path that the user has set under Settings, Options, Processing, Providers; empty by default."""
+    return ProcessingConfig.getSetting(EXECUTABLE_SETTING) or ""
+
+
+class AgalignProvider(QgsProcessingProvider):
+    """The algorithms of agalign."""
+
+    def id(self):
+        """Of the provider in `qgis_process` and models."""
+        return "agalign"
+
+    def name(self):
+        """Shown in the toolbox."""
+        return "agalign"
+
+    def longName(self):  # noqa: N802
+        """Shown in the settings."""
+        return "agalign: multispectral drone images"
+
+    def load(self):
+        """Add the setting and the algorithms."""
+        ProcessingConfig.addSetting(
+            Setting(
+                self.name(), EXECUTABLE_SETTING,
+                "Executable of agalign, or its virtual environment (empty: search PATH)", "",
+                valuetype=Setting.FILE,
+            )
+        )  # fmt: skip
+        ProcessingConfig.readSettings()
+        self.refreshAlgorithms()
+        return True
+
+    def unload(self):
+        """Remove the setting."""
+        ProcessingConfig.removeSetting(EXECUTABLE_SETTING)
+
+    def loadAlgorithms(self):  # noqa: N802
+        """Add every algorithm."""
+        for algorithm in (AlignFlight, SpectralIndices, AlignOnto, InspectFolder):
+            self.addAlgorithm(algorithm(executable_setting))
