@@ -46,7 +46,14 @@ RUN /opt/pip/bin/pip wheel --no-deps --no-index --no-build-isolation --wheel-dir
 
 
 FROM python
+# What a registry shows: --build-arg VERSION=, REVISION= and SOURCE=, the address of the source.
+ARG VERSION=
+ARG REVISION=
+ARG SOURCE=
 LABEL org.opencontainers.image.title="agalign" \
+      org.opencontainers.image.version="$VERSION" \
+      org.opencontainers.image.revision="$REVISION" \
+      org.opencontainers.image.source="$SOURCE" \
       org.opencontainers.image.description="Co-registers the bands of multispectral drone cameras" \
       org.opencontainers.image.licenses="MIT"
 COPY --from=build /opt/venv /opt/venv

@@ -21,8 +21,8 @@ chown "$user" "$folder/demo" "$folder/aligned" "$folder/cluster" 2> /dev/null ||
 chmod 755 "$folder"
 
 version=$(sed -n 's/^__version__ = "\(.*\)"/\1/p' agalign/_version.py)
-labels=(--label "org.opencontainers.image.version=$version")
-if revision=$(git rev-parse HEAD 2> /dev/null); then labels+=(--label "org.opencontainers.image.revision=$revision"); fi
+labels=(--build-arg "VERSION=$version" --build-arg "SOURCE=${SOURCE:-}")
+if revision=$(git rev-parse HEAD 2> /dev/null); then labels+=(--build-arg "REVISION=$revision"); fi
 
 if docker info > /dev/null 2>&1; then
     trap 'docker compose down > /dev/null 2>&1 || true; rm -rf "$folder"' EXIT

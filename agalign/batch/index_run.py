@@ -1,6 +1,5 @@
 """Spectral indices of all captures of a run: one after another, in processes of this machine, or on an executor."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import suppress
@@ -14,6 +13,7 @@ from agalign.products.index_rasters import IndexReport, bands_of, run_sidecars, 
 from agalign.products.index_table import IndexRow, row_of, update_table
 from agalign.products.indices import Index
 from agalign.products.sidecar import read_result
+from agalign.values.cores import usable_cores
 from agalign.values.process_pool import ProcessPool
 from agalign.values.processes import follow_parent, threads_of_children, worker_context
 
@@ -121,7 +121,7 @@ def _failed(task: IndexTask, problem: str) -> CaptureIndices:
 
 
 def _results(tasks: Sequence[IndexTask], options: IndexOptions) -> Iterator[CaptureIndices]:
-    processes = min(options.jobs or os.cpu_count() or 1, len(tasks) // _CAPTURES_WORTH_A_PROCESS)
+    processes = min(options.jobs or usable_cores(), len(tasks) // _CAPTURES_WORTH_A_PROCESS)
     if options.executor is not None:
         yield from _on_executor(options.executor, tasks)
     elif processes > 1:

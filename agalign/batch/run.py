@@ -1,6 +1,5 @@
 """Many captures: which are still to be done, what their flight learns first, and each one done."""
 
-import os
 import stat
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +36,7 @@ from agalign.products.sidecar import CaptureResult, read_result
 from agalign.products.sky import write_sky
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
+from agalign.values.cores import usable_cores
 
 _MAX_THREADS = 4
 """Threads that learn a flight: more wait for the interpreter."""
@@ -250,7 +250,7 @@ def _panels(
 def _cores(options: RunOptions, settings: Settings) -> int:
     """How many captures are worked on at a time where that costs nothing: one where a GPU does the work."""
     on_cpu = choose_device(settings.joint.device).type == "cpu"
-    return options.jobs or ((os.cpu_count() or 1) if on_cpu else 1)
+    return options.jobs or (usable_cores() if on_cpu else 1)
 
 
 def _given_model(path: Path, flight: FolderScan, settings: Settings) -> FlightModel:

@@ -31,6 +31,7 @@ from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
 from agalign.products.preview import preview_bytes
 from agalign.values.capture import Capture
+from agalign.values.cores import usable_cores
 from agalign.values.process_pool import Outcome, ProcessPool, WorkerDiedError
 from agalign.values.processes import follow_parent, threads_of_children, worker_context
 
@@ -184,7 +185,7 @@ def result_or_problem(result: Callable[[], R], timeout_s: float | None = None) -
 @contextmanager
 def own_processes(jobs: int) -> Iterator[CapturePool]:
     """So many processes of our own, which load what they need while the caller does something else."""
-    threads = max(1, (os.cpu_count() or 1) // jobs)
+    threads = max(1, usable_cores() // jobs)
     context = worker_context(__name__)
     with (
         threads_of_children(threads),
@@ -218,7 +219,7 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
         try:
             if address == LOCAL:
                 cluster = LocalCluster(
-                    n_workers=jobs or os.cpu_count() or 1, threads_per_worker=1, processes=True, dashboard_address=None
+                    n_workers=jobs or usable_cores(), threads_per_worker=1, processes=True, dashboard_address=None
                 )
                 address = stack.enter_context(cluster).scheduler_address
             client = Client(address, set_as_default=False, timeout=_DASK_ANSWERS_WITHIN_S)

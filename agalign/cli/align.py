@@ -1,6 +1,5 @@
 """The command that aligns a folder, and what `demo` shares with it."""
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -41,6 +40,7 @@ from agalign.values.choices import (
     SeedChoice,
     Sharing,
 )
+from agalign.values.cores import usable_cores
 from agalign.values.memory_limit import check_address_space
 
 FolderArgument = Annotated[
@@ -330,7 +330,7 @@ def align(
         )  # fmt: skip
         options = DiscoverOptions(
             pattern, reference, ignore_metadata, with_rgb, band_names(bands), order, (target,), max_pixels,
-            jobs or os.cpu_count() or 1, tuple(include or ()), tuple(exclude or ()),
+            jobs or usable_cores(), tuple(include or ()), tuple(exclude or ()),
         )  # fmt: skip
         if stac:
             need_stac()

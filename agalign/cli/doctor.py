@@ -4,7 +4,6 @@ import json
 import os
 import platform
 import shutil
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ import typer
 
 from agalign._version import __version__
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, Terminal, exits, shown
+from agalign.values.cores import usable_cores
 
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless", "rasterio", "tifffile", "scikit-image", "pydantic")
 EXTRAS = {
@@ -56,7 +56,7 @@ def _machine() -> dict[str, Any]:
     return {
         "agalign": __version__, "python": platform.python_version(), "system": platform.platform(),
         **{name: _version(name) for name in _LIBRARIES}, "gdal": gdal_version(),
-        "cores": _cores(), "memory_gb": _memory_gb(),
+        "cores": usable_cores(), "memory_gb": _memory_gb(),
     }  # fmt: skip
 
 
@@ -67,11 +67,6 @@ def _version(distribution: str) -> str | None:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _cores() -> int:
-    """Those that this process may use, which in a container or a cluster's job may be fewer than the machine has."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def _memory_gb() -> float | None:

@@ -16,6 +16,7 @@ from rich.table import Column, Table
 from agalign.cli.failures import explain
 from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, shown
 from agalign.errors import NoSuchBandError, OutputError, WorkerError
+from agalign.values.cores import limit_default_threads
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
@@ -109,6 +110,7 @@ def print_plan(flight: "FolderScan", out: Path, settings: "Settings", how: "RunO
 
 def load_ahead() -> None:
     """Begin to load what takes two seconds to load, torch among it, while the files are looked at."""
+    limit_default_threads()
 
     def load() -> None:
         with suppress(Exception):  # reported by what needs it

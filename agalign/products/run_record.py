@@ -1,6 +1,5 @@
 """OUT/agalign-run.json: what a run was, with what, on what, and what came of it; written before anything else is."""
 
-import os
 import platform
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
@@ -18,6 +17,7 @@ from agalign.errors import SidecarError
 from agalign.flight.overview import camera_overviews
 from agalign.products.sidecar import CaptureResult, compact_lists
 from agalign.values.capture import Capture
+from agalign.values.cores import usable_cores
 from agalign.values.files import RUN_FILE, write_text
 from agalign.values.text import harmless
 
@@ -172,5 +172,5 @@ def _versions() -> dict[str, str]:
 def _machine(settings: Settings) -> dict[str, str | int]:
     return {
         "system": platform.system(), "release": platform.release(), "processor": platform.machine(),
-        "cores": os.cpu_count() or 1, "device": settings.joint.device,
+        "cores": usable_cores(), "device": settings.joint.device,
     }  # fmt: skip

@@ -1,0 +1,71 @@
+"""How many processor cores this process may use."""
+
+import math
+import os
+import sys
+from pathlib import Path
+
+_CGROUPS = Path("/sys/fs/cgroup")
+_OWN_CGROUP = Path("/proc/self/cgroup")
+
+
+def usable_cores() -> int:
+    """Return the number of cores: those of the machine, or fewer where an affinity (taskset, a batch system) or the
+    quota of a control group (`docker run --cpus`, a Kubernetes limit) allows fewer. A share of a core counts as one.
+    """
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    quota = cgroup_quota() if sys.platform == "linux" else None
+    return cores if quota is None else max(1, min(cores, math.ceil(quota)))
+
+
+def limit_default_threads() -> None:
+    """Let libraries that are loaded later start no more threads than the quota allows: they count the cores of the
+    affinity. What the user has set stays.
+    """
+    quota = cgroup_quota() if sys.platform == "linux" else None
+    if quota is not None:
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            os.environ.setdefault(name, str(usable_cores()))
+
+
+def cgroup_quota(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float | None:
+    """Return the smallest quota of this process's control group and those above it, in cores; None for no limit.
+
+    Version 2 has `cpu.max` ("200000 100000": the first number of microseconds in each period of the second), version
+    1 two files.
+    """
+    quotas = [q for folder in _folders(root, own) if (q := _quota_in(folder)) is not None]
+    return min(quotas, default=None)
+
+
+def _folders(root: Path, own: Path) -> list[Path]:
+    """The folders of this process's control groups, and those above; in a container they begin at the root."""
+    result = [root, root / "cpu"]
+    for line in _text(own).splitlines():
+        _, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        folder = root / "cpu" if controllers else root
+        for part in Path(path.lstrip("/")).parts:
+            folder = folder / part
+            result.append(folder)
+    return result
+
+
+def _quota_in(folder: Path) -> float | None:
+    quota, _, period = _text(folder / "cpu.max").strip().partition(" ")
+    if not quota:
+        quota, period = (_text(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period"))
+    try:
+        cores = float(quota) / float(period)
+    except (ValueError, ZeroDivisionError):  # "max", or no such file
+        return None
+    return cores if cores > 0 else None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:
+        return ""
