@@ -13,6 +13,7 @@ from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
 FLIGHT_MAP_FILE = "flight.geojson"
+_WITHOUT_FOOTPRINT = ("panel", "sky")
 _DECIMALS = 7
 """Of degrees: a centimetre."""
 
@@ -30,7 +31,8 @@ class FlightMap:
         Its geometry is the footprint of its aligned rasters, or of the reference where there are none; the position of
         the camera where the footprint is unknown; nothing where that is unknown too.
         """
-        shown = with_assumed_height(capture)
+        # Panels are photographed from a metre, and the sky has no footprint.
+        shown = capture if status in _WITHOUT_FOOTPRINT else with_assumed_height(capture)
         ring = footprint(shown, _grid(capture, result))
         position, pose = shown.position, shown.pose
         place: dict[str, Any] | None = None

@@ -118,6 +118,7 @@ def test_a_run_writes_the_map_and_georeferenced_rasters_that_agree(tmp_path: Pat
     features = json.loads((tmp_path / "out" / "flight.geojson").read_text())["features"]
     by_status = {f["properties"]["status"] for f in features}
     assert "panel" in by_status
+    assert {f["geometry"]["type"] for f in features if f["properties"]["status"] == "panel"} == {"Point"}
     (feature, *_) = [f for f in features if f["properties"]["stack"]]
     assert feature["properties"]["height_from"] == "panel"
     with rasterio.open(tmp_path / "out" / feature["properties"]["stack"]) as stack:
