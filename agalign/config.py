@@ -100,7 +100,7 @@ class WriteSettings(Stage):
 
     interpolation: Interpolation = "lanczos"
     """Lanczos has half the error of OpenCV's cubic kernel on band-limited images, bilinear five times as much:
-    docs/method.md has the figures."""
+    docs/benchmarks.md has the figures."""
     crop: Crop = "flight"
     """The area that all bands share in all captures of the flight, where its rig is known, or in each by itself; or
     none."""

@@ -34,7 +34,7 @@ _MAX_MEDIAN_PX = 1.0
 _CLOSE_PX = 1.0
 """Residual shift up to which a single window counts as aligned."""
 _MIN_CLOSE = 0.9
-"""Share of the measured windows that must be close: a few scattered wrong peaks are normal (docs/method.md)."""
+"""Share of the measured windows that must be close: a few scattered wrong peaks are normal (docs/benchmarks.md)."""
 _MIN_CLUSTER, _MAX_CLUSTER = 5, 0.04
 """Adjacent windows that are not close, as a count and as a share of those measured, from which a part of the image is
 not aligned: wrong peaks are scattered, parallax is not. Both must be reached."""
