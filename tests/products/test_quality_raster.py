@@ -109,6 +109,13 @@ def test_glint_is_found_where_no_pixel_around_is_free_of_it() -> None:
     assert not sun_glint(green + 0.5, nir + 0.55).any()
 
 
+def test_bright_flat_ground_apart_from_the_water_has_no_glint() -> None:
+    green, nir = (np.tile(band, (1, 3)) for band in water(np.random.default_rng(0)))
+    green[:, 200:360], nir[:, 200:360] = 0.04, 0.4  # vegetation
+    green[:, 360:], nir[:, 360:] = 0.3, 0.32  # a road
+    assert not sun_glint(green, nir).any()
+
+
 def test_glint_of_unknown_pixels_and_of_tiny_images_is_none() -> None:
     green, nir = water(np.random.default_rng(0))
     nir[:80] = np.nan
