@@ -44,7 +44,7 @@ _EXAMPLES = examples(
     ("agalign demo", "a synthetic flight, aligned and compared with its truth"),
     ("agalign info flight/", "what would be aligned, and what is missing"),
     ("agalign flight/ -o aligned/", "align it; 'agalign align --help' has the options"),
-    ("agalign ndvi aligned/", "indices of what was aligned"),
+    ("agalign indices aligned/", "spectral indices of the aligned captures"),
     ("agalign doctor", "what this machine has"),
 )
 app = typer.Typer(
