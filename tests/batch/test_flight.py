@@ -103,7 +103,7 @@ def test_what_is_no_model_is_named(tmp_path: Path) -> None:
     from safetensors.torch import save_file
 
     save_file({"x": torch.zeros(1)}, path)
-    with pytest.raises(InputError, match="no model of agalign"):
+    with pytest.raises(InputError, match="not a model of agalign"):
         load_model(path, cpu)
 
 
