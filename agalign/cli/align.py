@@ -295,7 +295,6 @@ def align(
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal, GOES_ON):
         check_address_space()
-        from agalign.batch import RunOptions
         from agalign.cameras.discover import DiscoverOptions
         from agalign.cli.run import conclude, find_captures, load_ahead, print_plan, run
         from agalign.config import (
@@ -336,6 +335,8 @@ def align(
             need_stac()
         load_ahead()
         flight = find_captures(folder, options, terminal)
+        from agalign.batch import RunOptions
+
         how = RunOptions(
             overwrite, jobs, align_panels, retry_failed=retry_failed, timeout_s=timeout, command=command_line()
         )

@@ -1,5 +1,6 @@
 """A flight aligned from the command line, with a progress line, reports of captures and a summary."""
 
+import gc
 import re
 import threading
 import time
@@ -109,12 +110,19 @@ def print_plan(flight: "FolderScan", out: Path, settings: "Settings", how: "RunO
 
 
 def load_ahead() -> None:
-    """Begin to load what takes two seconds to load, torch among it, while the files are looked at."""
+    """Begin to import torch and the other large libraries, which takes two seconds, while the files are read.
+
+    The garbage collector pauses meanwhile, and later ignores what was imported: it would spend half a second on a
+    million objects that stay until the end.
+    """
     limit_default_threads()
 
     def load() -> None:
+        gc.disable()
         with suppress(Exception):  # reported by what needs it
-            import_module("agalign.batch")
+            import_module("agalign.batch.run")
+        gc.freeze()
+        gc.enable()
 
     threading.Thread(target=load, daemon=True).start()
 
