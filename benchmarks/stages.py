@@ -20,12 +20,13 @@ from statistics import median
 import cv2
 import numpy as np
 from bands.images import read
-from bands.methods import by_ransac, ecc, elastix, grey_8_bit
+from bands.methods import Align, UnavailableError, by_ransac, grey_8_bit, method_named
 from bands.score import Matrix
 
 from agalign.cameras.discover import discover
 
 ROUNDS = 3
+PEERS = ("ECC on gradients", "elastix affine", "XFeat")
 _FEATURES = 8000
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 IMPORTS = "import torch, cv2, rasterio, scipy"
@@ -59,7 +60,12 @@ def main() -> None:
     captures = discover(options.flight).captures
     band = captures[0].moving[0]
     pair = read(captures[0].reference.path), read(band.path)
-    methods = {"SIFT + RANSAC": sift} | ({"ECC on gradients": ecc, "elastix affine": elastix} if options.peers else {})
+    methods: dict[str, Align] = {"SIFT + RANSAC": sift}
+    for name in PEERS if options.peers else ():
+        try:
+            methods[name] = method_named(name)
+        except UnavailableError as error:
+            print(f"{name}: {error}", file=sys.stderr)
     seconds: dict[str, list[float]] = {}
     pairs = sum(len(c.moving) for c in captures)
     for _ in range(ROUNDS):
