@@ -14,7 +14,7 @@ from agalign.capture.align import PairProgress
 from agalign.pixels.raster import without_warnings
 from agalign.values.capture import Capture
 
-_CAPTURES_WORTH_A_PROCESS = 4
+_CAPTURES_WORTH_A_PROCESS = 2
 """To start a process takes as long as these."""
 _MAX_WAITING_TASKS = 1000
 """In an executor: enough for any cluster, and little memory."""

@@ -34,6 +34,9 @@ _MIN_WHOLE_WEIGHT = 0.999
 """Share of valid pixels in a resampled pixel that is valid: float32 weights do not add up to exactly 1."""
 _MIN_SIDE_PX = 8
 """A moving image is not reduced below this side, whatever the homography's scale."""
+_MIN_REDUCTION = 0.9
+"""Moving images are reduced before they are warped to fewer pixels than this share of theirs along a line: bilinear
+interpolation of nearly as many pixels aliases little, and an area average would blur them."""
 _NOWHERE = -1e6
 """Position, px, of points on the horizon of a homography: outside any image."""
 
@@ -65,7 +68,7 @@ def resample_tile_of(
     radiometry: Radiometry | None = None,
 ) -> tuple[NDArray[np.generic], Mask]:  # fmt: skip
     """`resample_tile` of a file that is open: what GDAL has decoded for one tile serves the next."""
-    positions = mapping.positions(tile)
+    positions = mapping.positions(tile, np.float32)
     shape = tile.height, tile.width
     # Without parallax the mapping is smooth: a coarse sample of it, edges included, gives its extent to a pixel.
     step = _SAMPLE_PX if mapping.parallax is None else 1
@@ -161,10 +164,12 @@ def warped(
     full = round(size_px[0] / fixed_scale[0]), round(size_px[1] / fixed_scale[1])
     magnification = float(np.median(np.abs(geometry.local_scale(mapping.fixed_to_moving, *full))))
     reduce = float(np.clip(fixed_scale[0] / magnification, _MIN_SIDE_PX / min(moving.size_px), 1.0))
-    width, height = (max(_MIN_SIDE_PX, round(side * reduce)) for side in moving.size_px)
-    moving_size = width, height
-    moving_scale = PixelScale.between(moving.size_px, moving_size)
-    small = shrink(moving, moving_size)
+    if reduce < _MIN_REDUCTION:
+        width, height = (max(_MIN_SIDE_PX, round(side * reduce)) for side in moving.size_px)
+        small = shrink(moving, (width, height))
+    else:
+        small = moving
+    moving_scale = PixelScale.between(moving.size_px, small.size_px)
     rescaled, whole = mapping.rescaled(fixed_scale, moving_scale), Tile(0, 0, *size_px)
     positions = rescaled.positions(whole, np.float32)
     cv2.patchNaNs(positions, _NOWHERE)

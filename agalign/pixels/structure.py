@@ -4,12 +4,13 @@ The double-angle field z = a ((gx + i gy) / |g|)^2 is the same for an edge and i
 gradient magnitude, clipped so that a few strong edges do not outvote the rest.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from agalign.values.image import FloatImage, Raster
 
@@ -80,13 +81,32 @@ def correlation_surface(fixed: Field, moving: Field) -> NDArray[np.float32]:
 def windowed_spectra(fields: Field) -> Field:
     """Fourier transform of fields (..., height, width) under a Hann window."""
     height, width = fields.shape[-2:]
-    window = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1]).astype(np.float32)
-    return np.asarray(fft.fft2(fields * window))
+    return _each_plane(cv2.dft, fields * _hann_window(height, width))
+
+
+@cache
+def _hann_window(height: int, width: int) -> FloatImage:
+    return np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1]).astype(np.float32)
+
+
+def inverse_transform(spectra: Field) -> Field:
+    """Inverse Fourier transform of spectra (..., height, width)."""
+    return _each_plane(lambda plane: cv2.idft(plane, flags=cv2.DFT_SCALE), spectra)
+
+
+def _each_plane(transform: Callable[[FloatImage], FloatImage], fields: Field) -> Field:
+    """OpenCV's Fourier transform, 2 to 3 times as fast as SciPy's, of each plane of fields (..., height, width)."""
+    height, width = fields.shape[-2:]
+    planes = np.ascontiguousarray(fields).view(np.float32).reshape(-1, height, width, 2)
+    result = np.empty_like(planes)
+    for plane, transformed in zip(planes, result, strict=True):
+        transformed[:] = transform(plane)
+    return result.view(np.complex64).reshape(fields.shape)
 
 
 def correlation_surfaces(fixed: Field, moving: Field) -> NDArray[np.float32]:
     """`correlation_surface` of fields given by their `windowed_spectra`, (..., height, width)."""
-    return np.asarray(fft.ifft2(whitened_cross_spectra(fixed, moving), overwrite_x=True).real)
+    return np.asarray(inverse_transform(whitened_cross_spectra(fixed, moving)).real)
 
 
 def whitened_cross_spectra(fixed: Field, moving: Field) -> Field:

@@ -66,8 +66,12 @@ def _grey(plane: NDArray[np.float32]) -> Grey:
     return np.asarray(np.clip(scaled, 0, 255, out=scaled).astype(np.uint8))
 
 
+_SAMPLE_PIXELS = 20_000
+"""Pixels that the limits of the grey values are taken from: percentiles are right to a tenth of a percent."""
+
+
 def _limits(plane: NDArray[np.float32]) -> tuple[float, float]:
-    sample = plane.ravel()[:: max(1, plane.size // 200_000)]
+    sample = plane.ravel()[:: max(1, plane.size // _SAMPLE_PIXELS)]
     sample = sample[np.isfinite(sample) & (sample != 0)]
     if sample.size == 0:
         return 0.0, 1.0

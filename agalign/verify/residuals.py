@@ -6,9 +6,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
-from agalign.pixels.structure import Field, peak_positions, structure_field, whitened_cross_spectra, windowed_spectra
+from agalign.pixels.structure import (
+    Field,
+    inverse_transform,
+    peak_positions,
+    structure_field,
+    whitened_cross_spectra,
+    windowed_spectra,
+)
 from agalign.values.alignment import Residual
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
@@ -134,7 +140,7 @@ def _starts(length: int, side: int, step: int | None) -> list[int]:
 def _peaks(cross: Field) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """((n, 2) shifts, nan where no peak stands out; (n,) heights in standard deviations) of cross spectra."""
     count, height, width = cross.shape
-    surfaces = fft.ifft2(cross).real.reshape(count, height * width)
+    surfaces = inverse_transform(cross).real.reshape(count, height * width)
     highest = surfaces.argmax(axis=1)
     # Their means are 0: the windows have none.
     spread = np.sqrt(np.einsum("ni,ni->n", surfaces, surfaces) / (height * width))
