@@ -34,9 +34,6 @@ _MIN_WHOLE_WEIGHT = 0.999
 """Share of valid pixels in a resampled pixel that is valid: float32 weights do not add up to exactly 1."""
 _MIN_SIDE_PX = 8
 """A moving image is not reduced below this side, whatever the homography's scale."""
-_MIN_REDUCTION = 0.9
-"""Moving images are reduced before they are warped to fewer pixels than this share of theirs along a line: bilinear
-interpolation of nearly as many pixels aliases little, and an area average would blur them."""
 _NOWHERE = -1e6
 """Position, px, of points on the horizon of a homography: outside any image."""
 
@@ -164,11 +161,8 @@ def warped(
     full = round(size_px[0] / fixed_scale[0]), round(size_px[1] / fixed_scale[1])
     magnification = float(np.median(np.abs(geometry.local_scale(mapping.fixed_to_moving, *full))))
     reduce = float(np.clip(fixed_scale[0] / magnification, _MIN_SIDE_PX / min(moving.size_px), 1.0))
-    if reduce < _MIN_REDUCTION:
-        width, height = (max(_MIN_SIDE_PX, round(side * reduce)) for side in moving.size_px)
-        small = shrink(moving, (width, height))
-    else:
-        small = moving
+    width, height = (max(_MIN_SIDE_PX, round(side * reduce)) for side in moving.size_px)
+    small = shrink(moving, (width, height))
     moving_scale = PixelScale.between(moving.size_px, small.size_px)
     rescaled, whole = mapping.rescaled(fixed_scale, moving_scale), Tile(0, 0, *size_px)
     positions = rescaled.positions(whole, np.float32)
@@ -196,10 +190,15 @@ def shrink(raster: Raster, size_px: tuple[int, int]) -> Raster:
     """Area-averaged copy of `size_px` (width, height); a pixel is valid where all of its source pixels are."""
     if size_px == raster.size_px:
         return raster
-    scale = PixelScale.between(raster.size_px, size_px)
-    weight = cv2.resize(raster.valid.astype(np.float32), size_px, interpolation=cv2.INTER_AREA)
     planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
-    shrunk = np.stack([cv2.resize(np.where(raster.valid, p, 0), size_px, interpolation=cv2.INTER_AREA) for p in planes])
-    shrunk = (shrunk / np.maximum(weight, 1e-6)).astype(np.float32)
-    valid: Mask = weight > _MIN_WHOLE_WEIGHT
+    if raster.valid.all():
+        shrunk = np.stack([cv2.resize(plane, size_px, interpolation=cv2.INTER_AREA) for plane in planes])
+        valid: Mask = np.ones(shrunk.shape[1:], bool)
+    else:
+        weight = cv2.resize(raster.valid.astype(np.float32), size_px, interpolation=cv2.INTER_AREA)
+        known = [np.where(raster.valid, plane, 0) for plane in planes]
+        shrunk = np.stack([cv2.resize(plane, size_px, interpolation=cv2.INTER_AREA) for plane in known])
+        shrunk = (shrunk / np.maximum(weight, 1e-6)).astype(np.float32)
+        valid = weight > _MIN_WHOLE_WEIGHT
+    scale = PixelScale.between(raster.size_px, size_px)
     return Raster(shrunk if raster.pixels.ndim == 3 else shrunk[0], valid, lens.rescaled(raster.lens, scale))
