@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 
-from agalign.products.sidecar import find_sidecars
+from agalign.products.sidecar_file import find_sidecars
 
 
 def medians_and_seconds(out: Path, truth: dict[str, list[list[float]]]) -> list[tuple[str, float, float, float]]:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 from synthetic_flights.troubles import make_troubled_flight, make_two_headings
 
-from agalign.products.sidecar import find_sidecars
+from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic import make_flight
 
 WRONG_PX = 1.0

@@ -19,7 +19,7 @@ import numpy as np
 import rasterio
 from scipy.interpolate import CloughTocher2DInterpolator
 
-from agalign.products.sidecar import find_sidecars
+from agalign.products.sidecar_file import find_sidecars
 
 Row = tuple[str, str, str, float, float]
 

@@ -11,14 +11,14 @@ import numpy as np
 import rasterio
 
 import agalign
+from agalign.batch.index_run import index_tasks, run_indices
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.config import Settings, WriteSettings
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import probe
-from agalign.products.index_rasters import write_indices
 from agalign.products.indices import INDICES, compute
-from agalign.products.sidecar import read_sidecar
+from agalign.products.sidecar_file import read_sidecar
 from agalign.synthetic import cameras, rig
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import reflectance
@@ -37,7 +37,8 @@ def main(captures: int) -> None:
         agalign.align_folder(folder, out, settings=settings)
         bands = {b.name: b for b in cameras.BANDS}
         reference = cameras.BANDS[cameras.REFERENCE]
-        for number, (pose, report) in enumerate(zip(poses, write_indices(out, [NDVI]), strict=True), start=1):
+        reports = [r for done in run_indices(index_tasks(out, [NDVI], out)) for r in done.reports]
+        for number, (pose, report) in enumerate(zip(poses, reports, strict=True), start=1):
             painted = [reflectance(ground, bands[name]) for name in ("NIR", "Red")]
             truth = compute(NDVI, [synthetic.view(p, ground, reference, pose, SIZE_PX) for p in painted])
             before = compute(NDVI, [as_it_lies(folder, number, bands[name]) for name in ("NIR", "Red")])

@@ -19,7 +19,7 @@ from agalign.config import FlightSettings, SeedSettings, Settings
 from agalign.flight.panels import read_panel, with_panels
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, probe
-from agalign.products.sidecar import find_sidecars
+from agalign.products.sidecar_file import find_sidecars
 from agalign.values import geometry
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]

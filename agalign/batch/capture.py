@@ -16,7 +16,8 @@ from agalign.products.layout import output_layers
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.registry import PRODUCTS
-from agalign.products.sidecar import Sidecar, read_result, write_sidecar
+from agalign.products.sidecar import Sidecar
+from agalign.products.sidecar_file import read_result, write_sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice

@@ -9,10 +9,12 @@ from pathlib import Path
 import cv2
 
 from agalign.errors import AgalignError
-from agalign.products.index_rasters import IndexReport, bands_of, run_sidecars, unit_of, write_rasters
+from agalign.products.flight_map import link_indices
+from agalign.products.index_bands import bands_of, unit_of
+from agalign.products.index_rasters import IndexReport, write_rasters
 from agalign.products.index_table import IndexRow, row_of, update_table
 from agalign.products.indices import Index
-from agalign.products.sidecar import read_result
+from agalign.products.sidecar_file import read_result, run_sidecars
 from agalign.values.cores import usable_cores
 from agalign.values.process_pool import ProcessPool
 from agalign.values.processes import follow_parent, threads_of_children, worker_context
@@ -98,7 +100,7 @@ def run_indices(tasks: Sequence[IndexTask], options: IndexOptions | None = None)
             yield done
     finally:
         if rows:  # also of what is finished before an interruption
-            update_table(tasks[0].target, rows)
+            link_indices(tasks[0].target, update_table(tasks[0].target, rows))
 
 
 def do_indices(task: IndexTask) -> CaptureIndices:

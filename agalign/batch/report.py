@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from agalign.capture.align import PairProgress
-from agalign.products.sidecar import BandResult, CaptureResult, Sidecar, read_sidecar
+from agalign.products.sidecar import BandResult, CaptureResult, Sidecar
+from agalign.products.sidecar_file import read_sidecar
 from agalign.values.text import counted
 
 _MAX_ROWS = 20

@@ -32,7 +32,8 @@ from agalign.products.panels import write_panels
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths
 from agalign.products.run_record import RunState, Tally, begun, problem_of, write_run_record
-from agalign.products.sidecar import CaptureResult, read_result
+from agalign.products.sidecar import CaptureResult
+from agalign.products.sidecar_file import read_result
 from agalign.products.sky import write_sky
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture

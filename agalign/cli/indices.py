@@ -84,7 +84,7 @@ def indices(
     with exits(terminal, _GOES_ON):
         from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run
         from agalign.batch.output_folder import locked
-        from agalign.products.index_rasters import RAW
+        from agalign.products.index_bands import RAW
         from agalign.products.index_table import INDICES_FILE
 
         chosen = chosen_indices(index, formula or [])
@@ -147,11 +147,11 @@ def _print(report: "IndexReport", terminal: Terminal) -> None:
 
 
 def _facts(report: "IndexReport") -> dict[str, Any]:
-    """A report as JSON has it; what is unknown is null."""
-    numbers = {k: v if isinstance(v, str) or math.isfinite(v) else None for k, v in vars(report.statistics).items()}
+    """A report as JSON; unknown values are null."""
     return {
         "capture": report.capture, "index": report.index, "path": None if report.path is None else str(report.path),
-        **numbers, "raw_numbers": report.raw_numbers, "kept": report.kept, "problem": report.problem or None,
+        **report.statistics.as_json(), "raw_numbers": report.raw_numbers, "kept": report.kept,
+        "problem": report.problem or None,
     }  # fmt: skip
 
 

@@ -129,7 +129,7 @@ def report(
         from agalign.cli.failures import explain
         from agalign.errors import InputError
         from agalign.products.report import write_pages
-        from agalign.products.sidecar import find_sidecars
+        from agalign.products.sidecar_file import find_sidecars
 
         if not out.is_dir() or not find_sidecars(out):
             raise InputError(f"{out}: no sidecars there; give the output folder of a run")

@@ -24,7 +24,7 @@ from agalign.pixels.masks import data_mask, learnable, undeclared_fill
 from agalign.values import lens
 from agalign.values.capture import Band, Georeference
 from agalign.values.choices import MAX_PIXELS
-from agalign.values.image import Mask, Raster, reduced_size_px
+from agalign.values.image import Mask, Raster, Tile, reduced_size_px
 from agalign.values.pixel_units import PixelScale
 
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
@@ -231,6 +231,15 @@ def read_window(
     if MaskFlags.per_dataset in dataset.mask_flag_enums[band.band_index - 1]:
         valid = valid & (dataset.read_masks(band.band_index, window=window) > 0)
     return pixels, valid
+
+
+def read_tile(band: Band, tile: Tile) -> tuple[NDArray[np.generic], Mask]:
+    """Pixels of the file's own type and their data mask, both (height, width), of a tile of a band's own pixels.
+
+    Raises UnreadableFileError.
+    """
+    with open_raster(band.path) as dataset:
+        return read_window(dataset, band, tile.x0, tile.y0, tile.width, tile.height)
 
 
 def read_preview(

@@ -9,7 +9,8 @@ import numpy as np
 
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.pixels.raster import without_warnings
-from agalign.products.sidecar import BandPart, Sidecar, find_sidecars, read_sidecar
+from agalign.products.sidecar import BandPart, Sidecar
+from agalign.products.sidecar_file import find_sidecars, read_sidecar
 
 if TYPE_CHECKING:
     import xarray

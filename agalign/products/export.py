@@ -1,14 +1,15 @@
-"""The captures of a run in the form that another program takes: band files in one folder, or matrices."""
+"""Exports of a run for other programs: band files in one folder, or matrices."""
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.products.export_matrices import AlignedCapture, write_micasense, write_opencv
-from agalign.products.sidecar import Sidecar, find_sidecars, read_sidecar
+from agalign.products.sidecar import Sidecar
+from agalign.products.sidecar_file import read_sidecar, run_sidecars
 from agalign.values.choices import ExportProgram
 from agalign.values.files import write_text
 
@@ -18,15 +19,15 @@ _IMAGES = "images"
 
 @dataclass
 class ExportReport:
-    """What an export has written."""
+    """Result of an export."""
 
     target: Path
     captures: int = 0
     files: list[Path] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)
-    """(label of a capture, why it is left out)."""
+    """(label of a capture, reason why it is left out)."""
     notes: list[str] = field(default_factory=list)
-    """What the user is to do in the other program, a line each."""
+    """Instructions for the other program, one per line."""
 
 
 def export(
@@ -34,18 +35,16 @@ def export(
 ) -> ExportReport:
     """Export the captures with status `ok` of the output folder of a run into a new folder.
 
-    Band files are hard links where the file system allows that, and copies otherwise or with `copy`. `source` is the
+    Band files are hard links if the file system allows that, and copies otherwise or with `copy`. `source` is the
     folder with the original images, by default the input of the run; only the MicaSense matrices need it.
-    Raises InputError where there is no run, or nothing to export; ConfigurationError where the run wrote no band files;
-    OutputError where `target` is not empty or cannot be written.
+    Raises InputError if there is no run or nothing to export, ConfigurationError if the run wrote no band files,
+    OutputError if `target` is not empty or cannot be written.
     """
-    captures = list(_captures(out))
-    if not captures:
-        raise InputError(f"{out}: no sidecars there; give the output folder of a run")
+    captures = [AlignedCapture(read_sidecar(path), path, path.parent.relative_to(out)) for path in run_sidecars(out)]
     _check_empty(target)
     report = ExportReport(target)
     good = [c for c in captures if c.sidecar.status == "ok"]
-    # A reconstruction is better off without a capture than with a band in the wrong place.
+    # A misaligned band harms a reconstruction more than a missing capture.
     report.left_out += [(c.label, f"its status is {c.sidecar.status}") for c in captures if c not in good]
     if not good:
         raise InputError(f"{out}: no capture with status ok; 'agalign report {out}' shows what failed")
@@ -61,13 +60,8 @@ def export(
     return report
 
 
-def _captures(out: Path) -> Iterator[AlignedCapture]:
-    for path in find_sidecars(out) if out.is_dir() else []:
-        yield AlignedCapture(read_sidecar(path), path, path.parent.relative_to(out))
-
-
 def _check_empty(target: Path) -> None:
-    """Raise OutputError where the target holds something."""
+    """Raise OutputError if the target folder is not empty."""
     try:
         if target.exists() and any(target.iterdir()):
             raise OutputError(f"{target}: is not empty; choose another folder with -o, or delete it")
@@ -97,7 +91,7 @@ def _placed(source: Path, target: Path, *, copy: bool) -> Path:
             try:
                 os.link(source, target)
                 return target
-            except OSError:  # another disk, or a file system without links
+            except OSError:  # another disk, or a file system without hard links
                 pass
         shutil.copyfile(source, target)
     except OSError as error:
@@ -105,19 +99,19 @@ def _placed(source: Path, target: Path, *, copy: bool) -> Path:
     return target
 
 
-# ---- what to do in the other program
+# ---- instructions for the other program
 
 
 def _for_odm(sidecar: Sidecar) -> list[str]:
     reference, output = sidecar.reference.band, sidecar.output
-    made = None if output is None else output.radiometry
-    calibration = "none" if made is not None else "camera+sun"
+    radiometry = None if output is None else output.radiometry
+    calibration = "none" if radiometry is not None else "camera+sun"
     return [
         "OpenDroneMap, WebODM: the bands of each capture are aligned, and have the tags of one camera.",
         f"  --skip-band-alignment --primary-band '{reference}' --radiometric-calibration {calibration}",
         f"{reference} is the reference band, which is not resampled.",
-        "The files hold raw numbers: camera+sun needs the light sensor's tags; without them use camera."
-        if made is None else f"The files hold {made}: OpenDroneMap must not calibrate them again.",
+        "The files contain raw numbers: camera+sun needs the light sensor's tags; without them use camera."
+        if radiometry is None else f"The files contain {radiometry}: OpenDroneMap must not calibrate them again.",
     ]  # fmt: skip
 
 

@@ -1,12 +1,10 @@
-"""The mappings of a run as matrices, for scripts that warp the original images themselves.
+"""The mappings of a run as matrices, for programs that warp the original images themselves.
 
 MicaSense's notebooks undistort each band with OpenCV's optimal new camera matrix, then warp it with
 `cv2.warpPerspective(..., flags=cv2.WARP_INVERSE_MAP)`. With K and N the old and the new camera matrix of a band, and H
 the mapping between undistorted pixels, their matrix is N_band K_band^-1 H K_reference N_reference^-1.
 """
 
-import csv
-import io
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,21 +19,24 @@ from agalign.cameras.folder_walk import natural_order
 from agalign.cameras.read_files import ImageFile, read_file
 from agalign.cameras.scan import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError
+from agalign.products.csv_file import write_csv
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar import BandPart, Sidecar
 from agalign.values import geometry, lens
-from agalign.values.files import complete_file, write_text
+from agalign.values.files import complete_file
 from agalign.values.geometry import Matrix, Points
 from agalign.values.lens import Lens
 
 
 @dataclass(frozen=True)
 class AlignedCapture:
-    """A capture of a run: its sidecar, where that is, and the folder below the run's output."""
+    """A capture of a run."""
 
     sidecar: Sidecar
     path: Path
+    """Path of the sidecar."""
     folder: Path
+    """Its folder, relative to the output folder of the run."""
 
     @property
     def label(self) -> str:
@@ -44,16 +45,22 @@ class AlignedCapture:
 
     @property
     def flat_name(self) -> str:
-        """The same as a part of a file name: names of captures repeat in the folders of a memory card."""
+        """The label as a single file name: the folders of a memory card contain captures of the same name."""
         return "_".join((*self.folder.parts, self.sidecar.capture))
 
 
+_Row = tuple[str, str, str, float]
+"""Capture, band, status, largest distance of the matrix from the complete mapping, px."""
 _TABLE = "matrices.csv"
 
 
 def write_opencv(captures: Sequence[AlignedCapture], target: Path) -> tuple[list[Path], list[str]]:
-    """Write <capture>.npz for each capture, and a table of what a matrix leaves out. Raises OutputError."""
-    files, rows = [], []
+    """Write <capture>.npz for each capture, and a table of the distances from the complete mappings.
+
+    Returns the files and notes for the user. Raises OutputError.
+    """
+    files: list[Path] = []
+    rows: list[_Row] = []
     for capture in captures:
         bands, name = _in_order(capture.sidecar), capture.flat_name
         arrays: dict[str, NDArray[np.generic]] = {"bands": np.array([b.band for b in bands])}
@@ -67,13 +74,15 @@ def write_opencv(captures: Sequence[AlignedCapture], target: Path) -> tuple[list
             arrays |= {f"grid_reference_px_{k}": points_px, f"grid_moving_px_{k}": mapped_px}
             rows.append((name, band.band, band.status, error_px))
         arrays |= {"matrices": np.stack(matrices), "max_error_px": np.array(errors_px)}
-        files.append(_write_npz(target / f"{name}.npz", arrays))
+        files.append(target / f"{name}.npz")
+        with complete_file(files[-1]) as partial:
+            np.savez(partial, allow_pickle=False, **arrays)
     return [*files, _write_table(rows, target)], [
         "OpenCV: <capture>.npz holds `bands`, and `matrices` (n, 3, 3) from raw pixels of the reference to a band's:",
         "  cv2.warpPerspective(band, matrices[k], (width, height), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP)",
         "`max_error_px` is the largest distance from the complete mapping, which includes lenses and relief. That is",
         "sampled in `grid_reference_px_k` and `grid_moving_px_k` (n, 2). (0, 0) is the centre of a pixel.",
-        *_deviations(rows),
+        _largest_distance(rows),
     ]  # fmt: skip
 
 
@@ -82,13 +91,15 @@ def write_micasense(
 ) -> tuple[list[Path], list[str]]:
     """Write <capture>_warp_matrices.npy for each capture, and <serial>_warp_matrices_opencv.npy for each camera.
 
-    Raises InputError where the original images cannot be read, ConfigurationError for other cameras, OutputError.
+    Returns the files and notes for the user. Raises InputError if the original images cannot be read,
+    ConfigurationError for other cameras, OutputError.
     """
     run = read_run_record(out)
     folder = source or (None if run is None else Path(run.input))
     if folder is None:
         raise InputError(f"{out}: does not name the folder of the images; give it with --source")
-    files, rows = [], []
+    files: list[Path] = []
+    rows: list[_Row] = []
     by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     first = captures[0].sidecar.reference
     for capture in captures:
@@ -104,25 +115,26 @@ def write_micasense(
         by_camera[images[0].tags.serial or "camera"].append(stacked)
         files.append(_write_npy(target / f"{name}_warp_matrices.npy", stacked))
     for serial, of_camera in by_camera.items():
-        typical = _most_typical([m for m in of_camera if m.shape == of_camera[0].shape], (first.width, first.height))
-        files.append(_write_npy(target / f"{serial}_warp_matrices_opencv.npy", typical))
+        complete = [m for m in of_camera if m.shape == of_camera[0].shape]
+        matrices_of_camera = _nearest_to_median(complete, (first.width, first.height))
+        files.append(_write_npy(target / f"{serial}_warp_matrices_opencv.npy", matrices_of_camera))
     return [*files, _write_table(rows, target)], [
         "MicaSense imageprocessing: put <serial>_warp_matrices_opencv.npy next to the notebook; it loads that file.",
         "It is of the most typical capture: for one capture use its own <capture>_warp_matrices.npy,",
         "  warp_matrices = [m.astype('float32') for m in numpy.load(FILE)]",
         f"Match index: the place of {first.band} among the bands; warp mode: cv2.MOTION_HOMOGRAPHY.",
         "Relief and the lenses' displacement fields are not in a matrix; matrices.csv has the largest distance.",
-        *_deviations(rows),
+        _largest_distance(rows),
     ]
 
 
 def _in_order(sidecar: Sidecar) -> list[BandPart]:
-    """The bands as the camera counts them."""
+    """The bands in the order of their numbers in the file names."""
     return sorted(sidecar.bands, key=lambda b: (natural_order(b.file), b.band_index))
 
 
 def _grid(band: BandPart) -> tuple[Points, Points]:
-    """((n, 2) raw pixels of the reference, those of the band); none of the reference itself."""
+    """(raw pixels (n, 2) of the reference, corresponding raw pixels of the band); n = 0 for the reference itself."""
     if band.grid is None:
         return np.empty((0, 2)), np.empty((0, 2))
     return np.array(band.grid.reference_px), np.array(band.grid.moving_px)
@@ -136,19 +148,19 @@ def _original(path: Path) -> ImageFile:
 
 def _in_notebook_px(band: BandPart, reference: ImageFile, image: ImageFile) -> tuple[Matrix, float]:
     """(the matrix between the pixels that the notebooks warp, its largest distance from the complete mapping, px)."""
-    of_reference, of_band = _lens(reference), _lens(image)
-    before, after = (_new_matrix(r, i) for r, i in ((of_reference, reference), (of_band, image)))
+    reference_lens, band_lens = _lens(reference), _lens(image)
+    new_reference, new_band = _new_camera_matrix(reference_lens, reference), _new_camera_matrix(band_lens, image)
     points_px, mapped_px = _grid(band)
-    straight, mapped = lens.undistort(of_reference, points_px), lens.undistort(of_band, mapped_px)
-    known = band.homography
+    undistorted, mapped = lens.undistort(reference_lens, points_px), lens.undistort(band_lens, mapped_px)
+    homography = band.homography
     if not len(points_px):
         matrix = geometry.identity()
-    elif known is not None and known.space == "undistorted":
-        matrix = np.array(known.fixed_to_moving)
+    elif homography is not None and homography.space == "undistorted":
+        matrix = np.array(homography.fixed_to_moving)
     else:
-        matrix = geometry.fit_homography(straight, mapped)
-    error_px = _max_distance_px(geometry.apply(matrix, straight), mapped)
-    to_new, from_new = after @ np.linalg.inv(of_band.matrix), of_reference.matrix @ np.linalg.inv(before)
+        matrix = geometry.fit_homography(undistorted, mapped)
+    error_px = _max_distance_px(geometry.apply(matrix, undistorted), mapped)
+    to_new, from_new = new_band @ np.linalg.inv(band_lens.matrix), reference_lens.matrix @ np.linalg.inv(new_reference)
     return geometry.compose(to_new, matrix, from_new), error_px
 
 
@@ -159,46 +171,35 @@ def _lens(image: ImageFile) -> Lens:
     return result
 
 
-def _new_matrix(of_band: Lens, image: ImageFile) -> Matrix:
-    size_px = image.bands[0].size_px
-    k1, k2, p1, p2, k3 = (*of_band.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-    new, _ = cv2.getOptimalNewCameraMatrix(of_band.matrix, np.array([k1, k2, p1, p2, k3]), size_px, 1)
-    return np.asarray(new, np.float64)
+def _new_camera_matrix(band_lens: Lens, image: ImageFile) -> Matrix:
+    distortion = np.array((*band_lens.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5])  # k1, k2, p1, p2, k3
+    matrix, _ = cv2.getOptimalNewCameraMatrix(band_lens.matrix, distortion, image.bands[0].size_px, 1)
+    return np.asarray(matrix, np.float64)
 
 
-def _most_typical(of_camera: Sequence[NDArray[np.float64]], size_px: tuple[int, int]) -> NDArray[np.float64]:
-    """The matrices (bands, 3, 3) of the capture with corners nearest to the median."""
+def _nearest_to_median(captures: Sequence[NDArray[np.float64]], size_px: tuple[int, int]) -> NDArray[np.float64]:
+    """The matrices (bands, 3, 3) of the capture whose mapped corners are nearest to the median of all captures."""
     corners_px = geometry.corners(*size_px)
-    mapped = np.array([[geometry.apply(m, corners_px) for m in matrices] for matrices in of_camera])
+    mapped = np.array([[geometry.apply(m, corners_px) for m in matrices] for matrices in captures])
     distances_px = np.linalg.norm(mapped - np.median(mapped, axis=0), axis=-1)
-    return of_camera[int(distances_px.mean(axis=(1, 2)).argmin())]
+    return captures[int(distances_px.mean(axis=(1, 2)).argmin())]
 
 
 def _max_distance_px(points_px: Points, others_px: Points) -> float:
     return float(np.linalg.norm(points_px - others_px, axis=1).max()) if len(points_px) else 0.0
 
 
-def _deviations(rows: Sequence[tuple[str, str, str, float]]) -> list[str]:
-    largest = max(rows, key=lambda row: row[3])
-    return [f"Largest distance from the complete mapping: {largest[3]:.2f} px ({largest[0]} {largest[1]})."]
+def _largest_distance(rows: Sequence[_Row]) -> str:
+    capture, band, _, error_px = max(rows, key=lambda row: row[3])
+    return f"Largest distance from the complete mapping: {error_px:.2f} px ({capture} {band})."
 
 
-def _write_table(rows: Sequence[tuple[str, str, str, float]], target: Path) -> Path:
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(("capture", "band", "status", "max_error_px"))
-    writer.writerows((name, band, status, f"{error_px:.4f}") for name, band, status, error_px in rows)
-    write_text(target / _TABLE, table.getvalue())
+def _write_table(rows: Sequence[_Row], target: Path) -> Path:
+    write_csv(target / _TABLE, ("capture", "band", "status", "max_error_px"), ((*r[:3], f"{r[3]:.4f}") for r in rows))
     return target / _TABLE
 
 
 def _write_npy(path: Path, matrices: NDArray[np.float64]) -> Path:
-    with complete_file(path) as partial, partial.open("wb") as file:
-        np.save(file, matrices)
-    return path
-
-
-def _write_npz(path: Path, arrays: dict[str, NDArray[np.generic]]) -> Path:
-    with complete_file(path) as partial, partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    with complete_file(path) as partial:
+        np.save(partial, matrices)
     return path

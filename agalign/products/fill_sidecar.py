@@ -1,6 +1,5 @@
-"""The sidecar of a capture, filled from its alignments and the files that were written."""
+"""The sidecar of a capture, from its alignments and the files that were written."""
 
-import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -10,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign._version import __version__
-from agalign.errors import OutputError
 from agalign.flight.fingerprint import fingerprint
 from agalign.products.band_files import BandFiles
 from agalign.products.product import ProductContext, WrittenFile
 from agalign.products.relief_map import ReliefMap
 from agalign.products.sidecar import (
     BandPart,
-    BandResult,
     CameraPart,
     FilePart,
     GridPart,
@@ -38,42 +35,41 @@ from agalign.products.sidecar import (
     SeedPart,
     Sidecar,
     SimilarityPart,
+    is_delivered,
 )
 from agalign.products.stack import Stack
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementResult, JointResult, Prediction, Residual
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import CaptureStatus
+from agalign.values.files import file_checksum
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping, mapping_of
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.relief import Relief
 
 _GRID = 17, 13
-"""Columns and rows of the sampled mapping, which is nearly a homography."""
+"""Columns and rows of the sampled mapping if that is nearly a homography."""
 _FINE_GRID = 65, 49
-"""The same where local displacements or a lens curve it."""
-_MAX_CURVATURE_PX = 0.2
-"""A coarse grid is not sufficient if its bilinear interpolation is off by more than this."""
+"""Columns and rows with a displacement field, or if the lens models differ."""
+_MAX_INTERPOLATION_ERROR_PX = 0.2
+"""The coarse grid is used if bilinear interpolation between its points is at most this far off."""
 
 
 def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:
-    """Ok where every moving band is delivered, failed where none is of use, else degraded."""
+    """Return `ok` if every moving band is delivered, `failed` if all failed, else `degraded`."""
     moving = [b for b in bands if b.status != "reference"]
-    if all(is_delivered(b, accept_predicted_px) for b in moving):
+    predicted_px = [None if b.prediction is None else b.prediction.std_px for b in moving]
+    if all(is_delivered(b.status, px, accept_predicted_px) for b, px in zip(moving, predicted_px, strict=True)):
         return "ok"
     return "failed" if all(b.status == "failed" for b in moving) else "degraded"
 
 
-def is_delivered(band: BandResult, accept_predicted_px: float) -> bool:
-    """True for a band that is aligned, or predicted this well."""
-    if band.status == "predicted" and band.prediction is not None:
-        return band.prediction.std_px <= accept_predicted_px
-    return band.status in ("reference", "aligned")
-
-
 def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Sidecar:
-    """Return the sidecar of a capture after its products were written, but those `not_written`. Raises OutputError."""
+    """Return the sidecar of a capture after its products were written; `not_written` has the kinds that failed.
+
+    Raises OutputError.
+    """
     capture, reference = context.capture, context.capture.reference
     bands = [_band_part(context, band) for band in capture.bands]
     accept_predicted_px = context.settings.check.accept_predicted_px
@@ -106,7 +102,7 @@ def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Side
 
 
 def _output_part(context: ProductContext) -> OutputPart:
-    """The stack and the band files, which readers of before `products` know."""
+    """The stack and the band files; older readers use these fields instead of `products`."""
     stacks, band_files = _file_parts(Stack.kind, context), _file_parts(BandFiles.kind, context)
     stack = stacks[0] if stacks else None
     values = {part.nodata for part in stacks or band_files}
@@ -131,14 +127,9 @@ def _file_parts(kind: str, context: ProductContext) -> list[FilePart]:
 
 
 def _product_part(file: WrittenFile, context: ProductContext) -> ProductPart:
-    """The file was written a moment ago: its bytes come from memory. Raises OutputError."""
-    try:
-        with file.path.open("rb") as opened:
-            digest = hashlib.file_digest(opened, "sha256").hexdigest()
-            size = opened.tell()
-    except OSError as error:
-        raise OutputError(f"{file.path}: cannot be read back ({error.strerror or error})") from None
-    return ProductPart(kind=file.kind, file=_name(file.path, context), bytes=size, sha256=digest)
+    """Raises OutputError."""
+    checksum, size = file_checksum(file.path), file.path.stat().st_size
+    return ProductPart(kind=file.kind, file=_name(file.path, context), bytes=size, sha256=checksum)
 
 
 def _name(path: Path, context: ProductContext) -> str:
@@ -146,17 +137,17 @@ def _name(path: Path, context: ProductContext) -> str:
 
 
 def _radiometry(capture: Capture) -> str | None:
-    made = dict.fromkeys(f"{b.radiometry.quantity} by {b.radiometry.source}" for b in capture.bands if b.radiometry)
-    return " and ".join(made) or None
+    names = dict.fromkeys(f"{b.radiometry.quantity} by {b.radiometry.source}" for b in capture.bands if b.radiometry)
+    return " and ".join(names) or None
 
 
 def _nodata(value: float | None) -> float | str | None:
-    """JSON has no nan."""
+    """The value, with the text "nan" for nan, which JSON does not have."""
     return "nan" if value is not None and math.isnan(value) else value
 
 
 def _place(context: ProductContext, band: Band) -> PlacePart | None:
-    """None for a band that is all nodata."""
+    """The file with the aligned pixels of a band; None if all of them are nodata."""
     place = context.places.get(band.name)
     return None if place is None else PlacePart(file=_name(place[0], context), band_index=place[1])
 
@@ -176,9 +167,11 @@ def _relief_part(context: ProductContext, mapping: PixelMapping) -> ReliefPart |
     if parallax is None:
         return None
     nodes_px = geometry.lattice(*context.capture.reference.size_px, *_GRID)
+    # The mapping is linear in the parallax: its values for a parallax of 0 and of 1 px determine it.
     flat = np.zeros((1, 1), np.float32)
     at_zero, at_one = (
-        replace(mapping, parallax=replace(parallax, relief=Relief(flat + level, flat)))(nodes_px) for level in (0, 1)
+        replace(mapping, parallax=replace(parallax, relief=Relief(flat + parallax_px, flat)))(nodes_px)
+        for parallax_px in (0, 1)
     )
     file = next((f.path for f in context.written if f.kind == ReliefMap.kind), None)
     occluded = 0.0 if parallax.hidden is None else float(parallax.hidden.mean())
@@ -193,8 +186,8 @@ def _moving_part(context: ProductContext, band: Band, place: PlacePart | None) -
     joint, residual = alignment.joint, alignment.residual
     local = alignment.local
     mapping = mapping_of(reference, band, alignment)
-    is_fine = alignment.field is not None or _is_curved(mapping.of_the_plane, reference.size_px)
-    grid_px = geometry.lattice(*reference.size_px, *(_FINE_GRID if is_fine else _GRID))
+    needs_fine_grid = alignment.field is not None or _is_curved(mapping.of_the_plane, reference.size_px)
+    grid_px = geometry.lattice(*reference.size_px, *(_FINE_GRID if needs_fine_grid else _GRID))
     after = dict(alignment.after) | _residual_metrics(residual)
     return BandPart(
         band=band.name,
@@ -234,11 +227,11 @@ def _residual_metrics(residual: Residual[FixedFilePx] | None) -> dict[str, float
 
 
 def _is_curved(mapping: PixelMapping, size_px: tuple[int, int]) -> bool:
-    """True where linear interpolation halfway between the points of a coarse grid misses the mapping."""
+    """True if linear interpolation halfway between the points of the coarse grid is too far off the mapping."""
     points = geometry.lattice(*size_px, *_GRID).reshape(_GRID[1], _GRID[0], 2)
     mapped = mapping(points)
     error_px = mapping(0.5 * (points[:, 1:] + points[:, :-1])) - 0.5 * (mapped[:, 1:] + mapped[:, :-1])
-    return bool(np.abs(error_px).max() > _MAX_CURVATURE_PX)
+    return bool(np.abs(error_px).max() > _MAX_INTERPOLATION_ERROR_PX)
 
 
 def _prediction_part(prediction: Prediction) -> PredictionPart:
@@ -265,7 +258,7 @@ def _joint_part(joint: JointResult[FixedFilePx], *, accepted: bool) -> JointPart
 
 
 def _similarity_part(metrics: Mapping[str, float]) -> SimilarityPart:
-    # Digits beyond the sixth depend on how many threads added them up.
+    # Digits beyond the sixth depend on the order in which threads add up.
     return SimilarityPart(**{k: round(v, 6) if math.isfinite(v) else None for k, v in metrics.items()})
 
 

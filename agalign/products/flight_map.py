@@ -1,12 +1,15 @@
-"""OUT/flight.geojson: where the captures of a run are on the ground, with what became of them."""
+"""OUT/flight.geojson: footprints of the captures of a run, with their results and links to their files."""
 
 import json
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from agalign.products.footprint import accuracy_of_footprint_m, footprint, with_assumed_height
+from agalign.products.index_table import IndexRow, read_table
 from agalign.products.product import CapturePaths
-from agalign.products.sidecar import BandResult, CaptureResult
+from agalign.products.sidecar import CaptureResult
 from agalign.values.capture import Capture
 from agalign.values.files import write_text
 from agalign.values.image import OutputGrid
@@ -14,34 +17,34 @@ from agalign.values.pixel_units import PixelScale
 
 FLIGHT_MAP_FILE = "flight.geojson"
 _WITHOUT_FOOTPRINT = ("panel", "sky")
+"""Panels are photographed from 1 m, and the sky is not on the ground."""
 _DECIMALS = 7
 """Of degrees: a centimetre."""
 
 
 class FlightMap:
-    """The features of a run's captures, collected one by one."""
+    """The GeoJSON features of the captures of a run, added one by one."""
 
     def __init__(self, out: Path) -> None:
         self._out = out
         self._features: dict[str, dict[str, Any]] = {}
 
     def add(self, capture: Capture, status: str, result: CaptureResult | None = None) -> None:
-        """Add a capture, with what its sidecar contains where it has one.
+        """Add a capture, with the result in its sidecar if there is one.
 
-        Its geometry is the footprint of its aligned rasters, or of the reference where there are none; the position of
-        the camera where the footprint is unknown; nothing where that is unknown too.
+        The geometry is the footprint of the aligned rasters, or of the reference if there are none; else the position
+        of the camera; else null.
         """
-        # Panels are photographed from a metre, and the sky has no footprint.
         shown = capture if status in _WITHOUT_FOOTPRINT else with_assumed_height(capture)
         ring = footprint(shown, _grid(capture, result))
         position, pose = shown.position, shown.pose
-        place: dict[str, Any] | None = None
+        geometry: dict[str, Any] | None = None
         if ring is not None:
-            # GeoJSON wants outer rings counter-clockwise.
-            place = {"type": "Polygon", "coordinates": [ring[::-1].round(_DECIMALS).tolist()]}
+            # RFC 7946: outer rings are counter-clockwise.
+            geometry = {"type": "Polygon", "coordinates": [ring[::-1].round(_DECIMALS).tolist()]}
         elif position is not None:
-            place = {"type": "Point", "coordinates": [position.longitude, position.latitude]}
-        known = ring is not None and capture.reference.georeference is None and pose is not None
+            geometry = {"type": "Point", "coordinates": [position.longitude, position.latitude]}
+        by_pose = ring is not None and capture.reference.georeference is None and pose is not None
         properties = {
             "capture": capture.label, "status": status,
             "camera": f"{capture.camera.make} {capture.camera.model}".strip(), "captured_at": capture.captured_at,
@@ -51,35 +54,63 @@ class FlightMap:
             "height_m": None if pose is None or pose.height_m is None else round(pose.height_m, 1),
             "height_from": None if pose is None or pose.height_m is None else pose.height_from,
             "heading_deg": None if pose is None else round(pose.heading_deg, 1),
-            "accuracy_m": accuracy_of_footprint_m(shown) if known else _given_accuracy_m(capture),
+            "accuracy_m": accuracy_of_footprint_m(shown) if by_pose else _georeference_accuracy_m(capture),
         }  # fmt: skip
-        properties |= _of_result(result) | self._links(capture, result)
-        self._features[capture.label] = {"type": "Feature", "id": capture.label, "geometry": place} | {
-            "properties": properties
-        }
+        properties |= _of_result(result) | _links(capture, result)
+        self._features[capture.label] = {
+            "type": "Feature", "id": capture.label, "geometry": geometry, "properties": properties,
+        }  # fmt: skip
 
     def write(self) -> Path | None:
-        """Write the map atomically; None where no capture has a place. Raises OutputError."""
+        """Write the file atomically and return it; None if no capture has a position. Raises OutputError.
+
+        Index rasters that `agalign indices` wrote in earlier commands are linked too.
+        """
         features = [self._features[label] for label in sorted(self._features)]
         if not any(f["geometry"] for f in features):
             return None
-        path = self._out / FLIGHT_MAP_FILE
-        lines = ",\n".join(json.dumps(f, ensure_ascii=False) for f in features)
-        write_text(path, f'{{"type": "FeatureCollection", "name": "flight", "features": [\n{lines}\n]}}\n')
-        return path
+        _write(self._out, features, read_table(self._out))
+        return self._out / FLIGHT_MAP_FILE
 
-    def _links(self, capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
-        """Files relative to the output folder."""
-        links: dict[str, Any] = {"sidecar": None, "stack": None, "picture": None, "indices": []}
-        if result is None:
-            return links
-        folder = capture.folder.as_posix()
-        prefix = "" if folder == "." else f"{folder}/"
-        files = {part.kind: f"{prefix}{part.file}" for part in result.products}
-        sidecar = CapturePaths.of(capture, self._out).sidecar
-        links |= {"sidecar": f"{prefix}{sidecar.name}", "stack": files.get("stack"), "picture": files.get("picture")}
-        indices = [f"{prefix}{p.file}" for p in result.products if p.kind == "index" and p.file.endswith(".tif")]
-        return links | {"indices": indices}
+
+def link_indices(out: Path, rows: Iterable[IndexRow]) -> None:
+    """Link the rasters of an index table in OUT/flight.geojson. Raises OutputError.
+
+    Without the file, or with a file that a run did not write, nothing is changed.
+    """
+    try:
+        features = json.loads((out / FLIGHT_MAP_FILE).read_text(encoding="utf-8"))["features"]
+        is_of_a_run = all(isinstance(f["properties"]["indices"], list) and f["properties"]["capture"] for f in features)
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if is_of_a_run:
+        _write(out, features, rows)
+
+
+def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexRow]) -> None:
+    rasters: dict[str, list[str]] = defaultdict(list)
+    for row in rows:
+        if row.file:
+            rasters[row.label].append(row.file)
+    for feature in features:
+        properties = feature["properties"]
+        properties["indices"] = list(dict.fromkeys([*properties["indices"], *rasters[properties["capture"]]]))
+    lines = ",\n".join(json.dumps(f, ensure_ascii=False) for f in features)
+    text = f'{{"type": "FeatureCollection", "name": "flight", "features": [\n{lines}\n]}}\n'
+    write_text(out / FLIGHT_MAP_FILE, text)
+
+
+def _links(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
+    """Files relative to the output folder."""
+    if result is None:
+        return {"sidecar": None, "stack": None, "picture": None, "indices": []}
+    paths = CapturePaths.of(capture, Path())
+    files = [(part.kind, (paths.folder / part.file).as_posix()) for part in result.products]
+    by_kind = dict(files)
+    return {
+        "sidecar": paths.sidecar.as_posix(), "stack": by_kind.get("stack"), "picture": by_kind.get("picture"),
+        "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
+    }  # fmt: skip
 
 
 def _grid(capture: Capture, result: CaptureResult | None) -> OutputGrid:
@@ -88,14 +119,14 @@ def _grid(capture: Capture, result: CaptureResult | None) -> OutputGrid:
     return OutputGrid(*result.output.crop, PixelScale(*result.output.scale))
 
 
-def _given_accuracy_m(capture: Capture) -> float | None:
+def _georeference_accuracy_m(capture: Capture) -> float | None:
     georeference = capture.reference.georeference
     return None if georeference is None else georeference.accuracy_m
 
 
 def _of_result(result: CaptureResult | None) -> dict[str, Any]:
-    """The number of bands and the residuals of the band with the largest ones, px of the reference."""
-    bands: list[BandResult] = [] if result is None else [b for b in result.bands if b.status != "reference"]
+    """The number of bands, and the largest residuals of a band, px of the reference."""
+    bands = [] if result is None else [b for b in result.bands if b.status != "reference"]
     after = [b.metrics.after for b in bands if b.metrics is not None]
     return {
         "bands": len(bands),

@@ -2,14 +2,14 @@
 
 import csv
 import io
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from agalign.products.index_rasters import IndexReport, IndexStatistics, read_statistics
+from agalign.products.csv_file import write_csv
+from agalign.products.index_rasters import IndexReport
+from agalign.products.index_statistics import IndexStatistics, read_statistics
 from agalign.products.sidecar import CaptureResult
-from agalign.values.files import write_text
 from agalign.values.text import without_formula
 
 INDICES_FILE = "indices.csv"
@@ -17,6 +17,8 @@ COLUMNS = (
     "folder", "capture", "captured_at", "latitude", "longitude", "index", "median", "p5", "p95", "valid_share", "input",
     "low", "high", "file", "problem",
 )  # fmt: skip
+_STATISTICS = ("median", "p5", "p95", "valid_share", "low", "high")
+"""Columns with a number of `IndexStatistics`."""
 
 _Key = tuple[str, str, str]
 """(folder, capture, index)."""
@@ -24,7 +26,7 @@ _Key = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class IndexRow:
-    """One index of one capture, as the table has it."""
+    """One index of one capture."""
 
     folder: str
     capture: str
@@ -33,14 +35,19 @@ class IndexRow:
     longitude: float | None
     index: str
     file: str
-    """Relative to the table's folder; empty where nothing was written."""
+    """The raster, relative to the folder of the table; empty if it was not written."""
     statistics: IndexStatistics
     problem: str = ""
 
     @property
     def key(self) -> _Key:
-        """What no other row has."""
+        """Identify the row."""
         return self.folder, self.capture, self.index
+
+    @property
+    def label(self) -> str:
+        """The capture with its folder."""
+        return Path(self.folder, self.capture).as_posix()
 
 
 def row_of(report: IndexReport, sidecar: CaptureResult, folder: str, out: Path) -> IndexRow:
@@ -55,7 +62,7 @@ def row_of(report: IndexReport, sidecar: CaptureResult, folder: str, out: Path) 
 
 
 def rows_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexRow]:
-    """Return the rows of the indices that the run itself wrote of a capture, by the rasters' tags."""
+    """Return the rows of the indices that the run itself wrote, from the tags of the rasters."""
     result = []
     for part in sidecar.products:
         path = out / folder / part.file
@@ -69,7 +76,7 @@ def rows_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexRow
 
 
 def read_table(out: Path) -> list[IndexRow]:
-    """Return the rows of OUT/indices.csv with rasters that still exist; empty without a table."""
+    """Return the rows of OUT/indices.csv whose rasters still exist; empty if there is no table."""
     try:
         text = (out / INDICES_FILE).read_text(encoding="utf-8")
         rows = [_row(line) for line in csv.DictReader(io.StringIO(text))]
@@ -80,41 +87,26 @@ def read_table(out: Path) -> list[IndexRow]:
 
 def write_table(out: Path, rows: Iterable[IndexRow]) -> None:
     """Write OUT/indices.csv. Raises OutputError."""
-    table = io.StringIO()
-    writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    for row in sorted(rows, key=lambda r: r.key):
-        writer.writerow({k: without_formula(v) for k, v in _cells(row).items()})
-    write_text(out / INDICES_FILE, table.getvalue())
-
-
-def merged(old: Sequence[IndexRow], new: Sequence[IndexRow]) -> list[IndexRow]:
-    """Return all rows, the new ones in place of old ones of the same capture and index."""
-    return list(({row.key: row for row in old} | {row.key: row for row in new}).values())
+    in_order = sorted(rows, key=lambda row: row.key)
+    cells = [vars(row) | row.statistics.as_json() | {"input": row.statistics.unit} for row in in_order]
+    write_csv(out / INDICES_FILE, COLUMNS, ([without_formula(one[name]) for name in COLUMNS] for one in cells))
 
 
 def update_table(out: Path, rows: Sequence[IndexRow]) -> list[IndexRow]:
-    """Add rows to OUT/indices.csv and return all; a table that would be empty is not written. Raises OutputError."""
+    """Add rows to OUT/indices.csv, replacing those of the same capture and index, and return all rows.
+
+    An empty table is not written. Raises OutputError.
+    """
     old = read_table(out)
-    result = merged(old, rows)
+    result = list({row.key: row for row in [*old, *rows]}.values())
     if result and (result != old or not (out / INDICES_FILE).is_file()):
         write_table(out, result)
     return result
 
 
-def _cells(row: IndexRow) -> dict[str, object]:
-    known = row.statistics
-    numbers = {name: getattr(known, name) for name in ("median", "p5", "p95", "valid_share", "low", "high")}
-    return {
-        "folder": row.folder, "capture": row.capture, "captured_at": row.captured_at, "latitude": row.latitude,
-        "longitude": row.longitude, "index": row.index, "input": known.unit, "file": row.file, "problem": row.problem,
-        **{k: v if math.isfinite(v) else None for k, v in numbers.items()},
-    }  # fmt: skip
-
-
 def _row(cells: Mapping[str, str]) -> IndexRow:
     cells = {k: _unquoted(v) for k, v in cells.items()}
-    numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
+    numbers = {k: float(cells[k] or "nan") for k in _STATISTICS}
     latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
     return IndexRow(
         cells["folder"], cells["capture"], cells["captured_at"], latitude, longitude, cells["index"], cells["file"],
@@ -123,5 +115,5 @@ def _row(cells: Mapping[str, str]) -> IndexRow:
 
 
 def _unquoted(text: str) -> str:
-    """What `without_formula` was given."""
+    """The text that `without_formula` quoted."""
     return text[1:] if text.startswith("'") and without_formula(text[1:]) != text[1:] else text

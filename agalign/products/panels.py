@@ -1,4 +1,4 @@
-"""What was read off calibration panels, OUT/panels.json, and a picture of each with the area that was read."""
+"""OUT/panels.json with the measurements on calibration panels, and a picture of each panel with the measured area."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -7,21 +7,20 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from agalign.errors import SidecarError
 from agalign.flight.panels import BandReading, PanelReading
 from agalign.pixels.raster import read_preview
 from agalign.products.drawing import Picture, with_text, write_png
-from agalign.products.sidecar import compact_lists
+from agalign.products.json_file import read_model, write_model
 from agalign.values.capture import PanelSource
-from agalign.values.files import write_text
 from agalign.values.pixel_units import PixelScale
 
 PANELS_FILE = "panels.json"
-_TILE_PX = 320
-_TITLE_PX = 24
-_GAP_PX = 6
+_TILE_PX, _TITLE_PX, _GAP_PX = 320, 24, 6
+"""Width of a band in the picture, height of its title, distance to the next band."""
+_PERCENTILES = 1.0, 99.5
+"""Limits of the contrast: a few hot pixels must not determine it."""
 _AREA_COLOUR = 255, 64, 32
 
 
@@ -30,19 +29,19 @@ class _Part(BaseModel):
 
 
 class PanelBandPart(_Part):
-    """The panel in one band."""
+    """Measurement on the panel in one band."""
 
     band: str
     file: str
     area_px: list[tuple[float, float]]
-    """Corners (x, y) of what was read, raw pixels of the file."""
+    """Corners (x, y) of the measured area, raw pixels of the file."""
     albedo: float | None
-    """Its reflectance, 0 to 1."""
+    """Reflectance of the panel, 0 to 1."""
     radiance: float | None
-    """Mean over the area, in the unit of the camera's own calibration."""
+    """Mean over the area, in the unit of the camera's calibration."""
     reflectance_per_radiance: float | None
     problem: str | None
-    """Why the band cannot be used."""
+    """Reason why the band cannot be used."""
 
 
 class PanelPart(_Part):
@@ -60,35 +59,33 @@ class PanelPart(_Part):
 
     @property
     def sentence(self) -> str:
-        """What it is, in words."""
+        """Describe the capture for the summary and the report."""
         albedos = sorted({f"{b.albedo:.2f}" for b in self.bands if b.albedo is not None})
-        known = (
-            f"reflectance {' to '.join(albedos[:: max(len(albedos) - 1, 1)])}" if albedos else "reflectance not known"
-        )
+        # The smallest and the largest value, or the only one.
+        reflectance = " to ".join(dict.fromkeys((albedos[0], albedos[-1]))) if albedos else "not known"
         name = f"calibration panel {self.serial}".strip()
-        what = "part of a scene that is aligned" if self.in_scene else "kept out of the alignment"
-        return f"{name} ({known}; seen by its {self.seen_by}): {what}"
+        use = "part of a scene that is aligned" if self.in_scene else "kept out of the alignment"
+        return f"{name} (reflectance {reflectance}; seen by its {self.seen_by}): {use}"
 
 
-class Panels(_Part):
-    """All of a run."""
+class PanelsFile(_Part):
+    """All captures of panels of a run."""
 
     schema_: Annotated[Literal["agalign-panels/1"], Field(alias="schema")] = "agalign-panels/1"
     panels: list[PanelPart]
 
 
 def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]:
-    """OUT/panels.json and <capture>.panel.png where the capture's files would be; where there is none, neither
-    of an earlier run is left.
+    """Write OUT/panels.json and <capture>.panel.png; without panels, remove the panels.json of an earlier run.
 
     Raises OutputError.
     """
     path = out / PANELS_FILE
-    parts: list[PanelPart] = []
     if not readings:
         with suppress(OSError):
             path.unlink(missing_ok=True)
-        return parts
+        return []
+    parts = []
     for reading in readings:
         capture = reading.capture
         picture = out / capture.folder / f"{capture.name}.panel.png"
@@ -101,19 +98,14 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
                 bands=[_band_part(b) for b in reading.bands],
             )
         )  # fmt: skip
-    write_text(path, compact_lists(Panels(panels=parts).model_dump_json(by_alias=True, indent=1)) + "\n")
+    write_model(path, PanelsFile(panels=parts))
     return parts
 
 
 def read_panels(out: Path) -> list[PanelPart]:
-    """Of an earlier run; none where there are none. Raises SidecarError for a file that is none of ours."""
-    path = out / PANELS_FILE
-    try:
-        return Panels.model_validate_json(path.read_bytes()).panels
-    except FileNotFoundError:
-        return []
-    except (OSError, ValidationError):
-        raise SidecarError(f"{path}: cannot be read; run again") from None
+    """Return the captures of panels of an earlier run. Raises SidecarError for a file that agalign did not write."""
+    file = read_model(out / PANELS_FILE, PanelsFile)
+    return [] if file is None else file.panels
 
 
 def _band_part(reading: BandReading) -> PanelBandPart:
@@ -127,7 +119,7 @@ def _band_part(reading: BandReading) -> PanelBandPart:
 
 
 def _sheet(reading: PanelReading) -> Picture:
-    """All bands side by side, with the area that was read."""
+    """All bands next to each other, with the measured area."""
     tiles = [_tile(b) for b in reading.bands]
     height = max(t.shape[0] for t in tiles)
     gap = np.full((height, _GAP_PX, 3), 255, np.uint8)
@@ -140,12 +132,12 @@ def _tile(reading: BandReading) -> Picture:
     scale = _TILE_PX / band.width_px
     size = _TILE_PX, max(1, round(band.height_px * scale))
     pixels = read_preview(band.path, band.band_index, (0, 0, *band.size_px), size)
-    low, high = np.nanpercentile(pixels, (1, 99.5)) if np.isfinite(pixels).any() else (0.0, 1.0)
+    low, high = np.nanpercentile(pixels, _PERCENTILES) if np.isfinite(pixels).any() else (0.0, 1.0)
     grey = np.clip(np.nan_to_num((pixels - low) / max(high - low, 1e-9)), 0, 1) * 255
     image = np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
     if band.panel is not None and band.panel.corners_px:
         corners = PixelScale(scale, scale).positions(band.panel.corners_px).round().astype(np.int32)
         cv2.polylines(image, [corners], isClosed=True, color=_AREA_COLOUR, thickness=2, lineType=cv2.LINE_AA)
-    said = f"{band.name}: " + ("?" if reading.albedo is None else f"{reading.albedo:.3f}")
+    title = f"{band.name}: " + ("?" if reading.albedo is None else f"{reading.albedo:.3f}")
     strip = np.full((_TITLE_PX, _TILE_PX, 3), 255, np.uint8)
-    return np.vstack([with_text(strip, said, (2, 17)), image])
+    return np.vstack([with_text(strip, title, (2, 17)), image])

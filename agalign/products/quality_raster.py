@@ -1,4 +1,4 @@
-"""A raster of quality flags on the grid of the aligned files: a layer of all bands together, and one of each band."""
+"""A raster of quality flags on the grid of the aligned files: a layer for all bands together, and one for each band."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from agalign.config import WriteSettings
 from agalign.pixels.radiometry import calibrated, to_reflectance
-from agalign.pixels.raster import open_raster, read_window
+from agalign.pixels.raster import read_tile
 from agalign.pixels.resample import resample_tile
 from agalign.pixels.sun_glint import sun_glint
 from agalign.products.error_map import error_lattice_px, error_on_tile
@@ -21,11 +21,12 @@ from agalign.values.capture import Radiometry
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
 from agalign.values.quality import MEANINGS, Quality
 
-ALL_BANDS = "all bands"
-"""The first layer: flags that any band has."""
+_ALL_BANDS = "all bands"
+"""Name of the first layer: flags that are set in any band."""
 _MIN_WEIGHT = 1e-3
-"""Of a pixel that contributes to a resampled one."""
-_HALF_PX, _ONE_PX = 0.5, 1.0
+"""Bilinear weight from which a source pixel contributes: smaller ones are rounding errors."""
+_ERROR_FLAGS = {0.5: Quality.ERROR_OVER_HALF_PX, 1.0: Quality.ERROR_OVER_1_PX}
+"""Flags by the expected error, px of the reference, that they indicate."""
 _ASSESSED = "water by NDWI > 0 (McFeeters 1996), glint by the excess of near infrared (Hedley et al. 2005)"
 _NOT_ASSESSED = "not assessed: the reflectance of green and near infrared is not known"
 
@@ -51,19 +52,20 @@ class QualityRaster(Product):
         predicted = {name for name, alignment in context.usable.items() if alignment.status == "predicted"}
 
         def flags_on(tile: Tile) -> list[Flags]:
-            glint = None if water is None else water.glint(tile)
             bands = [
                 _flags(layer, tile, grid, nodes, is_predicted=layer.band.name in predicted) for layer in context.layers
             ]
-            for flags in bands if glint is not None else ():
-                flags[glint & (flags & _bit(Quality.MISSING) == 0)] |= _bit(Quality.SUN_GLINT)
+            if water is not None:
+                glint = water.glint(tile)
+                for flags in bands:
+                    flags[glint & (flags & _bit(Quality.MISSING) == 0)] |= _bit(Quality.SUN_GLINT)
             return [np.bitwise_or.reduce(bands), *bands]
 
         tags = {
             "flag_masks": ", ".join(str(int(flag)) for flag in Quality), "flag_meanings": MEANINGS,
             "SUN_GLINT": _NOT_ASSESSED if water is None else _ASSESSED,
         }  # fmt: skip
-        names = [ALL_BANDS, *(layer.band.name for layer in context.layers)]
+        names = [_ALL_BANDS, *(layer.band.name for layer in context.layers)]
         write_flags(path, names, grid, context.capture.reference.georeference, tags, flags_on)
         return [WrittenFile(self.kind, path, StacAsset("qa", GEOTIFF, ("metadata",)))]
 
@@ -75,7 +77,7 @@ def _bit(flag: Quality) -> np.uint16:
 def _flags(
     layer: Layer, tile: Tile, grid: OutputGrid, nodes: Mapping[str, NDArray[np.float32]], *, is_predicted: bool
 ) -> Flags:
-    """(height, width) flags of a band on a tile, without sun glint."""
+    """Flags (height, width) of a band on a tile, except sun glint; `nodes` has the expected error by band."""
     shape = tile.height, tile.width
     if layer.is_gap:
         return np.full(shape, _bit(Quality.MISSING), np.uint16)
@@ -90,35 +92,31 @@ def _flags(
         result[mask] |= _bit(flag)
     if layer.band.name in nodes:
         error_px = error_on_tile(nodes[layer.band.name], grid, tile)
-        with np.errstate(invalid="ignore"):
-            # The comparisons are false for nan: an unknown error is a large one.
-            result[~(error_px <= _HALF_PX)] |= _bit(Quality.ERROR_OVER_HALF_PX)
-            result[~(error_px <= _ONE_PX)] |= _bit(Quality.ERROR_OVER_1_PX)
+        for limit_px, flag in _ERROR_FLAGS.items():
+            result[np.isnan(error_px) | (error_px > limit_px)] |= _bit(flag)
     return result
 
 
 def _of_source(layer: Layer, tile: Tile) -> tuple[Mask, Mask, Mask, Mask]:
     """(outside, nodata, saturated, occluded) of a band's file on a tile, each (height, width)."""
-    nothing = np.zeros((tile.height, tile.width), dtype=bool)
+    none = np.zeros((tile.height, tile.width), dtype=bool)
     band = layer.band
     if layer.mapping is None:
-        with open_raster(band.path) as source:
-            pixels, valid = read_window(source, band, tile.x0, tile.y0, tile.width, tile.height)
-        return nothing, ~valid, _saturated(pixels, valid, band.saturation_value), nothing
+        pixels, valid = read_tile(band, tile)
+        return none, ~valid, _saturated(pixels, valid, band.saturation_value), none
     positions = layer.mapping.positions(tile, np.float32)
     end = np.subtract(band.size_px, 1)
     with np.errstate(invalid="ignore"):
         inside: Mask = np.asarray(((positions >= 0) & (positions <= end)).all(axis=-1))
     occluded = inside & layer.mapping.hidden(tile)
     if not inside.any():
-        return ~inside, nothing, nothing, nothing
-    x0, y0 = np.floor(positions[inside].min(axis=0)).astype(int)
-    x1, y1 = np.minimum(np.ceil(positions[inside].max(axis=0)).astype(int) + 1, band.size_px)
-    with open_raster(band.path) as source:
-        pixels, valid = read_window(source, band, int(x0), int(y0), int(x1 - x0), int(y1 - y0))
-    at = (positions - np.array([x0, y0], np.float32)).astype(np.float32)
-    nodata = inside & _contributes(~valid, at)
-    saturated = inside & _contributes(_saturated(pixels, valid, band.saturation_value), at)
+        return ~inside, none, none, none
+    x0, y0 = np.floor(positions[inside].min(axis=0)).astype(int).tolist()
+    x1, y1 = np.minimum(np.ceil(positions[inside].max(axis=0)).astype(int) + 1, band.size_px).tolist()
+    pixels, valid = read_tile(band, Tile(x0, y0, x1 - x0, y1 - y0))
+    in_window = (positions - np.array([x0, y0], np.float32)).astype(np.float32)
+    nodata = inside & _contributes(~valid, in_window)
+    saturated = inside & _contributes(_saturated(pixels, valid, band.saturation_value), in_window)
     return ~inside, nodata, saturated, occluded
 
 
@@ -129,7 +127,7 @@ def _saturated(pixels: NDArray[np.generic], valid: Mask, saturation_value: float
 
 
 def _contributes(mask: Mask, positions: NDArray[np.float32]) -> Mask:
-    """True where a pixel of the mask is one of the four around a position."""
+    """True where one of the four pixels around a position is in the mask."""
     if not mask.any():
         return np.zeros(positions.shape[:2], dtype=bool)
     weight = cv2.remap(mask.astype(np.float32), positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -138,7 +136,7 @@ def _contributes(mask: Mask, positions: NDArray[np.float32]) -> Mask:
 
 @dataclass(frozen=True)
 class _WaterBands:
-    """The bands that show sun glint, with what makes reflectance of their numbers."""
+    """The bands from which sun glint is detected, with their conversion to reflectance."""
 
     green: tuple[Layer, Radiometry]
     nir: tuple[Layer, Radiometry]
@@ -161,11 +159,10 @@ class _WaterBands:
 
 
 def _reflectance(layer: Layer, radiometry: Radiometry, tile: Tile) -> FloatImage:
-    """(height, width) on a tile, nan where the band has no value."""
+    """Reflectance (height, width) on a tile, nan for invalid pixels."""
     if layer.mapping is not None:
         pixels, valid = resample_tile(layer.band, layer.mapping, tile, "bilinear", radiometry)
     else:
-        with open_raster(layer.band.path) as source:
-            raw, valid = read_window(source, layer.band, tile.x0, tile.y0, tile.width, tile.height)
+        raw, valid = read_tile(layer.band, tile)
         pixels = calibrated(raw, radiometry, tile.x0, tile.y0)
     return np.where(valid, pixels, np.nan).astype(np.float32)

@@ -1,4 +1,4 @@
-"""libtiff prints some errors of a full disk itself, past GDAL's error handlers, to file descriptor 2."""
+"""Suppression of messages that libtiff prints to file descriptor 2 instead of passing them to GDAL's error handler."""
 
 import os
 import re
@@ -6,38 +6,38 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-_OF_LIBTIFF = re.compile(rb"^_?(?:tiff|TIFF)\w+: .*\n?", re.MULTILINE)
+_LIBTIFF_LINE = re.compile(rb"^_?(?:tiff|TIFF)\w+: .*\n?", re.MULTILINE)
 _MAX_BYTES = 1 << 16
-"""What a pipe holds: more is not printed."""
-_ONE_AT_A_TIME = threading.Lock()
+"""Capacity of a pipe on Linux: what exceeds it is lost."""
+_REDIRECTED = threading.Lock()
+"""File descriptor 2 belongs to the process: one thread redirects it at a time."""
 
 
 @contextmanager
-def without_libtiffs_lines() -> Iterator[None]:
-    """Nothing that libtiff prints inside reaches standard error; what others print there follows at the end.
-
-    The writer finds out by itself that a file is not complete, and one line then names it.
+def without_libtiff_messages() -> Iterator[None]:
+    """Drop what libtiff prints to standard error inside the block, such as for a full disk; other text is printed at
+    its end. `checked_raster` detects and reports the incomplete file itself.
     """
-    if not _ONE_AT_A_TIME.acquire(blocking=False):
-        yield  # a thread that writes at the same time has taken the descriptor
+    if not _REDIRECTED.acquire(blocking=False):
+        yield  # another thread has redirected the descriptor
         return
     try:
         read_end, write_end = os.pipe()
         os.set_blocking(read_end, False)
         os.set_blocking(write_end, False)
-        kept = os.dup(2)
+        stderr = os.dup(2)
         os.dup2(write_end, 2)
         os.close(write_end)
         try:
             yield
         finally:
-            os.dup2(kept, 2)  # the pipe's last write end is closed by it
-            os.close(kept)
+            os.dup2(stderr, 2)  # closes the last write end of the pipe in this process
+            os.close(stderr)
             printed = b""
-            with suppress(BlockingIOError):  # a process that was started meanwhile has a write end too
+            with suppress(BlockingIOError):  # a child process started in the block has the write end open too
                 printed = os.read(read_end, _MAX_BYTES)
             os.close(read_end)
             with suppress(OSError):
-                os.write(2, _OF_LIBTIFF.sub(b"", printed))
+                os.write(2, _LIBTIFF_LINE.sub(b"", printed))
     finally:
-        _ONE_AT_A_TIME.release()
+        _REDIRECTED.release()

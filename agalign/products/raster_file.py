@@ -1,53 +1,39 @@
-"""One aligned raster on the reference's pixel grid, a tiled GeoTIFF or COG: written, then checked to be complete."""
+"""Rasters on the output grid: aligned bands as GeoTIFF or COG, layers of float32, and quality flags."""
 
-import errno
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import rasterio
-import tifffile
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, Resampling
-from rasterio.errors import RasterioError
 from rasterio.fill import fillnodata
 from rasterio.shutil import copy as copy_dataset
-from rasterio.transform import Affine
-from rasterio.windows import Window
 
 from agalign.cameras.tag_transfer import TransferredTags
 from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
-from agalign.errors import OutputError
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_window, why, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, read_tile, without_warnings
 from agalign.pixels.resample import resample_tile, tiles
+from agalign.products.checked_raster import CheckedRaster, checked_raster, grid_profile
 from agalign.products.indices import Role, role_of
 from agalign.products.layout import Layer
 from agalign.products.nodata import Pixels, nodata_value, with_nodata
-from agalign.products.quiet_libtiff import without_libtiffs_lines
 from agalign.products.raster_tags import describe, georeference_tags
-from agalign.values import geometry
-from agalign.values.capture import Band, Capture, Georeference
-from agalign.values.files import complete_file
+from agalign.values.capture import Capture, Georeference
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
 
 GEOTIFF = "image/tiff; application=geotiff"
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
-_TILE_PX = 256
-"""Side of the tiles within a TIFF: GDAL's default, which viewers read quickly."""
 _WORK_TILE_PX = 2048
-"""Side of the tiles in which moving bands are resampled: it bounds the memory."""
+"""Side of the tiles that are processed one after another: it limits the memory."""
 _FILL_DISTANCE_PX = 100.0
-"""From which occluded pixels are interpolated: GDAL's default, wider than any occlusion."""
-_COG_TILE_PX = 512
+"""Search distance of the interpolation of occluded pixels: GDAL's default, wider than any occlusion."""
+_COG_BLOCK_PX = 512
 """GDAL's default for a COG."""
-_INCOMPLETE = "the file came out incomplete; is the disk full?"
-
 _COLOURS: Mapping[Role, ColorInterp] = {
     "red": ColorInterp.red, "green": ColorInterp.green, "blue": ColorInterp.blue,
 }  # fmt: skip
@@ -59,119 +45,78 @@ def write_raster(
 ) -> float | None:  # fmt: skip
     """Write layers as the bands of one file atomically; return its nodata value.
 
-    The type is the layers' where all share it, else the smallest that holds them all; float32 after radiometry. A
-    nodata value is declared only where some pixel needs it; valid moving pixels that happen to equal it change by
-    the smallest step. A COG gets no tags that GDAL does not write: they would break its layout.
+    The type is that of the layers if all have the same, else the smallest type that represents them all; float32 after
+    radiometric calibration. A nodata value is declared only if some pixel needs it; valid moving pixels that equal it
+    change by the smallest step. A COG gets no `tags`: tags that GDAL does not write itself would break its layout.
     Raises OutputError, or UnreadableFileError for an input.
     """
     raw = settings.radiometry == "off"
     dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
     nodata = nodata_value(capture, layers, grid, dtype, settings)
     compression = _compression(settings, all_bands=len(layers) == len(capture.bands))
-    profile = _profile(capture.reference, len(layers), grid, dtype, nodata, compression)
-    try:
-        with complete_file(path) as partial, without_libtiffs_lines():
-            checksums = PixelChecksums()
-            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT):
-                with rasterio.open(partial, "w", **profile) as dataset:
-                    describe(dataset, capture, layers, settings)
-                    if len(layers) > 1:
-                        dataset.colorinterp = _colours(layers)
-                    for index, layer in enumerate(layers, start=1):
-                        _write_layer(dataset, index, layer, grid, nodata, settings, checksums)
-                if capture.reference.overviews and settings.format == "gtiff":
-                    with rasterio.open(partial, "r+") as dataset:
-                        dataset.build_overviews(list(capture.reference.overviews), Resampling.average)
-                check_complete(partial)
-                if tags is not None:
-                    add_directories(partial, tags.first, tags.exif, tags.gps)
-                if settings.format == "cog":
-                    _to_cog(partial, compression)
-            check_complete(partial)
-            checksums.check(partial)
-    except (RasterioError, tifffile.TiffFileError) as error:
-        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
+    options: dict[str, object] = {"interleave": "band", "photometric": "minisblack"}
+    if nodata is not None:
+        options["nodata"] = nodata
+    if compression != "none":
+        options |= {"compress": compression, "predictor": predictor(dtype.kind)}
+        options |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
+
+    def finish(partial: Path) -> None:
+        if capture.reference.overviews and settings.format == "gtiff":
+            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "r+") as dataset:
+                dataset.build_overviews(list(capture.reference.overviews), Resampling.average)
+        if tags is not None:
+            add_directories(partial, tags.first, tags.exif, tags.gps)
+        if settings.format == "cog":
+            _to_cog(partial, compression)
+
+    profile = grid_profile(grid, capture.reference.georeference, len(layers), dtype.name, **options)
+    with checked_raster(path, profile, finish) as raster:
+        describe(raster.dataset, capture, layers, settings)
+        if len(layers) > 1:
+            raster.dataset.colorinterp = _colours(layers)
+        for index, layer in enumerate(layers, start=1):
+            _write_layer(raster, index, layer, grid, nodata, settings)
     return nodata
-
-
-def _colours(layers: Sequence[Layer]) -> list[ColorInterp]:
-    """Red, green and blue where all three are there, of the first band of each: viewers show them as such."""
-    roles = [None if b.companion else role_of(b.name, b.wavelength_nm) for b in (layer.band for layer in layers)]
-    result = [ColorInterp.gray, *[ColorInterp.undefined] * (len(layers) - 1)]
-    if not set(_COLOURS) <= set(roles):
-        return result
-    result[0] = ColorInterp.undefined
-    for role, colour in _COLOURS.items():
-        result[roles.index(role)] = colour
-    return result
 
 
 def write_layers(
     path: Path, layers: Mapping[str, NDArray[np.float32]], grid: OutputGrid, georeference: Georeference | None,
     units: Mapping[str, str] | None = None, tags: Mapping[str, Mapping[str, str]] | None = None,
 ) -> None:  # fmt: skip
-    """Write float32 layers (height, width) by name, with their units and tags atomically; nan is nodata.
+    """Write float32 layers (height, width) by name, with their units and tags, atomically; nodata is nan.
 
     Raises OutputError.
     """
-    profile: dict[str, Any] = {
-        "driver": "GTiff", "width": grid.width, "height": grid.height, "count": len(layers), "dtype": "float32",
-        "tiled": True, "blockxsize": _TILE_PX, "blockysize": _TILE_PX, "compress": "deflate", "predictor": 3,
-        "nodata": np.nan,
-    }  # fmt: skip
-    profile |= {} if georeference is None else georeferenced(georeference, grid)
-    try:
-        with complete_file(path) as partial, without_libtiffs_lines():
-            checksums = PixelChecksums()
-            with (
-                without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
-            ):  # fmt: skip
-                dataset.update_tags(**georeference_tags(georeference))
-                for index, (name, values) in enumerate(layers.items(), start=1):
-                    checksums.write(dataset, values, index, Window(0, 0, grid.width, grid.height))
-                    dataset.set_band_description(index, name)
-                    if units is not None:
-                        dataset.set_band_unit(index, units[name])
-                    if tags is not None:
-                        dataset.update_tags(index, **tags[name])
-            check_complete(partial)
-            checksums.check(partial)
-    except (RasterioError, tifffile.TiffFileError) as error:
-        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
+    options = {"compress": "deflate", "predictor": predictor("f"), "nodata": np.nan}
+    with checked_raster(path, grid_profile(grid, georeference, len(layers), "float32", **options)) as raster:
+        raster.dataset.update_tags(**georeference_tags(georeference))
+        for index, (name, values) in enumerate(layers.items(), start=1):
+            raster.write(values, index)
+            raster.dataset.set_band_description(index, name)
+            if units is not None:
+                raster.dataset.set_band_unit(index, units[name])
+            if tags is not None:
+                raster.dataset.update_tags(index, **tags[name])
 
 
 def write_flags(
     path: Path, names: Sequence[str], grid: OutputGrid, georeference: Georeference | None, tags: Mapping[str, str],
     flags_on: Callable[[Tile], Sequence[NDArray[np.uint16]]],
 ) -> None:  # fmt: skip
-    """Write uint16 layers with these names atomically; `flags_on` returns them (height, width) on a tile
-    of the grid. They have no nodata value: 0 is a pixel without any flag.
+    """Write uint16 layers with these names atomically. `flags_on` returns all layers (height, width) on a tile of the
+    grid. There is no nodata value: 0 means that no flag is set.
 
     Raises OutputError.
     """
-    profile: dict[str, Any] = {
-        "driver": "GTiff", "width": grid.width, "height": grid.height, "count": len(names), "dtype": "uint16",
-        "tiled": True, "blockxsize": _TILE_PX, "blockysize": _TILE_PX, "compress": "deflate", "interleave": "band",
-        "bigtiff": "if_safer",
-    }  # fmt: skip
-    profile |= {} if georeference is None else georeferenced(georeference, grid)
-    try:
-        with complete_file(path) as partial, without_libtiffs_lines():
-            checksums = PixelChecksums()
-            with (
-                without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as dataset,
-            ):  # fmt: skip
-                dataset.update_tags(**tags, **georeference_tags(georeference))
-                for index, name in enumerate(names, start=1):
-                    dataset.set_band_description(index, name)
-                for tile in tiles(grid.tile, _WORK_TILE_PX):
-                    window = Window(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
-                    for index, flags in enumerate(flags_on(tile), start=1):
-                        checksums.write(dataset, flags, index, window)
-            check_complete(partial)
-            checksums.check(partial)
-    except (RasterioError, tifffile.TiffFileError) as error:
-        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
+    options = {"compress": "deflate", "interleave": "band"}
+    with checked_raster(path, grid_profile(grid, georeference, len(names), "uint16", **options)) as raster:
+        raster.dataset.update_tags(**tags, **georeference_tags(georeference))
+        for index, name in enumerate(names, start=1):
+            raster.dataset.set_band_description(index, name)
+        for tile in tiles(grid.tile, _WORK_TILE_PX):
+            for index, flags in enumerate(flags_on(tile), start=1):
+                raster.write(flags, index, tile.x0 - grid.x0, tile.y0 - grid.y0)
 
 
 def media_type(settings: WriteSettings) -> str:
@@ -179,126 +124,73 @@ def media_type(settings: WriteSettings) -> str:
     return COG if settings.format == "cog" else GEOTIFF
 
 
-def check_complete(path: Path) -> None:
-    """Raise OSError for a TIFF in which a tile or strip is missing or cut off.
+def predictor(kind: str) -> int:
+    """Return the TIFF predictor for a kind of numpy type: 3 for floating point, 2 for integers."""
+    return 3 if kind == "f" else 2
 
-    GDAL flushes when a file is closed, and a failure then (a full disk) raises nothing.
+
+def _colours(layers: Sequence[Layer]) -> list[ColorInterp]:
+    """The colour interpretation of each layer. If there are red, green and blue, the first band of each is displayed as
+    such by viewers; else the first layer is grey.
     """
-    size = path.stat().st_size
-    with tifffile.TiffFile(path) as tiff:
-        segments = [s for page in tiff.pages for s in zip(page.dataoffsets, page.databytecounts, strict=True)]
-    if not segments or any(count == 0 or offset + count > size for offset, count in segments):
-        raise OSError(errno.EIO, _INCOMPLETE)
-
-
-class PixelChecksums:
-    """Checksums of pixels as they are written, and the comparison with the finished file.
-
-    GDAL keeps tiles in memory and writes the last ones when it closes a file. Where that write fails once, it reports
-    no error and fills the tile with zeros.
-    """
-
-    def __init__(self) -> None:
-        self._written: list[tuple[int, Window, int]] = []
-
-    def write(self, dataset: Any, pixels: Pixels, index: int, window: Window) -> None:
-        """Write the pixels of a band, from 1, into a window of an open dataset."""
-        dataset.write(pixels, index, window=window)
-        self._written.append((index, window, _checksum(pixels)))
-
-    def check(self, path: Path) -> None:
-        """Raise OSError where the file does not have the pixels that were written."""
-        with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(path) as dataset:
-            for index, window, checksum in self._written:
-                if _checksum(dataset.read(index, window=window)) != checksum:
-                    raise OSError(errno.EIO, _INCOMPLETE)
-
-
-def _checksum(pixels: Pixels) -> int:
-    return zlib.crc32(np.ascontiguousarray(pixels).data.cast("B"))
-
-
-def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any]:
-    """Return rasterio's `transform` and `crs` of an output grid, given the georeference of the reference's file."""
-    # Only where the source has one: an identity transform would be an invented georeference.
-    # Geotransforms count from corners, where a change of resolution is a mere factor.
-    shrunk = np.diag([1 / grid.scale.x, 1 / grid.scale.y, 1.0])
-    written = georeference.transform @ shrunk @ geometry.translation(grid.x0, grid.y0)
-    return {"transform": Affine(*written[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
+    roles = [None if b.companion else role_of(b.name, b.wavelength_nm) for b in (layer.band for layer in layers)]
+    if not set(_COLOURS) <= set(roles):
+        return [ColorInterp.gray, *[ColorInterp.undefined] * (len(layers) - 1)]
+    result = [ColorInterp.undefined] * len(layers)
+    for role, colour in _COLOURS.items():
+        result[roles.index(role)] = colour
+    return result
 
 
 def _write_layer(
-    dataset: Any, index: int, layer: Layer, grid: OutputGrid, nodata: float | None, settings: WriteSettings,
-    checksums: PixelChecksums,
-) -> None:  # fmt: skip
-    dtype = np.dtype(dataset.dtypes[0])
+    raster: CheckedRaster, index: int, layer: Layer, grid: OutputGrid, nodata: float | None, settings: WriteSettings
+) -> None:
+    dtype = np.dtype(raster.dataset.dtypes[0])
     for tile in tiles(grid.tile, _WORK_TILE_PX):
         pixels, valid = _tile_of(layer, tile, settings)
         if pixels is None:
             pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
         elif nodata is not None and not (valid.all() and layer.is_copied):
             pixels = with_nodata(pixels.astype(dtype, copy=False), valid, nodata)
-        window = Window(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
-        checksums.write(dataset, pixels.astype(dtype, copy=False), index, window)
+        raster.write(pixels.astype(dtype, copy=False), index, tile.x0 - grid.x0, tile.y0 - grid.y0)
 
 
 def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels | None, Mask]:
-    """A layer's pixels on a tile and their mask; no pixels for a gap."""
+    """A layer's pixels (height, width) on a tile and their mask; no pixels for a layer without any."""
     if layer.is_gap:
         return None, np.zeros((tile.height, tile.width), dtype=bool)
     radiometry = None if settings.radiometry == "off" else layer.band.radiometry
-    if layer.mapping is not None:
-        pixels, valid = resample_tile(layer.band, layer.mapping, tile, settings.interpolation, radiometry)
-        return (
-            _with_occluded(pixels, valid, _fillable(layer, layer.mapping, tile))
-            if settings.fill_occluded
-            else (pixels, valid)
-        )
-    with open_raster(layer.band.path) as source:
-        pixels, valid = read_window(source, layer.band, tile.x0, tile.y0, tile.width, tile.height)
-    return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
+    if layer.mapping is None:
+        pixels, valid = read_tile(layer.band, tile)
+        return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
+    pixels, valid = resample_tile(layer.band, layer.mapping, tile, settings.interpolation, radiometry)
+    if settings.fill_occluded:
+        return _with_occluded(pixels, valid, _fillable(layer, layer.mapping, tile))
+    return pixels, valid
 
 
 def _fillable(layer: Layer, mapping: PixelMapping, tile: Tile) -> Mask:
-    """(height, width) True for occluded pixels of a tile inside the image of the band: beyond it there is nothing."""
+    """(height, width), True for pixels of a tile that are occluded in the band and inside its image."""
     positions = mapping.positions(tile)
     inside = ((positions >= 0) & (positions <= np.subtract(layer.band.size_px, 1))).all(axis=-1)
     return np.asarray(mapping.hidden(tile) & inside)
 
 
-def _with_occluded(pixels: Pixels, valid: Mask, hidden: Mask) -> tuple[Pixels, Mask]:
-    """Pixels and their mask with the hidden ones interpolated from valid ones around, by GDAL's inverse distances."""
-    if not hidden.any() or not valid.any():
+def _with_occluded(pixels: Pixels, valid: Mask, occluded: Mask) -> tuple[Pixels, Mask]:
+    """Pixels and their mask, with occluded pixels interpolated from valid ones by GDAL's inverse distance weighting."""
+    if not occluded.any() or not valid.any():
         return pixels, valid
     distance_px = cv2.distanceTransform((~valid).astype(np.uint8), cv2.DIST_L2, 3)
-    hidden = hidden & (distance_px < _FILL_DISTANCE_PX)
+    occluded = occluded & (distance_px < _FILL_DISTANCE_PX)
     filled = fillnodata(np.where(valid, pixels, 0).astype(np.float32), valid, _FILL_DISTANCE_PX)
     if pixels.dtype.kind in "iu":
         limits = np.iinfo(str(pixels.dtype))
         filled = np.clip(np.rint(filled), limits.min, limits.max)
-    return np.where(hidden, filled, pixels).astype(pixels.dtype), valid | hidden
-
-
-def _profile(
-    reference: Band, count: int, grid: OutputGrid, dtype: np.dtype[Any], nodata: float | None, compression: str
-) -> dict[str, Any]:
-    profile: dict[str, Any] = {
-        "driver": "GTiff", "width": grid.width, "height": grid.height, "count": count, "dtype": dtype.name,
-        "interleave": "band", "photometric": "minisblack", "bigtiff": "if_safer",
-        "tiled": True, "blockxsize": _TILE_PX, "blockysize": _TILE_PX,
-    }  # fmt: skip
-    if nodata is not None:
-        profile["nodata"] = nodata
-    if compression != "none":
-        profile |= {"compress": compression, "predictor": 3 if dtype.kind == "f" else 2}
-        profile |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
-    if reference.georeference is not None:
-        profile |= georeferenced(reference.georeference, grid)
-    return profile
+    return np.where(occluded, filled, pixels).astype(pixels.dtype), valid | occluded
 
 
 def _compression(settings: WriteSettings, *, all_bands: bool) -> str:
-    """Files of single bands often go on to programs without Zstandard."""
+    """Deflate for files of single bands: many programs that read them do not support Zstandard."""
     if settings.compression != "auto":
         return settings.compression
     return "zstd" if all_bands and settings.layout != "bands" else "deflate"
@@ -308,7 +200,7 @@ def _to_cog(path: Path, compression: str) -> None:
     cog = path.with_name(f"{path.name}.cog")
     options = {} if compression == "none" else {"compress": compression, "predictor": "yes"}
     try:
-        copy_dataset(path, cog, driver="COG", blocksize=_COG_TILE_PX, bigtiff="if_safer", **options)
+        copy_dataset(path, cog, driver="COG", blocksize=_COG_BLOCK_PX, bigtiff="if_safer", **options)
         cog.replace(path)
     finally:
         cog.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""OUT/agalign-run.json: what a run was, with what, on what, and what came of it; written before anything else is."""
+"""OUT/agalign-run.json: command, settings, versions, machine and results of a run; the first file that a run writes."""
 
 import platform
 from collections import Counter, defaultdict
@@ -9,21 +9,19 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from agalign._version import __version__
 from agalign.config import Settings
-from agalign.errors import SidecarError
 from agalign.flight.overview import camera_overviews
-from agalign.products.sidecar import CaptureResult, compact_lists
+from agalign.products.json_file import read_model, write_model
+from agalign.products.sidecar import CaptureResult
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
-from agalign.values.files import RUN_FILE, write_text
+from agalign.values.files import RUN_FILE
 from agalign.values.text import harmless
 
 _LIBRARIES = ("torch", "numpy", "rasterio", "opencv-python-headless", "tifffile", "pydantic")
-_MAX_BYTES = 1 << 28
-"""A record of 100,000 captures has a tenth of this."""
 
 RunState = Literal["running", "interrupted", "finished"]
 
@@ -42,14 +40,14 @@ class RefusalPart(_Part):
 
 
 class ProblemPart(_Part):
-    """A file that took no part, or a capture that came to nothing, and why."""
+    """A file that was left out or a capture that failed, and the reason."""
 
     of: str
     problem: str
 
 
 class CameraOverviewPart(_Part):
-    """The captures of one camera, as `agalign info` begins with them."""
+    """Summary of the captures of one camera, as `agalign info` prints it."""
 
     camera: str
     serial: str
@@ -66,7 +64,7 @@ class CameraOverviewPart(_Part):
 
 
 class RunPart(_Part):
-    """One run. `running` is also what a run that was killed has left."""
+    """Record of one run. A run that was killed leaves the state `running`."""
 
     schema_: Annotated[Literal["agalign-run/1"], Field(alias="schema")] = "agalign-run/1"
     agalign: str = __version__
@@ -82,25 +80,25 @@ class RunPart(_Part):
     machine: dict[str, str | int]
     settings: dict[str, Any]
     captures: dict[str, int]
-    """How many were found, and how many are done, kept, panel, sky, error."""
+    """Number of captures found, done, kept, panel, sky, and error."""
     pairs: dict[str, int]
-    """How many band pairs have which status."""
+    """Number of band pairs by status."""
     stage_seconds: dict[str, float]
-    """What the captures that were done cost, added over workers, and the learning before them."""
+    """Processing time by stage, summed over workers; includes learning the flight."""
     capture_seconds: dict[str, float]
-    """The same by capture."""
+    """Processing time by capture."""
     refused: list[RefusalPart]
     problems: list[ProblemPart]
 
 
 def problem_of(what: str, text: str) -> ProblemPart:
-    """Names of files may contain characters that are not printable; those are escaped."""
+    """Return a problem of a file or capture; characters that are not printable are escaped."""
     return ProblemPart(of=harmless(what), problem=harmless(text))
 
 
 @dataclass
 class Tally:
-    """What a run has come to so far."""
+    """Results of a run so far."""
 
     captures: Counter[str] = field(default_factory=Counter)
     pairs: Counter[str] = field(default_factory=Counter)
@@ -110,7 +108,7 @@ class Tally:
     problems: list[ProblemPart] = field(default_factory=list)
 
     def add(self, label: str, state: str, result: CaptureResult | None, problems: Iterable[str]) -> None:
-        """One capture more."""
+        """Add the result of a capture."""
         self.captures[state] += 1
         self.problems += [problem_of(label, text) for text in problems]
         for band in [] if result is None else result.bands:
@@ -123,7 +121,7 @@ class Tally:
 
 
 def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:
-    """A run that has just begun."""
+    """Return the record of a run that starts now."""
     cameras = [CameraOverviewPart.model_validate(asdict(o)) for o in camera_overviews(captures)]
     return RunPart(
         state="running", started_at=datetime.now(UTC).isoformat(timespec="seconds"), seconds=0.0,
@@ -135,28 +133,19 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
 
 
 def write_run_record(out: Path, run: RunPart, tally: Tally, state: RunState, seconds: float) -> None:
-    """OUT/agalign-run.json of a run that has come so far. Raises OutputError."""
+    """Write OUT/agalign-run.json with the results so far. Raises OutputError."""
     facts = {
         "state": state, "seconds": round(seconds, 2), "captures": dict(tally.captures), "pairs": dict(tally.pairs),
         "refused": tally.refused, "problems": tally.problems,
         "stage_seconds": {k: round(v, 3) for k, v in sorted(tally.stage_seconds.items())},
         "capture_seconds": {k: round(v, 3) for k, v in sorted(tally.capture_seconds.items())},
     }  # fmt: skip
-    part = run.model_copy(update=facts)
-    write_text(out / RUN_FILE, compact_lists(part.model_dump_json(by_alias=True, indent=1)) + "\n")
+    write_model(out / RUN_FILE, run.model_copy(update=facts))
 
 
 def read_run_record(out: Path) -> RunPart | None:
-    """Of the last run into a folder; None where there is none. Raises SidecarError for a file that is none of ours."""
-    path = out / RUN_FILE
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise SidecarError(f"{path}: is too large for what it should be; run again")
-        return RunPart.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
-        return None
-    except (OSError, ValidationError):
-        raise SidecarError(f"{path}: cannot be read; run again") from None
+    """Return the record of the last run into a folder, if any. Raises SidecarError for a file of another format."""
+    return read_model(out / RUN_FILE, RunPart)
 
 
 def _versions() -> dict[str, str]:

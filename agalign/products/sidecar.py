@@ -4,18 +4,13 @@ All pixel coordinates are x right, y down, (0, 0) the centre of the top-left pix
 the reference to a pixel of the moving band; `grid` samples the complete mapping between the raw pixels of the files.
 """
 
-import hashlib
-import json
-import re
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from agalign.errors import SidecarError
 from agalign.values.choices import CaptureStatus, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
-from agalign.values.files import is_inside, open_regular, write_text
+from agalign.values.files import is_inside
 from agalign.verify.checks import KINDS
 
 SCHEMA = "agalign/1"
@@ -23,10 +18,6 @@ SCHEMA = "agalign/1"
 Row = tuple[float, float, float]
 Matrix3x3 = tuple[Row, Row, Row]
 PointPx = tuple[float, float]
-_MAX_BYTES = 1 << 26
-"""A sidecar of many bands has a tenth of this; reading a larger file would take the memory."""
-_MAX_QUOTED = 60
-"""Characters of a wrong value in a message."""
 
 
 def _inside_folder(name: str) -> str:
@@ -35,8 +26,15 @@ def _inside_folder(name: str) -> str:
     return name
 
 
+def rounded(value: float | None) -> float | None:
+    """Return a measured value to the four decimals that tables and the report have."""
+    return None if value is None else round(value, 4)
+
+
 RelativeFile = Annotated[str, AfterValidator(_inside_folder)]
-"""A file in the sidecar's folder or below. Anyone may write a sidecar, and agalign reads and removes what it names."""
+"""A file in the sidecar's folder or below. A sidecar may come from anyone, and agalign reads and removes the files that
+it lists.
+"""
 Count = Annotated[int, Field(gt=0)]
 
 
@@ -45,7 +43,7 @@ class _Part(BaseModel):
 
 
 class _Result(_Part):
-    """Ignores fields that it does not have."""
+    """A model of a part of the fields: it ignores the others when a sidecar is read."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -210,6 +208,11 @@ class MetricsResult(_Result):
     """Files as they are."""
     after: SimilarityPart
     """Bands as written."""
+
+    def similarity(self) -> dict[str, tuple[float | None, float | None]]:
+        """Return (before, after) by the name of each measure of similarity."""
+        names = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
+        return {n: (rounded(getattr(self.before, n)), rounded(getattr(self.after, n))) for n in names}
 
 
 class MetricsPart(MetricsResult):
@@ -455,7 +458,7 @@ class CaptureResult(_Result):
 
 
 class Sidecar(CaptureResult):
-    """One capture, as its sidecar describes it."""
+    """Result of one capture, with the complete mappings of its bands."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -463,98 +466,13 @@ class Sidecar(CaptureResult):
     """One entry per band, the reference included."""
 
     def result(self) -> CaptureResult:
-        """The same without the long tables of its bands, which need too much memory for a season."""
-        short: dict[str, Any] = {"bands": {"__all__": {"grid": True, "relief": True, "metrics": {"tiles"}}}}
-        return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude=short))
+        """Return the sidecar without the long tables of its bands: those of a season would not fit into memory."""
+        tables: dict[str, Any] = {"bands": {"__all__": {"grid": True, "relief": True, "metrics": {"tiles"}}}}
+        return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude=tables))
 
 
-def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
-    """Write atomically; returned with its checksum. Raises OutputError."""
-    checksum = content_checksum(sidecar.model_dump_json(by_alias=True))
-    whole = sidecar.model_copy(update={"checksum": checksum})
-    write_text(path, compact_lists(whole.model_dump_json(by_alias=True, indent=1)))
-    return whole
-
-
-def content_checksum(text: str | bytes) -> str:
-    """SHA-256 of a sidecar's JSON: of its canonical form (sorted keys, no spaces) without `checksum` and without every
-    `seconds`, which differ from run to run.
-    """
-    content = json.loads(text, object_hook=_without_seconds)
-    content.pop("checksum", None)
-    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def _without_seconds(part: dict[str, Any]) -> dict[str, Any]:
-    part.pop("seconds", None)
-    return part
-
-
-_LIST_ELEMENT = r"(?=[-0-9ntf])"
-"""A line of indented JSON that is a number, null, true or false in a list: names and texts begin with a quote."""
-
-
-def compact_lists(text: str) -> str:
-    """Indented JSON with each list of numbers on one line: legible matrices, and a third of the size."""
-    text = re.sub(r"\[\n +" + _LIST_ELEMENT, "[", text)
-    text = re.sub(r",\n +" + _LIST_ELEMENT, ", ", text)
-    return re.sub(r"(?<=[0-9le])\n *\]", "]", text)
-
-
-def read_sidecar(path: Path) -> Sidecar:
-    """Raises SidecarError, naming the file and the field, where it is missing, malformed or of another version."""
-    return _read(path, Sidecar)
-
-
-def read_result(path: Path) -> CaptureResult:
-    """A sidecar without its long tables, which take most of the time to read. Raises as `read_sidecar` does."""
-    return _read(path, CaptureResult)
-
-
-Model = TypeVar("Model", bound=CaptureResult)
-
-
-def _read(path: Path, model: type[Model]) -> Model:
-    try:
-        with open_regular(path) as file:
-            contents = file.read(_MAX_BYTES + 1)
-        if len(contents) > _MAX_BYTES:
-            raise SidecarError(
-                f"{path}: over {_MAX_BYTES >> 20} MB are too many for a sidecar; delete it and run again"
-            )
-        return model.model_validate_json(contents)
-    except OSError as error:
-        raise SidecarError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except ValidationError as error:
-        problems = {".".join(map(str, e["loc"])): e for e in error.errors(include_url=False)}
-        (where, first), *_ = problems.items()
-        if first["type"] == "json_invalid":
-            raise SidecarError(f"{path}: not valid JSON ({first['msg']}); delete it and run again") from None
-        if not where:
-            raise SidecarError(f"{path}: not a sidecar of schema {SCHEMA!r}; delete it and run again") from None
-        if "schema" in problems:
-            result = _shortened(problems["schema"]["input"] if problems["schema"]["type"] != "missing" else None)
-            raise SidecarError(f"{path}: schema is {result}, not {SCHEMA!r}; run again with --overwrite") from None
-        raise SidecarError(f"{path}: {where}: {first['msg']}; run again with --overwrite") from None
-
-
-def _shortened(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}…"
-
-
-def find_sidecars(folder: Path) -> list[Path]:
-    """The sidecars below an output folder, sorted; other JSON files are passed over, but not what cannot be read."""
-    result = []
-    for path in sorted(folder.rglob("*.json")):
-        try:
-            if not path.is_file():
-                continue
-            with open_regular(path) as file:
-                head = file.read(200)
-        except OSError:
-            result.append(path)
-            continue
-        if b'"agalign/' in head:
-            result.append(path)
-    return result
+def is_delivered(status: PairStatus, std_px: float | None, accept_predicted_px: float) -> bool:
+    """Return True for the reference, an aligned band, or a predicted band whose standard error `std_px` is accepted."""
+    if status == "predicted":
+        return std_px is not None and std_px <= accept_predicted_px
+    return status in ("reference", "aligned")

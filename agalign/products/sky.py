@@ -1,17 +1,16 @@
-"""OUT/sky.json: the captures of the sky that a run left out, and the radiance of each band."""
+"""OUT/sky.json: the captures of the sky, which a run does not align, and the radiance of each band."""
 
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from agalign.errors import AgalignError, SidecarError
+from agalign.errors import AgalignError
 from agalign.flight.sky import SkyCapture, sky_radiance
-from agalign.products.sidecar import compact_lists
+from agalign.products.json_file import read_model, write_model
 from agalign.values.capture import Band
-from agalign.values.files import write_text
 
 SKY_FILE = "sky.json"
 
@@ -26,7 +25,7 @@ class SkyBandPart(_Part):
     band: str
     file: str
     radiance: float | None
-    """Median over the image, W / m^2 / sr / nm; null where it is not known, or half of the band is saturated."""
+    """Median over the image, W / m^2 / sr / nm; null if it is unknown or half of the band is saturated."""
 
 
 class SkyPart(_Part):
@@ -36,24 +35,24 @@ class SkyPart(_Part):
     capture: str
     captured_at: str
     cues: list[str]
-    """The reasons for which it counts as one, in words."""
+    """Evidence that the capture shows the sky, in words."""
     bands: list[SkyBandPart]
 
     @property
     def sentence(self) -> str:
-        """Why it is left out, in words."""
+        """State in words why the capture is not aligned."""
         return f"shows the sky ({', '.join(self.cues)}): not aligned"
 
 
 class SkyFile(_Part):
-    """All of a run."""
+    """All captures of the sky of a run."""
 
     schema_: Annotated[Literal["agalign-sky/1"], Field(alias="schema")] = "agalign-sky/1"
     captures: list[SkyPart]
 
 
 def write_sky(sky: Sequence[SkyCapture], out: Path) -> list[SkyPart]:
-    """Write OUT/sky.json, or remove that of an earlier run where there is no such capture. Raises OutputError."""
+    """Write OUT/sky.json; without captures of the sky, remove that of an earlier run. Raises OutputError."""
     path = out / SKY_FILE
     if not sky:
         with suppress(OSError):
@@ -67,19 +66,14 @@ def write_sky(sky: Sequence[SkyCapture], out: Path) -> list[SkyPart]:
         )
         for s in sky
     ]  # fmt: skip
-    write_text(path, compact_lists(SkyFile(captures=parts).model_dump_json(by_alias=True, indent=1)) + "\n")
+    write_model(path, SkyFile(captures=parts))
     return parts
 
 
 def read_sky(out: Path) -> list[SkyPart]:
-    """Return the captures of an earlier run. Raises SidecarError for a file that agalign did not write."""
-    path = out / SKY_FILE
-    try:
-        return SkyFile.model_validate_json(path.read_bytes()).captures
-    except FileNotFoundError:
-        return []
-    except (OSError, ValidationError):
-        raise SidecarError(f"{path}: cannot be read; run again") from None
+    """Return the captures of the sky of an earlier run. Raises SidecarError for a file that agalign did not write."""
+    file = read_model(out / SKY_FILE, SkyFile)
+    return [] if file is None else file.captures
 
 
 def _radiance(band: Band) -> float | None:

@@ -17,11 +17,11 @@ from agalign.errors import ConfigurationError, OutputError
 from agalign.flight.fingerprint import hashed
 from agalign.flight.groups import camera_key, flight_key, flights_of
 from agalign.pixels.raster import crs_code
+from agalign.products.checked_raster import georeferenced
 from agalign.products.footprint import footprint
 from agalign.products.indices import role_of
 from agalign.products.pan_sharpen import panchromatic
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
-from agalign.products.raster_file import georeferenced
 from agalign.products.raster_tags import UNITS
 from agalign.values.capture import Band, Capture
 from agalign.values.files import write_text

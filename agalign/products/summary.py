@@ -1,14 +1,12 @@
 """OUT/summary.csv: one row per band pair of a run, and one for each band of a calibration panel or of the sky."""
 
-import csv
-import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from agalign.products.csv_file import write_csv
 from agalign.products.panels import PanelPart
-from agalign.products.sidecar import BandPart, Sidecar
+from agalign.products.sidecar import BandPart, Sidecar, rounded
 from agalign.products.sky import SkyPart
-from agalign.values.files import write_text
 from agalign.values.text import without_formula
 
 SUMMARY_COLUMNS = (
@@ -22,7 +20,7 @@ SUMMARY_COLUMNS = (
 
 
 def summary_rows(folder: str, sidecar: Sidecar) -> list[dict[str, object]]:
-    """A row for each band pair of a capture."""
+    """Return a row for each band pair of a capture, by column."""
     return [_row(folder, sidecar, band) for band in sidecar.bands if band.status != "reference"]
 
 
@@ -41,12 +39,8 @@ def sky_rows(sky: SkyPart) -> list[dict[str, object]]:
 
 
 def write_summary(rows: Iterable[Mapping[str, object]], path: Path) -> None:
-    """Raises OutputError."""
-    table = io.StringIO()
-    writer = csv.DictWriter(table, SUMMARY_COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: without_formula(v) for k, v in row.items()} for row in rows)
-    write_text(path, table.getvalue())
+    """Write rows by column, where a missing column is empty. Raises OutputError."""
+    write_csv(path, SUMMARY_COLUMNS, ([without_formula(row.get(name)) for name in SUMMARY_COLUMNS] for row in rows))
 
 
 def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:
@@ -61,22 +55,18 @@ def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:
         "seconds": band.seconds,
     }
     if band.joint is not None:
-        row |= {"retrieval": round(band.joint.retrieval, 4), "corner_std_px": round(band.joint.corner_std_px, 4)}
+        row |= {"retrieval": rounded(band.joint.retrieval), "corner_std_px": rounded(band.joint.corner_std_px)}
     if band.local is not None:
         local = band.local
-        before_px, after_px = _short(local.before_p95_px), _short(local.after_p95_px)
+        before_px, after_px = rounded(local.before_p95_px), rounded(local.after_p95_px)
         row |= {"local_applied": local.applied, "local_p95_before_px": before_px, "local_p95_after_px": after_px}
     if band.prediction is not None:
         prediction = band.prediction
-        std_px, off_px = _short(prediction.std_px), _short(prediction.off_px)
+        std_px, off_px = rounded(prediction.std_px), rounded(prediction.off_px)
         row |= {"prediction_from": prediction.source, "prediction_std_px": std_px, "prediction_off_px": off_px}
     if band.metrics is not None:
-        before, after = band.metrics.before.model_dump(), band.metrics.after.model_dump()
-        row |= {k: _short(after[k]) for k in ("residual_px", "residual_p95_px", "residual_coverage")}
-        for name in ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim"):
-            row |= {f"{name}_before": _short(before[name]), f"{name}_after": _short(after[name])}
+        after = band.metrics.after
+        row |= {k: rounded(getattr(after, k)) for k in ("residual_px", "residual_p95_px", "residual_coverage")}
+        for name, (before_value, after_value) in band.metrics.similarity().items():
+            row |= {f"{name}_before": before_value, f"{name}_after": after_value}
     return row
-
-
-def _short(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)

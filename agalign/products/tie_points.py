@@ -1,11 +1,9 @@
-"""The tie points of a capture: where windows of each band show the same as the reference, as CSV and as GeoJSON.
+"""The tie points between the reference and each band of a capture, as CSV and as GeoJSON.
 
-They are measured on the aligned bands and independent of the descriptors: another program can estimate any mapping from
-them, or verify its own. Only their search starts from the alignment.
+They are measured by phase correlation of windows of the aligned bands, independently of the learned descriptors:
+another program can estimate a mapping from them, or verify its own. Only the search starts from the alignment.
 """
 
-import csv
-import io
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,6 +14,7 @@ import numpy as np
 from agalign.config import WriteSettings
 from agalign.errors import GeometryError
 from agalign.pixels.raster import transformed
+from agalign.products.csv_file import write_csv
 from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
@@ -31,11 +30,13 @@ _COLUMNS = (
     "band", "status", "reference_x_px", "reference_y_px", "moving_x_px", "moving_y_px", "residual_px", "weight",
 )  # fmt: skip
 _WGS84 = "EPSG:4326"
+_DECIMALS, _DEGREE_DECIMALS = 4, 8
+"""Of px and weights; of degrees: a millimetre."""
 
 
 @dataclass(frozen=True)
 class TiePoint:
-    """One window: raw pixels of both files, (0, 0) the centre of the top-left pixel."""
+    """Corresponding raw pixels of both files, (0, 0) the centre of the top-left pixel."""
 
     band: str
     status: PairStatus
@@ -44,11 +45,11 @@ class TiePoint:
     residual_px: float
     """Distance from the alignment, px of the reference's file."""
     weight: float
-    """Inverse of the variance, 1 for the median window of the band."""
+    """Inverse of the variance, 1 for the median tie point of the band."""
 
 
 class TiePoints(Product):
-    """The tie points of all bands that are not failed."""
+    """The tie points of all bands that did not fail."""
 
     kind = "tie_points"
     suffix = ".ties.csv"
@@ -58,14 +59,14 @@ class TiePoints(Product):
         return settings.tie_points
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
-        """The CSV and the GeoJSON."""
+        """Return the CSV and the GeoJSON file."""
         return [paths.file(self.suffix), paths.file(".ties.geojson")]
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.ties.csv and <capture>.ties.geojson."""
         table, features = self.paths(context.capture, context.paths, context.write_settings)
         points = list(_points(context))
-        write_text(table, _csv(points))
+        write_csv(table, _COLUMNS, map(_cells, points))
         write_text(features, _geojson(points, context.capture.reference.georeference))
         return [
             WrittenFile(self.kind, table, StacAsset("tie_points", "text/csv", ("metadata",))),
@@ -81,16 +82,17 @@ def _points(context: ProductContext) -> Iterator[TiePoint]:
 
 
 def tie_points(reference: Band, band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoint]:
-    """The tie points of a band with a residual.
+    """Yield the tie points of a band with a measured residual.
 
-    What the reference shows at p, the warped band shows at p + shift: it is at mapping(p + shift) in the band's file.
+    The point p of the reference corresponds to p + shift in the warped band, and so to mapping(p + shift) in the file
+    of the band.
     """
     residual = alignment.residual
     assert residual is not None
     measured = np.isfinite(residual.shifts_px[:, 0])
     at_px, shifts_px = residual.centres_px[measured], residual.shifts_px[measured]
     moving_px = mapping_of(reference, band, alignment)(at_px + shifts_px)
-    # The error of a shift falls with the square of its peak's height.
+    # The standard error of a shift is proportional to 1 / (height of its correlation peak)^2.
     sigma = residual.peaks_sigma[measured] if len(residual.peaks_sigma) else np.ones(len(at_px))
     weights = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
     rows = zip(at_px.tolist(), moving_px.tolist(), np.hypot(*shifts_px.T).tolist(), weights.tolist(), strict=True)
@@ -98,38 +100,37 @@ def tie_points(reference: Band, band: Band, alignment: Alignment[FixedFilePx]) -
         yield TiePoint(band.name, alignment.status, (x, y), (moving_x, moving_y), residual_px, weight)
 
 
-def _csv(points: Sequence[TiePoint]) -> str:
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for p in points:
-        numbers = (*p.reference_px, *p.moving_px, p.residual_px, p.weight)
-        writer.writerow([harmless(p.band), p.status, *(f"{n:.4f}" for n in numbers)])
-    return table.getvalue()
+def _cells(point: TiePoint) -> list[str]:
+    numbers = (*point.reference_px, *point.moving_px, point.residual_px, point.weight)
+    return [harmless(point.band), point.status, *(f"{n:.{_DECIMALS}f}" for n in numbers)]
 
 
 def _geojson(points: Sequence[TiePoint], georeference: Georeference | None) -> str:
-    """Points in WGS 84, or in px (x, -y) from the corner of the reference where it has no georeference: GIS programs
-    display such an image there.
+    """Points in WGS 84, or, without a georeference, in px (x, -y) from the corner of the reference, where GIS programs
+    display such an image.
     """
     places, unit = _places(np.array([p.reference_px for p in points]).reshape(-1, 2), georeference)
     features = [
         {
             "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": [round(x, 8), round(y, 8)]},
+            "geometry": {
+                "type": "Point", "coordinates": [round(x, _DEGREE_DECIMALS), round(y, _DEGREE_DECIMALS)],
+            },
             "properties": {
-                "band": harmless(p.band), "status": p.status, "reference_px": [round(v, 4) for v in p.reference_px],
-                "moving_px": [round(v, 4) for v in p.moving_px], "residual_px": round(p.residual_px, 4),
-                "weight": round(p.weight, 4),
+                "band": harmless(p.band), "status": p.status,
+                "reference_px": [round(v, _DECIMALS) for v in p.reference_px],
+                "moving_px": [round(v, _DECIMALS) for v in p.moving_px],
+                "residual_px": round(p.residual_px, _DECIMALS), "weight": round(p.weight, _DECIMALS),
             },
         }
         for p, (x, y) in zip(points, places.tolist(), strict=True)
     ]  # fmt: skip
-    return json.dumps({"type": "FeatureCollection", "coordinates_in": unit, "features": features}, indent=None) + "\n"
+    return json.dumps({"type": "FeatureCollection", "coordinates_in": unit, "features": features}) + "\n"
 
 
 def _places(points_px: Points, georeference: Georeference | None) -> tuple[Points, str]:
-    corner_px = points_px + 0.5
+    """(coordinates (n, 2) of the points, their unit)."""
+    corner_px = points_px + 0.5  # GDAL's convention
     if georeference is not None and len(points_px):
         try:
             on_map = geometry.apply(georeference.transform, corner_px)

@@ -1,23 +1,20 @@
-"""Whether the files of a run are still what was written: by the sizes and checksums in their sidecars."""
+"""Comparison of the files of a run with the checksums in their sidecars."""
 
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from agalign.errors import InputError, SidecarError
-from agalign.products.sidecar import content_checksum, find_sidecars, read_result
+from agalign.errors import SidecarError
+from agalign.products.sidecar_file import content_checksum, read_result, run_sidecars
 from agalign.values.files import open_regular
 
 
 def verify_outputs(out: Path) -> Iterator[tuple[Path, list[str]]]:
-    """(the sidecar, what is wrong with it or with a file that it lists) for every capture below `out`.
+    """Yield (sidecar, problems of the sidecar and the files that it lists) for every capture below `out`.
 
-    Raises InputError where there is no sidecar.
+    Raises InputError if there is no sidecar.
     """
-    sidecars = find_sidecars(out) if out.is_dir() else []
-    if not sidecars:
-        raise InputError(f"{out}: no sidecars there; give the output folder of a run")
-    for path in sidecars:
+    for path in run_sidecars(out):
         try:
             yield path, list(_problems(path))
         except SidecarError as error:

@@ -1,6 +1,7 @@
 """Files that are complete or not there, and the names that they may have."""
 
 import errno
+import hashlib
 import os
 import platform
 import secrets
@@ -57,6 +58,15 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file atomically, the same on every system. Raises OutputError."""
     with complete_file(path) as partial:
         partial.write_text(text, encoding="utf-8", newline="\n")
+
+
+def file_checksum(path: Path) -> str:
+    """Return the SHA-256 of a file that was written a moment ago. Raises OutputError."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be read back ({error.strerror or error})") from None
 
 
 def open_regular(path: Path) -> BufferedReader:

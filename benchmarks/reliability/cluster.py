@@ -18,7 +18,7 @@ import psutil
 from kills import contents, differences, files
 from report import Section
 
-from agalign.products.sidecar import find_sidecars
+from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic import flight as synthetic
 
 SIZE_PX = 480, 360

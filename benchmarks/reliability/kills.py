@@ -25,7 +25,7 @@ import psutil
 import rasterio
 from report import Section
 
-from agalign.products.sidecar import find_sidecars
+from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic import flight as synthetic
 from agalign.values.files import RUN_FILE
 

@@ -14,8 +14,8 @@ from agalign.products.sidecar import (
     ProductPart,
     ReferencePart,
     Sidecar,
-    write_sidecar,
 )
+from agalign.products.sidecar_file import write_sidecar
 
 BANDS = {"Green": 560.0, "Red": 668.0, "NIR": 842.0, "Red edge": 717.0}
 _FULL = 40000

@@ -25,7 +25,7 @@ from agalign.method.fast import Schedule, learn
 from agalign.method.state import JointState
 from agalign.products import picture
 from agalign.products.run_record import read_run_record
-from agalign.products.sidecar import find_sidecars, read_sidecar
+from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.synthetic.score import score_against_truth
 from agalign.values.capture import Capture
 

@@ -15,7 +15,7 @@ from agalign.cameras.pix4d import perspective_lens
 from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.products.export import export
-from agalign.products.sidecar import find_sidecars, read_sidecar
+from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.choices import ExportProgram
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")

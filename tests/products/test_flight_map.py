@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from synthetic_flights.aligned import make_aligned
 from synthetic_flights.panel import make_flight_between_panels
 
 import agalign
+from agalign.batch.index_run import index_tasks, run_indices
 from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.errors import ConfigurationError
 from agalign.products.flight_map import FlightMap
@@ -21,6 +23,7 @@ from agalign.products.footprint import (
     with_approximate_georeference,
     with_assumed_height,
 )
+from agalign.products.indices import INDICES
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Pose, Position
 
@@ -66,6 +69,39 @@ def test_an_unknown_height_is_assumed_and_marked(tmp_path: Path) -> None:
     assert accuracy_m is not None
     assert feature["properties"]["accuracy_m"] > 2 * accuracy_m
     assert with_assumed_height(capture(Pose(0.0, focal_length_px=1000.0), 40.0)).pose.height_m == 40.0  # type: ignore[union-attr]
+
+
+def test_index_rasters_of_a_later_command_are_linked_and_stay_linked(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
+    known = replace(capture(Pose(0.0, height_m=50.0)), name="IMG_0001", folder=Path("0000SET"))
+
+    def links() -> list[str]:
+        (feature,) = json.loads((tmp_path / "flight.geojson").read_text())["features"]
+        return list(feature["properties"]["indices"])
+
+    def end_of_a_run() -> None:
+        on_map = FlightMap(tmp_path)
+        on_map.add(known, "ok")
+        on_map.write()
+
+    end_of_a_run()
+    assert links() == []
+    list(run_indices(index_tasks(tmp_path, [INDICES["ndvi"], INDICES["ndre"]], tmp_path)))
+    linked = ["0000SET/IMG_0001_ndre.tif", "0000SET/IMG_0001_ndvi.tif"]
+    assert sorted(links()) == linked
+    end_of_a_run()
+    assert sorted(links()) == linked
+    (tmp_path / linked[0]).unlink()
+    end_of_a_run()
+    assert links() == linked[1:]
+
+
+def test_a_map_of_another_program_is_not_changed(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
+    for text in ('{"features": [{"properties": {"name": "mine"}}]}', "[]", "not JSON"):
+        (tmp_path / "flight.geojson").write_text(text)
+        list(run_indices(index_tasks(tmp_path, [INDICES["ndvi"]], tmp_path)))
+        assert (tmp_path / "flight.geojson").read_text() == text
 
 
 def test_captures_without_a_footprint_are_points_or_left_without_a_place(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from synthetic_flights.troubles import make_two_headings
 import agalign
 from agalign.cameras.discover import DiscoverOptions
 from agalign.config import SeedSettings, Settings, WriteSettings
-from agalign.products.sidecar import find_sidecars
+from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.rig import CameraSpec
 

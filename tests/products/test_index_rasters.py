@@ -11,7 +11,8 @@ from synthetic_flights.aligned import make_aligned
 from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run
 from agalign.errors import ConfigurationError
 from agalign.products.formula import evaluate, symbols_of
-from agalign.products.index_rasters import RAW, IndexReport, write_indices
+from agalign.products.index_bands import RAW
+from agalign.products.index_rasters import IndexReport
 from agalign.products.index_table import read_table
 from agalign.products.indices import INDICES, Index, index_named, index_of_formula
 from agalign.products.report import write_pages
@@ -71,7 +72,7 @@ def test_the_catalogue_gives_names_and_constants() -> None:
 def test_values_statistics_and_tags_of_a_raster(tmp_path: Path) -> None:
     make_aligned(tmp_path, 1)
     mine = index_of_formula("mine = (N-RE)/(N+RE)")
-    ndvi, ndre, by_formula = write_indices(tmp_path, [NDVI, NDRE, mine])
+    ndvi, ndre, by_formula = run(tmp_path, NDVI, NDRE, mine)
     with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif") as stack:
         _, red, nir, _ = stack.read().astype(float)
     truth = (nir - red) / (nir + red)
@@ -96,7 +97,7 @@ def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> Non
     assert [unit_of_run(index_tasks(tmp_path / n, [NDVI], tmp_path / n)) for n in ("raw", "reflectance")] == [
         RAW, "reflectance",
     ]  # fmt: skip
-    (of_raw,), (of_reflectance,) = (write_indices(tmp_path / n, [NDVI]) for n in ("raw", "reflectance"))
+    (of_raw,), (of_reflectance,) = (run(tmp_path / n) for n in ("raw", "reflectance"))
     assert of_raw.path is not None
     assert of_reflectance.path is not None
     with rasterio.open(of_raw.path) as dataset:

@@ -12,13 +12,13 @@ import tifffile
 
 import agalign
 from agalign.batch import RunOptions
-from agalign.batch.index_run import do_indices, index_tasks
+from agalign.batch.index_run import do_indices, index_tasks, run_indices
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.tag_seeds import geo_seed
 from agalign.config import CheckSettings, JointSettings, ReliefSettings, SeedSettings, Settings, WriteSettings
 from agalign.errors import ConfigurationError, InputError
 from agalign.products.band_files import band_file_names
-from agalign.products.index_rasters import write_indices
+from agalign.products.index_rasters import IndexReport
 from agalign.products.indices import INDICES
 from agalign.products.layout import output_layers
 from agalign.products.verify_outputs import verify_outputs
@@ -33,6 +33,11 @@ from ..conftest import textured_image
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 ONLY_SEED = Settings(seed=SeedSettings(only=True, force="identity"), joint=JointSettings())
+
+
+def indices_of(out: Path, *names: str) -> list[IndexReport]:
+    tasks = index_tasks(out, [INDICES[name] for name in names], out, overwrite=True)
+    return [report for done in run_indices(tasks) for report in done.reports]
 
 
 def write_band(path: Path, pixels: np.ndarray, **profile: object) -> None:
@@ -160,7 +165,7 @@ def calibrated(calibrated_capture: Path, tmp_path: Path) -> Path:
 
 def test_ndvi_of_the_synthetic_flight_is_its_truth(calibrated: Path) -> None:
     out = calibrated / "out"
-    (result,) = write_indices(out, [INDICES["ndvi"]])
+    (result,) = indices_of(out, "ndvi")
     assert not result.problem
     assert not result.raw_numbers
     assert result.path is not None
@@ -211,13 +216,11 @@ def test_an_index_that_no_capture_can_have_is_refused_first(
 
 def test_an_index_of_bands_that_are_not_aligned_is_left_out(aligned_capture: Path, tmp_path: Path) -> None:
     agalign.align_folder(aligned_capture, tmp_path / "out", settings=ONLY_SEED)
-    (result,) = write_indices(tmp_path / "out", [INDICES["ndvi"]])
+    (result,) = indices_of(tmp_path / "out", "ndvi")
     assert "nir is seed_only" in result.problem
     assert not list((tmp_path / "out").glob("*ndvi*"))
     with pytest.raises(InputError, match="no sidecars"):
-        list(write_indices(tmp_path, [INDICES["ndvi"]])) if not list(tmp_path.rglob("*.json")) else list(
-            write_indices(tmp_path / "nowhere", [INDICES["ndvi"]])
-        )
+        indices_of(tmp_path / "nowhere", "ndvi")
 
 
 def test_indices_go_with_the_stack_that_they_were_made_of(aligned_capture: Path, tmp_path: Path) -> None:
@@ -339,10 +342,10 @@ def test_bands_in_different_units_make_no_index(calibrated: Path) -> None:
     (stack,) = out.rglob("IMG_0001.tif")
     with rasterio.open(stack, "r+") as dataset:
         dataset.update_tags(dataset.descriptions.index("NIR") + 1, QUANTITY="radiance")
-    assert "different units" in next(write_indices(out, [INDICES["ndvi"]])).problem
+    assert "different units" in indices_of(out, "ndvi")[0].problem
     with rasterio.open(stack, "r+") as dataset:
         dataset.update_tags(dataset.descriptions.index("Red") + 1, QUANTITY="radiance")
-    assert "needs reflectance, and the bands are radiance" in next(write_indices(out, [INDICES["savi"]])).problem
+    assert "needs reflectance, and the bands are radiance" in indices_of(out, "savi")[0].problem
 
 
 def test_the_folder_of_the_images_is_no_output(aligned_capture: Path) -> None:
@@ -436,7 +439,7 @@ def test_floats_without_a_unit_are_reflectance_only_where_they_can_be(
     for name in ("red", "nir"):
         write_band(tmp_path / "in" / f"field_{name}.tif", scene.astype(np.float32))
     agalign.align_folder(tmp_path / "in", tmp_path / "out")
-    by_name = {r.index: r for r in write_indices(tmp_path / "out", [INDICES["savi"], INDICES["ndvi"]])}
+    by_name = {r.index: r for r in indices_of(tmp_path / "out", "savi", "ndvi")}
     assert (by_name["savi"].path is not None) == written
     assert "needs reflectance, and the bands are raw numbers" in by_name["savi"].problem or written
     assert by_name["ndvi"].path is not None
@@ -472,6 +475,6 @@ def test_indices_take_the_bands_that_the_run_delivered(
         if band["status"] != "reference":
             band |= {"status": "predicted", "prediction": {"from": "flight", "std_px": std_px, "off_px": None}}
     path.write_text(json.dumps(sidecar))
-    (result,) = write_indices(tmp_path / "out", [INDICES["ndvi"]])
+    (result,) = indices_of(tmp_path / "out", "ndvi")
     assert (result.path is not None) == written
     assert written or f"predicted to {std_px:g} px, not {accepted_px:g}" in result.problem

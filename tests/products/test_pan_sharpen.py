@@ -10,8 +10,12 @@ from synthetic_flights.troubles import make_two_headings
 import agalign
 from agalign.cameras.discover import DiscoverOptions
 from agalign.config import SeedSettings, Settings, WriteSettings
-from agalign.products.pan_sharpen import _is_seen, _sharpen, brovey_ratio, panchromatic, weights_of
+from agalign.pixels.raster import open_raster
+from agalign.products.layout import Layer
+from agalign.products.pan_sharpen import _is_in_range, _sharpen, _Sources, brovey_ratio, panchromatic, weights_of
 from agalign.values.capture import Band, Capture
+from agalign.values.image import OutputGrid
+from agalign.values.pixel_units import PixelScale
 
 from ..conftest import textured_image
 
@@ -110,11 +114,11 @@ def test_gaps_keep_the_nodata_value_and_what_is_not_seen_is_not_sharpened(
     profile = {"driver": "GTiff", "width": 320, "height": 240, "dtype": planes.dtype, "count": 3, "nodata": nodata}
     with rasterio.open(tmp_path / "layers.tif", "w", **profile) as file:
         file.write(planes)
-    bands = [Band(n, tmp_path, 1, 320, 240, "uint16") for n in ("Green", "NIR")]
-    panchro = Band("Panchro", tmp_path, 1, 320, 240, "uint16")
-    _sharpen(
-        tmp_path / "layers.tif", tmp_path / "out.tif", bands, [panchro], [True, False], [0.0] * 3, 2.0, nodata
-    )  # fmt: skip
+    layers = [Layer(Band(n, tmp_path, 1, 320, 240, "uint16"), None) for n in ("Green", "NIR", "Panchro")]
+    grid = OutputGrid(0, 0, 320, 240, PixelScale(2.0, 2.0))
+    with open_raster(tmp_path / "layers.tif") as file:
+        sources = _Sources(layers[:2], [True, False], layers[2:], grid)
+        _sharpen(file, tmp_path / "out.tif", sources, np.zeros(3, np.float32), nodata)
     with rasterio.open(tmp_path / "out.tif") as file:
         result = file.read()
     assert (result[:, :20] == nodata).all()
@@ -131,6 +135,5 @@ def test_a_photograph_sharpens_no_infra_red_alone(tmp_path: Path) -> None:
     assert report.error is None
     assert not list((tmp_path / "out").rglob("*.pan.tif"))
     colour = Band("RGB Red", tmp_path, 1, 64, 48, "uint8", companion=True)
-    assert [_is_seen(Band("b", tmp_path, 1, 64, 48, "uint16", wavelength_nm=nm), [colour]) for nm in (650, 730)] == [
-        True, False,
-    ]  # fmt: skip
+    red, red_edge = (Band("b", tmp_path, 1, 64, 48, "uint16", wavelength_nm=nm) for nm in (650.0, 730.0))
+    assert (_is_in_range(red, [colour]), _is_in_range(red_edge, [colour])) == (True, False)

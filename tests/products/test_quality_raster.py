@@ -12,11 +12,12 @@ import agalign
 from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.errors import InputError
 from agalign.pixels.sun_glint import sun_glint
-from agalign.products.index_rasters import bands_of, write_rasters
+from agalign.products.index_bands import bands_of
+from agalign.products.index_rasters import write_rasters
 from agalign.products.indices import index_named, index_of_formula
 from agalign.products.layout import Layer
 from agalign.products.quality_raster import _flags
-from agalign.products.sidecar import read_result
+from agalign.products.sidecar_file import read_result
 from agalign.values import geometry
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid

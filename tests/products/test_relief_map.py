@@ -20,7 +20,8 @@ from agalign.cameras.metadata import Tags
 from agalign.config import Settings, WriteSettings
 from agalign.products.raster_file import _with_occluded
 from agalign.products.relief_map import relief_layers
-from agalign.products.sidecar import Sidecar, read_sidecar
+from agalign.products.sidecar import Sidecar
+from agalign.products.sidecar_file import read_sidecar
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, Residual, Seed
 from agalign.values.capture import Capture

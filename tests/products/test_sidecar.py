@@ -20,11 +20,8 @@ from agalign.products.sidecar import (
     OutputPart,
     ReferencePart,
     Sidecar,
-    find_sidecars,
-    read_result,
-    read_sidecar,
-    write_sidecar,
 )
+from agalign.products.sidecar_file import find_sidecars, read_result, read_sidecar, write_sidecar
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.capture import Band, Capture

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from agalign.errors import InputError
-from agalign.products.sidecar import ProductPart, content_checksum, write_sidecar
+from agalign.products.sidecar import ProductPart
+from agalign.products.sidecar_file import content_checksum, write_sidecar
 from agalign.products.verify_outputs import verify_outputs
 
 from .test_sidecar import example

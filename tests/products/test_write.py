@@ -4,14 +4,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from rasterio.windows import Window
 
 from agalign.config import Settings, WriteSettings
 from agalign.errors import OutputError
 from agalign.products.band_files import BandFiles
+from agalign.products.checked_raster import CheckedRaster
 from agalign.products.layout import Layer
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.raster_file import PixelChecksums, write_raster
+from agalign.products.raster_file import write_raster
 from agalign.values import geometry
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference
 from agalign.values.image import OutputGrid
@@ -248,13 +248,13 @@ def test_files_of_bands_have_each_their_own_nodata(tmp_path: Path) -> None:
 
 def test_a_tile_that_gdal_lost_is_noticed(tmp_path: Path) -> None:
     """A write that fails once while GDAL closes a file leaves a tile of zeros and no error."""
-    path, window = tmp_path / "a.tif", Window(0, 0, 64, 48)
+    path = tmp_path / "a.tif"
     pixels = np.arange(64 * 48, dtype=np.uint16).reshape(48, 64)
-    checksums = PixelChecksums()
     with rasterio.open(path, "w", driver="GTiff", width=64, height=48, count=1, dtype="uint16") as dataset:
-        checksums.write(dataset, pixels, 1, window)
-    checksums.check(path)
+        raster = CheckedRaster(dataset)
+        raster.write(pixels, 1)
+    raster.verify(path)
     with rasterio.open(path, "r+") as dataset:
         dataset.write(np.zeros_like(pixels), 1)
     with pytest.raises(OSError, match="the file came out incomplete"):
-        checksums.check(path)
+        raster.verify(path)

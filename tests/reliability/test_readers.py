@@ -27,7 +27,7 @@ from agalign.method.descriptor import Descriptor
 from agalign.pixels.raster import RasterInfo, probe
 from agalign.products.panels import read_panels
 from agalign.products.run_record import read_run_record
-from agalign.products.sidecar import read_result, read_sidecar
+from agalign.products.sidecar_file import read_result, read_sidecar
 from agalign.values.capture import Band
 from agalign.values.files import RUN_FILE
 from agalign.values.image import OutputGrid

@@ -24,7 +24,7 @@ from agalign.products.panels import PANELS_FILE, PanelPart, read_panels
 from agalign.products.report.facts import Facts
 from agalign.products.report.rigs import drifts_of, rig_views
 from agalign.products.run_record import RunPart, read_run_record
-from agalign.products.sidecar import find_sidecars, read_sidecar
+from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.products.sky import SKY_FILE, SkyPart, read_sky
 from agalign.products.summary import panel_rows, sky_rows, summary_rows, write_summary
 from agalign.values.files import write_text

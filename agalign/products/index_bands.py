@@ -1,0 +1,155 @@
+"""The aligned bands that spectral indices are calculated from: where they are, their unit, and their values."""
+
+import math
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.enums import MaskFlags
+from rasterio.errors import RasterioError
+from rasterio.windows import Window
+
+from agalign.errors import InputError
+from agalign.pixels.raster import open_raster, why
+from agalign.products.sidecar import CaptureResult, is_delivered
+from agalign.values.image import FloatImage, Tile, reduced_size_px
+from agalign.values.quality import UNUSABLE
+
+RAW = "raw numbers"
+"""Unit of bands that are neither reflectance nor radiance."""
+_DEFAULT_ACCEPT_PREDICTED_PX = 1.0
+"""For sidecars without the limit of their run: the default of `--accept-predicted`."""
+_MAX_REFLECTANCE = 2.0
+"""Sun glint and specular leaves exceed 1; raw numbers of any sensor exceed this."""
+_SAMPLE_PX = 512
+"""Longer side of the reduced band from which the unit is inferred if no tag states it."""
+
+
+@dataclass(frozen=True)
+class IndexBand:
+    """An aligned band: the file and index of its pixels, or the reason why it cannot be used."""
+
+    name: str
+    wavelength_nm: float | None
+    file: Path
+    band_index: int
+    sha256: str = ""
+    """Checksum of the file, if it is known."""
+    problem: str = ""
+    quality: tuple[Path, int, str] | None = None
+    """Quality raster whose flagged pixels become nan: file, index of the band's layer, checksum of the file."""
+
+
+def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> list[IndexBand]:
+    """Return the bands of a capture, given the folder of its sidecar; with `mask_qa` with their quality flags.
+
+    Raises InputError with `mask_qa` if the run wrote no quality raster.
+    """
+    flags = next((part for part in sidecar.products if part.kind == "qa"), None)
+    if mask_qa and flags is None:
+        raise InputError(f"{sidecar.capture}: has no quality raster, which --mask-qa needs; align with --qa")
+    given = sidecar.accept_predicted_px
+    limit_px = _DEFAULT_ACCEPT_PREDICTED_PX if given is None else given
+    checksums = {part.file: part.sha256 for part in sidecar.products}
+    result = []
+    # Layer 1 of the quality raster is that of all bands together.
+    for layer, part in enumerate(sidecar.bands, start=2):
+        std_px = None if part.prediction is None else part.prediction.std_px
+        problem = ""
+        if not is_delivered(part.status, std_px, limit_px) or part.place is None:
+            error = "" if std_px is None else f" to {std_px:.1f} px, not {limit_px:g}"
+            problem = f"{part.band} is {part.status}{error} ({part.reason})"
+        file, index = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
+        quality = (folder / flags.file, layer, flags.sha256) if mask_qa and flags is not None else None
+        checksum = checksums.get(file, "")
+        result.append(IndexBand(part.band, part.wavelength_nm, folder / file, index, checksum, problem, quality))
+    return result
+
+
+def unit_of(bands: Sequence[IndexBand]) -> str:
+    """Return the unit of the first band that can be used; empty if there is none. Raises InputError."""
+    for band in bands:
+        if not band.problem:
+            with BandReader() as reader:
+                return reader.units(band)[0]
+    return ""
+
+
+class BandReader(ExitStack):
+    """Reads bands; opens each file once, and closes all of them at the end of the `with` block."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._files: dict[Path, rasterio.DatasetReader] = {}
+
+    def file(self, path: Path, index: int) -> rasterio.DatasetReader:
+        """Return the open file. Raises InputError if it cannot be read or has no band `index`, counted from 1."""
+        if path not in self._files:
+            self._files[path] = self.enter_context(open_raster(path))
+        if index > self._files[path].count:
+            raise InputError(f"{path}: has no band {index}, as its sidecar says; run again")
+        return self._files[path]
+
+    def units(self, band: IndexBand) -> list[str]:
+        """Return the units of a band's numbers: one, unless the tag of a stack lists several.
+
+        Without radiometry tags, numbers that the file's scale brings into the range of reflectance are reflectance.
+        Raises InputError.
+        """
+        source = self.file(band.file, band.band_index)
+        tag = source.tags(band.band_index).get("QUANTITY") or source.tags().get("RADIOMETRY")
+        if tag:
+            return str(tag).split(" and ")
+        is_integer = np.dtype(source.dtypes[band.band_index - 1]).kind in "ui"
+        if is_integer and source.scales[band.band_index - 1] == 1.0:
+            return [RAW]
+        size_px = source.width, source.height
+        sample_px = reduced_size_px(size_px, max(1.0, max(size_px) / _SAMPLE_PX))
+        values = _scaled(source, band.band_index, Window(0, 0, *size_px), sample_px[::-1])
+        known = values[np.isfinite(values)]
+        low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 0.0)
+        return ["reflectance"] if low >= -_MAX_REFLECTANCE and high <= _MAX_REFLECTANCE else [RAW]
+
+    def values(self, band: IndexBand, tile: Tile) -> FloatImage:
+        """Return (height, width) of a tile, scaled as the file states; nan where nodata or flagged as unusable.
+
+        Raises InputError.
+        """
+        window = Window(tile.x0, tile.y0, tile.width, tile.height)
+        result = _scaled(self.file(band.file, band.band_index), band.band_index, window)
+        if band.quality is not None:
+            path, layer, _ = band.quality
+            flags = _read(self.file(path, layer), layer, window).astype(np.uint16)
+            result[flags & np.uint16(UNUSABLE.value) != 0] = np.nan
+        return result
+
+
+def _scaled(
+    source: rasterio.DatasetReader, index: int, window: Window, shape: tuple[int, int] | None = None
+) -> FloatImage:
+    """A window in the unit of the file's scale and offset, nan for nodata, resampled to `shape` (height, width)."""
+    scale, offset, nodata = source.scales[index - 1], source.offsets[index - 1], source.nodatavals[index - 1]
+    pixels = _read(source, index, window, shape).astype(np.float32)
+    if scale != 1.0 or offset != 0.0:
+        pixels = pixels * np.float32(scale) + np.float32(offset)
+    nodata_is_nan = nodata is not None and math.isnan(nodata)
+    if nodata_is_nan or MaskFlags.all_valid in source.mask_flag_enums[index - 1]:
+        return pixels
+    masks = _read(source, index, window, shape, masks=True)
+    return np.where(masks > 0, pixels, np.float32(np.nan))
+
+
+def _read(
+    source: rasterio.DatasetReader, index: int, window: Window, shape: tuple[int, int] | None = None, *,
+    masks: bool = False,
+) -> NDArray[Any]:  # fmt: skip
+    """The pixels of a window, or their masks. Raises InputError."""
+    try:
+        return np.asarray((source.read_masks if masks else source.read)(index, window=window, out_shape=shape))
+    except RasterioError as error:
+        raise InputError(f"{source.name}: cannot be read ({why(error)}); run again") from None

@@ -1,0 +1,111 @@
+"""Writing, reading and finding sidecars."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from agalign.errors import InputError, SidecarError
+from agalign.products.json_file import compact_lists
+from agalign.products.sidecar import SCHEMA, CaptureResult, Sidecar
+from agalign.values.files import open_regular, write_text
+
+_MAX_BYTES = 1 << 26
+"""Limit of a file that is read: ten times the sidecar of many bands."""
+_MAX_QUOTED = 60
+"""Characters of a wrong value that a message quotes."""
+_HEAD_BYTES = 200
+"""Start of a JSON file in which a sidecar has its schema."""
+
+
+def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
+    """Write a sidecar atomically, and return it with its checksum. Raises OutputError."""
+    checksum = content_checksum(sidecar.model_dump_json(by_alias=True))
+    complete = sidecar.model_copy(update={"checksum": checksum})
+    write_text(path, compact_lists(complete.model_dump_json(by_alias=True, indent=1)))
+    return complete
+
+
+def content_checksum(text: str | bytes) -> str:
+    """Return the SHA-256 of a sidecar's JSON in canonical form: sorted keys, no spaces, without `checksum`, and without
+    every `seconds`, which differs from run to run.
+    """
+    content = json.loads(text, object_hook=_without_seconds)
+    content.pop("checksum", None)
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _without_seconds(part: dict[str, Any]) -> dict[str, Any]:
+    part.pop("seconds", None)
+    return part
+
+
+def read_sidecar(path: Path) -> Sidecar:
+    """Return a sidecar. Raises SidecarError with file and field if it is missing, malformed or of another version."""
+    return _read(path, Sidecar)
+
+
+def read_result(path: Path) -> CaptureResult:
+    """Return a sidecar without its long tables, which take most of the time to read. Raises SidecarError."""
+    return _read(path, CaptureResult)
+
+
+def find_sidecars(folder: Path) -> list[Path]:
+    """Return the sidecars below an output folder, sorted; unreadable files are included, other JSON files are not."""
+    result = []
+    for path in sorted(folder.rglob("*.json")):
+        try:
+            if not path.is_file():
+                continue
+            with open_regular(path) as file:
+                head = file.read(_HEAD_BYTES)
+        except OSError:
+            result.append(path)
+            continue
+        if b'"agalign/' in head:
+            result.append(path)
+    return result
+
+
+def run_sidecars(out: Path) -> list[Path]:
+    """Return the sidecars below the output folder of a run. Raises InputError if there are none."""
+    sidecars = find_sidecars(out) if out.is_dir() else []
+    if not sidecars:
+        raise InputError(f"{out}: no sidecars there; give the output folder of a run")
+    return sidecars
+
+
+Model = TypeVar("Model", bound=CaptureResult)
+
+
+def _read(path: Path, model: type[Model]) -> Model:
+    try:
+        with open_regular(path) as file:
+            contents = file.read(_MAX_BYTES + 1)
+        if len(contents) > _MAX_BYTES:
+            raise SidecarError(
+                f"{path}: over {_MAX_BYTES >> 20} MB are too many for a sidecar; delete it and run again"
+            )
+        return model.model_validate_json(contents)
+    except OSError as error:
+        raise SidecarError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except ValidationError as error:
+        raise SidecarError(f"{path}: {_problem(error)}") from None
+
+
+def _problem(error: ValidationError) -> str:
+    """The first problem of a sidecar, and the remedy; a wrong schema version before anything else."""
+    problems = {".".join(map(str, e["loc"])): e for e in error.errors(include_url=False)}
+    (field, first), *_ = problems.items()
+    if first["type"] == "json_invalid":
+        return f"not valid JSON ({first['msg']}); delete it and run again"
+    if not field:
+        return f"not a sidecar of schema {SCHEMA!r}; delete it and run again"
+    if "schema" in problems:
+        schema = problems["schema"]
+        value = repr(None if schema["type"] == "missing" else schema["input"])
+        quoted = value if len(value) <= _MAX_QUOTED else f"{value[:_MAX_QUOTED]}…"
+        return f"schema is {quoted}, not {SCHEMA!r}; run again with --overwrite"
+    return f"{field}: {first['msg']}; run again with --overwrite"
