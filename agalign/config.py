@@ -99,8 +99,8 @@ class WriteSettings(Stage):
     """The aligned stacks."""
 
     interpolation: Interpolation = "lanczos"
-    """Lanczos has half the error of OpenCV's cubic kernel on band-limited images, bilinear five times as much:
-    docs/benchmarks.md has the figures."""
+    """RMS error on a random image of waves of up to 0.25 cycles/px, relative to its standard deviation: Lanczos 1.4 %,
+    OpenCV's cubic kernel 3.0 %, bilinear 16 %."""
     crop: Crop = "flight"
     """The area that all bands share in all captures of the flight, where its rig is known, or in each by itself; or
     none."""

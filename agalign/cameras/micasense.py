@@ -49,7 +49,7 @@ _LAYOUT = {
     "Blue": (-0.9, 0.0), "Green": (0.0, 0.0), "Red": (0.0, -0.65), "NIR": (-0.9, -0.7), "Red edge": (-0.4, -0.35),
 }  # fmt: skip
 """How a RedEdge-M's bands move against green as the ground comes nearer: two flights of two cameras agree on it within
-a twentieth (docs/benchmarks.md)."""
+a twentieth."""
 
 
 class _TagTransfer(TagTransfer):

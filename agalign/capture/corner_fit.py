@@ -23,7 +23,7 @@ _MIN_SPREAD_PX = 0.05
 _REWEIGHTINGS = 6
 """A fixed number, enough for the weights to settle."""
 _COMMON_STD_PX = 0.01
-"""Error along x and y that all windows have in common, in addition to what they disagree by (docs/benchmarks.md)."""
+"""Error along x and y that all windows have in common, in addition to what they disagree by."""
 _UNKNOWN = 1e-9
 """Share of the total information that directions get which no window determines."""
 

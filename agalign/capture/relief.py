@@ -40,7 +40,7 @@ _MIN_WINDOWS = 24
 """Measured windows, in each band, without which neither the test for parallax nor a fit is made."""
 _MIN_PARALLAX_PX = 0.3
 """95th percentile of the parallax of windows below which a homography is enough: larger windows of flat fields show up
-to 0.2 px, mostly noise (docs/benchmarks.md)."""
+to 0.2 px, mostly noise."""
 _MIN_GAIN_SIGMA = 4.0
 """Fall of the squared shifts of each band under the parallax of the others, in standard errors, from which a scene has
 relief: chance stays below 3."""

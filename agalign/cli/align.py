@@ -48,7 +48,7 @@ FolderArgument = Annotated[
 ]
 Pattern = Annotated[
     str | None,
-    of_input(help="File names as '{capture}_{band}.tif', where agalign does not know them."),
+    of_input(help="Pattern of file names that agalign does not know, as '{capture}_{band}.tif'."),
 ]
 Reference = Annotated[str | None, of_input(help="Name of the reference band; by default green.")]
 Jobs = Annotated[
@@ -60,14 +60,14 @@ Jobs = Annotated[
 Dask = Annotated[
     str | None,
     of_running(
-        help="Address of a Dask scheduler, tcp://host:8786: its workers process the captures and need the same "
-        "folders. 'local' starts worker processes here."
+        help="Address of a Dask scheduler, as tcp://host:8786; its workers need the same folders. 'local' starts "
+        "worker processes on this machine."
     ),
 ]
 IgnoreMetadata = Annotated[bool, of_input("--ignore-metadata", help="Use no lens or rig tags.")]
 BandNames = Annotated[
     str | None,
-    of_input("--bands", help="Names of the bands that take part, separated by commas; by default all."),
+    of_input("--bands", help="Names of the bands to align, separated by commas; by default all."),
 ]
 Order = Annotated[
     BandOrder,
@@ -75,17 +75,17 @@ Order = Annotated[
 ]
 WithRgb = Annotated[
     bool,
-    of_input("--with-rgb", help="The camera's colour photograph (JPEG) takes part too, as three bands."),
+    of_input("--with-rgb", help="Also align the camera's colour photograph (JPEG), as three bands."),
 ]
 
 
 _EXAMPLES = examples(
-    ("agalign flight/", "into flight-aligned/, with what the images and their tags say"),
-    ("agalign flight/ -o aligned/ --radiometry", "reflectance where the camera's tags allow it"),
-    ("agalign flight/ -o aligned/ --layout bands", "single files with their tags, for photogrammetry"),
-    ("agalign orchard/ --relief --error-map", "follow trees and terraces; map the expected error"),
-    ("agalign flight/ --model earlier/models/CAMERA.safetensors", "begin with what an earlier flight learnt"),
-    ("agalign flight/ --retry-failed", "process captures again that did not align"),
+    ("agalign flight/", "align the bands of all captures, into flight-aligned/"),
+    ("agalign flight/ -o aligned/ --radiometry", "write reflectance, if the camera's tags are sufficient"),
+    ("agalign flight/ -o aligned/ --layout bands", "write a file per band with its tags, for photogrammetry"),
+    ("agalign orchard/ --relief --error-map", "correct parallax of trees; map the expected error"),
+    ("agalign flight/ --model earlier/models/CAMERA.safetensors", "reuse the network and rig of an earlier flight"),
+    ("agalign flight/ --retry-failed", "process failed captures again"),
 )
 
 
@@ -112,31 +112,31 @@ def align(
     ] = None,
     align_panels: Annotated[
         bool,
-        of_input("--align-panels", help="Align captures of calibration panels and of the sky too."),
+        of_input("--align-panels", help="Also align captures of calibration panels and of the sky."),
     ] = False,
     max_pixels: Annotated[
         int,
-        of_input(min=1, help="Refuse images with more pixels, before anything is read."),
+        of_input(min=1, help="Refuse images with more pixels than this, without reading them."),
     ] = MAX_PIXELS,
     seed: Annotated[
         SeedChoice, of_alignment(help="Use only this kind of initial alignment; by default the best of all.")
     ] = "auto",
     only_seed: Annotated[
         bool,
-        of_alignment("--only-seed", help="Stop after the initial alignment; learn nothing."),
+        of_alignment("--only-seed", help="Stop after the initial alignment."),
     ] = False,
     relief: Annotated[
         ReliefUse,
         of_alignment(
-            help="Correct parallax (trees, terraces, buildings, close range) by one relief for all bands of a capture: "
-            "if windows show parallax, always, or never. --relief alone is always."
+            help="Correct parallax (trees, terraces, buildings, close range) by one relief for all bands of a capture. "
+            "auto: if windows show parallax. --relief alone means always."
         ),
     ] = "auto",
     accept_predicted: Annotated[
         float,
         of_alignment(
             min=0,
-            help="Count a band that is predicted by the rig of the flight as delivered up to this standard error, px.",
+            help="Largest standard error, px, at which a predicted band counts as usable.",
         ),
     ] = 1.0,
     model: Annotated[
@@ -151,13 +151,13 @@ def align(
     crop: Annotated[
         Crop,
         of_output(
-            help="Crop to the area that all bands share, the same for all captures of a flight or per capture, or keep "
-            "the frame of the reference."
+            help="Area to write. flight: shared by all bands of all captures; common: shared by all bands of the capture; "
+            "none: the whole frame of the reference."
         ),
     ] = "flight",
     undistort: Annotated[
         bool,
-        of_output("--undistort", help="Write the lens-corrected grid of the reference."),
+        of_output("--undistort", help="Remove the lens distortion of the reference from the output."),
     ] = False,
     resolution: Annotated[
         Resolution,
@@ -165,21 +165,21 @@ def align(
     ] = "reference",
     layout: Annotated[
         Layout,
-        of_output(help="One stack per capture, one file per input file with its tags, or both."),
+        of_output(help="Write one stack per capture, one file with tags per input file, or both."),
     ] = "stack",
     radiometry: Annotated[
         RadiometryChoice,
         of_output(
-            help="Write float32: radiance by the camera's calibration, reflectance by its light sensor or by a panel; "
-            "thermal bands in degrees C. --radiometry alone is auto: "
-            "by panel if available for all bands, else by light sensor, else radiance."
+            help="Write float32. camera: radiance by the camera's calibration; sun, panel: reflectance by light sensor or "
+            "calibration panel; auto (--radiometry alone): panel if available for all bands, else sun, else camera. "
+            "Thermal bands are written in degrees C."
         ),
     ] = "off",
     panel_albedo: Annotated[
         str | None,
         of_output(
-            help="Reflectance of the calibration panel, as 0.51 or as Blue=0.51,NIR=0.49; by default what tags or its "
-            "QR code say. With it a panel is also known by its looks."
+            help="Reflectance of the calibration panel, as 0.51 or as Blue=0.51,NIR=0.49; by default from tags or QR "
+            "code. With this option, panels without tags and code are recognised too."
         ),
     ] = None,
     pan_sharpen: Annotated[
@@ -201,14 +201,14 @@ def align(
         bool,
         of_output(
             "--georeference",
-            help="Give the rasters an approximate georeference from GPS, altitude and yaw; tags state how accurate.",
+            help="Give the rasters an approximate georeference from GPS, altitude and yaw; a tag has its expected error.",
         ),
     ] = False,
     ground_elevation: Annotated[
         float | None,
         of_output(
             show_default=False,
-            help="Elevation of the ground, m, as the camera's GPS measures altitude: for footprints where the tags "
+            help="Elevation of the ground, m, in the height system of the camera's GPS; for footprints, if the tags "
             "contain no height above ground.",
         ),
     ] = None,
@@ -241,10 +241,10 @@ def align(
             "and .ties.geojson.",
         ),
     ] = False,
-    format: Annotated[RasterFormat, of_output(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
+    format: Annotated[RasterFormat, of_output(help="Write tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
     compression: Annotated[
         Compression,
-        of_output(help="Lossless; auto is zstd for stacks and deflate for single bands."),
+        of_output(help="Lossless compression; auto is zstd for stacks and deflate for single bands."),
     ] = "auto",
     device: Annotated[str, of_running(help="Torch device: auto, cpu, cuda, cuda:1 …")] = "auto",
     jobs: Jobs = 0,
@@ -255,7 +255,7 @@ def align(
     ] = False,
     retry_failed: Annotated[
         bool,
-        of_running("--retry-failed", help="Process captures again in which a band is not aligned or missing."),
+        of_running("--retry-failed", help="Process captures again if a band is not aligned or missing."),
     ] = False,
     timeout: Annotated[
         float | None,
@@ -268,19 +268,19 @@ def align(
             is_eager=True,
             callback=load_config,
             show_default=False,
-            help="TOML file with values of these options; 'agalign info --options' prints one.",
+            help="Read these options from a TOML file; 'agalign info --options' prints one.",
         ),
     ] = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
-    recipe: Annotated[Recipe, of_expert(help="Algorithm: fast, or the published one step by step.")] = "fast",
+    recipe: Annotated[Recipe, of_expert(help="Algorithm: fast, or the published one (paper).")] = "fast",
     sharing: Annotated[
-        Sharing, of_expert(help="Layers shared by the descriptors of both bands: all, all but the first, or none.")
+        Sharing, of_expert(help="Layers that the networks of both bands share: all, all but the first, or none.")
     ] = "pseudo-siamese",
     model_family: Annotated[
         FamilyChoice,
-        of_expert(help="Mapping to fit; auto is the richest one that the images determine."),
+        of_expert(help="Mapping to fit; auto is the most general one that the images determine."),
     ] = "auto",
     each_alone: Annotated[
         bool,

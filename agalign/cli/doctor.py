@@ -31,10 +31,10 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor(
-    folder: Annotated[Path, typer.Argument(help="Where aligned files would be written.")] = Path(),
+    folder: Annotated[Path, typer.Argument(help="Folder for aligned files.")] = Path(),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
-    """Check this machine: versions, devices, threads, memory, disk, and what extras would add."""
+    """Check this machine: versions, devices, threads, memory, disk and extras."""
     terminal = Terminal(quiet=False, verbose=False, log_json=False)
     with exits(terminal):
         facts = {"machine": _machine(), "disk": _disk(folder), "devices": _devices(), "extras": _extras()}

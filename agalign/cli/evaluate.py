@@ -39,11 +39,11 @@ def evaluate(
         ),
     ] = None,
     shift: Annotated[
-        str, typer.Option(help="Per cent of the longer side by which the start is off, separated by commas.")
+        str, typer.Option(help="Distances of the start from the truth, per cent of the longer side, separated by commas.")
     ] = "5",
-    directions: Annotated[int, typer.Option(min=1, help="Starts of each shift, evenly around the circle.")] = 1,
+    directions: Annotated[int, typer.Option(min=1, help="Directions of the start for each distance, evenly spaced.")] = 1,
     seeding: Annotated[
-        bool, typer.Option("--seeding", help="Let the structures correct the start first, as a run does.")
+        bool, typer.Option("--seeding", help="Correct the start by the initial alignment first, as a run does.")
     ] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file with a row per pair and method.")] = None,
     device: Device = "auto",
@@ -52,7 +52,7 @@ def evaluate(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
-    """Descriptors and homographies on pairs with ground truth: the paper's protocol."""
+    """Evaluate descriptors and homographies on pairs with ground truth, as Dong et al. (2018)."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
         check_address_space()
@@ -81,17 +81,17 @@ def evaluate(
 def surface(
     pairs: Pairs,
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("loss-surface.png"),
-    number: Annotated[int, typer.Option(min=1, help="Which of the pairs.")] = 1,
+    number: Annotated[int, typer.Option(min=1, help="Number of the pair, from 1.")] = 1,
     reach: Annotated[float, typer.Option(min=1, help="Largest offset, px.")] = 100.0,
     points: Annotated[int, typer.Option(min=3, help="Offsets along each axis.")] = 17,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes over the keypoints for each offset.")] = 2,
+    epochs: Annotated[int, typer.Option(min=1, help="Training epochs for each offset.")] = 2,
     device: Device = "auto",
     rng_seed: RngSeed = 0,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
-    """Draw the training loss over misalignments of a pair, as in the second figure of the paper."""
+    """Plot the training loss over misalignments of a pair (Dong et al. 2018, Fig. 2)."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
         check_address_space()
@@ -125,7 +125,7 @@ def surface(
 def learn(
     pairs: Pairs,
     out: Annotated[Path, typer.Option("--out", "-o", help="Network to write.")] = Path("learnt.safetensors"),
-    steps: Annotated[int, typer.Option(min=1, help="Steps a pair that was aligned.")] = 200,
+    steps: Annotated[int, typer.Option(min=1, help="Training steps per aligned pair.")] = 200,
     sharing: Annotated[str, typer.Option(help="siamese, pseudo-siamese or unshared.")] = "pseudo-siamese",
     device: Device = "auto",
     rng_seed: RngSeed = 0,
@@ -133,7 +133,7 @@ def learn(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
-    """Learn one descriptor from pairs without labels: those that can be aligned teach it."""
+    """Learn one descriptor from pairs without labels, using those that can be aligned."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
         check_address_space()

@@ -41,11 +41,11 @@ def export(
         ),
     ],
     target: Annotated[
-        Path | None, of_output("-o", "--out", help="Folder to make; by default OUT with the program's name added.")
+        Path | None, of_output("-o", "--out", help="Output folder; by default OUT with the program's name added.")
     ] = None,
-    copy: Annotated[bool, of_output("--copy", help="Copy the band files instead of hard links to them.")] = False,
+    copy: Annotated[bool, of_output("--copy", help="Copy the band files instead of creating hard links.")] = False,
     source: Annotated[
-        Path | None, of_output(help="Folder with the original images, where they have moved; for micasense only.")
+        Path | None, of_output(help="Folder with the original images, if they were moved; for micasense only.")
     ] = None,
     quiet: Quiet = False,
     log_json: LogJson = False,

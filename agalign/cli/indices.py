@@ -67,19 +67,19 @@ def indices(
     ] = None,
     mask_qa: Annotated[
         bool,
-        of_output("--mask-qa", help="Leave out saturated, occluded, glint … pixels; the run needs --qa."),
+        of_output("--mask-qa", help="Omit saturated, occluded and glint pixels; the run needs --qa."),
     ] = False,
     jobs: Jobs = 0,
     dask: Dask = None,
     overwrite: Annotated[
-        bool, of_running("--overwrite", help="Calculate again what an earlier command wrote.")
+        bool, of_running("--overwrite", help="Compute again what an earlier command wrote.")
     ] = False,
     as_json: Annotated[bool, of_running("--json", help="Print JSON to standard output.")] = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:  # fmt: skip
-    """Calculate spectral indices of aligned captures: rasters, pictures and a table of statistics."""
+    """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal, _GOES_ON):
         from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run

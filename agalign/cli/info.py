@@ -44,7 +44,7 @@ def info(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder with the images, or a model that a run wrote (OUT/models/….safetensors).", show_default=False
+            help="Folder with images, or the model of a run (OUT/models/….safetensors).", show_default=False
         ),
     ] = None,
     pattern: Pattern = None,
@@ -55,10 +55,10 @@ def info(
     ignore_metadata: IgnoreMetadata = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
     options: Annotated[
-        bool, typer.Option("--options", help="Print a file of all options of 'agalign align', for its --config.")
+        bool, typer.Option("--options", help="Print a --config file with all options of 'agalign align'.")
     ] = False,
 ) -> None:
-    """Show the cameras, captures and bands of a folder, and what is missing; or the rig of a model."""
+    """List cameras, captures, bands and missing files of a folder, or show the rig of a model."""
     terminal = Terminal(quiet=False, verbose=False, log_json=False)
     with exits(terminal):
         if options:

@@ -41,11 +41,11 @@ from agalign.values.choices import RadiometryChoice, ReliefUse
 from agalign.values.memory_limit import check_address_space
 
 _EXAMPLES = examples(
-    ("agalign demo", "a synthetic flight, aligned and compared with its truth"),
-    ("agalign info flight/", "what would be aligned, and what is missing"),
-    ("agalign flight/ -o aligned/", "align it; 'agalign align --help' has the options"),
-    ("agalign indices aligned/", "spectral indices of the aligned captures"),
-    ("agalign doctor", "what this machine has"),
+    ("agalign demo", "align a synthetic flight and compare it with its ground truth"),
+    ("agalign info flight/", "list captures, bands and missing files"),
+    ("agalign flight/ -o aligned/", "align a flight; 'agalign align --help' lists the options"),
+    ("agalign indices aligned/", "compute spectral indices of the aligned captures"),
+    ("agalign doctor", "check this machine"),
 )
 app = typer.Typer(
     cls=RootGroup,
@@ -79,7 +79,7 @@ def demo(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
-    """Make a synthetic flight, align it, and compare the result with the known truth."""
+    """Make a synthetic flight, align it, and compare the result with the ground truth."""
     from rich.table import Table
 
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
@@ -94,7 +94,7 @@ def demo(
         source, target = out / "flight", out / "aligned"
         prepare_output(source)
         terminal.event(
-            "make", f"Painting a field and photographing it: {captures} captures of 5 bands …", captures=captures
+            "make", f"Rendering a synthetic flight: {captures} captures of 5 bands …", captures=captures
         )
         truth = make_flight(source, captures, rng_seed=rng_seed)
         flight = find_captures(source, DiscoverOptions(), terminal)
@@ -118,7 +118,7 @@ cli_info.register(app)
 @app.command()
 def report(
     out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.", show_default=False)],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the facts of the report as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the content of the report as JSON.")] = False,
 ) -> None:
     """Rebuild the report and the summary from the sidecars."""
     from rich.table import Table
@@ -155,7 +155,7 @@ def report(
 def verify(
     out: Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)],
 ) -> None:
-    """Check that the files of a run are what was written, by their checksums."""
+    """Compare the files of a run with their checksums."""
     terminal = Terminal(quiet=False, verbose=False, log_json=False)
     with exits(terminal):
         from agalign.products.verify_outputs import verify_outputs

@@ -31,20 +31,20 @@ def onto(
     ] = None,
     band: Annotated[
         str | None,
-        of_input("--reference", "--band", show_default=False, help="Name of the reference's band; by default green."),
+        of_input("--reference", "--band", show_default=False, help="Name of the band of REFERENCE to compare; by default green."),
     ] = None,
     relief: Annotated[
-        ReliefUse, of_alignment(help="Follow what one homography leaves by a smooth field: where it helps, or never.")
+        ReliefUse, of_alignment(help="Add a smooth displacement field to the homography. auto: if left-out windows confirm it.")
     ] = "auto",
     interpolation: Annotated[Interpolation, of_output(help="Resampling of the moving mosaics.")] = "lanczos",
     format: Annotated[RasterFormat, of_output(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
-    compression: Annotated[Compression, of_output(help="Lossless.")] = "auto",
+    compression: Annotated[Compression, of_output(help="Lossless compression.")] = "auto",
     device: Annotated[str, of_running(help="auto, cpu, cuda, cuda:1 …")] = "auto",
     rng_seed: RngSeed = 0,
     jobs: Jobs = 1,
-    overwrite: Annotated[bool, of_running("--overwrite", help="Do again what an earlier run finished.")] = False,
+    overwrite: Annotated[bool, of_running("--overwrite", help="Process finished mosaics again.")] = False,
     max_pixels: Annotated[
-        int, of_input(min=1, help="Mosaics that declare more are refused before anything is read.")
+        int, of_input(min=1, help="Refuse mosaics with more pixels than this, without reading them.")
     ] = MAX_MOSAIC_PIXELS,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -52,8 +52,8 @@ def onto(
 ) -> None:
     """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.
 
-    Grids, resolutions and coordinate reference systems may differ. Written are, for each MOVING, a raster on the
-    reference's pixels that holds the band it was compared with and the moving mosaic's bands, and a sidecar.
+    Grids, resolutions and coordinate reference systems may differ. For each MOVING, agalign writes a sidecar and a
+    raster on the grid of REFERENCE, with the compared band of REFERENCE and all bands of MOVING.
     """
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):

@@ -1,7 +1,6 @@
 """Recipe fast: Adam on theta through in-batch negatives, and every few steps one Gauss-Newton step on psi.
 
 One theta for as many captures as are given, each pair with its own psi (the paper's future work).
-Effects of the choices: docs/benchmarks.md.
 """
 
 import math

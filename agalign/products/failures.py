@@ -8,7 +8,7 @@ from agalign.verify.checks import KINDS
 
 _GRAVITY = {"failed": 0, "seed_only": 1, "missing": 2, "predicted": 3}
 """The worse comes first."""
-_UNTOLD = Remedy("no reason is on record", "run again with --overwrite")
+_UNTOLD = Remedy("no reason was recorded", "run again with --overwrite")
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class FailureGroup:
         """The remedy, if something must be done."""
         if self.status != "predicted":
             return self.remedy.advice
-        usable = "those known to a px or better may be used, as indices do (prediction in the sidecar)"
+        usable = "use those with a standard error of at most 1 px (prediction.std_px in the sidecar), as indices do"
         return f"{usable}; {self.remedy.advice}"
 
     @property

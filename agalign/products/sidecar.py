@@ -89,7 +89,7 @@ class HomographyPart(_Part):
     """Homography between reference and moving band."""
 
     fixed_to_moving: Matrix3x3
-    """3 x 3, maps a pixel of the reference to a pixel of the moving band."""
+    """Maps a pixel of the reference to a pixel of the moving band."""
     space: Space
     """`pixel`: between raw pixels of the files. `undistorted`: between the pixels that both cameras would have without
     lens distortion (same focal length and principal point).
@@ -104,7 +104,7 @@ class SeedPart(_Part):
     `centre` (optical centres of DJI); `geo` (geotransforms); `structure` (phase correlation); `identity`.
     """
     fixed_to_moving: Matrix3x3
-    """3 x 3, as in `homography`."""
+    """As in `homography`."""
     peak_sigma: float
     """Height of its correlation peak above the surface, standard deviations."""
     runner_up_sigma: float
@@ -112,8 +112,8 @@ class SeedPart(_Part):
 
 
 class GridPart(_Part):
-    """The complete mapping, lenses included, sampled: 17 x 13 points, 65 x 49 with a displacement field or if lens
-    models differ. With a `relief`, use that instead.
+    """The complete mapping, lenses included, at 17 x 13 points, or 65 x 49 with a displacement field or if lens models
+    differ. If there is a `relief`, use that instead.
     """
 
     reference_px: list[PointPx]
@@ -136,7 +136,7 @@ class IssuePart(_Part):
     value: float | None
     """Measured value."""
     limit: float | None
-    """Limit that it exceeds or misses."""
+    """Limit of the check."""
 
 
 class JointPart(_Part):
@@ -155,22 +155,22 @@ class JointPart(_Part):
     levels: list[float]
     """Scales of the images used; 1 is full resolution."""
     recipe: str
-    """`flight` (frozen network of the flight), `fast` (learned on this capture), `paper`, or `windows` (phase-
-    correlation windows alone).
+    """`flight` (frozen network of the flight), `fast` (learned on this capture), `paper`, or `windows` (windows
+    alone).
     """
     model_family: ModelFamily
     """Mapping that was fitted."""
     last_step_px: float
     """Largest movement of a corner in the last step, px."""
     corner_std_px: float
-    """Root mean square error of the least certain corner, px of the reference."""
+    """Standard error of the least certain corner, px of the reference."""
     corner_std_xy_px: list[PointPx]
     """Standard errors along x and y at the corners of the reference, clockwise from the top left, px of the reference.
     """
 
 
 class SimilarityPart(_Part):
-    """Similarity on the common valid area."""
+    """Similarity of the pixels that are valid in both bands; of large images a regular sample of 250,000 or more."""
 
     mattes_mi: float | None = None
     """Negative mutual information by Mattes, nats, 32 bins, as in elastix: lower is better."""
@@ -189,7 +189,7 @@ class SimilarityPart(_Part):
     residual_p95_px: float | None = None
     """Their 95th percentile, px."""
     residual_coverage: float | None = None
-    """Share of windows with structure in which a shift was measured."""
+    """Share of the textured windows in which a shift was measured."""
 
 
 class ResidualTile(_Part):
@@ -225,7 +225,7 @@ class MetricsPart(MetricsResult):
 
 
 class LocalPart(_Part):
-    """Displacement field of this band alone: p95 shift of windows left out of its fit."""
+    """Displacement field of this band alone, and the p95 shift of windows left out of its fit."""
 
     applied: bool
     """Whether the field was used."""
@@ -257,7 +257,7 @@ class ReliefPart(_Part):
 
 
 class PredictionPart(_Part):
-    """Position of the band predicted without its own image, or extrapolated from a part of it."""
+    """Position of the band, predicted without its own image or extrapolated from a part of it."""
 
     source: Annotated[PredictionSource, Field(alias="from")]
     """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (extrapolated
@@ -353,8 +353,8 @@ class OutputPart(_Part):
     scale: tuple[float, float] = (1.0, 1.0)
     """Output pixels per reference pixel along x and y."""
     nodata: float | str | None
-    """Nodata value of the stack, or common to the single bands; null if they differ; `"nan"` for NaN. 0 if no valid
-    pixel is 0, else a value that does not occur.
+    """Nodata value of the stack, or of all single bands; null if they differ; `"nan"` for NaN. 0 if no valid pixel is
+    0, else a value that no pixel has.
     """
 
 
@@ -373,7 +373,7 @@ class ProductPart(_Part):
 
 
 class ReliefPreviewPart(_Part):
-    """Picture of the relief in the preview: first column, last row."""
+    """Picture of the relief in the preview: first column, row 5."""
 
     parallax_px: tuple[float, float]
     """Parallax shown as black and as white (nearest), px."""
@@ -382,8 +382,8 @@ class ReliefPreviewPart(_Part):
 
 
 class PreviewPart(_Part):
-    """Preview image of all bands for the report: a column for each of `bands`, and rows of raw files, of what was
-    written, of a detail of either, of the expected error, and of the relief.
+    """Pictures for the report, a column for each of `bands`. Rows 0 and 1 show input and output, rows 2 and 3 a detail of
+    each, row 4 the expected error, row 5 the relief.
     """
 
     file: RelativeFile
@@ -434,7 +434,7 @@ class CaptureResult(_Result):
     preview: PreviewPart | None = None
     """Preview image."""
     accept_predicted_px: float | None = None
-    """Standard error up to which a predicted band counts as delivered, px; null in older sidecars."""
+    """Standard error up to which a predicted band counts as usable, px; null in older sidecars."""
     products: list[ProductPart] = []
     """All files written for the capture except the sidecar."""
     not_written: list[str] = []

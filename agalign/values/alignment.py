@@ -26,7 +26,7 @@ from agalign.values.relief import Parallax
 
 MIN_RETRIEVAL = 0.2
 """Held-out retrieval below which descriptors do not match: psi does not move and no result is accepted. Chance is below
-0.01, unrelated images reach 0.05 (docs/benchmarks.md)."""
+0.01, unrelated images reach 0.05."""
 MIN_TIMES_CHANCE = 5.0
 """The same as a multiple of chance: it decides where few keypoints can be drawn and chance is high."""
 

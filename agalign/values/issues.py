@@ -69,7 +69,7 @@ MISSING_BAND = Remedy("a band is missing that other captures of this camera have
 
 _BLANK = Remedy(
     "a band is blank: its pixels are constant or invalid",
-    "look at the file: covered lens, defective sensor or wrong exposure; --bands leaves a band out",
+    "look at the file: covered lens, defective sensor or wrong exposure; --bands omits a band",
 )
 _ASKED = Remedy("only the seed was requested", "omit --seed and --only-seed")
 
@@ -79,23 +79,23 @@ UNREADABLE = IssueKind(
 )  # fmt: skip
 BLANK_REFERENCE = IssueKind("blank_reference", "the reference band is constant or all invalid", _BLANK)
 BLANK_MOVING = IssueKind("blank_moving", "the moving band is constant or all invalid", _BLANK)
-NO_SUCH_SEED = IssueKind("no_such_seed", "it has no {detail} seed; omit --seed", _ASKED)
+NO_SUCH_SEED = IssueKind("no_such_seed", "this band has no {detail} seed; omit --seed", _ASKED)
 SEED_ASKED_FOR = IssueKind("seed_asked_for", "only the seed was requested", _ASKED)
 NO_CONTRAST = IssueKind(
     "no_contrast", "no pixel of the reference band has enough contrast to learn from", TEXTURELESS
 )  # fmt: skip
 FEW_KEYPOINTS = IssueKind(
-    "few_keypoints", "only {value:.0f} keypoints are in the common valid area", TEXTURELESS
+    "few_keypoints", "only {value:.0f} keypoints are in the area that both bands show", TEXTURELESS
 )  # fmt: skip
 NOT_INVERTIBLE = IssueKind(
     "not_invertible", "the optimisation diverged to a mapping that cannot be inverted", UNLIKE
 )  # fmt: skip
-CORNERS_UNKNOWN = IssueKind("corners_unknown", "the patches do not determine the corners", TEXTURELESS)
+CORNERS_UNKNOWN = IssueKind("corners_unknown", "the patches do not determine the mapping at the corners of the image", TEXTURELESS)
 RETRIEVAL = IssueKind(
     "retrieval", "the descriptors do not distinguish held-out patches (retrieval {value:.2f})", TEXTURELESS
 )  # fmt: skip
 """Reported by the descriptor check, and by an estimation that stops early."""
-SEED_DOES_NOT_FIT = IssueKind("seed_does_not_fit", "but it does not fit either", UNLIKE)
+SEED_DOES_NOT_FIT = IssueKind("seed_does_not_fit", "but the seed does not fit either", UNLIKE)
 """Added to the issues of a result if its seed cannot be used instead."""
 
 KINDS = (

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 LENS_STD = (1.3e-3, 0.7e-3, 1.2e-3, 1.2e-3)
 """Standard deviation of each shape at the corners, as a share of half the diagonal. The lenses of 28 band pairs of six
 cameras (RedEdge-3, RedEdge-M, RedEdge-MX dual, Sequoia; calibrations in the tags) differ by 1.0, 0.6, 1.0 and 1.0 px
-at 800 px from the centre (docs/benchmarks.md)."""
+at 800 px from the centre."""
 CALIBRATED = 0.4
 """The same where both lenses are calibrated: reference tie points of 45 RedEdge pairs show two fifths of it."""
 _CORNER_STD_PX = 5.0

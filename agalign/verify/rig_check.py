@@ -7,7 +7,7 @@ from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
 UNEXPECTED_PX = IssueKind(
-    "unexpected_px", "it is {value:.1f} px from the position that the rig of the flight predicts",
+    "unexpected_px", "the result is {value:.1f} px from the position that the rig of the flight predicts",
     Remedy(
         "the result contradicts the rig of the flight",
         "if a lens was replaced or moved, align without --model; otherwise look at the picture",

@@ -15,12 +15,12 @@ from agalign.verify.check import Check, Evidence
 
 _RELIEF = Remedy(
     "parallax (trees, buildings or terraces near the camera), or motion between the exposures",
-    "fly higher, or slower; --relief never must not be set, and --bands leaves a band out",
+    "fly higher or slower, and do not use --relief never; --bands omits a band",
 )
 FEW_WINDOWS = IssueKind("few_windows", "too little common structure to verify the result", TEXTURELESS)
 COVERAGE = IssueKind("coverage", "a shift can be measured in only {value:.0%} of the windows", UNLIKE)
 CLOSE_WINDOWS = IssueKind(
-    "close_windows", "only {value:.0%} of the windows are aligned to {detail}", _RELIEF
+    "close_windows", "only {value:.0%} of the windows are aligned within {detail}", _RELIEF
 )  # fmt: skip
 CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", _RELIEF)
 RESIDUAL_PX = IssueKind("residual_px", "the median residual shift is {value:.1f} px", UNLIKE)
@@ -34,7 +34,7 @@ _MAX_MEDIAN_PX = 1.0
 _CLOSE_PX = 1.0
 """Residual shift up to which a single window counts as aligned."""
 _MIN_CLOSE = 0.9
-"""Share of the measured windows that must be close: a few scattered wrong peaks are normal (docs/benchmarks.md)."""
+"""Share of the measured windows that must be close: a few scattered wrong peaks are normal."""
 _MIN_CLUSTER, _MAX_CLUSTER = 5, 0.04
 """Adjacent windows that are not close, as a count and as a share of those measured, from which a part of the image is
 not aligned: wrong peaks are scattered, parallax is not. Both must be reached."""

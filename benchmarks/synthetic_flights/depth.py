@@ -36,7 +36,7 @@ _GLINT_POWER, _GLINT_SLOPE = 300.0, 0.05
 _SEEN_THROUGH = 0.02
 """A pixel that a hand covers by more than this share does not show the scene."""
 
-# Lens positions of a RedEdge-M, from the movement of its bands against Green (`docs/benchmarks.md`).
+# Lens positions of a RedEdge-M, from the movement of its bands against Green.
 _PLACES_M = {
     "Blue": (-0.030, 0.0), "Green": (0.0, 0.0), "Red": (0.0, -0.021), "NIR": (-0.030, -0.021),
     "Red edge": (-0.015, -0.0105),

@@ -18,8 +18,9 @@ def test_fault(fault: Fault, tmp_path: Path) -> None:
     assert not list(tmp_path.rglob(".agalign-part-*"))
 
 
-def test_the_document_has_a_row_for_each_fault() -> None:
+def test_the_document_has_a_row_for_each_fault_that_is_reported() -> None:
     text = DOCUMENT.read_text()
     section = text.partition("<!-- faults -->")[2].partition("<!-- end of faults -->")[0]
     rows = [line.split(" | ") for line in section.splitlines() if line.startswith("| ")][2:]
-    assert [(name.removeprefix("| "), code) for name, code, *_ in rows] == [(f.name, str(f.code)) for f in FAULTS]
+    reported = [(f.name, str(f.code)) for f in FAULTS if f.code]
+    assert [(name.removeprefix("| "), code) for name, code, *_ in rows] == reported
