@@ -26,14 +26,14 @@ class GeometryError(AgalignError):
 
 
 class NotEnoughTextureError(AgalignError):
-    """Too few keypoints lie on the common valid area to learn from."""
+    """Too few keypoints are in the area that both bands show to learn from them."""
 
     def __init__(self, keypoints: int, minimum: int) -> None:
         super().__init__(keypoints, minimum)
         self.keypoints, self.minimum = keypoints, minimum
 
     def __str__(self) -> str:
-        return f"only {self.keypoints} keypoints lie on the common valid area"
+        return f"only {self.keypoints} keypoints are in the area that both bands show"
 
 
 class NoContrastError(AgalignError):

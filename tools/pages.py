@@ -115,7 +115,8 @@ def json_type(field: dict[str, Any]) -> str:
         return " or ".join(json_type(one) for one in field["anyOf"])
     if field.get("type") == "array":
         if "prefixItems" in field:
-            count, (item, either, rest) = len(field["prefixItems"]), json_type(field["prefixItems"][0]).partition(" or ")
+            count = len(field["prefixItems"])
+            item, either, rest = json_type(field["prefixItems"][0]).partition(" or ")
             return f"{count} x {item}" if item[0].isdigit() else f"{count} {item}s{either}{rest}"
         return f"list of {json_type(field['items'])}"
     return str(field.get("type", "text")).replace("string", "text")

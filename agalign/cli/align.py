@@ -151,8 +151,8 @@ def align(
     crop: Annotated[
         Crop,
         of_output(
-            help="Area to write. flight: shared by all bands of all captures; common: shared by all bands of the capture; "
-            "none: the whole frame of the reference."
+            help="Area to write. flight: shared by all bands of all captures; common: shared by all bands of the "
+            "capture; none: the whole frame of the reference."
         ),
     ] = "flight",
     undistort: Annotated[
@@ -170,8 +170,8 @@ def align(
     radiometry: Annotated[
         RadiometryChoice,
         of_output(
-            help="Write float32. camera: radiance by the camera's calibration; sun, panel: reflectance by light sensor or "
-            "calibration panel; auto (--radiometry alone): panel if available for all bands, else sun, else camera. "
+            help="Write float32. camera: radiance by the camera's calibration; sun, panel: reflectance by light sensor "
+            "or calibration panel; auto (--radiometry alone): panel if available for all bands, else sun, else camera. "
             "Thermal bands are written in degrees C."
         ),
     ] = "off",
@@ -201,7 +201,7 @@ def align(
         bool,
         of_output(
             "--georeference",
-            help="Give the rasters an approximate georeference from GPS, altitude and yaw; a tag has its expected error.",
+            help="Write an approximate georeference from GPS, altitude and yaw; a tag has its expected error.",
         ),
     ] = False,
     ground_elevation: Annotated[

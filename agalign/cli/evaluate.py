@@ -39,9 +39,9 @@ def evaluate(
         ),
     ] = None,
     shift: Annotated[
-        str, typer.Option(help="Distances of the start from the truth, per cent of the longer side, separated by commas.")
+        str, typer.Option(help="Distances of the start from the truth, % of the longer side, separated by commas.")
     ] = "5",
-    directions: Annotated[int, typer.Option(min=1, help="Directions of the start for each distance, evenly spaced.")] = 1,
+    directions: Annotated[int, typer.Option(min=1, help="Directions of the start for each distance.")] = 1,
     seeding: Annotated[
         bool, typer.Option("--seeding", help="Correct the start by the initial alignment first, as a run does.")
     ] = False,

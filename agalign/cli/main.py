@@ -93,9 +93,7 @@ def demo(
 
         source, target = out / "flight", out / "aligned"
         prepare_output(source)
-        terminal.event(
-            "make", f"Rendering a synthetic flight: {captures} captures of 5 bands …", captures=captures
-        )
+        terminal.event("make", f"Rendering a synthetic flight: {captures} captures of 5 bands …", captures=captures)
         truth = make_flight(source, captures, rng_seed=rng_seed)
         flight = find_captures(source, DiscoverOptions(), terminal)
         settings = Settings(joint=JointSettings(device=device, rng_seed=rng_seed))

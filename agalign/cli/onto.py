@@ -31,10 +31,11 @@ def onto(
     ] = None,
     band: Annotated[
         str | None,
-        of_input("--reference", "--band", show_default=False, help="Name of the band of REFERENCE to compare; by default green."),
+        of_input("--reference", "--band", show_default=False, help="Band of REFERENCE to compare; by default green."),
     ] = None,
     relief: Annotated[
-        ReliefUse, of_alignment(help="Add a smooth displacement field to the homography. auto: if left-out windows confirm it.")
+        ReliefUse,
+        of_alignment(help="Add a smooth displacement field to the homography. auto: if left-out windows confirm it."),
     ] = "auto",
     interpolation: Annotated[Interpolation, of_output(help="Resampling of the moving mosaics.")] = "lanczos",
     format: Annotated[RasterFormat, of_output(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",

@@ -382,8 +382,8 @@ class ReliefPreviewPart(_Part):
 
 
 class PreviewPart(_Part):
-    """Pictures for the report, a column for each of `bands`. Rows 0 and 1 show input and output, rows 2 and 3 a detail of
-    each, row 4 the expected error, row 5 the relief.
+    """Pictures for the report, a column for each of `bands`. Rows 0 and 1 show input and output, rows 2 and 3 a detail
+    of each, row 4 the expected error, row 5 the relief.
     """
 
     file: RelativeFile

@@ -90,7 +90,9 @@ FEW_KEYPOINTS = IssueKind(
 NOT_INVERTIBLE = IssueKind(
     "not_invertible", "the optimisation diverged to a mapping that cannot be inverted", UNLIKE
 )  # fmt: skip
-CORNERS_UNKNOWN = IssueKind("corners_unknown", "the patches do not determine the mapping at the corners of the image", TEXTURELESS)
+CORNERS_UNKNOWN = IssueKind(
+    "corners_unknown", "the patches do not determine the mapping at the corners of the image", TEXTURELESS
+)  # fmt: skip
 RETRIEVAL = IssueKind(
     "retrieval", "the descriptors do not distinguish held-out patches (retrieval {value:.2f})", TEXTURELESS
 )  # fmt: skip

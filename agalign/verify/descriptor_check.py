@@ -12,7 +12,9 @@ from agalign.values.issues import RETRIEVAL, TEXTURELESS, Issue, IssueKind
 from agalign.values.pixel_units import FixedPx
 from agalign.verify.check import Check, Evidence
 
-CORNER_STD_PX = IssueKind("corner_std_px", "the standard error at the corners of the image is {value:.1f} px", TEXTURELESS)
+CORNER_STD_PX = IssueKind(
+    "corner_std_px", "the standard error at the corners of the image is {value:.1f} px", TEXTURELESS
+)  # fmt: skip
 _MAX_CORNER_STD_PX = 2.0
 """Standard deviation of the least certain mapped corner: beyond, the windows in the middle verify nothing there."""
 BY_WINDOWS = "windows"

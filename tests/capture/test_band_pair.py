@@ -32,7 +32,7 @@ def test_a_seed_that_tags_do_not_give_is_not_replaced_by_another(flight: Path, k
     settings = Settings(seed=SeedSettings(force=kind))
     result = align_capture_bands(capture, settings, None, lambda *_: None)
     assert {a.status for a in result.values()} == {"failed"}
-    assert {a.reason for a in result.values()} == {f"it has no {kind} seed; omit --seed"}
+    assert {a.reason for a in result.values()} == {f"this band has no {kind} seed; omit --seed"}
 
 
 def test_the_reference_is_worked_out_once_for_all_bands(flight: Path) -> None:

@@ -66,7 +66,7 @@ def test_a_doubted_result_leaves_the_seed_and_its_windows(pair: BandPair) -> Non
 def test_no_result_at_all_is_told_in_its_own_words(pair: BandPair) -> None:
     result = verified(pair, SEED, Issue(FEW_KEYPOINTS, 3, 16), SETTINGS)
     assert result.status == "seed_only"
-    assert result.reason == "only 3 keypoints are in the common valid area; the rig seed is used unchanged"
+    assert result.reason == "only 3 keypoints are in the area that both bands show; the rig seed is used unchanged"
 
 
 def test_an_unrelated_image_is_failed_seed_or_not() -> None:
@@ -75,7 +75,7 @@ def test_an_unrelated_image_is_failed_seed_or_not() -> None:
     )
     assert results.status == "failed"
     assert results.reason is not None
-    assert results.reason.endswith("but it does not fit either")
+    assert results.reason.endswith("but the seed does not fit either")
 
 
 def test_the_verdict_is_asked_again_under_a_local_field(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:

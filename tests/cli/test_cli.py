@@ -405,7 +405,7 @@ def test_a_seed_that_there_is_not_is_told(tmp_path: Path) -> None:
     write_pair(tmp_path / "in")
     done = agalign(tmp_path / "in", "-o", tmp_path / "out", "--seed", "rig")
     assert done.returncode == 3
-    assert "it has no rig seed; omit --seed" in done.stderr
+    assert "this band has no rig seed; omit --seed" in done.stderr
 
 
 def test_wrong_words_are_usage_errors(flight: Path, tmp_path: Path) -> None:

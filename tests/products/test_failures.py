@@ -34,7 +34,7 @@ def test_bands_of_one_cause_and_status_are_one_group_and_the_gravest_comes_first
     assert [g.status for g in groups] == ["failed", "seed_only", "missing", "predicted"]
     assert [b.capture for b in groups[-1].bands] == ["one", "two"]
     assert groups[-1].captures == 2
-    assert groups[-1].advice.startswith("those known to a px or better may be used")
+    assert groups[-1].advice.startswith("use those with a standard error of at most 1 px")
     assert "card" in groups[0].advice
 
 

@@ -71,7 +71,7 @@ def test_a_seed_that_does_not_fit_is_not_used() -> None:
     assert status_of(issues, off, seed=True) == "failed"
     failed = Alignment(np.eye(3), "pixel", "failed", (*issues, Issue(SEED_DOES_NOT_FIT)), SEED, None, off, 0.0)
     assert failed.reason is not None
-    assert "rig seed is used unchanged, but it does not fit either" in failed.reason
+    assert "rig seed is used unchanged, but the seed does not fit either" in failed.reason
 
 
 def test_an_aligned_input_is_left_as_it_is() -> None:

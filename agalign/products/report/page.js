@@ -984,10 +984,10 @@ function sentence(pair, reference) {
     const std = pair.prediction?.std_px ?? Infinity;
     const use = std <= 1 ? "suitable for indices within that error" : "not suitable for indices";
     const how = pair.prediction?.from === "windows" ? "is predicted by its windows" : "is predicted by the rig of the flight";
-    return `${offset}${how}, standard error ${fixed(std)} px (${use}): ${pair.reason ?? "no reason on record"}.`;
+    return `${offset}${how}, standard error ${fixed(std)} px (${use}): ${pair.reason ?? "no reason was recorded"}.`;
   }
-  if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason on record"}. Only its seed is applied; exclude it from indices.`;
-  return `failed: ${pair.reason ?? "no reason on record"}. It is nodata in the output.`;
+  if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason was recorded"}. Only its seed is applied; exclude it from indices.`;
+  return `failed: ${pair.reason ?? "no reason was recorded"}. It is nodata in the output.`;
 }
 
 /** @param {Capture} capture */
