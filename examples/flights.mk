@@ -1,4 +1,4 @@
-# Many flights on one machine: each folder below FLIGHTS that is new or was not finished. A second call resumes.
+# Align many flights on one machine: each folder below FLIGHTS that is not finished. A second call resumes.
 #
 #     make -f examples/flights.mk FLIGHTS=season OUT=aligned
 #

@@ -1,4 +1,4 @@
-"""A flight as one lazily read xarray Dataset: NDVI of every capture, and where it was taken.
+"""Read a flight as one lazy xarray Dataset; print the NDVI and position of every capture.
 
 pip install 'agalign[xarray]'
 python examples/ndvi_over_a_flight.py ALIGNED
@@ -18,6 +18,6 @@ for capture in median.capture:
     here = median.sel(capture=capture)
     print(f"{capture.item()}: {float(here):.3f} at {float(here.latitude):.6f}, {float(here.longitude):.6f}")
 
-# A single capture is georeferenced if its file is: .rio is rioxarray's.
+# rioxarray gives the coordinate reference system of a capture, if its file has one.
 one = agalign.open_capture(f"{sys.argv[1]}/{flight.capture.values[0]}.json")
 print(one["NIR"].attrs, one.rio.crs)

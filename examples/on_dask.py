@@ -1,4 +1,4 @@
-"""A flight on the workers of a Dask cluster; without an address on worker processes of this machine.
+"""Align a flight on the workers of a Dask cluster or, without an address, on worker processes of this machine.
 
 pip install 'agalign[dask]'
 python examples/on_dask.py FLIGHT OUT [tcp://SCHEDULER:8786]

@@ -1,4 +1,4 @@
-"""One capture of a flight: find, align and write its bands, and print the result of each.
+"""Find one capture of a flight, align and write its bands, and print the result of each.
 
 python examples/one_capture.py FLIGHT OUT
 """
@@ -15,6 +15,6 @@ outcome = agalign.align_capture(capture, sys.argv[2])
 for band in outcome.sidecar.bands:
     if band.status == "reference":
         continue
-    # Maps the centre of the reference to the band's own file, lenses included.
+    # The grid maps pixels of the reference to pixels of the band's own file, lenses included.
     here, there = (points[len(points) // 2] for points in (band.grid.reference_px, band.grid.moving_px))
     print(f"{band.band}: {band.status}, {here} maps to {there}, residual {band.metrics.after.residual_px} px")

@@ -17,7 +17,7 @@ code=$?
 
 case $code in
     0) ;;
-    3) echo "$name" >> "$OUT/incomplete.txt" ;;  # finished; some bands are not aligned: OUT/<flight>/index.html says why
+    3) echo "$name" >> "$OUT/incomplete.txt" ;;  # finished; some bands are not aligned: see OUT/<flight>/index.html
     143) exec scontrol requeue "$SLURM_JOB_ID" ;;  # stopped at the time limit: the same command resumes the run
     *) exit "$code" ;;  # 1: nothing could be processed, 2: wrong options
 esac

@@ -1,4 +1,4 @@
-"""Two images of one scene in different modalities, aligned as arrays.
+"""Align two arrays: images of one scene in different modalities.
 
 python examples/two_arrays.py
 """

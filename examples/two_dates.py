@@ -1,4 +1,4 @@
-"""Change between two mosaics: the later one is aligned to the earlier one, then they are subtracted.
+"""Align a mosaic to an earlier one and write the difference of their bands.
 
 python examples/two_dates.py EARLIER.tif LATER.tif CHANGE.tif
 """

@@ -1,4 +1,4 @@
-"""A folder of captures, aligned from Python, and what each sidecar says.
+"""Align all captures of a folder from Python and print the status of each band.
 
 python examples/whole_flight.py FLIGHT OUT
 """
@@ -20,6 +20,6 @@ def main() -> None:
             print(report.label, band.band, band.status, "" if residual is None else f"{residual:.3f} px")
 
 
-# Worker processes import this file: what is to run once stands here.
+# Worker processes import this file, so the work must not start on import.
 if __name__ == "__main__":
     main()
