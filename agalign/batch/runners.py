@@ -13,9 +13,8 @@ from agalign.batch.workers import DaskExecutor, OnStart, Task, do_capture, done_
 from agalign.capture.align import PairProgress
 from agalign.pixels.raster import without_warnings
 from agalign.values.capture import Capture
+from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
 
-_CAPTURES_WORTH_A_PROCESS = 2
-"""To start a process takes as long as these."""
 _MAX_WAITING_TASKS = 1000
 """In an executor: enough for any cluster, and little memory."""
 _MAX_THREADS = 4
@@ -136,7 +135,7 @@ def choose_runner(
         return ExecutorRunner(executor, timeout_s)
     if timeout_s is not None and captures:
         return ProcessRunner(min(cores, captures), timeout_s)
-    processes = min(cores, captures // _CAPTURES_WORTH_A_PROCESS)
+    processes = min(cores, captures // CAPTURES_WORTH_A_PROCESS)
     if processes > 1:
         return ProcessRunner(processes)
     threads = min(cores, captures, _MAX_THREADS)

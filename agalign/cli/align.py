@@ -307,6 +307,7 @@ def align(
             WriteSettings,
         )
         from agalign.products.stac import need_stac
+        from agalign.values.processes import start_server_ahead
 
         whole = folder.resolve()
         target = out or whole.parent / f"{whole.name}-aligned"
@@ -335,6 +336,8 @@ def align(
             need_stac()
         load_ahead()
         flight = find_captures(folder, options, terminal)
+        if not dask and not dry_run:
+            start_server_ahead("agalign.batch.workers", len(flight.captures), jobs or usable_cores())
         from agalign.batch import RunOptions
 
         how = RunOptions(

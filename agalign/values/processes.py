@@ -6,7 +6,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import current_process, get_all_start_methods, get_context, parent_process, resource_tracker
 from multiprocessing.context import BaseContext
 
@@ -64,6 +64,24 @@ def worker_context(preload: str) -> BaseContext:
     context = get_context("forkserver")
     context.set_forkserver_preload([preload])
     return context
+
+
+CAPTURES_WORTH_A_PROCESS = 2
+"""A process takes as long to start as to align one capture; its start overlaps with the learning of the flight."""
+
+
+def start_server_ahead(preload: str, captures: int, cores: int) -> None:
+    """Start the process that workers will be forked from, if a run of so many captures will have any: it loads what
+    they need while this process loads the same.
+    """
+    processes = min(cores, captures // CAPTURES_WORTH_A_PROCESS)
+    if processes < 2 or worker_context(preload).get_start_method() != "forkserver":
+        return
+    from multiprocessing import forkserver
+
+    # Where it cannot be started now, the workers report why.
+    with suppress(OSError, RuntimeError), threads_of_children(max(1, cores // processes)), without_interrupt_key():
+        forkserver.ensure_running()
 
 
 def _has_temporary_folder() -> bool:
