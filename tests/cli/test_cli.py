@@ -19,6 +19,7 @@ import tifffile
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign as agalign_package
+from agalign.cameras.discover import FolderScan
 from agalign.config import Settings
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel, save_model
@@ -27,15 +28,9 @@ from agalign.method.descriptor import Descriptor
 from agalign.values.geometry import translation
 
 from ..conftest import textured_image
+from ..program import agalign, agalign_here
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
-
-
-def agalign(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "agalign", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False, **options)  # type: ignore[call-overload]
-    assert "Traceback" not in done.stderr, done.stderr
-    return done
 
 
 @pytest.fixture(scope="module")
@@ -99,14 +94,14 @@ def test_summary_and_report(aligned: tuple[Path, subprocess.CompletedProcess[str
     assert '"picture":"0000SET/000/IMG_0001.png"' in page
     before = page
     (out / "index.html").unlink()
-    done = agalign("report", out)
+    done = agalign_here("report", out)
     assert done.returncode == 0
     assert (out / "index.html").read_text() == before
 
 
 def test_report_tells_of_sidecars_it_cannot_read(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('{"schema": "agalign/1"}')
-    done = agalign("report", tmp_path)
+    done = agalign_here("report", tmp_path)
     assert done.returncode == 3
     assert "a.json" in done.stderr
 
@@ -123,7 +118,7 @@ def test_a_second_run_keeps_what_is_done(flight: Path, aligned: tuple[Path, subp
     out, _ = aligned
     stack = out / "0000SET" / "000" / "IMG_0001.tif"
     before = stack.stat().st_mtime_ns
-    done = agalign(flight, "-o", out)
+    done = agalign_here(flight, "-o", out)
     assert done.returncode == 0
     assert "kept from an earlier run" in done.stderr
     assert stack.stat().st_mtime_ns == before
@@ -144,7 +139,7 @@ def test_one_hopeless_band_does_not_stop_the_others(flight: Path, tmp_path: Path
         with path.open("r+b") as file:
             file.seek(offset)
             file.write(pixels.astype("<u2").tobytes())
-    done = agalign(tmp_path / "in", "-o", tmp_path / "out")
+    done = agalign_here(tmp_path / "in", "-o", tmp_path / "out")
     assert done.returncode == 3
     data = json.loads((tmp_path / "out" / "000" / "IMG_0001.json").read_text())
     status = {b["band"]: b["status"] for b in data["bands"]}
@@ -163,7 +158,7 @@ def test_unrelated_bands_exit_with_3(tmp_path: Path) -> None:
     for name, seed in (("a_red", 1), ("a_nir", 2)):
         pixels = (textured_image(300, 240, seed) * 4000 + 20000).astype(np.uint16)
         tifffile.imwrite(tmp_path / f"{name}.tif", pixels)
-    done = agalign(tmp_path, "-o", tmp_path / "out")
+    done = agalign_here(tmp_path, "-o", tmp_path / "out")
     assert done.returncode == 3
     assert json.loads((tmp_path / "out" / "a.json").read_text())["status"] == "failed"
 
@@ -180,7 +175,7 @@ def test_an_input_is_never_overwritten(tmp_path: Path) -> None:
     pixels = np.stack([textured_image(300, 240), textured_image(300, 240)])
     tifffile.imwrite(tmp_path / "ortho.tif", pixels, planarconfig="separate", photometric="minisblack")
     before = (tmp_path / "ortho.tif").read_bytes()
-    done = agalign(tmp_path, "-o", tmp_path)
+    done = agalign_here(tmp_path, "-o", tmp_path)
     assert done.returncode == 2
     assert "is the folder of the images" in done.stderr
     assert (tmp_path / "ortho.tif").read_bytes() == before
@@ -190,17 +185,17 @@ def test_a_repaired_input_and_a_damaged_output_are_done_again(tmp_path: Path) ->
     write_pair(tmp_path / "in")
     good = (tmp_path / "in" / "a_nir.tif").read_bytes()
     (tmp_path / "in" / "a_nir.tif").write_bytes(good[: len(good) // 2])
-    first = agalign(tmp_path / "in", "-o", tmp_path / "out", "--log-json")
+    first = agalign_here(tmp_path / "in", "-o", tmp_path / "out", "--log-json")
     assert first.returncode == 3
     problems = [json.loads(line) for line in first.stderr.splitlines()]
     assert any("a_nir.tif" in p.get("message", "") for p in problems)
     assert not (tmp_path / "out" / "a.tif").exists()
     (tmp_path / "in" / "a_nir.tif").write_bytes(good)
-    assert agalign(tmp_path / "in", "-o", tmp_path / "out").returncode == 0
+    assert agalign_here(tmp_path / "in", "-o", tmp_path / "out").returncode == 0
     stack = tmp_path / "out" / "a.tif"
     size = stack.stat().st_size
     stack.write_bytes(b"")
-    again = agalign(tmp_path / "in", "-o", tmp_path / "out")
+    again = agalign_here(tmp_path / "in", "-o", tmp_path / "out")
     assert again.returncode == 0
     assert "kept" not in again.stderr
     assert stack.stat().st_size == size
@@ -237,13 +232,13 @@ def test_too_little_address_space_is_refused_before_libraries_are_loaded(tmp_pat
 
 
 def test_info(flight: Path) -> None:
-    done = agalign("info", flight, "--json")
+    done = agalign_here("info", flight, "--json")
     assert done.returncode == 0
     data = json.loads(done.stdout)
     assert [c["label"] for c in data["captures"]] == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
     assert data["captures"][0]["seeds"] == ["rig", "structure", "identity"]
     assert [b["name"] for b in data["captures"][0]["bands"] if b["reference"]] == ["Green"]
-    table = agalign("info", flight)
+    table = agalign_here("info", flight)
     assert "IMG_0002" in table.stdout
     assert "[Green]" in table.stdout
 
@@ -265,7 +260,7 @@ def test_info_shows_the_rig_of_a_model(model_file: Callable[[Rig | None], Path])
         mappings = {"NIR": translation(8 + 0.8 * height, 6), "[Red]": translation(-3, 4 + 0.6 * height)}
         captures.append(Observation(float(k), mappings, dict.fromkeys(mappings, 0.05)))
     path = model_file(learn_rig(captures, (640, 480), {}))
-    rig = json.loads(agalign("info", path, "--json").stdout)["rig"]
+    rig = json.loads(agalign_here("info", path, "--json").stdout)["rig"]
     nir, red = rig["bands"]
     assert (rig["captures"], rig["factors"]) == (4, ["distance"])
     assert nir["offset_px"] == pytest.approx([8 + 0.8 * 1.75, 6], abs=0.1)
@@ -273,13 +268,13 @@ def test_info_shows_the_rig_of_a_model(model_file: Callable[[Rig | None], Path])
     assert np.abs(red["baseline"]) == pytest.approx([0, 0.6], abs=0.02)
     assert nir["from_bands_px"] < 0.5 < nir["from_flight_px"]
     assert nir["field_px"] is None
-    table = agalign("info", path).stdout
+    table = agalign_here("info", path).stdout
     assert "[Red]" in table
     assert "+9.4, +6.0" in table
 
 
 def test_info_of_a_model_without_a_rig(model_file: Callable[[Rig | None], Path]) -> None:
-    done = agalign("info", model_file(None))
+    done = agalign_here("info", model_file(None))
     assert done.returncode == 0
     assert "no rig" in done.stdout
 
@@ -287,7 +282,7 @@ def test_info_of_a_model_without_a_rig(model_file: Callable[[Rig | None], Path])
 def test_info_of_what_is_no_model_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "broken.safetensors"
     path.write_bytes(b"nothing")
-    done = agalign("info", path)
+    done = agalign_here("info", path)
     assert done.returncode == 1
     assert str(path) in done.stderr.replace("\n", "")
     assert "Traceback" not in done.stderr
@@ -309,9 +304,12 @@ def test_info_of_what_is_no_model_is_one_line(tmp_path: Path) -> None:
         (["align"], 2, "folder"),
     ],
 )
-def test_bad_input_is_one_clear_line(flight: Path, tmp_path: Path, arguments: list[str], code: int, word: str) -> None:
+def test_bad_input_is_one_clear_line(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], code: int, word: str
+) -> None:
     (tmp_path / "file").touch()
-    done = agalign(*(a.format(flight=flight, tmp=tmp_path) for a in arguments), cwd=tmp_path)
+    monkeypatch.chdir(tmp_path)
+    done = agalign_here(*(a.format(flight=flight, tmp=tmp_path) for a in arguments))
     assert done.returncode == code
     assert word in done.stderr
     if code == 1:
@@ -355,7 +353,7 @@ def test_an_interrupted_run_goes_on_where_it_was(flight: Path, tmp_path: Path) -
     assert first.exists()
     assert not list((tmp_path / "out").rglob(".*"))
     assert not (first.parent / "IMG_0002.json").exists()
-    done = agalign(flight, "-o", tmp_path / "out")
+    done = agalign_here(flight, "-o", tmp_path / "out")
     assert done.returncode == 0
     assert "IMG_0001: 4 of 4 aligned" in done.stderr
     assert done.stderr.count("kept from an earlier run") == 1
@@ -363,20 +361,20 @@ def test_an_interrupted_run_goes_on_where_it_was(flight: Path, tmp_path: Path) -
 
 def test_indices_of_a_run(aligned: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     out, _ = aligned
-    done = agalign("ndvi", out, "--index", "ndvi,GNDVI")
+    done = agalign_here("ndvi", out, "--index", "ndvi,GNDVI")
     assert done.returncode == 0, done.stderr
     assert "4 of 4 written" in done.stdout
     assert "raw numbers, not reflectance" in done.stderr
     assert len(list(out.rglob("*_gndvi.tif"))) == len(list(out.rglob("*_ndvi.png"))) == 2
-    misspelt = agalign("ndiv", out)
+    misspelt = agalign_here("ndiv", out)
     assert (misspelt.returncode, "did you mean 'ndvi'" in misspelt.stderr) == (2, True)
-    assert agalign("ndvi", out, "--index", "xyz").returncode == 2
-    assert agalign("ndvi", out, "--index", "savi").returncode == 1
-    assert agalign("ndvi", out / "nowhere").returncode == 1
+    assert agalign_here("ndvi", out, "--index", "xyz").returncode == 2
+    assert agalign_here("ndvi", out, "--index", "savi").returncode == 1
+    assert agalign_here("ndvi", out / "nowhere").returncode == 1
 
 
 def test_seeds_alone_are_no_alignment(flight: Path, tmp_path: Path) -> None:
-    done = agalign(flight, "-o", tmp_path, "--only-seed", "--bands", "green,red,blue", "--layout", "bands")
+    done = agalign_here(flight, "-o", tmp_path, "--only-seed", "--bands", "green,red,blue", "--layout", "bands")
     assert done.returncode == 3, done.stderr
     data = json.loads((tmp_path / "0000SET" / "000" / "IMG_0001.json").read_text())
     assert [b["band"] for b in data["bands"]] == ["Blue", "Green", "Red"]
@@ -397,20 +395,20 @@ def test_info_is_json_whatever_the_nodata(tmp_path: Path) -> None:
     def no_constant(name: str) -> None:
         raise ValueError(f"{name} is no JSON")
 
-    result = json.loads(agalign("info", tmp_path / "in", "--json").stdout, parse_constant=no_constant)
+    result = json.loads(agalign_here("info", tmp_path / "in", "--json").stdout, parse_constant=no_constant)
     assert [b["nodata"] for b in result["captures"][0]["bands"]] == ["nan", "nan"]
 
 
 def test_a_seed_that_there_is_not_is_told(tmp_path: Path) -> None:
     write_pair(tmp_path / "in")
-    done = agalign(tmp_path / "in", "-o", tmp_path / "out", "--seed", "rig")
+    done = agalign_here(tmp_path / "in", "-o", tmp_path / "out", "--seed", "rig")
     assert done.returncode == 3
     assert "this band has no rig seed; omit --seed" in done.stderr
 
 
 def test_wrong_words_are_usage_errors(flight: Path, tmp_path: Path) -> None:
     for options in (("--layout", "pile"), ("--order", "size"), ("--seed", "luck"), ("--compression", "lzma")):
-        done = agalign(flight, "-o", tmp_path, *options)
+        done = agalign_here(flight, "-o", tmp_path, *options)
         assert done.returncode == 2
         assert "is unknown; choose from" in done.stderr
 
@@ -459,7 +457,7 @@ def test_options_of_relief_become_settings(
         raise SystemExit(0)
 
     monkeypatch.setattr(cli_run, "run", run)
-    monkeypatch.setattr(cli_run, "find_captures", lambda *_: None)
+    monkeypatch.setattr(cli_run, "find_captures", lambda folder, *_: FolderScan(folder, (), ()))
     monkeypatch.setattr(cli_run, "load_ahead", lambda: None)
     monkeypatch.setattr(sys, "argv", ["agalign", str(tmp_path), *arguments])
     with pytest.raises(SystemExit):

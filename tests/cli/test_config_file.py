@@ -8,7 +8,7 @@ import pytest
 from synthetic_flights.aligned import make_aligned
 from typer.testing import CliRunner
 
-from agalign.cameras.discover import DiscoverOptions
+from agalign.cameras.discover import DiscoverOptions, FolderScan
 from agalign.cli import run as cli_run
 from agalign.cli.main import app
 from agalign.config import Settings
@@ -23,8 +23,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[DiscoverOptions, Setting
     found: list[DiscoverOptions] = []
     result: list[tuple[DiscoverOptions, Settings]] = []
 
-    def find(_folder: Path, options: DiscoverOptions, *_: object) -> None:
+    def find(folder: Path, options: DiscoverOptions, *_: object) -> FolderScan:
         found.append(options)
+        return FolderScan(folder, (), ())
 
     def run(_flight: object, _out: Path, settings: Settings, *_: object, **__: object) -> None:
         result.append((found[0], settings))

@@ -10,7 +10,7 @@ from rasterio.transform import Affine
 from agalign.values import geometry
 
 from ..conftest import textured_pair
-from .test_cli import agalign
+from ..program import agalign_here
 
 TRUTH = np.array([[1.001, 0.002, 9.3], [-0.002, 1.001, -14.6], [0, 0, 1.0]])
 
@@ -41,7 +41,9 @@ def mosaics(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_mosaic_is_laid_on_the_grid_of_another(mosaics: Path, tmp_path: Path) -> None:
-    done = agalign("onto", mosaics / "spring.tif", mosaics / "summer.tif", "-o", tmp_path / "out", "--relief", "never")
+    done = agalign_here(
+        "onto", mosaics / "spring.tif", mosaics / "summer.tif", "-o", tmp_path / "out", "--relief", "never"
+    )
     assert done.returncode == 0, done.stderr
     sidecar = json.loads((tmp_path / "out" / "summer.json").read_text())
     assert [b["band"] for b in sidecar["bands"]] == ["spring band_1", "band_1", "band_2"]
@@ -62,7 +64,7 @@ def test_bad_mosaics_are_told_in_a_line(mosaics: Path, tmp_path: Path) -> None:
         (mosaics / "spring.tif", "is the reference itself"),
         (tmp_path / "missing.tif", "does not exist"),
     ):
-        done = agalign("onto", mosaics / "spring.tif", moving, "-o", tmp_path / "out")
+        done = agalign_here("onto", mosaics / "spring.tif", moving, "-o", tmp_path / "out")
         assert done.returncode == 1
         assert problem in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
@@ -75,7 +77,7 @@ def test_a_south_up_mosaic_is_turned_when_it_is_read(mosaics: Path, tmp_path: Pa
         with rasterio.open(tmp_path / "south-up.tif", "w", **{**source.profile, "transform": flipped}) as target:
             target.write(source.read()[:, ::-1])
     for name, path in (("out", mosaics / "summer.tif"), ("turned", tmp_path / "south-up.tif")):
-        done = agalign("onto", mosaics / "spring.tif", path, "-o", tmp_path / name, "--relief", "never")
+        done = agalign_here("onto", mosaics / "spring.tif", path, "-o", tmp_path / name, "--relief", "never")
         assert done.returncode == 0, done.stderr
     with (
         rasterio.open(tmp_path / "out" / "summer.tif") as one,
@@ -89,5 +91,7 @@ def test_a_mosaic_of_another_place_is_told(mosaics: Path, tmp_path: Path) -> Non
         away = {**source.profile, "transform": Affine.translation(0, 111_000) * source.transform}
         with rasterio.open(tmp_path / "away.tif", "w", **away) as target:
             target.write(source.read())
-    done = agalign("onto", mosaics / "spring.tif", tmp_path / "away.tif", "-o", tmp_path / "out", "--relief", "never")
+    done = agalign_here(
+        "onto", mosaics / "spring.tif", tmp_path / "away.tif", "-o", tmp_path / "out", "--relief", "never"
+    )
     assert re.search(r"away\.tif: is 11[01]\.\d km away from the reference", done.stderr)

@@ -9,7 +9,6 @@ import contextlib
 import ctypes
 import errno
 import fcntl
-import io
 import os
 import re
 import resource
@@ -29,13 +28,13 @@ import numpy as np
 import psutil
 import tifffile
 
-from agalign.cli import main as cli
 from agalign.cli import run as cli_run
 from agalign.errors import SidecarError
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.files import RUN_FILE
 
 from ..conftest import textured_pair
+from ..program import agalign_here
 
 SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])
 SIZE_PX = 320, 240
@@ -155,7 +154,7 @@ def aligned(out: Path) -> list[str]:
 
 def run_inside(arguments: list[str], scene: Scene) -> tuple[int, str]:
     """In this process, which has loaded everything: (exit code, standard error)."""
-    said, real = io.StringIO(), cli_run.find_captures
+    real = cli_run.find_captures
 
     def result(*given: Any, **named: Any) -> Any:
         flight = real(*given, **named)
@@ -163,21 +162,15 @@ def run_inside(arguments: list[str], scene: Scene) -> tuple[int, str]:
             scene.during()
         return flight
 
-    before = sys.argv
-    sys.argv = ["agalign", *arguments]
     homes = [module for module in list(sys.modules.values()) if getattr(module, "find_captures", None) is real]
     for home in homes:
         home.find_captures = result  # type: ignore[attr-defined]
     try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
-            cli.main()
-    except SystemExit as ended:
-        return int(ended.code or 0), said.getvalue()
+        done = agalign_here(*arguments)
     finally:
-        sys.argv = before
         for home in homes:
             home.find_captures = real  # type: ignore[attr-defined]
-    return 0, said.getvalue()
+    return done.returncode, done.stderr
 
 
 def run_outside(arguments: list[str], scene: Scene) -> tuple[int, str]:
