@@ -1,6 +1,6 @@
-"""What camera files contain: tags, one module per vendor, and the captures of a folder.
+"""Camera files: their tags, one module per vendor, and the captures below a folder.
 
-The first camera that recognises a file reads it; `generic` reads the rest.
+The first camera that recognises a file reads it; `generic` recognises every file.
 """
 
 from agalign.cameras.base import Camera, default_reference, other_rig_seed, rig_seed
@@ -16,12 +16,12 @@ __all__ = ["Camera", "camera_of", "default_reference", "known_cameras", "other_r
 
 
 def known_cameras(pattern: str | None = None) -> tuple[Camera, ...]:
-    """The cameras in the order in which they are tried, `generic` last. With a `pattern` only `generic`, which reads
-    file names instead of tags.
+    """Return the cameras in the order in which they are tried, `generic` last. With a `pattern` of file names only
+    `generic`.
     """
     return (Generic(pattern),) if pattern else (MicaSense(), Dji(), Sequoia(), Sentera(), Mapir(), Generic())
 
 
 def camera_of(tags: Tags) -> Camera:
-    """The camera that wrote a file's tags."""
+    """Return the camera that wrote the tags of a file."""
     return next(camera for camera in known_cameras() if camera.recognises(tags))

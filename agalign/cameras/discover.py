@@ -15,27 +15,27 @@ from agalign.values.capture import Capture
 __all__ = ["DiscoverOptions", "FolderScan", "Problem", "discover"]
 
 _MAX_SUFFIXES = 5
-"""Kinds of other files that a message names."""
+"""Suffixes of other files that a message lists."""
 Progress = Callable[[int, int], None]
-"""Called with (files read, files in all)."""
+"""Called with (number of files read, number of files)."""
 
 
 def discover(
     folder: str | Path, options: DiscoverOptions | None = None, progress: Progress | None = None
 ) -> FolderScan:
-    """All captures below `folder`, sorted by folder and name.
+    """Return all captures below `folder`, sorted by folder and name, and the problems.
 
-    Raises InputError where the folder does not exist or holds no image, ConfigurationError for a band that no capture
+    Raises InputError if the folder does not exist or contains no image, ConfigurationError for a band that no capture
     has.
     """
     folder, options = Path(folder), options or DiscoverOptions()
     check_folder(folder)
-    there, problems = image_files(folder, options.skip)
-    paths = [p for p in there if is_chosen(p.relative_to(folder), options.include, options.exclude)]
+    images, problems = image_files(folder, options.skip)
+    paths = [p for p in images if is_chosen(p.relative_to(folder), options.include, options.exclude)]
     if not paths and problems:
         raise problems[0].error
-    if there and not paths:
-        raise InputError(f"{folder}: has {len(there)} images, and --include and --exclude leave none")
+    if images and not paths:
+        raise InputError(f"{folder}: has {len(images)} images, and --include and --exclude leave none")
     if not paths:
         others = ", ".join(f"{count} {suffix}" for suffix, count in other_files(folder).most_common(_MAX_SUFFIXES))
         only = f"; there are only {others}" if others else ""
@@ -58,12 +58,12 @@ def discover(
 def _read(
     paths: Sequence[Path], options: DiscoverOptions, progress: Progress | None, problems: list[Problem]
 ) -> list[ImageFile]:
-    """The files that hold a band; adds those that cannot be read to the problems."""
+    """The files that contain a band; files that cannot be read are added to `problems`."""
     files: list[ImageFile] = []
     for number, result in enumerate(read_files(paths, options), start=1):
         if isinstance(result, ImageFile):
             files += [result] if result.bands else []
-        # An unreadable colour photograph is a problem only where photographs were asked for.
+        # An unreadable colour photograph is a problem only if photographs take part.
         elif options.with_rgb or result.path.suffix.lower() in TIFF_SUFFIXES:
             problems.append(result)
         if progress is not None:
@@ -72,7 +72,7 @@ def _read(
 
 
 def _check_bands_exist(files: Sequence[ImageFile], names: Sequence[str], folder: Path) -> None:
-    """Raises ConfigurationError where no file has a band of one of these names."""
+    """Raises ConfigurationError if no file has a band of one of these names."""
     known = {b.name.lower() for file in files for b in file.bands}
     unknown = [name for name in names if name.lower() not in known]
     if unknown and files:

@@ -1,13 +1,13 @@
 """DJI Phantom 4 Multispectral and Mavic 3 Multispectral: one TIFF a band and a JPEG in colour.
 
-Phantom 4: x_band = x_reference + (RelativeOpticalCenter_band - RelativeOpticalCenter_reference) between raw pixels. Its
-DewarpData makes the bands fit worse than none (0.13 to 0.19 px against 0.08 to 0.11 px on the best homography), and
-DewarpHMatrix is worse than no seed at all: neither is used.
+Phantom 4: x_band = x_reference + (RelativeOpticalCenter_band - RelativeOpticalCenter_reference) between raw pixels.
+DewarpData and DewarpHMatrix are not used: with DewarpData the residuals of the best homography are 0.13 to 0.19 px,
+without it 0.08 to 0.11 px, and DewarpHMatrix is less accurate than the identity.
 
-Mavic 3: after undistortion by DewarpData, CalibratedHMatrix maps a band to a plane that all bands share, the designed
-bands' frame: H(reference -> band) = C_band^-1 C_reference. The rule of the Phantom 4 is a second seed, and the
-only one where firmware does not write the matrix. DewarpHMatrix, in the bands' files, maps that frame to the colour
-photograph's. Its bands are exposed one after another, so that in motion a seed is off by tens of pixels.
+Mavic 3: after undistortion by DewarpData, CalibratedHMatrix C maps a band to a frame that all bands share:
+H(reference -> band) = C_band^-1 C_reference. The rule of the Phantom 4 gives a second seed, and the only one if the
+firmware does not write the matrix. DewarpHMatrix, in the files of the bands, maps the shared frame to that of the
+colour photograph. The bands are exposed one after another, so in motion a seed is off by tens of pixels.
 """
 
 import math
@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
+from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import BAND_NAME, CAMERA, TagTransfer, number_text, spectral
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import GeometryError
 from agalign.pixels.raster import RasterInfo
@@ -33,8 +33,6 @@ from agalign.values.lens import Lens
 _PHANTOM_4_BANDS = {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}
 _MAVIC_3_BANDS = {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}
 _MAVIC_3_NAME = re.compile(r"^(?P<capture>.*?)_(?:MS_(?P<band>G|RE?|NIR)|D)$", re.IGNORECASE)
-
-
 _DJI = "dji.com/drone-dji"
 _CAPTURE_UUID: Name = (_DJI, "CaptureUUID")
 _DEWARP_DATA: Name = (_DJI, "DewarpData")
@@ -44,20 +42,20 @@ _RELATIVE_CENTRE: tuple[Name, Name] = ((_DJI, "RelativeOpticalCenterX"), (_DJI, 
 _FOCAL_LENGTH_PX: Name = (_DJI, "CalibratedFocalLength")
 _H_MATRIX: Name = (_DJI, "CalibratedHMatrix")
 _MAX_UPRIGHT_ROLL_DEG = 90.0
-"""Gimbals write a roll near 0 or near 180 degrees."""
+"""Larger gimbal rolls mean upside down: gimbals write a roll near 0 or near 180 degrees."""
 _FULL_SCALE = 65536.0
-"""Bands are stored as 16 bits."""
+"""Pixel values are divided by this in DJI's guide: bands are stored as 16 bits."""
 _SPEED = "FlightXSpeed", "FlightYSpeed", "GimbalYawDegree", "RelativeAltitude"
 _VIGNETTING: Name = (_DJI, "VignettingData")
 _TO_COLOUR: Name = (_DJI, "DewarpHMatrix")
 
 
-class _TagTransfer(TagTransfer):
-    geometry = TagTransfer.geometry | {
+class _TagTransfer(pix4d.TagTransfer):
+    geometry = pix4d.TagTransfer.geometry | {
         *_CENTRE, *_RELATIVE_CENTRE, _DEWARP_DATA, _FOCAL_LENGTH_PX, _H_MATRIX, _DEWARP_FLAG, _TO_COLOUR,
     }  # fmt: skip
-    sensor_only = TagTransfer.sensor_only | {_VIGNETTING}
-    radiometry = TagTransfer.radiometry | {(_DJI, "BlackLevel")}
+    sensor_only = pix4d.TagTransfer.sensor_only | {_VIGNETTING}
+    radiometry = pix4d.TagTransfer.radiometry | {(_DJI, "BlackLevel")}
     in_px = (_FOCAL_LENGTH_PX, *_RELATIVE_CENTRE)
 
     def put_geometry(
@@ -67,11 +65,11 @@ class _TagTransfer(TagTransfer):
         centre = _pair(tags, _CENTRE)
         if centre is not None:
             for name, value in zip(_CENTRE, grid.px(*centre), strict=True):
-                packet.put(name, [number_text(value)])
+                packet.put(name, [pix4d.number_text(value)])
         date, terms = _dewarp_data(tags)
         if terms:
             scaled = [v * grid.scale.mean for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]
-            packet.put(_DEWARP_DATA, [f"{date};" + ",".join(map(number_text, scaled))])
+            packet.put(_DEWARP_DATA, [f"{date};" + ",".join(map(pix4d.number_text, scaled))])
         if grid.undistorted:
             packet.put(_DEWARP_FLAG, ["1"])
 
@@ -97,8 +95,8 @@ class Dji(Camera):
         lens = _lens(tags) if is_mavic or calibrated is not None else None
         if len(info.dtypes) > 1:
             return colour_bands(path, info, lens, None if is_mavic else by_centres)
-        name = tags.text(*BAND_NAME) or tags.text(_DJI, "BandName") or _band_in_name(path)
-        band = spectral(band_of(path, info, name), tags)
+        name = tags.text(*pix4d.BAND_NAME) or tags.text(_DJI, "BandName") or _band_in_name(path)
+        band = pix4d.with_wavelength(band_of(path, info, name), tags)
         if calibrated is None or lens is None:
             return (replace(band, lens=lens, to_rig=by_centres, radiometry=_radiometry(tags)),)
         return (
@@ -123,7 +121,7 @@ class Dji(Camera):
         )  # fmt: skip
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
-        """From the speed over ground (north, east, m/s), the gimbal's yaw, which is the image's upward direction, and
+        """Calculate the motion from the speed over ground (north, east, m/s), the heading of the image's upper edge and
         the height above the take-off point.
         """
         north, east, yaw_deg, height_m = (tags.number(_DJI, name) for name in _SPEED)
@@ -140,13 +138,15 @@ class Dji(Camera):
 
 
 def _heading_deg(tags: Tags, yaw_deg: float) -> float:
-    """Some units write a gimbal that looks down as rolled by 180 degrees: its yaw is then the opposite one."""
+    """The heading of the image's upper edge. Some gimbals that look down report a roll of 180 degrees and the opposite
+    yaw.
+    """
     return yaw_deg + (180 if abs(tags.number(_DJI, "GimbalRollDegree") or 0.0) > _MAX_UPRIGHT_ROLL_DEG else 0)
 
 
 def _radiometry(tags: Tags) -> Radiometry | None:
-    """The signal is (raw - black) / 65536 (1 + k1 r + ... + k6 r^6) / (gain exposure), and as DJI's guide has
-    it, signal SensorGainAdjustment / Irradiance is reflectance up to a factor that all bands share.
+    """The signal is (raw - black) / 65536 (1 + k1 r + ... + k6 r^6) / (gain exposure). By DJI's guide, signal *
+    SensorGainAdjustment / Irradiance is proportional to reflectance, with the same factor for all bands.
     """
     gain, exposure_us, black = tags.number(_DJI, "SensorGain"), tags.number(_DJI, "ExposureTime"), _black_level(tags)
     if not gain or not exposure_us or black is None:
@@ -162,8 +162,8 @@ def _radiometry(tags: Tags) -> Radiometry | None:
 
 
 def _black_level(tags: Tags) -> float | None:
-    """The first that the tags hold; 0 is a black level."""
-    levels = tags.number(_DJI, "BlackLevel"), tags.number(CAMERA, "BlackCurrent"), tags.black_level
+    """The first black level in the tags, which may be 0."""
+    levels = tags.number(_DJI, "BlackLevel"), tags.number(pix4d.NAMESPACE, "BlackCurrent"), tags.black_level
     return next((level for level in levels if level is not None), None)
 
 
@@ -189,7 +189,7 @@ def _pair(tags: Tags, names: tuple[Name, Name]) -> tuple[float, float] | None:
 
 
 def _matrix(tags: Tags, name: Name) -> Matrix | None:
-    """3 x 3; None where there is none that can be inverted."""
+    """A tag as a matrix (3, 3); None if it is missing or singular."""
     values = tags.numbers(*name)
     if len(values) != 9:
         return None
@@ -202,7 +202,9 @@ def _matrix(tags: Tags, name: Name) -> Matrix | None:
 
 
 def _lens(tags: Tags) -> Lens | None:
-    """K = [fx, fy, COCx + cx, COCy + cy] from DewarpData, without distortion where DewarpFlag is 1."""
+    """The lens by DewarpData (fx, fy, cx, cy, k …), with the principal point CalibratedOpticalCenter + (cx, cy). If
+    DewarpFlag is 1, the image is already undistorted.
+    """
     (_, terms), centre = _dewarp_data(tags), _pair(tags, _CENTRE)
     if centre is None or not terms or not (terms[0] > 0 and terms[1] > 0):
         return None
@@ -212,8 +214,8 @@ def _lens(tags: Tags) -> Lens | None:
 
 
 def _dewarp_data(tags: Tags) -> tuple[str, list[float]]:
-    """(date, fx, fy, cx, cy, k1, k2, p1, p2, k3) of DewarpData 'date;fx,fy,…', px and OpenCV's order; no terms where
-    it has another form.
+    """(date, [fx, fy, cx, cy, k1, k2, p1, p2, k3]) of DewarpData 'date;fx,fy,…', px, in OpenCV's order; no terms if the
+    tag has another form.
     """
     date, _, text = tags.text(*_DEWARP_DATA).rpartition(";")
     try:

@@ -1,4 +1,4 @@
-"""The image files below a folder, in natural order, without those of earlier outputs."""
+"""The image files below a folder, in natural order, without those in output folders of earlier runs."""
 
 import os
 import re
@@ -15,13 +15,13 @@ from agalign.values.files import RUN_FILE
 _SUFFIXES = TIFF_SUFFIXES | PICTURE_SUFFIXES
 IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
 _ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
-"""Network address such as s3://bucket or https://host (a path keeps one slash of two); drives have one letter."""
+"""Network address such as s3://bucket or https://host, as a Path writes it, with one slash. A drive has one letter."""
 _SYSTEM_FOLDERS = {"lost+found", "System Volume Information", "$RECYCLE.BIN"}
 """Operating systems create these on a memory card."""
 
 
 def check_folder(folder: Path) -> None:
-    """Raises InputError where `folder` is not a folder that can be listed."""
+    """Raise InputError if `folder` is not a folder that can be listed."""
     if folder.as_posix().startswith("/vsi"):
         raise InputError(f"{folder}: is one of GDAL's virtual paths; mount or unpack it, and give the folder")
     if _ADDRESS.match(folder.as_posix()):
@@ -37,7 +37,7 @@ def check_folder(folder: Path) -> None:
 
 
 def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Problem]]:
-    """(the image files below a folder, the folders that cannot be listed)."""
+    """Return (image files below a folder, problems of folders that cannot be listed)."""
     skipped = {p.resolve() for p in skip}
     result: list[Path] = []
     problems: list[Problem] = []
@@ -55,9 +55,9 @@ def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Pr
 
 
 def is_chosen(path: Path, include: Sequence[str], exclude: Sequence[str]) -> bool:
-    """True for a path, relative to the input folder, that a glob of `include` matches, if any, and none of `exclude`.
+    """Return True for a path that matches a glob of `include`, or `include` is empty, and no glob of `exclude`.
 
-    A glob is compared with the whole path and with the file's name; * matches / too.
+    A glob is compared with the path relative to the input folder and with the file name; * matches / too.
     """
 
     def matches(globs: Sequence[str]) -> bool:
@@ -67,7 +67,7 @@ def is_chosen(path: Path, include: Sequence[str], exclude: Sequence[str]) -> boo
 
 
 def other_files(folder: Path) -> Counter[str]:
-    """How many files below a folder are not images that can be read, by their suffix in lower case."""
+    """Return the number of other files below a folder by suffix, in lower case."""
     suffixes: Counter[str] = Counter()
     for _, folders, names in os.walk(folder):
         folders[:] = [d for d in folders if not d.startswith(".")]
@@ -76,7 +76,7 @@ def other_files(folder: Path) -> Counter[str]:
 
 
 def natural_order(name: str) -> list[tuple[bool, int, str]]:
-    """Sort key that puts `_2` before `_10`."""
+    """Return a sort key that puts `_2` before `_10`."""
     parts = re.split(r"(\d+)", name)
     return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part.lower()) for part in parts]
 
@@ -88,9 +88,9 @@ def _is_input_folder(folder: Path, skipped: set[Path]) -> bool:
 
 
 def _is_output_folder(folder: Path) -> bool:
-    """True for the output of an earlier run inside the input folder: its stacks are not captures.
+    """True for the output folder of a run, whose stacks are not captures.
 
-    A run writes RUN_FILE before anything else, so the output of a killed run is recognised too.
+    A run writes RUN_FILE first, so the output of a killed run is recognised too.
     """
     try:
         entries = {entry.name for entry in os.scandir(folder)}

@@ -1,4 +1,4 @@
-"""Any other GeoTIFF: multiband files, and one file a band under any naming."""
+"""Any other GeoTIFF: multiband files, and files of single bands with any naming scheme."""
 
 import re
 from dataclasses import replace
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import BAND_NAME, CAMERA
+from agalign.cameras.pix4d import BAND_NAME, NAMESPACE
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import JPEG_SUFFIXES, PICTURE_SUFFIXES, RasterInfo
 from agalign.values.capture import Band
@@ -20,16 +20,15 @@ _SUFFIX = re.compile(
     rf"|(?<=[0-9a-z])(?P<glued>(?-i:Blue|Green|RedEdge|Red|NIR|GRE|REG|RED|BLUE|GREEN)|\d{{3,4}}nm))$",
     re.IGNORECASE | re.DOTALL,
 )
-
-
+"""A band at the end of a file name, after a separator, or `glued` to the name of the capture as in DJI_0001NIR."""
 _SPECTRAL = re.compile(rf"(?!rgb|vis|ms)(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|re|[bgrn]", re.IGNORECASE)
-"""Names of single bands, which no photograph has."""
+"""Names of single bands; colour photographs do not have them."""
 _DATE = re.compile(r"(?:19|20)\d\d([-_.])\d{1,2}\1\d{1,2}$")
-"""At a name's end: its last number is a day, not a band."""
+"""A date at the end of a name: its last number is a day, not a band."""
 
 
 class Generic(Camera):
-    """Files that no vendor claims. `pattern` holds {capture} and {band}, as in '{capture}_{band}.tif'."""
+    """Files that no vendor's module recognises. `pattern` has {capture} and {band}, as in '{capture}_{band}.tif'."""
 
     name = "generic"
 
@@ -44,7 +43,7 @@ class Generic(Camera):
             return self._picture_bands(path, info)
         own_name = tags.text(*BAND_NAME) or self.split(path)[1]
         indexes = info.band_indexes
-        file_wavelength_nm = tags.number(CAMERA, "CentralWavelength") or _wavelength_in(own_name)
+        file_wavelength_nm = tags.number(NAMESPACE, "CentralWavelength") or _wavelength_in(own_name)
         result = []
         for i in indexes:
             name = info.descriptions[i - 1] or (own_name if len(indexes) == 1 else "") or f"band_{i}"
@@ -53,9 +52,9 @@ class Generic(Camera):
         return tuple(result)
 
     def _picture_bands(self, path: Path, info: RasterInfo) -> tuple[Band, ...]:
-        """The band that a picture is by its name, else the colours of a photograph; no other PNG takes part.
+        """One band if the file name is that of a band, else the colours of a JPEG; none of another PNG.
 
-        Numbers count pictures and not their bands. A grey picture may be stored with three equal channels.
+        A number in the name of a picture is not a band. If a band is stored as three equal channels, the first is read.
         """
         name = self.split(path)[1]
         if name and (self._patterns or _SPECTRAL.fullmatch(name)):
@@ -66,11 +65,11 @@ class Generic(Camera):
         return self.split(path)[0]
 
     def capture_name(self, path: Path) -> str:
-        # `red.tif` and `nir.tif` alone in a folder are a capture that the folder names.
+        # `red.tif` and `nir.tif` in a folder are a capture with the name of the folder.
         return self.split(path)[0] or path.absolute().parent.name
 
     def split(self, path: Path) -> tuple[str, str]:
-        """(capture, band) as the file's name has them; the band is empty where the name holds none."""
+        """Return (capture, band) from the file name; the band is empty if the name contains none."""
         for pattern in self._patterns:
             match = pattern.fullmatch(path.name)
             if match:
@@ -82,11 +81,11 @@ class Generic(Camera):
 
 
 def compile_pattern(pattern: str) -> tuple[re.Pattern[str], ...]:
-    """A --pattern as regular expressions, to be tried in turn. Raises ConfigurationError where {capture} or {band} is
-    missing.
+    """Return the regular expressions of a --pattern, to be tried in this order.
 
-    A name may be split in several places: `IMG_0007_red_edge` where the band is a word that is known, else as late as
-    the pattern allows, so that the band is `1` in `IMG_0007_1`.
+    A name may match in several ways. The first expression matches known names of bands (`red_edge` in
+    `IMG_0007_red_edge`), the second the shortest band (`1` in `IMG_0007_1`).
+    Raises ConfigurationError if {capture} or {band} is missing.
     """
     if pattern.count("{capture}") != 1 or pattern.count("{band}") != 1:
         raise ConfigurationError(

@@ -1,4 +1,4 @@
-"""From image files to captures: which files belong to one capture, its reference, and the bands it lacks."""
+"""Grouping of image files into captures: the files of each capture, its reference band, and its missing bands."""
 
 import math
 from collections import Counter, defaultdict
@@ -22,17 +22,17 @@ from agalign.values.choices import BandOrder
 _MIN_BANDS = 2
 """The reference and a band to align to it."""
 _NAMELESS = "capture"
-"""Name of a capture where the names of its files leave none, such as `_1.tif`."""
+"""Name of a capture if the names of its files contain only the band, such as `_1.tif`."""
 
 _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""
 _CameraKey = tuple[str, ...]
-_BETWEEN_SERIALS = "+"
-"""Between the serial numbers of the halves of a dual camera."""
+_SERIAL_SEPARATOR = "+"
+"""Between the serial numbers of the two halves of a dual camera."""
 
 
 def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
-    """The files of each capture: same camera, folder and key. Files of colour photographs come last."""
+    """Return the files of each capture: same camera, folder and key. Colour photographs come last."""
     groups: dict[_GroupKey, list[ImageFile]] = defaultdict(list)
     for file in files:
         key = file.path.name if file.is_whole_capture else file.camera.capture_key(file.path, file.tags)
@@ -44,7 +44,7 @@ def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
 
 
 def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Add files without a capture id, because of damaged tags, to the group that has the id and the same file name."""
+    """Add files whose capture id is damaged to the group with an id and the same capture name."""
     by_name: dict[_GroupKey, _GroupKey] = {}
     for key, group in groups.items():
         names = {f.camera.capture_name(f.path) for f in group}
@@ -58,35 +58,36 @@ def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
 
 
 def _add_files_without_tags(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Add single bands without tags, removed by another program, to the group that has tags and the same file name."""
+    """Add single bands whose tags another program removed to the group with tags and the same capture name."""
     tagged: dict[tuple[str, str], list[_GroupKey]] = defaultdict(list)
     for key, group in groups.items():
         if key[0] != Generic.name:
             for name in {f.camera.capture_name(f.path) for f in group if not f.is_whole_capture}:
                 tagged[key[1], name].append(key)
     for key in [k for k in groups if k[0] == Generic.name]:
-        left = []
+        remaining = []
         for file in groups[key]:
             with_tags = _group_for(file, key[1], tagged, groups)
             if with_tags is None:
-                left.append(file)
+                remaining.append(file)
             else:
                 band = file.bands[0]
                 named = replace(band, name=f"band_{band.name}") if band.name.isdecimal() else band
                 with_tags.append(replace(file, camera=with_tags[0].camera, bands=(named,)))
                 with_tags.sort(key=lambda f: natural_order(f.path.name))
-        if left:
-            groups[key] = left
+        if remaining:
+            groups[key] = remaining
         else:
             del groups[key]
 
 
 def _drop_copies(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Drop pictures of single bands where the capture has TIFFs, or where they are no capture next to others: programs
-    leave quick looks among the images.
+    """Drop JPEG and PNG copies of bands, which programs leave as quick looks: next to the TIFFs of a capture, and alone
+    if there are other captures.
     """
     for key, group in list(groups.items()):
-        groups[key] = [f for f in group if not _is_picture_band(f)] if any(_is_tiff(f) for f in group) else group
+        if any(_is_tiff(f) for f in group):
+            groups[key] = [f for f in group if not _is_picture_band(f)]
     alone = {k for k, group in groups.items() if len(group) == 1 and _is_picture_band(group[0])}
     if len(alone) < len(groups):
         for key in alone:
@@ -98,7 +99,7 @@ def _is_tiff(file: ImageFile) -> bool:
 
 
 def _is_picture_band(file: ImageFile) -> bool:
-    """True for a band by its name in a format of photographs."""
+    """True for a JPEG or PNG with the name of a band."""
     return file.camera.name == Generic.name and not _is_tiff(file) and not file.bands[0].companion
 
 
@@ -106,8 +107,8 @@ def _group_for(
     file: ImageFile, folder: str, tagged: Mapping[tuple[str, str], list[_GroupKey]],
     groups: Mapping[_GroupKey, list[ImageFile]],
 ) -> list[ImageFile] | None:  # fmt: skip
-    """The only group in the folder that a single band without tags belongs to by its name."""
-    if file.tags.make or file.tags.xmp or len(file.bands) != 1 or file.path.suffix.lower() not in TIFF_SUFFIXES:
+    """The group that a single band without tags belongs to by its name; None if there is not exactly one."""
+    if file.tags.make or file.tags.xmp or len(file.bands) != 1 or not _is_tiff(file):
         return None
     keys = {
         key for (where, name), keys in tagged.items() if where == folder
@@ -117,7 +118,7 @@ def _group_for(
 
 
 def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
-    """Files of one capture that a pattern takes for the same band: it splits their names in the wrong place."""
+    """Return the files of one capture that a pattern assigns to the same band: it splits their names wrongly."""
     first: dict[str, Path] = {}
     result = []
     for file in files:
@@ -132,9 +133,9 @@ def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
 
 
 def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOptions) -> Capture:
-    """The capture of a group of files below the input `folder`.
+    """Return the capture of a group of files below the input `folder`.
 
-    Raises InputError where fewer than two bands are left to align, NoSuchBandError where it lacks the reference band.
+    Raises InputError if fewer than two bands remain, NoSuchBandError if the reference band is missing.
     """
     first = files[0]
     bands = with_unique_band_names(_bands_to_align(files, options.bands))
@@ -151,7 +152,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         folder=_relative_folder(first.camera.capture_folder(first.path), folder),
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),
-        camera=CameraIdentity(tags.make, tags.model, _BETWEEN_SERIALS.join(serials)),
+        camera=CameraIdentity(tags.make, tags.model, _SERIAL_SEPARATOR.join(serials)),
         capture_id=tags.first_text(camera.capture_ids),
         flight_id=tags.first_text(camera.flight_ids),
         captured_at=tags.captured_at,
@@ -163,14 +164,14 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
 
 
 def _tags_of(reference: Band, files: Sequence[ImageFile]) -> Tags:
-    """The tags that describe the capture: the reference's, else the first file's where the reference's are damaged."""
+    """The tags that describe the capture: those of the reference, or of the first file if these are damaged."""
     with_tags = [f for f in files if f.tags != Tags()]
     first = with_tags[0].tags if with_tags else files[0].tags
     return next((f.tags for f in with_tags if f.path == reference.path), first)
 
 
 def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Band]:
-    """The bands of these names (all if there are none). Raises InputError where there is nothing to align."""
+    """The bands with these names, or all without names. Raises InputError if there is nothing to align."""
     first = files[0]
     bands = _with_names([b for file in files for b in file.bands], names)
     if len(bands) < _MIN_BANDS and names:
@@ -183,7 +184,7 @@ def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Ba
 
 
 def _with_names(bands: list[Band], names: Sequence[str]) -> list[Band]:
-    """The bands of these names, in any case; all where no name is given."""
+    """The bands with these names, ignoring case; all without names."""
     wanted = {name.lower() for name in names}
     return [b for b in bands if b.name.lower() in wanted] if wanted else bands
 
@@ -195,14 +196,15 @@ def _in_order(bands: Sequence[Band], order: BandOrder) -> list[Band]:
 
 
 def _relative_folder(capture_folder: Path, folder: Path) -> Path:
-    """Relative to the input folder, never above it: the input may be one of several folders of a capture's bands."""
+    """The folder relative to the input folder; "." if it is above, as the input may be the folder of one band."""
     return capture_folder.relative_to(folder) if capture_folder.is_relative_to(folder) else Path()
 
 
 def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
-    """The captures, each with the names of the bands that at least half of its camera's captures have and it lacks. A
-    multiband file is complete. A capture of a dual camera that lacks all files of one half has the serial numbers of
-    both.
+    """Return the captures with their `missing_bands`, which at least half of the captures of their camera have.
+
+    A multiband file has no missing bands. A capture of a dual camera without files of one half gets the serial numbers
+    of both.
     """
     cameras = _cameras(captures)
     usual = _usual_bands([(c, k) for c, k in zip(captures, cameras, strict=True) if _has_a_file_per_band(c)])
@@ -214,13 +216,13 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
         own = {b.name for b in capture.bands}
         expected = usual[camera] if _has_a_file_per_band(capture) else ()
         missing = tuple(name for name in expected if name not in own)
-        identity = replace(capture.camera, serial=_whole_serial(capture.camera.serial, serials[camera]))
+        identity = replace(capture.camera, serial=_complete_serial(capture.camera.serial, serials[camera]))
         result.append(replace(capture, missing_bands=missing, camera=identity))
     return result
 
 
 def _usual_bands(captures: Sequence[tuple[Capture, _CameraKey]]) -> Mapping[_CameraKey, list[str]]:
-    """Names of the bands that at least half of a camera's captures have: rarer ones come from damaged tags."""
+    """The names of the bands that at least half of a camera's captures have; rarer names come from damaged tags."""
     members = Counter(camera for _, camera in captures)
     counts: dict[_CameraKey, Counter[str]] = defaultdict(Counter)
     for capture, camera in captures:
@@ -233,10 +235,11 @@ def _has_a_file_per_band(capture: Capture) -> bool:
 
 
 def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:
-    """The camera of each capture: make, model and serial numbers, or the folder where no tag names a model.
+    """The camera of each capture: make, model and serial numbers, or the folder if no tag names a model.
 
-    Captures of one model that share a serial number are of one camera: a dual camera has two, and a capture that lost
-    all files of one half has one of them. Without a serial number it is of the only camera of its model.
+    Captures of one model that share a serial number are of one camera: a dual camera has two serial numbers, and a
+    capture without files of one half has one of them. A capture without a serial number belongs to the only camera of
+    its model.
     """
     cameras: dict[tuple[str, str], list[set[str]]] = defaultdict(list)
     for capture in captures:
@@ -258,11 +261,11 @@ def _camera_of(capture: Capture, same_model: Sequence[set[str]]) -> _CameraKey:
 
 
 def _serials(camera: CameraIdentity) -> set[str]:
-    return set(camera.serial.split(_BETWEEN_SERIALS)) - {""}
+    return set(camera.serial.split(_SERIAL_SEPARATOR)) - {""}
 
 
-def _whole_serial(serial: str, of_camera: set[str]) -> str:
-    """The serial numbers of all halves of a camera, where a single text of its captures has them and `serial` not."""
-    own = set(serial.split(_BETWEEN_SERIALS))
-    larger = [text for text in of_camera if own < set(text.split(_BETWEEN_SERIALS))]
+def _complete_serial(serial: str, of_camera: set[str]) -> str:
+    """The only one of a camera's texts that has the numbers in `serial` and more; `serial` if there is none."""
+    own = set(serial.split(_SERIAL_SEPARATOR))
+    larger = [text for text in of_camera if own < set(text.split(_SERIAL_SEPARATOR))]
     return larger[0] if len(larger) == 1 else serial

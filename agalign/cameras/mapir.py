@@ -1,7 +1,7 @@
 """MAPIR: LATTICE arrays, one file per camera, and Survey3, which has three bands and one lens.
 
-`capture_<serial>_<sequence>_<date>_<time>_<fraction>.tiff`: what follows the serial number is the capture. The model
-`LATT-<sensor>-<lens>-F<filter>` holds the wavelength. There are no rig tags.
+File names are `capture_<serial>_<sequence>_<date>_<time>_<fraction>.tiff`; the part after the serial number identifies
+the capture. The model `LATT-<sensor>-<lens>-F<filter>` contains the wavelength. There are no rig tags.
 """
 
 import re
@@ -16,7 +16,7 @@ from agalign.values.capture import Band
 _FILE = re.compile(r"^capture_(?P<serial>[^_]+)_(?P<moment>.+)$", re.IGNORECASE)
 _FILTER = re.compile(r"-F(?P<wavelength>\d{3,4})$")
 _NAMES = ((500, "Blue"), (600, "Green"), (690, "Red"), (760, "Red edge"), (1100, "NIR"))
-"""The name of a band up to a wavelength, nm."""
+"""(longest wavelength in nm, name of the band)."""
 
 
 class Mapir(Camera):
@@ -30,13 +30,13 @@ class Mapir(Camera):
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
         if len(info.dtypes) > 1:
             return tuple(replace(band_of(path, info, f"band_{i}", i), one_lens=True) for i in info.band_indexes)
-        result = _FILTER.search(tags.model)
-        if not result:
+        bandpass = _FILTER.search(tags.model)
+        if not bandpass:
             file = _FILE.match(path.stem)
             return (band_of(path, info, f"band_{file['serial']}" if file else path.stem),)
-        wavelength = float(result["wavelength"])
-        name = next((n for maximum, n in _NAMES if wavelength <= maximum), f"{wavelength:g}nm")
-        return (replace(band_of(path, info, name), wavelength_nm=wavelength),)
+        wavelength_nm = float(bandpass["wavelength"])
+        name = next((n for longest_nm, n in _NAMES if wavelength_nm <= longest_nm), f"{wavelength_nm:g}nm")
+        return (replace(band_of(path, info, name), wavelength_nm=wavelength_nm),)
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         return self.capture_name(path)

@@ -22,16 +22,16 @@ _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
 _MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _BLACK_LEVEL = 271, 272, 274, 306, 50714
 _TAGS = {_MAKE, _MODEL, _ORIENTATION, _DATE_TIME, XMP, EXIF, GPS, _BLACK_LEVEL}
-"""The TIFF tags that are read: the values of others may be of any length."""
+"""The TIFF tags that are read; values of other tags may be of any length."""
 _MAX_LATITUDE_DEG, _MAX_LONGITUDE_DEG, _MAX_ALTITUDE_M = 90.0, 180.0, 20_000.0
-"""Positions beyond these come from damaged tags."""
+"""Positions beyond these limits come from damaged tags."""
 _BELOW_SEA_LEVEL = (1, b"\x01")
-"""EXIF GPSAltitudeRef of an altitude below sea level, as readers return a BYTE."""
+"""Values of EXIF GPSAltitudeRef for an altitude below sea level: libraries return a BYTE as either."""
 _MAX_TEXT_LENGTH = 200
-"""Makes, models and serial numbers are shorter; a damaged tag may hold megabytes."""
+"""Makes, models and serial numbers are shorter; a damaged tag may contain megabytes."""
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _MAX_NUMBER = 1e15
-"""Times in microseconds are below; larger numbers are damage, and their squares overflow."""
+"""Larger than any valid value (times in microseconds); the squares of damaged values would overflow."""
 
 
 @dataclass(frozen=True)
@@ -43,35 +43,37 @@ class Tags:
     serial: str = ""
     position: Position | None = None
     captured_at: str = ""
-    """ISO 8601 as written by the camera, without a time zone where it gives none."""
+    """ISO 8601; without a time zone if the camera writes none."""
     orientation: int = 1
-    """EXIF's: 1 for an image that is stored upright, 3 for one rotated by 180 degrees."""
+    """EXIF Orientation: 1 if the image is stored upright, 3 if it is rotated by 180 degrees."""
     black_level: float | None = None
-    """Mean of the tag's values."""
+    """Mean of the values of the TIFF tag BlackLevel."""
     xmp: Mapping[Name, tuple[str, ...]] = field(default_factory=dict)
     exif: Mapping[str, Any] = field(default_factory=dict)
 
     def text(self, namespace: str, name: str) -> str:
-        """An XMP value as text, by its namespace as `xmp.Name` has it; a sequence's items are joined by commas."""
+        """Return an XMP value as text, with the items of a sequence joined by commas; empty if it is missing.
+
+        `namespace` is as in `xmp.Name`.
+        """
         return ",".join(self.xmp.get((namespace, name), ()))
 
     def first_text(self, names: Iterable[Name]) -> str:
-        """The text of the first of some names that has one."""
+        """Return the text of the first of these XMP values that is not empty."""
         return next((text for name in names if (text := self.text(*name))), "")
 
     def numbers(self, namespace: str, name: str) -> tuple[float, ...]:
-        """The numbers in an XMP value that can be true, whether it is one text, a list in a text, or a sequence."""
+        """Return the numbers in an XMP value, a text or a sequence, without impossibly large ones."""
         numbers = (float(n) for n in _NUMBER.findall(self.text(namespace, name)))
         return tuple(n for n in numbers if abs(n) < _MAX_NUMBER)
 
     def number(self, namespace: str, name: str) -> float | None:
-        """The first number in an XMP value."""
-        numbers = self.numbers(namespace, name)
-        return numbers[0] if numbers else None
+        """Return the first number in an XMP value; None if there is none."""
+        return next(iter(self.numbers(namespace, name)), None)
 
     @property
     def pixels_per_mm(self) -> float | None:
-        """Density of the pixels in the focal plane, from EXIF FocalPlaneXResolution and its unit."""
+        """Pixels per mm of the focal plane, from EXIF FocalPlaneXResolution and its unit."""
         resolution = rational(self.exif.get("FocalPlaneXResolution"))
         unit = self.exif.get("FocalPlaneResolutionUnit", 2)
         mm = _MM_PER_UNIT.get(int(unit)) if isinstance(unit, int) else None
@@ -79,12 +81,12 @@ class Tags:
 
     @property
     def focal_length_mm(self) -> float | None:
-        """EXIF's."""
+        """EXIF FocalLength."""
         return rational(self.exif.get("FocalLength"))
 
 
 def rational(value: Any) -> float | None:
-    """An EXIF number or numerator-denominator pair as a finite float, else None."""
+    """Return an EXIF number, or a pair of numerator and denominator, as a finite float; None for anything else."""
     try:
         number = value[0] / value[1] if isinstance(value, (tuple, list)) else float(value)
     except (TypeError, ValueError, ZeroDivisionError, IndexError):
@@ -93,16 +95,16 @@ def rational(value: Any) -> float | None:
 
 
 def read_tags(path: Path) -> Tags:
-    """The tags of a TIFF's first page or of a JPEG; none of a PNG.
+    """Return the tags of the first page of a TIFF or of a JPEG; empty for a PNG.
 
-    Raises UnreadableFileError where the file is none of these or is cut short.
+    Raises UnreadableFileError if the file is not of the format of its suffix or is truncated.
     """
     if path.suffix.lower() in PNG_SUFFIXES:
         return Tags()
     kind, read = ("JPEG", _jpeg_values) if path.suffix.lower() in JPEG_SUFFIXES else ("TIFF", _tiff_values)
     try:
         values = read(path)
-    except Exception as error:  # a damaged file makes readers fail in any way: struct.error, KeyError, MemoryError …
+    except Exception as error:  # damaged files cause struct.error, KeyError, MemoryError … in the libraries
         raise UnreadableFileError(
             f"{path}: not a readable {kind} ({error or 'empty'}); copy it from the card again"
         ) from None
@@ -130,7 +132,7 @@ def _tiff_values(path: Path) -> dict[int, Any]:
 
 
 def _fractions(value: tuple[int, ...]) -> tuple[float, ...]:
-    """From numerators and denominators one after the other."""
+    """Fractions from a sequence of numerator, denominator, numerator, denominator …; nan for a denominator of 0."""
     return tuple(n / d if d else math.nan for n, d in zip(value[::2], value[1::2], strict=True))
 
 
@@ -143,7 +145,7 @@ def _jpeg_values(path: Path) -> dict[int, Any]:
 
 
 def _position(gps: Any) -> Position | None:
-    """From a GPS directory; cameras without a fix write an empty one."""
+    """The position in a GPS directory; None without a fix, for which cameras write no coordinates or zeros."""
     if not isinstance(gps, dict):
         return None
     latitude_deg = _signed_degrees(gps, "Latitude", "S", _MAX_LATITUDE_DEG)
@@ -154,7 +156,7 @@ def _position(gps: Any) -> Position | None:
 
 
 def _signed_degrees(gps: Mapping[str, Any], axis: str, negative: str, max_deg: float) -> float | None:
-    """A coordinate, negative where its reference is `negative`; None where it is missing or beyond `max_deg`."""
+    """A coordinate, negative if its reference (N, S, E, W) is `negative`; None if it is missing or beyond `max_deg`."""
     degrees = _degrees(gps.get(f"GPS{axis}"))
     if degrees is None or abs(degrees) > max_deg:
         return None
@@ -162,7 +164,7 @@ def _signed_degrees(gps: Mapping[str, Any], axis: str, negative: str, max_deg: f
 
 
 def _altitude_m(gps: Mapping[str, Any]) -> float | None:
-    """Above sea level; None where it is missing or beyond any that a drone reaches."""
+    """Altitude above sea level; None if it is missing or impossible."""
     altitude_m = rational(gps.get("GPSAltitude"))
     if altitude_m is None or abs(altitude_m) > _MAX_ALTITUDE_M:
         return None
@@ -170,7 +172,7 @@ def _altitude_m(gps: Mapping[str, Any]) -> float | None:
 
 
 def _degrees(value: Any) -> float | None:
-    """Degrees, minutes and seconds, as fractions or as the numerators and denominators of fractions."""
+    """Degrees from degrees, minutes and seconds, given as 3 fractions or as 3 numerators and denominators."""
     if not isinstance(value, (tuple, list)):
         return None
     pairs = [value[i : i + 2] for i in range(0, 6, 2)] if len(value) == 6 else list(value)
@@ -181,7 +183,7 @@ def _degrees(value: Any) -> float | None:
 
 
 def _mean(value: Any) -> float | None:
-    """Of a tag of one or several numbers."""
+    """The mean of a tag of one or several numbers; None for another type."""
     numbers = value if isinstance(value, (tuple, list)) else [value]
     if not numbers or not all(isinstance(n, (int, float)) and math.isfinite(n) for n in numbers):
         return None

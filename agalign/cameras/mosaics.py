@@ -1,4 +1,4 @@
-"""Captures of georeferenced mosaics: one for each pair of a reference mosaic and a moving one."""
+"""Captures of georeferenced mosaics: one for each moving mosaic, together with a band of the reference mosaic."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,16 +18,16 @@ from agalign.values.capture import Band, Capture
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 
 _EARTH_RADIUS_KM = 6371.0
-"""Mean radius: distances are right to half a percent, which is enough to tell where a map is."""
+"""Mean radius: distances are accurate to 0.5 %, which is sufficient for comparing the extents of maps."""
 
 
 def captures_onto(
     reference: Path, moving: Sequence[Path], band: str | None = None, max_pixels: int = MAX_MOSAIC_PIXELS
 ) -> list[Capture]:
-    """One capture for each moving mosaic, to be aligned to the grid of the reference mosaic: the reference's `band`
-    (None for the default, the green one) and all bands of the moving mosaic, which share one mapping.
+    """Return a capture for each moving mosaic: the reference's `band` (None for the default, green) and all bands of
+    the moving mosaic, which share one mapping.
 
-    Raises UnreadableFileError, InputError where a mosaic is not georeferenced, NoSuchBandError.
+    Raises UnreadableFileError, InputError if a mosaic is not georeferenced, NoSuchBandError.
     """
     reference_bands = _georeferenced_bands(reference, max_pixels)
     fixed = reference_bands[reference_index(reference_bands, band, reference)]
@@ -35,7 +35,7 @@ def captures_onto(
     captures = []
     for path in moving:
         if path.resolve() == reference.resolve():
-            raise InputError(f"{path}: is the reference itself; name the mosaics that are to be aligned to it")
+            raise InputError(f"{path}: is the reference itself; give the mosaics to be aligned to it")
         bands = [fixed, *(replace(b, one_lens=True, companion=False) for b in _georeferenced_bands(path, max_pixels))]
         captured_at = read_tags(path).captured_at
         captures.append(Capture(path.stem, Path(), tuple(with_unique_band_names(bands)), 0, captured_at=captured_at))
@@ -43,26 +43,26 @@ def captures_onto(
 
 
 def distance_km(fixed: Band, moving: Band) -> float:
-    """Distance between the centres of two georeferenced rasters on the ground; 0 where they may overlap.
+    """Return the distance between the centres of two georeferenced rasters on the ground; 0 if they may overlap.
 
-    Raises GeometryError where their coordinates cannot be transformed.
+    Raises GeometryError if their coordinates cannot be transformed.
     """
-    places = []
+    centres_and_corners = []
     for band in (fixed, moving):
         assert band.georeference is not None
         width, height = band.size_px
-        corners = geometry.apply(band.georeference.transform, np.array([[width / 2, height / 2], [0.0, 0.0]]))
-        places.append(np.radians(transformed(corners, band.georeference.crs_wkt, "EPSG:4326")))
-    reach_km = sum(_great_circle_km(*place) for place in places)
-    apart_km = _great_circle_km(places[0][0], places[1][0])
-    return apart_km if apart_km > reach_km else 0.0
+        on_map = geometry.apply(band.georeference.transform, np.array([[width / 2, height / 2], [0.0, 0.0]]))
+        centres_and_corners.append(np.radians(transformed(on_map, band.georeference.crs_wkt, "EPSG:4326")))
+    half_diagonals_km = sum(_great_circle_km(centre, corner) for centre, corner in centres_and_corners)
+    result_km = _great_circle_km(centres_and_corners[0][0], centres_and_corners[1][0])
+    return result_km if result_km > half_diagonals_km else 0.0
 
 
 def _great_circle_km(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """Distance of two points (longitude, latitude), radians, by the haversine formula."""
-    half = np.sin((other - one) / 2) ** 2
-    share = half[1] + np.cos(one[1]) * np.cos(other[1]) * half[0]
-    return float(2 * _EARTH_RADIUS_KM * np.arcsin(np.sqrt(min(1.0, share))))
+    haversine = np.sin((other - one) / 2) ** 2
+    result = haversine[1] + np.cos(one[1]) * np.cos(other[1]) * haversine[0]
+    return float(2 * _EARTH_RADIUS_KM * np.arcsin(np.sqrt(min(1.0, result))))
 
 
 def _georeferenced_bands(path: Path, max_pixels: int) -> tuple[Band, ...]:

@@ -1,4 +1,4 @@
-"""Unique names: of the bands within a capture, and of the captures that write to one folder."""
+"""Unique names of the bands of a capture, and of the captures of an output folder."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -10,12 +10,12 @@ from types import MappingProxyType
 from agalign.values.capture import Band, Capture
 from agalign.values.files import RUN_FILE
 
-_NAMES_OF_THE_RUN = {"panels", "sky", Path(RUN_FILE).stem, "summary", "index"}
-"""Files at the top of an output folder that are not of a capture, without suffix."""
+_RESERVED_NAMES = {"panels", "sky", Path(RUN_FILE).stem, "summary", "index"}
+"""Files of a run in its output folder, without suffix."""
 
 
 def with_unique_band_names(bands: Sequence[Band]) -> list[Band]:
-    """The bands, renamed where a name repeats: the first band keeps it, the others get the next free number."""
+    """Return the bands with unique names: the first band keeps a repeated name, the others get a number."""
     taken = {b.name for b in bands}
     kept: set[str] = set()
     unique = []
@@ -30,7 +30,7 @@ def with_unique_band_names(bands: Sequence[Band]) -> list[Band]:
 
 
 def band_file_owners(captures: Sequence[Capture]) -> dict[str, str]:
-    """{file below the output folder that a layout of single bands may write, without suffix: its capture's label}."""
+    """Return the label of the capture by the band files that it may write, without suffix, below the output folder."""
     return {
         (c.folder / b.path.stem).as_posix().lower(): c.label
         for c in captures if len({b.path for b in c.bands}) > 1 for b in c.bands
@@ -40,10 +40,10 @@ def band_file_owners(captures: Sequence[Capture]) -> dict[str, str]:
 def with_unique_capture_names(
     captures: Sequence[Capture], file_owners: Mapping[str, str] = MappingProxyType({})
 ) -> list[Capture]:
-    """The captures, numbered where their file would be that of an earlier capture, of another capture's band
-    (`file_owners`, as `band_file_owners` returns them) or of the run.
+    """Return the captures with a number added to names that are those of an earlier capture, of a file of the run, or
+    of another capture's band file. `file_owners` is from `band_file_owners`.
     """
-    taken = set(_NAMES_OF_THE_RUN)
+    taken = set(_RESERVED_NAMES)
     counts: Counter[str] = Counter()
     unique = []
     for capture in captures:

@@ -1,9 +1,10 @@
-"""Parrot Sequoia: four fisheye bands and a perspective JPEG in colour.
+"""Parrot Sequoia: four fisheye bands and a perspective colour JPEG.
 
-A ray (X, Y, Z) falls at theta = (2 / pi) atan2(sqrt(X^2 + Y^2), Z), rho = p0 + p1 theta + p2 theta^2 + p3 theta^3, and
-[u v] = [C D; E F] rho (X, Y) / sqrt(X^2 + Y^2) + c with FisheyePolynomial p and FisheyeAffineMatrix C, D, E, F. Around
-the axis that is a pinhole of f = p1 2 C / pi. RigRelatives turn a band's camera to that of the green one:
-H(band -> green) = K_green R K_band^-1. Principal point and RigRelatives are of the image that EXIF's Orientation makes.
+A ray (X, Y, Z) is projected to [u v] = [C D; E F] rho (X, Y) / sqrt(X^2 + Y^2) + c with
+theta = (2 / pi) atan2(sqrt(X^2 + Y^2), Z) and rho = p0 + p1 theta + p2 theta^2 + p3 theta^3, FisheyePolynomial p,
+FisheyeAffineMatrix C, D, E, F and principal point c. Near the axis this is a pinhole camera of f = p1 2 C / pi.
+RigRelatives rotate a band's camera to that of the green band: H(band -> green) = K_green R K_band^-1. Principal point
+and RigRelatives refer to the image after EXIF's Orientation is applied.
 """
 
 import math
@@ -13,24 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, band_of, colour_bands, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import (
-    BAND_NAME,
-    CAMERA,
-    CAPTURE_UUID,
-    FLIGHT_UUID,
-    FOCAL_LENGTH,
-    FOCAL_LENGTH_UNITS,
-    MODEL_TYPE,
-    TagTransfer,
-    number_text,
-    perspective_lens,
-    principal_point_px,
-    rig_degrees,
-    rotated_180,
-    spectral,
-)
 from agalign.cameras.xmp import Name, Packet
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band
@@ -41,21 +27,19 @@ from agalign.values.lens import Lens, radial_coefficients
 _NAMES = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
 _SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
 _MAX_RAY_TAN = 3.0
-"""tan of the largest angle from the axis that a lens is fitted to: 72 degrees."""
+"""Tangent of the largest angle from the axis: 72 degrees, beyond the corners of any Sequoia."""
 _CORNER_MARGIN = 1.1
-"""The lens is fitted to this multiple of the corners' rays, so that it holds at the image's border."""
+"""The distortion is fitted up to this multiple of the corners' distance, so that it is accurate at the border."""
 _FIT_SAMPLES = 1000
 _MAX_SHEAR = 1e-3
-"""Of a fisheye's affine matrix, relative to its scale: more cannot be expressed and leaves the lens out."""
+"""Limit of D and E relative to C: `Lens` has no shear, so that the lens is not used beyond it."""
+_POLYNOMIAL: Name = (pix4d.NAMESPACE, "FisheyePolynomial")
+_AFFINE: Name = (pix4d.NAMESPACE, "FisheyeAffineMatrix")
+_FISHEYE: tuple[Name, ...] = (_POLYNOMIAL, _AFFINE, (pix4d.NAMESPACE, "FisheyeAffineSymmetric"))
 
 
-_POLYNOMIAL: Name = (CAMERA, "FisheyePolynomial")
-_AFFINE: Name = (CAMERA, "FisheyeAffineMatrix")
-_FISHEYE: tuple[Name, ...] = (_POLYNOMIAL, _AFFINE, (CAMERA, "FisheyeAffineSymmetric"))
-
-
-class _TagTransfer(TagTransfer):
-    geometry = TagTransfer.geometry | {*_FISHEYE}
+class _TagTransfer(pix4d.TagTransfer):
+    geometry = pix4d.TagTransfer.geometry | {*_FISHEYE}
     in_px = (_AFFINE,)
     principal_point_follows_orientation = True
 
@@ -65,43 +49,43 @@ class _TagTransfer(TagTransfer):
         super().put_geometry(packet, reference_packet, reference, tags, grid)
         density = self.pixels_per_mm(tags)
         if grid.undistorted and tags.numbers(*_AFFINE) and density and reference.lens is not None:
-            # What was a fisheye is a pinhole now.
+            # The undistorted image is that of a pinhole camera.
             packet.remove(_FISHEYE)
-            packet.put(MODEL_TYPE, ["perspective"])
-            packet.add(FOCAL_LENGTH, number_text(reference.lens.fx_px / density))
-            packet.add(FOCAL_LENGTH_UNITS, "mm")
+            packet.put(pix4d.MODEL_TYPE, ["perspective"])
+            packet.add(pix4d.FOCAL_LENGTH, pix4d.number_text(reference.lens.fx_px / density))
+            packet.add(pix4d.FOCAL_LENGTH_UNITS, "mm")
 
 
 class Sequoia(Camera):
     """Parrot Sequoia and Sequoia+."""
 
     name = "Parrot Sequoia"
-    capture_ids = (CAPTURE_UUID,)
-    flight_ids = (FLIGHT_UUID,)
+    capture_ids = (pix4d.CAPTURE_UUID,)
+    flight_ids = (pix4d.FLIGHT_UUID,)
     tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
-        return tags.make.lower() == "parrot" or tags.text(CAMERA, "RigName").lower().startswith("sequoia")
+        return tags.make.lower() == "parrot" or tags.text(pix4d.NAMESPACE, "RigName").lower().startswith("sequoia")
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        fisheye = "fisheye" in tags.text(*MODEL_TYPE).lower()
-        lens = _fisheye_lens(tags, info) if fisheye else perspective_lens(tags)
+        fisheye = "fisheye" in tags.text(*pix4d.MODEL_TYPE).lower()
+        lens = _fisheye_lens(tags, info) if fisheye else pix4d.perspective_lens(tags)
         to_camera = np.eye(3)
         if self.tag_transfer.is_rotated(tags):
             lens, to_camera = lens and _upside_down(lens, info), np.diag([-1.0, -1.0, 1.0])
-        to_rig = rays_to_rig(lens, rotation(*rig_degrees(tags)) @ to_camera)
+        to_rig = rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags)) @ to_camera)
         if len(info.dtypes) > 1:
             return colour_bands(path, info, lens, to_rig)
         suffix = _SUFFIX.search(path.stem)
-        name = _NAMES.get(suffix[1].upper(), suffix[1]) if suffix else tags.text(*BAND_NAME) or path.stem
-        return (replace(spectral(band_of(path, info, name), tags), lens=lens, to_rig=to_rig),)
+        name = _NAMES.get(suffix[1].upper(), suffix[1]) if suffix else tags.text(*pix4d.BAND_NAME) or path.stem
+        return (replace(pix4d.with_wavelength(band_of(path, info, name), tags), lens=lens, to_rig=to_rig),)
 
     def capture_name(self, path: Path) -> str:
         return _SUFFIX.sub("", path.stem)
 
 
 def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
-    polynomial, affine, centre_px = tags.numbers(*_POLYNOMIAL), tags.numbers(*_AFFINE), principal_point_px(tags)
+    polynomial, affine, centre_px = tags.numbers(*_POLYNOMIAL), tags.numbers(*_AFFINE), pix4d.principal_point_px(tags)
     if len(polynomial) != 4 or len(affine) != 4 or centre_px is None:
         return None
     c, d, e, f = affine
@@ -110,21 +94,21 @@ def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
         return None
     fx, fy = slope * 2 * c / math.pi, slope * 2 * f / math.pi
     cx, cy = centre_px
-    reach = math.hypot(max(cx, info.width_px - cx) / fx, max(cy, info.height_px - cy) / fy)
+    corner_distance = math.hypot(max(cx, info.width_px - cx) / fx, max(cy, info.height_px - cy) / fy)
 
-    def bent(r: Matrix) -> Matrix:
-        """Distance from the axis in the image over its focal length, of a ray at r = tan(angle)."""
+    def distorted(r: Matrix) -> Matrix:
+        """Distance from the principal point, in focal lengths, of a ray at r = tan(angle from the axis)."""
         theta = 2 / math.pi * np.arctan(r)
         return np.asarray(np.polynomial.polynomial.polyval(theta, polynomial) * math.pi / (2 * slope))
 
     rays = np.linspace(0.0, _MAX_RAY_TAN, _FIT_SAMPLES)
-    corner = np.interp(reach, bent(rays), rays)
-    return Lens(fx, fy, cx, cy, radial_coefficients(bent, _CORNER_MARGIN * float(corner)))
+    corner_ray = np.interp(corner_distance, distorted(rays), rays)
+    return Lens(fx, fy, cx, cy, radial_coefficients(distorted, _CORNER_MARGIN * float(corner_ray)))
 
 
 def _upside_down(lens: Lens, info: RasterInfo) -> Lens:
-    """The lens in pixels of the stored image, which is rotated by 180 degrees."""
+    """The lens in pixels of the stored image, rotated by 180 degrees: tangential distortion changes its sign."""
     k = lens.distortion
-    flipped = (*k[:2], -k[2], -k[3], *k[4:]) if len(k) > 3 else k
-    cx, cy = rotated_180((lens.cx_px, lens.cy_px), (info.width_px, info.height_px))
-    return replace(lens, cx_px=cx, cy_px=cy, distortion=flipped)
+    distortion = (*k[:2], -k[2], -k[3], *k[4:]) if len(k) > 3 else k
+    cx, cy = pix4d.rotated_180((lens.cx_px, lens.cy_px), (info.width_px, info.height_px))
+    return replace(lens, cx_px=cx, cy_px=cy, distortion=distortion)

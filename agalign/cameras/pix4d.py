@@ -1,6 +1,6 @@
-"""The tags that most makers share, in the namespace that Pix4D gave them: lens, rig, band, and vignetting.
+"""The XMP tags that most makers share, defined by Pix4D: lens, rig, band, vignetting and panel.
 
-`TagTransfer` converts them for a band that is written on the reference's grid; a maker with tags of its own extends it.
+`TagTransfer` converts them for a band that is written on the reference's grid; vendors with other tags subclass it.
 """
 
 import math
@@ -13,39 +13,43 @@ from agalign.values.capture import Band, Panel, Pose
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 
-CAMERA = "pix4d.com"
-"""Firmware writes `pix4d.com/camera/1.0`, and older one `pix4d.com/1.0`."""
-BAND_NAME: Name = (CAMERA, "BandName")
-CAPTURE_UUID: Name = (CAMERA, "CaptureUUID")
-FLIGHT_UUID: Name = (CAMERA, "FlightUUID")
-PRINCIPAL_POINT: Name = (CAMERA, "PrincipalPoint")
-FOCAL_LENGTH: Name = (CAMERA, "PerspectiveFocalLength")
-FOCAL_LENGTH_UNITS: Name = (CAMERA, "PerspectiveFocalLengthUnits")
-DISTORTION: Name = (CAMERA, "PerspectiveDistortion")
-MODEL_TYPE: Name = (CAMERA, "ModelType")
-RIG_RELATIVES: Name = (CAMERA, "RigRelatives")
-RIG_TRANSLATIONS: Name = (CAMERA, "RigTranslations")
-VIGNETTING_CENTRE: Name = (CAMERA, "VignettingCenter")
-VIGNETTING_POLYNOMIAL: Name = (CAMERA, "VignettingPolynomial")
+NAMESPACE = "pix4d.com"
+"""Contains `pix4d.com/camera/1.0`, and `pix4d.com/1.0` of older firmware."""
+BAND_NAME: Name = (NAMESPACE, "BandName")
+CAPTURE_UUID: Name = (NAMESPACE, "CaptureUUID")
+FLIGHT_UUID: Name = (NAMESPACE, "FlightUUID")
+PRINCIPAL_POINT: Name = (NAMESPACE, "PrincipalPoint")
+FOCAL_LENGTH: Name = (NAMESPACE, "PerspectiveFocalLength")
+FOCAL_LENGTH_UNITS: Name = (NAMESPACE, "PerspectiveFocalLengthUnits")
+DISTORTION: Name = (NAMESPACE, "PerspectiveDistortion")
+MODEL_TYPE: Name = (NAMESPACE, "ModelType")
+RIG_RELATIVES: Name = (NAMESPACE, "RigRelatives")
+RIG_TRANSLATIONS: Name = (NAMESPACE, "RigTranslations")
+VIGNETTING_CENTRE: Name = (NAMESPACE, "VignettingCenter")
+VIGNETTING_POLYNOMIAL: Name = (NAMESPACE, "VignettingPolynomial")
 
-_PANEL_SERIALS: tuple[Name, ...] = (("micasense.com/MicaSense", "PanelSerial"), (CAMERA, "PanelSerial"))
+_PANEL_SERIALS: tuple[Name, ...] = (("micasense.com/MicaSense", "PanelSerial"), (NAMESPACE, "PanelSerial"))
 _AREA_NUMBERS = 8
 """x and y of four corners."""
 _MAX_FOCAL_LENGTH_MM = 100.0
 """Larger numbers are px: lenses of drone cameras have 2 to 50 mm, or 300 px and more."""
 _MAX_OFFSET_M = 0.5
+"""Larger numbers are mm: no rig of a drone is half a metre wide."""
 _MAX_MAGNIFICATION = 1.02
-"""Beyond this a polynomial of vignetting in the band's own pixels is dropped."""
+"""Vignetting is removed if the bands' scales differ by more: its polynomial in r would be wrong at the corners."""
 
 FromSource = Callable[[float, float], tuple[float, float]]
-"""Maps a pixel (x, y) of the band's own file to the reference's pixels; nan where the mapping has no inverse."""
+"""Maps a pixel (x, y) of the band's own file to the reference's pixels; nan if the mapping has no inverse there."""
 
 
 # ---- reading
 
 
 def perspective_lens(tags: Tags) -> Lens | None:
-    """K = [f r, f r, ppx r, ppy r] with r in px/mm; Camera:PerspectiveDistortion is k1, k2, k3, p1, p2."""
+    """Return fx = fy = f r, (cx, cy) = PrincipalPoint r with r in px/mm; None if a tag is missing.
+
+    Camera:PerspectiveDistortion is k1, k2, k3, p1, p2; `Lens` has OpenCV's order k1, k2, p1, p2, k3.
+    """
     focal_px, centre_px = focal_length_px(tags), principal_point_px(tags)
     if focal_px is None or centre_px is None:
         return None
@@ -55,13 +59,13 @@ def perspective_lens(tags: Tags) -> Lens | None:
 
 
 def principal_point_px(tags: Tags) -> tuple[float, float] | None:
-    """(x, y) with the centre of the top-left pixel at (0, 0), as makers' libraries take millimetres times density."""
+    """Return (x, y), with the centre of the top-left pixel at (0, 0): the vendors' libraries multiply mm by px/mm."""
     density, point_mm = pixels_per_mm(tags), tags.numbers(*PRINCIPAL_POINT)
     return (point_mm[0] * density, point_mm[1] * density) if density and len(point_mm) == 2 else None
 
 
 def pixels_per_mm(tags: Tags) -> float | None:
-    """EXIF's density, else the ratio of a focal length in px to EXIF's in mm."""
+    """Return EXIF's resolution of the focal plane, else the ratio of the focal length in px to EXIF's in mm."""
     if tags.pixels_per_mm:
         return tags.pixels_per_mm
     focal_px = tags.number(*FOCAL_LENGTH) if focal_length_is_in_px(tags) else None
@@ -69,76 +73,79 @@ def pixels_per_mm(tags: Tags) -> float | None:
 
 
 def focal_length_is_in_px(tags: Tags) -> bool:
-    """True where Camera:PerspectiveFocalLength is in px: old firmware gives them without saying so."""
+    """Return True if Camera:PerspectiveFocalLength is in px, which old firmware does not state."""
     units, length = tags.text(*FOCAL_LENGTH_UNITS).lower(), tags.number(*FOCAL_LENGTH)
     return "px" in units or "pixel" in units or (length is not None and length > _MAX_FOCAL_LENGTH_MM)
 
 
 def focal_length_px(tags: Tags) -> float | None:
-    """Camera:PerspectiveFocalLength; None where it is missing or not positive."""
-    focal, density = tags.number(*FOCAL_LENGTH), pixels_per_mm(tags)
-    if focal is None or density is None or focal <= 0:
+    """Return Camera:PerspectiveFocalLength in px; None if it is missing or not positive."""
+    focal_length, density = tags.number(*FOCAL_LENGTH), pixels_per_mm(tags)
+    if focal_length is None or density is None or focal_length <= 0:
         return None
-    return focal if focal_length_is_in_px(tags) else focal * density
+    return focal_length if focal_length_is_in_px(tags) else focal_length * density
 
 
 def rig_degrees(tags: Tags) -> tuple[float, ...]:
-    """The three angles of Camera:RigRelatives; zeros where they are missing."""
+    """Return the three angles of Camera:RigRelatives; zeros if they are missing."""
     angles = tags.numbers(*RIG_RELATIVES)
     return angles if len(angles) == 3 else (0.0, 0.0, 0.0)
 
 
 def parallax_of(tags: Tags) -> tuple[float, float] | None:
-    """Direction in which a band's pixels move as the ground comes nearer: opposite to the position of the lens right
-    of and below the rig's origin in Camera:RigTranslations, metres or millimetres. None where that is missing.
+    """Return the direction (x, y) in which a band's pixels move as the distance of the ground decreases, in any unit:
+    opposite to the position of the lens in Camera:RigTranslations. None if that is missing.
     """
-    place = tags.numbers(*RIG_TRANSLATIONS)
-    return (-place[0], -place[1]) if len(place) == 3 else None
+    position = tags.numbers(*RIG_TRANSLATIONS)
+    return (-position[0], -position[1]) if len(position) == 3 else None
 
 
 def lens_offset_m(tags: Tags) -> tuple[float, float] | None:
-    """Position of a band's lens right of and below the rig's origin, metres, from Camera:RigTranslations; None where
-    that is missing. Some cameras write millimetres: no rig of a drone is half a metre wide.
+    """Return the position (right, down) of a band's lens in the rig from Camera:RigTranslations, which is in m or mm;
+    None if that is missing.
     """
-    place = tags.numbers(*RIG_TRANSLATIONS)
-    if len(place) != 3:
+    position = tags.numbers(*RIG_TRANSLATIONS)
+    if len(position) != 3:
         return None
-    scale = 1.0 if max(map(abs, place)) < _MAX_OFFSET_M else 1e-3
-    return place[0] * scale, place[1] * scale
+    scale = 1.0 if max(map(abs, position)) < _MAX_OFFSET_M else 1e-3
+    return position[0] * scale, position[1] * scale
 
 
-def spectral(band: Band, tags: Tags) -> Band:
-    """The band with the wavelength and width that its tags give, nm."""
+def with_wavelength(band: Band, tags: Tags) -> Band:
+    """Return the band with the centre wavelength and bandwidth in its tags, nm."""
     return replace(
         band,
-        wavelength_nm=tags.number(CAMERA, "CentralWavelength"),
-        bandwidth_nm=tags.number(CAMERA, "WavelengthFWHM"),
+        wavelength_nm=tags.number(NAMESPACE, "CentralWavelength"),
+        bandwidth_nm=tags.number(NAMESPACE, "WavelengthFWHM"),
     )
 
 
 def pose_of(tags: Tags, height_m: float | None = None) -> Pose | None:
-    """From Camera:Yaw, Pitch and Roll, degrees, of a camera that looks down; None where they are missing."""
-    yaw, pitch, roll = (tags.number(CAMERA, name) for name in ("Yaw", "Pitch", "Roll"))
+    """Return the pose by Camera:Yaw, Pitch and Roll, degrees; None if the yaw is missing. All are 0 for a camera that
+    looks straight down with its upper edge to the north.
+    """
+    yaw, pitch, roll = (tags.number(NAMESPACE, name) for name in ("Yaw", "Pitch", "Roll"))
     if yaw is None:
         return None
     return Pose(yaw, pitch or 0.0, roll or 0.0, height_m, focal_length_px(tags))
 
 
 def panel_in(tags: Tags, size_px: tuple[int, int]) -> Panel | None:
-    """The calibration panel that the firmware saw in an image (width, height): CalibrationPicture, Albedo, ReflectArea
-    (x, y of four corners, px) and PanelSerial; None where it saw none.
+    """Return the calibration panel that the firmware detected in an image (width, height), by CalibrationPicture,
+    Albedo, ReflectArea (x, y of four corners, px) and PanelSerial; None if it detected none.
     """
-    corners, is_picture = _panel_corners(tags, size_px), tags.number(CAMERA, "CalibrationPicture")
+    corners, is_picture = _panel_corners(tags, size_px), tags.number(NAMESPACE, "CalibrationPicture")
     if is_picture == 0 or (is_picture is None and not corners):
         return None
-    albedo = tags.number(CAMERA, "Albedo")
-    known = albedo if albedo is not None and 0 < albedo <= 1 else None
-    return Panel("tags", tags.first_text(_PANEL_SERIALS), known, corners)
+    albedo = tags.number(NAMESPACE, "Albedo")
+    if albedo is not None and not 0 < albedo <= 1:
+        albedo = None
+    return Panel("tags", tags.first_text(_PANEL_SERIALS), albedo, corners)
 
 
 def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, float], ...]:
-    """(x, y) of the four corners of ReflectArea; none where they are not four points of the image."""
-    area = tags.numbers(CAMERA, "ReflectArea")
+    """(x, y) of the corners of ReflectArea; empty if they are not four different points of the image."""
+    area = tags.numbers(NAMESPACE, "ReflectArea")
     if len(area) != _AREA_NUMBERS:
         return ()
     corners = tuple(zip(area[::2], area[1::2], strict=True))
@@ -150,31 +157,31 @@ def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, f
 
 
 class TagTransfer:
-    """How XMP values are converted for a band on the reference's grid."""
+    """Conversion of XMP values for a band that is written on the reference's grid."""
 
     geometry: frozenset[Name] = frozenset({
         PRINCIPAL_POINT, FOCAL_LENGTH, FOCAL_LENGTH_UNITS, DISTORTION, MODEL_TYPE, RIG_RELATIVES,
-        RIG_TRANSLATIONS, (CAMERA, "RigRelativesReferenceRigCameraIndex"),
+        RIG_TRANSLATIONS, (NAMESPACE, "RigRelativesReferenceRigCameraIndex"),
     })  # fmt: skip
-    """Values of the lens and the rig, which are replaced by the reference's."""
+    """Values of lens and rig, which are replaced by those of the reference."""
     sensor_only: frozenset[Name] = frozenset({
-        (CAMERA, "InvalidPixel"), (CAMERA, "VignettingPolynomial2D"), (CAMERA, "VignettingPolynomial2DName"),
+        (NAMESPACE, "InvalidPixel"), (NAMESPACE, "VignettingPolynomial2D"), (NAMESPACE, "VignettingPolynomial2DName"),
     })  # fmt: skip
-    """Values that are true of the sensor's own pixels only, which are removed."""
-    radiometry: frozenset[Name] = frozenset({VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL, (CAMERA, "BlackCurrent")})
-    """Corrections that the pixels have had where reflectance is written."""
+    """Values that refer to the sensor's own pixels and are removed."""
+    radiometry: frozenset[Name] = frozenset({VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL, (NAMESPACE, "BlackCurrent")})
+    """Values of corrections that have been applied to the pixels if radiance or reflectance is written."""
     in_px: tuple[Name, ...] = ()
-    """Lengths in px, which grow with the resolution."""
+    """Lengths in px, which are multiplied by the scale of the output."""
     principal_point_follows_orientation = False
-    """True where the principal point is in the image after EXIF's Orientation, not as it is stored."""
+    """True if the principal point refers to the image after EXIF's Orientation is applied."""
 
     def put_geometry(
         self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
     ) -> None:
-        """Replace a band's geometry by the reference's on a grid; `reference_packet` and `tags` are of the reference's
-        file.
+        """Replace a band's geometry in `packet` by that of the reference on a grid. `reference_packet` and `tags` are
+        those of the reference's file.
 
-        The rig is removed: software that reads it would align the bands a second time.
+        The rig becomes zero: software that reads it would otherwise align the bands a second time.
         """
         packet.take(reference_packet, self.geometry)
         packet.remove(self.sensor_only)
@@ -202,7 +209,7 @@ class TagTransfer:
     def put_vignetting(
         self, packet: Packet, tags: Tags, grid: OutputGrid, from_source: FromSource, *, radiometry: bool
     ) -> None:
-        """Convert the vignetting's centre and polynomial to the pixels that are written; `tags` are the band's own.
+        """Convert the centre and polynomial of the vignetting to output pixels; `tags` are the band's own.
 
         With `radiometry` they are removed, because the pixels have been corrected.
         """
@@ -214,7 +221,7 @@ class TagTransfer:
             return
         new_centre, next_pixel = from_source(*centre), from_source(centre[0] + 1, centre[1])
         magnification = math.dist(new_centre, next_pixel)
-        # In this form nan is out of range too.
+        # The condition is also true for nan.
         if not 1 / _MAX_MAGNIFICATION < magnification < _MAX_MAGNIFICATION:
             packet.remove([VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL])
             return
@@ -223,11 +230,11 @@ class TagTransfer:
         packet.put(VIGNETTING_POLYNOMIAL, [f"{v:.9e}" for v in scaled])
 
     def pixels_per_mm(self, tags: Tags) -> float | None:
-        """Of the focal plane."""
+        """Return the resolution of the focal plane."""
         return pixels_per_mm(tags)
 
     def is_rotated(self, tags: Tags) -> bool:
-        """True where the principal point is in the image rotated by 180 degrees."""
+        """Return True if the principal point refers to the image rotated by 180 degrees."""
         return self.principal_point_follows_orientation and tags.orientation == UPSIDE_DOWN
 
 
@@ -236,10 +243,12 @@ UPSIDE_DOWN = 3
 
 
 def rotated_180(point_px: Sequence[float], size_px: tuple[int, int]) -> tuple[float, float]:
-    """A position of an image (width, height) in the image rotated by 180 degrees, pixel centres at whole numbers."""
+    """Return a pixel (x, y) of an image (width, height) in the image rotated by 180 degrees; (0, 0) is the centre of
+    the top-left pixel.
+    """
     return size_px[0] - 1 - point_px[0], size_px[1] - 1 - point_px[1]
 
 
 def number_text(value: float) -> str:
-    """A number as tags hold it."""
+    """Return a number as text for a tag."""
     return f"{value:.10g}"

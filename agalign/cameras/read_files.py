@@ -1,4 +1,4 @@
-"""The tags and bands of many image files, read by one process or by several."""
+"""Reading the tags and bands of many image files, in one process or several."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,31 +19,31 @@ from agalign.values.process_pool import ProcessPool, WorkerDiedError
 from agalign.values.processes import follow_parent
 
 _FILES_PER_TASK = 100
-"""A file that kills its process takes the others of its task with it; smaller tasks cost more per file."""
+"""If a file crashes the process, the other files of its task are lost; smaller tasks take more time per file."""
 _MIN_FILES_FOR_PROCESSES = 1000
-"""Reading fewer takes less time than starting the processes."""
+"""Reading fewer files takes less time than starting processes."""
 _PHOTOGRAPH_CHANNELS = (3, 4)
 """RGB, or RGB with alpha."""
 
 
 @dataclass(frozen=True)
 class ImageFile:
-    """One image file with what its camera's tags say."""
+    """One image file with its tags and bands."""
 
     path: Path
     camera: Camera
     tags: Tags
     bands: tuple[Band, ...]
-    """Empty where the file holds no band that was asked for."""
+    """Empty if the file contains no band that takes part."""
 
     @property
     def is_whole_capture(self) -> bool:
-        """True for a file of several bands that each came through a lens of their own."""
+        """True for a file of several bands with a lens each."""
         return len(self.bands) > 1 and not self.bands[0].one_lens
 
 
 def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[ImageFile | Problem]:
-    """Each file with its bands, or why it cannot be used, in the order of `paths`."""
+    """Yield each file with its bands, or the reason why it cannot be used, in the order of `paths`."""
     tasks = [paths[i : i + _FILES_PER_TASK] for i in range(0, len(paths), _FILES_PER_TASK)]
     processes = min(options.jobs, len(tasks))
     if processes > 1 and len(paths) >= _MIN_FILES_FOR_PROCESSES:
@@ -54,10 +54,10 @@ def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[Imag
 
 
 def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> ImageFile:
-    """One file with its bands. Raises UnreadableFileError."""
+    """Return a file with its bands. Raises UnreadableFileError."""
     info = probe(path, options.max_pixels)
     tags = read_tags(path)
-    # Cameras write one band per file, or photographs: a stack is a product, whatever make its tags still name.
+    # A stack was made by software, even if its tags name a camera: cameras write single bands and photographs.
     *_, generic = cameras
     camera = generic if _is_stack(path, info) else next(c for c in cameras if c.recognises(tags))
     panel = panel_in(tags, (info.width_px, info.height_px))
@@ -68,19 +68,19 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
 def _read_in_processes(
     tasks: Sequence[Sequence[Path]], options: DiscoverOptions, processes: int
 ) -> Iterator[ImageFile | Problem]:
-    # Spawned, not forked: a fork would copy the locks that threads of the calling program hold.
+    # Not forked: a fork would copy locks that are held by threads of the calling program.
     read = partial(_read_task, options=options)
-    early: dict[int, list[ImageFile | Problem]] = {}
-    following = 0
+    finished: dict[int, list[ImageFile | Problem]] = {}
+    next_task = 0
     with ProcessPool(read, processes, get_context("spawn"), follow_parent) as pool:
         for outcome in pool.run(tasks):
             try:
-                early[outcome.number] = outcome.value()
+                finished[outcome.number] = outcome.value()
             except WorkerDiedError:
-                early[outcome.number] = [Problem(path, _killed(path)) for path in outcome.argument]
-            while following in early:
-                yield from early.pop(following)
-                following += 1
+                finished[outcome.number] = [Problem(path, _killed(path)) for path in outcome.argument]
+            while next_task in finished:
+                yield from finished.pop(next_task)
+                next_task += 1
 
 
 def _killed(path: Path) -> UnreadableFileError:
@@ -100,9 +100,10 @@ def _read_task(paths: Sequence[Path], options: DiscoverOptions) -> list[ImageFil
 
 
 def _without_impossible_values(band: Band) -> Band:
-    """The band without a radiometric calibration that no camera has: its tags are damaged."""
-    possible = band.radiometry is None or is_physical(band.radiometry, band.size_px)
-    return band if possible else replace(band, radiometry=None)
+    """The band, without a radiometric calibration whose values are impossible because of damaged tags."""
+    if band.radiometry is None or is_physical(band.radiometry, band.size_px):
+        return band
+    return replace(band, radiometry=None)
 
 
 def _is_stack(path: Path, info: RasterInfo) -> bool:

@@ -1,6 +1,6 @@
-"""The options and the result of a search for captures below a folder."""
+"""Options and result of the search for captures below a folder."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from agalign.errors import AgalignError
@@ -10,12 +10,12 @@ from agalign.values.choices import MAX_PIXELS, BandOrder
 
 @dataclass(frozen=True)
 class DiscoverOptions:
-    """What to look for."""
+    """Options of `discover`."""
 
     pattern: str | None = None
-    """File names as '{capture}_{band}.tif', for file names of no known scheme."""
+    """Pattern of file names, as '{capture}_{band}.tif', for naming schemes that agalign does not know."""
     reference: str | None = None
-    """Name of the reference band; None is the camera's default."""
+    """Name of the reference band; None for the default of the camera."""
     ignore_metadata: bool = False
     """Ignore lens and rig tags."""
     with_rgb: bool = False
@@ -23,13 +23,13 @@ class DiscoverOptions:
     bands: tuple[str, ...] = ()
     """Names of the bands to include; empty for all."""
     order: BandOrder = "index"
-    """Order of the bands in the stacks: as the camera counts them, by wavelength, or by name."""
-    skip: tuple[Path, ...] = field(default=())
-    """Folders to leave out, such as the output's."""
+    """Order of the bands in the stacks: as numbered by the camera, by wavelength, or by name."""
+    skip: tuple[Path, ...] = ()
+    """Folders to leave out, such as the output folder."""
     max_pixels: int = MAX_PIXELS
-    """Larger images are refused before their pixels are read."""
+    """Images with more pixels are refused before they are read."""
     jobs: int = 1
-    """Processes that read the files' tags where there are many files; the calling script must be importable then."""
+    """Processes that read the tags of many files; with more than one the calling script must be importable."""
     include: tuple[str, ...] = ()
     """Globs of the files to use, by path below the folder or by name; empty for all."""
     exclude: tuple[str, ...] = ()
@@ -38,14 +38,14 @@ class DiscoverOptions:
 
 @dataclass(frozen=True)
 class Problem:
-    """A file or capture that is left out, and why."""
+    """A file or capture that is left out, and the reason."""
 
     path: Path
     error: AgalignError
 
     @property
     def text(self) -> str:
-        """One line with the file and the remedy."""
+        """The message, one line with the file and the remedy."""
         return str(self.error)
 
 
@@ -59,7 +59,7 @@ class FolderScan:
 
     @property
     def eight_bit(self) -> tuple[Capture, ...]:
-        """The captures with a file per band and at most 256 levels in each band."""
+        """The captures with a file per band and 8 bits per pixel in each band."""
         return tuple(
             c for c in self.captures
             if len({b.path for b in c.bands}) > 1 and all(b.dtype == "uint8" for b in c.bands)

@@ -1,8 +1,8 @@
-"""Sentera 6X (a folder a band) and Double 4K (two folders of JPEGs with equal names).
+"""Sentera 6X (one folder per band) and Double 4K (two folders of JPEGs with equal names).
 
-6X files are registered on board by default, so that identity is tried as well as Sentera:AlignMatrix, a band -> colour
-camera matrix. The Double 4K's second camera has red edge in its red and near infra-red in its blue channel; the two
-expose 0.3 s apart, which makes an offset of hundreds of pixels.
+6X files are by default already registered by the camera, so that the identity is tried as well as Sentera:AlignMatrix,
+which maps a band to the colour camera. The second camera of the Double 4K has red edge in its red channel and near
+infrared in its blue channel; the two cameras expose 0.3 s apart, which causes an offset of hundreds of pixels.
 """
 
 import re
@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import BAND_NAME, CAMERA, CAPTURE_UUID, FLIGHT_UUID, perspective_lens, pose_of, spectral
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose
 
@@ -22,10 +22,9 @@ _ANY_BAND_FOLDER = re.compile(
     r"^(?:\d+-)?[A-Za-z ]+-\d{3,4}(?:-\d+)?$|^(?:\d+-)?(?:n?RGB|NDRE|NDVI|NIR|RE|LWIR)$", re.I
 )
 _CHANNELS = {"NDRE": {1: ("Red edge", 720.0), 3: ("NIR", 840.0)}, "NDVI": {1: ("Red", 625.0), 3: ("NIR", 850.0)}}
-"""Of the one-lens cameras: the channels that hold a band, with their centre wavelengths in nm."""
-
-
-_SPELT = {"RedEdge": "Red edge"}
+"""Bands of single-lens cameras by the filter: {channel, from 1: (name, centre wavelength in nm)}."""
+_BAND_NAMES = {"RedEdge": "Red edge"}
+"""Names in the tags that are written differently here."""
 _SENTERA = "sentera.com"
 
 
@@ -33,8 +32,8 @@ class Sentera(Camera):
     """Sentera 6X and Double 4K."""
 
     name = "Sentera"
-    capture_ids = (CAPTURE_UUID, (_SENTERA, "CaptureUUID"), (_SENTERA, "ImageUniqueID"))
-    flight_ids = (FLIGHT_UUID, (_SENTERA, "FlightUUID"), (_SENTERA, "FlightUniqueID"))
+    capture_ids = (pix4d.CAPTURE_UUID, (_SENTERA, "CaptureUUID"), (_SENTERA, "ImageUniqueID"))
+    flight_ids = (pix4d.FLIGHT_UUID, (_SENTERA, "FlightUUID"), (_SENTERA, "FlightUniqueID"))
 
     def recognises(self, tags: Tags) -> bool:
         return "sentera" in tags.make.lower() or any(namespace == _SENTERA for namespace, _ in tags.xmp)
@@ -45,15 +44,16 @@ class Sentera(Camera):
         matrix = tags.numbers(_SENTERA, "AlignMatrix")
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
         folder = _BAND_FOLDER.match(path.parent.name)
-        name = tags.text(*BAND_NAME) or (folder["name"] if folder else path.stem)
-        band = spectral(band_of(path, info, name), tags)
+        name = tags.text(*pix4d.BAND_NAME) or (folder["name"] if folder else path.stem)
+        band = pix4d.with_wavelength(band_of(path, info, name), tags)
         if folder and band.wavelength_nm is None:
             width = float(folder["width"]) if folder["width"] else None
             band = replace(band, wavelength_nm=float(folder["wavelength"]), bandwidth_nm=width)
-        return (replace(band, lens=perspective_lens(tags) if to_rig is None else None, to_rig=to_rig),)
+        return (replace(band, lens=pix4d.perspective_lens(tags) if to_rig is None else None, to_rig=to_rig),)
 
     def pose(self, tags: Tags) -> Pose | None:
-        return pose_of(tags, tags.number(_SENTERA, "AboveGroundAltitude") or tags.number(CAMERA, "AboveGroundAltitude"))
+        altitude = "AboveGroundAltitude"
+        return pix4d.pose_of(tags, tags.number(_SENTERA, altitude) or tags.number(pix4d.NAMESPACE, altitude))
 
     def capture_folder(self, path: Path) -> Path:
         return path.parent.parent if _ANY_BAND_FOLDER.match(path.parent.name) else path.parent
@@ -63,29 +63,29 @@ class Sentera(Camera):
 
 
 def _channel_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-    """The bands of a photograph by the filter that its folder or model names, else red, green and blue."""
-    kind = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), None)
-    if kind is None:
-        # The Double 4K's colour camera is one of its two, not a companion that is left out by default.
+    """The bands of a photograph by the filter in the name of its folder or model, else red, green and blue."""
+    bandpass = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), None)
+    if bandpass is None:
+        # The colour camera of the Double 4K takes part by default, that of the 6X does not.
         return tuple(replace(b, companion="6X" in tags.model.upper()) for b in colour_bands(path, info))
     return tuple(
         replace(band_of(path, info, name, index), wavelength_nm=wavelength, one_lens=True)
-        for index, (name, wavelength) in _CHANNELS[kind].items()
+        for index, (name, wavelength) in _CHANNELS[bandpass].items()
         if index <= len(info.dtypes)
     )
 
 
 def _listed_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-    """The bands of a photograph as its tags list them, channel by channel; one without a wavelength is not a band."""
-    names = tags.xmp.get(BAND_NAME, ())
-    wavelengths, widths = (tags.numbers(CAMERA, name) for name in ("CentralWavelength", "WavelengthFWHM"))
+    """The bands of a photograph as its tags list them by channel; a channel without a wavelength is left out."""
+    names = tags.xmp.get(pix4d.BAND_NAME, ())
+    wavelengths, widths = (tags.numbers(pix4d.NAMESPACE, name) for name in ("CentralWavelength", "WavelengthFWHM"))
     if not len(names) == len(wavelengths) == len(info.dtypes):
         return ()
-    lens = perspective_lens(tags)
+    lens = pix4d.perspective_lens(tags)
     return tuple(
         replace(
-            band_of(path, info, _SPELT.get(name, name), index), wavelength_nm=wavelength, one_lens=True, lens=lens,
-            bandwidth_nm=widths[index - 1] if len(widths) == len(names) else None,
+            band_of(path, info, _BAND_NAMES.get(name, name), index), wavelength_nm=wavelength, one_lens=True,
+            lens=lens, bandwidth_nm=widths[index - 1] if len(widths) == len(names) else None,
         )
         for index, (name, wavelength) in enumerate(zip(names, wavelengths, strict=True), start=1)
         if wavelength > 0

@@ -1,11 +1,13 @@
-"""The tags of a camera file that still hold for its band on the reference's grid: TIFF, Exif and GPS tags and the XMP
-packet, with the reference's geometry in place of the band's own, as photogrammetry software needs them.
+"""Tags for aligned files, as photogrammetry software needs them: TIFF, Exif and GPS tags and the XMP packet of the
+input file, with the lens and rig of the reference instead of the band's own.
 """
 
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+from PIL.ExifTags import Base
 
 from agalign.cameras import camera_of
 from agalign.cameras.metadata import read_tags
@@ -26,23 +28,27 @@ from agalign.errors import UnreadableFileError
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 
-_ORIENTATION = 274
-_BLACK_LEVEL = {50713, 50714}
-_OF_THE_FILE = {270, 271, 272, 305, 306, 315, 33432, 50735, 50827} | _BLACK_LEVEL
-"""Description, make, model, firmware, time, artist, copyright, serial number, original name, black level."""
-_OF_THE_CAPTURE = {271, 272, 306, 33432, 50735}
-_NOT_CARRIED = {37500, 40965}
-"""A maker's note holds places in the old file; the interoperability directory is one."""
-_DENSITIES = {41486, 41487}
-_GEOMETRIC_EXIF = _DENSITIES | {37386, 41488, 41989}
-_EXIF_SIZES = (40962, 40963)
-_EXIF_OF_THE_CAPTURE = _GEOMETRIC_EXIF | {36864, 36867, 36868, 36880, 36881, 36882, 37520, 37521, 37522, 42033, 42036}
-"""For a stack, with bands of different exposure: version, times, body and lens."""
+_BLACK_LEVEL: set[int] = {Base.BlackLevelRepeatDim, Base.BlackLevel}
+_CAPTURE_TAGS: set[int] = {Base.Make, Base.Model, Base.DateTime, Base.Copyright, Base.CameraSerialNumber}
+"""Tags of the first directory that are the same for all bands of a capture."""
+_FILE_TAGS = (
+    _CAPTURE_TAGS | _BLACK_LEVEL | {Base.ImageDescription, Base.Software, Base.Artist, Base.OriginalRawFileName}
+)
+_NOT_COPIED: set[int] = {Base.MakerNote, Base.ExifInteroperabilityOffset}
+"""Tags with offsets in the old file."""
+_DENSITIES: set[int] = {Base.FocalPlaneXResolution, Base.FocalPlaneYResolution}
+_GEOMETRIC_EXIF = _DENSITIES | {Base.FocalLength, Base.FocalPlaneResolutionUnit, Base.FocalLengthIn35mmFilm}
+_CAPTURE_EXIF = _GEOMETRIC_EXIF | {
+    Base.ExifVersion, Base.DateTimeOriginal, Base.DateTimeDigitized, Base.OffsetTime, Base.OffsetTimeOriginal,
+    Base.OffsetTimeDigitized, Base.SubsecTime, Base.SubsecTimeOriginal, Base.SubsecTimeDigitized, Base.BodySerialNumber,
+    Base.LensModel,
+}  # fmt: skip
+"""Exif tags for a stack: exposure differs between its bands."""
 
 
 @dataclass(frozen=True)
 class TransferredTags:
-    """Entries for an aligned file."""
+    """Entries for the first, the Exif and the GPS directory of an aligned file."""
 
     first: Directory
     exif: Directory
@@ -50,26 +56,25 @@ class TransferredTags:
 
 
 def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
-    """For a stack: what is true of all bands of a capture."""
+    """Return the tags for a stack: those that apply to all bands of a capture."""
     source = _directories(reference.path)
-    first = _some(source[0], _OF_THE_CAPTURE | {_ORIENTATION})
-    return TransferredTags(first, _on_grid(_some(source[EXIF], _EXIF_OF_THE_CAPTURE), source[EXIF], grid), source[GPS])
+    first = _some(source[0], _CAPTURE_TAGS | {Base.Orientation})
+    return TransferredTags(first, _on_grid(_some(source[EXIF], _CAPTURE_EXIF), source[EXIF], grid), source[GPS])
 
 
 def band_tags(
     source: Path, reference: Band, grid: OutputGrid, from_source: FromSource, *, radiometry: bool = False
 ) -> TransferredTags:
-    """For a file with aligned bands from `source`.
+    """Return the tags for a file with aligned bands from the file `source`.
 
-    With `radiometry` black level, vignetting and exposure have been taken out of the pixels.
+    With `radiometry` the pixels are corrected for black level, vignetting and exposure, and their tags are left out.
     """
     own, of_reference = _directories(source), _directories(reference.path)
-    first = _some(own[0], _OF_THE_FILE - _BLACK_LEVEL if radiometry else _OF_THE_FILE)
-    first |= _some(of_reference[0], {_ORIENTATION})
-    exif = {tag: entry for tag, entry in own[EXIF].items() if tag not in _NOT_CARRIED | _GEOMETRIC_EXIF}
-    packet = Packet.parse(own[0][XMP].data if XMP in own[0] else b"")
+    first = _some(own[0], _FILE_TAGS - _BLACK_LEVEL if radiometry else _FILE_TAGS)
+    first |= _some(of_reference[0], {Base.Orientation})
+    exif = {tag: entry for tag, entry in own[EXIF].items() if tag not in _NOT_COPIED | _GEOMETRIC_EXIF}
+    packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
     with suppress(UnreadableFileError):
-        reference_packet = Packet.parse(of_reference[0][XMP].data if XMP in of_reference[0] else b"")
         reference_tags, own_tags = read_tags(reference.path), read_tags(source)
         transfer = camera_of(reference_tags).tag_transfer
         transfer.put_geometry(packet, reference_packet, reference, reference_tags, grid)
@@ -81,10 +86,10 @@ def band_tags(
 
 
 def _directories(path: Path) -> dict[int, Directory]:
-    """A file's directories; empty ones where they are damaged, because its pixels may still be good."""
+    """The directories of a file; empty if they are damaged, because the pixels may still be good."""
     try:
         return read_directories(path)
-    except Exception:  # a damaged file makes a reader fail in any way
+    except Exception:  # a damaged file causes any exception
         return {0: {}, EXIF: {}, GPS: {}}
 
 
@@ -93,12 +98,12 @@ def _some(directory: Directory, tags: Iterable[int]) -> Directory:
 
 
 def _on_grid(exif: Directory, reference: Directory, grid: OutputGrid) -> Directory:
-    """With the reference's focal length and pixel density, and the size that is written."""
+    """The Exif directory with the focal length and pixel density of the reference, and the size of the output."""
     result = exif | _some(reference, _GEOMETRIC_EXIF)
     for tag in _DENSITIES & result.keys() if grid.scale.mean != 1 else ():
         density = number(result[tag])
         if density is not None and density > 0:
-            with suppress(ValueError):  # a density that no camera has
+            with suppress(ValueError):  # too large for a fraction: a damaged tag
                 result[tag] = rational(grid.scale.mean * density)
-    sizes = zip(_EXIF_SIZES, (grid.width, grid.height), strict=True)
-    return result | {tag: long(size) for tag, size in sizes if tag in result}
+    sizes = {Base.ExifImageWidth: grid.width, Base.ExifImageHeight: grid.height}
+    return result | {tag: long(size) for tag, size in sizes.items() if tag in result}

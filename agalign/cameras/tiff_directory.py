@@ -1,5 +1,5 @@
-"""The directories of a TIFF, entry by entry: what rasterio and tifffile do not write, Exif and GPS, is added to a
-finished file. Classic TIFF and BigTIFF, TIFF 6.0 and the EXIF specification.
+"""Reading the directories of a TIFF, and adding Exif and GPS directories, which rasterio and tifffile do not write, to
+a finished file. Classic TIFF and BigTIFF in either byte order, by TIFF 6.0 and the EXIF specification.
 """
 
 import struct
@@ -10,31 +10,38 @@ from pathlib import Path
 from typing import BinaryIO
 
 from PIL import Image
+from tifffile import DATATYPE
 
 EXIF, GPS = 34665, 34853
 """Tags with the offset of a directory as value."""
 XMP = 700
-_SIZE = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+_NUMBERS: dict[int, str] = {
+    DATATYPE.SHORT: "H", DATATYPE.LONG: "I", DATATYPE.RATIONAL: "II", DATATYPE.SSHORT: "h", DATATYPE.SLONG: "i",
+    DATATYPE.SRATIONAL: "ii", DATATYPE.FLOAT: "f", DATATYPE.DOUBLE: "d",
+}  # fmt: skip
+_FORMATS: dict[int, str] = {
+    **_NUMBERS, DATATYPE.BYTE: "B", DATATYPE.ASCII: "B", DATATYPE.SBYTE: "b", DATATYPE.UNDEFINED: "B",
+    DATATYPE.IFD: "I", DATATYPE.LONG8: "Q", DATATYPE.SLONG8: "q", DATATYPE.IFD8: "Q",
+}  # fmt: skip
+"""A value of each type as the module `struct` describes it; a rational is two numbers."""
+_SIZE = {kind: struct.calcsize(f"<{numbers}") for kind, numbers in _FORMATS.items()}
 """Bytes of a value of each type."""
-_NUMBER_SIZE = {**_SIZE, 5: 4, 10: 4}
-"""Bytes of the numbers to swap: a rational is two numbers."""
-_RATIONAL, _SIGNED_RATIONAL = 5, 10
 _MAX_BYTES = 1 << 25
-"""Of the tags of one file: cameras write a few thousand. Its pixels are elsewhere."""
+"""Limit of all tags of a file, without the pixels: cameras write a few thousand bytes."""
 _MAX_ENTRIES = 4096
-"""Of a directory: cameras write fewer than 100; a damaged count must not be followed."""
+"""Limit of the number of entries in a directory, which may be damaged: cameras write fewer than 100."""
 _MAX_LONG = (1 << 32) - 1
 _MILLION = 1_000_000
 _MAX_MILLIONTHS = 4000
-"""Values below fit into 32 bits as millionths."""
+"""Values below this are written as millionths, whose numerators fit into 32 bits."""
 _HEADER_BYTES, _BIG_HEADER_BYTES = 8, 16
 _TIFF, _BIG_TIFF = 42, 43
-"""Version numbers."""
+"""Version numbers in the header."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A tag's value: its TIFF type, how many there are, and their bytes, little-endian."""
+    """The values of a tag: their TIFF type, their number, and their bytes, little-endian."""
 
     type: int
     count: int
@@ -42,53 +49,54 @@ class Entry:
 
 
 Directory = dict[int, Entry]
+"""The entries by tag."""
 
 
 def short(*values: int) -> Entry:
-    """16-bit numbers."""
-    return Entry(3, len(values), struct.pack(f"<{len(values)}H", *values))
+    """Return an entry of 16-bit integers."""
+    return Entry(DATATYPE.SHORT, len(values), struct.pack(f"<{len(values)}H", *values))
 
 
 def long(*values: int) -> Entry:
-    """32-bit numbers."""
-    return Entry(4, len(values), struct.pack(f"<{len(values)}I", *values))
+    """Return an entry of 32-bit integers."""
+    return Entry(DATATYPE.LONG, len(values), struct.pack(f"<{len(values)}I", *values))
 
 
 def text(value: str) -> Entry:
-    """A text; other characters than ASCII are written as UTF-8, which most readers expect."""
+    """Return an entry of text; characters beyond ASCII are written as UTF-8, which most readers expect."""
     data = value.encode() + b"\0"
-    return Entry(2, len(data), data)
+    return Entry(DATATYPE.ASCII, len(data), data)
 
 
-def byte_string(value: bytes, kind: int = 1) -> Entry:
-    """Bytes; `kind` is 1 for BYTE or 7 for UNDEFINED."""
+def byte_string(value: bytes, kind: int = DATATYPE.BYTE) -> Entry:
+    """Return an entry of bytes of the type BYTE or UNDEFINED."""
     return Entry(kind, len(value), value)
 
 
 def rational(*values: float) -> Entry:
-    """Fractions, of millionths where they fit into 32 bits. Raises ValueError for values that do not fit."""
+    """Return an entry of unsigned fractions. Raises ValueError for values that do not fit."""
     pairs = b""
     for value in values:
         if not 0 <= value < _MAX_LONG:
             raise ValueError(f"{value} does not fit into a TIFF fraction")
         denominator = _MILLION if value < _MAX_MILLIONTHS else max(1, int(_MAX_LONG / (value + 1)))
         pairs += struct.pack("<II", round(value * denominator), denominator)
-    return Entry(_RATIONAL, len(values), pairs)
+    return Entry(DATATYPE.RATIONAL, len(values), pairs)
 
 
 def number(entry: Entry) -> float | None:
-    """The first value of an entry of numbers; None for other entries and for a denominator of 0."""
-    formats = {3: "<H", 4: "<I", 8: "<h", 9: "<i", 11: "<f", 12: "<d"}
-    if entry.type in (_RATIONAL, _SIGNED_RATIONAL):
-        numerator, denominator = struct.unpack_from("<II" if entry.type == _RATIONAL else "<ii", entry.data)
-        return numerator / denominator if denominator else None
-    return float(struct.unpack_from(formats[entry.type], entry.data)[0]) if entry.type in formats else None
+    """Return the first value of an entry of numbers; None for other types and for a denominator of 0."""
+    if entry.type not in _NUMBERS:
+        return None
+    numerator, *rest = struct.unpack_from(f"<{_FORMATS[entry.type]}", entry.data)
+    denominator = rest[0] if rest else 1
+    return float(numerator / denominator) if denominator else None
 
 
 def read_directories(path: Path) -> dict[int, Directory]:
-    """{0: the first directory, EXIF: …, GPS: …} of a TIFF, or of the Exif part of a JPEG, with its XMP.
+    """Return {0: the first directory, EXIF: …, GPS: …} of a TIFF, or of the Exif part of a JPEG, with its XMP packet.
 
-    Raises ValueError where the file is malformed, OSError where it cannot be read.
+    Raises ValueError if the file is malformed, OSError if it cannot be read.
     """
     with path.open("rb") as file:
         if file.read(2) != b"\xff\xd8":
@@ -102,7 +110,7 @@ def read_directories(path: Path) -> dict[int, Directory]:
 
 
 def check_directories(path: Path) -> None:
-    """Raises ValueError where a TIFF is malformed or its tags declare more bytes than any camera writes."""
+    """Raise ValueError if a TIFF is malformed or its tags declare more bytes than any camera writes."""
     with path.open("rb") as file:
         layout, at, _ = _header(file)
         first = _entries(file, layout, at)[0]
@@ -116,9 +124,9 @@ def check_directories(path: Path) -> None:
 
 
 def add_directories(path: Path, first: Mapping[int, Entry], exif: Directory, gps: Directory) -> None:
-    """Give a finished TIFF these entries in its first directory, and these Exif and GPS directories.
+    """Add entries to the first directory of a finished TIFF, and Exif and GPS directories, in place.
 
-    The first directory is rewritten at the end of the file; pixels stay where they are.
+    The first directory is written again at the end of the file; the pixels are not moved.
     """
     with path.open("r+b") as file:
         layout, at, pointer_at = _header(file)
@@ -132,27 +140,25 @@ def add_directories(path: Path, first: Mapping[int, Entry], exif: Directory, gps
         file.write(struct.pack(layout.order + layout.offset, start))
 
 
-# ---- within
-
-
 @dataclass(frozen=True)
 class _Layout:
-    """How a file writes numbers: classic TIFF or BigTIFF, in either byte order."""
+    """Number formats of a file, as in the module `struct`: classic TIFF or BigTIFF, in either byte order."""
 
     order: str
     offset: str
-    """Format of an offset, and of a value's count."""
+    """Format of an offset, and of the number of values of an entry."""
     entries: str
-    """Format of a directory's number of entries."""
+    """Format of the number of entries of a directory."""
 
     @property
     def inline_bytes(self) -> int:
-        """Values up to this length are stored in the entry itself."""
+        """Length up to which values are stored in the entry itself."""
         return struct.calcsize(self.offset)
 
-    def pointer(self, place: int) -> Entry:
-        """The place of a directory as a tag's value: LONG, or LONG8 in a BigTIFF."""
-        return Entry(16 if self.offset == "Q" else 4, 1, struct.pack("<" + self.offset, place))
+    def pointer(self, offset: int) -> Entry:
+        """Return the offset of a directory as a tag's value: LONG, or LONG8 in a BigTIFF."""
+        kind = DATATYPE.LONG8 if self.offset == "Q" else DATATYPE.LONG
+        return Entry(kind, 1, struct.pack("<" + self.offset, offset))
 
 
 def _read_all(file: BinaryIO) -> dict[int, Directory]:
@@ -167,7 +173,7 @@ def _read_all(file: BinaryIO) -> dict[int, Directory]:
 
 
 def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
-    """(layout, where the first directory is, where that is written)."""
+    """(layout, offset of the first directory, position of that offset in the file)."""
     file.seek(0)
     head = file.read(_BIG_HEADER_BYTES)
     order = {b"II": "<", b"MM": ">"}.get(head[:2])
@@ -182,23 +188,23 @@ def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
 
 
 def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory, int]:
-    """(entries, where the next directory is)."""
+    """(entries, offset of the next directory); entries beyond the limit of all tags are left out."""
     entries, following = _entries(file, layout, at)
     result: Directory = {}
-    left = _MAX_BYTES
-    for tag, kind, number, length, value in entries:
-        if length == 0 or length > left:
+    remaining_bytes = _MAX_BYTES
+    for tag, kind, count, length, value in entries:
+        if length == 0 or length > remaining_bytes:
             continue
-        left -= length
+        remaining_bytes -= length
         if length > layout.inline_bytes:
             file.seek(struct.unpack(layout.order + layout.offset, value)[0])
             value = _exactly(file, length)
-        result[tag] = Entry(kind, number, _swapped(value[:length], kind, layout.order))
+        result[tag] = Entry(kind, count, _swapped(value[:length], kind, layout.order))
     return result, following
 
 
 def _entries(file: BinaryIO, layout: _Layout, at: int) -> tuple[list[tuple[int, int, int, int, bytes]], int]:
-    """((tag, type, count, length in bytes, the value or its place) of each entry, where the next directory is)."""
+    """((tag, type, count, length in bytes, value or its offset) of each entry, offset of the next directory)."""
     entry_format = f"{layout.order}HH{layout.offset}"
     fixed = struct.calcsize(entry_format)
     file.seek(at)
@@ -216,29 +222,29 @@ def _entries(file: BinaryIO, layout: _Layout, at: int) -> tuple[list[tuple[int, 
 
 
 def _write_directory(file: BinaryIO, layout: _Layout, entries: Directory, following: int) -> int:
-    """Append a directory, values first, and return where it is."""
+    """Append a directory, values first, and return its offset."""
     packed = []
     for tag, entry in sorted(entries.items()):
         value = _swapped(entry.data, entry.type, layout.order)
         if len(value) > layout.inline_bytes:
             value = struct.pack(layout.order + layout.offset, _append(file, value))
-        place = struct.pack(f"{layout.order}HH{layout.offset}", tag, entry.type, entry.count)
-        packed.append(place + value.ljust(layout.inline_bytes, b"\0"))
+        head = struct.pack(f"{layout.order}HH{layout.offset}", tag, entry.type, entry.count)
+        packed.append(head + value.ljust(layout.inline_bytes, b"\0"))
     count = struct.pack(layout.order + layout.entries, len(packed))
     return _append(file, count + b"".join(packed) + struct.pack(layout.order + layout.offset, following))
 
 
 def _append(file: BinaryIO, data: bytes) -> int:
-    """Write at the file's end, on an even place as the specification wants it; returns the place."""
+    """Append data at an even offset, which the specification requires, and return the offset."""
     end = file.seek(0, 2)
-    place = end + file.write(b"\0" * (end % 2))
+    offset = end + file.write(b"\0" * (end % 2))
     file.write(data)
-    return place
+    return offset
 
 
 def _swapped(value: bytes, kind: int, order: str) -> bytes:
     """A value converted between little-endian and a file's byte order."""
-    size = _NUMBER_SIZE[kind]
+    size = struct.calcsize(f"<{_FORMATS[kind][0]}")
     if order == "<" or size == 1:
         return value
     return b"".join(value[i : i + size][::-1] for i in range(0, len(value), size))

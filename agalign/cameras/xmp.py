@@ -1,4 +1,4 @@
-"""XMP packets: values by namespace, in whatever form a camera wrote them, and changes to them."""
+"""XMP packets: reading and changing values by namespace, in any of the forms that cameras write."""
 
 import re
 import threading
@@ -17,16 +17,16 @@ from defusedxml.ElementTree import fromstring
 from agalign.values.text import without_controls
 
 Name = tuple[str, str]
-"""(namespace, name). A namespace is a domain, such as `micasense.com`, or a place in it, such as `micasense.com/DLS`:
-its URI without scheme, `www.`, version and closing slash, which firmware changes.
+"""(namespace, name). A namespace is its URI without scheme, `www.`, version and final slash, which differ between
+versions of firmware: `micasense.com/DLS`, or only the start of its path, `micasense.com`.
 """
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 _MAX_NAMESPACE_DEPTH = 4
-"""Parts of a namespace's path that a tag can be found by; cameras write at most three."""
+"""Parts of a namespace that are used; cameras write at most three."""
 _MAX_DEPTH = 50
-"""Of nested elements; cameras write six."""
+"""Limit of nested elements, which protects the recursive XML library; cameras write six."""
 _MAX_LENGTH = 1 << 22
-"""Characters of a packet; cameras write a few thousand."""
+"""Limit of the characters of a packet; cameras write a few thousand."""
 _NAMESPACES = threading.Lock()
 _SCHEME_AND_VERSION = re.compile(r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$", re.IGNORECASE)
 _PREFIX = re.compile(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""")
@@ -38,11 +38,11 @@ class Packet:
 
     root: Element | None = None
     prefixes: tuple[tuple[str, str], ...] = ()
-    """(prefix, namespace) as it came with them."""
+    """(prefix, namespace URI) as they were read."""
 
     @classmethod
     def parse(cls, packet: Any) -> "Packet":
-        """From bytes or text. A malformed packet is an empty one: cameras do write them, and the images are good."""
+        """Parse bytes or text. A malformed packet becomes an empty one, because the image may still be good."""
         text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
         if not isinstance(text, str) or len(text) > _MAX_LENGTH:
             return cls()
@@ -59,8 +59,9 @@ class Packet:
         return cls(root, tuple(p for p in _PREFIX.findall(text) if not re.fullmatch(r"ns\d+", p[0])))
 
     def values(self) -> dict[Name, tuple[str, ...]]:
-        """{(namespace, name): values} from all rdf:Description blocks; the first of two counts. A value has a key for
-        its own namespace and one for each namespace that contains it.
+        """Return {(namespace, name): values} of all rdf:Description elements; the first of two values is used.
+
+        A value has a key for its namespace and one for each start of its path.
         """
         result: dict[Name, tuple[str, ...]] = {}
         for description in self._descriptions():
@@ -72,7 +73,7 @@ class Packet:
         return result
 
     def remove(self, names: Collection[Name]) -> None:
-        """Take values out."""
+        """Remove values."""
         for description in self._descriptions():
             for tag in [t for t in description.attrib if _is_one_of(t, names)]:
                 del description.attrib[tag]
@@ -80,7 +81,7 @@ class Packet:
                 description.remove(child)
 
     def take(self, other: "Packet", names: Collection[Name]) -> None:
-        """Have another packet's values of these names, or none where it has none."""
+        """Replace the values with these names by those of another packet, which may have none."""
         self.remove(names)
         mine = next(self._descriptions(), None)
         if mine is None:
@@ -90,7 +91,7 @@ class Packet:
             mine.extend(deepcopy(child) for child in description if _is_one_of(child.tag, names))
 
     def put(self, name: Name, values: Sequence[str]) -> None:
-        """Change a value that is there, in the form in which it is there."""
+        """Change an existing value, in its existing form: attribute, element or sequence."""
         for description in self._descriptions():
             for tag in [t for t in description.attrib if _is_one_of(t, [name])]:
                 description.attrib[tag] = ",".join(values)
@@ -98,7 +99,7 @@ class Packet:
                 _put_texts(child, values)
 
     def add(self, name: Name, value: str) -> None:
-        """Give it a value that it does not have, in a namespace in which it has others."""
+        """Add or replace a value, in a namespace that the packet already uses; else nothing is changed."""
         self.remove([name])
         for description in self._descriptions():
             for tag in [*description.attrib, *(child.tag for child in description)]:
@@ -108,7 +109,7 @@ class Packet:
                     return
 
     def serialised(self) -> bytes:
-        """The bytes of the packet as a file holds them; empty for an empty packet."""
+        """Return the bytes of the packet for a file; empty for an empty packet."""
         if self.root is None:
             return b""
         with _registered(self.prefixes):
@@ -122,24 +123,24 @@ class Packet:
 
 @contextmanager
 def _registered(prefixes: Sequence[tuple[str, str]]) -> Iterator[None]:
-    """Write namespaces under the prefixes they were read with. The library keeps one list of prefixes for the whole
-    process, so it is restored afterwards: one file's prefixes must not reach another file.
+    """Serialise with these prefixes. ElementTree has one global table of prefixes, which is restored afterwards so that
+    the prefixes of one file are not used for another.
     """
-    prefixes_of_the_process: dict[str, str] = vars(ElementTree)["_namespace_map"]
+    table: dict[str, str] = vars(ElementTree)["_namespace_map"]
     with _NAMESPACES:
-        before = dict(prefixes_of_the_process)
+        before = dict(table)
         try:
             for prefix, uri in prefixes:
                 ElementTree.register_namespace(prefix, uri)
             yield
         finally:
-            prefixes_of_the_process.clear()
-            prefixes_of_the_process.update(before)
+            table.clear()
+            table.update(before)
 
 
-def _is_deeper(root: Element, deepest: int) -> bool:
+def _is_deeper(root: Element, depth: int) -> bool:
     level = [root]
-    for _ in range(deepest):
+    for _ in range(depth):
         level = [child for element in level for child in element]
     return bool(level)
 
@@ -150,7 +151,7 @@ def _texts(element: Element) -> tuple[str, ...]:
 
 
 def _put_texts(element: Element, values: Sequence[str]) -> None:
-    """Into an element's items where it has as many, else joined by commas into one text."""
+    """Set the items of a sequence if their number agrees, else one text with the values joined by commas."""
     items = list(element.iter(f"{_RDF}li"))
     if items and len(items) == len(values):
         for item, value in zip(items, values, strict=True):
@@ -159,9 +160,9 @@ def _put_texts(element: Element, values: Sequence[str]) -> None:
         (items[0] if items else element).text = ",".join(values)
 
 
-@lru_cache(maxsize=4096)  # a thousand captures of one camera have the same few tags
+@lru_cache(maxsize=4096)  # all files of a camera have the same tags
 def _names(tag: str) -> tuple[Name, ...]:
-    """A tag's name in its namespace and in those that contain it; none for RDF's own namespaces and for none."""
+    """The keys of an XML tag '{uri}name'; none for RDF's own namespaces and without a namespace."""
     uri, _, name = tag.removeprefix("{").rpartition("}")
     return tuple((namespace, name) for namespace in _namespaces(uri))
 
@@ -173,6 +174,6 @@ def _is_one_of(tag: str, names: Collection[Name]) -> bool:
 def _namespaces(uri: str) -> list[str]:
     if uri.startswith("http://www.w3.org/"):
         return []
-    place = _SCHEME_AND_VERSION.sub("", uri)
-    parts = place.split("/")[:_MAX_NAMESPACE_DEPTH]
-    return ["/".join(parts[:count]) for count in range(len(parts), 0, -1)] if place else []
+    path = _SCHEME_AND_VERSION.sub("", uri)
+    parts = path.split("/")[:_MAX_NAMESPACE_DEPTH]
+    return ["/".join(parts[:count]) for count in range(len(parts), 0, -1)] if path else []

@@ -32,7 +32,7 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     are the file's own, with its nodata value as `_FillValue`: differences of unsigned integers wrap around.
     Bands without pixels are left out. A capture with a relief has the variables `parallax` (px along a
     baseline of length 1, positive nearer) and, where they were asked for, `confidence` and `range` (m).
-    Raises SidecarError, UnreadableFileError, and ConfigurationError where xarray is not installed.
+    Raises SidecarError, UnreadableFileError, and ConfigurationError if xarray is not installed.
     """
     import_xarray()
     given = Path(path)
@@ -45,7 +45,7 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
 
     Coordinates of `capture` are its label, and `time`, `latitude`, `longitude` and `altitude_m` as far as the camera
     wrote them; `status` (capture, band) is that of each band in each capture. Bands are those that all captures have.
-    Raises InputError where there is no run or its captures differ in size (write with crop 'flight'), and what
+    Raises InputError if there is no run or its captures differ in size (write with crop 'flight'), and what
     `open_capture` raises.
     """
     xr = import_xarray()
@@ -91,7 +91,7 @@ def _coordinate(sidecar: Sidecar, name: str) -> float:
 
 
 def import_xarray() -> Any:
-    """Raises ConfigurationError where it is not installed."""
+    """Raises ConfigurationError if it is not installed."""
     try:
         import dask.array  # noqa: F401
         import rioxarray  # noqa: F401

@@ -28,7 +28,7 @@ _HEIGHT_ERROR_M, _ASSUMED_HEIGHT_ERROR = 5.0, 0.5
 def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
     """Return a closed ring (5, 2) of longitudes and latitudes around the pixels of a grid, degrees.
 
-    None where neither a georeference nor the camera's pose is known.
+    None if neither a georeference nor the camera's pose is known.
     """
     x0, y0 = grid.x0, grid.y0
     x1, y1 = x0 + grid.width, y0 + grid.height
@@ -48,7 +48,7 @@ def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
 def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Project pixels of the reference (n, 2) onto a horizontal plane: (n, 2) metres east and north of the camera.
 
-    None where height, heading or focal length is unknown, or the camera looks too far aside.
+    None if height, heading or focal length is unknown, or the camera looks too far aside.
     """
     pose = capture.pose
     if pose is None or pose.height_m is None or pose.focal_length_px is None:
@@ -112,7 +112,7 @@ def with_approximate_georeference(capture: Capture) -> Capture:
 
 def accuracy_of_footprint_m(capture: Capture) -> float | None:
     """Return the expected error (1 sigma, metres) of the farthest corner of a footprint that `ground_m` gives: of the
-    camera's position, heading, tilt and height. None where `ground_m` gives none.
+    camera's position, heading, tilt and height. None if `ground_m` gives none.
     """
     width, height = capture.reference.size_px
     offsets_m = ground_m(capture, np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width, height], [-0.5, height]]))

@@ -113,7 +113,7 @@ def index_of_formula(text: str) -> Index:
 
 
 def _catalogue() -> Mapping[str, Any]:
-    """The indices of spyndex by name in lower case; empty where it is not installed. Its code is not executed."""
+    """The indices of spyndex by name in lower case; empty if it is not installed. Its code is not executed."""
     return {name.lower(): entry for name, entry in _data_of_spyndex(_CATALOGUE, "SpectralIndices").items()}
 
 
@@ -138,7 +138,7 @@ def _of_catalogue(name: str, entry: Mapping[str, Any]) -> Index:
 
 
 def _check_bands(index: Index) -> None:
-    """Raise ConfigurationError where the formula has no band, or has other names than those of bands."""
+    """Raise ConfigurationError if the formula has no band, or has other names than those of bands."""
     unknown = [s for s in index.symbols if s.upper() not in _LETTERS]
     if unknown or not index.symbols:
         used = ", ".join(unknown) or "no band"

@@ -27,7 +27,7 @@ class Layer:
     """One band of the output: where its pixels come from.
 
     `mapping` leads from the written pixels, before they are cut, to raw pixels of the file. The reference has none
-    where its own pixels are copied, and a moving band has none where there is nothing to write.
+    where its own pixels are copied, and a moving band has none if there is nothing to write.
     """
 
     band: Band

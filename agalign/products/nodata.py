@@ -25,7 +25,7 @@ _MAX_VALUES_TRIED = 1 << 16
 def nodata_value(
     capture: Capture, layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any], settings: WriteSettings
 ) -> float | None:
-    """Return the value that a file of these layers declares; None where every pixel holds a measurement."""
+    """Return the value that a file of these layers declares; None if every pixel holds a measurement."""
     if settings.radiometry != "off":
         return math.nan
     declared = capture.reference.nodata

@@ -52,7 +52,7 @@ class ReliefView:
     parallax_px: NDArray[np.float32]
     """(height, width)"""
     range_m: tuple[float, float] | None
-    """Nearest and farthest; None where the range is unknown."""
+    """Nearest and farthest; None if the range is unknown."""
 
     @property
     def limits_px(self) -> tuple[float, float]:
@@ -88,7 +88,7 @@ class Preview(Product):
 
 
 def relief_view(context: ProductContext) -> ReliefView | None:
-    """Return the relief of a capture as the preview has it; None where none displaces a band."""
+    """Return the relief of a capture as the preview has it; None if none displaces a band."""
     relief = relief_of(context.usable)
     if relief is None:
         return None

@@ -134,7 +134,7 @@ class Product(ABC):
         return True
 
     def check(self, capture: Capture) -> None:  # noqa: B027
-        """Raise an AgalignError where the capture or the installation lacks what it needs.
+        """Raise an AgalignError if the capture or the installation lacks what it needs.
 
         It is called before the capture is aligned, and only where the product is enabled.
         """
@@ -145,7 +145,7 @@ class Product(ABC):
 
     @abstractmethod
     def write(self, context: ProductContext) -> list[WrittenFile]:
-        """Write its files, each atomically, and return them; none where nothing can be made.
+        """Write its files, each atomically, and return them; none if nothing can be made.
 
         Raises OutputError, or UnreadableFileError for an input.
         """

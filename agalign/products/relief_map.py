@@ -49,7 +49,7 @@ class ReliefMap(Product):
 
 
 def relief_of(alignments: Mapping[str, Alignment[FixedFilePx]]) -> Relief | None:
-    """The relief that displaces the bands of a capture; None where none does."""
+    """The relief that displaces the bands of a capture; None if none does."""
     return next((a.parallax.relief for a in alignments.values() if a.parallax is not None), None)
 
 

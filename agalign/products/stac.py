@@ -49,7 +49,7 @@ class StacItem(Product):
         return settings.stac
 
     def check(self, capture: Capture) -> None:  # noqa: ARG002
-        """Raise ConfigurationError where the library is not installed."""
+        """Raise ConfigurationError if the library is not installed."""
         need_stac()
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
@@ -63,7 +63,7 @@ class StacItem(Product):
 
 
 def need_stac() -> None:
-    """Raise ConfigurationError where the library is not installed."""
+    """Raise ConfigurationError if the library is not installed."""
     try:
         import pystac  # noqa: F401
     except ImportError:
@@ -223,7 +223,7 @@ def _um(length_nm: float | None) -> float | None:
 
 
 def _common_name(band: Band, capture: Capture) -> str | None:
-    """The common name of the electro-optical extension; None where it has none for the band."""
+    """The common name of the electro-optical extension; None if it has none for the band."""
     if is_thermal(band):
         return "lwir11"
     if band in panchromatic(capture) and not band.companion:

@@ -9,7 +9,7 @@ from agalign.cameras.generic import Generic
 from agalign.cameras.mapir import Mapir
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
-from agalign.cameras.pix4d import CAMERA
+from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import RasterInfo, probe
 from agalign.synthetic import cameras, rig
@@ -60,7 +60,7 @@ INFO = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
 
 def tags(**camera: str) -> Tags:
     exif = {"FocalPlaneXResolution": (266666667, 1000000), "FocalPlaneResolutionUnit": 4, "FocalLength": (55, 10)}
-    return Tags(make="MicaSense", xmp={(CAMERA, k): (v,) for k, v in camera.items()}, exif=exif)
+    return Tags(make="MicaSense", xmp={(NAMESPACE, k): (v,) for k, v in camera.items()}, exif=exif)
 
 
 def test_focal_length_of_old_firmware_is_in_pixels() -> None:
@@ -94,7 +94,7 @@ def test_without_a_lens_there_is_no_rig_seed() -> None:
         (Tags(xmp={(MICASENSE, "CaptureId"): ("a",)}), "MicaSense"),
         (Tags(make="DJI"), "DJI"),
         (Tags(make="Parrot"), "Parrot Sequoia"),
-        (Tags(xmp={(CAMERA, "RigName"): ("Sequoia",)}), "Parrot Sequoia"),
+        (Tags(xmp={(NAMESPACE, "RigName"): ("Sequoia",)}), "Parrot Sequoia"),
         (Tags(make="Sentera"), "Sentera"),
         (Tags(xmp={(SENTERA, "AlignMatrix"): ("1",)}), "Sentera"),
         (Tags(make="MAPIR"), "MAPIR"),

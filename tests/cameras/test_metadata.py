@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from agalign.cameras.metadata import Tags, rational, read_tags
-from agalign.cameras.pix4d import CAMERA
+from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.xmp import Packet
 from agalign.errors import UnreadableFileError
 
@@ -29,20 +29,20 @@ def packet(body: str, camera: str = "http://pix4d.com/camera/1.0") -> bytes:
     ],
 )
 def test_a_value_may_be_attribute_element_sequence_or_bag(body: str) -> None:
-    assert Tags(xmp=Packet.parse(packet(body)).values()).numbers(CAMERA, "PrincipalPoint") == (2.4, 1.8)
+    assert Tags(xmp=Packet.parse(packet(body)).values()).numbers(NAMESPACE, "PrincipalPoint") == (2.4, 1.8)
 
 
 @pytest.mark.parametrize("uri", ["http://pix4d.com/camera/1.0/", "http://pix4d.com/1.0", "http://www.pix4d.com/camera"])
 def test_namespaces_are_places_whatever_their_version_and_slash(uri: str) -> None:
     values = Packet.parse(packet('<rdf:Description Camera:BandName="Red"/>', uri)).values()
-    assert values[CAMERA, "BandName"] == ("Red",)
+    assert values[NAMESPACE, "BandName"] == ("Red",)
 
 
 def test_the_same_name_in_another_namespace_is_another_tag() -> None:
     tags = Tags(xmp=Packet.parse(packet('<rdf:Description other:Yaw="1"/>')).values())
     assert tags.number("example.org/other", "Yaw") == 1
     assert tags.number("example.org", "Yaw") == 1
-    assert tags.number(CAMERA, "Yaw") is None
+    assert tags.number(NAMESPACE, "Yaw") is None
     assert tags.number("example.org/oth", "Yaw") is None
 
 
@@ -79,8 +79,8 @@ def test_reading_a_file(flight: Path) -> None:
     tags = read_tags(flight / "0000SET" / "000" / "IMG_0002_4.tif")
     assert (tags.make, tags.model, tags.serial) == ("MicaSense", "RedEdge-M", "SY01-0000001-AG")
     assert tags.captured_at == "2026-06-21T10:00:02.000000"
-    assert tags.text(CAMERA, "BandName") == "NIR"
-    assert tags.numbers(CAMERA, "RigRelatives") == (0.55, -0.16, 0.21)
+    assert tags.text(NAMESPACE, "BandName") == "NIR"
+    assert tags.numbers(NAMESPACE, "RigRelatives") == (0.55, -0.16, 0.21)
     assert tags.pixels_per_mm == pytest.approx(266.666667 * 480 / 1280, rel=1e-6)
 
 

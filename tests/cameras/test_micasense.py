@@ -6,14 +6,16 @@ import tifffile
 
 from agalign.cameras.metadata import Tags
 from agalign.cameras.micasense import MicaSense
-from agalign.cameras.pix4d import BAND_NAME, CAMERA, panel_in
+from agalign.cameras.pix4d import BAND_NAME, NAMESPACE, panel_in
 from agalign.pixels.raster import probe
 
 
 def test_thermal_bands_count_in_hundredths_of_a_kelvin(tmp_path: Path) -> None:
     path = tmp_path / "IMG_0001_6.tif"
     tifffile.imwrite(path, np.zeros((48, 64), np.uint16), photometric="minisblack", metadata=None)
-    tags = Tags(make="MicaSense", model="Altum", xmp={BAND_NAME: ("LWIR",), (CAMERA, "CentralWavelength"): ("11000",)})
+    tags = Tags(
+        make="MicaSense", model="Altum", xmp={BAND_NAME: ("LWIR",), (NAMESPACE, "CentralWavelength"): ("11000",)}
+    )
     (band,) = MicaSense().bands(path, tags, probe(path))
     assert band.radiometry is not None
     assert (band.radiometry.quantity, band.radiometry.gain) == ("temperature", 0.01)
@@ -30,7 +32,7 @@ def test_thermal_bands_count_in_hundredths_of_a_kelvin(tmp_path: Path) -> None:
     ],
 )
 def test_panels_as_firmware_writes_them(values: dict[str, str], albedo: float | None, corners: int) -> None:
-    result = panel_in(Tags(xmp={(CAMERA, k): (v,) for k, v in values.items()}), (64, 48))
+    result = panel_in(Tags(xmp={(NAMESPACE, k): (v,) for k, v in values.items()}), (64, 48))
     assert result is not None
     assert (result.albedo, len(result.corners_px)) == (albedo, corners)
 
@@ -43,4 +45,4 @@ def test_panels_as_firmware_writes_them(values: dict[str, str], albedo: float | 
     ],
 )  # fmt: skip
 def test_other_captures_are_no_panels(values: dict[str, str]) -> None:
-    assert panel_in(Tags(xmp={(CAMERA, k): (v,) for k, v in values.items()}), (64, 48)) is None
+    assert panel_in(Tags(xmp={(NAMESPACE, k): (v,) for k, v in values.items()}), (64, 48)) is None

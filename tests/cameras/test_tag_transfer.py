@@ -15,7 +15,7 @@ from agalign.cameras import rig_seed
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.parrot import Sequoia
-from agalign.cameras.pix4d import CAMERA
+from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.tag_transfer import band_tags
 from agalign.cameras.tiff_directory import (
     EXIF,
@@ -77,13 +77,13 @@ def test_aligned_bands_look_like_one_camera(flight: Path, both: Path) -> None:
 def test_vignetting_lies_where_the_band_was_moved_to(flight: Path, both: Path) -> None:
     data = json.loads((both / "IMG_0001.json").read_text())
     truth = json.loads((flight / "truth.json").read_text())["IMG_0001"]["bands"]["IMG_0001_4.tif"]
-    centre = np.array(read_tags(flight / "0000SET" / "000" / "IMG_0001_4.tif").numbers(CAMERA, "VignettingCenter"))
+    centre = np.array(read_tags(flight / "0000SET" / "000" / "IMG_0001_4.tif").numbers(NAMESPACE, "VignettingCenter"))
     bands = bands_in(flight / "0000SET" / "000")
     back = geometry.apply(
         geometry.invert(np.array(truth["fixed_to_moving"])), lens.undistort(bands["NIR"].lens, centre)
     )
     expected = lens.distort(bands["Green"].lens, back) - data["output"]["crop"][:2]
-    result = read_tags(both / "IMG_0001_4.tif").numbers(CAMERA, "VignettingCenter")
+    result = read_tags(both / "IMG_0001_4.tif").numbers(NAMESPACE, "VignettingCenter")
     np.testing.assert_allclose(result, expected, atol=0.2)
     assert np.linalg.norm(np.array(result) - centre) > 3
 
@@ -148,7 +148,7 @@ def test_djis_geometry_is_the_references(tmp_path: Path) -> None:
     grid = OutputGrid(20, 10, 200, 180, scale=PixelScale(2.0, 2.0))
     prefix = "DJI_20230607112233_0001_MS_"
     result = carried(tmp_path, "Mavic 3", f"{prefix}NIR.TIF", f"{prefix}G.TIF", grid)
-    assert result.text(CAMERA, "BandName") == "NIR"
+    assert result.text(NAMESPACE, "BandName") == "NIR"
     assert result.number(DJI, "CalibratedOpticalCenterX") == 2 * 80.5 - 0.5 - 20
     assert result.number(DJI, "CalibratedOpticalCenterY") == 2 * 60.5 - 0.5 - 10
     assert result.text(DJI, "DewarpData") == "2022-09-08;340,340,3,-5,-0.1,0.05,0,0,0"
@@ -159,7 +159,7 @@ def test_an_upside_down_principal_point_counts_from_the_other_end(tmp_path: Path
     files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
     result = carried(tmp_path, "Sequoia", *files, OutputGrid(30, 20, 120, 90))
     # Stored: (160 - 80, 120 - 58.67) - (30, 20); seen upright it counts from 120, 90.
-    x, y = (v * 266.67 for v in result.numbers(CAMERA, "PrincipalPoint"))
+    x, y = (v * 266.67 for v in result.numbers(NAMESPACE, "PrincipalPoint"))
     assert (x, y) == pytest.approx((120 - (160 - 80.0 - 30), 90 - (120 - 58.667 - 20)), abs=0.01)
     assert result.orientation == 3
 
@@ -168,19 +168,19 @@ def test_undistorted_pixels_have_no_distortion(tmp_path: Path) -> None:
     result = carried(
         tmp_path, "RedEdge", "IMG_0007_4.tif", "IMG_0007_2.tif", OutputGrid(0, 0, 160, 120, undistorted=True)
     )
-    assert result.numbers(CAMERA, "PerspectiveDistortion") == (0.0,) * 5
+    assert result.numbers(NAMESPACE, "PerspectiveDistortion") == (0.0,) * 5
 
 
 def test_radiometry_takes_what_it_used(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["RedEdge"])
-    values = {(CAMERA, "VignettingCenter"): ("80", "60"), (CAMERA, "BandName"): ("NIR",),
+    values = {(NAMESPACE, "VignettingCenter"): ("80", "60"), (NAMESPACE, "BandName"): ("NIR",),
               (MICASENSE, "RadiometricCalibration"): ("1", "2", "3")}  # fmt: skip
     add_directories(
         tmp_path / "IMG_0007_4.tif", {XMP: byte_string(packet(values, "sequences")), 50714: short(5)}, {}, {}
     )
     for radiometry in (False, True):
         result = carried_from(tmp_path, radiometry=radiometry)
-        assert ((CAMERA, "VignettingCenter") in result.xmp) != radiometry
+        assert ((NAMESPACE, "VignettingCenter") in result.xmp) != radiometry
         assert ((MICASENSE, "RadiometricCalibration") in result.xmp) != radiometry
         assert (result.black_level is None) == radiometry
 
@@ -220,7 +220,7 @@ def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
 
 
 def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
-    values = {(CAMERA, "PrincipalPoint"): ("2.4", "1.8"), (CAMERA, "PerspectiveFocalLength"): ("1451.8",)}
+    values = {(NAMESPACE, "PrincipalPoint"): ("2.4", "1.8"), (NAMESPACE, "PerspectiveFocalLength"): ("1451.8",)}
     path = tmp_path / "IMG_0001_2.tif"
     tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
     exif = {37386: rational(5.45)}
@@ -239,7 +239,7 @@ def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("centre", [("1e14", "1e14"), ("nan", "0"), ("99999", "99999")])
 def test_a_centre_of_vignetting_that_lies_nowhere_is_left_out(tmp_path: Path, centre: tuple[str, str]) -> None:
-    values = {(CAMERA, "VignettingCenter"): centre, (CAMERA, "VignettingPolynomial"): ("1e-4",)}
+    values = {(NAMESPACE, "VignettingCenter"): centre, (NAMESPACE, "VignettingPolynomial"): ("1e-4",)}
     path = tmp_path / "IMG_0001_2.tif"
     tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
     add_directories(path, {271: text("MicaSense"), 700: byte_string(packet(values, "elements"))}, {}, {})
@@ -253,6 +253,6 @@ def test_a_turned_principal_point_stays_on_its_pixel_at_any_resolution(tmp_path:
     files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
     density, seen = 266.67, (80.0, 58.667)
     result = carried(tmp_path, "Sequoia", *files, OutputGrid(0, 0, 320, 240, scale=PixelScale(2.0, 2.0)))
-    x, y = (v * 2 * density for v in result.numbers(CAMERA, "PrincipalPoint"))
+    x, y = (v * 2 * density for v in result.numbers(NAMESPACE, "PrincipalPoint"))
     # Of an image of twice as many pixels: 2 (p + 0.5) - 0.5, whichever way it is seen.
     assert (x, y) == pytest.approx((2 * (seen[0] + 0.5) - 0.5, 2 * (seen[1] + 0.5) - 0.5), abs=0.02)

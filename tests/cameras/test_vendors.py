@@ -15,7 +15,7 @@ from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.parrot import Sequoia
-from agalign.cameras.pix4d import BAND_NAME, CAMERA
+from agalign.cameras.pix4d import BAND_NAME, NAMESPACE
 from agalign.cameras.sentera import Sentera
 from agalign.cameras.tiff_directory import Entry, add_directories, byte_string, rational, short, text
 from agalign.pixels.raster import RasterInfo, probe
@@ -27,7 +27,7 @@ URIS = {
     "Camera": "http://pix4d.com/camera/1.0/", "MicaSense": "http://micasense.com/MicaSense/1.0/",
     "drone-dji": "http://www.dji.com/drone-dji/1.0/", "Sentera": "https://www.sentera.com/schemas/",
 }  # fmt: skip
-PREFIXES = {CAMERA: "Camera", MICASENSE: "MicaSense", DJI: "drone-dji", SENTERA: "Sentera"}
+PREFIXES = {NAMESPACE: "Camera", MICASENSE: "MicaSense", DJI: "drone-dji", SENTERA: "Sentera"}
 SIZE = 160, 120
 
 Values = Mapping[tuple[str, str], Sequence[str]]
@@ -47,9 +47,9 @@ class Vendor:
 
 def pinhole(k: int) -> Values:
     return {
-        (CAMERA, "PrincipalPoint"): (f"{2.4 + 0.01 * k}", "1.8"), (CAMERA, "PerspectiveFocalLength"): ("5.45",),
-        (CAMERA, "PerspectiveFocalLengthUnits"): ("mm",), (CAMERA, "RigRelatives"): (f"{0.1 * k}", "0", "0.05"),
-        (CAMERA, "PerspectiveDistortion"): ("-0.1", "0.1", "0", "0", "0"),
+        (NAMESPACE, "PrincipalPoint"): (f"{2.4 + 0.01 * k}", "1.8"), (NAMESPACE, "PerspectiveFocalLength"): ("5.45",),
+        (NAMESPACE, "PerspectiveFocalLengthUnits"): ("mm",), (NAMESPACE, "RigRelatives"): (f"{0.1 * k}", "0", "0.05"),
+        (NAMESPACE, "PerspectiveDistortion"): ("-0.1", "0.1", "0", "0", "0"),
     }  # fmt: skip
 
 
@@ -79,15 +79,16 @@ VENDORS = {
     }, frozenset(band for band, _ in MAVIC_BANDS.values())),
     "Sequoia": Vendor("Parrot", "Sequoia", {
         f"IMG_180413_080658_0000_{k}.TIF": (band, nm, {
-            (CAMERA, "CaptureUUID"): ("abc",), (CAMERA, "ModelType"): ("fisheye",),
-            (CAMERA, "PrincipalPoint"): ("0.3", "0.22"), (CAMERA, "FisheyeAffineMatrix"): ("207", "0", "0", "207"),
-            (CAMERA, "FisheyePolynomial"): ("0", "1", "0.0096", "-0.1455"),
-            (CAMERA, "RigRelatives"): ("-0.17", f"{0.1 * len(band)}", "0"),
+            (NAMESPACE, "CaptureUUID"): ("abc",), (NAMESPACE, "ModelType"): ("fisheye",),
+            (NAMESPACE, "PrincipalPoint"): ("0.3", "0.22"),
+            (NAMESPACE, "FisheyeAffineMatrix"): ("207", "0", "0", "207"),
+            (NAMESPACE, "FisheyePolynomial"): ("0", "1", "0.0096", "-0.1455"),
+            (NAMESPACE, "RigRelatives"): ("-0.17", f"{0.1 * len(band)}", "0"),
         }) for k, (band, nm) in SEQUOIA_BANDS.items()
     }, frozenset(band for band, _ in SEQUOIA_BANDS.values()), orientation=3),
     "6X": Vendor("Sentera", "6X", {
         f"{k}-{band}-{nm}-30/IMG_00012_{nm}_30.tif": (band, nm, {
-            (CAMERA, "CaptureUUID"): ("abc",),
+            (NAMESPACE, "CaptureUUID"): ("abc",),
             (SENTERA, "AlignMatrix"): ("1", "0.001", f"{k}", "-0.001", "1", "5", "0", "0", "1"),
         }) for k, (band, nm) in enumerate({"Blue": 475, "Green": 550, "Red": 670, "RedEdge": 715, "NIR": 840}.items())
     }, frozenset({"Blue", "Green", "Red", "RedEdge", "NIR"})),
@@ -120,15 +121,15 @@ def write_capture(folder: Path, vendor: Vendor, dialect: str = "attributes", dam
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         tifffile.imwrite(path, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
-        spectral = {(CAMERA, "BandName"): (band,), (CAMERA, "CentralWavelength"): (f"{nm}",)}
+        spectral = {(NAMESPACE, "BandName"): (band,), (NAMESPACE, "CentralWavelength"): (f"{nm}",)}
         xmp = packet({**spectral, **values}, dialect)
         if damage == "empty":
             xmp = packet(dict.fromkeys({**spectral, **values}, ("",)), dialect)
         elif damage == "malformed":
             xmp = xmp[: len(xmp) // 2]
         elif damage == "no numbers":
-            keep = {(CAMERA, "BandName"), (MICASENSE, "CaptureId"), (DJI, "CaptureUUID"),
-                    (CAMERA, "CaptureUUID")}  # fmt: skip
+            keep = {(NAMESPACE, "BandName"), (MICASENSE, "CaptureId"), (DJI, "CaptureUUID"),
+                    (NAMESPACE, "CaptureUUID")}  # fmt: skip
             xmp = packet({k: v if k in keep else ("-inf;nan",) for k, v in {**spectral, **values}.items()}, dialect)
         first = {271: text(vendor.make), 272: text(vendor.model), 274: short(vendor.orientation)}
         if damage != "missing":
@@ -285,8 +286,8 @@ def test_double_4k_is_a_capture_of_two_photographs(tmp_path: Path) -> None:
 
 def test_a_double_4k_lists_its_bands_and_calls_one_garbage(tmp_path: Path) -> None:
     lens = {
-        (CAMERA, "PrincipalPoint"): ("3.1,2.325",), (CAMERA, "PerspectiveFocalLength"): ("3484",),
-        (CAMERA, "PerspectiveDistortion"): ("-0.093", "0.122", "0", "0", "0"),
+        (NAMESPACE, "PrincipalPoint"): ("3.1,2.325",), (NAMESPACE, "PerspectiveFocalLength"): ("3484",),
+        (NAMESPACE, "PerspectiveDistortion"): ("-0.093", "0.122", "0", "0", "0"),
     }  # fmt: skip
     for folder, names, wavelengths in (
         ("nRGB", ("Red", "Green", "Blue"), ("650", "548", "446")),
@@ -294,7 +295,7 @@ def test_a_double_4k_lists_its_bands_and_calls_one_garbage(tmp_path: Path) -> No
     ):
         path = tmp_path / folder / "IMG_00042.jpg"
         info = RasterInfo(160, 120, ("uint8",) * 3, (None,) * 3, (None,) * 3, (None,) * 3, None, None)
-        tags = Tags(make="Sentera", xmp=lens | {BAND_NAME: names, (CAMERA, "CentralWavelength"): wavelengths})
+        tags = Tags(make="Sentera", xmp=lens | {BAND_NAME: names, (NAMESPACE, "CentralWavelength"): wavelengths})
         bands = Sentera().bands(path, tags, info)
         assert [b.band_index for b in bands] == ([1, 2, 3] if folder == "nRGB" else [1, 3])
         assert [b.name for b in bands] == (["Red", "Green", "Blue"] if folder == "nRGB" else ["Red edge", "NIR"])
@@ -357,7 +358,7 @@ def test_a_flat_folder_named_like_a_band(tmp_path: Path, folder: str) -> None:
         path.parent.mkdir(exist_ok=True)
         tifffile.imwrite(path, np.zeros((120, 160), np.uint16), photometric="minisblack", metadata=None)
         name = ("Blue", "Green", "NIR")[k]
-        xmp = packet({(CAMERA, "BandName"): (name,)}, "attributes")
+        xmp = packet({(NAMESPACE, "BandName"): (name,)}, "attributes")
         add_directories(path, {271: text("Sentera"), 700: byte_string(xmp)}, {}, {})
     (capture,) = discover(tmp_path / folder).captures
     assert {b.name for b in capture.bands} == {"Blue", "Green", "NIR"}
