@@ -1,1 +1,1 @@
-"""What a run writes: rasters, sidecars, pictures, indices, the summary and the report."""
+"""The files that a run writes: rasters, sidecars, pictures, indices, the summary and the report."""

@@ -1,6 +1,7 @@
-"""A file for each input file, with the input's name and tags: what photogrammetry programs expect."""
+"""An aligned file for each input file, with its name and tags, for photogrammetry programs."""
 
 import math
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +19,13 @@ from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
 _MAX_INVERSE_ERROR_PX = 0.1
-"""An inverse mapping that misses its target by more has not converged."""
-_MAX_INVERSE_STEPS = 20
-"""Newton's method takes 3 to 5 steps through a lens model."""
+"""Larger errors of an inverse mapping mean that Newton's method did not converge."""
+_INVERSE_STEPS = 20
+"""Newton's method converges in 3 to 5 steps through a lens model."""
 
 
 class BandFiles(Product):
-    """An aligned raster for each input file; none for a band that failed."""
+    """An aligned raster for each input file; none if its bands failed."""
 
     kind = "band"
 
@@ -33,7 +34,7 @@ class BandFiles(Product):
         return settings.layout != "stack"
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:
-        """The files where they are asked for: otherwise images may have these names."""
+        """Return the files if they are enabled. Otherwise other files, such as stacks, may have these names."""
         names = dict.fromkeys(band_file_names(capture).values()) if self.is_enabled(settings) else ()
         return [paths.folder / name for name in names]
 
@@ -44,8 +45,9 @@ class BandFiles(Product):
         for layer in context.layers:
             if not layer.is_gap:
                 by_file.setdefault(names[layer.band.name], []).append(layer)
-        in_order = [name for name in dict.fromkeys(names.values()) if name in by_file]
-        return [self._write_file(context, name, by_file[name]) for name in in_order]
+        return [
+            self._write_file(context, name, by_file[name]) for name in dict.fromkeys(names.values()) if name in by_file
+        ]
 
     def _write_file(self, context: ProductContext, name: Path, layers: list[Layer]) -> WrittenFile:
         settings, grid, path = context.write_settings, context.grid, context.paths.folder / name
@@ -59,10 +61,10 @@ class BandFiles(Product):
 
 
 def band_file_names(capture: Capture) -> dict[str, Path]:
-    """By band: its file in layout `bands`, relative to the capture's output folder.
+    """Return the file of each band in layout `bands`, relative to the capture's output folder.
 
-    It has the name of the input file. The band's name is part of it where several bands of that file have lenses of
-    their own, and the folder where only the folders distinguish the input files.
+    It has the name of the input file, with the band's name if several bands of that file have a lens each, and with the
+    folder if input files of the same name are in several folders.
     """
     split = _files_to_split(capture)
     by_folder = _needs_folders(capture)
@@ -72,7 +74,7 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
         stem = f"{band.path.stem}_{_safe_name(band.name)}" if band.path in split else band.path.stem
         folder = band.path.parent.name if by_folder else ""
         name = Path(folder, f"{stem}{_tiff_suffix(band)}")
-        # The stack has its own name, and so has each file.
+        # The name of the stack, or of another input file with a different suffix.
         if name == Path(f"{capture.name}.tif") or taken.get(name, band.path) != band.path:
             name = Path(folder, f"{stem}_{band.path.suffix[1:].lower()}.tif")
         taken[name] = band.path
@@ -81,12 +83,13 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
 
 
 def _files_to_split(capture: Capture) -> set[Path]:
-    """Input files of several bands, each with its own lens."""
-    return {b.path for b in capture.bands if not b.one_lens and sum(b.path == o.path for o in capture.bands) > 1}
+    """Input files of several bands with a lens each."""
+    bands_per_file = Counter(b.path for b in capture.bands)
+    return {b.path for b in capture.bands if not b.one_lens and bands_per_file[b.path] > 1}
 
 
 def _needs_folders(capture: Capture) -> bool:
-    """True where input files in several folders have the same name."""
+    """True if input files in several folders have the same name."""
     files = {b.path for b in capture.bands}
     return len({p.stem for p in files}) < len(files) and len({p.parent for p in files}) > 1
 
@@ -100,22 +103,22 @@ def _safe_name(text: str) -> str:
 
 
 def _from_source(layer: Layer, grid: OutputGrid) -> FromSource:
-    """Return the mapping from pixels of the layer's file to the reference's, the inverse by Newton's method."""
+    """Return the mapping from pixels of the layer's file to pixels of the reference, inverted by Newton's method."""
     to_file = PixelMapping(geometry.identity()) if layer.mapping is None else layer.mapping
-    middle = np.array([grid.x0 + grid.width / 2, grid.y0 + grid.height / 2])
+    centre = np.array([grid.x0 + grid.width / 2, grid.y0 + grid.height / 2])
 
     def from_source(x: float, y: float) -> tuple[float, float]:
-        at = middle
+        position = centre
         try:
-            for _ in range(_MAX_INVERSE_STEPS):
-                mapped = to_file(at)
-                jacobian = np.stack([to_file(at + d) - mapped for d in np.eye(2)], axis=-1)
-                at = at + np.linalg.solve(jacobian, np.array([x, y]) - mapped)
+            for _ in range(_INVERSE_STEPS):
+                mapped = to_file(position)
+                jacobian = np.stack([to_file(position + d) - mapped for d in np.eye(2)], axis=-1)
+                position = position + np.linalg.solve(jacobian, np.array([x, y]) - mapped)
         except np.linalg.LinAlgError:
             return math.nan, math.nan
-        if not np.abs(to_file(at) - (x, y)).max() < _MAX_INVERSE_ERROR_PX:
+        if not np.abs(to_file(position) - (x, y)).max() < _MAX_INVERSE_ERROR_PX:  # nan fails too
             return math.nan, math.nan
-        x_px, y_px = grid.scale.inverse.positions(at).tolist()
+        x_px, y_px = grid.scale.inverse.positions(position).tolist()
         return x_px, y_px
 
     return from_source

@@ -1,4 +1,4 @@
-"""Aligned captures as xarray datasets: a variable for each band, with its wavelength and unit, read lazily."""
+"""Aligned captures as lazily read xarray datasets, with a variable for each band."""
 
 import math
 import re
@@ -9,6 +9,7 @@ import numpy as np
 
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.pixels.raster import without_warnings
+from agalign.products.relief_map import RELIEF_UNITS
 from agalign.products.sidecar import BandPart, Sidecar
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 
@@ -16,55 +17,55 @@ if TYPE_CHECKING:
     import xarray
 
 _RAW_UNIT = "count"
-_RELIEF = {"parallax": "px", "confidence": "1", "range": "m"}
-"""Layers of a relief's raster, and their units."""
-_MORE = re.compile(r"(?:\.stac)?\.json$|\.tiff?$", re.IGNORECASE)
+_SUFFIX = re.compile(r"(?:\.stac)?\.json$|\.tiff?$", re.IGNORECASE)
+"""Suffix of a sidecar, a STAC item or a stack."""
 _COORDINATES = ("latitude", "longitude", "altitude_m")
 _CHUNKS = {"x": 1024, "y": 1024}
+"""Four blocks of the stacks along each axis: dask reads 2 MB of 16 bits at a time."""
 
 
 def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
-    """The aligned bands of a capture by its sidecar, its stack or its STAC item, lazily (dask).
+    """Return the aligned bands of a capture, read lazily with dask, given its sidecar, stack or STAC item.
 
-    Dimensions are y and x, at the centres of pixels: map coordinates if the capture is georeferenced (`.rio.crs`), else
-    px of what was written, with (0, 0) the centre of the top-left pixel. A variable is named after its band and has the
-    attributes `wavelength_nm`, `units` and `status`. Values are float32 with nan for nodata; with `masked=False` they
-    are the file's own, with its nodata value as `_FillValue`: differences of unsigned integers wrap around.
-    Bands without pixels are left out. A capture with a relief has the variables `parallax` (px along a
-    baseline of length 1, positive nearer) and, where they were asked for, `confidence` and `range` (m).
+    Dimensions are y and x, at pixel centres: map coordinates if the capture is georeferenced (`.rio.crs`), else px of
+    the output, with (0, 0) the centre of the top-left pixel. A variable has the name of its band and the attributes
+    `wavelength_nm`, `units` and `status`. Values are float32 with nan for nodata. With `masked=False` they have the
+    type of the file, with its nodata value as `_FillValue`; differences of unsigned integers then wrap around.
+    Bands without pixels are left out. A capture with a relief has the variable `parallax` (px along a baseline of
+    length 1, larger for nearer objects) and, if the run wrote them, `confidence` and `range` (m).
     Raises SidecarError, UnreadableFileError, and ConfigurationError if xarray is not installed.
     """
     import_xarray()
     given = Path(path)
-    sidecar_path = given.with_name(_MORE.sub("", given.name) + ".json")
+    sidecar_path = given.with_name(_SUFFIX.sub("", given.name) + ".json")
     return _dataset(read_sidecar(sidecar_path), sidecar_path.parent, masked=masked)
 
 
 def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
-    """All captures below the output folder of a run, stacked along `capture`, lazily (dask).
+    """Return all captures below the output folder of a run, stacked along `capture`, read lazily with dask.
 
-    Coordinates of `capture` are its label, and `time`, `latitude`, `longitude` and `altitude_m` as far as the camera
-    wrote them; `status` (capture, band) is that of each band in each capture. Bands are those that all captures have.
-    Raises InputError if there is no run or its captures differ in size (write with crop 'flight'), and what
-    `open_capture` raises.
+    The coordinates of `capture` are its label, `time`, `latitude`, `longitude` and `altitude_m`, as far as the camera
+    wrote them; `status` has the dimensions (capture, band). Bands that some capture lacks are left out.
+    Raises InputError if there is no run or its captures differ in size (write with crop 'flight'), and the errors of
+    `open_capture`.
     """
     xr = import_xarray()
     folder = Path(out)
     captures = _captures_with_output(folder)
     opened = [_dataset(s, p.parent, masked=masked) for p, s in captures]
     common = [name for name in opened[0].data_vars if all(name in one for one in opened)]
-    # Each capture has its own position on the map: only their pixels can be stacked.
-    plain = [_in_pixels(one[common]) for one in opened]
+    # In pixels: the map coordinates of the captures differ.
+    in_pixels = [_in_pixels(one[common]) for one in opened]
     bands = [name for name in common if "status" in opened[0][name].attrs]
     status = [[one[name].attrs["status"] for name in bands] for one in opened]
-    for one in plain:
+    for one in in_pixels:
         for name in bands:
             del one[name].attrs["status"]
-    stacked = xr.concat(plain, dim="capture", join="override", combine_attrs="override", coords="minimal")
+    stacked = xr.concat(in_pixels, dim="capture", join="override", combine_attrs="override", coords="minimal")
     stacked.attrs = {k: opened[0].attrs[k] for k in ("camera", "reference_band")}
     flight: xarray.Dataset = stacked.assign_coords(
         capture=[(p.parent / p.stem).relative_to(folder).as_posix() for p, _ in captures],
-        time=("capture", [_moment(s) for _, s in captures]),
+        time=("capture", [_time(s) for _, s in captures]),
         band=bands,
         status=(("capture", "band"), status),
         **{name: ("capture", [_coordinate(s, name) for _, s in captures]) for name in _COORDINATES},
@@ -73,9 +74,9 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
 
 
 def _captures_with_output(folder: Path) -> list[tuple[Path, Sidecar]]:
-    """The sidecars with rasters of one size, and their paths. Raises InputError."""
-    read = [(p, read_sidecar(p)) for p in find_sidecars(folder)] if folder.is_dir() else []
-    written = [(p, s) for p, s in read if s.output is not None]
+    """(path, sidecar) of all captures with rasters, which have one size. Raises InputError."""
+    sidecars = [(p, read_sidecar(p)) for p in find_sidecars(folder)] if folder.is_dir() else []
+    written = [(p, s) for p, s in sidecars if s.output is not None]
     if not written:
         raise InputError(f"{folder}: no aligned captures there; give the output folder of a run")
     sizes = {s.output.crop[2:]: p.stem for p, s in written if s.output is not None}
@@ -85,13 +86,13 @@ def _captures_with_output(folder: Path) -> list[tuple[Path, Sidecar]]:
 
 
 def _coordinate(sidecar: Sidecar, name: str) -> float:
-    """A coordinate of the capture's position; nan where it is unknown."""
+    """A coordinate of the capture's position; nan if it is unknown."""
     value = None if sidecar.position is None else getattr(sidecar.position, name)
     return math.nan if value is None else float(value)
 
 
 def import_xarray() -> Any:
-    """Raises ConfigurationError if it is not installed."""
+    """Import and return xarray. Raises ConfigurationError if it or a library that it needs here is not installed."""
     try:
         import dask.array  # noqa: F401
         import rioxarray  # noqa: F401
@@ -119,7 +120,7 @@ def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset
         layers = _opened(folder, relief, masked=True)
         for index, name in enumerate(np.atleast_1d(layers.attrs.get("long_name", "parallax"))):
             result[str(name)] = layers.isel(band=index, drop=True).assign_attrs(
-                long_name=str(name), units=_RELIEF[name]
+                long_name=str(name), units=RELIEF_UNITS[name]
             )
     dataset: xarray.Dataset = xr.Dataset(result)
     dataset.attrs = {
@@ -136,7 +137,7 @@ def _opened(folder: Path, name: str, *, masked: bool) -> "xarray.DataArray":
     path = folder / name
     try:
         with without_warnings():
-            # Other drivers may open other files.
+            # Some of GDAL's other drivers open files or addresses that the contents of a file name.
             opened: xarray.DataArray = rioxarray.open_rasterio(path, chunks=_CHUNKS, masked=masked, driver="GTiff")
     except OSError as error:
         raise UnreadableFileError(f"{path}: cannot be read ({error}); run again") from None
@@ -148,22 +149,23 @@ def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str, *
         raise UnreadableFileError(f"{name}: has no band {index}, as its sidecar says; run again")
     one = file.isel(band=index - 1, drop=True)
     if masked:
-        one = one.astype(np.float32)  # also of integers without nodata
+        one = one.astype(np.float32)  # rioxarray keeps integers without a nodata value
     units = file.attrs.get("units")
     unit = units[index - 1] if isinstance(units, tuple) else units
-    kept = {k: v for k, v in file.attrs.items() if k in ("_FillValue", "scale_factor", "add_offset")}
-    one.attrs = kept | {"long_name": band.band, "units": unit or _RAW_UNIT, "status": band.status}
+    encoding = {k: v for k, v in file.attrs.items() if k in ("_FillValue", "scale_factor", "add_offset")}
+    one.attrs = encoding | {"long_name": band.band, "units": unit or _RAW_UNIT, "status": band.status}
     if band.wavelength_nm is not None:
         one.attrs["wavelength_nm"] = band.wavelength_nm
     return one
 
 
 def _in_pixels(dataset: "xarray.Dataset") -> "xarray.Dataset":
-    counted = {axis: range(dataset.sizes[axis]) for axis in ("y", "x")}
-    return dataset.drop_vars("spatial_ref", errors="ignore").assign_coords(counted)
+    """The dataset with pixel coordinates instead of map coordinates."""
+    px = {axis: range(dataset.sizes[axis]) for axis in ("y", "x")}
+    return dataset.drop_vars("spatial_ref", errors="ignore").assign_coords(px)
 
 
-def _moment(sidecar: Sidecar) -> Any:
+def _time(sidecar: Sidecar) -> Any:
     try:
         return np.datetime64(sidecar.captured_at.partition("+")[0].rstrip("Z"), "us")
     except ValueError:

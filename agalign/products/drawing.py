@@ -1,4 +1,4 @@
-"""Pictures with words on them, and how they are written."""
+"""Drawing text on pictures, and writing them as PNG."""
 
 from pathlib import Path
 
@@ -12,23 +12,22 @@ from agalign.values.files import complete_file
 
 Picture = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""
-_INK = 40, 40, 40
+_TEXT_COLOUR = 40, 40, 40
 
 
 def write_png(image: Picture, path: Path) -> None:
-    """Write atomically. Raises OutputError."""
+    """Write a picture atomically. Raises OutputError."""
     with complete_file(path) as partial:
         encoded, data = cv2.imencode(".png", image[..., ::-1])
         if not encoded:
-            raise OutputError(f"{path}: cannot be made")
+            raise OutputError(f"{path}: cannot be encoded")
         partial.write_bytes(data.tobytes())
 
 
 def with_text(
-    image: Picture, text: str, at_px: tuple[float, float], size_px: float = 14, anchor: str = "ls",
-    ink: tuple[int, int, int] = _INK,
-) -> Picture:  # fmt: skip
-    """The picture with a line of text; `anchor` is Pillow's, by default the left end of the baseline."""
+    image: Picture, text: str, at_px: tuple[float, float], size_px: float = 14, anchor: str = "ls"
+) -> Picture:
+    """Return the picture with a line of text; `anchor` is Pillow's, by default the left end of the baseline."""
     drawn = Image.fromarray(image)
-    ImageDraw.Draw(drawn).text(at_px, text, ink, ImageFont.load_default(size_px), anchor)
+    ImageDraw.Draw(drawn).text(at_px, text, _TEXT_COLOUR, ImageFont.load_default(size_px), anchor)
     return np.asarray(drawn)

@@ -1,4 +1,4 @@
-"""A raster of the expected error at every pixel, a band for each moving band, on the grid of the aligned files."""
+"""A raster of the expected alignment error at every pixel, with a layer for each moving band, on the output grid."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,9 +18,9 @@ from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.expected_error import expected_error_px
 
 _LATTICE_PX = 16
-"""Between the nodes at which the error is calculated: it changes slowly."""
+"""Distance of the nodes at which the error, which is smooth, is calculated."""
 _STEP_PX = 0.001
-"""Errors are rounded to this: they are known less well, and compress better."""
+"""Errors are rounded to this step, below their accuracy: the raster compresses better."""
 
 
 class ErrorMap(Product):
@@ -43,8 +43,8 @@ class ErrorMap(Product):
 def write_error_map(
     capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], grid: OutputGrid, path: Path
 ) -> None:
-    """Write (bands, height, width) float32, px of the reference's file, on the grid of the capture's aligned files,
-    atomically. Raises OutputError.
+    """Write the expected errors (bands, height, width), float32, px of the reference's file, on the output grid of the
+    capture, atomically. Raises OutputError.
     """
     size_px, georeference = capture.reference.size_px, capture.reference.georeference
     layers = {name: _error_px(alignment, size_px, grid) for name, alignment in alignments.items()}
@@ -55,8 +55,8 @@ def write_error_map(
 def error_lattice_px(
     alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid
 ) -> NDArray[np.float32]:
-    """Return the expected error (rows, columns) on a lattice over a grid, px of the reference (width, height); nan
-    where it is unknown.
+    """Return the expected error (rows, columns) on a lattice over a grid, px of the reference's file; nan where it is
+    unknown. `size_px` is (width, height) of that file.
     """
     columns, rows = (max(2, -(-n // _LATTICE_PX)) for n in (grid.width, grid.height))
     points = grid.reference_positions(geometry.lattice(grid.width, grid.height, columns, rows))
@@ -65,15 +65,16 @@ def error_lattice_px(
 
 
 def error_on_tile(nodes: NDArray[np.float32], grid: OutputGrid, tile: Tile) -> NDArray[np.float32]:
-    """Return the expected error (height, width) on a tile of a grid, linear between the nodes of `error_lattice_px`."""
+    """Return the expected error (height, width) on a tile of a grid, linearly interpolated from `error_lattice_px`."""
     rows, columns = nodes.shape
-    at_x, at_y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in ((columns, grid.width), (rows, grid.height)))
+    # Positions of the pixels of the grid, in nodes.
+    x, y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in ((columns, grid.width), (rows, grid.height)))
     x0, y0 = tile.x0 - grid.x0, tile.y0 - grid.y0
-    crossings = np.meshgrid(at_x[x0 : x0 + tile.width], at_y[y0 : y0 + tile.height])
-    return np.asarray(cv2.remap(nodes, *crossings, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+    positions = np.meshgrid(x[x0 : x0 + tile.width], y[y0 : y0 + tile.height])
+    return np.asarray(cv2.remap(nodes, *positions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
 def _error_px(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
-    """(height, width): linear between the nodes of a lattice."""
+    """Expected error (height, width) on a grid, rounded."""
     result = error_on_tile(error_lattice_px(alignment, size_px, grid), grid, grid.tile)
     return np.asarray(np.round(result / _STEP_PX) * _STEP_PX, np.float32)

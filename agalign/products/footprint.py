@@ -1,4 +1,4 @@
-"""Where a capture is on the ground: by its georeference, or by the camera's position, height and direction."""
+"""The footprint of a capture on the ground, by its georeference or the camera's position, height and attitude."""
 
 import math
 from dataclasses import replace
@@ -14,19 +14,22 @@ from agalign.values.image import OutputGrid
 
 _WGS84 = "EPSG:4326"
 _MAX_TILT_DEG = 45.0
-"""A camera that looks farther aside has no useful footprint, and often a wrong tag."""
+"""The footprint of a camera with a larger tilt is not useful, and the tag is often wrong."""
 _MAX_ASSUMED_HEIGHT_M = 120.0
-"""Most countries allow drones no more above the ground."""
+"""Legal limit of the height above ground of drones in most countries."""
 _MIN_HEIGHT_M = 1.0
-_POSITION_ERROR_M, _HEADING_ERROR_DEG, _TILT_ERROR_DEG, _UNKNOWN_TILT_DEG = 3.0, 5.0, 2.0, 7.0
-"""1 sigma: of a GPS receiver without corrections, of a compass in an aircraft, of a gimbal or an attitude sensor, and
-of a camera that is fixed to an aircraft of unknown attitude."""
+_POSITION_ERROR_M = 3.0
+"""Standard error of a GPS receiver without corrections."""
+_HEADING_ERROR_DEG = 5.0
+"""Standard error of the compass of an aircraft."""
+_TILT_ERROR_DEG, _UNKNOWN_TILT_DEG = 2.0, 7.0
+"""Standard error of a gimbal or an attitude sensor; standard deviation of the tilt of a camera fixed to an aircraft."""
 _HEIGHT_ERROR_M, _ASSUMED_HEIGHT_ERROR = 5.0, 0.5
-"""1 sigma: of a barometer over uneven ground, and the share of an assumed height."""
+"""Standard error of a barometric height over uneven ground; relative standard error of an assumed height."""
 
 
 def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
-    """Return a closed ring (5, 2) of longitudes and latitudes around the pixels of a grid, degrees.
+    """Return a closed ring (5, 2) of (longitude, latitude) in degrees around the pixels of a grid.
 
     None if neither a georeference nor the camera's pose is known.
     """
@@ -48,43 +51,45 @@ def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
 def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Project pixels of the reference (n, 2) onto a horizontal plane: (n, 2) metres east and north of the camera.
 
-    None if height, heading or focal length is unknown, or the camera looks too far aside.
+    None if height, heading or focal length is unknown, or the camera is tilted too much.
     """
     pose = capture.pose
     if pose is None or pose.height_m is None or pose.focal_length_px is None:
         return None
     if math.hypot(pose.pitch_deg, pose.roll_deg) > _MAX_TILT_DEG:
         return None
-    middle = (np.array(capture.reference.size_px) - 1) / 2
-    right, down = ((points_px - middle) / pose.focal_length_px).T
-    # Rotated by the pitch, then by the roll: components ahead, to the right and below.
+    centre = (np.array(capture.reference.size_px) - 1) / 2
+    right, down = ((points_px - centre) / pose.focal_length_px).T
+    # Rays rotated by the pitch, then by the roll: components (forward, right, downward).
     pitch, roll, heading = np.radians((pose.pitch_deg, pose.roll_deg, pose.heading_deg))
-    ahead, below = -down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) + down * np.sin(pitch)
-    aside, below = right * np.cos(roll) - below * np.sin(roll), below * np.cos(roll) + right * np.sin(roll)
-    if not (below > 0).all():
+    forward, downward = -down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) + down * np.sin(pitch)
+    right, downward = (
+        right * np.cos(roll) - downward * np.sin(roll), downward * np.cos(roll) + right * np.sin(roll),
+    )  # fmt: skip
+    if not (downward > 0).all():
         return None
-    ahead_m, aside_m = pose.height_m * ahead / below, pose.height_m * aside / below
-    east = aside_m * np.cos(heading) + ahead_m * np.sin(heading)
-    return np.stack([east, ahead_m * np.cos(heading) - aside_m * np.sin(heading)], axis=-1)
+    forward_m, right_m = pose.height_m * forward / downward, pose.height_m * right / downward
+    east_m = right_m * np.cos(heading) + forward_m * np.sin(heading)
+    return np.stack([east_m, forward_m * np.cos(heading) - right_m * np.sin(heading)], axis=-1)
 
 
 def above_elevation(capture: Capture, ground_elevation_m: float) -> Capture:
-    """The capture with its height above ground of a known elevation, where neither tags nor a panel give a height."""
+    """Return the capture with the height above ground of this elevation, if neither tags nor a panel give a height."""
     height_m = _altitude_m(capture) - ground_elevation_m
     return _with_height(capture, height_m, "ground elevation")
 
 
 def with_assumed_height(capture: Capture) -> Capture:
-    """The capture with the largest height above the ground that is likely, where none is known: the altitude above sea
-    level, at most what most countries allow.
+    """Return the capture with an upper limit of the height above ground, if no height is known: the altitude above sea
+    level, at most the legal limit.
     """
     return _with_height(capture, min(_altitude_m(capture), _MAX_ASSUMED_HEIGHT_M), "assumed")
 
 
 def with_approximate_georeference(capture: Capture) -> Capture:
-    """The capture with an affine georeference of its reference in UTM, where it has none and its height is known.
+    """Return the capture with an affine georeference of its reference in UTM, if it has none and its height is known.
 
-    The terrain is taken as a horizontal plane, lens distortion is neglected, and `accuracy_m` is set.
+    The ground is assumed to be a horizontal plane, lens distortion is neglected, and `accuracy_m` is set.
     """
     reference, position = capture.reference, capture.position
     width, height = reference.size_px
@@ -100,34 +105,34 @@ def with_approximate_georeference(capture: Capture) -> Capture:
         return capture
     design = np.column_stack([corners, np.ones(4)])
     affine, *_ = np.linalg.lstsq(design, on_map - on_map[0], rcond=None)
-    off_m = float(np.abs(design @ affine - (on_map - on_map[0])).max())
+    fit_error_m = float(np.abs(design @ affine - (on_map - on_map[0])).max())
     transform = np.vstack([affine.T, [0.0, 0.0, 1.0]])
     transform[:2, 2] += on_map[0]
     accuracy_m = accuracy_of_footprint_m(capture)
     assert accuracy_m is not None
-    georeference = Georeference(transform, crs, round(math.hypot(accuracy_m, off_m), 1))
+    georeference = Georeference(transform, crs, round(math.hypot(accuracy_m, fit_error_m), 1))
     bands = tuple(replace(b, georeference=georeference) if b is reference else b for b in capture.bands)
     return replace(capture, bands=bands)
 
 
 def accuracy_of_footprint_m(capture: Capture) -> float | None:
-    """Return the expected error (1 sigma, metres) of the farthest corner of a footprint that `ground_m` gives: of the
-    camera's position, heading, tilt and height. None if `ground_m` gives none.
+    """Return the standard error, metres, of the farthest corner of a footprint by `ground_m`, from the errors of the
+    camera's position, heading, tilt and height. None if `ground_m` returns None.
     """
     width, height = capture.reference.size_px
     offsets_m = ground_m(capture, np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width, height], [-0.5, height]]))
     pose = capture.pose
     if offsets_m is None or pose is None or pose.height_m is None:
         return None
-    reach_m = float(np.linalg.norm(offsets_m, axis=1).max())
-    slope = reach_m / pose.height_m
+    distance_m = float(np.linalg.norm(offsets_m, axis=1).max())
+    tangent = distance_m / pose.height_m  # of the corner's angle from the vertical
     tilt_deg = _TILT_ERROR_DEG if pose.pitch_deg or pose.roll_deg else _UNKNOWN_TILT_DEG
-    of_height_m = _ASSUMED_HEIGHT_ERROR * pose.height_m if pose.height_from == "assumed" else _HEIGHT_ERROR_M
+    height_error_m = _ASSUMED_HEIGHT_ERROR * pose.height_m if pose.height_from == "assumed" else _HEIGHT_ERROR_M
     errors_m = (
         _POSITION_ERROR_M,
-        math.radians(_HEADING_ERROR_DEG) * reach_m,
-        math.radians(tilt_deg) * pose.height_m * (1 + slope**2),
-        of_height_m * slope,
+        math.radians(_HEADING_ERROR_DEG) * distance_m,
+        math.radians(tilt_deg) * pose.height_m * (1 + tangent**2),
+        height_error_m * tangent,
     )
     return round(math.hypot(*errors_m), 1)
 
@@ -145,5 +150,5 @@ def _with_height(capture: Capture, height_m: float, source: HeightSource) -> Cap
 
 
 def _local_crs(position: Position) -> str:
-    """A coordinate system of metres east and north of a position."""
+    """Azimuthal equidistant projection around a position: metres east and north of it."""
     return f"+proj=aeqd +lat_0={position.latitude:.9f} +lon_0={position.longitude:.9f} +datum=WGS84 +units=m"

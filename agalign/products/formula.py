@@ -1,4 +1,4 @@
-"""Formulas of spectral indices such as (N-R)/(N+R): parsed as Python arithmetic, and nothing else is executed."""
+"""Formulas of spectral indices such as (N-R)/(N+R), which are parsed as Python and evaluated without executing code."""
 
 import ast
 from collections.abc import Callable, Iterator, Mapping
@@ -11,7 +11,9 @@ from agalign.errors import ConfigurationError
 from agalign.values.image import FloatImage
 
 _MAX_LENGTH = 300
+"""Characters of a formula: longer ones could exhaust Python's recursion limit."""
 _MAX_NUMBER = 1e30
+"""Numbers must fit into float32."""
 _OPERATORS: Mapping[type, Callable[[Any, Any], Any]] = {
     ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power,
 }  # fmt: skip
@@ -20,15 +22,16 @@ _FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {"sqrt": np.sqrt, "log": np.log
 
 
 def symbols_of(formula: str) -> tuple[str, ...]:
-    """Return the names in a formula, each once, in their order. Raises ConfigurationError for anything but arithmetic.
+    """Return the different names in a formula, in the order of their first use.
 
-    Allowed are names, numbers, + - * / ** (or ^), parentheses, and sqrt, log, exp and abs.
+    Allowed are names, numbers, + - * / ** (or ^), parentheses, and sqrt, log, exp and abs. Raises ConfigurationError
+    for anything else.
     """
     return tuple(dict.fromkeys(_names(_parsed(formula), formula)))
 
 
 def evaluate(formula: str, values: Mapping[str, FloatImage]) -> FloatImage:
-    """Return the value of a formula, float32, given an array for each name; what is undefined is not finite."""
+    """Return the value of a formula, float32, given an array for each name; not finite where it is undefined."""
     with np.errstate(all="ignore"):
         return np.asarray(_value(_parsed(formula), values), np.float32)
 
@@ -69,7 +72,7 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
         case ast.Name(id=name):
             return values[name]
         case ast.Constant(value=value):
-            # Python's numbers would grow without limit: 9**9**9.
+            # float32 overflows to infinity; Python's integers would grow without limit, as in 9**9**9.
             return np.float32(value)  # type: ignore[arg-type]
         case ast.BinOp(left=left, op=op, right=right):
             return _OPERATORS[type(op)](_value(left, values), _value(right, values))

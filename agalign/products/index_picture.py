@@ -1,4 +1,4 @@
-"""The picture of an index raster: its values in colours, above their histogram."""
+"""The picture of an index raster: its values in colours, and below them their histogram."""
 
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,11 @@ from agalign.products.drawing import with_text, write_png
 
 _BARS = 120
 _PICTURE_PX = 720
-"""Longer side of the image at the top left of the picture; the report draws it over the composite."""
+"""Longer side of the image at the top left of the picture; the report overlays it on the composite."""
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
-"""Water, soil, and the greens, as red, green, blue over the span of an index of reflectance."""
+"""Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
 _NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
-"""For raw numbers: colours of soil or vegetation would be wrong."""
+"""Greys for raw numbers, whose values do not distinguish soil and vegetation."""
 _NODATA_COLOUR = (225, 190, 215)
 
 
@@ -29,13 +29,13 @@ def write_picture(
     values: NDArray[np.float32], sample: NDArray[np.float32], span: tuple[float, float], title: str, path: Path, *,
     neutral: bool,
 ) -> None:  # fmt: skip
-    """Write an image (height, width) of an index and the histogram of a sample of its values, coloured alike.
+    """Write an image (height, width) of an index and the histogram of a sample of its values in the same colours.
 
-    `neutral` is in greys. Raises OutputError.
+    `span` is the range of the colour scale; with `neutral` the colours are greys. Raises OutputError.
     """
     shape = values.shape
     width, margin, bars = max(shape[1], 360), 24, 90
-    # In float32 a clipped value may be just outside the span.
+    # In float64: a value clipped in float32 may be just outside the span.
     counts = np.histogram(sample.astype(float).clip(*span), _BARS, span)[0]
     sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
     sheet[: shape[0], : shape[1]] = _coloured(values, span, neutral=neutral)
@@ -43,7 +43,7 @@ def write_picture(
     edges = np.linspace(margin, width - margin, _BARS + 1).round().astype(int)
     centres = np.linspace(*span, 2 * _BARS + 1, dtype=np.float32)[1::2]
     colours = _coloured(centres[None], span, neutral=neutral)[0]
-    # The outermost bins also hold what is beyond the span.
+    # The first and last bins also contain the values beyond the span.
     heights = (bars * counts / max(int(counts[1:-1].max(initial=1)), 1)).clip(0, bars).round().astype(int)
     for left, right, height, colour in zip(edges, edges[1:], heights.tolist(), colours.tolist(), strict=False):
         cv2.rectangle(sheet, (int(left), base - height), (int(right) - 1, base), colour, -1)
@@ -54,7 +54,7 @@ def write_picture(
 
 
 def _coloured(values: NDArray[Any], span: tuple[float, float], *, neutral: bool) -> NDArray[np.uint8]:
-    """(H, W) values as (H, W, 3) red, green, blue."""
+    """Values (height, width) as colours (height, width, 3)."""
     ramp = _NEUTRAL if neutral else _COLOURS
     share = np.nan_to_num(np.clip((values - span[0]) / (span[1] - span[0]), 0, 1))
     stops = np.linspace(0, 1, len(ramp))

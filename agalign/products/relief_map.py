@@ -1,4 +1,4 @@
-"""A raster of the relief of a capture: parallax, and on request its confidence and the range, on the output grid."""
+"""A raster of the relief of a capture on the output grid: parallax and, on request, its confidence and the range."""
 
 from collections.abc import Mapping
 
@@ -19,20 +19,22 @@ from agalign.values.mapping import mapping_of
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.relief import Relief
 
+RELIEF_UNITS = {"parallax": "px", "confidence": "1", "range": "m"}
+"""Units by layer of the raster."""
 _STEP_PX, _STEP_CONFIDENCE = 0.01, 0.01
-"""Values are rounded: parallax is known less well, and compresses better."""
+"""Values are rounded to these steps: less than their errors, and the raster compresses better."""
 _MAX_RANGE_M = 1e5
-"""Beyond, the parallax of a drone's camera cannot be distinguished from that of an infinite range."""
+"""Larger ranges are nan: the parallax cannot be distinguished from that of an infinite range."""
 
 
 class ReliefMap(Product):
-    """The relief, where one displaces the bands: the sidecar's mapping needs it."""
+    """The relief that displaces the bands of a capture; the mapping in the sidecar refers to it."""
 
     kind = "relief"
     suffix = ".relief.tif"
 
     def is_enabled(self, settings: WriteSettings) -> bool:  # noqa: ARG002
-        """Always: it is written wherever a relief was estimated."""
+        """Return True: the raster is written whenever a relief was estimated."""
         return True
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
@@ -44,12 +46,12 @@ class ReliefMap(Product):
         layers = relief_layers(context.capture, context.usable, relief, context.grid)
         if not context.write_settings.relief_map:
             layers = {"parallax": layers["parallax"]}
-        write_layers(path, layers, context.grid, context.capture.reference.georeference, _UNITS)
+        write_layers(path, layers, context.grid, context.capture.reference.georeference, RELIEF_UNITS)
         return [WrittenFile(self.kind, path, StacAsset("relief", GEOTIFF, ("data",)))]
 
 
 def relief_of(alignments: Mapping[str, Alignment[FixedFilePx]]) -> Relief | None:
-    """The relief that displaces the bands of a capture; None if none does."""
+    """Return the relief of a capture; None if no band is displaced by one."""
     return next((a.parallax.relief for a in alignments.values() if a.parallax is not None), None)
 
 
@@ -57,9 +59,10 @@ def relief_layers(
     capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], relief: Relief, grid: OutputGrid,
     size_px: tuple[int, int] | None = None,
 ) -> dict[str, NDArray[np.float32]]:  # fmt: skip
-    """Return (height, width) on a grid: `parallax` in px of the reference's file along a baseline of length 1,
-    `confidence` from 0 to 1, and `range` in metres along the optical axis, nan where it is unknown. `size_px` (width,
-    height) has fewer points on the same area.
+    """Return layers (height, width) on a grid: `parallax` in px of the reference's file along a baseline of length 1,
+    `confidence` from 0 to 1, and `range` in metres along the optical axis, nan where it is unknown.
+
+    With `size_px` (width, height) the same area is sampled at that size.
     """
     columns, rows = size_px or (grid.width, grid.height)
     x, y = np.meshgrid(np.linspace(0, grid.width - 1, columns), np.linspace(0, grid.height - 1, rows))
@@ -79,23 +82,24 @@ def _range_m(
     capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], points: NDArray[np.float64],
     parallax_px: NDArray[np.float64],
 ) -> NDArray[np.float32]:  # fmt: skip
-    """(height, width), nan where baselines, focal length or the orientation of the lenses are unknown."""
-    reference, at_infinity, layout_m, mappings = capture.reference, [], [], []
+    """Range (height, width), nan if baselines, focal length or the orientation of the lenses are unknown."""
+    reference, at_infinity, baselines_m, mappings = capture.reference, [], [], []
     for band in capture.moving:
         alignment = alignments.get(band.name)
         if alignment is None or alignment.parallax is None or alignment.space != "undistorted":
             continue
         try:
-            rotation = rig_seed(reference, band)
+            homography_at_infinity = rig_seed(reference, band)
         except GeometryError:
-            rotation = None
-        if rotation is not None and band.lens_offset_m is not None and reference.lens_offset_m is not None:
-            at_infinity.append(rotation)
-            layout_m.append(np.subtract(reference.lens_offset_m, band.lens_offset_m))
-            mappings.append(mapping_of(reference, band, alignment))
+            continue
+        if homography_at_infinity is None or band.lens_offset_m is None or reference.lens_offset_m is None:
+            continue
+        at_infinity.append(homography_at_infinity)
+        baselines_m.append(np.subtract(reference.lens_offset_m, band.lens_offset_m))
+        mappings.append(mapping_of(reference, band, alignment))
     if not mappings or reference.lens is None:
         return np.full(parallax_px.shape, np.nan, np.float32)
-    inverse_m = inverse_range(mappings, at_infinity, np.array(layout_m), reference.lens, points, parallax_px)
+    inverse_m = inverse_range(mappings, at_infinity, np.array(baselines_m), reference.lens, points, parallax_px)
     with np.errstate(divide="ignore"):
         range_m = np.where(inverse_m > 1 / _MAX_RANGE_M, 1 / inverse_m, np.nan)
     return np.asarray(range_m, np.float32)
@@ -103,6 +107,3 @@ def _range_m(
 
 def _rounded(values: NDArray[np.float64], step: float) -> NDArray[np.float32]:
     return np.asarray(np.round(values / step) * step, np.float32)
-
-
-_UNITS = {"parallax": "px", "confidence": "1", "range": "m"}
