@@ -43,24 +43,24 @@ def align(
     moving_valid: ArrayLike | None = None,
     settings: Settings | None = None,
 ) -> Alignment[FixedImagePx]:
-    """Find the homography from one image to another of the same scene, whatever their modalities.
+    """Estimate the homography between two images of the same scene, which may be of different modalities.
 
     fixed, moving
         (H, W), (H, W, C) or (C, H, W) arrays of any numeric type; their sizes may differ. The largest value of an
-        integer type counts as saturated; constant fill connected to the border, and nan, are ignored.
+        integer type counts as saturated. nan, and constant areas at the border, are ignored.
     seed
-        3x3 fixed_to_moving to start from, within about 10 % of the image size; None starts from the images alone.
+        Initial `fixed_to_moving` (3x3), accurate to about 10 % of the image size; None: estimated from the images.
     seed_std_px
-        Standard error of the seed in px of `fixed`. In a repetitive scene the match within three of these is taken;
-        without it such a scene is not aligned.
+        Standard error of the seed, px of `fixed`. It decides between several matches in a repetitive scene, which is
+        otherwise not aligned.
     fixed_valid, moving_valid
         (H, W), False where pixels must not be used.
 
     Returns an Alignment. Its `fixed_to_moving` (3x3) maps a pixel of `fixed` to a pixel of `moving`: x right, y down,
-    (0, 0) the centre of the top-left pixel. Check its `status`: only `aligned` has passed verification. `predicted` is
-    extrapolated over a part of the image that shows nothing, with the error `prediction.std_px`; its `field` of lens
-    displacements comes before the homography. `seed_only` and `failed` have the seed's homography. All three have a
-    `reason`.
+    (0, 0) the centre of the top-left pixel. Check its `status`: only `aligned` has passed verification. With
+    `predicted`, the mapping is extrapolated over a part of the image that shows nothing, with the standard error
+    `prediction.std_px`; apply `field` before the homography. With `seed_only` and `failed`, the homography is that of
+    the seed. `reason` explains each of the three.
     Raises InputError for arrays that are not images, GeometryError for a seed that is not a homography.
     """
     settings = settings or Settings()
@@ -98,9 +98,9 @@ def warp_onto(
 
 
 def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureOutcome:
-    """Align one capture, as `discover` returns them, and write its stack and sidecar below `out`.
+    """Align a capture that `discover` returned, and write its stack and sidecar below `out`.
 
-    Raises UnreadableFileError where its reference band cannot be read, and OutputError.
+    Raises UnreadableFileError if its reference band cannot be read, and OutputError.
     """
     settings = settings or Settings()
     return process_capture(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings)
@@ -116,13 +116,14 @@ def align_folder(
     model: str | Path | None = None,
     progress: Progress | None = None,
 ) -> FlightReports:
-    """Align every capture below `folder` into `out` and write the summary and the report.
+    """Align every capture below `folder`, and write results, summary and report to `out`.
 
-    `run` sets the number of captures at a time, or the executor; with several processes the calling script must be
+    `run` sets the number of processes, or the executor; with several processes the calling script must be
     importable (`if __name__ == "__main__":`). `model` is a file from the `models` folder of an earlier run.
-    `progress` is called after each capture; the logger `agalign` has a line for each at the level INFO.
+    `progress` is called after each capture with its report, the number of finished captures and their total; the
+    logger `agalign` logs each capture at the level INFO.
     Returns the reports in the order in which the captures were finished.
-    Raises InputError if the folder does not exist, OutputError where `out` cannot be written, ConfigurationError
+    Raises InputError if the folder does not exist, OutputError if `out` cannot be written, ConfigurationError
     for a model of another camera.
     """
     from agalign.products.report import write_pages

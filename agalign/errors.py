@@ -1,8 +1,8 @@
-"""The exceptions that agalign raises on purpose. Each carries one line that a user can act on."""
+"""Exceptions of agalign. Their text is one line with the cause and the remedy."""
 
 
 class AgalignError(Exception):
-    """Base of everything agalign raises on purpose; its text is one line fit to be shown to a user."""
+    """Base of the exceptions of agalign; the text is one line for the user."""
 
 
 class InputError(AgalignError):
@@ -18,7 +18,7 @@ class ConfigurationError(AgalignError):
 
 
 class NoSuchBandError(ConfigurationError):
-    """A band that was asked for by name is in no capture."""
+    """No capture has a band of this name."""
 
 
 class GeometryError(AgalignError):

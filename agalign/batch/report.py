@@ -19,50 +19,50 @@ _MAX_ROWS = 20
 
 @dataclass(frozen=True)
 class CaptureReport:
-    """What became of one capture."""
+    """State and result of one capture."""
 
     label: str
     state: Literal["done", "kept", "error", "panel", "sky"]
-    """`kept`: an earlier run's result with the same settings was there. `panel` and `sky`: the capture shows a
-    calibration panel or the sky, and is left out.
+    """`kept`: an earlier run with the same settings has finished the capture. `panel` and `sky`: the capture shows a
+    calibration panel or the sky, and is not aligned.
     """
     result: CaptureResult | None = None
-    """What its sidecar says, without the long tables."""
+    """Content of the sidecar, without the long tables."""
     path: Path | None = None
-    """Of the sidecar."""
+    """Path of the sidecar."""
     error: str | None = None
     panel: str | None = None
-    """What the calibration panel is, in words."""
+    """Description of the calibration panel."""
     sky: str | None = None
-    """Why the capture counts as one of the sky, in words."""
+    """Why the capture counts as sky."""
     shortcomings: tuple[str, ...] = ()
-    """What was not written though the capture is done, and why."""
+    """Products that could not be written, and why."""
     seconds: float = 0.0
-    """What it took in this run."""
+    """Processing time in this run."""
     stages: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    """The same by (band, stage)."""
+    """Processing time by (band, stage), s."""
 
     @property
     def sidecar(self) -> Sidecar | None:
-        """The whole of it, read from its file; None where there is none. Raises SidecarError."""
+        """The complete sidecar, read from its file; None if there is none. Raises SidecarError."""
         return None if self.path is None else read_sidecar(self.path)
 
     @property
     def good(self) -> bool:
-        """True where nothing is left to be wished for: every band pair of the capture is aligned, or predicted well
-        enough, none is missing, and all is written.
+        """True if every band pair is aligned or predicted accurately enough, none is missing, and all products are
+        written; also for panels and the sky.
         """
         done = self.result is not None and self.result.status == "ok" and not self.shortcomings
         return self.state in ("panel", "sky") or done
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What went wrong, but for bands that are not aligned, which the sidecar has."""
+        """Errors, except bands that are not aligned; those are in the sidecar."""
         return self.shortcomings if self.error is None else (self.error, *self.shortcomings)
 
     @property
     def summary(self) -> str:
-        """The state and how many bands have which status, or what went wrong."""
+        """The state, with the number of bands by status, or the error."""
         if self.result is None:
             return f"{self.state}: {self.error or self.panel or self.sky}"
         statuses = Counter(b.status for b in self.result.bands if b.status != "reference")
@@ -85,7 +85,7 @@ class CaptureReport:
 
     @property
     def useful(self) -> bool:
-        """True where at least one band pair is aligned or predicted."""
+        """True if at least one band pair is aligned or predicted."""
         return self.result is not None and any(b.status in ("aligned", "predicted") for b in self.result.bands)
 
 

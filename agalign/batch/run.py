@@ -45,23 +45,23 @@ _MAX_THREADS = 4
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run goes about it: nothing here changes a capture's result."""
+    """How to run; no option changes the result of a capture."""
 
     overwrite: bool = False
-    """Do captures again that an earlier run finished."""
+    """Process finished captures again."""
     jobs: int = 1
-    """Captures at a time, in as many processes; few captures are done one after another. 0 is one for each core."""
+    """Captures to process at the same time; 0 is one per core. Few captures are processed one after another."""
     align_panels: bool = False
-    """Align captures of calibration panels and of the sky like any other."""
+    """Also align captures of calibration panels and of the sky."""
     executor: Executor | None = None
-    """Processes the captures instead: any executor with workers that see the same folders (`dask_executor` is one)."""
+    """Executor that processes the captures, such as `dask_executor`; its workers need the same folders."""
     retry_failed: bool = False
-    """Do those captures again that an earlier run finished in which a band is not aligned, or missing."""
+    """Process captures again if a band is not aligned or missing."""
     timeout_s: float | None = None
-    """After which a capture is stopped; it has a process of its own then, which is killed. Not for an
-    `executor`, which has its own (`dask_executor`)."""
+    """Seconds after which the process of a capture is killed; ignored with an `executor` (`dask_executor` has its
+    own)."""
     command: str = ""
-    """The command line that asked for the run, for its record and report."""
+    """Command line, for run record and report."""
 
 
 @dataclass(frozen=True)

@@ -33,18 +33,18 @@ MIN_TIMES_CHANCE = 5.0
 
 @dataclass(frozen=True)
 class Seed:
-    """A coarse mapping to start from and how well the images agree under it."""
+    """Initial alignment, with the correlation of the images under it."""
 
     kind: SeedKind
     fixed_to_moving: Matrix
     score: float
-    """By which candidates are compared: the height of the correlation at this mapping, in standard deviations."""
+    """Height of the correlation at this mapping, in standard deviations; candidates are compared by it."""
     peak_sigma: float = 0.0
     """Height of the correlation peak above its surroundings, in standard deviations."""
     runner_up_sigma: float = 0.0
     """The same for the second highest separate peak."""
     trusted: bool = False
-    """The images themselves leave no doubt that it is good to a few pixels."""
+    """The images confirm that it is accurate to a few pixels."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class JointResult(Generic[FixedPx]):
 
 @dataclass(frozen=True)
 class Residual(Generic[FixedPx]):
-    """Shifts of windows that an alignment leaves, measured independently of how it was found, on the fixed grid."""
+    """Shifts of windows that remain after alignment, measured independently of the estimation, on the fixed grid."""
 
     centres_px: NDArray[np.float64]
     """(n, 2) centres of the windows."""
@@ -97,10 +97,10 @@ class Residual(Generic[FixedPx]):
     median_px: FixedPx
     p95_px: FixedPx
     coverage: float
-    """Share of the tiles with enough structure in which a shift could be measured."""
+    """Share of the textured windows in which a shift could be measured."""
     peaks_sigma: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.empty(0))
-    """(n,) how far each tile's correlation peak stands out, in standard deviations: the error of a shift falls with its
-    square."""
+    """(n,) height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
+    proportional to its square."""
 
     @classmethod
     def of(
@@ -121,7 +121,7 @@ class Residual(Generic[FixedPx]):
         return self.centres_px[np.isfinite(self.shifts_px[:, 0])]
 
     def is_better_than(self, other: "Residual[FixedPx]") -> bool:
-        """True where the median shift, divided by the share of windows that could be measured, is smaller."""
+        """True if the median shift, divided by the coverage, is smaller."""
         return self.median_px / max(self.coverage, 1e-6) < other.median_px / max(other.coverage, 1e-6)
 
     def in_file_px(self: "Residual[FixedImagePx]", scales: "PairScales") -> "Residual[FixedFilePx]":
@@ -214,17 +214,16 @@ _SOURCES: dict[PredictionSource, str] = {
 
 @dataclass(frozen=True)
 class Prediction:
-    """The mapping of a band where its own image does not determine it: by the rig of a flight, or extrapolated."""
+    """Mapping of a band by the rig of the flight, or by extrapolation."""
 
     fixed_to_moving: Matrix
-    """Between the files, undistorted where the rig's mappings are."""
+    """Between the files; between undistorted pixels if the mappings of the rig are."""
     source: PredictionSource
-    """From the capture's other bands, from the captures around it, from the flight's mean, or from the windows in the
-    rest of the image."""
+    """Other bands of the capture, neighbouring captures, mean of the flight, or windows in the rest of the image."""
     std_px: MovingFilePx
     """Standard error: root mean square over the image."""
     off_px: MovingFilePx | None = None
-    """Root mean square distance from the band's own alignment; None where it has none."""
+    """Root mean square distance from the band's own alignment; None if there is none."""
     covariance_px2: NDArray[np.float64] | None = None
     """(12, 12) of an extrapolated mapping, over the corners and the lens shapes (`verify.lens_shapes`), px of the
     reference's file; None for a rig's."""
@@ -232,14 +231,14 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Alignment(Generic[FixedPx]):
-    """The mapping of one band pair and everything known about it, between the images or between the files."""
+    """Mapping of one band pair, between the images or between the files, and how it was estimated and verified."""
 
     fixed_to_moving: Matrix
-    """Between undistorted pixels where both lenses are known, else between raw pixels."""
+    """Between undistorted pixels if both lenses are known, else between raw pixels."""
     space: Space
     status: PairStatus
     issues: tuple[Issue, ...]
-    """Reasons against accepting it, the most important first; empty if it is `aligned`."""
+    """Reasons against accepting the alignment, the most important first; empty if it is `aligned`."""
     seed: Seed
     joint: JointResult[FixedPx] | None
     residual: Residual[FixedPx] | None
@@ -247,9 +246,9 @@ class Alignment(Generic[FixedPx]):
     before: Mapping[str, float] = dataclasses.field(default_factory=dict)
     after: Mapping[str, float] = dataclasses.field(default_factory=dict)
     local: DisplacementResult[FixedPx] | None = None
-    """What a field of displacements of this capture's own gains; None where it was not asked for."""
+    """Displacement field of this band alone and its gain; None if none was tried."""
     field: DisplacementField | None = None
-    """All displacements in raw px of the reference, before the homography: the rig's and the capture's own."""
+    """Displacements of rig and capture in raw px of the reference, applied before the homography."""
     parallax: Parallax | None = None
     """The capture's relief, which displaces undistorted px of the reference along the band's baseline."""
     prediction: Prediction | None = None
@@ -271,7 +270,7 @@ class Alignment(Generic[FixedPx]):
 
     @property
     def reason(self) -> str | None:
-        """Why it is not aligned, in words; None where it is."""
+        """Why the band is not aligned; None if it is."""
         text = explanation(self.issues)
         if text is None or self.status == "aligned":
             return None
