@@ -160,7 +160,7 @@ RngSeed = Annotated[
 ]
 Quiet = Annotated[bool, of_running("--quiet", "-q", help="Print problems only.")]
 Verbose = Annotated[bool, of_running("--verbose", "-v", help="Print a line per band pair.")]
-LogJson = Annotated[bool, of_running("--log-json", help="Print one JSON object a line to standard error.")]
+LogJson = Annotated[bool, of_running("--log-json", help="Print one JSON object per line to standard error.")]
 
 
 @contextmanager
