@@ -61,7 +61,7 @@ class MemoryLimitError(AgalignError):
 
 _SAID_OF_MEMORY = (
     "not enough memory", "can't allocate memory", "Cannot allocate memory", "bad_alloc", "Insufficient memory",
-    "can't start new thread", "could not create a primitive",
+    "can't start new thread", "could not create a primitive", "out of memory",
 )  # fmt: skip
 
 

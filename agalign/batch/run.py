@@ -87,9 +87,11 @@ def run_flight(
     One capture's failure never stops the others, and no result depends on the order in which they are done. What the
     run was is in OUT/agalign-run.json.
     Raises OutputError where the output folder cannot be used, another run writes there or the disk is full, WorkerError
-    where no worker process can be started or they end one after another, InputError or ConfigurationError for `model`.
+    where no worker process can be started or they end one after another, InputError or ConfigurationError for `model`,
+    ConfigurationError for a device.
     """
     options, listener = options or RunOptions(), listener or Listener()
+    choose_device(settings.joint.device)
     check_indices(flight.captures, settings.write)
     _refuse_to_overwrite(flight, out, settings.write)
     known = None if model is None else _given_model(model, flight, settings)
@@ -193,6 +195,7 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
     Raises ConfigurationError as `run_flight` does.
     """
     options = options or RunOptions()
+    choose_device(settings.joint.device)
     check_indices(flight.captures, settings.write)
     _refuse_to_overwrite(flight, out, settings.write)
     sky, captures = _sky(flight.captures, options)

@@ -12,29 +12,40 @@ import cv2
 import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
+from torch.nn import functional
 
 from agalign.errors import ConfigurationError, is_want_of_memory
 
 
 def choose_device(name: str) -> torch.device:
-    """`auto` is CUDA where there is one, else the CPU. Raises ConfigurationError where `name` cannot be had."""
+    """`auto` is CUDA where it is available, else the CPU. Raises ConfigurationError where a device cannot be used."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
     except RuntimeError:
         raise ConfigurationError(f"unknown device '{name}'; use auto, cpu, cuda, cuda:1 or mps") from None
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ConfigurationError(
-            f"device '{name}' cannot be used: no CUDA device, or PyTorch without CUDA; 'agalign doctor' lists devices"
-        )
+    for kind, is_available in (("cuda", torch.cuda.is_available), ("mps", torch.backends.mps.is_available)):
+        if device.type == kind and not is_available():
+            no = f"no {kind.upper()} device, or PyTorch without {kind.upper()}"
+            raise ConfigurationError(f"device '{name}' cannot be used: {no}; 'agalign doctor' lists devices")
     try:
-        if device.type == "meta":
-            raise RuntimeError("it holds no numbers")
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
+        if device.type != "cpu":
+            _try_out(device)
+    except (RuntimeError, AssertionError, ImportError) as error:
         raise ConfigurationError(f"device '{name}' cannot be used here: {str(error).splitlines()[0]}") from None
     return device
+
+
+@cache
+def _try_out(device: torch.device) -> None:
+    """Sample an image and multiply matrices. Raises RuntimeError where the device cannot; before 2.13 PyTorch may lack
+    this padding on Apple's GPUs.
+    """
+    ones = torch.ones(1, 1, 64, 64, device=device)
+    sampled = functional.grid_sample(ones, ones.expand(2, 1, 64, 64).permute(1, 2, 3, 0), "bilinear", "border", True)
+    if float((sampled @ ones).sum()) != 64**3:
+        raise RuntimeError("it computes wrong values")
 
 
 @dataclass(frozen=True)
@@ -51,22 +62,22 @@ class Device:
 
 def devices() -> list[Device]:
     """The CPU and every GPU, each tried."""
-    result = [Device("cpu", platform.machine(), torch.get_num_threads(), _trial("cpu"))]
+    result = [Device("cpu", platform.machine(), torch.get_num_threads(), _problem("cpu"))]
     for i in range(torch.cuda.device_count()):
         facts = torch.cuda.get_device_properties(i)
         what = f"{facts.name}, {facts.total_memory / 1e9:.0f} GB"
-        result.append(Device(f"cuda:{i}", what, 0, _trial(f"cuda:{i}")))
+        result.append(Device(f"cuda:{i}", what, 0, _problem(f"cuda:{i}")))
     if torch.backends.mps.is_available():
-        result.append(Device("mps", "Apple GPU", 0, _trial("mps")))
+        result.append(Device("mps", "Apple GPU", 0, _problem("mps")))
     return result
 
 
-def _trial(name: str) -> str:
+def _problem(name: str) -> str:
     try:
-        ones = torch.ones(64, 64, device=name)
-        return "" if float((ones @ ones).sum()) == 64**3 else "it multiplies wrongly"
+        _try_out(torch.device(name))
     except RuntimeError as error:
         return str(error).splitlines()[0]
+    return ""
 
 
 def exact(tensor: Tensor) -> Tensor:

@@ -180,7 +180,7 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach
         return homography.new_zeros(2)
     f = describe_fixed(band.net, band.level, keypoints)
     count = int(reach_px / step_px)
-    along = torch.arange(-count, count + 1, device=homography.device) * step_px
+    along = torch.arange(-count, count + 1) * step_px
     shifts = torch.cartesian_prod(along, along).to(homography)
     lengths = shifts.norm(dim=1)
     shifts = shifts[lengths <= reach_px]

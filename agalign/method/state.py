@@ -88,6 +88,6 @@ class JointState:
     def _random_descriptor(self, channels: Sequence[int], *, half_rectified: bool, unit_length: bool) -> Descriptor:
         """Its weights depend only on the rng_seed of the settings."""
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.settings.rng_seed)
+            torch.default_generator.manual_seed(self.settings.rng_seed)
             net = Descriptor(self.settings.sharing, channels, half_rectified=half_rectified, unit_length=unit_length)
         return net.to(self.device)

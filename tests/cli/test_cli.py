@@ -298,6 +298,8 @@ def test_info_of_what_is_no_model_is_one_line(tmp_path: Path) -> None:
         (["export", "nowhere", "--for", "excel"], 2, "excel"),
         (["align", "{flight}", "-o", "{tmp}/o", "--reference", "SWIR"], 2, "SWIR"),
         (["align", "{flight}", "-o", "{tmp}/o", "--device", "abacus"], 2, "abacus"),
+        (["align", "{flight}", "-o", "{tmp}/o", "--device", "cuda:99"], 2, "device 'cuda:99' cannot be used"),
+        (["align", "{flight}", "--dry-run", "--device", "cuda:99"], 2, "device 'cuda:99' cannot be used"),
         (["align", "{flight}", "-o", "{tmp}/o", "--pattern", "x"], 2, "pattern"),
         (["align", "{flight}", "-o", "{tmp}/file"], 1, "file"),
         (["align", "{flight}", "--seed", "luck"], 2, "luck"),
@@ -314,7 +316,7 @@ def test_bad_input_is_one_clear_line(
     assert word in done.stderr
     if code == 1:
         assert len([line for line in done.stderr.splitlines() if line.startswith("agalign: ")]) == 1
-    assert not (tmp_path / "o" / "summary.csv").exists()
+    assert not (tmp_path / "o").exists()
 
 
 def test_help_and_version() -> None:

@@ -1,16 +1,38 @@
 import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from agalign.batch.learn import learn_flight
+from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.capture.align import align_capture_bands
+from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError
+from agalign.flight.model import load_model, save_model
 from agalign.method import device
 from agalign.method.device import choose_device, exact, one_memory_error, one_thread
+from agalign.method.fast import Schedule
+from agalign.method.joint import align_from_scratch
+from agalign.method.paper import Training
+from agalign.method.state import ImageGroup
+from agalign.values import geometry
+from agalign.values.alignment import DisplacementField, JointResult
+from agalign.values.choices import Recipe
+from agalign.values.image import Raster
+from agalign.values.lens import Lens
+
+from ..conftest import textured_pair
+from .pretended_device import NAME, PretendedDevice
 
 
 def test_a_device_that_is_not_there_is_a_configuration_error() -> None:
     assert choose_device("cpu").type == "cpu"
-    for name in ("nonsense", "cuda:99"):
+    assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+    for name in ("nonsense", "cuda:99", "hpu", "xpu:99"):
         with pytest.raises(ConfigurationError, match=name):
             choose_device(name)
 
@@ -57,5 +79,73 @@ def test_without_float64_on_the_device_psi_is_solved_for_on_the_cpu(monkeypatch:
 def test_want_of_memory_has_one_name() -> None:
     with pytest.raises(MemoryError, match="not enough memory"), one_memory_error():
         raise RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory")
+    with pytest.raises(MemoryError, match="MPS"), one_memory_error():
+        raise RuntimeError("MPS backend out of memory (MPS allocated: 8.00 GB)")
     with pytest.raises(RuntimeError, match="something else"), one_memory_error():
         raise RuntimeError("something else, of memory")
+
+
+GPU = Callable[[bool], PretendedDevice]
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> GPU:
+    """The context of a device with float64, or without as Apple's, and of all work in one thread."""
+    monkeypatch.setattr(ThreadPoolExecutor, "map", lambda _self, function, *items: map(function, *items))
+
+    def of_kind(has_float64: bool) -> PretendedDevice:
+        monkeypatch.setattr(device, "_has_float64", lambda d: has_float64 or d.type != NAME)
+        return PretendedDevice(has_float64=has_float64)
+
+    return of_kind
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("recipe", "has_float64"), [("fast", True), ("fast", False), ("paper", False)])
+def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64: bool) -> None:
+    fixed, moving = textured_pair(geometry.translation(6.0, -4.0), 260, 200)
+    rgb, lens = np.stack([fixed, 0.5 * fixed, -fixed]), Lens(260.0, 260.0, 130.0, 100.0, (0.01,))
+    valid = np.ones(fixed.shape, bool)
+    fields = [DisplacementField(60.0, np.full((5, 6, 2), 0.1))]
+
+    def align(name: str) -> JointResult:
+        images, seed = [Raster(pixels, valid, lens) for pixels in (rgb, moving)], geometry.translation(7.0, -5.0)
+        group = ImageGroup(images[0], images[1:], [seed], [1], [False], reach_px=[9.0], fields=fields)
+        (result,) = align_from_scratch(
+            group, JointSettings(recipe=recipe, device=name), lambda *_: None,
+            schedule=Schedule(max_steps=10, enough_retrieval=2.0), training=Training(200, 1),
+        )  # fmt: skip
+        assert isinstance(result, JointResult)
+        return result
+
+    on_cpu = align("cpu")
+    with gpu(has_float64) as used:
+        on_gpu = align(NAME)
+    assert used.operations > 1000
+    np.testing.assert_allclose(on_gpu.fixed_to_moving, on_cpu.fixed_to_moving, rtol=1e-9)
+    np.testing.assert_allclose((on_gpu.loss, on_gpu.retrieval), (on_cpu.loss, on_cpu.retrieval), rtol=1e-6)
+    assert on_gpu.iterations == on_cpu.iterations > 0
+
+
+@pytest.mark.slow
+def test_a_flight_on_a_gpu_has_the_result_of_the_cpu(gpu: GPU, flight: Path, tmp_path: Path) -> None:
+    """Learning, the file of the model, keypoint matching and the refinement by the frozen network."""
+    captures = discover(flight, DiscoverOptions(bands=("Green", "NIR"))).captures
+
+    def align(name: str) -> JointResult:
+        settings = Settings(joint=JointSettings(device=name), seed=SeedSettings(force="match"))
+        model, path = learn_flight(captures, settings, lambda *_: None), tmp_path / name
+        assert model is not None
+        save_model(model, path)
+        loaded = load_model(path, lambda: choose_device(name))
+        assert {w.device.type for w in (*model.net.parameters(), *loaded.net.parameters())} == {name}
+        joint = align_capture_bands(captures[0], settings, loaded, lambda *_: None)["NIR"].joint
+        assert joint is not None
+        return joint
+
+    on_cpu = align("cpu")
+    with gpu(True) as used:
+        on_gpu = align(NAME)
+    assert used.operations > 1000
+    np.testing.assert_allclose(on_gpu.fixed_to_moving, on_cpu.fixed_to_moving, rtol=1e-9)
+    assert on_gpu.retrieval == on_cpu.retrieval
