@@ -44,14 +44,14 @@ class JointSettings(Stage):
     """Joint optimisation of the descriptor and the homographies."""
 
     recipe: Recipe = "fast"
-    """`paper` is the published algorithm; `fast` gives the same result sooner."""
+    """`paper` follows the published algorithm step by step; `fast` reaches the same result sooner."""
     sharing: Sharing = "pseudo-siamese"
-    """Layers that the networks of reference and moving band share: all (siamese), all but the first (pseudo-siamese),
-    or none (unshared)."""
+    """Layers that the descriptors of the reference and of a moving band share: all (siamese), all but the first
+    (pseudo-siamese), or none (unshared)."""
     model_family: FamilyChoice = "auto"
-    """Mapping to fit; `auto` is the most general one that the images determine."""
+    """Mappings to fit; `auto` takes the richest one that the images determine."""
     device: str = "auto"
-    """Torch device: cpu, cuda, cuda:1 and so on; `auto` is CUDA if it is available."""
+    """Of torch: cpu, cuda, cuda:1 and so on; `auto` is CUDA where it is available."""
     rng_seed: Annotated[int, Field(ge=0, le=MAX_RNG_SEED)] = 0
     """The same seed gives the same result, bit by bit."""
 
@@ -60,33 +60,34 @@ class FlightSettings(Stage):
     """One network for many captures."""
 
     together: bool = True
-    """False learns a network for each capture."""
+    """False learns every capture alone."""
     start: str = ""
-    """Fingerprint of the model that a run starts from, set by `run_flight`; runs with another one repeat a capture."""
+    """Fingerprint of the model that a run starts from, set by `run_flight`: a result is kept only by runs with it."""
 
 
 class SeedSettings(Stage):
-    """Initial alignment."""
+    """Coarse alignment."""
 
     force: SeedKind | None = None
-    """Use only this kind of seed."""
+    """Use this kind of seed whatever its score."""
     only: bool = False
-    """Stop after the initial alignment."""
+    """Stop at the seed: nothing is learnt or optimised."""
 
 
 class CheckSettings(Stage):
-    """Acceptance of predicted bands. The limits of the checks are in their modules in `verify`."""
+    """What counts as delivered. The limits of each check are in its module in `verify`."""
 
     accept_predicted_px: Annotated[float, Field(ge=0)] = 1.0
-    """Largest standard error at which a predicted band counts as usable, px of its file."""
+    """Largest standard error of a predicted band that counts as delivered, px of its file."""
 
 
 class ReliefSettings(Stage):
-    """Correction of parallax over trees, terraces, buildings and benches."""
+    """Parallax beyond the homography, over trees, terraces, buildings and benches."""
 
     use: ReliefUse = "auto"
-    """`auto` estimates one relief for all bands of a capture if its windows show parallax. A single moving lens, whose
-    relief no other band can verify, gets a smooth displacement field instead, if left-out windows confirm it."""
+    """`auto` estimates one relief for all bands of a capture where its windows show parallax. A band that has no other
+    to be verified by gets a smooth displacement field, where parallax may be the only reason against it or where no rig
+    of a flight knows the distortion that the lenses leave."""
 
     @field_validator("use", mode="before")
     @classmethod
@@ -95,51 +96,52 @@ class ReliefSettings(Stage):
 
 
 class WriteSettings(Stage):
-    """Output files."""
+    """The aligned stacks."""
 
     interpolation: Interpolation = "lanczos"
     """RMS error on a random image of waves of up to 0.25 cycles/px, relative to its standard deviation: Lanczos 1.4 %,
     OpenCV's cubic kernel 3.0 %, bilinear 16 %."""
     crop: Crop = "flight"
-    """Area to write: shared by all bands of all captures (`flight`), by all bands of the capture (`common`), or the
-    whole frame of the reference (`none`)."""
+    """The area that all bands share in all captures of the flight, where its rig is known, or in each by itself; or
+    none."""
     format: RasterFormat = "gtiff"
     compression: Compression = "auto"
     """auto is Zstandard for stacks and Deflate for files of single bands."""
     undistort: bool = False
-    """Remove the lens distortion of the reference from the output."""
+    """Write the lens-corrected grid of the reference instead of its own."""
     layout: Layout = "stack"
-    """One stack per capture, one file per input file, or both."""
+    """One file a capture, one for each of its files, or both."""
     resolution: Resolution = "reference"
-    """Pixel size of the output: that of the reference, or of the finest band."""
+    """The reference's own pixels, or as many more as the finest band has."""
     georeference: bool = False
-    """Write an approximate georeference from position, altitude, yaw and focal length."""
+    """Give rasters of single captures an approximate georeference, by position, altitude, yaw and focal length."""
     ground_elevation_m: float | None = None
-    """Elevation of the ground in the height system of the camera's GPS, if neither tags nor a panel give the height."""
+    """Of the ground, in the altitudes of the camera's GPS: for heights where neither tags nor a panel give them."""
+    statistics: bool = False
+    """Store minimum, maximum, mean and standard deviation of each band in the rasters, as `gdalinfo -stats` does."""
     qa: bool = False
-    """Write a raster of quality flags."""
+    """A raster of quality flags next to them."""
     stac: bool = False
-    """Write a STAC item for each capture."""
+    """A STAC item for each capture."""
     indices: tuple[str, ...] = ()
-    """Names of the spectral indices to write, such as ndvi and ndre."""
+    """Names of the spectral indices to write of each capture, such as ndvi and ndre."""
     pan_sharpen: bool = False
-    """Also write the narrow bands at the resolution of the panchromatic band."""
+    """The narrow bands at the panchromatic band's resolution, in addition to the others."""
     error_map: bool = False
-    """Write a raster of the expected error at every pixel."""
+    """A raster of the expected error at every pixel."""
     tie_points: bool = False
-    """Write the measured windows of each band as CSV and GeoJSON."""
+    """The windows in which each band was measured, as CSV and GeoJSON."""
     relief_map: bool = False
-    """Add confidence and range to the raster of the relief."""
+    """The confidence and the range of the relief in its raster, next to the parallax."""
     fill_occluded: bool = False
-    """Interpolate pixels that are occluded in a band, instead of writing nodata."""
+    """Interpolate pixels that nearer parts of the scene occlude in a band, instead of nodata."""
     radiometry: RadiometryChoice = "off"
-    """Write float32 instead of raw numbers: radiance by the camera's calibration (`camera`), reflectance by light
-    sensor (`sun`) or by panel; `auto` is panel if available for all bands, else sun, else camera. Thermal bands are
-    written in degrees C.
+    """Write float32 instead of raw numbers: radiance as the camera's own calibration has it, reflectance by the light
+    sensor, or by a panel; auto is the last of these that every band can be given. Thermal bands are in degrees C then.
     """
     panel_albedo: tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...] = ()
-    """(band in lower case, reflectance 0 to 1) of the calibration panel; an empty name stands for all other bands. It
-    takes precedence over tags and QR code. If it is given, panels without tags and code are recognised too."""
+    """Reflectance of the calibration panel, 0 to 1, by band in lower case, or for all others by the empty name; before
+    what tags or its code say. Where it is given, a panel is also known by its looks."""
 
     @field_validator("radiometry", mode="before")
     @classmethod
@@ -148,7 +150,7 @@ class WriteSettings(Stage):
 
 
 class Settings(Stage):
-    """All settings that change results."""
+    """Everything that a run depends on."""
 
     seed: SeedSettings = SeedSettings()
     joint: JointSettings = JointSettings()
@@ -159,5 +161,5 @@ class Settings(Stage):
 
     @property
     def learns_flights(self) -> bool:
-        """True if one network is learned for a flight before its captures are aligned."""
+        """True where one network is learnt for a flight before its captures."""
         return self.joint.recipe == "fast" and self.flight.together and not self.seed.only

@@ -216,6 +216,12 @@ def align(
         bool,
         of_output("--qa", help="Write a raster of quality flags (saturated, occluded, glint …), <capture>.qa.tif."),
     ] = False,
+    statistics: Annotated[
+        bool,
+        of_output(
+            "--statistics", help="Store minimum, maximum, mean and standard deviation of each band (gdalinfo -stats)."
+        ),
+    ] = False,
     stac: Annotated[
         bool, of_output("--stac", help="Write a STAC item per capture and a collection per flight.")
     ] = False,
@@ -325,6 +331,7 @@ def align(
                 indices=tuple(name.lower() for name in band_names(index)), error_map=error_map, tie_points=tie_points,
                 relief_map=relief_map, fill_occluded=fill_occluded,
                 pan_sharpen=pan_sharpen, georeference=georeference, ground_elevation_m=ground_elevation, qa=qa,
+                statistics=statistics,
                 format=format, compression=compression,
             ),
         )  # fmt: skip

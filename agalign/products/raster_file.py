@@ -61,10 +61,15 @@ def write_raster(
         options |= {"compress": compression, "predictor": predictor(dtype.kind)}
         options |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
 
+    overviews = list(capture.reference.overviews) if settings.format == "gtiff" else []
+
     def finish(partial: Path) -> None:
-        if capture.reference.overviews and settings.format == "gtiff":
+        if overviews or settings.statistics:
             with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "r+") as dataset:
-                dataset.build_overviews(list(capture.reference.overviews), Resampling.average)
+                if settings.statistics:
+                    dataset.stats(approx=False)  # GDAL stores in the file what it computes
+                if overviews:
+                    dataset.build_overviews(overviews, Resampling.average)
         if tags is not None:
             add_directories(partial, tags.first, tags.exif, tags.gps)
         if settings.format == "cog":

@@ -121,6 +121,33 @@ def test_the_georeference_follows_the_crop(tmp_path: Path, file_format: str) -> 
         assert written.descriptions == ("B0", "B1", "B2")
 
 
+@pytest.mark.parametrize("file_format", ["gtiff", "cog"])
+def test_statistics_are_those_of_the_valid_pixels(tmp_path: Path, file_format: str) -> None:
+    capture, grid = make_capture(tmp_path), replace(CROP, has_gaps=True)
+    moved = Layer(capture.bands[0], PixelMapping(geometry.translation(40.0, 0.0)))
+    layers = [Layer(capture.bands[1], None, is_reference=True), moved]
+    path = tmp_path / "out.tif"
+    write_raster(capture, layers, grid, path, WriteSettings(statistics=True, format=file_format))
+    with rasterio.open(path) as dataset:
+        for index in dataset.indexes:
+            stored, pixels = dataset.tags(index), dataset.read(index, masked=True).compressed()
+            assert float(stored["STATISTICS_MINIMUM"]) == pixels.min()
+            assert float(stored["STATISTICS_MAXIMUM"]) == pixels.max()
+            assert float(stored["STATISTICS_MEAN"]) == pytest.approx(pixels.mean())
+            assert float(stored["STATISTICS_STDDEV"]) == pytest.approx(pixels.std())
+
+
+def test_a_band_without_valid_pixels_has_no_statistics(tmp_path: Path) -> None:
+    capture = make_capture(tmp_path)
+    layers = [Layer(capture.bands[1], None, is_reference=True), Layer(capture.bands[0], None)]
+    path = tmp_path / "out.tif"
+    write_raster(capture, layers, replace(CROP, has_gaps=True), path, WriteSettings(statistics=True))
+    with rasterio.open(path) as dataset:
+        assert dataset.tags(1)["STATISTICS_VALID_PERCENT"] == "100"
+        assert dataset.tags(2)["STATISTICS_VALID_PERCENT"] == "0"
+        assert "STATISTICS_MEAN" not in dataset.tags(2)
+
+
 def test_moving_bands_are_resampled_where_the_mapping_says(tmp_path: Path) -> None:
     capture = make_capture(tmp_path, "float32")
     whole = PixelMapping(geometry.translation(3, -2))
