@@ -1,6 +1,7 @@
-"""Spectral indices of the bands of a capture, which are found by their wavelengths or names."""
+"""Spectral indices, and the choice of their bands by wavelength or name."""
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,29 +17,27 @@ from agalign.products.formula import evaluate, symbols_of
 from agalign.values.image import FloatImage
 
 Role = Literal["blue", "green", "red", "red edge", "nir"]
-_NOMINAL_NM: dict[Role, tuple[float, float, float]] = {
+"""The part of the spectrum that a band of an index is from."""
+_RANGES_NM: dict[Role, tuple[float, float, float]] = {
     "blue": (430, 475, 510), "green": (520, 560, 590), "red": (620, 668, 695), "red edge": (697, 717, 760),
     "nir": (765, 840, 920),
 }  # fmt: skip
-"""Shortest, nominal and longest centre wavelength of what a role is."""
+"""Shortest, nominal and longest centre wavelength of each role."""
 _NAMES: dict[Role, tuple[str, ...]] = {
     "blue": ("blue", "blu", "b"), "green": ("green", "gre", "grn", "g"), "red": ("red", "r"),
     "red edge": ("red edge", "rededge", "red_edge", "red-edge", "reg", "re"),
     "nir": ("nir", "near infrared", "near infra-red", "near-infrared", "n"),
 }  # fmt: skip
-
-
 _NOT_NARROW = ("pan", "rgb", "lwir", "thermal")
-"""Bands of these names lie within a role's wavelengths by accident."""
-
-
+"""Starts of the names of bands that have no role, whatever their centre wavelength."""
 _LETTERS: dict[str, Role] = {
     "B": "blue", "G": "green", "R": "red", "RE": "red edge", "RE1": "red edge", "N": "nir",
 }  # fmt: skip
 """The names of bands in formulas, as in the catalogue Awesome Spectral Indices."""
 _CATALOGUE, _CONSTANTS = "spyndex/data/spectral-indices-dict.json", "spyndex/data/constants.json"
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
-_PROBE_SCALE = 1000.0
+_TEST_FACTOR = 1000.0
+"""A formula whose value is the same after multiplication of all bands by this does not depend on their unit."""
 
 
 @dataclass(frozen=True)
@@ -47,26 +46,26 @@ class Index:
 
     name: str
     formula: str
-    """Of the letters B, G, R, RE and N, and of `constants`."""
+    """Arithmetic of the bands B, G, R, RE and N, and of `constants`."""
     span: tuple[float, float] | None = None
-    """Values between which a picture shows it; None for the 2nd and 98th percentile of its values."""
+    """Range of the colour scale of a picture; None for the 2nd and 98th percentile of the values."""
     source: str = ""
     constants: tuple[tuple[str, float], ...] = ()
     any_unit: bool = True
-    """False where the formula applies to reflectance only."""
+    """False if the formula applies to reflectance only."""
 
     @cached_property
     def symbols(self) -> tuple[str, ...]:
-        """The bands in the formula, in their order."""
+        """The bands in the formula, in the order of their first use."""
         return tuple(s for s in symbols_of(self.formula) if s not in dict(self.constants))
 
     @property
     def roles(self) -> tuple[Role, ...]:
-        """What the bands of `symbols` are."""
+        """The roles of `symbols`."""
         return tuple(_LETTERS[s.upper()] for s in self.symbols)
 
 
-_ALL = (
+_BUILT_IN = (
     Index("ndvi", "(N - R) / (N + R)", (-0.2, 1.0), "Rouse et al. 1974"),
     Index("ndre", "(N - RE) / (N + RE)", (-0.2, 0.8), "Gitelson and Merzlyak 1994"),
     Index("gndvi", "(N - G) / (N + G)", (-0.2, 1.0), "Gitelson et al. 1996"),
@@ -80,11 +79,11 @@ _ALL = (
           any_unit=False),
     Index("evi", "2.5 * (N - R) / (N + 6 * R - 7.5 * B + 1)", (-0.2, 1.0), "Huete et al. 2002", any_unit=False),
 )  # fmt: skip
-INDICES: Mapping[str, Index] = {index.name: index for index in _ALL}
+INDICES: Mapping[str, Index] = {index.name: index for index in _BUILT_IN}
 
 
 def index_named(name: str) -> Index:
-    """Return an index by name: one of `INDICES`, or of the catalogue of spyndex where that is installed.
+    """Return an index by name: one of `INDICES`, or of the catalogue of spyndex if that is installed.
 
     Raises ConfigurationError for an unknown name, or for an index of bands that drone cameras do not have.
     """
@@ -99,13 +98,10 @@ def index_named(name: str) -> Index:
 
 
 def index_of_formula(text: str) -> Index:
-    """Return the index of a text 'name=(N-R)/(N+R)', or of a formula alone, which is named 'formula'.
-
-    Raises ConfigurationError.
-    """
+    """Return the index of a text 'name=(N-R)/(N+R)'; the default name is 'formula'. Raises ConfigurationError."""
     name, equals, formula = text.partition("=")
     name, formula = (name.strip().lower(), formula) if equals else ("formula", text)
-    if not _NAME.fullmatch(name) or (name in INDICES):
+    if not _NAME.fullmatch(name) or name in INDICES:
         raise ConfigurationError(f"'{name}' cannot name a formula; use letters, digits and _, and no index's name")
     index = Index(name, formula.strip(), source="formula of the user")
     _check_bands(index)
@@ -113,7 +109,7 @@ def index_of_formula(text: str) -> Index:
 
 
 def _catalogue() -> Mapping[str, Any]:
-    """The indices of spyndex by name in lower case; empty if it is not installed. Its code is not executed."""
+    """The indices of spyndex by name in lower case, read without executing its code; empty if it is not installed."""
     return {name.lower(): entry for name, entry in _data_of_spyndex(_CATALOGUE, "SpectralIndices").items()}
 
 
@@ -124,21 +120,21 @@ def _data_of_spyndex(file: str, key: str) -> Mapping[str, Any]:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (metadata.PackageNotFoundError, OSError, ValueError):
         return {}
-    found: Mapping[str, Any] = data.get(key, data)
-    return found
+    entries: Mapping[str, Any] = data.get(key, data)
+    return entries
 
 
 def _of_catalogue(name: str, entry: Mapping[str, Any]) -> Index:
     formula = str(entry["formula"])
-    known = {k: v.get("default") for k, v in _data_of_spyndex(_CONSTANTS, "").items()}
-    constants = tuple((s, float(known[s])) for s in symbols_of(formula) if known.get(s) is not None)
+    defaults = {k: v.get("default") for k, v in _data_of_spyndex(_CONSTANTS, "").items()}
+    constants = tuple((s, float(defaults[s])) for s in symbols_of(formula) if defaults.get(s) is not None)
     index = Index(name, formula, source=str(entry.get("reference", "")), constants=constants)
     _check_bands(index)
     return replace(index, any_unit=_is_of_any_unit(index))
 
 
 def _check_bands(index: Index) -> None:
-    """Raise ConfigurationError if the formula has no band, or has other names than those of bands."""
+    """Raise ConfigurationError if the formula has no band, or a name that is not that of a band."""
     unknown = [s for s in index.symbols if s.upper() not in _LETTERS]
     if unknown or not index.symbols:
         used = ", ".join(unknown) or "no band"
@@ -146,45 +142,43 @@ def _check_bands(index: Index) -> None:
 
 
 def _is_of_any_unit(index: Index) -> bool:
-    """True where the value stays the same when all bands are multiplied by one number."""
+    """True if the value does not change when all bands are multiplied by the same number."""
     bands = [np.array([0.1 * k, 0.5 / k], np.float32) for k in range(1, len(index.symbols) + 1)]
-    scaled = [b * np.float32(_PROBE_SCALE) for b in bands]
+    scaled = [b * np.float32(_TEST_FACTOR) for b in bands]
     return bool(np.allclose(compute(index, bands), compute(index, scaled), rtol=1e-4, equal_nan=True))
 
 
 def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float | None]) -> list[int]:
-    """Which of some bands are the index's, by wavelength where one is known, else by name.
+    """Return the positions of the bands of an index, in the order of `index.symbols`, among bands with these names.
 
-    Raises InputError that names the missing one.
+    If several bands have a role, that nearest to the nominal wavelength is used. Raises InputError, which names the
+    missing role.
     """
+    roles = [role_of(name, wavelength_nm) for name, wavelength_nm in zip(names, wavelengths_nm, strict=True)]
     result = []
-    narrow = [not name.lower().startswith(_NOT_NARROW) for name in names]
     for role in index.roles:
-        shortest, nominal, longest = _NOMINAL_NM[role]
-        near = [
-            (abs(w - nominal), i)
-            for i, w in enumerate(wavelengths_nm)
-            if w is not None and narrow[i] and shortest <= w <= longest
-        ]
-        named = [i for i, n in enumerate(names) if wavelengths_nm[i] is None and n.lower() in _NAMES[role]]
-        if not near and not named:
+        _, nominal_nm, _ = _RANGES_NM[role]
+        candidates = [i for i, own_role in enumerate(roles) if own_role == role]
+        if not candidates:
             raise InputError(f"{index.name} needs a {role} band; there are {', '.join(names)}")
-        result.append(min(near)[1] if near else named[0])
+        # Bands with a known wavelength first.
+        distances_nm = [math.inf if w is None else abs(w - nominal_nm) for w in wavelengths_nm]
+        result.append(min(candidates, key=distances_nm.__getitem__))
     return result
 
 
 def role_of(name: str, wavelength_nm: float | None) -> Role | None:
-    """What a narrow band is for vegetation, by its wavelength where that is known, else by name."""
+    """Return the role of a band by its wavelength if that is known, else by its name; None for a band without one."""
     if name.lower().startswith(_NOT_NARROW):
         return None
-    for role, (shortest, _, longest) in _NOMINAL_NM.items():
-        if name.lower() in _NAMES[role] if wavelength_nm is None else shortest <= wavelength_nm <= longest:
+    for role, (shortest_nm, _, longest_nm) in _RANGES_NM.items():
+        if name.lower() in _NAMES[role] if wavelength_nm is None else shortest_nm <= wavelength_nm <= longest_nm:
             return role
     return None
 
 
 def compute(index: Index, bands: Sequence[FloatImage]) -> FloatImage:
-    """The index of reflectances (H, W), nan where a band is nan or the formula divides by zero."""
+    """Return the index (height, width) of its bands; nan where a band is nan or the formula divides by zero."""
     values: dict[str, FloatImage] = dict(zip(index.symbols, bands, strict=True))
     values |= {name: np.asarray(number, np.float32) for name, number in index.constants}
     value = evaluate(index.formula, values)

@@ -1,4 +1,4 @@
-"""Which pixels of a capture are written: its layers, and their common grid."""
+"""The layers of a capture that are written, and their common pixel grid."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -18,54 +18,56 @@ from agalign.values.mapping import PixelMapping, mapping_of
 from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, PixelScale
 
 _FLIGHT_MARGIN_PX = 2
-"""How far captures that the rig was not learnt on may exceed its extremes."""
+"""The crop of a flight is smaller by this: captures that the rig was not learned from may exceed its extremes."""
+_MAX_CELL_PX, _MIN_CELLS = 8, 64
+"""The common area is found in cells of at most 8 px, and at least 64 cells along each axis if the image has as many."""
 _BORDER_POINTS = 64
+"""Points on each side of the crop at which its coverage by the moving images is tested."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One band of the output: where its pixels come from.
-
-    `mapping` leads from the written pixels, before they are cut, to raw pixels of the file. The reference has none
-    where its own pixels are copied, and a moving band has none if there is nothing to write.
-    """
+    """One band of the output, and the source of its pixels."""
 
     band: Band
     mapping: PixelMapping | None
+    """From output pixels, before the crop, to raw pixels of the file. None for a reference that is copied, and for a
+    moving band without pixels.
+    """
     is_reference: bool = False
 
     @property
     def is_gap(self) -> bool:
-        """True where there is nothing to write."""
+        """True if the band has no pixels: all of them are nodata."""
         return self.mapping is None and not self.is_reference
 
     @property
     def is_copied(self) -> bool:
-        """True where pixels are the file's own."""
+        """True if the pixels are copied from the file."""
         return self.mapping is None and self.is_reference
 
 
 def output_layers(
     capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], settings: WriteSettings, rig: Rig | None = None
 ) -> tuple[list[Layer], OutputGrid]:
-    """The layers of a capture with these alignments of its usable moving bands, and the grid they are written on.
+    """Return a layer for each band of a capture, given the alignments of its usable moving bands, and their grid.
 
-    With the flight's `rig` the grid is that of all its captures: one flight, one geometry.
+    With the `rig` of the flight, all captures of the flight have the same grid.
     """
     pixels = _OutputPixels.of(capture, alignments, settings)
     layers = _layers(capture, alignments, pixels)
-    # The crop is that of the reference plane; relief may leave pixels of single bands without a value.
-    moved = [(layer.mapping.of_the_plane, layer.band) for layer in layers if layer.mapping is not None]
-    crop = _crop(capture, moved, pixels, settings, rig)
+    # The crop is calculated without relief, which may leave pixels of single bands without a value.
+    mapped = [(layer.mapping.of_the_plane, layer.band) for layer in layers if layer.mapping is not None]
+    crop = _crop(capture, mapped, pixels, settings, rig)
     has_relief = any(layer.mapping is not None and layer.mapping.parallax is not None for layer in layers)
-    has_gaps = has_relief or not _covers(moved, crop)
+    has_gaps = has_relief or not _covers(mapped, crop)
     grid = OutputGrid(crop.x0, crop.y0, crop.width, crop.height, pixels.scale, pixels.undistorted, has_gaps)
     return layers, grid
 
 
 @dataclass(frozen=True)
 class _OutputPixels:
-    """The reference's pixels as they are written, before the crop: finer, or without lens distortion."""
+    """The pixel grid of the output before the crop: that of the reference, a finer one, or one without distortion."""
 
     reference: Band
     size_px: tuple[int, int]
@@ -88,18 +90,18 @@ class _OutputPixels:
 
     @property
     def are_copied(self) -> bool:
-        """True where the reference's pixels are written as they are."""
+        """True if the pixels of the reference are copied."""
         return self.size_px == self.reference.size_px and not self.undistorted
 
     def on_grid(self, mapping: PixelMapping) -> PixelMapping:
-        """Return a mapping of the reference's raw pixels as one of the output pixels."""
+        """Return a mapping from the reference's raw pixels as a mapping from output pixels."""
         if self.reference.lens is not None and self.undistorted:
             mapping = mapping.from_undistorted(self.reference.lens)
         return mapping if self.size_px == self.reference.size_px else mapping.rescaled(self.scale, SAME_PIXELS)
 
 
 def _mappings(capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]]) -> dict[str, PixelMapping]:
-    """Raw pixels of the reference to raw pixels of each usable moving band."""
+    """The mapping from raw pixels of the reference to raw pixels of each usable moving band."""
     usable = [b for b in capture.moving if b.name in alignments]
     return {b.name: mapping_of(capture.reference, b, alignments[b.name]) for b in usable}
 
@@ -114,25 +116,25 @@ def _layers(capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], 
 
 
 def _crop(
-    capture: Capture, moved: list[tuple[PixelMapping, Band]], pixels: _OutputPixels, settings: WriteSettings,
+    capture: Capture, mapped: list[tuple[PixelMapping, Band]], pixels: _OutputPixels, settings: WriteSettings,
     rig: Rig | None,
 ) -> Tile:  # fmt: skip
     """The rectangle of the output pixels that is written."""
-    whole = Tile(0, 0, *pixels.size_px)
+    frame = Tile(0, 0, *pixels.size_px)
     if settings.crop == "none":
-        return whole
-    of_flight = [] if rig is None or settings.crop == "common" else _of_the_flight(capture, rig)
+        return frame
+    of_flight = [] if rig is None or settings.crop == "common" else _extremes_of_flight(capture, rig)
     if not of_flight:
-        return common_area(moved, *pixels.size_px) or whole
+        return common_area(mapped, *pixels.size_px) or frame
     limits = [(pixels.on_grid(mapping), band) for mapping, band in of_flight]
-    # The reference's own border takes part where it is resampled too.
-    limits += [(mapping, band) for mapping, band in moved if band is capture.reference]
+    # A reference that is resampled has a border too.
+    limits += [(mapping, band) for mapping, band in mapped if band is capture.reference]
     area = common_area(limits, *pixels.size_px)
-    return whole if area is None else _inset(area, _FLIGHT_MARGIN_PX)
+    return frame if area is None else _inset(area, _FLIGHT_MARGIN_PX)
 
 
-def _of_the_flight(capture: Capture, rig: Rig) -> list[tuple[PixelMapping, Band]]:
-    """Where the rig has the capture's bands in the nearest and the farthest captures of the flight."""
+def _extremes_of_flight(capture: Capture, rig: Rig) -> list[tuple[PixelMapping, Band]]:
+    """The mappings of the capture's bands by the rig, for the smallest and the largest distance in the flight."""
     reference = capture.reference
     return [
         (PixelMapping(matrix, reference.lens, band.lens if reference.lens is not None else None), band)
@@ -149,38 +151,37 @@ def _inset(tile: Tile, margin_px: int) -> Tile:
 
 
 def _covers(mappings: list[tuple[PixelMapping, Band]], tile: Tile) -> bool:
-    """True where every pixel of a tile is inside every moving image; only those along its border are tested."""
+    """True if every pixel of a tile is inside every moving image, tested at points of its border."""
     x, y = (np.linspace(a, a + n - 1, _BORDER_POINTS) for a, n in ((tile.x0, tile.width), (tile.y0, tile.height)))
     sides = [(x, np.full_like(x, v)) for v in y[[0, -1]]] + [(np.full_like(y, v), y) for v in x[[0, -1]]]
     border = np.concatenate([np.stack(side, axis=-1) for side in sides])
-    for mapping, band in mappings:
-        mapped = mapping(border)
-        if not ((mapped >= 0) & (mapped <= np.subtract(band.size_px, 1))).all():
-            return False
-    return True
+    return all(_is_inside(mapping(border), band).all() for mapping, band in mappings)
+
+
+def _is_inside(positions: NDArray[np.float64], band: Band) -> Mask:
+    """True for positions (..., 2) within the image of a band; False for nan."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((positions >= 0) & (positions <= np.subtract(band.size_px, 1))).all(axis=-1))
 
 
 def _finest_scale(mappings: Iterable[PixelMapping], reference: Band) -> float:
-    """Pixels of the finest band per pixel of the reference along a line in the middle of the image, at least 1."""
-    middle = (np.array(reference.size_px) - 1) / 2
+    """Pixels of the finest band per pixel of the reference along a line, in the centre of the image; at least 1."""
+    centre = (np.array(reference.size_px) - 1) / 2
     finest = 1.0
     for mapping in mappings:
-        across = np.stack([mapping(middle + d) - mapping(middle - d) for d in 0.5 * np.eye(2)])
-        finest = max(finest, math.sqrt(abs(float(np.linalg.det(across)))))
+        jacobian = np.stack([mapping(centre + d) - mapping(centre - d) for d in 0.5 * np.eye(2)])
+        finest = max(finest, math.sqrt(abs(float(np.linalg.det(jacobian)))))
     return round(finest, 2)
 
 
 def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height_px: int) -> Tile | None:
-    """Return the largest rectangle of the reference grid that is inside every moving image; None for no such."""
-    step = max(1, min(8, width_px // 64, height_px // 64))
-    x = _cell_edges(width_px, step)
-    y = _cell_edges(height_px, step)
+    """Return the largest rectangle of a grid of this size that is inside every moving image; None if there is none."""
+    step = max(1, min(_MAX_CELL_PX, width_px // _MIN_CELLS, height_px // _MIN_CELLS))
+    x, y = _cell_edges(width_px, step), _cell_edges(height_px, step)
     inside = np.ones((len(y), len(x)), dtype=bool)
     for mapping, band in mappings:
-        mapped = mapping.at_crossings(x, y)
-        with np.errstate(invalid="ignore"):
-            inside &= (mapped >= 0).all(axis=-1) & (mapped <= np.subtract(band.size_px, 1)).all(axis=-1)
-    # A cell counts where its four corners do: between them the mapping is all but straight.
+        inside &= _is_inside(mapping.at_crossings(x, y), band)
+    # A cell is inside if its four corners are: between them the mapping is almost linear.
     cells = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:] & inside[1:, 1:]
     result = _largest_rectangle(cells, np.diff(x), np.diff(y))
     if result is None:
@@ -197,31 +198,32 @@ def _cell_edges(length_px: int, step: int) -> NDArray[np.float64]:
 def _largest_rectangle(
     cells: Mask, widths: NDArray[np.float64], heights: NDArray[np.float64]
 ) -> tuple[int, int, int, int] | None:
-    """(top, bottom, left, right) in cell edges of the all-True rectangle of the largest area.
+    """(top, bottom, left, right), as indices of cell edges, of the rectangle of True cells with the largest area.
 
-    A histogram with a stack, row by row; rows and columns like the one before them are taken as one with it.
+    The largest rectangle in a histogram, with a stack, for each row: the histogram is the height of the True cells that
+    end in the row. Equal neighbouring rows and columns are merged before.
     """
     first_rows, first_columns = _changes(cells), _changes(cells.T)
     rows, columns = ([*firsts.tolist(), n] for firsts, n in zip((first_rows, first_columns), cells.shape, strict=True))
     left_edge = np.concatenate([[0.0], np.cumsum(widths)])[columns].tolist()
     top_edge = np.concatenate([[0.0], np.cumsum(heights)])[rows].tolist()
     best_area, best = 0.0, None
-    since = [0] * len(first_columns)
+    tops = [0] * len(first_columns)
     for row, line in enumerate(cells[np.ix_(first_rows, first_columns)].tolist()):
-        since = [begun if one else row + 1 for begun, one in zip(since, line, strict=True)]
+        tops = [top if is_inside else row + 1 for top, is_inside in zip(tops, line, strict=True)]
         bottom = top_edge[row + 1]
         stack: list[tuple[int, float, int]] = []
-        for column, top in enumerate([*since, row + 1]):
+        for column, top in enumerate([*tops, row + 1]):
             start, height = column, bottom - top_edge[top]
             while stack and stack[-1][1] >= height:
-                start, stacked, stacked_top = stack.pop()
-                area = stacked * (left_edge[column] - left_edge[start])
+                start, bar_height, bar_top = stack.pop()
+                area = bar_height * (left_edge[column] - left_edge[start])
                 if area > best_area:
-                    best_area, best = area, (rows[stacked_top], rows[row + 1], columns[start], columns[column])
+                    best_area, best = area, (rows[bar_top], rows[row + 1], columns[start], columns[column])
             stack.append((start, height, top))
     return best
 
 
 def _changes(cells: Mask) -> NDArray[np.int64]:
-    """The rows that differ from the one before, the first among them."""
+    """The indices of the first row and of each row that differs from the previous one."""
     return np.flatnonzero(np.append(True, (cells[1:] != cells[:-1]).any(axis=1)))

@@ -1,4 +1,4 @@
-"""The nodata value of an output file, and pixels that carry it."""
+"""The choice of the nodata value of an output file, and pixels with that value."""
 
 import itertools
 import math
@@ -17,29 +17,29 @@ from agalign.values.image import Mask, OutputGrid, Tile
 
 Pixels = NDArray[np.generic]
 _TILE_PX = 2048
-"""Side of the tiles in which a band's values are collected: it bounds the memory."""
-_MAX_VALUES_TRIED = 1 << 16
-"""All values of a 16 bit type; of a larger type the first ones suffice."""
+"""Side of the tiles in which a band's values are collected: it limits the memory."""
+_MAX_CANDIDATES = 1 << 16
+"""All values of a 16-bit type; for larger types the first ones are sufficient."""
 
 
 def nodata_value(
     capture: Capture, layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any], settings: WriteSettings
 ) -> float | None:
-    """Return the value that a file of these layers declares; None if every pixel holds a measurement."""
+    """Return the nodata value of a file with these layers; None if every pixel is valid. Raises UnreadableFileError."""
     if settings.radiometry != "off":
         return math.nan
     declared = capture.reference.nodata
     if declared is not None and _fits(declared, dtype):
         return declared
     if dtype.kind == "f":
-        return math.nan  # nan needs no declaration in a source
+        return math.nan  # input files may contain nan without declaring it
     return _unused_value(layers, grid, dtype) if _has_invalid_pixels(layers, grid) else None
 
 
 def with_nodata(pixels: Pixels, valid: Mask, nodata: float) -> Pixels:
     """Return pixels (height, width) with nodata where they are not valid.
 
-    Valid pixels that happen to equal nodata change by the smallest step of their type.
+    Valid pixels that equal nodata change by the smallest step of their type.
     """
     if not math.isnan(nodata):
         pixels = np.where(valid & (pixels == nodata), pixels.dtype.type(_next_value(nodata, pixels.dtype)), pixels)
@@ -58,18 +58,18 @@ def _has_invalid_pixels(layers: Sequence[Layer], grid: OutputGrid) -> bool:
 
 
 def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any]) -> float:
-    """0; where copied bands contain zeros, the largest value, or else the first that they do not contain.
+    """The first of 0, the largest value of the type, 1, 2 … that no copied band contains; 0 if there is none.
 
-    Copied pixels never change, except if they contain all values of the type: then 0.
+    Copied pixels then keep their values.
     """
     copied = [_values_in(layer.band, grid.tile) for layer in layers if layer.is_copied]
     limits = np.iinfo(str(dtype))
-    candidates = itertools.chain([0, limits.max], range(1, min(limits.max, _MAX_VALUES_TRIED)))
+    candidates = itertools.chain([0, limits.max], range(1, min(limits.max, _MAX_CANDIDATES)))
     return float(next((v for v in candidates if not any((values == v).any() for values in copied)), 0))
 
 
 def _values_in(band: Band, tile: Tile) -> Pixels:
-    """All different values of a band in a rectangle of its file."""
+    """The different values of a band in a rectangle of its file."""
     with open_raster(band.path) as source:
         result = [np.unique(read_window(source, band, t.x0, t.y0, t.width, t.height)[0]) for t in tiles(tile, _TILE_PX)]
     return np.unique(np.concatenate(result))

@@ -1,4 +1,4 @@
-"""The small before/after picture of a capture: three bands as red, green and blue; misalignment is colour."""
+"""The before/after picture of a capture: three bands as red, green and blue, so that misalignment shows as colour."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,17 +12,20 @@ from agalign.products.reduced_bands import Grey, ReducedBands
 from agalign.values.capture import Band
 
 _OVERVIEW_PX = 480
-_ZOOM_SOURCE_PX = 160
-_GAP_PX = 8
-_TITLE_PX = 26
+"""Width of the overview and of the detail."""
+_DETAIL_SOURCE_PX = 160
+"""Width of the part of the image that the detail enlarges."""
+_MAX_EDGE = 60
+"""Limit of the Laplacian of grey values: single strong edges must not determine the position of the detail."""
+_GAP_PX, _TITLE_PX = 8, 26
 _RED_NM = 668.0
-"""The middle band of the picture is the one nearest to this."""
-_THERMAL_NM = 1000.0
-"""A band beyond this shows warmth, in which vegetation has few edges."""
+"""The band nearest to this wavelength is shown as green."""
+_MAX_REFLECTIVE_NM = 1000.0
+"""Bands at longer wavelengths are thermal: vegetation has few edges in them."""
 
 
 class BeforeAfterPicture(Product):
-    """Before and after, with a detail of each."""
+    """The bands before and after alignment, with a detail of each."""
 
     kind = "picture"
     suffix = ".png"
@@ -38,13 +41,13 @@ class BeforeAfterPicture(Product):
 
 
 def choose_bands(moving: list[Band], reference: Band) -> list[Band]:
-    """Return three bands for red, green and blue: the longest wavelength, a middle one, and the reference."""
+    """Return three bands for red, green and blue: the longest wavelength, the one nearest to red, and the reference."""
     known = sorted((b for b in moving if b.wavelength_nm is not None), key=_wavelength_nm)
-    others = known if len(known) >= 2 else moving
-    red = max(others, key=lambda b: _wavelength_nm(b) if _wavelength_nm(b) < _THERMAL_NM else 0.0)
-    rest = [b for b in others if b is not red]
-    between = min(rest, key=lambda b: abs((b.wavelength_nm or _RED_NM) - _RED_NM)) if rest else reference
-    return [red, between, reference]
+    candidates = known if len(known) >= 2 else moving
+    longest = max(candidates, key=lambda b: _wavelength_nm(b) if _wavelength_nm(b) < _MAX_REFLECTIVE_NM else 0.0)
+    rest = [b for b in candidates if b is not longest]
+    nearest_to_red = min(rest, key=lambda b: abs((b.wavelength_nm or _RED_NM) - _RED_NM)) if rest else reference
+    return [longest, nearest_to_red, reference]
 
 
 def _wavelength_nm(band: Band) -> float:
@@ -53,38 +56,36 @@ def _wavelength_nm(band: Band) -> float:
 
 def write_picture(views: ReducedBands, names: Sequence[str], path: Path) -> None:
     """Write the picture of three bands as red, green and blue. Raises OutputError."""
-    before, after = (np.stack([of[name] for name in names], axis=-1) for of in (views.before, views.after))
-    sheet = _sheet(before, after, f"before: {', '.join(names)} as red, green, blue", "after")
-    write_png(sheet, path)
+    before, after = (np.stack([bands[name] for name in names], axis=-1) for bands in (views.before, views.after))
+    write_png(_sheet(before, after, f"before: {', '.join(names)} as red, green, blue", "after"), path)
 
 
 def _sheet(before: Picture, after: Picture, title_before: str, title_after: str) -> Picture:
     height, width = before.shape[:2]
-    overview = _OVERVIEW_PX, max(1, round(_OVERVIEW_PX * height / width))
-    side_x = min(width, _ZOOM_SOURCE_PX)
-    side_y = max(1, min(height, round(side_x * height / width)))
-    zoom_x, zoom_y = busiest_window(after[..., 2], (side_x, side_y))
+    size_px = _OVERVIEW_PX, max(1, round(_OVERVIEW_PX * height / width))
+    detail_width = min(width, _DETAIL_SOURCE_PX)
+    detail_height = max(1, min(height, round(detail_width * height / width)))
+    x0, y0 = busiest_window(after[..., 2], (detail_width, detail_height))
+    x1, y1 = x0 + detail_width, y0 + detail_height
+    scale = size_px[0] / width
     columns = []
     for image, title in ((before, title_before), (after, title_after)):
-        whole = cv2.resize(image, overview, interpolation=cv2.INTER_AREA)
-        scale = overview[0] / width
-        corner = round(zoom_x * scale), round(zoom_y * scale)
-        opposite = round((zoom_x + side_x) * scale), round((zoom_y + side_y) * scale)
-        cv2.rectangle(whole, corner, opposite, (255, 255, 255), 1)
-        detail = image[zoom_y : zoom_y + side_y, zoom_x : zoom_x + side_x]
-        detail = cv2.resize(detail, overview, interpolation=cv2.INTER_NEAREST)
-        strip = np.full((_TITLE_PX, overview[0], 3), 255, np.uint8)
-        gap = np.full((_GAP_PX, overview[0], 3), 255, np.uint8)
-        columns.append(np.vstack([with_text(strip, title, (2, 18)), whole, gap, detail]))
+        overview = cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)
+        corners = (round(x0 * scale), round(y0 * scale)), (round(x1 * scale), round(y1 * scale))
+        cv2.rectangle(overview, *corners, (255, 255, 255), 1)
+        detail = cv2.resize(image[y0:y1, x0:x1], size_px, interpolation=cv2.INTER_NEAREST)
+        strip = np.full((_TITLE_PX, size_px[0], 3), 255, np.uint8)
+        gap = np.full((_GAP_PX, size_px[0], 3), 255, np.uint8)
+        columns.append(np.vstack([with_text(strip, title, (2, 18)), overview, gap, detail]))
     between = np.full((columns[0].shape[0], _GAP_PX, 3), 255, np.uint8)
     return np.hstack([columns[0], between, columns[1]])
 
 
 def busiest_window(image: Grey, size_px: tuple[int, int]) -> tuple[int, int]:
-    """(x, y) of the window (width, height) with the most edges: there a misalignment shows."""
-    (height, width), (side_x, side_y) = image.shape, size_px
-    edges = np.abs(cv2.Laplacian(image.astype(np.float32), cv2.CV_32F)).clip(0, 60)
-    activity = cv2.boxFilter(edges, -1, size_px, anchor=(0, 0), normalize=True)
-    inside = activity[: height - side_y + 1, : width - side_x + 1]
+    """Return the top-left pixel (x, y) of the window (width, height) with the most edges, where misalignment shows."""
+    (height, width), (window_width, window_height) = image.shape, size_px
+    edges = np.abs(cv2.Laplacian(image.astype(np.float32), cv2.CV_32F)).clip(0, _MAX_EDGE)
+    density = cv2.boxFilter(edges, -1, size_px, anchor=(0, 0), normalize=True)
+    inside = density[: height - window_height + 1, : width - window_width + 1]
     y, x = np.unravel_index(int(inside.argmax()), inside.shape)
     return int(x), int(y)

@@ -1,14 +1,14 @@
-"""The preview of a capture: every band small and grey, before and after, on one JPEG from which the report composes
-any three of them.
+"""The preview of a capture: all bands in grey, before and after alignment, on one JPEG, from which the report composes
+colour pictures of any three bands.
 
-The sheet has a column for each band of the sidecar, in its order, and these rows:
+The JPEG has a column for each band of the sidecar, in its order, and these rows:
 
     0  the raw files, each resized to the reference's file
-    1  what was written; black where nothing was
-    2  a detail of row 0 at full resolution of the reduced bands, where there are most edges
+    1  the written bands; black for a band that was not written
+    2  a detail of row 0, where there are most edges, at the resolution of the reduced bands
     3  the same detail of row 1
-    4  where error maps are written: the expected error, white for `ERROR_FULL_PX` and more
-    5  (4 without error maps) in the first column, where a relief displaces the bands: its parallax, the nearest white
+    4  if error maps are written: the expected error, white for `ERROR_FULL_PX` and more
+    5  (4 without error maps) in the first column, if the capture has a relief: its parallax, white for the nearest
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,45 +30,49 @@ from agalign.values.files import complete_file
 from agalign.values.image import Tile, reduced_size_px
 
 ERROR_FULL_PX = 0.5
+"""Expected error that is shown as white."""
 _MAX_TILE_PX, _MIN_TILE_PX, _DETAIL_SHARE = 640, 96, 0.35
-"""Longer side of a tile, and the size of a detail as a share of it."""
+"""Limits of the longer side of a tile, and the size of a detail as a share of a tile."""
 _RELIEF_PERCENTILES = 1.0, 99.0
-"""Limits of what is black and white: single wrong pixels must not take the contrast."""
-_QUALITY, _BLOCK_PX = 35, 8
-"""Of the JPEG: pictures that share no block do not show in each other."""
+"""Percentiles shown as black and white: a few wrong pixels must not determine the contrast."""
+_QUALITY = 35
+"""JPEG quality."""
+_BLOCK_PX = 8
+"""Side of a JPEG block: tiles are multiples of it, so that compression does not mix neighbouring tiles."""
+_MAX_SHRINK_STEPS = 6
 _MAX_BYTES_EACH, _MAX_TOTAL_BYTES = 600_000, 44_000_000
-"""The report of a season, which contains them all, stays small enough for an e-mail service."""
+"""Limits that keep the report of a season, which contains all previews, small enough for an e-mail."""
 
 
 def preview_bytes(captures: int) -> int:
-    """Return the largest size of the preview of one of this many captures, bytes."""
+    """Return the largest size in bytes of the preview of a capture in a run of this many captures."""
     return min(_MAX_BYTES_EACH, _MAX_TOTAL_BYTES // max(captures, 1))
 
 
 @dataclass(frozen=True)
 class ReliefView:
-    """The relief of a capture, small."""
+    """The relief of a capture, reduced to the size of a tile."""
 
     parallax_px: NDArray[np.float32]
     """(height, width)"""
     range_m: tuple[float, float] | None
-    """Nearest and farthest; None if the range is unknown."""
+    """Smallest and largest range; None if it is unknown."""
 
     @property
     def limits_px(self) -> tuple[float, float]:
-        """What is black and white."""
+        """Parallax shown as black and as white."""
         low, high = np.percentile(self.parallax_px, _RELIEF_PERCENTILES)
         return float(low), max(float(high), float(low) + 1e-3)
 
     @property
     def grey(self) -> Grey:
-        """(height, width)"""
+        """The parallax as grey values (height, width)."""
         low, high = self.limits_px
         return np.asarray(np.rint(((self.parallax_px - low) / (high - low)).clip(0, 1) * 255), np.uint8)
 
 
 class Preview(Product):
-    """The sheet from which the report composes its views; that of a failed capture shows why it failed."""
+    """The bands for the report; also of a failed capture, where they help to find the reason."""
 
     kind = "preview"
     suffix = ".preview.jpg"
@@ -88,7 +92,7 @@ class Preview(Product):
 
 
 def relief_view(context: ProductContext) -> ReliefView | None:
-    """Return the relief of a capture as the preview has it; None if none displaces a band."""
+    """Return the reduced relief of a capture; None if no band is displaced by one."""
     relief = relief_of(context.usable)
     if relief is None:
         return None
@@ -106,18 +110,21 @@ def write_preview(
     views: ReducedBands, bands: Sequence[str], errors_px: Mapping[str, NDArray[np.float32]], path: Path, max_bytes: int,
     relief: ReliefView | None = None,
 ) -> PreviewPart:  # fmt: skip
-    """Write the sheet, about as large as `max_bytes` allows, with a detail where the first of the bands has most to
-    show; `errors_px` has a coarse map (rows, columns) by band, or none. Raises OutputError.
+    """Write the preview, with tiles as large as `max_bytes` allows.
+
+    The detail is where the first of the bands has most edges. `errors_px` has the expected error (rows, columns) by
+    band, or is empty. Raises OutputError.
     """
     longest_px = max(views.size_px)
     tile_px = min(_MAX_TILE_PX, longest_px)
-    for _ in range(6):
+    for _ in range(_MAX_SHRINK_STEPS):
         part, sheet = _sheet(views, bands, errors_px, relief, tile_px / longest_px, path.name)
         encoded, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         if not encoded:
-            raise OutputError(f"{path}: cannot be made")
+            raise OutputError(f"{path}: cannot be encoded")
         if len(data) <= max_bytes or tile_px <= _MIN_TILE_PX:
             break
+        # The size is proportional to the area of a tile.
         tile_px = max(_MIN_TILE_PX, int(tile_px * 0.97 * (max_bytes / len(data)) ** 0.5))
     with complete_file(path) as partial:
         partial.write_bytes(data.tobytes())
@@ -129,23 +136,24 @@ def _sheet(
     scale: float, name: str,
 ) -> tuple[PreviewPart, Grey]:  # fmt: skip
     width, height = views.size_px
-    tile_px = _blocks(width * scale, width), _blocks(height * scale, height)
-    detail_px = _blocks(tile_px[0] * _DETAIL_SHARE, width), _blocks(tile_px[1] * _DETAIL_SHARE, height)
-    x, y = busiest_window(next(of[n] for n in bands for of in (views.after, views.before) if n in of), detail_px)
+    tile_px = _whole_blocks(width * scale, width), _whole_blocks(height * scale, height)
+    detail_px = _whole_blocks(tile_px[0] * _DETAIL_SHARE, width), _whole_blocks(tile_px[1] * _DETAIL_SHARE, height)
+    first = next(images[n] for n in bands for images in (views.after, views.before) if n in images)
+    x, y = busiest_window(first, detail_px)
     detail = Tile(x, y, *detail_px)
     rows = [
-        [_small(views.before.get(n), tile_px) for n in bands],
-        [_small(views.after.get(n), tile_px) for n in bands],
-        [_cut(views.before.get(n), detail) for n in bands],
-        [_cut(views.after.get(n), detail) for n in bands],
+        [_resized(views.before.get(n), tile_px) for n in bands],
+        [_resized(views.after.get(n), tile_px) for n in bands],
+        [_cropped(views.before.get(n), detail) for n in bands],
+        [_cropped(views.after.get(n), detail) for n in bands],
     ]
     if errors_px:
-        rows.append([_small(_as_grey(errors_px.get(n)), tile_px) for n in bands])
+        rows.append([_resized(_as_grey(errors_px.get(n)), tile_px) for n in bands])
     if relief is not None:
-        rows.append([_small(relief.grey, tile_px)])
+        rows.append([_resized(relief.grey, tile_px)])
     strips = [np.hstack(row) for row in rows]
-    whole = max(s.shape[1] for s in strips)
-    sheet = np.vstack([np.pad(s, ((0, 0), (0, whole - s.shape[1]))) for s in strips])
+    sheet_width = max(s.shape[1] for s in strips)
+    sheet = np.vstack([np.pad(s, ((0, 0), (0, sheet_width - s.shape[1]))) for s in strips])
     part = PreviewPart(
         file=name, tile_px=tile_px, detail_px=detail_px,
         detail=(x / width, y / height, detail_px[0] / width, detail_px[1] / height),
@@ -154,18 +162,20 @@ def _sheet(
     return part, np.asarray(sheet, np.uint8)
 
 
-def _blocks(length_px: float, max_px: int) -> int:
+def _whole_blocks(length_px: float, max_px: int) -> int:
     return min(max_px, max(_BLOCK_PX, int(length_px / _BLOCK_PX) * _BLOCK_PX))
 
 
-def _small(image: Grey | None, size_px: tuple[int, int]) -> Grey:
+def _resized(image: Grey | None, size_px: tuple[int, int]) -> Grey:
+    """The image at a size (width, height); black for None."""
     if image is None:
         return np.zeros(size_px[::-1], np.uint8)
     larger = size_px[0] > image.shape[1]
     return np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_LINEAR if larger else cv2.INTER_AREA))
 
 
-def _cut(image: Grey | None, tile: Tile) -> Grey:
+def _cropped(image: Grey | None, tile: Tile) -> Grey:
+    """A part of the image; black for None."""
     if image is None:
         return np.zeros((tile.height, tile.width), np.uint8)
     return image[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]

@@ -1,4 +1,4 @@
-"""What every kind of output of a capture has in common: the interface `Product` and what travels through it."""
+"""The interface `Product` of each kind of output of a capture, and its arguments and results."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -20,18 +20,18 @@ from agalign.values.pixel_units import FixedFilePx
 
 @dataclass(frozen=True)
 class CapturePaths:
-    """The names of a capture's files: OUT/<relative folder>/<capture><suffix>."""
+    """The paths of a capture's files: OUT/<relative folder>/<capture><suffix>."""
 
     folder: Path
     name: str
 
     @classmethod
     def of(cls, capture: Capture, out: Path) -> "CapturePaths":
-        """The paths of a capture below the output folder of a run."""
+        """Return the paths of a capture below the output folder of a run."""
         return cls(out / capture.folder, capture.name)
 
     def file(self, suffix: str) -> Path:
-        """The file of the capture with this suffix, such as `.png`."""
+        """Return the file of the capture with this suffix, such as `.png`."""
         return self.folder / f"{self.name}{suffix}"
 
     @property
@@ -42,7 +42,7 @@ class CapturePaths:
 
 @dataclass(frozen=True)
 class StacAsset:
-    """How a file appears in the capture's STAC item."""
+    """The asset of a file in the capture's STAC item."""
 
     key: str
     media_type: str
@@ -51,39 +51,39 @@ class StacAsset:
 
 @dataclass(frozen=True)
 class WrittenFile:
-    """One file that a product has written, complete."""
+    """A complete file that a product has written."""
 
     kind: str
     """The product's `kind`."""
     path: Path
     asset: StacAsset | None = None
-    """None for a file that the STAC item leaves out."""
+    """None if the STAC item does not list the file."""
     bands: tuple[str, ...] = ()
-    """The bands with aligned pixels in it, in the order of the file."""
+    """Names of the bands in a file of aligned pixels, in the order of the file."""
     nodata: float | None = None
-    """The value that it declares."""
+    """Nodata value of a file of aligned pixels."""
     preview: PreviewPart | None = None
-    """Where its pictures are, for the preview only."""
+    """Layout of the preview; None for other files."""
 
 
 @dataclass(frozen=True)
 class ProductContext:
-    """What products are made of: one capture, its alignments, and the grid of its output."""
+    """The input of products: one capture, its alignments, and the grid of its output."""
 
     capture: Capture
     paths: CapturePaths
     settings: Settings
     alignments: Mapping[str, Alignment[FixedFilePx]]
-    """By moving band; failed ones included."""
+    """By moving band, including failed ones."""
     layers: Sequence[Layer]
-    """Of all bands, in their order; empty where no moving band can be written."""
+    """One for each band, in their order; empty if no moving band can be written."""
     grid: OutputGrid
-    """What all rasters are written on; the reference's own where there are no layers."""
+    """Grid of all rasters; that of the reference's file if there are no layers."""
     rig: Rig | None
-    """Of the flight, where one is known."""
+    """Rig of the flight, if it is known."""
     max_preview_bytes: int
     written: list[WrittenFile] = field(default_factory=list)
-    """The files of the products before this one in `PRODUCTS`."""
+    """Files of the products before this one in `PRODUCTS`."""
 
     @property
     def write_settings(self) -> WriteSettings:
@@ -97,7 +97,7 @@ class ProductContext:
 
     @property
     def places(self) -> dict[str, tuple[Path, int]]:
-        """By band with pixels: a file, the stack where there is one, and the band's index there, from 1."""
+        """File and index, from 1, of the pixels of each band that has any; the stack if there is one."""
         gaps = {layer.band.name for layer in self.layers if layer.is_gap}
         return {
             name: (file.path, index)
@@ -108,44 +108,44 @@ class ProductContext:
 
     @cached_property
     def reduced_bands(self) -> ReducedBands:
-        """The bands as small grey images, before and after. Raises UnreadableFileError."""
+        """The bands as reduced grey images, before and after alignment. Raises UnreadableFileError."""
         return read_reduced_bands(self.capture, self.places, self.grid)
 
 
 class Product(ABC):
     """One kind of output of a capture.
 
-    A new one is a module with a subclass, and an entry in `products/registry.py`. Its files are then listed in the
-    sidecar with size and checksum, checked when a run resumes, removed before a capture is done again, protected
-    from two captures with one name, and part of the STAC item.
+    A new product is a module with a subclass, and an entry in `products/registry.py`. Its files are then listed in the
+    sidecar with size and checksum, verified when a run resumes, removed before a capture is processed again, protected
+    against two captures with the same name, and part of the STAC item.
     """
 
     kind: ClassVar[str]
-    """Its name in the sidecar's `products`."""
+    """Name in the sidecar's `products`."""
     suffix: ClassVar[str]
-    """What follows the capture's name in the name of its file."""
+    """End of the file name, after the name of the capture."""
     is_required: ClassVar[bool] = True
-    """False for a convenience: where it fails, the run reports that and the capture counts as done."""
+    """False if a failure is only reported and the capture counts as done."""
     needs_layers: ClassVar[bool] = True
-    """False for what is written even where no moving band can be."""
+    """False if the product is also written for captures without usable moving bands."""
 
     def is_enabled(self, settings: WriteSettings) -> bool:  # noqa: ARG002
-        """True where these settings ask for it."""
+        """Return True if the settings request the product."""
         return True
 
     def check(self, capture: Capture) -> None:  # noqa: B027
-        """Raise an AgalignError if the capture or the installation lacks what it needs.
+        """Raise an AgalignError if the capture or the installation lacks something that the product needs.
 
-        It is called before the capture is aligned, and only where the product is enabled.
+        It is called before the capture is aligned, and only if the product is enabled.
         """
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
-        """Every file that a run with these settings may write or remove, enabled or not."""
+        """Return every file that a run with these settings may write or remove, also if the product is not enabled."""
         return [paths.file(self.suffix)]
 
     @abstractmethod
     def write(self, context: ProductContext) -> list[WrittenFile]:
-        """Write its files, each atomically, and return them; none if nothing can be made.
+        """Write the files, each atomically, and return them; none if the capture lacks the input for them.
 
         Raises OutputError, or UnreadableFileError for an input.
         """

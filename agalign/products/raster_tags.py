@@ -1,4 +1,4 @@
-"""What an output file says about itself: band names, wavelengths, units, radiometry, and where it is from."""
+"""Tags of output files: band names, wavelengths, units, radiometry, camera and time."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,35 +11,34 @@ UNITS: Mapping[Quantity, str] = {
     "radiance": "W m-2 sr-1 nm-1", "relative radiance": "", "reflectance": "1", "relative reflectance": "1",
     "temperature": "degC",
 }  # fmt: skip
-"""As UDUNITS spells them."""
+"""Units in the notation of UDUNITS."""
 
 
 def describe(dataset: Any, capture: Capture, layers: Sequence[Layer], settings: WriteSettings) -> None:
     """Set tags, units, scales and descriptions of an open rasterio dataset with these layers as bands."""
     raw = settings.radiometry == "off"
-    facts = (
-        {
-            "TIFFTAG_SOFTWARE": "agalign",
-            "TIFFTAG_DATETIME": capture.captured_at[:19].replace("-", ":").replace("T", " "),
-            "CAPTURE_ID": capture.capture_id,
-            "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
-            "REFERENCE_BAND": capture.reference.name,
-        }
-        | ({} if raw else _radiometry(layers))
-        | georeference_tags(capture.reference.georeference)
-    )
-    dataset.update_tags(**{k: v for k, v in facts.items() if v})
-    if raw:
-        _describe_scales(dataset, layers)
-    else:
+    tags = {
+        "TIFFTAG_SOFTWARE": "agalign",
+        "TIFFTAG_DATETIME": capture.captured_at[:19].replace("-", ":").replace("T", " "),
+        "CAPTURE_ID": capture.capture_id,
+        "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
+        "REFERENCE_BAND": capture.reference.name,
+    }
+    if not raw:
+        tags |= _radiometry(layers)
+    tags |= georeference_tags(capture.reference.georeference)
+    dataset.update_tags(**{k: v for k, v in tags.items() if v})
+    if not raw:
         _describe_quantities(dataset, layers)
+    elif any(layer.band.scale_offset != (1.0, 0.0) for layer in layers):
+        dataset.scales, dataset.offsets = zip(*(layer.band.scale_offset for layer in layers), strict=True)
     for index, layer in enumerate(layers, start=1):
         dataset.set_band_description(index, layer.band.name)
         _describe_wavelength(dataset, index, layer.band)
 
 
 def georeference_tags(georeference: Georeference | None) -> dict[str, str]:
-    """Mark a georeference that was calculated from the camera's pose as approximate; empty for a file's own."""
+    """Return tags that mark a georeference by the camera's pose as approximate; empty for that of an input file."""
     if georeference is None or georeference.accuracy_m is None:
         return {}
     return {
@@ -56,18 +55,14 @@ def _radiometry(layers: Sequence[Layer]) -> dict[str, str]:
     }
 
 
-def _describe_scales(dataset: Any, layers: Sequence[Layer]) -> None:
-    if any(layer.band.scale_offset != (1.0, 0.0) for layer in layers):
-        dataset.scales, dataset.offsets = zip(*(layer.band.scale_offset for layer in layers), strict=True)
-
-
 def _describe_quantities(dataset: Any, layers: Sequence[Layer]) -> None:
     quantities = [None if layer.band.radiometry is None else layer.band.radiometry.quantity for layer in layers]
     if not any(quantities):
         return
     dataset.units = [UNITS[q] if q is not None else "" for q in quantities]
     for index, quantity in enumerate(quantities, start=1):
-        dataset.update_tags(index, **({} if quantity is None else {"QUANTITY": quantity}))
+        if quantity is not None:
+            dataset.update_tags(index, QUANTITY=quantity)
 
 
 def _describe_wavelength(dataset: Any, index: int, band: Band) -> None:

@@ -1,4 +1,4 @@
-"""A capture's bands as grey pictures, before and after: the source of the picture and the preview."""
+"""The bands of a capture as reduced grey images, before and after alignment, for the picture and the preview."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -17,30 +17,34 @@ from agalign.values.image import OutputGrid, reduced_size_px
 Grey = NDArray[np.uint8]
 """(height, width)"""
 _MAX_SIDE_PX = 2048
-"""More than a screen shows."""
+"""Longer side of the images: larger than most screens."""
+_PERCENTILES = 1.5, 98.5
+"""Percentiles of a band that are shown as black and white."""
+_SAMPLE_PIXELS = 20_000
+"""Pixels from which the percentiles are calculated, with an error of 0.1 %."""
 
 
 @dataclass(frozen=True)
 class ReducedBands:
-    """The bands of a capture on the grid of its aligned files, reduced where that is larger than a screen."""
+    """The bands of a capture on its output grid, reduced to the size of a screen."""
 
     before: Mapping[str, Grey]
-    """By band that can be read: the raw file, resized to the reference's."""
+    """The raw file, resized to that of the reference, of each band that can be read."""
     after: Mapping[str, Grey]
-    """By band that was written: what was written."""
+    """The aligned pixels of each band that was written."""
     size_px: tuple[int, int]
-    """(width, height) of all of them."""
+    """(width, height) of all images."""
 
 
 def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> ReducedBands:
-    """Views of a capture with bands written to `places` on a grid. Raises UnreadableFileError."""
-    size_px = _reduced(grid.width, grid.height)
-    whole = 0, 0, grid.width, grid.height
+    """Read the bands of a capture, given file and index of each written band. Raises UnreadableFileError for those."""
+    size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / _MAX_SIDE_PX))
     before = {}
     for band in capture.bands:
-        with suppress(UnreadableFileError):  # its pair has failed with a reason
+        with suppress(UnreadableFileError):  # the band pair has failed with this reason
             before[band.name] = _grey(_before(band, capture.reference, grid, size_px))
-    after = {name: _grey(read_preview(*place, whole, size_px)) for name, place in places.items()}
+    window = 0, 0, grid.width, grid.height
+    after = {name: _grey(read_preview(*place, window, size_px)) for name, place in places.items()}
     return ReducedBands(before, after, size_px)
 
 
@@ -52,13 +56,8 @@ def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, i
     return read_preview(band.path, band.band_index, window, size_px)
 
 
-def _reduced(width: int, height: int) -> tuple[int, int]:
-    reduction = max(1.0, max(width, height) / _MAX_SIDE_PX)
-    return reduced_size_px((width, height), reduction)
-
-
 def _grey(plane: NDArray[np.float32]) -> Grey:
-    """Each by its own limits: what is written may be reflectance of what the files have as numbers."""
+    """The grey values between percentiles of the plane itself: raw numbers and reflectance have different ranges."""
     low, high = _limits(plane)
     scaled = np.subtract(plane, np.float32(low))
     scaled *= np.float32(255.0 / (high - low))
@@ -66,14 +65,10 @@ def _grey(plane: NDArray[np.float32]) -> Grey:
     return np.asarray(np.clip(scaled, 0, 255, out=scaled).astype(np.uint8))
 
 
-_SAMPLE_PIXELS = 20_000
-"""Pixels that the limits of the grey values are taken from: percentiles are right to a tenth of a percent."""
-
-
 def _limits(plane: NDArray[np.float32]) -> tuple[float, float]:
     sample = plane.ravel()[:: max(1, plane.size // _SAMPLE_PIXELS)]
     sample = sample[np.isfinite(sample) & (sample != 0)]
     if sample.size == 0:
         return 0.0, 1.0
-    low, high = np.percentile(sample, (1.5, 98.5))
+    low, high = np.percentile(sample, _PERCENTILES)
     return float(low), max(float(high), float(low) + 1e-9)

@@ -24,6 +24,6 @@ PRODUCTS: tuple[Product, ...] = (
     IndexRasters(),
     BeforeAfterPicture(),
     Preview(),
-    # Last: its assets are the files of those before it.
+    # Last: its assets are the files of the products before it.
     StacItem(),
 )

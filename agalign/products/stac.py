@@ -1,4 +1,6 @@
-"""A STAC item for each capture and a collection for each flight: where and when, which bands, and in which files."""
+"""A STAC item for each capture and a collection for each flight, by the specification 1.1 and its extensions
+electro-optical, raster and projection.
+"""
 
 import json
 import math
@@ -32,14 +34,14 @@ if TYPE_CHECKING:
 
 _COLLECTION_SUFFIX = ".collection.json"
 _MAX_NAME, _CHECKSUM_DIGITS = 60, 8
-"""Characters of a collection's id: file systems allow 255 bytes, and a character takes up to four."""
+"""Characters of a collection's id, which is a file name: at most 255 bytes, and up to 4 bytes per character."""
 _GEOJSON = "application/geo+json"
 _JSON = "application/json"
 _COMMON_NAMES = {"blue": "blue", "green": "green", "red": "red", "red edge": "rededge", "nir": "nir"}
 
 
 class StacItem(Product):
-    """The item of a capture, with the files of the products before it as assets."""
+    """The STAC item of a capture, with the files of the other products as assets."""
 
     kind = "stac_item"
     suffix = ".stac.json"
@@ -49,7 +51,7 @@ class StacItem(Product):
         return settings.stac
 
     def check(self, capture: Capture) -> None:  # noqa: ARG002
-        """Raise ConfigurationError if the library is not installed."""
+        """Raise ConfigurationError if pystac is not installed."""
         need_stac()
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
@@ -63,7 +65,7 @@ class StacItem(Product):
 
 
 def need_stac() -> None:
-    """Raise ConfigurationError if the library is not installed."""
+    """Raise ConfigurationError if pystac is not installed."""
     try:
         import pystac  # noqa: F401
     except ImportError:
@@ -108,9 +110,9 @@ def _read_item(path: Path) -> "pystac.Item":
 
 
 def _collection_id(capture: Capture) -> str:
-    """Of the capture's flight: its id or camera in words, and a checksum that no other flight has.
+    """The id or camera of the capture's flight, and a checksum that is unique for the flight.
 
-    It depends only on the capture: a capture of another run, or alone, finds the same collection.
+    It depends only on tags of the capture, so that captures of one flight in several runs have the same collection.
     """
     camera = f"{capture.camera.model} {capture.camera.serial}".strip()
     name = re.sub(r"[^\w.-]+", "_", capture.flight_id or camera or "flight")
@@ -172,7 +174,7 @@ def _projection(capture: Capture, grid: OutputGrid) -> dict[str, Any]:
 
 
 def _add_assets(item: "pystac.Item", context: ProductContext) -> None:
-    """The sidecar, and every file written before that has an entry for it."""
+    """Add the sidecar and every file with a STAC asset."""
     import pystac
 
     folder, sidecar = context.paths.folder, context.paths.sidecar
@@ -191,7 +193,7 @@ def _add_assets(item: "pystac.Item", context: ProductContext) -> None:
 def _describe_bands(
     asset: "pystac.Asset", bands: Sequence[Band], nodata: float | None, context: ProductContext
 ) -> None:
-    """The asset's bands: in the fields of the extensions, and in those of STAC 1.1 itself."""
+    """Describe the bands of an asset in the fields of the extensions, and in the common `bands` of STAC 1.1."""
     from pystac.extensions.eo import Band as EoBand
     from pystac.extensions.eo import EOExtension
     from pystac.extensions.raster import DataType, NoDataStrings, RasterBand, RasterExtension
@@ -223,7 +225,7 @@ def _um(length_nm: float | None) -> float | None:
 
 
 def _common_name(band: Band, capture: Capture) -> str | None:
-    """The common name of the electro-optical extension; None if it has none for the band."""
+    """The common name of a band in the electro-optical extension; None if it has none."""
     if is_thermal(band):
         return "lwir11"
     if band in panchromatic(capture) and not band.companion:
@@ -246,9 +248,9 @@ def _write_json(path: Path, facts: dict[str, Any]) -> None:
 
 
 def _moment(capture: Capture) -> tuple[datetime, str]:
-    """(time of the capture, source of it). Cameras write no time zone: it is taken as UTC."""
+    """(time of the capture, its source). Cameras write no time zone; UTC is assumed."""
     with suppress(ValueError):
         moment = datetime.fromisoformat(capture.captured_at)
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)), "camera"
-    # STAC requires a time; orthomosaics seldom have one.
+    # STAC requires a time, which orthomosaics seldom have.
     return datetime.fromtimestamp(capture.reference.path.stat().st_mtime, UTC), "change of the reference's file"

@@ -229,7 +229,7 @@ def test_indices_go_with_the_stack_that_they_were_made_of(aligned_capture: Path,
     agalign.align_folder(aligned_capture, out, settings=ONLY_SEED)
     write_band(out / "field_mine.tif", np.zeros((8, 8), np.float32))
     with rasterio.open(out / "field_mine.tif", "r+") as dataset:
-        dataset.update_tags(INDEX_STATISTICS="{}")
+        dataset.update_tags(INDEX_STATISTICS='{"unit": "reflectance"}')
     for name in ("field_mine.png", "field_notes.tif"):
         (out / name).write_bytes(b"x")
     agalign.align_folder(aligned_capture, out, settings=ONLY_SEED)

@@ -1,4 +1,4 @@
-"""Documents about a run as a whole, from the sidecars below its output folder: the page and the summary."""
+"""The report and the tables of a run, from the sidecars below its output folder."""
 
 from agalign.products.report.pages import REPORT_FILE, SUMMARY_FILE, Pages, pages_exist, write_pages
 

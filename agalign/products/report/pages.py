@@ -35,21 +35,22 @@ _SLOWEST = 5
 
 @dataclass(frozen=True)
 class Pages:
-    """Documents about a run as a whole."""
+    """The written documents, and their contents."""
 
     report: Path
     summary: Path
     failures: Sequence[FailureGroup]
     facts: Mapping[str, Any]
-    """What the page shows, schema `agalign-report/1`."""
+    """Data of the report, schema `agalign-report/1`."""
     slowest: tuple[tuple[str, float], ...]
-    """Labels of the captures that took longest, with their seconds."""
+    """(label, seconds) of the captures with the longest processing time."""
 
 
 def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
-    """Write OUT/index.html and OUT/summary.csv from all sidecars below OUT; report unreadable files to `on_problem`.
+    """Write OUT/index.html, OUT/summary.csv and OUT/indices.csv from all sidecars below OUT.
 
-    Pages that lack an unreadable file count as outdated in `pages_exist`. Raises OutputError.
+    Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
+    Raises OutputError.
     """
     rows: list[dict[str, object]] = []
     indices: list[IndexRow] = []
@@ -88,7 +89,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
 
 
 def pages_exist(out: Path) -> bool:
-    """True where the pages of an earlier run are complete and newer than all files that they describe."""
+    """Return True if the pages of an earlier run are complete and newer than all files that they describe."""
     try:
         written = min((out / name).stat().st_mtime_ns for name in (REPORT_FILE, SUMMARY_FILE))
         entries = [*find_sidecars(out), *(out / f for f in (PANELS_FILE, SKY_FILE) if (out / f).exists())]
@@ -108,13 +109,13 @@ def _page(
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    script = _own("page.js")
+    script = _resource("page.js")
     return environment.get_template("page.html.j2").render(
         version=__version__,
-        style=_own("page.css"),
+        style=_resource("page.css"),
         script=script,
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        facts=_in_a_page(facts.as_json()),
+        facts=_script_json(facts.as_json()),
         captures=facts.entries,
         counts=Counter(c.status for c in facts.entries),
         statuses=Counter(b.status for b in facts.bands),
@@ -137,7 +138,7 @@ def _page(
 
 
 def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
-    """The settings of a run that are not the defaults, by their Python names."""
+    """(Python name, value) of the settings of a run that differ from the defaults."""
     if run is None:
         return []
     defaults = Settings().model_dump(mode="json")
@@ -149,29 +150,29 @@ def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
     ]  # fmt: skip
 
 
-def _own(name: str) -> str:
+def _resource(name: str) -> str:
     return resources.files("agalign.products.report").joinpath(name).read_text(encoding="utf-8")
 
 
-def _in_a_page(facts: dict[str, Any]) -> str:
-    """JSON that ends no script, whatever names are in it."""
+def _script_json(facts: dict[str, Any]) -> str:
+    """JSON for an HTML script element, escaped so that no text in it ends the element."""
     text = json.dumps(facts, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 @dataclass(frozen=True)
 class _Seconds:
-    """What it took."""
+    """Processing times."""
 
     capture: float | None
-    """Median of a capture's alignment."""
+    """Median over the captures."""
     run: float | None
-    """The whole of the run, where one run did it all."""
+    """Duration of the run, if one run processed all captures."""
 
     @classmethod
     def of(cls, facts: Facts, run: RunPart | None) -> "_Seconds":
-        at_once = run is not None and run.captures.get("done") == len(facts.entries)
+        did_all = run is not None and run.captures.get("done") == len(facts.entries)
         return cls(
             median(c.seconds for c in facts.entries) if facts.entries else None,
-            run.seconds if run is not None and at_once else None,
+            run.seconds if run is not None and did_all else None,
         )

@@ -1,13 +1,12 @@
-"""Drawings of the rig of a flight, in the units of their SVGs."""
+"""Drawings of the rig of a flight and of its drift, in SVG units."""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from statistics import median
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agalign.errors import InputError
 from agalign.flight.rig import Rig
@@ -17,27 +16,35 @@ from agalign.products.report.facts import CaptureEntry
 from agalign.values import geometry
 
 PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
-_FIELD_REACH = 11.0
-"""Of the longest arrow of a lens field."""
+_MAX_ARROW = 11.0
+"""Length of the longest arrow of a displacement field."""
 _FIELD_COLUMNS, _FIELD_ROWS = 13, 10
-_MIN_SPREAD_PX = 0.2
+_PLAN_SHARE, _CHART_SHARE = 0.36, 0.92
+"""Largest distance from the centre: share of the width of a plan, and of half the height of a chart."""
+_MIN_CHART_PX = 0.2
+"""Smallest range of a drift chart."""
 _MAX_POINTS = 400
+"""Points of a line: the drift of more captures is averaged."""
 
 
 @dataclass(frozen=True)
 class BandView:
-    """A band of a rig: position of its lens relative to the reference's, and residuals of the lens model."""
+    """A band of a rig: the position of its lens, errors of its prediction, and the residuals of its lens model."""
 
     name: str
     hue: float
     x: float
     y: float
+    """Position of the lens in the plan of the rig."""
     offset_px: tuple[float, float]
     from_bands_px: float
+    """Error of the prediction from the other bands of a capture."""
     from_flight_px: float
+    """Error of the prediction from the mean of the flight."""
     field_px: float | None
+    """Size of the displacement field of the lens."""
     arrows: tuple[tuple[float, float, float, float], ...]
-    """x1, y1, x2, y2."""
+    """(x1, y1, x2, y2) of the displacement field."""
 
 
 @dataclass(frozen=True)
@@ -53,31 +60,31 @@ class RigView:
 
 @dataclass(frozen=True)
 class Line:
-    """One band over a flight: how far it is from its median, along the direction in which it moves most."""
+    """One band over a flight: the difference of its offset from the median, along the direction of largest variance."""
 
     name: str
     hue: float
     points: tuple[str, ...]
-    """Runs of points of captures in which the band is known, as an SVG takes them."""
+    """The `points` of an SVG polyline for each sequence of captures in which the band is known."""
 
 
 @dataclass(frozen=True)
 class Drift:
-    """The bands of a camera from capture to capture."""
+    """The variation of the offsets of a camera's bands over its captures."""
 
     camera: str
     full_px: float
-    """The largest distance; 0.92 of the way from the middle to the edges of the chart."""
+    """The largest difference."""
     captures: int
     lines: tuple[Line, ...]
     first: str
-    """Label of the first capture,"""
+    """Label of the first capture."""
     last: str
-    """and of the last."""
+    """Label of the last capture."""
 
 
 def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
-    """Of the models below OUT/models; what cannot be read is reported to `on_problem`."""
+    """Return the rigs of the models below OUT/models; unreadable models are reported to `on_problem`."""
     views = []
     for path in sorted((out / "models").glob("*.safetensors")):
         try:
@@ -92,8 +99,8 @@ def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
 
 def _rig_view(camera: str, rig: Rig) -> RigView:
     rows = band_summaries(rig)
-    reach = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
-    to_plan = 0.36 * PLAN_WIDTH / reach
+    longest = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
+    to_plan = _PLAN_SHARE * PLAN_WIDTH / longest
     width, height = rig.size_px
     bands = []
     for number, row in enumerate(rows):
@@ -114,66 +121,55 @@ def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...
     points = geometry.lattice(*rig.size_px, _FIELD_COLUMNS, _FIELD_ROWS)
     scale = FIELD_WIDTH / rig.size_px[0]
     field = rig.fields[band](points)
-    begins, reach = points * scale, field * _FIELD_REACH / max(float(np.linalg.norm(field, axis=1).max()), 1e-6)
-    return tuple((x, y, x + dx, y + dy) for (x, y), (dx, dy) in zip(begins.tolist(), reach.tolist(), strict=True))
+    starts, arrows = points * scale, field * _MAX_ARROW / max(float(np.linalg.norm(field, axis=1).max()), 1e-6)
+    return tuple((x, y, x + dx, y + dy) for (x, y), (dx, dy) in zip(starts.tolist(), arrows.tolist(), strict=True))
 
 
 def hue_of(number: int, count: int) -> float:
-    """Colours that lie apart."""
+    """Return one of `count` equally spaced hues, degrees."""
     return round(205 + 360 * number / max(count, 1)) % 360
 
 
 def drifts_of(captures: Sequence[CaptureEntry]) -> list[Drift]:
-    """A chart for each camera that took three captures or more, in the order in which they were taken."""
+    """Return a chart, in the order of time, for each camera with three captures or more."""
     result = []
     for camera in dict.fromkeys(c.camera for c in captures):
-        mine = sorted((c for c in captures if c.camera == camera), key=lambda c: (c.captured_at, c.label))
-        names = list(dict.fromkeys(name for c in mine for name in c.offsets_px))
-        if len(mine) >= 3 and names:
-            result.append(_drift(camera, mine, names))
+        in_order = sorted((c for c in captures if c.camera == camera), key=lambda c: (c.captured_at, c.label))
+        names = list(dict.fromkeys(name for c in in_order for name in c.offsets_px))
+        if len(in_order) >= 3 and names:
+            result.append(_drift(camera, in_order, names))
     return result
 
 
 def _drift(camera: str, captures: Sequence[CaptureEntry], names: Sequence[str]) -> Drift:
-    along = {name: _along([c.offsets_px.get(name) for c in captures]) for name in names}
-    # The sign of a direction is arbitrary: the same for all as for the first band.
-    first = along[names[0]]
-    along = {name: values if _together(first, values) else [None if v is None else -v for v in values]
-             for name, values in along.items()}  # fmt: skip
-    full = max([_MIN_SPREAD_PX, *(abs(v) for values in along.values() for v in values if v is not None)])
+    offsets_px = np.array([[c.offsets_px.get(name, (np.nan, np.nan)) for c in captures] for name in names])
+    differences = [_principal_component(band_offsets_px) for band_offsets_px in offsets_px]
+    # The sign of a principal component is arbitrary: choose that of the first band.
+    differences = [d if np.nansum(differences[0] * d) >= 0 else -d for d in differences]
+    full = max(_MIN_CHART_PX, float(np.nanmax(np.abs(differences))))
     step = max(1, math.ceil(len(captures) / _MAX_POINTS))
     lines = tuple(
-        Line(name, hue_of(number, len(names)), _runs(along[name], full, step)) for number, name in enumerate(names)
+        Line(name, hue_of(number, len(names)), _polylines(values, full, step))
+        for number, (name, values) in enumerate(zip(names, differences, strict=True))
     )
     return Drift(camera, full, len(captures), lines, captures[0].label, captures[-1].label)
 
 
-def _along(offsets: Sequence[tuple[float, float] | None]) -> list[float | None]:
-    """Distances from the median along the direction of most change, with its sign."""
-    known = [o for o in offsets if o is not None]
-    middle = np.array([median(o[0] for o in known), median(o[1] for o in known)])
-    _, _, directions = np.linalg.svd(np.array(known) - middle)
-    return [None if o is None else float((np.array(o) - middle) @ directions[0]) for o in offsets]
+def _principal_component(offsets_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) differences of offsets (n, 2) from their median along the direction of largest variance; nan for nan."""
+    differences = offsets_px - np.nanmedian(offsets_px, axis=0)
+    _, _, directions = np.linalg.svd(differences[np.isfinite(differences).all(axis=1)])
+    return np.asarray(differences @ directions[0])
 
 
-def _together(one: Sequence[float | None], other: Sequence[float | None]) -> bool:
-    return sum(a * b for a, b in zip(one, other, strict=True) if a is not None and b is not None) >= 0
-
-
-def _runs(values: Sequence[float | None], full: float, step: int) -> tuple[str, ...]:
-    """Pieces of a line; of many captures the mean of so many that follow each other."""
-    parts = [[v for v in values[i : i + step] if v is not None] for i in range(0, len(values), step)]
-    places = [
-        None if not part else (
-            CHART_WIDTH * (i + 0.5) / len(parts), CHART_HEIGHT / 2 * (1 - 0.92 * sum(part) / len(part) / full),
-        )
-        for i, part in enumerate(parts)
-    ]  # fmt: skip
-    runs: list[list[str]] = [[]]
-    for before, here in pairwise([None, *places]):
-        if here is None:
+def _polylines(values: NDArray[np.float64], full: float, step: int) -> tuple[str, ...]:
+    """SVG points of each sequence of known values; `step` neighbouring values are averaged."""
+    groups = [values[i : i + step] for i in range(0, len(values), step)]
+    lines: list[list[str]] = [[]]
+    for i, group in enumerate(groups):
+        if np.isnan(group).all():
+            lines.append([])
             continue
-        if before is None and runs[-1]:
-            runs.append([])
-        runs[-1].append(f"{here[0]:.1f},{here[1]:.1f}")
-    return tuple(" ".join(run) for run in runs if run)
+        x, y = CHART_WIDTH * (i + 0.5) / len(groups), 1 - _CHART_SHARE * float(np.nanmean(group)) / full
+        lines[-1].append(f"{x:.1f},{CHART_HEIGHT / 2 * y:.1f}")
+    return tuple(" ".join(line) for line in lines if line)
