@@ -44,14 +44,14 @@ class JointSettings(Stage):
     """Joint optimisation of the descriptor and the homographies."""
 
     recipe: Recipe = "fast"
-    """`paper` follows the published algorithm step by step; `fast` reaches the same result sooner."""
+    """`paper` is the published algorithm; `fast` gives the same result sooner."""
     sharing: Sharing = "pseudo-siamese"
-    """Layers that the descriptors of the reference and of a moving band share: all (siamese), all but the first
-    (pseudo-siamese), or none (unshared)."""
+    """Layers that the networks of reference and moving band share: all (siamese), all but the first (pseudo-siamese),
+    or none (unshared)."""
     model_family: FamilyChoice = "auto"
-    """Mappings to fit; `auto` takes the richest one that the images determine."""
+    """Mapping to fit; `auto` is the most general one that the images determine."""
     device: str = "auto"
-    """Of torch: cpu, cuda, cuda:1 and so on; `auto` is CUDA where it is available."""
+    """Torch device: cpu, cuda, cuda:1 and so on; `auto` is CUDA if it is available."""
     rng_seed: Annotated[int, Field(ge=0, le=MAX_RNG_SEED)] = 0
     """The same seed gives the same result, bit by bit."""
 
@@ -60,34 +60,33 @@ class FlightSettings(Stage):
     """One network for many captures."""
 
     together: bool = True
-    """False learns every capture alone."""
+    """False learns a network for each capture."""
     start: str = ""
-    """Fingerprint of the model that a run starts from, set by `run_flight`: a result is kept only by runs with it."""
+    """Fingerprint of the model that a run starts from, set by `run_flight`; runs with another one repeat a capture."""
 
 
 class SeedSettings(Stage):
-    """Coarse alignment."""
+    """Initial alignment."""
 
     force: SeedKind | None = None
-    """Use this kind of seed whatever its score."""
+    """Use only this kind of seed."""
     only: bool = False
-    """Stop at the seed: nothing is learnt or optimised."""
+    """Stop after the initial alignment."""
 
 
 class CheckSettings(Stage):
-    """What counts as delivered. The limits of each check are in its module in `verify`."""
+    """Acceptance of predicted bands. The limits of the checks are in their modules in `verify`."""
 
     accept_predicted_px: Annotated[float, Field(ge=0)] = 1.0
-    """Largest standard error of a predicted band that counts as delivered, px of its file."""
+    """Largest standard error at which a predicted band counts as usable, px of its file."""
 
 
 class ReliefSettings(Stage):
-    """Parallax beyond the homography, over trees, terraces, buildings and benches."""
+    """Correction of parallax over trees, terraces, buildings and benches."""
 
     use: ReliefUse = "auto"
-    """`auto` estimates one relief for all bands of a capture where its windows show parallax. A band that has no other
-    to be verified by gets a smooth displacement field, where parallax may be the only reason against it or where no rig
-    of a flight knows the distortion that the lenses leave."""
+    """`auto` estimates one relief for all bands of a capture if its windows show parallax. A single moving lens, whose
+    relief no other band can verify, gets a smooth displacement field instead, if left-out windows confirm it."""
 
     @field_validator("use", mode="before")
     @classmethod
@@ -96,52 +95,53 @@ class ReliefSettings(Stage):
 
 
 class WriteSettings(Stage):
-    """The aligned stacks."""
+    """Output files."""
 
     interpolation: Interpolation = "lanczos"
     """RMS error on a random image of waves of up to 0.25 cycles/px, relative to its standard deviation: Lanczos 1.4 %,
     OpenCV's cubic kernel 3.0 %, bilinear 16 %."""
     crop: Crop = "flight"
-    """The area that all bands share in all captures of the flight, where its rig is known, or in each by itself; or
-    none."""
+    """Area to write: shared by all bands of all captures (`flight`), by all bands of the capture (`common`), or the
+    whole frame of the reference (`none`)."""
     format: RasterFormat = "gtiff"
     compression: Compression = "auto"
     """auto is Zstandard for stacks and Deflate for files of single bands."""
     undistort: bool = False
-    """Write the lens-corrected grid of the reference instead of its own."""
+    """Remove the lens distortion of the reference from the output."""
     layout: Layout = "stack"
-    """One file a capture, one for each of its files, or both."""
+    """One stack per capture, one file per input file, or both."""
     resolution: Resolution = "reference"
-    """The reference's own pixels, or as many more as the finest band has."""
+    """Pixel size of the output: that of the reference, or of the finest band."""
     georeference: bool = False
-    """Give rasters of single captures an approximate georeference, by position, altitude, yaw and focal length."""
+    """Write an approximate georeference from position, altitude, yaw and focal length."""
     ground_elevation_m: float | None = None
-    """Of the ground, in the altitudes of the camera's GPS: for heights where neither tags nor a panel give them."""
+    """Elevation of the ground in the height system of the camera's GPS, if neither tags nor a panel give the height."""
     statistics: bool = False
-    """Store minimum, maximum, mean and standard deviation of each band in the rasters, as `gdalinfo -stats` does."""
+    """Store minimum, maximum, mean and standard deviation of each band in the rasters."""
     qa: bool = False
-    """A raster of quality flags next to them."""
+    """Write a raster of quality flags."""
     stac: bool = False
-    """A STAC item for each capture."""
+    """Write a STAC item for each capture."""
     indices: tuple[str, ...] = ()
-    """Names of the spectral indices to write of each capture, such as ndvi and ndre."""
+    """Names of the spectral indices to write, such as ndvi and ndre."""
     pan_sharpen: bool = False
-    """The narrow bands at the panchromatic band's resolution, in addition to the others."""
+    """Also write the narrow bands at the resolution of the panchromatic band."""
     error_map: bool = False
-    """A raster of the expected error at every pixel."""
+    """Write a raster of the expected error at every pixel."""
     tie_points: bool = False
-    """The windows in which each band was measured, as CSV and GeoJSON."""
+    """Write the measured windows of each band as CSV and GeoJSON."""
     relief_map: bool = False
-    """The confidence and the range of the relief in its raster, next to the parallax."""
+    """Add confidence and range to the raster of the relief."""
     fill_occluded: bool = False
-    """Interpolate pixels that nearer parts of the scene occlude in a band, instead of nodata."""
+    """Interpolate pixels that are occluded in a band, instead of writing nodata."""
     radiometry: RadiometryChoice = "off"
-    """Write float32 instead of raw numbers: radiance as the camera's own calibration has it, reflectance by the light
-    sensor, or by a panel; auto is the last of these that every band can be given. Thermal bands are in degrees C then.
+    """Write float32 instead of raw numbers: radiance by the camera's calibration (`camera`), reflectance by light
+    sensor (`sun`) or by panel; `auto` is panel if available for all bands, else sun, else camera. Thermal bands are
+    written in degrees C.
     """
     panel_albedo: tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...] = ()
-    """Reflectance of the calibration panel, 0 to 1, by band in lower case, or for all others by the empty name; before
-    what tags or its code say. Where it is given, a panel is also known by its looks."""
+    """(band in lower case, reflectance 0 to 1) of the calibration panel; an empty name stands for all other bands. It
+    takes precedence over tags and QR code. If it is given, panels without tags and code are recognised too."""
 
     @field_validator("radiometry", mode="before")
     @classmethod
@@ -150,7 +150,7 @@ class WriteSettings(Stage):
 
 
 class Settings(Stage):
-    """Everything that a run depends on."""
+    """All settings that change results."""
 
     seed: SeedSettings = SeedSettings()
     joint: JointSettings = JointSettings()
@@ -161,5 +161,5 @@ class Settings(Stage):
 
     @property
     def learns_flights(self) -> bool:
-        """True where one network is learnt for a flight before its captures."""
+        """True if one network is learned for a flight before its captures are aligned."""
         return self.joint.recipe == "fast" and self.flight.together and not self.seed.only

@@ -38,7 +38,7 @@ SETTINGS = {
     "--error-map": "write.error_map", "--relief-map": "write.relief_map", "--fill-occluded": "write.fill_occluded",
     "--tie-points": "write.tie_points", "--qa": "write.qa", "--georeference": "write.georeference",
     "--ground-elevation": "write.ground_elevation_m", "--stac": "write.stac", "--format": "write.format",
-    "--compression": "write.compression",
+    "--compression": "write.compression", "--statistics": "write.statistics",
 }  # fmt: skip
 DISCOVER = {
     "--reference": "reference", "--bands": "bands", "--order": "order", "--with-rgb": "with_rgb",
@@ -49,6 +49,7 @@ RUN = {
     "--jobs": "jobs", "--dask": "executor", "--timeout": "timeout_s", "--overwrite": "overwrite",
     "--retry-failed": "retry_failed", "--align-panels": "align_panels",
 }  # fmt: skip
+COMMAND_LINE_ONLY = ("--model", "--dry-run", "--config", "--quiet", "--verbose", "--log-json")
 
 
 def options(names: dict[str, str], owner: object) -> str:
@@ -60,8 +61,10 @@ def options(names: dict[str, str], owner: object) -> str:
         opposite = " (opposite)" if option == "--each-alone" else ""
         rows.append((f"`{option}`", f"`{name}`{opposite}", kind, f"`{attrgetter(name)(owner)}`", text))
     if isinstance(owner, agalign.RunOptions):
-        command_line_only = of_command.keys() - {*SETTINGS, *DISCOVER, *RUN, "--out"}
-        for option in [o for o in of_command if o in command_line_only]:
+        unlisted = of_command.keys() - {*SETTINGS, *DISCOVER, *RUN, *COMMAND_LINE_ONLY, "--out"}
+        if unlisted:
+            raise SystemExit(f"tools/pages.py: say which setting these options are of: {', '.join(sorted(unlisted))}")
+        for option in COMMAND_LINE_ONLY:
             kind, text = of_command[option]
             rows.append((f"`{option}`", "argument `model`" if option == "--model" else "", kind, "", text))
     return table(rows)
