@@ -1,1 +1,1 @@
-"""The paper's method: a descriptor learnt on the images themselves while the homographies are optimised."""
+"""The method of Dong et al. (2018): a descriptor is learnt on the images while their homographies are optimised."""

@@ -1,6 +1,6 @@
-"""Adam (Kingma & Ba 2015, Algorithm 1) on a network's weights.
+"""Adam (Kingma & Ba 2015, Algorithm 1).
 
-Torch's own loads its compiler when it is made, which takes as long as most captures take to be learnt.
+It replaces torch.optim.Adam, which imports torch's compiler: about one second per process.
 """
 
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-8
 
 
 class Adam:
-    """Moves weights (any shapes) against the gradients that were left in them."""
+    """Optimiser of a network's weights, tensors of any shape."""
 
     def __init__(self, weights: Iterable[nn.Parameter], learning_rate: float) -> None:
         self.weights = list(weights)
@@ -22,7 +22,10 @@ class Adam:
 
     @torch.no_grad()
     def step(self, loss: Tensor) -> None:
-        """One step down the loss, a scalar. Weights that it does not depend on stay as they are, with their moments."""
+        """Take one step down the gradient of a scalar loss.
+
+        Weights that the loss does not depend on, and their moments, are unchanged.
+        """
         for weight in self.weights:
             weight.grad = None
         torch.autograd.backward(loss)
@@ -32,5 +35,5 @@ class Adam:
             self._steps[i] += 1
             first.lerp_(weight.grad, 1 - _BETA_1)
             second.mul_(_BETA_2).addcmul_(weight.grad, weight.grad, value=1 - _BETA_2)
-            spread = (second / (1 - _BETA_2 ** self._steps[i])).sqrt_().add_(_EPSILON)
-            weight.addcdiv_(first, spread, value=-self.learning_rate / (1 - _BETA_1 ** self._steps[i]))
+            denominator = (second / (1 - _BETA_2 ** self._steps[i])).sqrt_().add_(_EPSILON)
+            weight.addcdiv_(first, denominator, value=-self.learning_rate / (1 - _BETA_1 ** self._steps[i]))

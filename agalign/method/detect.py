@@ -1,4 +1,4 @@
-"""SIFT keypoints as centres of patches."""
+"""Detection of SIFT keypoints, the centres of patches."""
 
 import math
 
@@ -15,31 +15,31 @@ from agalign.values.image import Raster
 
 MAX_KEYPOINTS = 2000
 _SPACING_PER_SIZE = 6 / PATCH_PX
-"""SIFT describes an area 6 times its keypoint's size wide; so do the patches."""
+"""Patches are as wide as the area that SIFT describes, 6 times the size of the keypoint."""
 
 
 def to_8_bit(raster: Raster) -> NDArray[np.uint8]:
-    """(H, W), grey, between the 1st and the 99th percentile of the valid pixels."""
+    """Return the grey image, (H, W), stretched between the 1st and 99th percentile of the valid pixels."""
     return eight_bit(luma(raster.pixels), raster.valid)
 
 
 def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:
-    """The `maximum` strongest SIFT keypoints of an image, raw px."""
-    result = cv2.SIFT.create(nfeatures=maximum).detect(to_8_bit(raster), raster.valid.astype(np.uint8))
-    result = sorted(result, key=lambda k: -k.response)[:maximum]
+    """Return the `maximum` strongest SIFT keypoints of an image, raw px."""
+    detected = cv2.SIFT.create(nfeatures=maximum).detect(to_8_bit(raster), raster.valid.astype(np.uint8))
+    strongest = sorted(detected, key=lambda k: -k.response)[:maximum]
     return Keypoints(
-        torch.tensor([k.pt for k in result], dtype=torch.float32).reshape(-1, 2),
-        torch.tensor([math.radians(k.angle) for k in result], dtype=torch.float32),
-        torch.tensor([k.size * _SPACING_PER_SIZE for k in result], dtype=torch.float32),
+        torch.tensor([k.pt for k in strongest], dtype=torch.float32).reshape(-1, 2),
+        torch.tensor([math.radians(k.angle) for k in strongest], dtype=torch.float32),
+        torch.tensor([k.size * _SPACING_PER_SIZE for k in strongest], dtype=torch.float32),
     )
 
 
 def visible_in_both(keypoints: Keypoints, fixed_to_moving: Matrix, fixed: Raster, moving: Raster) -> Keypoints:
-    """The keypoints with patches inside both images."""
-    grid = patch_positions(keypoints)
-    there = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
+    """Return the keypoints of `fixed` with patches inside both images."""
+    positions = patch_positions(keypoints)
+    warped = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), positions)
     inside = torch.ones(len(keypoints), dtype=torch.bool)
-    for points, raster in ((grid, fixed), (there, moving)):
-        end = torch.tensor(raster.size_px, dtype=torch.float32) - 1
-        inside &= ((points >= 0) & (points <= end)).flatten(1).all(dim=1)
+    for points, raster in ((positions, fixed), (warped, moving)):
+        last_px = torch.tensor(raster.size_px, dtype=torch.float32) - 1
+        inside &= ((points >= 0) & (points <= last_px)).flatten(1).all(dim=1)
     return keypoints[inside.nonzero()[:, 0]]

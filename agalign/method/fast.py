@@ -1,6 +1,6 @@
-"""Recipe fast: Adam on theta through in-batch negatives, and every few steps one Gauss-Newton step on psi.
+"""Recipe fast: Adam on theta with in-batch negatives, and every few steps one Gauss-Newton step on psi.
 
-One theta for as many captures as are given, each pair with its own psi (the paper's future work).
+All given captures share one theta; each image pair has its own psi (the paper proposes this as future work).
 """
 
 import math
@@ -28,70 +28,71 @@ from agalign.method.refine import (
     describe_fixed,
     describe_reference,
     held_out_retrieval,
-    moved,
+    updated,
 )
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL
 
 BATCH = 128
-"""Keypoints of a step on theta, all negatives of each other."""
+"""Keypoints in a step on theta; each is a negative for the others."""
 LEARNING_RATE = 2e-3
 _TEMPERATURE = 0.07
-"""Of the in-batch loss (He et al. 2020, Sec. 3.3)."""
+"""Temperature of the in-batch loss (He et al. 2020, Sec. 3.3)."""
 _LEARN_PX = 640
-"""Longer side of the images on which theta is learnt, but at least half of the full resolution: what is learnt at this
-scale holds at full resolution, at a quarter of the cost."""
+"""Longer side of the images on which theta is learnt, but at least half of the full resolution: weights learnt at this
+scale also serve at full resolution, at a quarter of the cost."""
 _COARSEST_PX = 200
-"""The coarsest level, where an untrusted seed starts, is between this and twice this on its longer side."""
-_SEARCH_SHARE = 0.22
-"""How far around an untrusted seed the loss is searched at the coarsest level, in longer sides."""
+"""The longer side of the coarsest level, where an untrusted seed starts, is between this and twice this."""
+_SEARCH_RADIUS_SHARE = 0.22
+"""Radius of the search around an untrusted seed at the coarsest level, as a share of the longer side."""
 _SEARCH_STEP_PX = 3.0
-"""Between neighbouring translations that are tried, px of that level: within reach of a Gauss-Newton step."""
+"""Spacing of the translations that are searched, px of that level: a Gauss-Newton step can bridge it."""
 _SEARCH_PATCHES = 64
 _OCTAVES = 1.0
-"""Patch scales are drawn from [1, 2**octaves] px between samples."""
+"""Patch scales are drawn from [1, 2**_OCTAVES] px between samples."""
 _WARM_UP_STEPS = 50
-"""Steps on random weights before psi may move."""
+"""Steps on random weights before the first step on psi."""
 _FIRST_UPDATES = 5
-"""Steps on psi before the first on weights that are not random; twice as many where those suffice."""
+"""Steps on psi before learnt weights are trained further; twice as many if psi converges without training."""
 _STEPS_BETWEEN_UPDATES = 10
-_HOPELESS_STEPS = 30
-"""Steps after which a level is abandoned where no held-out patches could be retrieved."""
+_MAX_STEPS_WITHOUT_RETRIEVAL = 30
+"""A level is abandoned after this many steps if no held-out patches can be retrieved."""
 _PATCHES = 300
-"""Patches in a Gauss-Newton step: the cost of a step grows with them, its error falls with their square root."""
+"""Patches in a Gauss-Newton step: its cost grows linearly with their number, its error falls with the square root."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long theta is learnt at each level."""
+    """Learning rate and stopping rule of theta at each level."""
 
     learning_rate: float = LEARNING_RATE
     max_steps: int = 150
-    """Of each capture."""
+    """Per capture."""
     enough_retrieval: float = 0.6
-    """Held-out retrieval at which learning may stop once psi is at rest."""
+    """Held-out retrieval above which learning stops once psi has converged."""
 
 
 DEFAULT_SCHEDULE = Schedule()
 
 
 def learn(
-    state: JointState, groups: Sequence[ImageGroup], net: Descriptor, at_once: int = 1,
+    state: JointState, groups: Sequence[ImageGroup], net: Descriptor, threads: int = 1,
     schedule: Schedule = DEFAULT_SCHEDULE,
 ) -> tuple[int, float]:  # fmt: skip
     """Learn theta and every psi of all groups, coarse to fine; theta is carried from level to level.
 
-    The psi of `at_once` groups move at a time, each group in a thread; the result does not depend on it. Returns the
-    number of steps on theta and the last loss, NaN without a step. Raises NoContrastError.
+    The homographies are written into the groups. `threads` groups update their psi at the same time; the result does
+    not depend on it. Returns the number of steps on theta and the last loss, NaN without a step. Raises
+    NoContrastError.
     """
     scales = learn_scales(max(max(g.fixed.size_px) for g in groups))
     steps, loss = 0, math.nan
-    # Each group has its own random numbers: what is drawn for one does not depend on the others.
+    # Each group has its own random generator, so its samples do not depend on the other groups.
     states = [JointState(state.settings, state.progress) for _ in groups]
-    with ThreadPoolExecutor(at_once) as pool:
+    with ThreadPoolExecutor(threads) as pool:
 
-        def move_psi(some: Sequence[_GroupAtLevel]) -> list[bool]:
-            return list(pool.map(_move_psi, some))
+        def update_psi(some: Sequence[_GroupAtLevel]) -> list[bool]:
+            return list(pool.map(_update_psi, some))
 
         for scale in scales:
             at_level = [
@@ -103,21 +104,21 @@ def learn(
                 continue
             if scale == scales[0] and net.learnt:
                 list(pool.map(_search, at_level))
-            if not net.learnt or not _converges(at_level, move_psi):
-                taken, loss = _train(state, net, at_level, schedule, move_psi)
-                steps += taken
+            if not net.learnt or not _converges(at_level, update_psi):
+                level_steps, loss = _train(state, net, at_level, schedule, update_psi)
+                steps += level_steps
             for group in at_level:
-                group.hand_on()
+                group.store()
     return steps, loss
 
 
 def _bands_at(group: ImageGroup, *, is_finest: bool) -> list[int]:
-    """The moving images that take part at a level: those with a trusted seed only at the finest one."""
+    """Return the moving images that take part at a level: those with a trusted seed only at the finest one."""
     return [b for b in group.active if is_finest or not group.trusted[b]]
 
 
 def learn_scales(longer_side_px: int) -> list[float]:
-    """Resolutions at which theta is learnt, coarse to fine."""
+    """Return the scales of the levels on which theta is learnt, coarse to fine; 1 is full resolution."""
     scales = [min(1.0, max(0.5, _LEARN_PX / longer_side_px))]
     while scales[0] * longer_side_px >= 2 * _COARSEST_PX:
         scales.insert(0, scales[0] / 2)
@@ -126,86 +127,86 @@ def learn_scales(longer_side_px: int) -> list[float]:
 
 @dataclass
 class _GroupAtLevel:
-    """Some moving images of a group at one level, with their psi as homographies of that level."""
+    """Some moving images of a group at one level, and their homographies."""
 
     state: JointState
-    """The group's own."""
+    """With the random generator of this group."""
     net: Descriptor
     group: ImageGroup
-    which: Sequence[int]
-    """Indices of the moving images in the group."""
+    indices: Sequence[int]
+    """Of the moving images in the group."""
     level: Level
     schedule: Schedule
     h: list[Tensor] = field(init=False)
+    """(3, 3) fixed_to_moving of each moving image, px of the level."""
     converged: list[bool] = field(init=False)
-    """True once psi has been at rest; it is moved on all the same."""
+    """True after the first step on psi shorter than REST_PX; psi is updated further while others have not converged."""
     distinguished: list[bool] = field(init=False)
-    """True once held-out patches could be retrieved, so that psi could move."""
+    """True once held-out retrieval has reached MIN_RETRIEVAL, which steps on psi require."""
     retrieved: list[float] = field(init=False)
-    """Share of the held-out patches that were retrieved at the last test."""
+    """Held-out retrieval at the last test."""
 
     def __post_init__(self) -> None:
-        self.converged, self.distinguished = ([False] * len(self.which) for _ in range(2))
-        self.retrieved = [0.0] * len(self.which)
-        self.h = [self.level.homography(self.group.mappings[b], i) for i, b in enumerate(self.which)]
+        self.converged, self.distinguished = ([False] * len(self.indices) for _ in range(2))
+        self.retrieved = [0.0] * len(self.indices)
+        self.h = [self.level.homography(self.group.mappings[b], i) for i, b in enumerate(self.indices)]
 
     @property
     def bands(self) -> list[MovingBand]:
-        return [MovingBand(self.net, self.level, i, self.group.sides[b]) for i, b in enumerate(self.which)]
+        return [MovingBand(self.net, self.level, i, self.group.sides[b]) for i, b in enumerate(self.indices)]
 
     @property
-    def needs_only_steps(self) -> bool:
-        """True where the descriptors are good enough for every psi that has not converged: steps on psi suffice."""
+    def needs_no_training(self) -> bool:
+        """True where retrieval is high enough for every psi that has not converged: steps on psi suffice."""
         enough = self.schedule.enough_retrieval
         return all(r > enough for r, converged in zip(self.retrieved, self.converged, strict=True) if not converged)
 
-    def hand_on(self) -> None:
-        """Write the result into the group; a homography that cannot be inverted is left out."""
-        self.group.dropped |= {b: self.retrieved[i] for i, b in enumerate(self.which) if not self.distinguished[i]}
-        for i, b in enumerate(self.which):
+    def store(self) -> None:
+        """Write the homographies that can be inverted into the group, and the moving images that are dropped."""
+        self.group.dropped |= {b: self.retrieved[i] for i, b in enumerate(self.indices) if not self.distinguished[i]}
+        for i, b in enumerate(self.indices):
             with suppress(GeometryError):
                 self.group.mappings[b] = self.level.full_matrix(self.h[i], i)
 
 
-_MovePsi = Callable[[Sequence[_GroupAtLevel]], list[bool]]
-"""One step on each psi of some groups; True for each group in which all psi have converged."""
+_UpdatePsi = Callable[[Sequence[_GroupAtLevel]], list[bool]]
+"""Take one step on each psi of some groups; return True for each group in which all psi have converged."""
 
 
 @torch.no_grad()
-def _search(at: _GroupAtLevel) -> None:
-    """Move each untrusted psi by the translation under which the patches' loss is least.
+def _search(g: _GroupAtLevel) -> None:
+    """Shift each untrusted mapping by the translation with the smallest loss of the patches.
 
-    Around the truth the loss is a funnel (paper, Fig. 2) that is wider than what one Gauss-Newton step sees.
+    The loss decreases towards the true position (paper, Fig. 2) over a larger distance than a Gauss-Newton step covers.
     """
-    state, level = at.state, at.level
-    p, _ = state.sampler.draw(level, level.anywhere, at.h, _SEARCH_PATCHES, _OCTAVES)
-    for i, band in enumerate(at.bands):
-        if at.group.trusted[at.which[i]]:
+    p, _ = g.state.sampler.draw(g.level, g.level.anywhere, g.h, _SEARCH_PATCHES, _OCTAVES)
+    for i, band in enumerate(g.bands):
+        if g.group.trusted[g.indices[i]]:
             continue
-        reach = _SEARCH_SHARE * max(level.fixed.size_px)
-        if at.group.reach_px:
-            reach = min(reach, at.group.reach_px[at.which[i]] * level.fixed.scale[0])
-        shift = best_shift(band, at.h[i], p, reach, _SEARCH_STEP_PX)
-        at.h[i] = at.h[i] @ translation(shift).to(at.h[i])
+        radius_px = _SEARCH_RADIUS_SHARE * max(g.level.fixed.size_px)
+        if g.group.max_shift_px:
+            radius_px = min(radius_px, g.group.max_shift_px[g.indices[i]] * g.level.fixed.scale[0])
+        shift = best_shift(band, g.h[i], p, radius_px, _SEARCH_STEP_PX)
+        g.h[i] = g.h[i] @ translation(shift).to(g.h[i])
 
 
-def _converges(at_level: Sequence[_GroupAtLevel], move_psi: _MovePsi) -> bool:
-    """Move every psi with the network as it is; True where all converge, so that no step on theta is needed."""
+def _converges(at_level: Sequence[_GroupAtLevel], update_psi: _UpdatePsi) -> bool:
+    """Update every psi without training the network; return True if all converge."""
     remaining = at_level
     for update in range(1, 2 * _FIRST_UPDATES + 1):
-        remaining = [g for g, converged in zip(remaining, move_psi(remaining), strict=True) if not converged]
+        remaining = [g for g, converged in zip(remaining, update_psi(remaining), strict=True) if not converged]
         if not remaining:
             return True
-        cannot_move = update > 1 and not all(all(g.distinguished) for g in remaining)
-        if cannot_move or (update >= _FIRST_UPDATES and not all(g.needs_only_steps for g in remaining)):
+        is_blocked = update > 1 and not all(all(g.distinguished) for g in remaining)
+        if is_blocked or (update >= _FIRST_UPDATES and not all(g.needs_no_training for g in remaining)):
             return False
     return False
 
 
 def _train(
-    state: JointState, net: Descriptor, at_level: Sequence[_GroupAtLevel], schedule: Schedule, move_psi: _MovePsi
+    state: JointState, net: Descriptor, at_level: Sequence[_GroupAtLevel], schedule: Schedule, update_psi: _UpdatePsi
 ) -> tuple[int, float]:
-    """Theta by Adam, one group a step; every few steps Gauss-Newton on each psi with retrieved held-out patches.
+    """Learn theta with Adam, one group per step; every few steps update each psi by Gauss-Newton.
 
     Returns the number of steps and the last loss.
     """
@@ -221,39 +222,38 @@ def _train(
         if step < warm_up or step % (_STEPS_BETWEEN_UPDATES * count):
             continue
         state.progress("learning", step / max_steps)
-        if all(move_psi(at_level)):
+        if all(update_psi(at_level)):
             break
-        if step >= warm_up + _HOPELESS_STEPS * count and not any(any(g.distinguished) for g in at_level):
+        if step >= warm_up + _MAX_STEPS_WITHOUT_RETRIEVAL * count and not any(any(g.distinguished) for g in at_level):
             break
     net.learnt = True
     return step, loss_value
 
 
-def _loss(at: _GroupAtLevel) -> Tensor | None:
-    """The in-batch loss of one capture's pairs on newly drawn keypoints; None where none can be drawn."""
-    state, level = at.state, at.level
-    p, inside = state.sampler.draw(level, level.trainable, at.h, BATCH, _OCTAVES)
-    rows = [inside[:, i].nonzero()[:, 0] for i in range(len(at.h))]
-    visible = [band for band in at.bands if len(rows[band.index]) >= MIN_KEYPOINTS]
-    if not visible:
+def _loss(g: _GroupAtLevel) -> Tensor | None:
+    """Return the mean in-batch loss of the pairs of a capture on new keypoints; None if too few can be drawn."""
+    p, inside = g.state.sampler.draw(g.level, g.level.trainable, g.h, BATCH, _OCTAVES)
+    visible = [inside[:, i].nonzero()[:, 0] for i in range(len(g.h))]
+    bands = [band for band in g.bands if len(visible[band.index]) >= MIN_KEYPOINTS]
+    if not bands:
         return None
-    patches = [level.fixed.patches(patch_positions(p))]
-    patches += [band.patches(p[rows[band.index]], at.h[band.index]) for band in visible]
-    f, *f_primes = at.net.describe(patches, [REFERENCE, *(band.side for band in visible)])
-    apart = far_apart(p)
-    terms = []
-    for band, f_prime in zip(visible, f_primes, strict=True):
-        mine = rows[band.index]
-        terms.append(in_batch_loss(f[mine], f_prime, apart[mine][:, mine]))
-    return torch.stack(terms).mean()
+    patches = [g.level.fixed.patches(patch_positions(p))]
+    patches += [band.patches(p[visible[band.index]], g.h[band.index]) for band in bands]
+    f, *f_primes = g.net.describe(patches, [REFERENCE, *(band.side for band in bands)])
+    allowed = far_apart(p)
+    losses = []
+    for band, f_prime in zip(bands, f_primes, strict=True):
+        rows = visible[band.index]
+        losses.append(in_batch_loss(f[rows], f_prime, allowed[rows][:, rows]))
+    return torch.stack(losses).mean()
 
 
 def in_batch_loss(f: Tensor, f_prime: Tensor, allowed: Tensor) -> Tensor:
-    """InfoNCE in both directions with the other rows of the batch as negatives, a scalar.
+    """Return the symmetric InfoNCE loss with the other rows of the batch as negatives, a scalar.
 
-    `f` and `f_prime` are (N, D) of unit length, row i of one matching row i of the other; `allowed` (N, N) is False
-    where two keypoints are too close to count as negatives of each other (its diagonal does not matter).
-    van den Oord et al. 2018, Eq. 4, symmetrised.
+    `f` and `f_prime` are (N, D) descriptors of unit length; row i of one matches row i of the other. `allowed` (N, N)
+    is False where two keypoints are too close to be negatives of each other; its diagonal is ignored.
+    Source: van den Oord et al. 2018, Eq. 4.
     """
     logits = f @ f_prime.T / _TEMPERATURE
     keep = allowed | torch.eye(len(f), dtype=torch.bool, device=f.device)
@@ -263,24 +263,22 @@ def in_batch_loss(f: Tensor, f_prime: Tensor, allowed: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _move_psi(at: _GroupAtLevel) -> bool:
-    """One step on each psi of a capture with held-out patches that are retrieved; True where all have converged."""
-    state, level = at.state, at.level
-    test, _ = state.sampler.draw(level, level.held_out, at.h, TEST_KEYPOINTS, _OCTAVES)
-    p, _ = state.sampler.draw(level, level.anywhere, at.h, _PATCHES, _OCTAVES)
+def _update_psi(g: _GroupAtLevel) -> bool:
+    """Take one step on each psi of a capture that passes held-out retrieval; return True if all have converged."""
+    test, _ = g.state.sampler.draw(g.level, g.level.held_out, g.h, TEST_KEYPOINTS, _OCTAVES)
+    p, _ = g.state.sampler.draw(g.level, g.level.anywhere, g.h, _PATCHES, _OCTAVES)
     if len(p) < MIN_KEYPOINTS:
         return True
-    f_test = describe_fixed(at.net, level, test)
-    reference_patches = describe_reference(at.net, level, p)
-    solver = Solver(state.family)
-    for i, band in enumerate(at.bands):
-        retrieved, _ = held_out_retrieval(band, at.h[i], test, f_test)
-        at.retrieved[i] = retrieved
-        if retrieved < MIN_RETRIEVAL:
+    f_test = describe_fixed(g.net, g.level, test)
+    reference_patches = describe_reference(g.net, g.level, p)
+    solver = Solver(g.state.family)
+    for i, band in enumerate(g.bands):
+        g.retrieved[i], _ = held_out_retrieval(band, g.h[i], test, f_test)
+        if g.retrieved[i] < MIN_RETRIEVAL:
             continue
-        at.distinguished[i] = True
+        g.distinguished[i] = True
         with suppress(NotEnoughTextureError):
-            step = solver.step(band, at.h[i], reference_patches)
-            at.h[i] = moved(at.h[i], step)
-            at.converged[i] |= retrieved > at.schedule.enough_retrieval and step.length_px < REST_PX
-    return all(at.converged)
+            step = solver.step(band, g.h[i], reference_patches)
+            g.h[i] = updated(g.h[i], step)
+            g.converged[i] |= g.retrieved[i] > g.schedule.enough_retrieval and step.length_px < REST_PX
+    return all(g.converged)

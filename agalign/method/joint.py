@@ -1,16 +1,16 @@
-"""The method: learn a descriptor on the very images to be aligned while the homographies are optimised (paper, Sec. 4).
+"""The method: learn a descriptor on the images to be aligned while the homographies are optimised (paper, Sec. 4).
 
     argmin over theta and psi of   sum L0(x, w(x; psi); theta) + sum L1(x, x'; theta)
 
 theta are the weights of the descriptor f, psi the parameters of the homography w from I (`fixed`) to I' (`moving`),
-L0 the distance of two matching descriptors and L1 the hinge on the others. Two recipes do this on the
-same levels, keypoints, patches and networks:
+L0 is the distance of two matching descriptors, L1 the hinge loss of non-matching ones. Two recipes share levels,
+keypoints, patches and networks:
 
 * `paper` (`paper.descend`): SGD on theta and psi together, coarse to fine, one pair at a time, as published.
-* `fast` (`fast.learn`, then `refine.refine`): Adam on theta through in-batch negatives; every few steps one
-  Gauss-Newton step on psi minimises L0 squared; at full resolution psi alone, theta frozen.
+* `fast` (`fast.learn`, then `refine.refine`): Adam on theta with in-batch negatives; every few steps, one
+  Gauss-Newton step on psi minimises L0 squared. At full resolution theta is frozen and only psi is optimised.
 
-Where theta is known already, from the flight, only psi is optimised (`refine_with`).
+With the network of a flight, theta is frozen throughout (`refine_with`).
 """
 
 from dataclasses import replace
@@ -27,17 +27,17 @@ from agalign.values.issues import FEW_KEYPOINTS, NO_CONTRAST, NOT_INVERTIBLE, Is
 from agalign.values.pixel_units import FixedImagePx
 
 Results = list[JointResult[FixedImagePx] | Issue]
-"""For each moving image of a group the result, or the reason why there is none."""
+"""The result for each moving image of a group, or the reason why there is none."""
 
 
 def align_from_scratch(
     group: ImageGroup, settings: JointSettings, progress: Progress, *, start: ThetaStart = "starter",
     schedule: Schedule = DEFAULT_SCHEDULE, training: Training = DEFAULT_TRAINING,
 ) -> Results:  # fmt: skip
-    """Theta and every psi of one capture by itself.
+    """Optimise theta and every psi for one capture alone.
 
-    `start` and `schedule` are recipe fast's, `training` is recipe paper's. Raises ConfigurationError where there is no
-    such device.
+    Only recipe fast uses `start` and `schedule`, only recipe paper uses `training`. Raises ConfigurationError for a
+    device that cannot be used.
     """
     state = JointState(settings, progress)
     if settings.recipe == "paper":
@@ -54,7 +54,7 @@ def align_from_scratch(
 def refine_with(
     net: Descriptor, group: ImageGroup, settings: JointSettings, progress: Progress, patches: int = PATCHES
 ) -> Results:
-    """Every psi of a capture with the flight's theta frozen."""
+    """Optimise every psi of a capture with theta frozen, from at most `patches` patches per image."""
     try:
         results = refine(JointState(settings, progress), net, group, patches=patches)
     except NoContrastError:
@@ -63,11 +63,11 @@ def refine_with(
 
 
 def _by_paper(state: JointState, group: ImageGroup, band: int, training: Training) -> JointResult[FixedImagePx] | Issue:
-    one = ImageGroup.of_one(group.fixed, group.moving[band], group.mappings[band])
+    pair = ImageGroup.of_one(group.fixed, group.moving[band], group.mappings[band])
     try:
-        return align_by_paper(state, one, training)[1]
-    except NotEnoughTextureError as why_not:
-        return Issue(FEW_KEYPOINTS, why_not.keypoints, why_not.minimum)
+        return align_by_paper(state, pair, training)[1]
+    except NotEnoughTextureError as error:
+        return Issue(FEW_KEYPOINTS, error.keypoints, error.minimum)
     except NoContrastError:
         return Issue(NO_CONTRAST)
     except GeometryError:

@@ -1,4 +1,4 @@
-"""The images of one capture at one resolution, and the keypoints that may be drawn from them."""
+"""The images of one capture at one resolution, and random sampling of keypoints."""
 
 import math
 from collections.abc import Sequence
@@ -23,28 +23,28 @@ from agalign.values.lens import Lens
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 _HELD_OUT_CELLS = 8
-"""Cells along the longer side; every fifth cell, in a diagonal pattern, is kept from training."""
+"""Cells along the longer side; every fifth cell, in a diagonal pattern, is held out from training."""
 _FIELD_COLUMNS = 65
-_MIN_GRADIENT = 0.05
-"""Keypoints are drawn where the gradient of the standardised image is larger than this, per px (paper, Sec. 5.3)."""
+_MIN_GRADIENT_PER_PX = 0.05
+"""Keypoints are drawn where the gradient of the standardised image is larger than this (paper, Sec. 5.3)."""
 _MIN_CELL_PX = 4 * FOOTPRINT_PX
-"""Less than this across, a cell has no room for the patches of recipe fast, twice the smallest one's size."""
-_POOL = 16_384
-"""Positions kept of each kind: enough for any run, and each is undistorted only once."""
-_TRIES = 4
-"""Keypoints drawn for each that is wanted: some have patches that reach too far."""
+"""Minimum width of a cell, so that it can contain the largest patches of recipe fast, 2 px between samples."""
+_MAX_POSITIONS = 16_384
+"""Positions in a pool: enough for any run, and each is undistorted only once."""
+_TRIES_PER_KEYPOINT = 4
+"""Keypoints are drawn in excess, because patches that leave the valid area are rejected."""
 
 
 @dataclass(frozen=True)
 class LevelImage:
-    """One image at one level, standardised. Positions are given undistorted: the image is sampled through its lens."""
+    """One standardised image at one level. Its methods take undistorted positions and apply the lens model."""
 
     image: Tensor
     """(C, H, W), mean 0 and standard deviation 1 over the valid pixels, 0 elsewhere."""
-    room_px: Tensor
-    """(H, W) distance from each pixel to the nearest invalid one or to the border."""
+    clearance_px: Tensor
+    """(H, W) distance from each pixel to the nearest invalid pixel or the border."""
     scale: PixelScale = SAME_PIXELS
-    """Size (x, y) relative to the image that it was reduced from."""
+    """Size (x, y) relative to the image at full resolution."""
     lens: Lens | None = None
 
     @property
@@ -53,32 +53,32 @@ class LevelImage:
         return int(self.image.shape[2]), int(self.image.shape[1])
 
     def raw(self, points: Tensor) -> Tensor:
-        """Raw pixel positions of undistorted ones, (..., 2)."""
+        """Convert undistorted positions (..., 2) to raw pixel positions."""
         if self.lens is None or not lens.is_distorting(self.lens):
             return points
         return torch.stack(lens.distorted(self.lens, points[..., 0], points[..., 1]), dim=-1)
 
     def patches(self, positions: Tensor) -> Tensor:
-        """Undistorted sample positions (N, 16, 16, 2) -> (N, C, 16, 16)."""
+        """Sample patches at undistorted positions, (N, 16, 16, 2) -> (N, C, 16, 16)."""
         return bilinear(self.image, self.raw(positions))
 
-    def room_at(self, points: Tensor) -> Tensor:
-        """Distance to the nearest invalid pixel from undistorted positions (N, 2); 0 outside."""
+    def clearance_at(self, points: Tensor) -> Tensor:
+        """Return the distance (N,) px from undistorted positions (N, 2) to the nearest invalid pixel; 0 outside."""
         width, height = self.size_px
         column, row = self.raw(points).nan_to_num(-1.0).round().clamp(-2, 1e9).long().unbind(dim=1)
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        room = self.room_px[torch.where(inside, row, 0), torch.where(inside, column, 0)]
-        return torch.where(inside, room, 0.0)
+        clearance = self.clearance_px[torch.where(inside, row, 0), torch.where(inside, column, 0)]
+        return torch.where(inside, clearance, 0.0)
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Where keypoints may lie."""
+    """Candidate positions of keypoints."""
 
     xy: Tensor
     """(M, 2) undistorted positions."""
-    reach_px: Tensor
-    """(M,) how far a patch around each may reach; infinity where only the image bounds it."""
+    max_radius_px: Tensor
+    """(M,) largest radius of a patch around each; infinity where only the valid area limits it."""
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -86,24 +86,22 @@ class Pool:
 
 @dataclass(frozen=True)
 class Level:
-    """I and one or more I' at one resolution, and where in I keypoints may lie."""
+    """I and one or more I' at one resolution, and the candidate positions of keypoints in I."""
 
     fixed: LevelImage
     moving: tuple[LevelImage, ...]
     trainable: Pool
-    """Positions with contrast enough from which theta is learnt."""
+    """Positions with texture in the cells on which theta is trained."""
     held_out: Pool
-    """The same in cells of the image that theta never sees: patches around the ones share none with patches
-    around the others."""
+    """Positions with texture in the held-out cells. Their patches share no pixels with those of `trainable`."""
     anywhere: Pool
-    """Both together, their patches unbounded."""
+    """Both, without a limit on the radius of a patch."""
     fields: tuple[Tensor | None, ...] = ()
-    """(1, 2, rows, columns) for a moving image before whose homography positions of I are displaced: px of the level
-    on a lattice from corner to corner of I; empty where none is.
-    """
+    """Displacement field (1, 2, rows, columns) of each moving image: px of the level at the nodes of a grid over I,
+    added to positions of I before the homography. Empty if no image has one."""
 
-    def with_fields(self, fields: "Sequence[DisplacementField | None]") -> "Level":
-        """The same level with displacements, px of the image that I was reduced from."""
+    def with_fields(self, fields: Sequence[DisplacementField | None]) -> "Level":
+        """Return the level with displacement fields of the moving images, which are in px at full resolution."""
         width, height = self.fixed.size_px
         nodes = geometry.lattice(width, height, _FIELD_COLUMNS, round(_FIELD_COLUMNS * height / width) + 1)
         shape = (-1, _FIELD_COLUMNS, 2)
@@ -116,7 +114,7 @@ class Level:
         return replace(self, fields=tuple(None if f is None else on_lattice(f) for f in fields))
 
     def displacement(self, band: int, xy: Tensor) -> Tensor | None:
-        """(N, 2) px by which positions (N, 2) of I are displaced before a moving image's homography; None for none."""
+        """Return the displacement, (N, 2) px, of positions (N, 2) of I before the homography; None without a field."""
         field = self.fields[band] if self.fields else None
         if field is None:
             return None
@@ -126,18 +124,21 @@ class Level:
         return result[0, :, :, 0].T
 
     def homography(self, matrix: Matrix, band: int) -> Tensor:
-        """A full-resolution fixed_to_moving matrix of a moving image as one between the level's, (3, 3) float32."""
+        """Convert fixed_to_moving of a moving image from full resolution to px of the level, (3, 3) float32."""
         scaled = geometry.rescale(matrix, self.fixed.scale, self.moving[band].scale)
         return torch.tensor(scaled, dtype=torch.float32, device=self.fixed.image.device)
 
     def full_matrix(self, homography: Tensor, band: int) -> Matrix:
-        """The inverse of `homography`."""
+        """Convert fixed_to_moving of a moving image from px of the level to full resolution.
+
+        Raises GeometryError for a matrix that cannot be inverted.
+        """
         up, moving_up = self.fixed.scale.inverse, self.moving[band].scale.inverse
         return geometry.rescale(homography.cpu().double().numpy(), up, moving_up)
 
 
 def make_level_image(raster: Raster, scale: float, device: torch.device) -> LevelImage:
-    """A raster as the networks see it, reduced by `scale` (1 is its own resolution)."""
+    """Reduce a raster by `scale` (1 is full resolution) and standardise each channel."""
     width, height = raster.size_px
     small = shrink(raster, (max(1, round(width * scale)), max(1, round(height * scale))))
     planes = small.pixels if small.pixels.ndim == 3 else small.pixels[None]
@@ -148,15 +149,19 @@ def make_level_image(raster: Raster, scale: float, device: torch.device) -> Leve
         np.multiply(plane - np.float32(mean), np.float32(1 / max(deviation, 1e-12)), out=standard)
         standard[~small.valid] = 0
     relative = PixelScale.between(raster.size_px, small.size_px)
-    room = torch.from_numpy(_room_px(small.valid)).to(device)
-    return LevelImage(torch.from_numpy(image).to(device), room, relative, small.lens)
+    clearance_px = torch.from_numpy(_clearance_px(small.valid)).to(device)
+    return LevelImage(torch.from_numpy(image).to(device), clearance_px, relative, small.lens)
 
 
 def make_level(
     fixed: Raster, moving: Sequence[Raster], mappings: Sequence[Matrix], scale: float,
     generator: torch.Generator, device: torch.device,
 ) -> Level:  # fmt: skip
-    """The images reduced by `scale`, a moving one so that its mapping's magnification becomes 1 where it is larger."""
+    """Reduce the images by `scale`.
+
+    The moving images are reduced so that the magnification of their mapping is 1, but never enlarged. `mappings` are
+    fixed_to_moving at full resolution.
+    """
     fixed_view = make_level_image(fixed, scale, device)
     views = []
     for raster, matrix in zip(moving, mappings, strict=True):
@@ -164,11 +169,10 @@ def make_level(
         usable = np.isfinite(magnification) and magnification > 0
         views.append(make_level_image(raster, min(1.0, scale / magnification) if usable else scale, device))
     gradient = _gradient_magnitude(fixed_view.image.cpu().numpy())
-    room = fixed_view.room_px.cpu().numpy()
-    usable_px = (gradient > _MIN_GRADIENT) & (room > FOOTPRINT_PX)
+    has_texture = (gradient > _MIN_GRADIENT_PER_PX) & (fixed_view.clearance_px.cpu().numpy() > FOOTPRINT_PX)
     trainable, held_out = (
-        _pool(usable_px, reach_px, fixed_view.lens, generator, device)
-        for reach_px in _reach_within_cells(*fixed_view.size_px)
+        _pool(has_texture, max_radius_px, fixed_view.lens, generator, device)
+        for max_radius_px in _max_radius_in_cells(*fixed_view.size_px)
     )
     xy = torch.cat([trainable.xy, held_out.xy])
     anywhere = Pool(xy, torch.full_like(xy[:, 0], math.inf))
@@ -177,7 +181,7 @@ def make_level(
 
 @dataclass
 class Sampler:
-    """Draws random keypoints; the only source of randomness besides the initial weights."""
+    """Random sampling of keypoints, the only source of randomness apart from the initial weights."""
 
     generator: torch.Generator
 
@@ -185,19 +189,19 @@ class Sampler:
         self, level: Level, pool: Pool, homographies: Sequence[Tensor], count: int, octaves: float,
         spacing_px: float = 1.0,
     ) -> tuple[Keypoints, Tensor]:  # fmt: skip
-        """Up to `count` keypoints of I from `pool` with patches in the valid area of I and of some I', and in
-        which I' they do, (N, bands) bool. Those that lie in the most come first.
+        """Draw up to `count` keypoints with patches in the valid area of I and of at least one I'.
 
-        Orientation is uniform in [0, 2 pi], log2 of the scale in units of `spacing_px` uniform in [0, octaves]
-        (paper, Sec. 5.3).
+        Returns the keypoints and (N, bands) True for each I' that contains the patch; keypoints in most bands come
+        first. The orientation is uniform in [0, 2 pi], log2(scale / spacing_px) is uniform in [0, octaves] (paper,
+        Sec. 5.3). `homographies` are fixed_to_moving in px of the level.
         """
-        tries, device = _TRIES * count if len(pool) else 0, pool.xy.device
+        tries, device = _TRIES_PER_KEYPOINT * count if len(pool) else 0, pool.xy.device
         rows = torch.randint(max(1, len(pool)), (tries,), generator=self.generator).to(device)
         angle = torch.rand(tries, generator=self.generator) * (2 * math.pi)
         scale = spacing_px * 2 ** (torch.rand(tries, generator=self.generator) * octaves)
         keypoints = Keypoints(pool.xy[rows], angle.to(device), scale.to(device))
         inside = torch.stack([footprints_inside(level, b, keypoints, h) for b, h in enumerate(homographies)], dim=1)
-        inside &= (footprint_radius(keypoints.scale) + 1 < pool.reach_px[rows])[:, None]
+        inside &= (footprint_radius(keypoints.scale) + 1 < pool.max_radius_px[rows])[:, None]
         bands = inside.sum(dim=1)
         order = torch.argsort(bands, descending=True, stable=True)[:count]
         order = order[bands[order] > 0]
@@ -205,19 +209,20 @@ class Sampler:
 
 
 def footprints_inside(level: Level, band: int, keypoints: Keypoints, homography: Tensor) -> Tensor:
-    """(N,) True where a keypoint's patch touches only valid pixels in both images."""
-    here = level.fixed.room_at(keypoints.xy) > footprint_radius(keypoints.scale) + 1
-    return here & footprints_inside_moving(level, band, keypoints, homography)
+    """Return (N,) True for each keypoint with a patch of only valid pixels in both images."""
+    inside_fixed = level.fixed.clearance_at(keypoints.xy) > footprint_radius(keypoints.scale) + 1
+    return inside_fixed & footprints_inside_moving(level, band, keypoints, homography)
 
 
 def footprints_inside_moving(level: Level, band: int, keypoints: Keypoints, homography: Tensor) -> Tensor:
-    """(N,) the same in the moving image alone."""
-    there = transform(homography, keypoints.xy)
-    jacobian_scale = homography[:2, :2].det().abs().sqrt()
-    return level.moving[band].room_at(there) > (footprint_radius(keypoints.scale) + 1) * jacobian_scale
+    """Return (N,) True for each keypoint of I with a patch of only valid pixels in the moving image."""
+    warped_xy = transform(homography, keypoints.xy)
+    magnification = homography[:2, :2].det().abs().sqrt()
+    return level.moving[band].clearance_at(warped_xy) > (footprint_radius(keypoints.scale) + 1) * magnification
 
 
-def _room_px(valid: Mask) -> NDArray[np.float32]:
+def _clearance_px(valid: Mask) -> NDArray[np.float32]:
+    """Return the distance of each pixel to the nearest invalid pixel or the border."""
     if valid.all():
         column, row = (np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1)) for n in valid.shape[::-1])
         return np.minimum(column[None, :], row[:, None]).astype(np.float32)
@@ -226,7 +231,7 @@ def _room_px(valid: Mask) -> NDArray[np.float32]:
 
 
 def _gradient_magnitude(planes: FloatImage) -> FloatImage:
-    """Largest gradient over the channels, per pixel of distance."""
+    """Return the largest gradient magnitude over the channels, (C, H, W) -> (H, W), per px."""
     gradients = [
         gradient_magnitude(cv2.Sobel(p, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(p, cv2.CV_32F, 0, 1, scale=1 / 8))
         for p in planes
@@ -234,33 +239,35 @@ def _gradient_magnitude(planes: FloatImage) -> FloatImage:
     return np.asarray(np.max(gradients, axis=0))
 
 
-def _reserved_cells(width_px: int, height_px: int) -> Mask:
-    cell = max(max(width_px, height_px) / _HELD_OUT_CELLS, _MIN_CELL_PX)
-    column, row = (np.arange(n) // cell % 5 for n in (width_px, height_px))
-    # Within a row of cells, those of one column in five.
+def _held_out_cells(width_px: int, height_px: int) -> Mask:
+    """Return (height, width) True in the held-out cells: one cell in five of each row of cells, on diagonals."""
+    cell_px = max(max(width_px, height_px) / _HELD_OUT_CELLS, _MIN_CELL_PX)
+    column, row = (np.arange(n) // cell_px % 5 for n in (width_px, height_px))
     return np.asarray(column[None, :] == (-2 * row % 5)[:, None])
 
 
 @lru_cache(maxsize=2)
-def _reach_within_cells(width_px: int, height_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Distance from each pixel, (height, width), to the nearest one of the other kind of cells: in the cells for
-    training, and in the reserved ones; 0 elsewhere.
+def _max_radius_in_cells(width_px: int, height_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return, for the training cells and for the held-out cells, (height, width) px distances to the cells of the
+    other kind; 0 in the cells of the other kind.
     """
-    reserved = _reserved_cells(width_px, height_px)
+    is_held_out = _held_out_cells(width_px, height_px)
     training, held_out = (
         np.asarray(cv2.distanceTransform(c.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
-        for c in (~reserved, reserved)
+        for c in (~is_held_out, is_held_out)
     )
     return training, held_out
 
 
 def _pool(
-    usable: Mask, reach_px: NDArray[np.float32], model: Lens | None, generator: torch.Generator, device: torch.device
-) -> Pool:
-    """Up to _POOL of the usable pixels from which the smallest patch, and some more, can reach so far."""
-    result = np.flatnonzero(usable & (reach_px > FOOTPRINT_PX + 1))
-    if len(result) > _POOL:
-        result = result[torch.randint(len(result), (_POOL,), generator=generator).numpy()]
-    row, column = np.divmod(result, usable.shape[1])
+    has_texture: Mask, max_radius_px: NDArray[np.float32], model: Lens | None, generator: torch.Generator,
+    device: torch.device,
+) -> Pool:  # fmt: skip
+    """Select at random up to _MAX_POSITIONS pixels with texture around which the smallest patch fits."""
+    flat = np.flatnonzero(has_texture & (max_radius_px > FOOTPRINT_PX + 1))
+    if len(flat) > _MAX_POSITIONS:
+        flat = flat[torch.randint(len(flat), (_MAX_POSITIONS,), generator=generator).numpy()]
+    row, column = np.divmod(flat, has_texture.shape[1])
     xy = lens.undistort(model, np.stack([column, row], axis=1)).astype(np.float32)
-    return Pool(torch.from_numpy(xy).to(device), torch.from_numpy(reach_px[row, column].astype(np.float32)).to(device))
+    radius_px = max_radius_px[row, column].astype(np.float32)
+    return Pool(torch.from_numpy(xy).to(device), torch.from_numpy(radius_px).to(device))

@@ -1,5 +1,5 @@
-"""A seed for large displacements: keypoints of both images, learnt descriptors, nearest neighbours, and a homography
-that many of them agree on (the paper's supplement).
+"""Initial alignment for large displacements: SIFT keypoints, learnt descriptors, mutual nearest neighbours, MAGSAC++
+(after the paper's supplement).
 """
 
 import cv2
@@ -20,14 +20,14 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
 _LONGEST_SIDE_PX = 1024
-"""Larger images are reduced to this: a seed need not be exact."""
-_WITHIN_PX = 4.0
+"""Larger images are reduced to this; the accuracy suffices for a seed."""
+_INLIER_PX = 4.0
 _MIN_MATCHES = 12
-"""Of one homography: unrelated images reach 7."""
+"""Minimum number of inliers of a homography: unrelated images have up to 7."""
 
 
 def matching_network(learnt: Descriptor, side: int, channels: tuple[int, int]) -> Descriptor:
-    """A network for two images of these channels: the reference's and a moving side of a learnt one."""
+    """Return a two-sided network with the weights of the reference side and of moving side `side` of a learnt one."""
     sharing: Sharing = "unshared" if learnt.sharing == "unshared" else "pseudo-siamese"
     net = Descriptor(sharing, channels, half_rectified=True, unit_length=True)
     start_from(net, learnt.state_dict(), (REFERENCE, side))
@@ -35,7 +35,7 @@ def matching_network(learnt: Descriptor, side: int, channels: tuple[int, int]) -
 
 
 def starter_for_matching(channels: tuple[int, int]) -> Descriptor:
-    """The same of the starter."""
+    """Return a two-sided network with the weights of the starter network."""
     net = Descriptor("pseudo-siamese", channels, half_rectified=True, unit_length=True)
     start_from_starter(net)
     return net
@@ -43,51 +43,54 @@ def starter_for_matching(channels: tuple[int, int]) -> Descriptor:
 
 @torch.no_grad()
 def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MAX_KEYPOINTS) -> Matrix | None:
-    """fixed_to_moving between undistorted px, from matches of a `matching_network`'s descriptors.
+    """Return fixed_to_moving between undistorted px from at most `maximum` keypoints per image.
 
-    So many keypoints of each image are tried. None where fewer than twelve mutual nearest neighbours agree on one
-    homography.
+    `net` is a `matching_network`. None if a homography has fewer than _MIN_MATCHES inliers.
     """
     device = next(net.parameters()).device
-    here, there = (_keypoints(raster, device, maximum) for raster in (fixed, moving))
-    if min(len(here[1]), len(there[1])) < _MIN_MATCHES:
+    (image, keypoints), (image_prime, keypoints_prime) = (_keypoints(r, device, maximum) for r in (fixed, moving))
+    if min(len(keypoints), len(keypoints_prime)) < _MIN_MATCHES:
         return None
-    f = net(here[0].patches(patch_positions(here[1])), REFERENCE)
-    # Where contrast is reversed the gradient points the other way, and so does the keypoint.
-    both_ways = [_turned(there[1], angle) for angle in (0.0, torch.pi)]
-    f_prime = torch.cat([net(there[0].patches(patch_positions(k)), 1) for k in both_ways])
-    rows, columns = _mutual_nearest(f, f_prime, len(there[1]))
+    f = net(image.patches(patch_positions(keypoints)), REFERENCE)
+    # Reversed contrast turns the gradient, and with it the orientation of a keypoint, by 180 degrees.
+    orientations = [_rotated(keypoints_prime, angle) for angle in (0.0, torch.pi)]
+    f_prime = torch.cat([net(image_prime.patches(patch_positions(k)), 1) for k in orientations])
+    rows, columns = _mutual_nearest(f, f_prime, len(keypoints_prime))
     if len(rows) < _MIN_MATCHES:
         return None
-    xy = (here[1].xy[rows].cpu().numpy().astype(np.float64), there[1].xy[columns].cpu().numpy().astype(np.float64))
-    result, inliers = cv2.findHomography(*xy, cv2.USAC_MAGSAC, _WITHIN_PX, maxIters=20_000, confidence=0.9999)
-    if result is None or int(inliers.sum()) < _MIN_MATCHES:
+    xy, xy_prime = (
+        k.xy[i].cpu().numpy().astype(np.float64) for k, i in ((keypoints, rows), (keypoints_prime, columns))
+    )
+    matrix, inliers = cv2.findHomography(xy, xy_prime, cv2.USAC_MAGSAC, _INLIER_PX, maxIters=20_000, confidence=0.9999)
+    if matrix is None or int(inliers.sum()) < _MIN_MATCHES:
         return None
     try:
-        return geometry.rescale(geometry.normalised(result), here[0].scale.inverse, there[0].scale.inverse)
+        return geometry.rescale(geometry.normalised(matrix), image.scale.inverse, image_prime.scale.inverse)
     except GeometryError:
         return None
 
 
 def _keypoints(raster: Raster, device: torch.device, maximum: int) -> tuple[LevelImage, Keypoints]:
-    """An image at the resolution at which it is matched, and its keypoints as undistorted positions."""
+    """Return the image at the resolution of matching and its keypoints, undistorted px of that resolution."""
     scale = min(1.0, _LONGEST_SIDE_PX / max(raster.size_px))
-    view = make_level_image(raster, scale, device)
-    small = shrink(raster, view.size_px)
-    result = sift_keypoints(small, maximum)
-    xy = torch.from_numpy(lens.undistort(view.lens, result.xy.numpy()).astype(np.float32))
-    straight = Keypoints(xy, result.angle, result.scale).to(device)
-    rows = (view.room_at(straight.xy) > footprint_radius(straight.scale)).nonzero()[:, 0]
-    return view, straight[rows]
+    image = make_level_image(raster, scale, device)
+    raw = sift_keypoints(shrink(raster, image.size_px), maximum)
+    xy = torch.from_numpy(lens.undistort(image.lens, raw.xy.numpy()).astype(np.float32))
+    undistorted = Keypoints(xy, raw.angle, raw.scale).to(device)
+    rows = (image.clearance_at(undistorted.xy) > footprint_radius(undistorted.scale)).nonzero()[:, 0]
+    return image, undistorted[rows]
 
 
-def _turned(keypoints: Keypoints, angle: float) -> Keypoints:
+def _rotated(keypoints: Keypoints, angle: float) -> Keypoints:
     return Keypoints(keypoints.xy, keypoints.angle + angle, keypoints.scale)
 
 
 def _mutual_nearest(f: Tensor, f_prime: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Rows of `f` (N, D) and keypoints of `f_prime` (k count, D) that are mutual nearest neighbours."""
+    """Return indices of the keypoints that are mutual nearest neighbours.
+
+    `f` (N, D) has one descriptor per keypoint, `f_prime` (k * count, D) has k, for k orientations.
+    """
     d = torch.cdist(f, f_prime).reshape(len(f), -1, count).amin(dim=1)
-    forth, back = d.argmin(dim=1), d.argmin(dim=0)
-    rows = (back[forth] == torch.arange(len(f), device=f.device)).nonzero()[:, 0]
-    return rows, forth[rows]
+    forward, backward = d.argmin(dim=1), d.argmin(dim=0)
+    rows = (backward[forward] == torch.arange(len(f), device=f.device)).nonzero()[:, 0]
+    return rows, forward[rows]

@@ -1,7 +1,7 @@
-"""Recipe paper: SGD on theta and psi through one loss, level by level, as published (paper, Sec. 4 and 5).
+"""Recipe paper: SGD on theta and psi with a single loss, level by level, as published (paper, Sec. 4 and 5).
 
-Names follow the paper: I and I' are `fixed` and `moving`, f the descriptor, theta the network's weights, psi the
-parameters of a homography, L0 and L1 the losses. The constants are those of Sec. 5.3 unless they say otherwise.
+Names follow the paper: I and I' are `fixed` and `moving`, f is the descriptor, theta are the network's weights, psi
+the parameters of a homography, L0 and L1 the losses. The constants are those of Sec. 5.3 unless stated otherwise.
 """
 
 import math
@@ -37,12 +37,12 @@ _MOVING = 1
 _COARSEST_PX = 80
 """Longer side of the coarsest level."""
 _OCTAVES = 4.0
-"""log2 s is uniform in [0, octaves]."""
+"""log2 of the patch scale s is uniform in [0, _OCTAVES]."""
 _SPACING_PX = 0.25
-"""Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. The paper does not say."""
+"""Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. Not given in the paper."""
 _MARGIN = 1.0
 _MIN_NEGATIVE_PX = 16.0
-"""tau: least distance of a negative from the true position. The paper does not say."""
+"""tau: minimum distance of a negative from the true position. Not given in the paper."""
 _BATCH = 64
 _MOMENTUM = 0.9
 _LEARNING_RATE = 1e-4
@@ -55,14 +55,14 @@ class Training:
 
     keypoints: int = 4000
     epochs: int = 8
-    """Passes over the keypoints. The paper does not say."""
+    """Passes over the keypoints. Not given in the paper."""
 
 
 DEFAULT_TRAINING = Training()
 
 
 def pyramid(longer_side_px: int) -> tuple[float, ...]:
-    """Scales of the levels, each half of the next, coarse to fine; 1 is full resolution."""
+    """Return the scales of the levels, coarse to fine, each half of the next; 1 is full resolution."""
     halvings = max(0, round(math.log2(longer_side_px / _COARSEST_PX)))
     return tuple(0.5**k for k in range(halvings, -1, -1))
 
@@ -70,17 +70,17 @@ def pyramid(longer_side_px: int) -> tuple[float, ...]:
 def align_by_paper(
     state: JointState, group: ImageGroup, training: Training = DEFAULT_TRAINING
 ) -> tuple[Descriptor, JointResult[FixedImagePx] | Issue]:
-    """The network and the result for a group of one moving image.
+    """Align a group of one moving image; return the network and the result.
 
     Coarse to fine: theta is reinitialised at each level, psi is kept. Raises NotEnoughTextureError, NoContrastError,
-    and GeometryError where psi ends in no homography.
+    and GeometryError if the final matrix is not invertible.
     """
     channels = group.fixed.channels, group.moving[0].channels
     scales = pyramid(max(group.fixed.size_px))
     steps = 0
     for number, scale in enumerate(scales):
         level = state.level(group, scale, [0])
-        # Retrieval is measured with the last level's theta, from which its patches are kept.
+        # The last theta measures the held-out retrieval, so it must not be trained on the held-out cells.
         pool = level.trainable if scale == 1.0 else level.anywhere
         net = state.paper_descriptor(channels)
 
@@ -101,30 +101,30 @@ def align_by_paper(
 
 @dataclass(frozen=True)
 class Descent:
-    """Where SGD ended at one level."""
+    """Result of SGD at one level."""
 
     fixed_to_moving: Matrix
     steps: int
     loss: float
-    """Mean a keypoint of the last pass."""
+    """Mean per keypoint over the last epoch."""
     last_step_px: float
-    """Largest movement of a corner in the last step, px of the level."""
+    """Largest displacement of a corner in the last step, px of the level."""
 
 
 def descend(
     state: JointState, net: Descriptor, level: Level, pool: Pool, start: Matrix,
     training: Training = DEFAULT_TRAINING, *, report: Callable[[float], None] = lambda _: None, move: bool = True,
 ) -> Descent:  # fmt: skip
-    """Argmin over theta and psi of sum L0(x; psi, theta) + sum L1(x, x'; theta) (paper, Eq. 5).
+    """Minimise sum L0(x; psi, theta) + sum L1(x, x'; theta) over theta and psi (paper, Eq. 5).
 
-    Keypoints x are drawn from `pool`. Without `move` over theta alone, with psi known (paper, Eq. 3). Raises
+    Keypoints x are drawn from `pool`. Without `move`, psi is constant and only theta is learnt (paper, Eq. 3). Raises
     NotEnoughTextureError.
     """
     size_px = level.fixed.size_px
     psi = psi_from_homography(exact(level.homography(start, 0)), *size_px).to(level.fixed.image).requires_grad_()
-    movable = torch.zeros_like(psi)
+    is_free = torch.zeros_like(psi)
     if move:
-        movable[list(FAMILY_PARAMETERS[state.family or "homography"])] = 1.0
+        is_free[list(FAMILY_PARAMETERS[state.family or "homography"])] = 1.0
     keypoints = _draw(state, level, pool, homography_from_psi(psi.detach(), *size_px), training.keypoints)
 
     batches = len(keypoints.x) // _BATCH
@@ -140,7 +140,7 @@ def descend(
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             assert psi.grad is not None
-            psi.grad *= movable
+            psi.grad *= is_free
             before = psi.detach().clone()
             optimiser.step()
             annealing.step()
@@ -154,41 +154,42 @@ def descend(
 
 
 @dataclass(frozen=True)
-class _Drawn:
-    """Keypoints of I, and for each a place in I' that is not its own."""
+class _Samples:
+    """Keypoints of I, each with a non-matching keypoint of I'."""
 
     x: Keypoints
     x_false: Keypoints
     is_negative: Tensor
-    """(N,) False where that place is too near to count."""
+    """(N,) False where `x_false` is too close to the true position to serve as a negative."""
 
-    def of(self, rows: Tensor) -> "_Drawn":
-        return _Drawn(self.x[rows], self.x_false[rows], self.is_negative[rows])
+    def of(self, rows: Tensor) -> "_Samples":
+        return _Samples(self.x[rows], self.x_false[rows], self.is_negative[rows])
 
 
-def _draw(state: JointState, level: Level, pool: Pool, h: Tensor, count: int) -> _Drawn:
-    """The negatives are drawn once: each keypoint of I with a random other one's place in I'."""
+def _draw(state: JointState, level: Level, pool: Pool, h: Tensor, count: int) -> _Samples:
+    """Draw keypoints once for all epochs; a negative is the warped position of another random keypoint."""
     x, _ = state.sampler.draw(level, pool, [h], count, _OCTAVES, _SPACING_PX)
     if len(x) < _BATCH:
         raise NotEnoughTextureError(len(x), _BATCH)
     order = torch.randperm(len(x), generator=state.sampler.generator).to(state.device)
     x_false = warp_keypoints(x[order], h)
     is_negative = (x_false.xy - transform(h, x.xy)).norm(dim=1) >= _MIN_NEGATIVE_PX
-    return _Drawn(x, x_false, is_negative)
+    return _Samples(x, x_false, is_negative)
 
 
-def _loss(net: Descriptor, level: Level, batch: _Drawn, h: Tensor) -> Tensor:
-    """Sum of L0(x, w_k(x; psi)) and of L1(x, x') (paper, Eq. 4)."""
+def _loss(net: Descriptor, level: Level, batch: _Samples, h: Tensor) -> Tensor:
+    """Return the sum of L0(x, w_k(x; psi)) and of L1(x, x') (paper, Eq. 4)."""
     fixed, moving = level.fixed, level.moving[0]
     f = net(fixed.patches(patch_positions(batch.x)), REFERENCE)
     f_true = net(moving.patches(patch_positions(warp_keypoints(batch.x, h))), _MOVING)
     f_false = net(moving.patches(patch_positions(batch.x_false)), _MOVING)
-    apart = distance(f, f_false)[batch.is_negative]
-    return contrastive_loss(distance(f, f_true), apart)
+    return contrastive_loss(distance(f, f_true), distance(f, f_false)[batch.is_negative])
 
 
 def contrastive_loss(positive: Tensor, negative: Tensor) -> Tensor:
-    """The paper's loss (its Eq. 2), a scalar: the sum of L0 over positive and of L1 = max(0, margin - L0) over
-    negative pairs. Both arguments are distances, (P,) and (N,).
+    """Return the contrastive loss (paper, Eq. 2), a scalar.
+
+    The sum of L0 over positive pairs and of L1 = max(0, margin - L0) over negative pairs. `positive` (P,) and
+    `negative` (N,) are distances of descriptors.
     """
     return positive.sum() + functional.relu(_MARGIN - negative).sum()

@@ -1,6 +1,6 @@
 """Keypoints, their warp under a homography, and the patches around them (paper, Sec. 5.1 to 5.3).
 
-Tensors of positions are in pixels of the image at hand: x right, y down, (0, 0) the centre of the top-left pixel.
+Positions are in pixels of the given image: x right, y down, (0, 0) is the centre of the top-left pixel.
 """
 
 import math
@@ -17,21 +17,21 @@ ALPHA = 64.0
 """Scale of the homography's parameters (paper, Sec. 5.1)."""
 
 FOOTPRINT_PX = (PATCH_PX - 1) / 2 * math.sqrt(2.0)
-"""Distance from a keypoint to the farthest sample of its patch where the samples are 1 px apart."""
+"""Distance from a keypoint to the farthest sample of its patch at 1 px between samples."""
 
 _MIN_NEGATIVE_PX = 8.0
-"""Recipe fast: keypoints closer than half a patch show much the same and are not negatives of each other."""
+"""Recipe fast: patches of keypoints closer than half a patch are similar, so they are not negatives of each other."""
 
 FAMILY_PARAMETERS: dict[ModelFamily, tuple[int, ...]] = {
     "homography": (0, 1, 2, 3, 4, 5, 6, 7),
     "affine": (0, 1, 2, 3, 4, 5),
     "translation": (4, 5),
 }
-"""Which of the eight elements of psi a model family may move."""
+"""Indices of the elements of psi that are free parameters of a model family."""
 
 
 def homography_from_psi(psi: Tensor, width_px: int, height_px: int) -> Tensor:
-    """Psi (8,) -> H (3, 3), with psi = alpha [h11-1, h12, h21, h22-1, h13/w, h23/h, h31 w, h32 h]."""
+    """Return H (3, 3) of psi (8,) = alpha [h11-1, h12, h21, h22-1, h13/w, h23/h, h31 w, h32 h] (paper, Sec. 5.1)."""
     p = psi / ALPHA
     one = torch.ones_like(p[0])
     return torch.stack(
@@ -44,7 +44,7 @@ def homography_from_psi(psi: Tensor, width_px: int, height_px: int) -> Tensor:
 
 
 def psi_from_homography(homography: Tensor, width_px: int, height_px: int) -> Tensor:
-    """The inverse of `homography_from_psi`: (3, 3) -> (8,)."""
+    """Return psi (8,) of H (3, 3); the inverse of `homography_from_psi`."""
     h = homography / homography[2, 2]
     return ALPHA * torch.stack(
         [
@@ -61,13 +61,13 @@ def psi_from_homography(homography: Tensor, width_px: int, height_px: int) -> Te
 
 
 def transform(homography: Tensor, points: Tensor) -> Tensor:
-    """Points (..., 2) through H (3, 3)."""
+    """Map points (..., 2) by H (3, 3)."""
     mapped = points @ homography[:, :2].T + homography[:, 2]
     return mapped[..., :2] / mapped[..., 2:]
 
 
 def translation(shift: Tensor) -> Tensor:
-    """(2,) px -> (3, 3)."""
+    """Return the homography (3, 3) of a shift (2,) px."""
     h = torch.eye(3, dtype=shift.dtype, device=shift.device)
     h[:2, 2] = shift
     return h
@@ -91,16 +91,16 @@ class Keypoints:
         return Keypoints(self.xy[rows], self.angle[rows], self.scale[rows])
 
     def to(self, device: torch.device) -> "Keypoints":
-        """The same on a device."""
+        """Return the keypoints on a device."""
         return Keypoints(self.xy.to(device), self.angle.to(device), self.scale.to(device))
 
     def moved(self, dx_px: float, dy_px: float) -> "Keypoints":
-        """The same keypoints shifted."""
+        """Return the keypoints shifted by (dx_px, dy_px)."""
         return Keypoints(self.xy + self.xy.new_tensor([dx_px, dy_px]), self.angle, self.scale)
 
 
 def warp_keypoints(keypoints: Keypoints, homography: Tensor) -> Keypoints:
-    """w_k of the paper: the keypoints of the fixed image as keypoints of the moving one.
+    """Map keypoints of the fixed image to the moving image (the paper's w_k).
 
     v = s (cos phi, sin phi); v' = [h11 v0 + h12 v1, h21 v0 + h22 v1] / (h31 x + h32 y + 1);
     phi' = atan2(v1', v0'), s' = |v'|.
@@ -113,9 +113,9 @@ def warp_keypoints(keypoints: Keypoints, homography: Tensor) -> Keypoints:
 
 
 def patch_positions(keypoints: Keypoints, side: int = PATCH_PX) -> Tensor:
-    """Sample positions of each keypoint's patch, (N, side, side, 2) px, centred on the keypoint.
+    """Return the sample positions of each keypoint's patch, (N, side, side, 2) px, centred on the keypoint.
 
-    Another `side` than 16 samples the same patch more or less finely.
+    The patch has the same extent for every `side`; only the number of samples differs.
     """
     offset = torch.arange(side, dtype=keypoints.xy.dtype, device=keypoints.xy.device) - (side - 1) / 2
     offset = offset * (PATCH_PX / side)
@@ -128,20 +128,23 @@ def patch_positions(keypoints: Keypoints, side: int = PATCH_PX) -> Tensor:
 
 
 def bilinear(image: Tensor, positions: Tensor) -> Tensor:
-    """B(p; I): image (C, H, W) at positions (N, n, n, 2) px -> (N, C, n, n); the border pixel's value outside."""
+    """Sample an image (C, H, W) at positions (N, n, n, 2) px -> (N, C, n, n) (the paper's B(p; I)).
+
+    Positions outside have the value of the nearest border pixel.
+    """
     height, width = image.shape[-2:]
     count, rows, columns, _ = positions.shape
-    size = positions.new_tensor([width - 1, height - 1])
-    flat = (2 * positions / size - 1).reshape(1, count * rows, columns, 2)
-    sampled = functional.grid_sample(image[None], flat, padding_mode="border", align_corners=True)
+    last_px = positions.new_tensor([width - 1, height - 1])
+    grid = (2 * positions / last_px - 1).reshape(1, count * rows, columns, 2)
+    sampled = functional.grid_sample(image[None], grid, padding_mode="border", align_corners=True)
     return sampled[0].reshape(len(image), count, rows, columns).transpose(0, 1)
 
 
 def footprint_radius(scale: Tensor) -> Tensor:
-    """Distance in px from a keypoint to the farthest sample of its patch."""
+    """Return the distance in px from a keypoint to the farthest sample of its patch."""
     return scale * FOOTPRINT_PX
 
 
 def far_apart(keypoints: Keypoints) -> Tensor:
-    """(N, N) True where two keypoints are so far from each other that they count as negatives."""
+    """Return (N, N) True where two keypoints are far enough apart to be negatives of each other."""
     return torch.cdist(keypoints.xy, keypoints.xy) >= _MIN_NEGATIVE_PX

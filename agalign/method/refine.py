@@ -1,7 +1,7 @@
-"""Psi with theta frozen: inverse-compositional Gauss-Newton on L0 squared.
+"""Optimisation of psi with theta frozen: inverse-compositional Gauss-Newton on L0 squared.
 
-The descriptors of the reference and their gradient over a shift are computed once and serve every moving band and
-every step (Baker & Matthews 2004, Sec. 3.2): a step costs one pass of the moving band's patches.
+The descriptors of the reference and their gradient are computed once for all moving bands and all steps (Baker &
+Matthews 2004, Sec. 3.2). A step costs one forward pass of the moving band's patches.
 """
 
 import itertools
@@ -27,47 +27,49 @@ from agalign.values.pixel_units import FixedImagePx
 
 MIN_KEYPOINTS = 16
 TEST_KEYPOINTS = 256
-"""Held-out keypoints among which retrieval is measured: chance is then 0.004, the standard error of a share 0.03."""
+"""Keypoints that measure held-out retrieval: chance is 0.004, the standard error of the share 0.03."""
 REST_PX = 0.5
-"""psi is at rest when a step moves no corner by more than this, px of the level."""
+"""While learning, psi has converged if a step displaces no corner by more than this, px of the level."""
 PATCHES, FLIGHT_PATCHES = 400, 256
-"""Patches in a Gauss-Newton step at full resolution: of a capture alone, and of one of a flight, where the rig takes
-part in the estimate. Half as many serve while psi is not at rest."""
+"""Patches in a Gauss-Newton step at full resolution: for a single capture, and for a capture of a flight, where the
+rig contributes to the estimate. Half as many are used while the steps are longer than REST_PX."""
 _FINAL_OCTAVES = 0.3
-"""Range of their scales: small patches place themselves more exactly."""
-_FINAL_STEPS = 10
+"""Range of log2 of their scales: small patches localise better."""
+_MAX_FINAL_STEPS = 10
 _FINAL_REST_PX = 0.06
-"""psi has converged when a step moves no corner by more than this, px: steps shrink by more than half, so that less
-than the systematic error remains."""
+"""psi has converged if a step displaces no corner by more than this, px: steps shrink by more than half, so the
+remaining displacement is smaller than the systematic error."""
 _SYSTEMATIC_STD_PX = 0.035
-"""Added in quadrature to the standard deviations along x and y: what the curvature cannot see, such as a bias between
-two modalities. Measured on synthetic flights."""
+"""Added in quadrature to the standard errors along x and y: errors that the covariance does not contain, such as a
+bias between two modalities. Measured on synthetic flights."""
 _DIFFERENCE_PX = 0.75
-"""Half width of the central differences that give a descriptor's gradient."""
-_FIRST_PATCHES, _LIKELY_SHIFTS, _AT_ONCE = 24, 64, 16
+"""Half the step of the central differences that approximate a descriptor's gradient."""
+_PRESELECTION_PATCHES, _CANDIDATE_SHIFTS = 24, 64
+"""Patches with which all shifts of a search are compared, and number of best shifts compared with all patches."""
+_SHIFTS_PER_BATCH = 16
 _MAX_RATIO = 0.6
-"""Largest ratio of a step to the one before at which the steps are taken as a geometric series: above it the sum would
-be dominated by the error of the ratio."""
+"""Maximum ratio of successive steps for the extrapolation of a geometric series: above it, errors of the ratio dominate
+the sum."""
 _MIN_GAIN_SIGMA = 3.0
-"""Standard errors by which the loss of a shift must be less than without it."""
+"""Minimum decrease of the mean loss by a shift, in standard errors of the decrease."""
 
 
 @dataclass(frozen=True)
 class MovingBand:
-    """One moving image I' of a level, as its side of the network describes it."""
+    """One moving image I' of a level, and the side of the network that describes it."""
 
     net: Descriptor
     level: Level
     index: int
-    """Which of the level's moving images."""
+    """Of the moving image in the level."""
     side: int
 
-    def sees(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
-        """(M,) rows of the keypoints of I with patches in both images."""
+    def visible_rows(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
+        """Return the indices (M,) of the keypoints of I with patches inside both images."""
         return footprints_inside(self.level, self.index, keypoints, homography).nonzero()[:, 0]
 
     def patches(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
-        """B(w(x; psi); I'), (N, C, 16, 16): every sample goes through the homography, not only the keypoint's frame."""
+        """Return B(w(x; psi); I'), (N, C, 16, 16); the homography maps each sample position, not only the keypoint."""
         positions = patch_positions(keypoints)
         displacement = self.level.displacement(self.index, keypoints.xy)
         if displacement is not None:
@@ -75,36 +77,36 @@ class MovingBand:
         return self.level.moving[self.index].patches(transform(homography, positions))
 
     def describe(self, keypoints: Keypoints, homography: Tensor) -> Tensor:
-        """f(w(x; psi)) for keypoints x of I, (N, 256)."""
-        out: Tensor = self.net(self.patches(keypoints, homography), self.side)
-        return out
+        """Return f(w(x; psi)) for keypoints x of I, (N, 256)."""
+        f_prime: Tensor = self.net(self.patches(keypoints, homography), self.side)
+        return f_prime
 
 
 @dataclass(frozen=True)
 class ReferencePatches:
-    """Patches of the reference as the network describes them."""
+    """Descriptors of patches of the reference, and their gradient."""
 
     keypoints: Keypoints
     f: Tensor
     """(N, 256) descriptors."""
     gradient: Tensor
-    """(N, 256, 2) their derivative over a shift, per px."""
+    """(N, 256, 2) derivative of the descriptors with respect to a shift, per px."""
 
     def head(self, count: int) -> "ReferencePatches":
-        """The first `count` of them."""
+        """Return the first `count` patches."""
         rows = torch.arange(min(count, len(self.f)), device=self.f.device)
         return ReferencePatches(self.keypoints[rows], self.f[rows], self.gradient[rows])
 
 
 def describe_fixed(net: Descriptor, level: Level, keypoints: Keypoints) -> Tensor:
-    """f(x) for keypoints of I, (N, 256)."""
-    out: Tensor = net(level.fixed.patches(patch_positions(keypoints)), REFERENCE)
-    return out
+    """Return f(x) for keypoints x of I, (N, 256)."""
+    f: Tensor = net(level.fixed.patches(patch_positions(keypoints)), REFERENCE)
+    return f
 
 
 @torch.no_grad()
 def describe_reference(net: Descriptor, level: Level, keypoints: Keypoints) -> ReferencePatches:
-    """Descriptors and gradient of the reference's patches."""
+    """Compute the descriptors of keypoints of I and their gradient."""
 
     def describe(k: Keypoints) -> Tensor:
         return describe_fixed(net, level, k)
@@ -114,14 +116,15 @@ def describe_reference(net: Descriptor, level: Level, keypoints: Keypoints) -> R
 
 @dataclass(frozen=True)
 class Solver:
-    """How psi is moved: by which family of mappings (None for as rich a one as the patches allow)."""
+    """Gauss-Newton optimisation of psi for one model family."""
 
     family: ModelFamily | None
+    """None to select the family in each step, as `gauss_newton.solve` does."""
 
     @torch.no_grad()
     def step(self, band: MovingBand, homography: Tensor, reference_patches: ReferencePatches) -> Step:
-        """One Gauss-Newton step. Raises NotEnoughTextureError where too few patches lie in both images."""
-        rows = band.sees(reference_patches.keypoints, homography)
+        """Compute one Gauss-Newton step. Raises NotEnoughTextureError if too few patches are inside both images."""
+        rows = band.visible_rows(reference_patches.keypoints, homography)
         if len(rows) < MIN_KEYPOINTS:
             raise NotEnoughTextureError(len(rows), MIN_KEYPOINTS)
         p = reference_patches.keypoints[rows]
@@ -130,40 +133,40 @@ class Solver:
         return solve(equations, self.family)
 
     def converge(self, band: MovingBand, start: Tensor, reference_patches: ReferencePatches) -> tuple[Tensor, Step]:
-        """Steps from `start` until one moves no corner by more than `_FINAL_REST_PX`; returns (homography, last step).
+        """Take steps until no corner moves by more than `_FINAL_REST_PX`; return (homography, last step).
 
-        While the steps are long, some of the patches are enough. Steps of all patches become shorter by a constant
-        ratio, so every second one is lengthened by what the steps to come would add (Aitken 1926). A step of infinite
-        length moves nothing and is the last: the patches do not determine where the corners are mapped to.
+        Long steps use half of the patches. Steps with all patches shrink by a constant ratio, so every second one is
+        extended by the sum of the geometric series (Aitken 1926). A step of infinite length is the last one and is
+        not applied: the patches do not determine the mapping.
         """
-        h, some, before = start, reference_patches.head(len(reference_patches.f) // 2), math.inf
-        for _ in range(_FINAL_STEPS):
-            step = self.step(band, h, some)
+        h, patches, previous_px = start, reference_patches.head(len(reference_patches.f) // 2), math.inf
+        for _ in range(_MAX_FINAL_STEPS):
+            step = self.step(band, h, patches)
             if not math.isfinite(step.length_px):
                 break
-            ratio = min(step.length_px / before, _MAX_RATIO)
-            h = moved(h, step, 1 / (1 - ratio))
-            if step.length_px < _FINAL_REST_PX and some is reference_patches:
+            ratio = min(step.length_px / previous_px, _MAX_RATIO)
+            h = updated(h, step, 1 / (1 - ratio))
+            if step.length_px < _FINAL_REST_PX and patches is reference_patches:
                 break
-            before = step.length_px if some is reference_patches and ratio == 0 else math.inf
+            previous_px = step.length_px if patches is reference_patches and ratio == 0 else math.inf
             if step.length_px < REST_PX:
-                some = reference_patches
+                patches = reference_patches
         return h, step
 
 
-def moved(homography: Tensor, step: Step, times: float = 1.0) -> Tensor:
-    """H <- H @ change, (3, 3) float32; psi, in which the change is linear, scaled by a factor."""
-    unmoved = torch.eye(3, dtype=step.change.dtype, device=step.change.device)
-    return (exact(homography) @ (unmoved + times * (step.change - unmoved))).to(homography)
+def updated(homography: Tensor, step: Step, factor: float = 1.0) -> Tensor:
+    """Return H @ change, (3, 3) float32, with the change of psi, which is linear in it, scaled by a factor."""
+    identity = torch.eye(3, dtype=step.change.dtype, device=step.change.device)
+    return (exact(homography) @ (identity + factor * (step.change - identity))).to(homography)
 
 
 @torch.no_grad()
 def held_out_retrieval(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor) -> tuple[float, float]:
-    """(share of the keypoints visible in both images with their own as nearest descriptor in I', chance).
+    """Return the held-out retrieval of the keypoints visible in both images, and its value by chance.
 
-    `f` (N, 256) are the descriptors of the reference.
+    `f` (N, 256) are the descriptors of the keypoints in I.
     """
-    rows = band.sees(keypoints, homography)
+    rows = band.visible_rows(keypoints, homography)
     if len(rows) < MIN_KEYPOINTS:
         return 0.0, 1.0
     p = keypoints[rows]
@@ -172,57 +175,60 @@ def held_out_retrieval(band: MovingBand, homography: Tensor, keypoints: Keypoint
 
 
 @torch.no_grad()
-def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, reach_px: float, step_px: float) -> Tensor:
-    """The translation (2,) of the fixed side, up to `reach_px` long, at which the mean L0 of the patches that lie in
-    both images is least; none where that is not plainly less than without, for the patches that both have.
+def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, radius_px: float, step_px: float) -> Tensor:
+    """Search the translation (2,) of the fixed side, up to `radius_px` long, with the smallest mean L0.
+
+    Only patches inside both images count. Returns zeros if the decrease of L0 is less than _MIN_GAIN_SIGMA standard
+    errors over the patches that are visible with and without the shift.
     """
     if len(keypoints) < MIN_KEYPOINTS:
         return homography.new_zeros(2)
     f = describe_fixed(band.net, band.level, keypoints)
-    count = int(reach_px / step_px)
-    along = torch.arange(-count, count + 1) * step_px
-    shifts = torch.cartesian_prod(along, along).to(homography)
-    lengths = shifts.norm(dim=1)
-    shifts = shifts[lengths <= reach_px]
+    count = int(radius_px / step_px)
+    offsets = torch.arange(-count, count + 1) * step_px
+    shifts = torch.cartesian_prod(offsets, offsets).to(homography)
+    shifts = shifts[shifts.norm(dim=1) <= radius_px]
 
-    def table_of(some: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """(losses (shifts, count) of the first keypoints, nan where a patch leaves an image; their means)."""
+    def losses_of(some: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Return the losses (S, count) of shifts (S, 2) with the first keypoints, and their means (S,), inf where too
+        few patches are visible.
+        """
         p = keypoints[torch.arange(min(count, len(keypoints)), device=homography.device)]
-        table = torch.cat([_losses_moved(band, homography, p, f[: len(p)], s) for s in torch.split(some, _AT_ONCE)])
-        enough = table.isfinite().sum(dim=1) >= MIN_KEYPOINTS
-        return table, table.nanmean(dim=1).masked_fill(~enough, float("inf"))
+        batches = torch.split(some, _SHIFTS_PER_BATCH)
+        losses = torch.cat([_shifted_losses(band, homography, p, f[: len(p)], batch) for batch in batches])
+        enough = losses.isfinite().sum(dim=1) >= MIN_KEYPOINTS
+        return losses, losses.nanmean(dim=1).masked_fill(~enough, float("inf"))
 
-    # Some of the patches select the shifts that are tried with all of them.
-    _, rough = table_of(shifts, _FIRST_PATCHES)
-    likely = shifts[rough.argsort()[:_LIKELY_SHIFTS]]
-    table, means = table_of(torch.cat([homography.new_zeros(1, 2), likely]), len(keypoints))
+    _, means = losses_of(shifts, _PRESELECTION_PATCHES)
+    candidates = shifts[means.argsort()[:_CANDIDATE_SHIFTS]]
+    losses, means = losses_of(torch.cat([homography.new_zeros(1, 2), candidates]), len(keypoints))
     best = int(means.argmin())
-    gain = table[0] - table[best]
+    gain = losses[0] - losses[best]
     gain = gain[gain.isfinite()]
     if not bool(means[best].isfinite()) or len(gain) < MIN_KEYPOINTS:
         return homography.new_zeros(2)
-    plain = float(gain.mean()) > _MIN_GAIN_SIGMA * float(gain.std()) / math.sqrt(len(gain))
-    return likely[best - 1] if plain and best > 0 else homography.new_zeros(2)
+    is_significant = float(gain.mean()) > _MIN_GAIN_SIGMA * float(gain.std()) / math.sqrt(len(gain))
+    return candidates[best - 1] if is_significant and best > 0 else homography.new_zeros(2)
 
 
-def _losses_moved(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor, shifts: Tensor) -> Tensor:
-    """L0 of each keypoint under each shift (K, 2) of the fixed side, (K, N), nan where its patch leaves an image."""
+def _shifted_losses(band: MovingBand, homography: Tensor, keypoints: Keypoints, f: Tensor, shifts: Tensor) -> Tensor:
+    """Return L0 (S, N) of each keypoint with each shift (S, 2) of the fixed side, NaN where its patch leaves I'."""
     count = len(shifts)
     xy = (keypoints.xy + shifts[:, None]).reshape(-1, 2)
     shifted = Keypoints(xy, keypoints.angle.repeat(count), keypoints.scale.repeat(count))
-    apart = distance(f.repeat(count, 1), band.describe(shifted, homography))
+    losses = distance(f.repeat(count, 1), band.describe(shifted, homography))
     inside = footprints_inside_moving(band.level, band.index, shifted, homography)
-    return apart.masked_fill(~inside, float("nan")).reshape(count, -1)
+    return losses.masked_fill(~inside, float("nan")).reshape(count, -1)
 
 
 @torch.no_grad()
 def refine(
     state: JointState, net: Descriptor, group: ImageGroup, *, move: bool = True, patches: int = PATCHES
 ) -> list[JointResult[FixedImagePx] | Issue]:
-    """Refine every psi of a capture at full resolution with theta frozen; an issue is why a pair has no result.
+    """Refine every psi of a capture at full resolution with theta frozen.
 
-    A step uses up to `patches`. Without `move` psi stays as it is: only its retrieval and uncertainty are measured.
-    Raises NoContrastError.
+    Returns a result per moving image, or the issue that prevents one. A step uses up to `patches` patches. Without
+    `move`, psi is not changed and only its retrieval and standard errors are computed. Raises NoContrastError.
     """
     level = state.level(group, 1.0, range(len(group.moving)))
     h = [level.homography(matrix, b) for b, matrix in enumerate(group.mappings)]
@@ -263,12 +269,12 @@ def refine(
 
 
 def _complete_std(step: Step) -> tuple[tuple[float, float], ...]:
-    """Random and systematic parts together."""
+    """Return the standard errors (x, y) of the corners with the systematic part."""
     s = _SYSTEMATIC_STD_PX
     return tuple((math.hypot(x, s), math.hypot(y, s)) for x, y in step.corner_std_xy_px)
 
 
 def _complete_covariance(step: Step) -> NDArray[np.float64] | None:
-    """The same of all corners together; None where it is not finite."""
+    """Return the covariance (8, 8) of the corners with the systematic part; None where it is not finite."""
     random = step.corner_covariance_px2.cpu().numpy()
     return random + _SYSTEMATIC_STD_PX**2 * np.eye(8) if np.isfinite(random).all() else None

@@ -1,6 +1,6 @@
-"""The network that recipe fast starts from: learnt by the same method on synthetic flights (tools/learn_starter.py).
+"""Initial weights of recipe fast, learnt by the same method on synthetic flights (tools/learn_starter.py).
 
-It is one siamese network. A pseudo-siamese one takes its first layer on every side and is trained further.
+They are those of a siamese network. Every side of a pseudo-siamese network starts with its first layer.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,27 +18,27 @@ _FILE = "starter.safetensors"
 
 
 def start_from(net: Descriptor, weights: Mapping[str, Tensor], sides: Sequence[int] | None = None) -> None:
-    """Give a network the weights of another, as its state_dict has them.
+    """Initialise a network with the weights (state_dict) of another.
 
-    `sides` maps each side to the side of the other that it takes; by default the one with its number. Where the other
-    has fewer, its last one is used. A first layer of other channels takes them together: what describes a grey image
-    then describes three equal ones.
+    Side i takes the weights of side `sides[i]` of the other network, by default i, or of its last side if it has
+    fewer. If the numbers of channels differ, the first layer's weights are summed over the channels and divided
+    equally, so that an image of equal channels has the same descriptors in both networks.
     """
     state = net.state_dict()
     for name, value in state.items():
         group, side, rest = name.split(".", 2)
-        wanted = int(side) if sides is None else sides[int(side)]
+        source = int(side) if sides is None else sides[int(side)]
         last = max(int(other.split(".")[1]) for other in weights if other.startswith(f"{group}."))
-        given = weights[f"{group}.{min(wanted, last)}.{rest}"]
-        if given.shape != value.shape:
-            given = given.sum(dim=1, keepdim=True).expand_as(value) / value.shape[1]
-        state[name] = given
+        weight = weights[f"{group}.{min(source, last)}.{rest}"]
+        if weight.shape != value.shape:
+            weight = weight.sum(dim=1, keepdim=True).expand_as(value) / value.shape[1]
+        state[name] = weight
     net.load_state_dict(state)
     net.learnt = True
 
 
 def start_from_starter(net: Descriptor) -> None:
-    """Give a network the weights that come with the package."""
+    """Initialise a network with the weights in the package."""
     start_from(net, _weights())
 
 

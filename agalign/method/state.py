@@ -1,4 +1,4 @@
-"""Inputs of a joint optimisation: the images of a capture, settings and random numbers."""
+"""Inputs of a joint optimisation: the images of a capture, settings, device and random generator."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
 Progress = Callable[[str, float], None]
-"""Called with the name of a stage and the share of it that is done, 0 to 1."""
+"""Called with the name of a stage and its completed share, 0 to 1."""
 ThetaStart = Literal["starter", "random"]
 
 
@@ -28,32 +28,35 @@ class ImageGroup:
     fixed: Raster
     moving: Sequence[Raster]
     mappings: list[Matrix]
-    """fixed_to_moving of each moving image, undistorted px; moved along by the optimisation."""
+    """fixed_to_moving of each moving image, undistorted px; the optimisation updates them."""
     sides: Sequence[int]
-    """The side of the network that describes each moving image."""
+    """Side of the network that describes each moving image."""
     trusted: Sequence[bool]
-    """True for a seed that is good to a few pixels: recipe fast then skips the coarse levels."""
-    reach_px: Sequence[float] = ()
-    """Largest distance of each result from its mapping, px of `fixed`; empty if unlimited."""
+    """True for seeds with an error of a few pixels, for which recipe fast skips the coarse levels."""
+    max_shift_px: Sequence[float] = ()
+    """Maximum shift from each mapping in the search at the coarsest level, px of `fixed`; empty for no limit."""
     dropped: dict[int, float] = field(default_factory=dict)
-    """{moving image: held-out retrieval} where the descriptors could not distinguish patches at some level: they are
-    neither learnt nor refined any more."""
+    """Held-out retrieval of the moving images (by index) that the descriptors cannot distinguish at some level. They
+    are neither trained on nor refined further."""
     fields: Sequence[DisplacementField | None] = ()
-    """Displacements of the reference's positions before each homography, px of `fixed`; empty for none at all."""
+    """Displacement of positions of the reference before each homography, px of `fixed`; empty for none."""
 
     @property
     def active(self) -> list[int]:
-        """The moving images that are not dropped."""
+        """Indices of the moving images that are not dropped."""
         return [b for b in range(len(self.moving)) if b not in self.dropped]
 
     @classmethod
     def of_one(cls, fixed: Raster, moving: Raster, fixed_to_moving: Matrix, *, trusted: bool = False) -> "ImageGroup":
-        """A single pair, described by the network's first two sides."""
+        """Create the group of one image pair; sides 0 and 1 of the network describe it."""
         return cls(fixed, [moving], [fixed_to_moving], [1], [trusted])
 
 
 class JointState:
-    """What both recipes share: settings, device and random numbers. Raises ConfigurationError for an unknown device."""
+    """Settings, device and random generator of one optimisation.
+
+    Raises ConfigurationError for a device that cannot be used.
+    """
 
     def __init__(self, settings: JointSettings, progress: Progress) -> None:
         self.settings = settings
@@ -63,7 +66,7 @@ class JointState:
         self.family = None if settings.model_family == "auto" else settings.model_family
 
     def level(self, group: ImageGroup, scale: float, bands: Sequence[int]) -> Level:
-        """The reference of a group and some of its moving images at a resolution. Raises NoContrastError."""
+        """Build the level of the reference and some moving images at `scale`. Raises NoContrastError."""
         level = make_level(
             group.fixed, [group.moving[b] for b in bands], [group.mappings[b] for b in bands], scale,
             self.sampler.generator, self.device,
@@ -75,18 +78,18 @@ class JointState:
         return level
 
     def paper_descriptor(self, channels: Sequence[int]) -> Descriptor:
-        """F of recipe paper with random weights; `channels` of each side, the reference's first."""
+        """Create the network of recipe paper with random weights; `channels` per side, the reference first."""
         return self._random_descriptor(channels, half_rectified=False, unit_length=False)
 
     def fast_descriptor(self, channels: Sequence[int], start: ThetaStart = "starter") -> Descriptor:
-        """F of recipe fast where theta starts: with the network that comes with the package, or with random weights."""
+        """Create the network of recipe fast with the weights in the package or random ones."""
         net = self._random_descriptor(channels, half_rectified=True, unit_length=True)
         if start == "starter":
             start_from_starter(net)
         return net
 
     def _random_descriptor(self, channels: Sequence[int], *, half_rectified: bool, unit_length: bool) -> Descriptor:
-        """Its weights depend only on the rng_seed of the settings."""
+        """Create a network with weights that depend only on the rng_seed of the settings."""
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(self.settings.rng_seed)
             net = Descriptor(self.settings.sharing, channels, half_rectified=half_rectified, unit_length=unit_length)

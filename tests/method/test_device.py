@@ -62,8 +62,8 @@ def test_threads_that_overlap_leave_torch_as_the_first_one_found_it() -> None:
         for t in threads:
             t.join(10)
         # OpenMP's own number is each thread's: what counts is the one that torch hands to the next.
-        assert device._inside == 0
-        assert device._before == 3
+        assert device._active == 0
+        assert device._torch_threads_outside == 3
     finally:
         torch.set_num_threads(before)
 
@@ -110,7 +110,7 @@ def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64
 
     def align(name: str) -> JointResult:
         images, seed = [Raster(pixels, valid, lens) for pixels in (rgb, moving)], geometry.translation(7.0, -5.0)
-        group = ImageGroup(images[0], images[1:], [seed], [1], [False], reach_px=[9.0], fields=fields)
+        group = ImageGroup(images[0], images[1:], [seed], [1], [False], max_shift_px=[9.0], fields=fields)
         (result,) = align_from_scratch(
             group, JointSettings(recipe=recipe, device=name), lambda *_: None,
             schedule=Schedule(max_steps=10, enough_retrieval=2.0), training=Training(200, 1),

@@ -14,7 +14,7 @@ def solve(
     p: Keypoints, residual: torch.Tensor, gradient: torch.Tensor, family: str | None, max_std: float, longest: float
 ) -> Step:
     equations = PatchEquations.of(p, residual, gradient, (WIDTH, HEIGHT))
-    return solve_equations(equations, family, rich_enough_std_px=max_std, max_step_px=longest)
+    return solve_equations(equations, family, max_corner_std_px=max_std, max_step_px=longest)
 
 
 def scattered(count: int, seed: int = 0) -> Keypoints:
