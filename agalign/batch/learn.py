@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agalign.capture.align import align_pairs, verify_together
 from agalign.capture.band_pair import BandPair, read_pairs
@@ -66,7 +67,7 @@ def learn_flight(
     if start is not None and _still_holds(start, captures, plain, at_once):
         return replace(start, fingerprint=fingerprint_now)
     bands = flight_lenses(captures)
-    loaded = _load(captures, bands, plain, start)
+    loaded = _load(captures, bands, plain, start, at_once)
     network = _learn_network(loaded, bands, plain, progress, start, at_once)
     if network is None:
         return None
@@ -227,9 +228,10 @@ def _shown_by_enough(
     result: list[_Shown] = []
     counts: Counter[str] = Counter()
     with ThreadPoolExecutor(at_once) as pool:
-        # Those that the network was learned from cost little.
-        first = [c for c in captures if c.label in known]
-        for shown in pool.map(look_at, [*first, *(c for c in _spread(captures, count) if c.label not in known)]):
+        # The network's captures cost less than others: they come first where they may be enough, else last.
+        quick = [c for c in captures if c.label in known]
+        slow = [c for c in _spread(captures, count) if c.label not in known]
+        for shown in pool.map(look_at, [*quick, *slow] if len(captures) > count else [*slow, *quick]):
             if shown is None:
                 continue
             result.append(shown)
@@ -316,13 +318,13 @@ def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Ref
 
 
 def _load(
-    captures: Sequence[Capture], bands: Sequence[str], settings: Settings, start: FlightModel | None
+    captures: Sequence[Capture], bands: Sequence[str], settings: Settings, start: FlightModel | None, at_once: int
 ) -> list[_Loaded]:
     """Of each stretch of the flight, one capture: the first of three with bands that plainly show the same, else the
     one that shows it best. Water and fog teach nothing.
     """
-    loaded = []
-    for stretch in np.array_split(np.arange(len(captures)), min(_NETWORK_CAPTURES, len(captures))):
+
+    def best_of(stretch: NDArray[np.intp]) -> _Loaded | None:
         best: _Loaded | None = None
         for k in dict.fromkeys((len(stretch) // 2, 0, len(stretch) - 1)):
             result = _read(captures[stretch[k]], bands, settings, start)
@@ -330,9 +332,11 @@ def _load(
                 best = result
             if best is not None and all(s.trusted for s in best.seeds):
                 break
-        if best is not None:
-            loaded.append(best)
-    return loaded
+        return best
+
+    stretches = np.array_split(np.arange(len(captures)), min(_NETWORK_CAPTURES, len(captures)))
+    with ThreadPoolExecutor(at_once) as pool:
+        return [best for best in pool.map(best_of, stretches) if best is not None]
 
 
 def _read(capture: Capture, bands: Sequence[str], settings: Settings, start: FlightModel | None) -> _Loaded | None:
