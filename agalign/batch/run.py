@@ -246,7 +246,7 @@ def _panels(
     if options.align_panels:
         return [], list(captures)
     albedos = dict(settings.panel_albedo)
-    seen = with_panels(captures, by_look=bool(albedos))
+    seen = with_panels(captures, without_code=bool(albedos))
     panels = [read_panel(c, albedos) for c in seen if c.panel is not None]
     return panels, [c for c in seen if not c.is_of_a_panel]
 

@@ -1,1 +1,1 @@
-"""What the captures of a flight have in common: how they are grouped, and the model that they share."""
+"""Flights: grouping of captures, the model and the rig of a camera, calibration panels, fingerprints."""

@@ -1,7 +1,7 @@
-"""Mappings as linear functions of a capture's factors, and the least squares that finds the factors.
+"""Mappings as linear functions of a capture's factors, and the estimation of the factors by robust least squares.
 
-Differences between mappings of one band are written as (2, 3) coefficients over g = (1, u, v), the coordinates of
-`rig`'s model, in px: their norm is the root mean square distance over the image.
+The difference between two mappings of a band is expressed as (2, 3) coefficients of g = (1, u, v), the normalised
+coordinates of the model in `rig`, in px. The norm of the coefficients is the RMS distance over the image.
 """
 
 from collections.abc import Sequence
@@ -18,19 +18,20 @@ from agalign.values.robust import cauchy_weights
 Array = NDArray[np.float64]
 
 FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
-"""Prior of a capture's factors around the mean: wide, for heights that the flight has not seen."""
+"""Standard deviations of the prior of a capture's factors (5,); wide, to allow heights outside the learned range."""
 MIN_STD_PX = 0.05
-"""Standard error that a mapping has beyond its own estimate of it."""
+"""Added in quadrature to the standard error of a mapping, which does not contain all errors."""
 _COLUMNS: dict[Factor, tuple[int, ...]] = {"distance": (0,), "tilt": (1, 2), "motion": (3, 4), "reference": (3, 4)}
 _LATTICE = 7, 5
+"""Columns and rows of the points at which mappings are compared."""
 _OUTLIER_PX = 0.3
-"""A band that disagrees with the others by this has half its weight."""
+"""Residual of a band at which its robust weight is one half."""
 _REWEIGHTINGS = 6
-"""After so many the weights have converged."""
+"""Iterations after which the robust weights have converged."""
 
 
 def factor_mask(factors: Sequence[Factor]) -> Array:
-    """(5,): 1 for the columns of the factors that count, else 0."""
+    """Return (5,) 1 for the columns of the given factors, else 0."""
     result = np.zeros(FACTORS)
     for factor in factors:
         result[list(_COLUMNS[factor])] = 1.0
@@ -38,7 +39,10 @@ def factor_mask(factors: Sequence[Factor]) -> Array:
 
 
 def factor_design(baseline: Array, delay: float) -> Array:
-    """(2, 3, 5): the change of a band's coefficients with each factor, from its baseline (2,) and its delay."""
+    """Return (2, 3, 5) the derivative of a band's coefficients with respect to the factors.
+
+    `baseline` (2,) and `delay` are t_b and d_b of the model in `rig`.
+    """
     result = np.zeros((2, 3, FACTORS))
     result[:, range(3), range(3)] = baseline[:, None]
     result[(0, 1), 0, (3, 4)] = delay
@@ -46,10 +50,11 @@ def factor_design(baseline: Array, delay: float) -> Array:
 
 
 def solve_factors(differences: Array, designs: Array, weights: Array, mask: Array) -> tuple[Array, Array]:
-    """(factors (captures, 5), covariances (captures, 5, 5)) by robust least squares with Cauchy weights.
+    """Estimate factors (captures, 5) and covariances (captures, 5, 5) by least squares with Cauchy weights.
 
-    From the differences (captures, bands, 2, 3) of each capture's mappings from the bands' means, the bands' designs
-    (bands, 2, 3, 5), weights (captures, bands) and the mask (5,) of the factors that count.
+    `differences` (captures, bands, 2, 3) are coefficients of the mappings minus the means of the bands, px; `designs`
+    (bands, 2, 3, 5) are from `factor_design`, `weights` (captures, bands) from `mapping_weight`, 0 for bands without a
+    mapping, and `mask` (5,) from `factor_mask`.
     """
     x = (designs * mask).reshape(len(designs), 6, FACTORS)
     y = differences.reshape(*differences.shape[:2], 6)
@@ -69,18 +74,19 @@ def solve_factors(differences: Array, designs: Array, weights: Array, mask: Arra
 
 
 def mapping_weight(std_px: float, model_error_px: float = 0.0) -> float:
-    """Weight of a mapping with this standard error, in a model with an error of its own: 1 / px^2."""
+    """Return the weight, 1 / px^2, of a mapping from its standard error and the error of the model."""
     return 1 / (std_px**2 + model_error_px**2 + MIN_STD_PX**2)
 
 
 def lattice_points(size_px: tuple[int, int]) -> Points:
-    """The points of an image (width, height) at which mappings are compared, (35, 2)."""
+    """Return the points (35, 2) of an image (width, height) at which mappings are compared."""
     return geometry.lattice(*size_px, *_LATTICE)
 
 
 def coordinates(size_px: tuple[int, int], points_px: Points | None = None) -> Array:
-    """The g (points, 3) of points (points, 2), by default of the lattice; over the lattice the first column is 1, and
-    the others have mean 0 and variance 1.
+    """Return g = (1, u, v), (N, 3), of points (N, 2), by default of `lattice_points`.
+
+    u and v have mean 0 and variance 1 over the lattice.
     """
     lattice = lattice_points(size_px)
     points = lattice if points_px is None else points_px
@@ -88,29 +94,27 @@ def coordinates(size_px: tuple[int, int], points_px: Points | None = None) -> Ar
 
 
 def affine_difference(mean: Matrix, mapping: Matrix, size_px: tuple[int, int]) -> Array:
-    """(2, 3): the coefficients of the second mapping minus the first, as far as the difference is affine."""
+    """Return (2, 3) coefficients of the affine part of the second mapping minus the first, px."""
     points = lattice_points(size_px)
     difference_px = geometry.apply(mapping, points) - geometry.apply(mean, points)
     return np.asarray(np.linalg.lstsq(coordinates(size_px), difference_px, rcond=None)[0].T)
 
 
 def displaced(mean: Matrix, coefficients: Array, size_px: tuple[int, int]) -> Matrix:
-    """The mapping plus a difference with coefficients (2, 3): the inverse of `affine_difference`."""
+    """Add a difference with coefficients (2, 3) to a mapping; the inverse of `affine_difference`."""
     points = lattice_points(size_px)
     return geometry.fit_homography(points, geometry.apply(mean, points) + coordinates(size_px) @ coefficients.T)
 
 
 def distance_px(one: Matrix, other: Matrix, size_px: tuple[int, int]) -> MovingFilePx:
-    """Root mean square distance between the positions in the moving file to which two homographies map an image
-    (width, height).
-    """
+    """Return the RMS distance between two homographies over an image (width, height), px of the moving file."""
     points = lattice_points(size_px)
     difference_px = geometry.apply(one, points) - geometry.apply(other, points)
     return MovingFilePx(np.sqrt((difference_px**2).sum(axis=1).mean()))
 
 
 def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matrix:
-    """The homography through the median of the images of each lattice point."""
+    """Return the homography fitted to the coordinatewise median of the mapped lattice points."""
     if len(matrices) == 1:
         return matrices[0]
     points = lattice_points(size_px)

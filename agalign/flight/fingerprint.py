@@ -1,4 +1,4 @@
-"""What a result depends on, as a short text that changes when it does."""
+"""Fingerprints: hashes of everything that a result depends on."""
 
 import hashlib
 import struct
@@ -16,9 +16,9 @@ Fact = str | int | float | bool | None | np.ndarray | Lens | Iterable["Fact"]
 
 
 def fingerprint(capture: Capture, *stages: Stage) -> str:
-    """Changes when the files of a capture, what is known of their camera, these settings or the program's version do.
+    """Return the hash of the files of a capture, the metadata of its bands, settings and the version of agalign.
 
-    What the other captures of the flight are does not count: a result stays good when the card holds more.
+    It does not depend on the other captures of the flight, so results remain valid when captures are added.
     """
     bands = [
         (
@@ -31,12 +31,12 @@ def fingerprint(capture: Capture, *stages: Stage) -> str:
 
 
 def hashed(*facts: Fact) -> str:
-    """Sixteen digits of the facts, independent of numpy's print options."""
+    """Return the first 16 hexadecimal digits of the SHA-256 of the facts."""
     return hashlib.sha256(b"".join(map(_canonical, facts))).hexdigest()[:16]
 
 
 def _canonical(fact: Fact) -> bytes:
-    """Bytes that no other fact has: a type, a length and the contents."""
+    """Encode a fact unambiguously: type, length and contents."""
     if isinstance(fact, Lens):
         return _canonical((fact.fx_px, fact.fy_px, fact.cx_px, fact.cy_px, fact.distortion))
     if isinstance(fact, np.ndarray):
@@ -51,9 +51,9 @@ def _canonical(fact: Fact) -> bytes:
 
 
 def _state(path: Path) -> tuple[int, int]:
-    """Size and time of change: a file that was copied from the card again is another file."""
+    """Return the size and the modification time of a file, zeros if it cannot be read."""
     try:
-        state = path.stat()
+        status = path.stat()
     except OSError:
         return 0, 0
-    return state.st_size, state.st_mtime_ns
+    return status.st_size, status.st_mtime_ns

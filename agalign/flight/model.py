@@ -1,7 +1,7 @@
 """The learned model of a flight (network, mappings and rig) and its file.
 
-The captures of a flight share their camera, so one network, trained on a few of them, works for all (the paper's future
-work).
+One network, trained on a few captures of a flight, describes the bands of all of them (the paper proposes this as
+future work).
 """
 
 import hashlib
@@ -27,39 +27,39 @@ from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
 
 _FORMAT = "agalign-model/1"
-_LONGEST_BYTES = 1 << 28
+_MAX_FILE_BYTES = 1 << 28
 _MAX_SIDES = 512
 _MAX_VALUE = 1e6
-"""Weights are below 100, and mappings are in px: larger numbers are no model's."""
+"""Weights are below 100 and mappings are in px: larger numbers indicate a damaged file."""
 
 
 @dataclass(frozen=True)
 class FlightModel:
-    """A learnt network and the mappings that it found, for one camera."""
+    """A learnt network, the mappings of the bands and the rig of one camera."""
 
     net: Descriptor
     camera: str
-    """As `groups.flight_camera` has it; empty for one that was learnt on pairs of any cameras."""
+    """`groups.flight_camera` of the captures; empty if it was learnt on pairs of several cameras."""
     bands: tuple[str, ...]
-    """Names of the moving bands; the network's side of one is its place here, counted from 1."""
+    """Names of the moving bands, in the order of the network's sides from 1."""
     mappings: Mapping[str, Matrix]
-    """Median fixed_to_moving of the bands with distinguishable held-out patches, undistorted px of the files."""
+    """Median fixed_to_moving of each band that passed held-out retrieval, undistorted px of the files."""
     fingerprint: str
-    """Of what it was learnt from, and how."""
+    """Hash of the captures and settings from which it was learnt."""
     rig: Rig | None = None
     """Geometry of the camera; None if too few captures determine it."""
 
     def side(self, band: str) -> int | None:
-        """The network's side for a moving band; None where it knows none of that name."""
+        """Return the network's side of a moving band; None for an unknown band."""
         return self.bands.index(band) + 1 if band in self.bands else None
 
     def matching_network(self, band: str, channels: tuple[int, int]) -> Descriptor:
-        """A network that matches the reference with a moving band, images of these channels."""
+        """Return a network that matches the reference with a moving band, for images of these channels."""
         return matching_network(self.net, self.side(band) or 1, channels)
 
 
 def save_model(model: FlightModel, path: Path) -> None:
-    """Write a model atomically; the same model is the same bytes. Raises OutputError."""
+    """Write a model atomically; equal models have equal bytes. Raises OutputError."""
     tensors = {f"theta.{k}": v.detach().cpu().contiguous() for k, v in model.net.state_dict().items()}
     tensors |= {f"mapping.{k}": torch.tensor(m) for k, m in model.mappings.items()}
     if model.rig is not None:
@@ -75,16 +75,16 @@ def save_model(model: FlightModel, path: Path) -> None:
 
 
 def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
-    """Raises InputError, naming the file, where it is not a model of this program, or a damaged one."""
+    """Read a model and move its network to `device()`. Raises InputError if the file is damaged or not a model."""
     try:
         model = _read_model(path)
     except InputError:
         raise
-    except Exception as error:  # of a damaged file anything may be wrong
+    except Exception as error:  # damaged files raise errors of many classes
         if is_want_of_memory(error):
             raise MemoryError(str(error)) from None
-        said = next(iter(str(error).splitlines()), type(error).__name__)
-        raise InputError(f"{path}: cannot be read as a model ({said})") from None
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise InputError(f"{path}: cannot be read as a model ({reason})") from None
     return replace(model, net=model.net.to(device()))
 
 
@@ -92,22 +92,22 @@ def _read_model(path: Path) -> FlightModel:
     facts, tensors = _read_contents(path)
     channels = [int(c) for c in json.loads(facts["channels"])]
     if not 1 < len(channels) <= _MAX_SIDES or not all(0 < c <= _MAX_SIDES for c in channels):
-        raise ValueError(f"a network for images of {channels[:8]} channels")
+        raise ValueError(f"invalid numbers of channels: {channels[:8]}")
     net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
-    net.load_state_dict(_below("theta.", tensors))
+    net.load_state_dict(_with_prefix("theta.", tensors))
     net.learnt = True
-    fields = {band: values.numpy() for band, values in _below("field.", tensors).items()}
-    mappings = {band: normalised(matrix.numpy()) for band, matrix in _below("mapping.", tensors).items()}
+    fields = {band: values.numpy() for band, values in _with_prefix("field.", tensors).items()}
+    mappings = {band: normalised(matrix.numpy()) for band, matrix in _with_prefix("mapping.", tensors).items()}
     bands = tuple(map(str, json.loads(facts["bands"])))
     rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
     return FlightModel(net, facts["camera"], bands, mappings, facts["fingerprint"], rig)
 
 
 def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """(the facts, the tensors) of a file that is a model, and a complete one."""
+    """Return the metadata and the tensors of a file after checking its size, format, checksum and values."""
     with open_regular(path) as opened:
-        if os.fstat(opened.fileno()).st_size > _LONGEST_BYTES:
-            raise ValueError("it is too large for one")
+        if os.fstat(opened.fileno()).st_size > _MAX_FILE_BYTES:
+            raise ValueError(f"it is larger than {_MAX_FILE_BYTES >> 20} MiB")
     with safe_open(path, framework="pt") as file:
         facts = dict(file.metadata() or {})
         if facts.get("format") != _FORMAT:
@@ -118,18 +118,18 @@ def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]
         raise ValueError("it has no checksum")
     if digest != _digest(tensors, facts):
         raise ValueError("it is damaged")
-    if not all((t.abs() <= _MAX_VALUE).all() for t in tensors.values()):  # written so that nan does not pass
-        raise ValueError("it has numbers that no model has")
+    if not all((t.abs() <= _MAX_VALUE).all() for t in tensors.values()):  # also False for NaN
+        raise ValueError(f"it has values that are NaN or above {_MAX_VALUE:.0e}")
     return facts, tensors
 
 
-def _below(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The tensors with names that start with the prefix, by the rest of their names."""
+def _with_prefix(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Select the tensors with a prefix, which is removed from their names."""
     return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
 
 
 def _digest(tensors: Mapping[str, torch.Tensor], facts: Mapping[str, str]) -> str:
-    """Of the contents: nothing else would detect a flipped bit in a weight."""
+    """Return the checksum of the contents; the format of safetensors has none."""
     result = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
         result.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
@@ -138,7 +138,7 @@ def _digest(tensors: Mapping[str, torch.Tensor], facts: Mapping[str, str]) -> st
 
 
 def _with_sorted_header(contents: bytes) -> bytes:
-    """Safetensors' header with its names in their order, in which the library itself has the facts at random."""
+    """Sort the names in the header of a safetensors file; the library writes the metadata in random order."""
     (length,) = struct.unpack_from("<Q", contents)
     header = json.dumps(json.loads(contents[8 : 8 + length]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)

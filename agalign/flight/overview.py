@@ -1,4 +1,4 @@
-"""What a flight is, in a few numbers of each camera: captures, ground sample distance, height, radiometry."""
+"""Overview of the captures of each camera: number, bands, ground sample distance, height, radiometry."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,19 +22,19 @@ class CameraOverview:
     first_at: str
     last_at: str
     height_m: float | None
-    """Median height above the ground, where the tags or a panel give it."""
+    """Median height above the ground; None if neither the tags nor a panel give it."""
     altitude_m: tuple[float, float] | None
-    """The lowest and the highest, as the camera writes them: above the sea or an ellipsoid."""
+    """Minimum and maximum altitude in the tags, above sea level or an ellipsoid."""
     gsd_m: float | None
     """Median ground sample distance of the reference."""
     gsd_per_height: float | None
-    """Ground sample distance for each metre of height, by the lens of the reference."""
+    """Ground sample distance per metre of height, from the focal length of the reference."""
     radiometry: tuple[RadiometryChoice, ...]
-    """What `--radiometry` can be for the captures, without what only a panel gives."""
+    """Values of `--radiometry` that the tags of all captures support; panels are not considered."""
 
     @property
     def text(self) -> str:
-        """One line of it."""
+        """The overview in one line."""
         count = f"{self.captures} capture{'' if self.captures == 1 else 's'}"
         serial = f" ({self.serial})" if self.serial else ""
         parts = [f"{self.camera}{serial}: {count} of {len(self.bands)} bands", "{} x {} px".format(*self.size_px)]
@@ -74,7 +74,7 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
         altitude_m=(min(altitudes_m), max(altitudes_m)) if altitudes_m else None,
         gsd_m=median(gsds_m) if gsds_m else None,
         gsd_per_height=_gsd_per_height(captures[0]),
-        radiometry=tuple(choice for choice in choices if all(_can_be(c, choice) for c in captures)),
+        radiometry=tuple(choice for choice in choices if all(_supports(c, choice) for c in captures)),
     )  # fmt: skip
 
 
@@ -84,6 +84,6 @@ def _gsd_per_height(capture: Capture) -> float | None:
     return 1 / focal_px if focal_px else None
 
 
-def _can_be(capture: Capture, choice: RadiometryChoice) -> bool:
+def _supports(capture: Capture, choice: RadiometryChoice) -> bool:
     bands = with_radiometry(capture, choice, {}).bands
     return all(b.radiometry is not None for b in bands if not b.companion)

@@ -1,4 +1,4 @@
-"""What calibration panels say: which captures show one, and by what radiance is to be multiplied for reflectance."""
+"""Detection of captures of calibration panels, and reflectance factors from them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -8,40 +8,43 @@ import numpy as np
 
 from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
-from agalign.pixels.panel import PanelSight, albedo_of, find_panel, inside
+from agalign.pixels.panel import DetectedPanel, albedo_of, find_panel, inside
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, read_for_alignment, read_window, without_warnings
 from agalign.values.capture import Band, Capture, Panel
 from agalign.values.pixel_units import PixelScale
 
 Albedos = Mapping[str, float]
-"""Reflectance of the panel by band in lower case, or by the empty name for all others: what a user says."""
-_AT_EITHER_END = 3
-"""Captures at either end of a flight that are looked at in vain: panels are held before and after."""
+"""Reflectance of the panel as the user gives it, by band in lower case; the empty name is the default."""
+_MAX_CAPTURES_WITHOUT_PANEL = 3
+"""The search from either end of a flight stops after this many: panels are recorded before and after a flight."""
 _READERS = 4
-_LOOK_PX = 1600
-_SAME_OUTING_S = 6 * 3600.0
-"""A panel is not valid for the illumination of another day."""
+_DETECTION_PX = 1600
+"""Longer side of the images in which panels are searched."""
+_MAX_TIME_DIFFERENCE_S = 6 * 3600.0
+"""A panel does not represent the illumination many hours later."""
 _MAX_SATURATED = 0.01
-_PANEL_HEIGHT_M, _MIN_HEIGHT_M = 1.0, 3.0
-"""At which the camera is held over a panel; and what errors of altitudes come to."""
+_PANEL_HEIGHT_M = 1.0
+"""Height of the camera above a panel when it is recorded."""
+_MIN_HEIGHT_M = 3.0
+"""Lower heights are within the error of the altitudes."""
 
 
 @dataclass(frozen=True)
 class BandReading:
-    """A panel as one band has it."""
+    """Measurement of a panel in one band."""
 
     band: Band
     """With its panel."""
     albedo: float | None
     radiance: float | None
-    """Mean over its area, in the unit of the camera's own calibration."""
+    """Mean over the panel, in the unit of the camera's calibration."""
     problem: str = ""
-    """Why it cannot be used."""
+    """Why it cannot be used; empty if it can."""
 
     @property
     def factor(self) -> float | None:
-        """What radiance is to be multiplied by for reflectance."""
+        """Reflectance per radiance; None if the reading cannot be used."""
         if self.problem or self.albedo is None or self.radiance is None:
             return None
         return self.albedo / self.radiance
@@ -49,127 +52,135 @@ class BandReading:
 
 @dataclass(frozen=True)
 class PanelReading:
-    """A capture that shows a panel."""
+    """Measurement of a panel in all bands of a capture."""
 
     capture: Capture
     bands: tuple[BandReading, ...]
 
     @property
     def panel(self) -> Panel:
-        """As the first band shows it."""
+        """The panel in the first band that contains it."""
         assert self.capture.panel is not None
         return self.capture.panel
 
 
-def with_panels(captures: Sequence[Capture], *, by_look: bool = False) -> list[Capture]:
-    """The captures, with the panel of those that show one: by their tags or, for the first and last of each flight, by
-    its QR code, or with `by_look` by its appearance.
+def with_panels(captures: Sequence[Capture], *, without_code: bool = False) -> list[Capture]:
+    """Return the captures with their panels.
+
+    Panels are known from the tags or detected in the first and last captures of each flight by their QR code; with
+    `without_code` also by their appearance.
     """
-    ends = [end for flight in flights_of(captures) for end in _from_either_end(flight)]
+    ends = [end for flight in flights_of(captures) for end in _from_both_ends(flight)]
     with without_warnings(), ThreadPoolExecutor(_READERS) as pool:
-        seen = {c.label: c for result in pool.map(lambda end: _panels_at(end, by_look), ends) for c in result}
-    return [seen.get(c.label, c) for c in captures]
+        results = pool.map(lambda end: _captures_of_panels(end, without_code), ends)
+        of_panels = {c.label: c for result in results for c in result}
+    return [of_panels.get(c.label, c) for c in captures]
 
 
 def read_panel(capture: Capture, albedos: Albedos) -> PanelReading:
-    """What a capture of a panel shows, band by band."""
+    """Measure the panel in each band of a capture. `albedos` take precedence over the albedos of the panel."""
     return PanelReading(capture, tuple(_read(b, albedos) for b in capture.bands))
 
 
 def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, float]:
-    """By band, what a capture's radiance is to be multiplied by for reflectance: the light is linear in time between
-    the panels of its camera, and as the nearest one has it before the first and after the last. None where the time of
-    the capture or of all panels is unknown.
+    """Return the reflectance per radiance of a capture by band.
+
+    The illumination is interpolated linearly in time between the panels of the camera and constant outside. Empty if
+    the time of the capture or of all panels is unknown.
     """
     time_s = capture.time_s
     if time_s is None:
         return {}
-    result: dict[str, list[tuple[float, float]]] = {}
-    for panel_time_s, reading in _of_the_same_outing(readings, time_s):
+    illumination: dict[str, list[tuple[float, float]]] = {}
+    for panel_time_s, reading in _within_hours(readings, time_s):
         for band in reading.bands if camera_key(reading.capture) == camera_key(capture) else ():
             if band.factor is not None:
-                result.setdefault(band.band.name, []).append((panel_time_s, 1 / band.factor))
-    return {name: 1 / _at(time_s, known) for name, known in result.items()}
+                illumination.setdefault(band.band.name, []).append((panel_time_s, 1 / band.factor))
+    return {name: 1 / _interpolated(time_s, samples) for name, samples in illumination.items()}
 
 
 def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
-    """The capture with its height above the ground, where its tags have only an altitude and a panel of the same hours
-    was held on the ground.
+    """Return the capture with its height above the ground from the altitude of a panel.
+
+    Captures with a height in the tags, without an altitude or without a panel within hours are not changed.
     """
     pose, position, time_s = capture.pose, capture.position, capture.time_s
     if pose is None or pose.height_m is not None or position is None or position.altitude_m is None or time_s is None:
         return capture
-    panels = [
-        r.capture.position.altitude_m for _, r in _of_the_same_outing(readings, time_s)
+    altitudes_m = [
+        r.capture.position.altitude_m for _, r in _within_hours(readings, time_s)
         if r.capture.is_of_a_panel and r.capture.position is not None and r.capture.position.altitude_m is not None
     ]  # fmt: skip
-    height_m = position.altitude_m - min(panels) + _PANEL_HEIGHT_M if panels else 0.0
+    height_m = position.altitude_m - min(altitudes_m) + _PANEL_HEIGHT_M if altitudes_m else 0.0
     if height_m <= _MIN_HEIGHT_M:
         return capture
     return replace(capture, pose=replace(pose, height_m=height_m, height_from="panel"))
 
 
-def _of_the_same_outing(readings: Iterable[PanelReading], time_s: float) -> list[tuple[float, PanelReading]]:
-    """(time, reading) of the panels that were taken within hours of a time; panels of unknown time are left out."""
+def _within_hours(readings: Iterable[PanelReading], time_s: float) -> list[tuple[float, PanelReading]]:
+    """Return (time, reading) of the panels within _MAX_TIME_DIFFERENCE_S of a time."""
     return [
         (panel_time_s, r) for r in readings
-        if (panel_time_s := r.capture.time_s) is not None and abs(panel_time_s - time_s) <= _SAME_OUTING_S
+        if (panel_time_s := r.capture.time_s) is not None and abs(panel_time_s - time_s) <= _MAX_TIME_DIFFERENCE_S
     ]  # fmt: skip
 
 
-def _at(time_s: float, known: list[tuple[float, float]]) -> float:
-    times = sorted({t for t, _ in known})
-    return float(np.interp(time_s, times, [np.mean([v for t, v in known if t == time]) for time in times]))
+def _interpolated(time_s: float, samples: list[tuple[float, float]]) -> float:
+    """Interpolate (time, value) samples linearly; values at equal times are averaged."""
+    times = sorted({t for t, _ in samples})
+    return float(np.interp(time_s, times, [np.mean([v for t, v in samples if t == time]) for time in times]))
 
 
-def _from_either_end(flight: Sequence[Capture]) -> tuple[list[Capture], list[Capture]]:
-    """The first half of a flight, and the second from its end: in time, or as given where a time is unknown."""
+def _from_both_ends(flight: Sequence[Capture]) -> tuple[list[Capture], list[Capture]]:
+    """Return the first half of a flight, and the second half in reverse order.
+
+    The order is by time, or as given if a time is unknown.
+    """
     times = [t for c in flight if (t := c.time_s) is not None]
-    in_time = [flight[i] for i in np.argsort(times, kind="stable")] if len(times) == len(flight) else list(flight)
-    middle = (len(in_time) + 1) // 2
-    return in_time[:middle], in_time[middle:][::-1]
+    ordered = [flight[i] for i in np.argsort(times, kind="stable")] if len(times) == len(flight) else list(flight)
+    middle = (len(ordered) + 1) // 2
+    return ordered[:middle], ordered[middle:][::-1]
 
 
-def _panels_at(end: Sequence[Capture], by_look: bool) -> list[Capture]:
-    """Those that show a panel, looked for until a few in a row show none."""
+def _captures_of_panels(half: Sequence[Capture], without_code: bool) -> list[Capture]:
+    """Return the captures with a panel, searched until several captures in a row contain none."""
     result: list[Capture] = []
-    without = 0
-    for capture in end:
-        # Mosaics show none, and are long to read.
-        known = capture.panel is not None or capture.reference.georeference is not None
-        seen = capture if known else _looked_at(capture, by_look)
-        result += [] if seen.panel is None else [seen]
-        without = 0 if seen.panel is not None else without + 1
-        if without == _AT_EITHER_END:
+    without_panel = 0
+    for capture in half:
+        # Mosaics contain no panels and take long to read.
+        is_known = capture.panel is not None or capture.reference.georeference is not None
+        examined = capture if is_known else _with_detected_panel(capture, without_code)
+        result += [] if examined.panel is None else [examined]
+        without_panel = 0 if examined.panel is not None else without_panel + 1
+        if without_panel == _MAX_CAPTURES_WITHOUT_PANEL:
             break
     return result
 
 
-def _looked_at(capture: Capture, by_look: bool) -> Capture:
-    sight = _seen(capture.reference, without_code=by_look)
-    # A small square away from the middle is a roof or a sheet unless a code says otherwise.
-    if sight is None or (sight.in_scene and not sight.code):
+def _with_detected_panel(capture: Capture, without_code: bool) -> Capture:
+    detected = _detect(capture.reference, without_code=without_code)
+    # Without a code, a small square far from the image centre may be a roof or a sheet.
+    if detected is None or (detected.in_scene and not detected.code):
         return capture
-    sights = [_seen(b, without_code=True) for b in capture.bands]
-    in_scene = sight.in_scene
-    # A code that one band shows plainly is the others' too.
-    code = next((s.code for s in sights if s is not None and s.code), "")
+    by_band = [_detect(b, without_code=True) for b in capture.bands]
+    # The code may be readable in one band only; it is valid for all.
+    code = next((d.code for d in by_band if d is not None and d.code), "")
     bands = (
-        replace(b, panel=None if s is None else _panel(s, b, code, in_scene=in_scene))
-        for b, s in zip(capture.bands, sights, strict=True)
+        replace(b, panel=None if d is None else _panel(d, b, code, in_scene=detected.in_scene))
+        for b, d in zip(capture.bands, by_band, strict=True)
     )
     return replace(capture, bands=tuple(bands))
 
 
-def _panel(sight: PanelSight, band: Band, code: str, *, in_scene: bool) -> Panel:
+def _panel(detected: DetectedPanel, band: Band, code: str, *, in_scene: bool) -> Panel:
     serial, _, _ = code.partition("_")
-    return Panel("QR code" if code else "look", serial, albedo_of(code, band.wavelength_nm), sight.area_px, in_scene)
+    return Panel("QR code" if code else "look", serial, albedo_of(code, band.wavelength_nm), detected.area_px, in_scene)
 
 
-def _seen(band: Band, *, without_code: bool) -> PanelSight | None:
-    """What a band shows of a panel, px of its file."""
+def _detect(band: Band, *, without_code: bool) -> DetectedPanel | None:
+    """Detect the panel in a band; positions are px of the file. None without a panel or if the file is unreadable."""
     try:
-        image = read_for_alignment(band, _LOOK_PX)
+        image = read_for_alignment(band, _DETECTION_PX)
     except AgalignError:
         return None
     result = find_panel(replace(image, lens=None), without_code=without_code)
@@ -184,8 +195,8 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
     panel = band.panel
     if panel is not None and not panel.corners_px:
         # Firmware that recognises a panel does not always write its position.
-        sight = _seen(band, without_code=True)
-        panel = panel if sight is None else replace(panel, corners_px=sight.area_px)
+        detected = _detect(band, without_code=True)
+        panel = panel if detected is None else replace(panel, corners_px=detected.area_px)
         band = replace(band, panel=panel)
     albedo = albedos.get(band.name.lower(), albedos.get("", None if panel is None else panel.albedo))
     if panel is None or not panel.corners_px:
@@ -202,7 +213,7 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
 
 
 def _radiance(band: Band, panel: Panel) -> tuple[float | None, float]:
-    """(mean over the panel's area, None where the tags give no calibration; share of it that is saturated)."""
+    """Return the mean radiance over the panel, None without calibration, and the saturated share of its pixels."""
     corners = np.asarray(panel.corners_px)
     x0, y0 = np.floor(corners.min(axis=0)).astype(int).clip(0, np.subtract(band.size_px, 1))
     x1, y1 = np.ceil(corners.max(axis=0)).astype(int).clip((x0, y0), np.subtract(band.size_px, 1))

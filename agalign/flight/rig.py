@@ -1,19 +1,19 @@
-"""The rig of a flight: what the mappings of all bands have in common from capture to capture.
+"""The rig of a flight: a linear model of the mappings of all bands with few parameters (factors) per capture.
 
-A plane induces between two cameras of a rig the homography H_b = A_b + e_b nu^T, with A_b and e_b the rig's and
-nu = n / d, the ground's normal over its distance, the capture's (Hartley & Zisserman, Eq. 13.2). A rig that exposes its
-bands one after another sees the ground move in between, by w times the band's delay. Around the flight's mean m_b that
-is, at the pixel x of the reference,
+A plane induces the homography H_b = A_b + e_b nu^T between two cameras of a rig (Hartley & Zisserman, Eq. 13.2). A_b
+and e_b are constants of the rig; nu = n / d, the plane's normal over its distance, differs between captures. If the
+rig exposes its bands one after another, the image motion between exposures adds w times the delay of the band.
+Linearised around the mean m_b of a flight, the mapping of band b in capture c at pixel x of the reference is
 
     H_b(c) x = m_b(x) + t_b (nu_c . g(x)) + d_b w_c + residual
 
-with t_b (2,) the direction of the band's lens in the rig, d_b its delay, and the capture's factors, which ALL its bands
-share: nu_c (3,), over g = (1, u, v), the image's coordinates, scaled so that each has mean 0 and variance 1 over the
-image (the ground's distance moves each band along its own baseline, its tilt does so in proportion to the position in
-the image), and w_c (2,). The t_b together have length 1, and so have the d_b: the factors are in px.
+t_b (2,) is the baseline direction of the band's lens and d_b its delay. The factors nu_c (3,) and w_c (2,) are common
+to all bands of a capture. g = (1, u, v) are image coordinates, normalised to mean 0 and variance 1 over the image: a
+change of distance shifts each band along its baseline, a tilt does so in proportion to the position in the image. All
+t_b together have norm 1, as have all d_b, so the factors are in px.
 
-Which of them count is decided by cross-validation (`learn_rig`): each capture is predicted from rigs learned on the
-others, band by band from its other bands. The errors are the standard errors of predictions (`rig_prediction`).
+Cross-validation selects the factors (`learn_rig`): each band of a capture is predicted from its other bands by a rig
+learned without the capture. The RMS of these errors is the standard error of predictions (`rig_prediction`).
 """
 
 from collections.abc import Mapping
@@ -27,31 +27,31 @@ from agalign.values.pixel_units import MovingFilePx
 Factor = Literal["distance", "tilt", "motion", "reference"]
 
 FACTORS = 5
-"""nu and w together."""
+"""Number of elements of nu and w together."""
 NO_FACTORS: tuple[float, ...] = (0.0,) * FACTORS
 MIN_CAPTURES = 3
-"""Two captures agree on something by chance too often."""
+"""Fewer captures agree by chance too often."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """The mappings of one capture, as its images show them."""
+    """The mappings of one capture that were estimated from its images."""
 
     seconds: float | None
-    """When it was taken, from any beginning; None where that is unknown."""
+    """Capture time, from any origin; None if unknown."""
     mappings: Mapping[str, Matrix]
     """fixed_to_moving by band, undistorted px of the files."""
     std_px: Mapping[str, MovingFilePx]
-    """Standard error of each."""
+    """Standard error of each mapping."""
     altitude_m: float | None = None
-    """As the camera has it, above anything."""
+    """Altitude in the tags, above any datum; None if unknown."""
     motion: tuple[float, float] | None = None
-    """How fast the ground passes, right and down in the image, in any unit."""
+    """Velocity of the ground in the image (right, down), in any unit; None if unknown."""
 
 
 @dataclass(frozen=True)
 class CaptureFactors:
-    """The factors of a capture that a rig was learned on."""
+    """The factors of a capture from which a rig was learned."""
 
     seconds: float | None
     altitude_m: float | None
@@ -62,34 +62,33 @@ class CaptureFactors:
 
 @dataclass(frozen=True)
 class Rig:
-    """The geometry of a flight's camera, as some of its captures show it."""
+    """The geometry of a flight's camera; lengths of a band are in px of its own file."""
 
     size_px: tuple[int, int]
     """(width, height) of the reference's file."""
     mean: Mapping[str, Matrix]
-    """fixed_to_moving by band."""
+    """Mean fixed_to_moving by band, undistorted px of the files."""
     baselines: Mapping[str, tuple[float, float]]
     """t_b by band."""
     delays: Mapping[str, float]
     """d_b by band."""
     baseline_std: Mapping[str, float]
-    """Of either coordinate of t_b."""
+    """Standard error of each coordinate of t_b, by band."""
     centres: Mapping[str, tuple[float, ...]]
-    """Mean factors (5,) of the captures that showed a band: there its mean is best known."""
+    """Mean factors (5,) of the captures with a mapping of the band; at these its mean is most accurate."""
     factors: tuple[Factor, ...]
-    """Which of them a capture adds."""
+    """The factors that cross-validation selected."""
     captures: tuple[CaptureFactors, ...]
-    """The captures that it was learned on, in their order."""
+    """The captures from which the rig was learned, in their order."""
     from_bands_px: Mapping[str, MovingFilePx]
-    """Root mean square error of each band in captures left out, predicted from their other bands. Everything of a band
-    is in px of its own file.
-    """
+    """RMS error by band of predictions from the other bands, in captures that were left out."""
     extrapolation_px: Mapping[str, MovingFilePx] = field(default_factory=dict)
-    """Root mean square error of a band's mean where no capture shows a quarter of the image: of the lens differences
-    that a homography extrapolates. Bands that are shown everywhere are left out."""
+    """RMS error by band of the mean mapping, for bands without an observed quarter of the image, into which the
+    homography extrapolates differences of lens distortion."""
     fields: Mapping[str, DisplacementField] = field(default_factory=dict)
-    """What no homography explains and all captures have in common, raw px of the reference's file, by band."""
+    """Displacement field by band that all captures have in common and no homography represents, raw px of the
+    reference's file."""
 
     def covers(self, band: str) -> bool:
-        """True where captures show the band's mapping over the whole image."""
+        """Return True if the mapping of the band was observed in all parts of the image."""
         return band in self.mean and band not in self.extrapolation_px

@@ -1,4 +1,4 @@
-"""The rig as JSON, and read from a model's file without its network: reports of a run need no torch."""
+"""The rig as JSON, and reading it from a model file without torch, as reports of a run require."""
 
 import json
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from agalign.values.files import open_regular
 
 
 def rig_to_json(rig: Rig) -> str:
-    """Everything but the values of the displacement fields."""
+    """Serialise a rig without the values of its displacement fields."""
     facts = {k: v for k, v in vars(rig).items() if k not in ("mean", "fields", "captures")}
     facts["mean"] = {b: m.tolist() for b, m in rig.mean.items()}
     facts["seen"] = [vars(c) for c in rig.captures]
@@ -24,7 +24,10 @@ def rig_to_json(rig: Rig) -> str:
 
 
 def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
-    """The inverse, with the fields' values (rows, columns, 2) by band. Raises KeyError, TypeError, ValueError."""
+    """Deserialise a rig; `fields` are the values (rows, columns, 2) of the displacement fields by band.
+
+    Raises KeyError, TypeError or ValueError for damaged text.
+    """
     facts = json.loads(text)
     steps = facts.pop("field_steps_px")
     width, height = facts.pop("size_px")
@@ -38,7 +41,7 @@ def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
 
 
 def read_rig(path: Path) -> tuple[str, Rig | None]:
-    """(camera, rig) of a model's file, None where too few captures showed a rig. Raises InputError, naming the file."""
+    """Return the camera and the rig of a model file, or None for a model without a rig. Raises InputError."""
     try:
         open_regular(path).close()
         with safe_open(path, framework="np") as file:
@@ -47,7 +50,7 @@ def read_rig(path: Path) -> tuple[str, Rig | None]:
             fields = {n.removeprefix("field."): np.asarray(file.get_tensor(n)) for n in names}
         rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
         return str(facts.get("camera", "")), rig
-    except Exception as error:  # of a damaged file anything may be wrong
+    except Exception as error:  # damaged files raise errors of many classes
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise InputError(f"{path}: its rig cannot be read ({reason})") from None
 

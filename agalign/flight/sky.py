@@ -14,7 +14,7 @@ from agalign.pixels.sky import LOOK_PX, MAX_SKY_TEXTURE, relative_texture
 from agalign.values.capture import Band, Capture
 
 _MIN_ELEVATION_DEG = 20.0
-"""An aircraft that banks does not turn its camera above the horizon; half the field of view is 20 degrees."""
+"""Minimum elevation of the optical axis: half the field of view is about 20 degrees."""
 _MIN_UNSATURATED = 0.5
 _MIN_CUES = 2
 _NAMED = re.compile(r"(?:^|[-_. ])sky(?:$|[-_. ])", re.IGNORECASE)
@@ -26,14 +26,14 @@ class SkyCapture:
 
     capture: Capture
     cues: tuple[str, ...]
-    """The reasons for which it counts as one, in words."""
+    """The reasons to classify it so, in words."""
 
 
 def sky_cues(capture: Capture) -> tuple[str, ...]:
-    """Return the reasons to take a capture for one of the sky: none unless two independent ones agree.
+    """Return the reasons to classify a capture as one of the sky; empty if fewer than two of three hold.
 
-    They are: the tags point the camera above the horizon; a folder or the file is named `sky`; no band has texture.
-    Pixels are read only where one of the first two holds. The last one alone also holds for fog and calm water.
+    The camera points above the horizon according to the tags; the name of a folder or the file contains `sky`; no band
+    has texture, which alone is also true of fog and calm water. Pixels are read only if one of the first two holds.
     """
     cues = []
     if capture.elevation_deg is not None and capture.elevation_deg > _MIN_ELEVATION_DEG:
@@ -46,7 +46,7 @@ def sky_cues(capture: Capture) -> tuple[str, ...]:
 
 
 def sky_captures(captures: Iterable[Capture]) -> tuple[list[SkyCapture], list[Capture]]:
-    """Return (the captures of the sky, the other captures), both in their order."""
+    """Separate captures into (captures of the sky, other captures), both in their order."""
     sky: list[SkyCapture] = []
     others: list[Capture] = []
     with without_warnings():
@@ -60,8 +60,9 @@ def sky_captures(captures: Iterable[Capture]) -> tuple[list[SkyCapture], list[Ca
 
 
 def sky_radiance(band: Band) -> float | None:
-    """Return the median radiance of a band, W / m^2 / sr / nm; None without the camera's calibration, or where half of
-    the band is saturated. Raises UnreadableFileError.
+    """Return the median radiance of a band, W / m^2 / sr / nm.
+
+    None without calibration by the camera, or if half of the band is saturated. Raises UnreadableFileError.
     """
     if band.radiometry is None or band.radiometry.quantity != "radiance":
         return None
@@ -75,7 +76,7 @@ def sky_radiance(band: Band) -> float | None:
 
 
 def _is_without_texture(capture: Capture) -> bool:
-    """True where every band that sees sunlight is smooth; a thermal band sees too little of the sky."""
+    """Return True if all bands except thermal ones, in which the sky has little signal, have no texture."""
     bands = [b for b in capture.bands if not is_thermal(b) and not b.companion]
     return bool(bands) and all(_is_smooth(b) for b in bands)
 

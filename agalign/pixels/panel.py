@@ -46,7 +46,7 @@ Corners = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class PanelSight:
+class DetectedPanel:
     """What was seen of a panel."""
 
     code: str
@@ -57,7 +57,7 @@ class PanelSight:
     """The panel is small and away from the middle: the camera was aimed at something else."""
 
 
-def find_panel(image: Raster, *, without_code: bool = False) -> PanelSight | None:
+def find_panel(image: Raster, *, without_code: bool = False) -> DetectedPanel | None:
     """The panel in a band; None where there is none.
 
     Roofs and sheets are homogeneous squares too: one without a code counts only `without_code`.
@@ -69,9 +69,9 @@ def find_panel(image: Raster, *, without_code: bool = False) -> PanelSight | Non
     shown = np.asarray(cv2.GaussianBlur(shown, (0, 0), _SMOOTHING_PX), np.uint8)  # a dark panel's noise is no structure
     largest = _largest_panel(shown, at)
     if largest is None:
-        return None if at is None else PanelSight(code, (), _is_in_scene(at, shown))
+        return None if at is None else DetectedPanel(code, (), _is_in_scene(at, shown))
     area = PixelScale(scale, scale).inverse.positions(_shrunk(largest))
-    return PanelSight(code, tuple((float(x), float(y)) for x, y in area), _is_in_scene(largest, shown))
+    return DetectedPanel(code, tuple((float(x), float(y)) for x, y in area), _is_in_scene(largest, shown))
 
 
 def _is_in_scene(square: Corners, shown: NDArray[np.uint8]) -> bool:

@@ -8,7 +8,7 @@ from synthetic_flights.panel import make_flight_between_panels
 
 from agalign.cameras.discover import discover
 from agalign.flight.panels import BandReading, PanelReading, read_panel, reflectance_factors, with_height, with_panels
-from agalign.pixels.panel import PanelSight
+from agalign.pixels.panel import DetectedPanel
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Radiometry
 
 AREA = ((20.0, 10.0), (39.0, 10.0), (39.0, 29.0), (20.0, 29.0))
@@ -88,12 +88,12 @@ def test_the_ends_of_a_flight_are_looked_at_until_three_in_a_row_show_none(monke
     flight = [replace(capture(band, f"2026-06-21T10:00:{k:02d}"), name=f"{k}") for k in range(20)]
     looked: list[str] = []
 
-    def warped_pair(one: Capture, _by_look: bool) -> Capture:
+    def warped_pair(one: Capture, _without_code: bool) -> Capture:
         looked.append(one.name)
         shown = one.name in ("0", "1", "2", "3", "5", "18")
         return replace(one, bands=(replace(band, panel=Panel("look") if shown else None),))
 
-    monkeypatch.setattr("agalign.flight.panels._looked_at", warped_pair)
+    monkeypatch.setattr("agalign.flight.panels._with_detected_panel", warped_pair)
     result = with_panels(flight)
     assert [c.name for c in result if c.panel] == ["0", "1", "2", "3", "5", "18"]
     assert sorted(map(int, looked)) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 15, 16, 17, 18, 19]
@@ -142,7 +142,9 @@ def test_one_unknown_time_leaves_the_captures_of_a_flight_in_their_order(monkeyp
     moments = ["" if k == 10 else f"2026-06-21T10:00:{k:02d}" for k in range(20)]
     flight = [replace(capture(band, moment), name=f"{k}") for k, moment in enumerate(moments)]
     looked: list[str] = []
-    monkeypatch.setattr("agalign.flight.panels._looked_at", lambda one, _by_look: looked.append(one.name) or one)
+    monkeypatch.setattr(
+        "agalign.flight.panels._with_detected_panel", lambda one, _without_code: looked.append(one.name) or one
+    )
     with_panels(flight)
     assert sorted(map(int, looked)) == [0, 1, 2, 17, 18, 19]
 
@@ -160,6 +162,6 @@ def test_a_square_in_a_scene_is_a_panel_by_its_code_alone(
     monkeypatch: pytest.MonkeyPatch, code: str, in_scene: bool, expected: tuple[bool, bool]
 ) -> None:
     """A roof looks like a panel too. Only a capture of a panel is left out."""
-    monkeypatch.setattr("agalign.flight.panels._seen", lambda *_, **__: PanelSight(code, AREA, in_scene))
-    (result,) = with_panels([capture(Band("Green", Path("x.tif"), 1, 64, 48, "uint16"))], by_look=True)
+    monkeypatch.setattr("agalign.flight.panels._detect", lambda *_, **__: DetectedPanel(code, AREA, in_scene))
+    (result,) = with_panels([capture(Band("Green", Path("x.tif"), 1, 64, 48, "uint16"))], without_code=True)
     assert (result.panel is not None, result.is_of_a_panel) == expected
