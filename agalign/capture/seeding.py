@@ -15,7 +15,7 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.match import match_seed, starter_for_matching
 from agalign.method.state import ImageGroup
 from agalign.pixels.grey import channel_mean
-from agalign.pixels.landmarks import LANDMARK_INPUTS, agreed_homography, landmarks
+from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography
 from agalign.pixels.resample import textured, warped
 from agalign.pixels.structure import Peak, correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry
@@ -138,7 +138,7 @@ def _matches(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors
     for source in LANDMARK_INPUTS:
         fixed = pair.reference.landmarks(source).undistorted(pair.fixed.lens)
         moving = landmarks(pair.moving, source).undistorted(pair.moving.lens)
-        result = agreed_homography(fixed, moving, pair.fixed.size_px)
+        result = matched_homography(fixed, moving, pair.fixed.size_px)
         if result is not None:
             yield result
     if by_learnt_descriptors:
@@ -262,4 +262,4 @@ def _peak(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> Peak | Non
     surface = correlation_surfaces(pair.reference.seed_spectrum, windowed_spectra(structure_field(small_moving)))
     # Where the user knows a candidate to some px, a peak a period away is another place.
     within_px = max(_SAME_PEAK_PX, pair.reach_px * max(scale)) if kind == "user" else np.inf
-    return find_peak(surface, apart_px=max(size) // 16, within_px=within_px)
+    return find_peak(surface, exclusion_px=max(size) // 16, max_shift_px=within_px)

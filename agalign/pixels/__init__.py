@@ -1,1 +1,1 @@
-"""Pixels: read from files, masked, calibrated, resampled, and the structure that is blind to contrast."""
+"""Pixels: reading, masks, calibration, resampling, structure images, detection of panels, sky and glint."""

@@ -1,5 +1,5 @@
-"""SIFT landmarks of two images and their homography, for images that are rotated, scaled or far apart (Lowe 2004;
-square root of the descriptors: Arandjelovic & Zisserman 2012).
+"""SIFT matching of two images with a rotation, a scale or a large offset (Lowe 2004), with the RootSIFT descriptor
+(Arandjelovic & Zisserman 2012).
 """
 
 from dataclasses import dataclass
@@ -20,22 +20,24 @@ from agalign.values.lens import Lens
 
 LandmarkInput = Literal["edges", "image"]
 LANDMARK_INPUTS: tuple[LandmarkInput, ...] = ("edges", "image")
-"""What is looked at: the strength of the edges, which a reversed contrast leaves as it is, or the image itself."""
+"""What keypoints are detected in: the gradient magnitude, which does not depend on the sign of contrast, or the
+image."""
 
 _LONGEST_SIDE_PX = 640
-"""Larger images are reduced to this: a seed need not be exact."""
-_MOST = 3000
-_RATIO = 0.9
-"""Nearest over second nearest distance, from which a match is ambiguous."""
-_WITHIN_PX = 3.0
-_MIN_AGREED = 10
-"""Unrelated images reach 8."""
-_EDGES_SMOOTHED_PX, _BESIDE_INVALID_PX = 1.0, 7
+"""Larger images are reduced to this; the accuracy suffices for a seed."""
+_MAX_KEYPOINTS = 3000
+_MAX_RATIO = 0.9
+"""Maximum ratio of the distances of the nearest and second nearest descriptor (Lowe's ratio test)."""
+_INLIER_PX = 3.0
+_MIN_INLIERS = 10
+"""Unrelated images have up to 8."""
+_SMOOTHING_PX = 1.0
+_INVALID_MARGIN_PX = 7
 
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Where they are and what they look like."""
+    """Keypoints of an image and their descriptors."""
 
     xy: Points
     """(n, 2) px of the image."""
@@ -43,47 +45,51 @@ class Landmarks:
     """(n, 128), of length 1."""
 
     def undistorted(self, model: Lens | None) -> "Landmarks":
-        """The same in the pixels of a camera without the lens's distortion."""
+        """Return the landmarks in undistorted px."""
         return Landmarks(lens.undistort(model, self.xy), self.descriptors)
 
 
 def landmarks(raster: Raster, view: LandmarkInput) -> Landmarks:
-    """The strongest ones of an image, whatever its channels."""
+    """Detect the strongest landmarks in the mean of an image's channels."""
     width, height = raster.size_px
     scale = min(1.0, _LONGEST_SIDE_PX / max(width, height))
     small = shrink(channel_mean(raster), (max(8, round(width * scale)), max(8, round(height * scale))))
-    looked_at, valid = small.pixels, small.valid
+    image, valid = small.pixels, small.valid
     if view == "edges":
-        smooth = cv2.GaussianBlur(np.where(valid, looked_at, 0).astype(np.float32), (0, 0), _EDGES_SMOOTHED_PX)
-        looked_at = np.sqrt(gradient_magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))))
-        margin = np.ones((_BESIDE_INVALID_PX, _BESIDE_INVALID_PX), np.uint8)
+        smooth = cv2.GaussianBlur(np.where(valid, image, 0).astype(np.float32), (0, 0), _SMOOTHING_PX)
+        image = np.sqrt(gradient_magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))))
+        margin = np.ones((_INVALID_MARGIN_PX, _INVALID_MARGIN_PX), np.uint8)
         valid = cv2.erode(valid.astype(np.uint8), margin, borderValue=1) > 0
-    result, described = cv2.SIFT.create(nfeatures=_MOST).detectAndCompute(eight_bit(looked_at, valid), valid.view("u1"))
-    if described is None:
+    sift = cv2.SIFT.create(nfeatures=_MAX_KEYPOINTS)
+    keypoints, descriptors = sift.detectAndCompute(eight_bit(image, valid), valid.view("u1"))
+    if descriptors is None:
         return Landmarks(np.empty((0, 2)), np.empty((0, 128), np.float32))
-    there = np.array([k.pt for k in result], np.float64)
-    up = width / small.size_px[0], height / small.size_px[1]
-    root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-12))
-    return Landmarks((there + 0.5) * up - 0.5, np.asarray(root, np.float32))
+    xy = np.array([k.pt for k in keypoints], np.float64)
+    enlargement = width / small.size_px[0], height / small.size_px[1]
+    root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
+    return Landmarks((xy + 0.5) * enlargement - 0.5, np.asarray(root, np.float32))
 
 
-def agreed_homography(fixed: Landmarks, moving: Landmarks, size_px: tuple[int, int]) -> Matrix | None:
-    """fixed_to_moving that ten or more unambiguous matches agree on, for a fixed image (width, height), or None."""
-    if min(len(fixed.xy), len(moving.xy)) < _MIN_AGREED:
+def matched_homography(fixed: Landmarks, moving: Landmarks, size_px: tuple[int, int]) -> Matrix | None:
+    """Return fixed_to_moving from mutual nearest neighbours that pass the ratio test; None with too few inliers.
+
+    `size_px` is (width, height) of the fixed image.
+    """
+    if min(len(fixed.xy), len(moving.xy)) < _MIN_INLIERS:
         return None
-    alike = fixed.descriptors @ moving.descriptors.T
-    best, back = alike.argmax(axis=1), alike.argmax(axis=0)
-    second, first = np.sqrt(np.maximum(2 - 2 * np.partition(alike, -2, axis=1)[:, -2:], 0)).T
-    rows = np.flatnonzero((first < _RATIO * second) & (back[best] == np.arange(len(best))))
-    if len(rows) < _MIN_AGREED:
+    similarity = fixed.descriptors @ moving.descriptors.T
+    forward, backward = similarity.argmax(axis=1), similarity.argmax(axis=0)
+    second, first = np.sqrt(np.maximum(2 - 2 * np.partition(similarity, -2, axis=1)[:, -2:], 0)).T
+    rows = np.flatnonzero((first < _MAX_RATIO * second) & (backward[forward] == np.arange(len(forward))))
+    if len(rows) < _MIN_INLIERS:
         return None
-    within_px = _WITHIN_PX * max(1.0, max(size_px) / _LONGEST_SIDE_PX)
-    result, agrees = cv2.findHomography(
-        fixed.xy[rows], moving.xy[best[rows]], cv2.USAC_MAGSAC, within_px, maxIters=20_000, confidence=0.9999
+    inlier_px = _INLIER_PX * max(1.0, max(size_px) / _LONGEST_SIDE_PX)
+    matrix, inliers = cv2.findHomography(
+        fixed.xy[rows], moving.xy[forward[rows]], cv2.USAC_MAGSAC, inlier_px, maxIters=20_000, confidence=0.9999
     )
-    if result is None or int(agrees.sum()) < _MIN_AGREED:
+    if matrix is None or int(inliers.sum()) < _MIN_INLIERS:
         return None
     try:
-        return geometry.normalised(result)
+        return geometry.normalised(matrix)
     except GeometryError:
         return None

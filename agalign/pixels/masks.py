@@ -1,4 +1,4 @@
-"""Which pixels can be trusted."""
+"""Masks of valid pixels: nodata, fill values, saturation."""
 
 import cv2
 import numpy as np
@@ -8,46 +8,47 @@ from agalign.errors import InputError
 from agalign.values.image import Mask, Raster
 
 _MIN_SIDE_PX = 48
-"""Smaller images hold too few patches to learn from."""
+"""Smaller images contain too few patches for learning."""
 _MAX_CHANNELS = 16
 """Distinguishes (H, W, C) from (C, H, W): images have more rows than this."""
 _MAX_SENSOR_BYTES = 2
-"""Sensors count in 8 or 16 bits; the largest value of a wider type is not saturation."""
-_USUAL_FILLS = (-9999.0, -99999.0, -32767.0, -32768.0)
-_LARGEST_MEASURED = 1e15
-"""No sensor's unit reaches this; the fills of netCDF, GIS and C programs (1e20, 9.97e36, 3.4e38) do."""
+"""Sensors deliver 8 or 16 bits; the maximum of a wider type is not saturation."""
+_COMMON_FILL_VALUES = (-9999.0, -99999.0, -32767.0, -32768.0)
+_MAX_MEASURED = 1e15
+"""Above the values of any sensor, below the fill values of netCDF, GIS and C programs (1e20, 9.97e36, 3.4e38)."""
 _MIN_FILL_SHARE = 0.002
-"""A constant patch at the border smaller than this share of the image is content, not fill."""
+"""A constant area at the border is fill if it covers at least this share of the image."""
 _MIN_SATURATED_PX = 7
-"""Saturated spots narrower than this are content: half a patch still shows their surroundings."""
+"""Minimum width of a masked saturated area: patches around smaller ones contain enough of their surroundings."""
 
 
 def data_mask(pixels: NDArray[np.generic], nodata: float | None) -> Mask:
-    """(height, width), False where the pixels are nodata or not finite, and where they are what programs fill gaps of
-    floats with, if nothing is declared.
+    """Return (height, width) False where pixels are nodata or not finite.
+
+    Without a declared nodata value, common fill values of floating-point images are also False.
     """
     valid: Mask = np.isfinite(pixels) if pixels.dtype.kind == "f" else np.ones(pixels.shape, dtype=bool)
     if nodata is not None and np.isfinite(nodata):
         valid &= pixels != nodata
     if nodata is None and pixels.dtype.kind == "f":
-        valid &= (np.abs(pixels) < _LARGEST_MEASURED) & ~np.isin(pixels, _USUAL_FILLS)
+        valid &= (np.abs(pixels) < _MAX_MEASURED) & ~np.isin(pixels, _COMMON_FILL_VALUES)
     return valid
 
 
 def undeclared_fill(pixels: ArrayLike) -> Mask:
-    """(height, width), True where zeros (or the type's largest value) run in from the image's border.
+    """Return (height, width) True in constant areas, 0 or the type's maximum, that touch the image border.
 
-    Images that were warped before are filled this way, usually without metadata about it.
+    Warped images are often filled so without a nodata tag.
     """
     values = np.asarray(pixels)
     fill = np.zeros(values.shape, dtype=bool)
     constants = [0] if values.dtype.kind in "fb" else [0, np.iinfo(values.dtype).max]
     for constant in constants:
-        same = (values == constant).astype(np.uint8)
-        edge = np.concatenate([same[0], same[-1], same[:, 0], same[:, -1]])
-        if not edge.any():
+        equal = (values == constant).astype(np.uint8)
+        border = np.concatenate([equal[0], equal[-1], equal[:, 0], equal[:, -1]])
+        if not border.any():
             continue
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(same, connectivity=4)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(equal, connectivity=4)
         touching = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
         large = [k for k in touching if k and stats[k, cv2.CC_STAT_AREA] >= _MIN_FILL_SHARE * values.size]
         fill |= np.isin(labels, large)
@@ -55,9 +56,9 @@ def undeclared_fill(pixels: ArrayLike) -> Mask:
 
 
 def learnable(valid: Mask, pixels: ArrayLike, saturation_value: float | None) -> Mask:
-    """The valid pixels with a usable value: not in a saturated area, and not next to one.
+    """Return the valid pixels outside of saturated areas and their direct neighbours.
 
-    Glints narrower than an area's least width stay: their outlines are structure like any other.
+    Saturated spots narrower than _MIN_SATURATED_PX, such as glint, are kept.
     """
     if saturation_value is None:
         return valid
@@ -65,17 +66,19 @@ def learnable(valid: Mask, pixels: ArrayLike, saturation_value: float | None) ->
     if not saturated.any():
         return valid
     areas = cv2.morphologyEx(saturated, cv2.MORPH_OPEN, np.ones((_MIN_SATURATED_PX,) * 2, np.uint8))
-    grown = cv2.dilate(areas, np.ones((3, 3), np.uint8)) > 0
-    return np.asarray(valid & ~grown)
+    dilated = cv2.dilate(areas, np.ones((3, 3), np.uint8)) > 0
+    return np.asarray(valid & ~dilated)
 
 
 def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
-    """An array (H, W), (H, W, C) or (C, H, W) as the estimation sees it: without constant fill at its border, and for
-    integers without saturated areas. Raises InputError, with `name`, if it is not an image.
+    """Convert an array (H, W), (H, W, C) or (C, H, W) to a raster.
+
+    Constant fill at the border is masked, and saturated areas of 8 and 16 bit integers. Raises InputError, with `name`,
+    if the array is not an image or `valid` has another shape.
     """
     planes = _planes(np.asarray(image), name)
-    measured = planes.dtype.kind in "ui" and planes.dtype.itemsize <= _MAX_SENSOR_BYTES
-    saturation = float(np.iinfo(str(planes.dtype)).max) if measured else None
+    is_sensor_type = planes.dtype.kind in "ui" and planes.dtype.itemsize <= _MAX_SENSOR_BYTES
+    saturation = float(np.iinfo(str(planes.dtype)).max) if is_sensor_type else None
     mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
     if mask.shape != planes.shape[1:]:
         raise InputError(f"{name}_valid is {mask.shape}, the image {planes.shape[1:]}")
@@ -89,7 +92,7 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
 
 
 def _planes(array: NDArray[np.generic], name: str) -> NDArray[np.generic]:
-    """(C, H, W) from (H, W), (H, W, C) or (C, H, W). Raises InputError, with `name`, if the array is not an image."""
+    """Convert (H, W), (H, W, C) or (C, H, W) to (C, H, W). Raises InputError, with `name`, for any other array."""
     if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
         raise InputError(
             f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"

@@ -1,12 +1,11 @@
-"""From raw numbers to radiance and reflectance, as the cameras' makers document it.
+"""Conversion of raw values to radiance and reflectance, as documented by the camera makers.
 
     signal = (raw - black) / full_scale * vignetting(r) / (1 + gradient y)
     value = gain * signal
 
-y is the row and r the distance from the vignetting's centre, px of the band's own file. Vignetting multiplies by
-1 / (1 + k1 r + ... + k6 r^6) with MicaSense and by 1 + k1 r + ... + k6 r^6 with DJI. Reflectance is radiance times
-the irradiance of the light sensor, or times the factor from a panel of known reflectance. Temperatures are temperatures
-whatever is chosen.
+y is the row and r the distance from the vignetting centre, px of the band's own file. The vignetting correction is
+1 / (1 + k1 r + ... + k6 r^6) for MicaSense and 1 + k1 r + ... + k6 r^6 for DJI. Reflectance is radiance times a factor
+from the light sensor or from a panel of known reflectance. Thermal bands are not converted.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,15 +19,17 @@ from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage
 
 _MAX_FALLOFF = 1000.0
+"""Maximum correction of the vignetting and the row gradient."""
 _MAX_LOG_FALLOFF = np.log(_MAX_FALLOFF)
 _MAX_RAW = 65535.0
 _MAX_VALUE = 1e12
-"""Float32 holds more; no light does."""
+"""Above any radiance or reflectance."""
 
 
 def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
-    """True where a calibration is one that an image of (width, height) can have: finite, of a gain above nothing, and
-    darkening neither its corners nor its last row beyond a thousandfold. Damaged tags give others.
+    """Return True if a calibration is plausible for an image of (width, height); damaged tags are not.
+
+    It is finite, its gain is positive, and the corrections of the corners and of the last row are below _MAX_FALLOFF.
     """
     factor, _ = radiometry.by_sun or (1.0, None)
     numbers = (
@@ -42,32 +43,31 @@ def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
     r = np.linspace(0.0, max(np.hypot(x - cx, y - cy) for x in (0, width) for y in (0, height)), 32)
     with np.errstate(over="ignore", invalid="ignore"):
         falloff = np.polynomial.polynomial.polyval(r, (1.0, *radiometry.vignetting))
-        along = 1.0 + radiometry.row_gradient * np.array([0.0, height])
-        largest = radiometry.gain / radiometry.full_scale * factor * _MAX_RAW
+        by_row = 1.0 + radiometry.row_gradient * np.array([0.0, height])
+        max_value = radiometry.gain / radiometry.full_scale * factor * _MAX_RAW
     return bool(
         (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < _MAX_LOG_FALLOFF).all()
-        and (along > 1 / _MAX_FALLOFF).all() and largest < _MAX_VALUE
+        and (by_row > 1 / _MAX_FALLOFF).all() and max_value < _MAX_VALUE
     )  # fmt: skip
 
 
 def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, float]) -> Capture:
-    """The capture with the conversion of each band's numbers to the chosen quantity; None where it is not available.
+    """Return the capture with the conversion of each band to the chosen quantity; None if it is not available.
 
-    `by_panel` has the factor from radiance to reflectance for each band that a panel was measured in. `auto` is by
-    panel if available for all bands, else by light sensor, else by the camera's calibration; a colour photograph does
-    not count.
+    `by_panel` has the reflectance per radiance of each band that was measured on a panel. `auto` is by panel if
+    available for all bands, else by light sensor, else by the camera's calibration; RGB companions are ignored.
     """
     if choice == "off":
         return capture
-    in_turn: Sequence[RadiometryChoice] = ("panel", "sun", "camera") if choice == "auto" else (choice,)
-    for one in in_turn:
-        result = {b.name: _chosen(b.radiometry, one, by_panel.get(b.name)) for b in capture.bands}
+    candidates: Sequence[RadiometryChoice] = ("panel", "sun", "camera") if choice == "auto" else (choice,)
+    for candidate in candidates:
+        result = {b.name: _converted(b.radiometry, candidate, by_panel.get(b.name)) for b in capture.bands}
         if all(result[b.name] is not None for b in capture.bands if not b.companion):
             break
     return replace(capture, bands=tuple(replace(b, radiometry=result[b.name]) for b in capture.bands))
 
 
-def _chosen(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: float | None) -> Radiometry | None:
+def _converted(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: float | None) -> Radiometry | None:
     if of_camera is None or not of_camera.is_of_light or choice == "camera":
         return of_camera
     if choice == "sun":
@@ -76,7 +76,7 @@ def _chosen(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: fl
 
 
 def to_reflectance(radiometry: Radiometry) -> Radiometry | None:
-    """What gives reflectance: the radiometry itself where it does, else with the light sensor; None for neither."""
+    """Return the conversion to reflectance: `radiometry` if it is one, else with the light sensor, else None."""
     if radiometry.quantity in ("reflectance", "relative reflectance"):
         return radiometry
     if not radiometry.is_of_light or radiometry.by_sun is None:
@@ -89,7 +89,7 @@ def _reflectance(radiance: Radiometry, factor: float, quantity: Quantity, source
 
 
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:
-    """(H, W) float32 of raw pixels; the top left one is (x0, y0) of the file."""
+    """Calibrate raw pixels (H, W) to float32; the top left pixel is (x0, y0) of the file."""
     height, width = pixels.shape
     x, y = np.arange(x0, x0 + width, dtype=np.float64), np.arange(y0, y0 + height, dtype=np.float64)
     signal = (pixels.astype(np.float64) - radiometry.black_level) * (radiometry.gain / radiometry.full_scale)

@@ -1,4 +1,4 @@
-"""Reading rasters: what a file holds, its pixels at any resolution, and its validity."""
+"""Reading of rasters: metadata, pixels at any resolution, and validity masks."""
 
 import math
 import stat
@@ -29,32 +29,31 @@ from agalign.values.pixel_units import PixelScale
 
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 _READ_WHOLE_PX = 1 << 26
-"""Images up to this are decoded as a whole before they are averaged: 128 MB in 16 bits."""
+"""Images up to this size are decoded completely before averaging: 128 MB in 16 bits."""
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 PNG_SUFFIXES = frozenset({".png"})
 PICTURE_SUFFIXES = JPEG_SUFFIXES | PNG_SUFFIXES
-"""Photographs, or bands that a program has exported, most often in 8 bits."""
+"""Photographs, or bands exported by other software, mostly in 8 bits."""
 _BLOCK_CACHE_BYTES = 256 * 2**20
-"""rasterio takes an integer as bytes. GDAL's default is 5 % of the machine's memory, which every worker would take."""
+"""Limit of GDAL's block cache per worker; the default is 5 % of the machine's memory. rasterio reads it as bytes."""
 GDAL_ENVIRONMENT = {
     "GDAL_PAM_ENABLED": "NO", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_NUM_THREADS": "ALL_CPUS",
     "GDAL_CACHEMAX": _BLOCK_CACHE_BYTES,
 }  # fmt: skip
-"""GDAL neither writes files next to the user's nor reads any as part of an image: x.tif.ovr may hold anything, such as
-a description of other files or of a server.
+"""GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
+description that refers to other files or to a server.
 """
 _DRIVERS = {
     b"II*\0": "GTiff", b"MM\0*": "GTiff", b"II+\0": "GTiff", b"MM\0+": "GTiff", b"\xff\xd8\xff": "JPEG",
     b"\x89PNG": "PNG",
 }  # fmt: skip
-"""By the first bytes of a file: of GDAL's other drivers some execute code or contact servers, whatever the file's name.
-"""
+"""GDAL drivers by the first bytes of a file. Some of the other drivers execute code or contact servers."""
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
 _PREVIEW_SIDE_PX = 2048
-"""Default for the longest side of a preview: more than a page shows."""
+"""Default longest side of a preview; larger than it is displayed."""
 _MAX_MICROMETRES = 20.0
-"""Wavelengths below this without a unit are in micrometres: thermal bands end at 14 um, and none is below 100 nm."""
+"""Wavelengths without a unit are in micrometres below this: thermal bands end at 14 um, and none is below 100 nm."""
 
 
 @dataclass(frozen=True)
@@ -68,25 +67,25 @@ class RasterInfo:
     descriptions: tuple[str | None, ...]
     wavelengths_nm: tuple[float | None, ...]
     alpha_index: int | None
-    """Index from 1 of an alpha band, which does not show the scene."""
+    """Index from 1 of an alpha band."""
     georeference: Georeference | None
     has_mask: bool = False
     scales_offsets: tuple[tuple[float, float], ...] = ()
-    """A pair per band, or empty."""
+    """(scale, offset) of each band, or empty."""
     overviews: tuple[int, ...] = ()
 
     @property
     def band_indexes(self) -> tuple[int, ...]:
-        """Indexes from 1 of the bands that show the scene: all but the alpha band."""
+        """Indexes from 1 of all bands except the alpha band."""
         return tuple(i for i in range(1, len(self.dtypes) + 1) if i != self.alpha_index)
 
 
 @contextmanager
 def without_warnings() -> Iterator[None]:
-    """Silence rasterio's warning about images without a georeference: drone images have none.
+    """Suppress rasterio's warning about images without a georeference, which drone images do not have.
 
-    Warning filters belong to the process. Code that reads in several threads needs one more of these around all of
-    them, so that no thread restores a filter that another still needs.
+    Warning filters apply to the whole process. Code that reads in several threads needs this context around all of
+    them, so that no thread restores the filter while another one reads.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -94,14 +93,14 @@ def without_warnings() -> Iterator[None]:
 
 
 OpenRaster = rasterio.DatasetReader
-"""A file as `open_raster` gives it."""
+"""A file that `open_raster` has opened."""
 
 
 @contextmanager
 def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """A rasterio dataset of a TIFF, JPEG or PNG for reading; rows of a south-up map are reversed, as is its transform.
+    """Open a TIFF, JPEG or PNG for reading; south-up maps are flipped to north-up.
 
-    Raises UnreadableFileError, naming the file, where it is neither or GDAL cannot read it.
+    Raises UnreadableFileError for other files and those that GDAL cannot read.
     """
     driver = _driver_of(path)
     try:
@@ -117,7 +116,7 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
     except UnicodeEncodeError:
         raise UnreadableFileError(f"{path}: its name is not in this system's letters; set LC_ALL=C.UTF-8") from None
     except Exception as error:
-        # rasterio raises some of GDAL's errors as classes that are not public.
+        # Some classes of rasterio's errors are not public.
         if not isinstance(error, UnicodeDecodeError) and not type(error).__module__.startswith("rasterio."):
             raise
         text = why(error).replace(str(path), "").strip(" :'")
@@ -125,49 +124,51 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
 
 
 def _is_south_up(dataset: rasterio.DatasetReader) -> bool:
-    """True where rows run the other way than in images: a mirror image, which no homography between images is."""
+    """Return True if rows of a map run from south to north: a mirror image, which cannot be aligned as it is."""
     transform = dataset.transform
     return dataset.crs is not None and not transform.is_identity and transform.determinant > 0
 
 
 def why(error: BaseException) -> str:
-    """The first line of GDAL's message, which is the innermost cause; rasterio's own message is generic."""
+    """Return the first line of the innermost cause, GDAL's message; rasterio's own message is generic."""
     while error.__cause__ is not None:
         error = error.__cause__
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _driver_of(path: Path) -> str:
-    """The GDAL driver of a file by its first bytes. Raises UnreadableFileError where the path is not a file, cannot be
-    read, or is not a TIFF, JPEG or PNG.
+    """Return the GDAL driver of a file from its first bytes.
+
+    Raises UnreadableFileError if it is not a regular file, cannot be read, or is not a TIFF, JPEG or PNG.
     """
     try:
-        # Opening something else, such as a pipe, would wait forever.
+        # Opening a pipe would block.
         if not stat.S_ISREG(path.stat().st_mode):
             raise UnreadableFileError(f"{path}: is not a regular file; remove it from the folder")
         with path.open("rb") as file:
-            head = file.read(4)
+            magic = file.read(4)
     except FileNotFoundError:
         raise UnreadableFileError(f"{path}: does not exist") from None
     except (OSError, ValueError) as error:
         text = getattr(error, "strerror", None) or error
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
-    for magic, driver in _DRIVERS.items():
-        if head.startswith(magic):
+    for prefix, driver in _DRIVERS.items():
+        if magic.startswith(prefix):
             return driver
-    what = "is empty" if not head else "is not a TIFF, JPEG or PNG"
-    raise UnreadableFileError(f"{path}: {what}; copy it from the card again")
+    problem = "is empty" if not magic else "is not a TIFF, JPEG or PNG"
+    raise UnreadableFileError(f"{path}: {problem}; copy it from the card again")
 
 
 def probe(path: Path, max_pixels: int = MAX_PIXELS) -> RasterInfo:
-    """What a raster file holds, without reading its pixels. Raises UnreadableFileError, also where it declares more
-    than `max_pixels` per band.
+    """Read the metadata of a raster file.
+
+    Raises UnreadableFileError, also for more than `max_pixels` per band.
     """
     try:
         return _probe(path, max_pixels)
     except UnreadableFileError:
         raise
-    except Exception as error:  # a damaged file makes a reader fail in any way
+    except Exception as error:  # damaged files raise errors of many classes
         text = next(iter(str(error).splitlines()), type(error).__name__)
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
 
@@ -194,9 +195,9 @@ def _probe(path: Path, max_pixels: int) -> RasterInfo:
 
 
 def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
-    """A band as float32, averaged down where it is larger than `longest_side_px`, with its learnable pixels.
+    """Read a band as float32, reduced by averaging to at most `longest_side_px`, and its mask.
 
-    Invalid are nodata, masked and saturated pixels and constant fill that runs in from the border.
+    Nodata, masked and saturated pixels and constant areas at the border are invalid. Raises UnreadableFileError.
     """
     reduction = max(1.0, max(band.size_px) / longest_side_px)
     shape = reduced_size_px(band.size_px, reduction)[::-1]
@@ -213,10 +214,10 @@ def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
 
 
 def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]) -> NDArray[np.generic]:
-    """A band averaged down to (height, width)."""
-    plain = band.nodata is None and not band.has_mask and np.dtype(band.dtype).kind == "u"
-    if plain and band.width_px * band.height_px <= _READ_WHOLE_PX:
-        # GDAL's own averaging decodes a photograph many times: seconds per band.
+    """Read a band reduced to `shape` (height, width) by averaging."""
+    all_valid = band.nodata is None and not band.has_mask and np.dtype(band.dtype).kind == "u"
+    if all_valid and band.width_px * band.height_px <= _READ_WHOLE_PX:
+        # GDAL's averaging decodes a JPEG repeatedly, which takes seconds per band.
         return np.asarray(cv2.resize(dataset.read(band.band_index), shape[::-1], interpolation=cv2.INTER_AREA))
     return np.asarray(dataset.read(band.band_index, out_shape=shape, resampling=Resampling.average))
 
@@ -224,7 +225,7 @@ def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]
 def read_window(
     dataset: rasterio.DatasetReader, band: Band, x0: int, y0: int, width: int, height: int
 ) -> tuple[NDArray[np.generic], Mask]:
-    """Pixels of the file's own type and their data mask, both (height, width), of a window inside the image."""
+    """Read a window inside the image: pixels in the type of the file and their mask, each (height, width)."""
     window = Window(x0, y0, width, height)
     pixels = dataset.read(band.band_index, window=window)
     valid = data_mask(pixels, band.nodata)
@@ -234,7 +235,7 @@ def read_window(
 
 
 def read_tile(band: Band, tile: Tile) -> tuple[NDArray[np.generic], Mask]:
-    """Pixels of the file's own type and their data mask, both (height, width), of a tile of a band's own pixels.
+    """Read a tile of a band: pixels in the type of the file and their mask, each (height, width).
 
     Raises UnreadableFileError.
     """
@@ -245,39 +246,43 @@ def read_tile(band: Band, tile: Tile) -> tuple[NDArray[np.generic], Mask]:
 def read_preview(
     path: Path, index: int, window_px: tuple[int, int, int, int], size_px: tuple[int, int] | None = None
 ) -> NDArray[np.float32]:
-    """A window (x0, y0, width, height) of a band as (height, width) float32, perhaps resized; nodata as nan."""
+    """Read a window (x0, y0, width, height) of a band as (height, width) float32 with NaN for nodata.
+
+    It is resampled to `size_px` (width, height), by default to at most _PREVIEW_SIDE_PX. Raises UnreadableFileError.
+    """
     x0, y0, width, height = window_px
     reduction = max(1.0, max(width, height) / _PREVIEW_SIDE_PX)
-    out = size_px or reduced_size_px((width, height), reduction)
+    out_width, out_height = size_px or reduced_size_px((width, height), reduction)
     with open_raster(path) as dataset:
         window = Window(x0, y0, width, height)
-        resampling = Resampling.average if out[0] < width else Resampling.bilinear
-        pixels = dataset.read(index, window=window, out_shape=(out[1], out[0]), resampling=resampling, boundless=False)
+        resampling = Resampling.average if out_width < width else Resampling.bilinear
+        shape = out_height, out_width
+        pixels = dataset.read(index, window=window, out_shape=shape, resampling=resampling, boundless=False)
         nodata = dataset.nodata
     values = pixels.astype(np.float32)
     return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))
 
 
 def gdal_version() -> str:
-    """Of the GDAL that rasterio brings."""
+    """Return the version of rasterio's GDAL."""
     return str(rasterio.__gdal_version__)
 
 
 def crs_code(crs_wkt: str) -> str | None:
-    """Authority and number of a coordinate reference system, such as EPSG:32613; None where it has none."""
+    """Return authority and code of a coordinate reference system, such as EPSG:32613; None without one."""
     authority = rasterio.CRS.from_wkt(crs_wkt).to_authority()
     return None if authority is None else ":".join(authority)
 
 
 def crs_wkt(code: str) -> str:
-    """WKT of a coordinate reference system such as EPSG:32613."""
+    """Return the WKT of a coordinate reference system such as EPSG:32613."""
     return str(rasterio.CRS.from_user_input(code).to_wkt())
 
 
 def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDArray[np.float64]:
-    """(n, 2) map positions, x or longitude first, in another coordinate reference system (WKT or EPSG:number).
+    """Transform map coordinates (n, 2), x or longitude first, to another CRS (WKT or EPSG:number).
 
-    Raises GeometryError where GDAL cannot transform them.
+    Raises GeometryError if GDAL cannot transform them.
     """
     try:
         x, y = warp.transform(
@@ -296,7 +301,7 @@ def _dataset_mask(dataset: rasterio.DatasetReader, index: int, shape: tuple[int,
 
 
 def _georeference(dataset: rasterio.DatasetReader) -> Georeference | None:
-    """None also where the transform is the identity, which files without a georeference have, or is singular."""
+    """Return the georeference; None without one and for an identity or singular transform."""
     if dataset.crs is None or dataset.transform.is_identity:
         return None
     transform = np.array(dataset.transform, float).reshape(3, 3)
@@ -306,7 +311,7 @@ def _georeference(dataset: rasterio.DatasetReader) -> Georeference | None:
 
 
 def _wavelength_nm(tags: dict[str, str]) -> float | None:
-    """A band's wavelength from the tag names in use: ENVI's, GDAL's imagery domain, and ours."""
+    """Return the wavelength of a band from the tags of ENVI, GDAL's IMAGERY domain or agalign."""
     for name in ("wavelength", "WAVELENGTH", "CENTRAL_WAVELENGTH_NM", "central_wavelength_nm"):
         try:
             value = float(tags[name])

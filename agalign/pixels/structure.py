@@ -1,7 +1,7 @@
-"""The structure of an image, blind to contrast: its gradient orientations, and shifts measured on them.
+"""Structure images, which do not depend on the sign of contrast, and phase correlation of them.
 
-The double-angle field z = a ((gx + i gy) / |g|)^2 is the same for an edge and its contrast-reversed twin; a is the
-gradient magnitude, clipped so that a few strong edges do not outvote the rest.
+The double-angle gradient field z = a ((gx + i gy) / |g|)^2 is equal for edges of opposite contrast. The amplitude a is
+the gradient magnitude, clipped so that a few strong edges do not dominate.
 """
 
 from collections.abc import Callable
@@ -17,11 +17,11 @@ from agalign.values.image import FloatImage, Raster
 Field = NDArray[np.complex64]
 
 _AMPLITUDE_QUANTILE = 0.75
-"""Gradients above this quantile of the valid area count alike."""
+"""Quantile of the gradient magnitude in the valid area at which the amplitude is clipped."""
 
 
 def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
-    """Z of a single-band raster, (height, width) complex64 with |z| <= 1, and 0 at and next to invalid pixels."""
+    """Return z of a raster of one channel, (height, width) complex64, |z| <= 1; 0 at and next to invalid pixels."""
     complete = bool(raster.valid.all())
     pixels = raster.pixels if complete else np.where(raster.valid, raster.pixels, np.float32(0))
     smooth = cv2.GaussianBlur(np.asarray(pixels, np.float32), (0, 0), smoothing_px)
@@ -30,8 +30,8 @@ def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
     gx, gy = (cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1)))
     magnitude = gradient_magnitude(gx, gy)
     inside = cv2.erode(raster.valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    some = magnitude[::3, ::3][inside[::3, ::3]]
-    ceiling = float(np.quantile(some, _AMPLITUDE_QUANTILE)) if some.size else 0.0
+    sample = magnitude[::3, ::3][inside[::3, ::3]]
+    ceiling = float(np.quantile(sample, _AMPLITUDE_QUANTILE)) if sample.size else 0.0
     if ceiling <= 0:
         return np.zeros(raster.valid.shape, np.complex64)
     # a ((gx + i gy) / |g|)^2 with a = min(|g| / ceiling, 1)
@@ -47,8 +47,9 @@ def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
 
 
 def gradient_magnitude(gx: FloatImage, gy: FloatImage) -> FloatImage:
-    """(height, width). OpenCV's depends in its last digit on where in memory its arrays lie, and with it all results
-    would.
+    """Return sqrt(gx^2 + gy^2), (height, width).
+
+    The last digit of cv2.magnitude depends on the memory alignment of its arrays; this result is reproducible.
     """
     square = gx * gx
     square += gy * gy
@@ -57,29 +58,29 @@ def gradient_magnitude(gx: FloatImage, gy: FloatImage) -> FloatImage:
 
 @dataclass(frozen=True)
 class Peak:
-    """A shift between two structure fields."""
+    """The peak of a correlation surface; heights are above its mean, in its standard deviations."""
 
     shift_px: tuple[float, float]
     """(dx, dy): p in the first field corresponds to p + shift in the second."""
     sigma: float
-    """Height above the surface's mean, in standard deviations of the surface."""
+    """Height of the peak."""
     runner_up_sigma: float
-    """The same for the highest value away from the peak."""
+    """Maximum height outside the neighbourhood of the peak."""
     sigma_at_zero: float
-    """The same at no shift."""
+    """Height at zero shift."""
 
 
 def correlation_surface(fixed: Field, moving: Field) -> NDArray[np.float32]:
-    """Circular correlation of two windowed fields (height, width); index [dy, dx] is the shift.
+    """Return the circular correlation of two fields (height, width) under a Hann window; index [dy, dx] is the shift.
 
-    Half whitened: the square root of the cross spectrum's magnitude is divided away, between a plain correlation
-    (nothing) and phase correlation (all of it).
+    The cross spectrum is divided by the square root of its magnitude: half-way between cross correlation (not divided)
+    and phase correlation (divided by the magnitude).
     """
     return correlation_surfaces(windowed_spectra(fixed), windowed_spectra(moving))
 
 
 def windowed_spectra(fields: Field) -> Field:
-    """Fourier transform of fields (..., height, width) under a Hann window."""
+    """Return the Fourier transform of fields (..., height, width) under a Hann window."""
     height, width = fields.shape[-2:]
     return _each_plane(cv2.dft, fields * _hann_window(height, width))
 
@@ -90,12 +91,12 @@ def _hann_window(height: int, width: int) -> FloatImage:
 
 
 def inverse_transform(spectra: Field) -> Field:
-    """Inverse Fourier transform of spectra (..., height, width)."""
+    """Return the inverse Fourier transform of spectra (..., height, width)."""
     return _each_plane(lambda plane: cv2.idft(plane, flags=cv2.DFT_SCALE), spectra)
 
 
 def _each_plane(transform: Callable[[FloatImage], FloatImage], fields: Field) -> Field:
-    """OpenCV's Fourier transform, 2 to 3 times as fast as SciPy's, of each plane of fields (..., height, width)."""
+    """Apply a Fourier transform of OpenCV, 2 to 3 times faster than SciPy's, to each plane (..., height, width)."""
     height, width = fields.shape[-2:]
     planes = np.ascontiguousarray(fields).view(np.float32).reshape(-1, height, width, 2)
     result = np.empty_like(planes)
@@ -105,85 +106,87 @@ def _each_plane(transform: Callable[[FloatImage], FloatImage], fields: Field) ->
 
 
 def correlation_surfaces(fixed: Field, moving: Field) -> NDArray[np.float32]:
-    """`correlation_surface` of fields given by their `windowed_spectra`, (..., height, width)."""
+    """Return the `correlation_surface` of each pair of `windowed_spectra`, (..., height, width)."""
     return np.asarray(inverse_transform(whitened_cross_spectra(fixed, moving)).real)
 
 
 def whitened_cross_spectra(fixed: Field, moving: Field) -> Field:
-    """The cross spectrum; `correlation_surfaces` are its inverse transform."""
+    """Return the cross spectra divided by the square root of their magnitude, (..., height, width)."""
     cross = np.conj(fixed)
     cross *= moving
     power = cross.real**2 + cross.imag**2
     floor = np.maximum(power.max(axis=(-2, -1), keepdims=True) * 1e-18, 1e-30)
-    # The fourth root as two square roots, far quicker than a power, and a product, far quicker than a division.
+    # Two square roots and a product are much faster than a power and a division.
     cross *= 1 / np.sqrt(np.sqrt(np.maximum(power, floor)))
     return cross
 
 
 def peak_positions(cross: Field, near_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The highest points (n, 2) of the surfaces of cross spectra (n, height, width), each near the given one.
+    """Return the subpixel peak positions (n, 2) of the surfaces of cross spectra (n, height, width), near `near_px`.
 
-    A surface is a trigonometric polynomial, evaluated between its samples on finer and finer lattices of 3 x 3: a
-    paraboloid through the samples themselves takes a shift of a fifth of a px for an eighth.
+    The surfaces are trigonometric polynomials, which are evaluated at 3 x 3 points with decreasing spacing. A
+    paraboloid through the samples themselves is less accurate: it returns 0.125 px for a shift of 0.2 px.
     """
     height, width = cross.shape[-2:]
     result = near_px.copy()
     offset = np.array([-1.0, 0.0, 1.0])
-    for step in _LATTICE_STEPS_PX:
-        at_x, at_y = (result[:, axis, None] + step * offset for axis in (0, 1))
-        rows = _waves(at_y, height) @ cross
-        patches = (rows @ _waves(at_x, width).transpose(0, 2, 1)).real
+    for step in _REFINEMENT_STEPS_PX:
+        x, y = (result[:, axis, None] + step * offset for axis in (0, 1))
+        rows = _fourier_basis(y, height) @ cross
+        patches = (rows @ _fourier_basis(x, width).transpose(0, 2, 1)).real
         result += step * paraboloid_peaks(patches.astype(np.float64))
     return result
 
 
-_LATTICE_STEPS_PX = (0.5, 0.25)
+_REFINEMENT_STEPS_PX = (0.5, 0.25)
 
 
-def _waves(at_px: NDArray[np.float64], length: int) -> Field:
-    """(n, m, length): the waves of an inverse transform at m places each."""
+def _fourier_basis(positions_px: NDArray[np.float64], length: int) -> Field:
+    """Return the basis of an inverse transform at positions (n, m), (n, m, length)."""
     frequencies = np.fft.fftfreq(length)
-    return np.asarray(np.exp(2j * np.pi * at_px[..., None] * frequencies), np.complex64)
+    return np.asarray(np.exp(2j * np.pi * positions_px[..., None] * frequencies), np.complex64)
 
 
 def paraboloid_peaks(patches: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 2): (x, y) of the tops of the quadratic surfaces fitted to (n, 3, 3) samples, each within one of the centre;
-    0 where a surface has none.
+    """Return (n, 2) (x, y) of the maxima of quadratic surfaces fitted to (n, 3, 3) samples, relative to the centre.
+
+    They are clipped to [-1, 1], and 0 for a surface without a maximum.
     """
-    offset, curve = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -2.0, 1.0])
-    slope_x, slope_y = (patches @ offset).sum(axis=1) / 6, (offset @ patches).sum(axis=1) / 6
-    xx, yy = (patches @ curve).sum(axis=1) / 3, (curve @ patches).sum(axis=1) / 3
+    first, second = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -2.0, 1.0])
+    slope_x, slope_y = (patches @ first).sum(axis=1) / 6, (first @ patches).sum(axis=1) / 6
+    xx, yy = (patches @ second).sum(axis=1) / 3, (second @ patches).sum(axis=1) / 3
     xy = (patches[:, 0, 0] + patches[:, 2, 2] - patches[:, 0, 2] - patches[:, 2, 0]) / 4
     determinant = xx * yy - xy * xy
-    has_top = (xx < 0) & (determinant > 0)
-    divisor = np.where(has_top, determinant, 1.0)
-    top = np.stack([xy * slope_y - yy * slope_x, xy * slope_x - xx * slope_y], axis=1) / divisor[:, None]
-    return np.asarray(np.clip(np.where(has_top[:, None], top, 0.0), -1, 1))
+    has_maximum = (xx < 0) & (determinant > 0)
+    divisor = np.where(has_maximum, determinant, 1.0)
+    maximum = np.stack([xy * slope_y - yy * slope_x, xy * slope_x - xx * slope_y], axis=1) / divisor[:, None]
+    return np.asarray(np.clip(np.where(has_maximum[:, None], maximum, 0.0), -1, 1))
 
 
-def find_peak(surface: NDArray[np.float32], apart_px: int, within_px: float = np.inf) -> Peak:
-    """The highest point of a correlation surface (height, width), to a fraction of a pixel.
+def find_peak(surface: NDArray[np.float32], exclusion_px: int, max_shift_px: float = np.inf) -> Peak:
+    """Return the subpixel peak of a correlation surface (height, width) with a shift of at most `max_shift_px`.
 
-    `apart_px` is how far away the runner-up must lie, `within_px` how far from no shift the highest point may.
+    `exclusion_px` is half the side of the square around the peak that is excluded from the search for the runner-up.
     """
     height, width = surface.shape
-    spread = float(surface.std())
-    if spread <= 0:
+    std = float(surface.std())
+    if std <= 0:
         return Peak((0.0, 0.0), 0.0, 0.0, 0.0)
-    z = np.fft.fftshift((surface - surface.mean()) / spread)
+    z = np.fft.fftshift((surface - surface.mean()) / std)
     zero_row, zero_column = height // 2, width // 2
-    far = np.hypot(*np.ogrid[-zero_row : height - zero_row, -zero_column : width - zero_column]) > within_px
-    row, column = np.unravel_index(int(np.where(far, -np.inf, z).argmax()), z.shape)
+    shift_px = np.hypot(*np.ogrid[-zero_row : height - zero_row, -zero_column : width - zero_column])
+    row, column = np.unravel_index(int(np.where(shift_px > max_shift_px, -np.inf, z).argmax()), z.shape)
     dx = column - zero_column + _vertex(z[row, (column - 1) % width], z[row, column], z[row, (column + 1) % width])
     dy = row - zero_row + _vertex(z[(row - 1) % height, column], z[row, column], z[(row + 1) % height, column])
     sigma = float(z[row, column])
     at_zero = float(z[zero_row, zero_column])
-    z[max(0, row - apart_px) : row + apart_px + 1, max(0, column - apart_px) : column + apart_px + 1] = -np.inf
+    rows, columns = (slice(max(0, i - exclusion_px), i + exclusion_px + 1) for i in (int(row), int(column)))
+    z[rows, columns] = -np.inf
     runner_up = float(z.max())
     return Peak((float(dx), float(dy)), sigma, runner_up if np.isfinite(runner_up) else 0.0, at_zero)
 
 
-def _vertex(before: float, at: float, after: float) -> float:
-    """Offset of the top of the parabola through three samples a pixel apart, in [-0.5, 0.5]."""
-    curvature = before - 2 * at + after
-    return 0.0 if curvature >= 0 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
+def _vertex(left: float, centre: float, right: float) -> float:
+    """Return the offset of the maximum of the parabola through three samples 1 px apart, in [-0.5, 0.5]."""
+    curvature = left - 2 * centre + right
+    return 0.0 if curvature >= 0 else float(np.clip(0.5 * (left - right) / curvature, -0.5, 0.5))

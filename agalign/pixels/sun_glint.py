@@ -1,10 +1,10 @@
-"""Sun glint on water.
+"""Detection of sun glint on water.
 
-Water absorbs near infrared light, so what a pixel of water has above the darkest water around is light that the surface
-reflects (Hedley, Harborne & Mumby 2005, doi:10.1080/01431160500034086), and the surface reflects all wavelengths alike
-(Kay, Hedley & Lavender 2009, doi:10.3390/rs1040697). Water is where McFeeters' NDWI (1996,
-doi:10.1080/01431169608948714) of the darkest pixels around is positive. In the centre of a glint pattern no pixel is
-dark: what is spectrally flat and connected with water counts as water too, also a bright quay.
+Water absorbs near-infrared light, so the excess of a water pixel over the darkest water nearby is light reflected by
+the surface (Hedley, Harborne & Mumby 2005, doi:10.1080/01431160500034086). This reflection is nearly independent of the
+wavelength (Kay, Hedley & Lavender 2009, doi:10.3390/rs1040697). Water has a positive NDWI (McFeeters 1996,
+doi:10.1080/01431169608948714) in the darkest pixels nearby. In the centre of a glint pattern no pixel is dark, so
+spectrally flat areas connected with water are classified as water too; this includes a bright quay.
 """
 
 import cv2
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from agalign.values.image import FloatImage, Mask
 
 _BLOCK_PX = 16
-"""Side of the blocks in which the darkest pixels are searched."""
-_AROUND = 5
-"""Side of the square of blocks that a pixel is compared with: waves have their dark faces within it."""
+"""Side of the blocks for which a dark value is computed."""
+_NEIGHBOURHOOD_BLOCKS = 5
+"""Side of the square of blocks in which the darkest value is searched; it contains the dark faces of waves."""
 _DARK_PERCENTILE = 10
-"""Of a block's pixels: less noisy than the minimum."""
+"""Dark value of a block; less noisy than the minimum."""
 _MIN_SHARE = 0.5
-"""Of the green light that is glint."""
+"""Minimum share of glint in the green light."""
 _MIN_PIXEL_NDWI = -0.2
 """Glint is as bright in green as in near infrared; vegetation and soil at a shore are not."""
 _MIN_SIDE_BLOCKS = 2
@@ -29,44 +29,45 @@ _UNKNOWN = 1e30
 
 
 def sun_glint(green: FloatImage, nir: FloatImage) -> Mask:
-    """(height, width) True where more than half of the green light is sun glint on water, given reflectances
-    (height, width), nan where unknown.
+    """Return (height, width) True where more than half of the green light is sun glint on water.
+
+    `green` and `nir` are reflectances (height, width), NaN where unknown.
 
         glint = nir - nir_dark,  water where (green_dark - nir_dark) / (green_dark + nir_dark) > 0
 
-    Images smaller than a few blocks have none.
+    Images with sides of fewer than _MIN_SIDE_BLOCKS blocks have none.
     """
     height, width = green.shape
     if min(height, width) < _MIN_SIDE_BLOCKS * _BLOCK_PX:
         return np.zeros(green.shape, dtype=bool)
-    green_dark, nir_dark = (_darkest_around(band) for band in (green, nir))
+    green_dark, nir_dark = (_darkest_nearby(band) for band in (green, nir))
     size_px = width, height
     with np.errstate(invalid="ignore", divide="ignore"):
         ndwi = (green_dark - nir_dark) / (green_dark + nir_dark)
-        clear = ndwi > 0
-        if not clear.any():
+        is_water_block = ndwi > 0
+        if not is_water_block.any():
             return np.zeros(green.shape, dtype=bool)
-        # Where all pixels around are glint, the darkest of them is not that of the water.
-        nir_dark = np.fmin(nir_dark, np.median(nir_dark[clear]))
-        blocks = _connected(ndwi > _MIN_PIXEL_NDWI, clear)
-        water = cv2.resize(blocks.astype(np.uint8), size_px, interpolation=cv2.INTER_NEAREST) > 0
-        excess = nir - cv2.resize(nir_dark, size_px, interpolation=cv2.INTER_NEAREST)
-        flat = (green - nir) / (green + nir) > _MIN_PIXEL_NDWI
-        return np.asarray(water & flat & (excess > _MIN_SHARE * green))
+        # Where all pixels nearby are glint, their minimum is above the value of water.
+        nir_dark = np.fmin(nir_dark, np.median(nir_dark[is_water_block]))
+        blocks = _connected(ndwi > _MIN_PIXEL_NDWI, is_water_block)
+        is_water = cv2.resize(blocks.astype(np.uint8), size_px, interpolation=cv2.INTER_NEAREST) > 0
+        glint = nir - cv2.resize(nir_dark, size_px, interpolation=cv2.INTER_NEAREST)
+        is_flat = (green - nir) / (green + nir) > _MIN_PIXEL_NDWI
+        return np.asarray(is_water & is_flat & (glint > _MIN_SHARE * green))
 
 
 def _connected(candidates: Mask, seeds: Mask) -> Mask:
-    """The candidates (rows, columns) that are connected with a seed; all seeds are candidates."""
+    """Return the candidates (rows, columns) that are connected with a seed; all seeds are candidates."""
     _, labels = cv2.connectedComponents(candidates.astype(np.uint8))
     return np.asarray(candidates & np.isin(labels, np.unique(labels[seeds])))
 
 
-def _darkest_around(band: FloatImage) -> NDArray[np.float32]:
-    """(rows, columns) of blocks: the lowest of the dark values of the blocks around; nan where all is unknown."""
+def _darkest_nearby(band: FloatImage) -> NDArray[np.float32]:
+    """Return the minimum dark value of the blocks nearby for each block, (rows, columns); NaN if all are unknown."""
     rows, columns = (max(1, n // _BLOCK_PX) for n in band.shape)
-    cut = band[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
-    blocks = cut.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+    complete = band[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
+    blocks = complete.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
     known = np.where(np.isfinite(blocks), blocks, np.float32(_UNKNOWN))
     dark = np.percentile(known, _DARK_PERCENTILE, axis=-1, method="lower").astype(np.float32)
-    lowest = cv2.erode(dark, np.ones((_AROUND, _AROUND), np.uint8))
-    return np.where(lowest < _UNKNOWN, lowest, np.float32(np.nan))
+    darkest = cv2.erode(dark, np.ones((_NEIGHBOURHOOD_BLOCKS, _NEIGHBOURHOOD_BLOCKS), np.uint8))
+    return np.where(darkest < _UNKNOWN, darkest, np.float32(np.nan))

@@ -1,1 +1,1 @@
-"""The relief of a capture: plane + parallax from windows, and a dense parallax map by multi-baseline matching."""
+"""Relief of a capture: plane + parallax from windows, dense parallax by multi-baseline stereo, occlusions, range."""

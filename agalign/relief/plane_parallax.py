@@ -1,17 +1,16 @@
-"""Plane + parallax from the residual shifts of windows: a homography and a baseline for each band, a parallax for each
-window.
+"""Plane + parallax from the residual shifts of windows: homography and baseline per band, parallax per window.
 
 The shift of window i in band b, in undistorted px of the reference, is
 
     s_ib = D(x_i) delta_b + t_b z_i + noise
 
-with delta_b (8,) a correction of the band's homography by its corners, t_b (2,) its baseline, and z_i the parallax of
-the window, which all bands share: a factorisation of rank 1 (Irani 2002). It is solved by alternating least squares
-with Cauchy weights against wrong peaks and windows across an edge.
+delta_b (8,) corrects the band's homography at the image corners, t_b (2,) is the band's baseline, and z_i is the
+parallax of the window, common to all bands: a rank-1 factorisation (Irani 2002). It is solved by alternating least
+squares. Cauchy weights reduce the influence of wrong correlation peaks and of windows across depth edges.
 
-Two ambiguities are removed. Adding a plane a + b x + c y to z changes the homographies of all bands: z is 0 on the
-plane that most windows are on. The longest baseline has length 1; where the layout of the lenses is known,
-positive parallax is nearer.
+Two ambiguities are removed. A plane a + b x + c y added to z is equivalent to other homographies of all bands: z is 0
+on the plane that contains most windows. The scale of z is free: the longest baseline has length 1. If the lens layout
+is known, positive parallax is nearer to the camera.
 """
 
 from collections.abc import Sequence
@@ -30,38 +29,38 @@ from agalign.values.robust import MAD_TO_STD, cauchy_weights
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
-"""A fixed number, enough for baselines to settle to a thousandth."""
-_MIN_SPREAD_PX = 0.05
-"""Smaller misfits are the noise of shifts."""
-_SPREADS = 2.0
-"""A window has half its weight at twice the typical misfit."""
+"""Enough for the baselines to converge to a relative change of 0.001."""
+_MIN_SCALE_PX = 0.05
+"""Minimum residual scale: the noise of the shifts."""
+_CAUCHY_SCALES = 2.0
+"""Residual at which the robust weight is one half, in residual scales."""
 _PLANE_PX = 0.5
-"""Windows farther than this from the reference plane hardly take part in finding it."""
+"""Distance from the reference plane at which the robust weight of a window is one half."""
 _MAX_WEIGHT = 2.0
-"""Weights grow with the height of the peak up to here: textured parts must not outvote the rest."""
+"""Maximum weight by the peak height, so that well-textured parts do not dominate."""
 _DAMPING = 1e-3
-"""Weight of no correction and no parallax, relative to one window: it decides only what no window determines."""
+"""Weight of zero correction and zero parallax, relative to one window; matters only where no window contributes."""
 _MIN_INFORMATION = 0.2
-"""Sum of weights times squared baselines from which a window's parallax is known."""
+"""Minimum sum of weights times squared baselines for the parallax of a window to be known."""
 _CLIP_MEDIANS = 5.0
-"""Shifts beyond so many medians do not decide the first guess of the baselines."""
+"""Shifts are clipped at this multiple of the median for the initial estimate of the baselines."""
 
 
 @dataclass(frozen=True)
 class PlaneParallax:
-    """What the windows of a capture show."""
+    """The plane + parallax model of a capture."""
 
     baselines: Array
     """(bands, 2) t_b, the longest of length 1."""
     corners_px: Array
-    """(bands, 8) corrections of the homographies, px of the reference."""
+    """(bands, 8) corrections of the homographies at the corners, px of the reference."""
     parallax_px: Array
-    """(n,) of each window."""
-    misfits_px: Array
-    """(n, bands) lengths of what remains; nan where a window was not measured in a band."""
+    """(n,) parallax of the windows."""
+    residuals_px: Array
+    """(n, bands) lengths of the residuals; NaN where a window was not measured in a band."""
 
     def shifts_px(self, points_px: Points, size_px: tuple[int, int], band: int) -> Array:
-        """(n, 2) what the correction of a band's homography alone displaces at points (n, 2)."""
+        """Return the shifts (n, 2) by the correction of a band's homography at points (n, 2), without parallax."""
         return np.asarray(geometry.over_corners(points_px, *size_px) @ self.corners_px[band])
 
 
@@ -72,15 +71,15 @@ class WindowShifts:
     centres_px: Points
     """(n, 2) of the windows, raw px."""
     points_px: Points
-    """(n, 2) the same, undistorted."""
+    """(n, 2) of the windows, undistorted px."""
     shifts_px: Array
-    """(n, bands, 2), nan where not measured."""
+    """(n, bands, 2), NaN where not measured."""
     weights: Array
-    """(n, bands), 1 in the median, 0 where not measured."""
+    """(n, bands), median 1; 0 where not measured."""
 
     @classmethod
     def of(cls, residuals: Sequence[Residual[FixedImagePx]], mappings: Sequence[PixelMapping]) -> "WindowShifts":
-        """From the windows of each band, measured under its mapping. Windows are identified by their centres."""
+        """Collect the windows of each band, measured with its mapping. Windows are identified by their centres."""
         centres = sorted({tuple(c) for r in residuals for c in r.centres_px.tolist()})
         index = {centre: i for i, centre in enumerate(centres)}
         shifts, peaks = np.full((len(centres), len(residuals), 2), np.nan), np.zeros((len(centres), len(residuals)))
@@ -88,12 +87,12 @@ class WindowShifts:
             measured = np.isfinite(residual.shifts_px[:, 0])
             if not measured.any():
                 continue
-            at = residual.centres_px[measured]
-            rows = [index[tuple(c)] for c in at.tolist()]
-            shifts[rows, band] = mapping.undistorted(at + residual.shifts_px[measured]) - mapping.undistorted(at)
+            xy = residual.centres_px[measured]
+            rows = [index[tuple(c)] for c in xy.tolist()]
+            shifts[rows, band] = mapping.undistorted(xy + residual.shifts_px[measured]) - mapping.undistorted(xy)
             peaks[rows, band] = residual.peaks_sigma[measured]
-        some = peaks[peaks > 0]
-        weights = np.minimum((peaks / np.median(some)) ** 2, _MAX_WEIGHT) if some.size else peaks
+        positive = peaks[peaks > 0]
+        weights = np.minimum((peaks / np.median(positive)) ** 2, _MAX_WEIGHT) if positive.size else peaks
         centres_px = np.array(centres).reshape(-1, 2)
         points = mappings[0].of_the_plane.undistorted(centres_px)
         return cls(centres_px, points, shifts, np.where(np.isfinite(shifts[..., 0]), weights, 0.0))
@@ -102,8 +101,9 @@ class WindowShifts:
         return len(self.points_px)
 
     def plus(self, parallax: Array, baselines: Array) -> "WindowShifts":
-        """The shifts from the reference plane of windows measured under a relief. Its parallax (n,) has moved them
-        along the baselines (bands, 2) already.
+        """Add the parallax (n,) of the relief with which the windows were measured, along the baselines (bands, 2).
+
+        The result are shifts relative to the reference plane.
         """
         return replace(self, shifts_px=self.shifts_px + parallax[:, None, None] * baselines)
 
@@ -111,15 +111,15 @@ class WindowShifts:
 def fit_plane_parallax(
     windows: WindowShifts, size_px: tuple[int, int], layout: Array | None = None
 ) -> PlaneParallax | None:
-    """The model that explains the windows of a capture, on a reference (width, height).
+    """Fit the model to the windows of a capture; None if too few windows are measured in all bands.
 
-    `layout` (bands, 2) are the directions in which the bands move as the scene comes nearer, where they are known, in
-    any unit: it starts the baselines and decides their sign. None where too few windows are measured in all bands.
+    `size_px` is (width, height) of the reference. `layout` (bands, 2) are the known directions, in any unit, in which
+    points move in the bands when the scene comes nearer; they initialise the baselines and determine their sign.
     """
-    start = _first_baselines(windows) if layout is None else layout
-    if start is None or not np.linalg.norm(start, axis=1).max() > 0:
+    initial = _initial_baselines(windows) if layout is None else layout
+    if initial is None or not np.linalg.norm(initial, axis=1).max() > 0:
         return None
-    baselines = start / np.linalg.norm(start, axis=1).max()
+    baselines = initial / np.linalg.norm(initial, axis=1).max()
     design = geometry.over_corners(windows.points_px, *size_px)
     plane = _plane_coordinates(windows.points_px, size_px)
     shifts, weights = np.nan_to_num(windows.shifts_px), windows.weights
@@ -132,49 +132,51 @@ def fit_plane_parallax(
         if not longest > 0:
             return None
         baselines, parallax = baselines / longest, parallax * longest
-        explained = np.einsum("nki,bi->nbk", design, corners) + parallax[:, None, None] * baselines
-        misfits = np.where(windows.weights > 0, np.linalg.norm(shifts - explained, axis=2), np.nan)
-        spreads = _spreads_px(misfits)
-        weights = windows.weights * np.nan_to_num(cauchy_weights(misfits, _SPREADS * spreads))
-        # Inverse variances, of bands worse than the median: one that shows something else must not decide the parallax
-        # of the others.
-        weights *= np.minimum(1, (np.median(spreads) / spreads) ** 2)
+        predicted = np.einsum("nki,bi->nbk", design, corners) + parallax[:, None, None] * baselines
+        residuals = np.where(windows.weights > 0, np.linalg.norm(shifts - predicted, axis=2), np.nan)
+        scales = _scales_px(residuals)
+        weights = windows.weights * np.nan_to_num(cauchy_weights(residuals, _CAUCHY_SCALES * scales))
+        # Inverse variance of bands worse than the median, so that an inconsistent band does not determine the parallax.
+        weights *= np.minimum(1, (np.median(scales) / scales) ** 2)
     if layout is not None and np.sum(baselines * layout) < 0:
         baselines, parallax = -baselines, -parallax
-    return PlaneParallax(baselines, corners, parallax, misfits)
+    return PlaneParallax(baselines, corners, parallax, residuals)
 
 
 def parallax_of(residual_px: Array, baselines: Array, weights: Array) -> Array:
-    """(n,) parallax of windows by their shifts (n, bands, 2) beyond the homographies, 0 where nothing determines it."""
+    """Return the parallax (n,) of windows from their shifts (n, bands, 2) relative to the homographies.
+
+    `baselines` are (bands, 2), `weights` (n, bands). The parallax is 0 for windows without information.
+    """
     return _parallax(np.nan_to_num(residual_px), baselines, weights)[0]
 
 
-def _first_baselines(windows: WindowShifts) -> Array | None:
-    """(bands, 2): the first right singular vector of the shifts of the windows that all bands show."""
+def _initial_baselines(windows: WindowShifts) -> Array | None:
+    """Return (bands, 2) the first right singular vector of the shifts of windows that are measured in all bands."""
     complete = (windows.weights > 0).all(axis=1)
     if complete.sum() < 2 * windows.weights.shape[1]:
         return None
     shifts = windows.shifts_px[complete].reshape(int(complete.sum()), -1)
     shifts = shifts - np.median(shifts, axis=0)
-    limit = _CLIP_MEDIANS * np.median(np.abs(shifts)) + _MIN_SPREAD_PX
+    limit = _CLIP_MEDIANS * np.median(np.abs(shifts)) + _MIN_SCALE_PX
     _, _, right = np.linalg.svd(np.clip(shifts, -limit, limit), full_matrices=False)
     return np.asarray(right[0].reshape(-1, 2))
 
 
 def _plane_coordinates(points_px: Points, size_px: tuple[int, int]) -> Array:
-    """(n, 3): 1, u, v with u and v from -1 to 1 across the image."""
+    """Return (n, 3) = (1, u, v) with u and v from -1 to 1 across the image."""
     return np.column_stack([np.ones(len(points_px)), 2 * points_px / np.asarray(size_px) - 1])
 
 
 def _parallax(residual_px: Array, baselines: Array, weights: Array) -> tuple[Array, Array]:
-    """((n,) weighted least squares along the baselines, (n,) its information)."""
-    along = (weights * np.einsum("nbk,bk->nb", residual_px, baselines)).sum(axis=1)
+    """Return the parallax (n,) by weighted least squares along the baselines, and its information (n,)."""
+    projection = (weights * np.einsum("nbk,bk->nb", residual_px, baselines)).sum(axis=1)
     information = (weights * (baselines**2).sum(axis=1)).sum(axis=1)
-    return along / (information + 10 * _DAMPING), information
+    return projection / (information + 10 * _DAMPING), information
 
 
 def _reference_plane(parallax: Array, plane: Array, information: Array) -> Array:
-    """(3,) the plane in (1, u, v) that most windows are on: an M-estimate that starts at their median."""
+    """Return the coefficients (3,) in (1, u, v) of the plane of most windows: an M-estimate from their median."""
     known = (information > _MIN_INFORMATION).astype(float)
     result = np.array([np.median(parallax), 0.0, 0.0])
     for _ in range(8):
@@ -185,7 +187,7 @@ def _reference_plane(parallax: Array, plane: Array, information: Array) -> Array
 
 
 def _bands(shifts: Array, parallax: Array, design: Array, weights: Array) -> tuple[Array, Array]:
-    """(corrections (bands, 8), baselines (bands, 2)) by weighted least squares, band by band."""
+    """Return the corrections (bands, 8) and baselines (bands, 2) by weighted least squares for each band."""
     full = np.concatenate([design, parallax[:, None, None] * np.eye(2)], axis=2)
     normal = np.einsum("nb,nki,nkj->bij", weights, full, full, optimize=True)
     normal += _DAMPING * np.diag([1.0] * 8 + [1e-3] * 2)
@@ -194,7 +196,7 @@ def _bands(shifts: Array, parallax: Array, design: Array, weights: Array) -> tup
     return solution[:, :8], solution[:, 8:]
 
 
-def _spreads_px(misfits: Array) -> Array:
-    """(bands,) robust standard deviations of the misfits (n, bands)."""
-    medians = np.array([np.median(m[np.isfinite(m)]) if np.isfinite(m).any() else 0.0 for m in misfits.T])
-    return np.maximum(MAD_TO_STD * medians, _MIN_SPREAD_PX)
+def _scales_px(residuals: Array) -> Array:
+    """Return (bands,) robust standard deviations of the residuals (n, bands)."""
+    medians = np.array([np.median(r[np.isfinite(r)]) if np.isfinite(r).any() else 0.0 for r in residuals.T])
+    return np.maximum(MAD_TO_STD * medians, _MIN_SCALE_PX)

@@ -1,12 +1,13 @@
-"""The range of the scene from the parallax of all bands.
+"""Range of the scene from the parallax of all bands.
 
-A lens displaced by B_b (metres, right and down in the image) sees a point at range Z, measured along the optical axis,
+In a lens displaced by B_b (metres, right and down in the image), a point at range Z along the optical axis is shifted
+by
 
     d_b = -f B_b / Z
 
-px away from where it would be at an infinite range (Hartley & Zisserman 2004, Eq. 9.6), in px of the reference with
-focal length f. The homography of an infinite range follows from the orientation of the lenses in the tags. 1 / Z is the
-least-squares solution over all bands.
+relative to its position at infinite range (Hartley & Zisserman 2004, Eq. 9.6), in px of the reference with focal
+length f. The homography at infinite range follows from the orientations of the lenses in the tags. 1 / Z is the least
+squares solution over all bands.
 """
 
 from collections.abc import Sequence
@@ -23,21 +24,21 @@ from agalign.values.mapping import PixelMapping
 Array = NDArray[np.float64]
 
 _NODES = 33
-"""Of the lattice on which the smooth part is calculated, along both axes."""
+"""Nodes along both axes of the grid on which mappings are evaluated."""
 
 
 def inverse_range(
-    mappings: Sequence[PixelMapping], at_infinity: Sequence[Matrix], towards_m: Array, reference_lens: Lens,
+    mappings: Sequence[PixelMapping], at_infinity: Sequence[Matrix], directions_m: Array, reference_lens: Lens,
     points_px: Points, parallax_px: Array,
 ) -> Array:  # fmt: skip
-    """1 / Z (height, width), per metre, at raw pixels (height, width, 2) of the reference with their parallax.
+    """Return 1 / Z (height, width), per metre, at raw pixels (height, width, 2) of the reference with a parallax.
 
-    `mappings` are the complete mappings of the bands, `at_infinity` their homographies between undistorted pixels for
-    an infinite range, and `towards_m` (bands, 2) the directions in which pixels move as the scene comes nearer, metres:
-    the negative positions of the lenses relative to that of the reference.
+    `mappings` are the complete mappings of the bands and `at_infinity` their fixed_to_moving at infinite range,
+    undistorted px. `directions_m` (bands, 2) are the directions in which points move when the scene comes nearer: the
+    negative positions of the lenses relative to the reference, metres.
     """
     focal_px = np.array([reference_lens.fx_px, reference_lens.fy_px])
-    weights = towards_m * focal_px
+    weights = directions_m * focal_px
     low, high = points_px.reshape(-1, 2).min(axis=0), points_px.reshape(-1, 2).max(axis=0)
     x, y = (np.linspace(a, max(b, a + 1), _NODES) for a, b in zip(low, high, strict=True))
     nodes = np.stack(np.meshgrid(x, y), axis=-1)
@@ -49,9 +50,10 @@ def inverse_range(
             undistorted = mapping.of_the_plane.undistorted(nodes)
             assert mapping.parallax is not None
             moved = undistorted + level * np.array(mapping.parallax.baseline)
-            seen = geometry.apply(geometry.invert(infinite), geometry.apply(mapping.fixed_to_moving, moved))
-            total += (seen - lens.undistort(reference_lens, nodes)) @ weight
+            observed = geometry.apply(geometry.invert(infinite), geometry.apply(mapping.fixed_to_moving, moved))
+            total += (observed - lens.undistort(reference_lens, nodes)) @ weight
         values.append(total / (weights**2).sum())
-    at = [RegularGridInterpolator((y, x), v)(points_px[..., ::-1]) for v in values]
+    # Linear interpolation in the parallax between two levels.
+    low_value, high_value = (RegularGridInterpolator((y, x), v)(points_px[..., ::-1]) for v in values)
     share = (parallax_px - levels[0]) / (levels[1] - levels[0])
-    return np.asarray(at[0] + share * (at[1] - at[0]))
+    return np.asarray(low_value + share * (high_value - low_value))

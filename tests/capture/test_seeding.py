@@ -8,7 +8,7 @@ from agalign.capture.tag_seeds import geo_seed
 from agalign.capture.verification import WarpedPair
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
-from agalign.pixels.landmarks import LANDMARK_INPUTS, agreed_homography, landmarks
+from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography
 from agalign.values import geometry
 from agalign.values.alignment import Seed
 from agalign.values.capture import Band, Georeference
@@ -175,7 +175,7 @@ def test_unrelated_images_have_no_landmarks_in_common() -> None:
     valid = np.ones((320, 400), bool)
     one, other = (Raster(textured_image(400, 320, s), valid) for s in (5, 6))
     for view in LANDMARK_INPUTS:
-        assert agreed_homography(landmarks(one, view), landmarks(other, view), (400, 320)) is None
+        assert matched_homography(landmarks(one, view), landmarks(other, view), (400, 320)) is None
 
 
 def test_a_match_that_is_some_px_off_is_sharpened_by_the_windows(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -60,15 +60,15 @@ def test_everything_is_recovered_through_noise_and_wrong_peaks(unit: float) -> N
     """Whatever the unit of the layout."""
     model = fit_plane_parallax(shifts(), SIZE, BASELINES * unit)
     assert_recovered(model)
-    assert np.nanmedian(model.misfits_px) < 0.15
-    assert 0.1 < (model.misfits_px > 2).mean() < 0.25
+    assert np.nanmedian(model.residuals_px) < 0.15
+    assert 0.1 < (model.residuals_px > 2).mean() < 0.25
 
 
 def test_windows_that_some_bands_do_not_show() -> None:
     some = shifts(missing=0.3)
     model = fit_plane_parallax(some, SIZE, BASELINES)
     assert_recovered(model)
-    np.testing.assert_array_equal(np.isfinite(model.misfits_px), some.weights > 0)
+    np.testing.assert_array_equal(np.isfinite(model.residuals_px), some.weights > 0)
 
 
 @pytest.mark.parametrize("layout", [BASELINES, None])
