@@ -15,6 +15,7 @@ from concurrent.futures import (
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -211,13 +212,16 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
     a worker lacks this version of the package.
     """
     try:
-        from distributed import Client, LocalCluster
+        import dask
+        from distributed import Client, LocalCluster, fire_and_forget
     except ImportError:
         raise ConfigurationError("Dask is not installed; pip install 'agalign[dask]'") from None
     with ExitStack() as stack:
         stack.enter_context(_quiet_dask())
         try:
             if address == LOCAL:
+                # Without a dashboard nobody sees the profile, which costs a few percent.
+                stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
                 cluster = LocalCluster(
                     n_workers=jobs or usable_cores(), threads_per_worker=1, processes=True, dashboard_address=None
                 )
@@ -228,6 +232,9 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
         except (OSError, ValueError) as error:
             raise ConfigurationError(f"no Dask scheduler answers at {address} ({error})") from None
         _check_versions(stack.enter_context(client))
+        # Workers import the libraries of a capture while the flight is learned here.
+        for worker in client.ncores():
+            fire_and_forget(client.submit(import_module, __name__, workers=[worker], pure=False))
         yield DaskExecutor(client, timeout_s)
 
 
@@ -271,7 +278,7 @@ class DaskExecutor(Executor):
         self._client, self._executor, self._timeout_s = client, client.get_executor(pure=False), timeout_s
 
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
-        return self._executor.submit(_within, self._timeout_s, _of_version, __version__, function, *arguments, **named)
+        return self._executor.submit(_within, self._timeout_s, _on_worker, __version__, function, *arguments, **named)
 
     def loss(self) -> str:
         """Return why no task can be done any more; nothing while the scheduler answers."""
@@ -283,10 +290,14 @@ class DaskExecutor(Executor):
         )
 
 
-def _of_version(version: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Raise ConfigurationError on a worker of another version, which may have joined during the run."""
+def _on_worker(version: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Call a function in one thread, as Dask sets OMP_NUM_THREADS for libraries that read it.
+
+    Raises ConfigurationError on a worker of another version, which may have joined during the run.
+    """
     if version != __version__:
         raise ConfigurationError(f"a Dask worker has agalign {__version__}; install agalign {version} there")
+    limit_threads(1)
     return function(*arguments, **named)
 
 

@@ -177,9 +177,9 @@ def test_a_dask_scheduler_without_workers_is_reported(caplog: pytest.LogCaptureF
 
 
 def test_a_dask_worker_of_another_version_that_joins_later_does_nothing() -> None:
-    assert workers._of_version(agalign.__version__, max, 1, 2) == 2
+    assert workers._on_worker(agalign.__version__, max, 1, 2) == 2
     with pytest.raises(ConfigurationError, match=r"^a Dask worker has agalign .*; install agalign 0\.0\.9 there$"):
-        workers._of_version("0.0.9", max, 1, 2)
+        workers._on_worker("0.0.9", max, 1, 2)
 
 
 @pytest.mark.parametrize("ends", [True, False])
