@@ -35,7 +35,7 @@ from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.verify.displacement_field import common_field
-from agalign.verify.extrapolation_check import unseen_quarters
+from agalign.verify.extrapolation_check import unobserved_quarters
 from agalign.verify.lens_shapes import unmodelled_std_px
 
 _LOG = logging.getLogger(__name__)
@@ -204,7 +204,7 @@ def _extrapolation_px(
     result: dict[str, MovingFilePx] = {}
     for band, of_band in residuals.items():
         centres_px = np.concatenate([r.measured_px for r in of_band])
-        if unseen_quarters(centres_px, rig.size_px):
+        if unobserved_quarters(centres_px, rig.size_px):
             ratio = abs(float(geometry.local_scale(rig.mean[band], *rig.size_px)[-1]))
             std_px = unmodelled_std_px(centres_px, rig.size_px, calibrated=calibrated)
             result[band] = MovingFilePx(std_px * ratio)

@@ -42,7 +42,7 @@ def predicted_if_coarse(pair: BandPair, alignment: Alignment[FixedImagePx]) -> A
         if fit is None:
             return alignment
         start = with_fit(pair, start, fit)
-    if alias_peak(*WarpedPair.of(pair, pair.mapping(start.fixed_to_moving, start.field)).reduced_spectra()).share > (
+    if alias_peak(*WarpedPair.of(pair, pair.mapping(start.fixed_to_moving, start.field)).reduced_spectra()).ratio > (
         MAX_ALIAS_PEAK
     ):
         return alignment
@@ -60,5 +60,5 @@ def _agrees(fit: LensFit, residual: Residual[FixedImagePx]) -> bool:
     measured = np.isfinite(residual.shifts_px[:, 0])
     if measured.sum() < _MIN_WINDOWS:
         return False
-    misfits_px = np.linalg.norm(fit.misfits_px(residual.centres_px[measured], residual.shifts_px[measured]), axis=1)
+    misfits_px = np.linalg.norm(fit.residuals_px(residual.centres_px[measured], residual.shifts_px[measured]), axis=1)
     return bool((misfits_px <= _CLOSE_PX).mean() >= _MIN_CLOSE)

@@ -20,7 +20,7 @@ from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
 from agalign.verify.acceptance import is_unchanged, seed_fits, status_of
 from agalign.verify.check import Evidence
 from agalign.verify.checks import issues_of
-from agalign.verify.extrapolation_check import points_in_frame, unseen_quarters
+from agalign.verify.extrapolation_check import points_in_frame, unobserved_quarters
 from agalign.verify.residuals import residual_under
 from agalign.verify.window_check import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX
 
@@ -92,10 +92,10 @@ def _residual_of(pair: BandPair, mapping: PixelMapping, warped: Raster) -> Resid
     size_px = pair.fixed.size_px
     residual = pair.reference.windows.residuals(warped)
     in_frame_px = points_in_frame(mapping, size_px, pair.moving_image.size_px)
-    if not unseen_quarters(residual.centres_px, size_px, in_frame_px):
+    if not unobserved_quarters(residual.centres_px, size_px, in_frame_px):
         return residual
     smaller = pair.reference.small_windows.residuals(warped)
-    counts = [len(unseen_quarters(r.measured_px, size_px, in_frame_px)) for r in (residual, smaller)]
+    counts = [len(unobserved_quarters(r.measured_px, size_px, in_frame_px)) for r in (residual, smaller)]
     return smaller if counts[1] < counts[0] else residual
 
 

@@ -1,1 +1,1 @@
-"""Measurements of an alignment that do not depend on how it was estimated, and the checks that use them."""
+"""Verification: measurements of an alignment that are independent of its estimation, and checks of these."""

@@ -1,4 +1,4 @@
-"""The status that follows from the issues of an alignment. A wrong alignment called `aligned` is the worst error."""
+"""Status of a band pair from the issues of its alignment; a wrong alignment with status `aligned` is the worst error."""
 
 from collections.abc import Sequence
 
@@ -10,35 +10,33 @@ from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedImagePx
 
 _MIN_SEED_COVERAGE = 0.3
-"""Share of the windows in which a shift can be measured under a seed that is used as it is: a start, not a result."""
+"""Minimum share of windows with a measured shift for a seed with status `seed_only`."""
 _MAX_SEED_MEDIAN_PX = 8.0
-"""Median residual of a seed that is used as it is: rig tags are off by a few px (docs/cameras.md)."""
-_MAX_SNAP_PX = 0.25
-"""An input that is aligned already is left untouched where the result moves no corner by more, px of the file: a
-resampling would cost more sharpness than that gains,"""
-_MAX_SNAP_STD = 3.0
-"""nor by more than this many standard deviations of the least certain corner."""
+"""Maximum median residual of such a seed: rig tags have errors of a few px (docs/cameras.md)."""
+_MAX_UNCHANGED_PX = 0.25
+"""Maximum displacement of a corner, px of the file, for aligned input to be returned unchanged: resampling would cost
+more sharpness than the correction gains."""
+_MAX_UNCHANGED_STD = 3.0
+"""The same limit in standard errors of the least certain corner."""
 
 
 def status_of(issues: Sequence[Issue], residual: Residual[FixedImagePx], *, seed: bool) -> PairStatus:
-    """`aligned` without issues; else `seed_only` where the `seed` is usable and its `residual` small enough, or
-    `failed`.
-    """
+    """Return `aligned` without issues, else `seed_only` for a usable `seed` with a small `residual`, else `failed`."""
     if not issues:
         return "aligned"
     return "seed_only" if seed and seed_fits(residual) else "failed"
 
 
 def seed_fits(residual: Residual[FixedImagePx]) -> bool:
-    """True where the residual under a seed is small enough for the seed to be used as it is."""
+    """Return True if the residual of a seed is small enough for the status `seed_only`."""
     return residual.coverage >= _MIN_SEED_COVERAGE and residual.median_px <= _MAX_SEED_MEDIAN_PX
 
 
 def is_unchanged(joint: JointResult[FixedImagePx], given: Matrix, size_px: tuple[int, int], scale: float = 1.0) -> bool:
-    """True where a result on an image (width, height) does not differ from the mapping that the files came with.
+    """Return True if a result on an image (width, height) does not differ from the mapping `given` by the files.
 
     `scale` is the size of the image relative to its file.
     """
     change = geometry.compose(geometry.invert(given), joint.fixed_to_moving)
-    moved_px = FixedImagePx(geometry.corner_error_px(change, geometry.identity(), *size_px))
-    return moved_px <= min(FixedImagePx(_MAX_SNAP_PX * scale), joint.corner_std_px * _MAX_SNAP_STD)
+    change_px = FixedImagePx(geometry.corner_error_px(change, geometry.identity(), *size_px))
+    return change_px <= min(FixedImagePx(_MAX_UNCHANGED_PX * scale), joint.corner_std_px * _MAX_UNCHANGED_STD)

@@ -1,4 +1,4 @@
-"""The interface of a check: what it may look at, and what it returns."""
+"""The interface of a check: its input and its result."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from agalign.values.pixel_units import FixedPx, PixelScale
 
 
 class AlignedImages(Protocol):
-    """The two images of a result on one grid, for checks that need pixels."""
+    """The two images of a result on one grid, for checks that use pixels."""
 
     @property
     def reduced_scale(self) -> PixelScale:
@@ -21,31 +21,31 @@ class AlignedImages(Protocol):
         """Windowed spectra (height, width) of the structure of the reduced fixed image, and of the moving image."""
 
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        """True where tags, flight or user expect the mapping after a shift (x, y), px of the fixed image."""
+        """True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or user."""
 
 
 @dataclass(frozen=True)
 class Evidence(Generic[FixedPx]):
-    """Everything that checks may look at, on the grid of the images or of the files (`FixedPx`)."""
+    """The input of the checks, on the grid of the images or of the files (`FixedPx`)."""
 
     joint: JointResult[FixedPx]
     residual: Residual[FixedPx]
-    """The windows under the result."""
+    """Residual shifts of windows after alignment."""
     size_px: tuple[int, int]
     """(width, height) of the fixed image."""
     images: AlignedImages | None = None
-    """None leaves out the checks that need pixels."""
+    """None omits the checks that use pixels."""
     prediction: Prediction | None = None
-    """With `off_px`, how far the result is from it; None without a rig."""
+    """Prediction by the rig, with the distance `off_px` of the result; None without a rig."""
     file_px: float = 1.0
-    """Length of a pixel of the reference's file on this grid: residual shifts are limited in px of the file."""
+    """Size of a pixel of the reference's file on this grid; the limits of residual shifts are in px of the file."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One check: the kinds of issues that it defines and the function that finds them."""
+    """One check: the kinds of issues that it defines and the function that returns them."""
 
     kinds: tuple[IssueKind, ...]
     issues: Callable[[Evidence[Any]], Iterable[Issue]]
     is_costly: bool = False
-    """Runs only where no other check has found an issue."""
+    """Run only if no other check returns an issue."""

@@ -1,4 +1,4 @@
-"""All checks of an alignment, and all kinds of issues by code. A new check is one module, named here once."""
+"""All checks of an alignment, and all kinds of issues by code. A new check is one module and one line here."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ from agalign.verify.check import Check, Evidence
 CHECKS: tuple[Check, ...] = (
     mapping_check.CHECK, descriptor_check.CHECK, window_check.CHECK, rig_check.CHECK, repetition.CHECK,
 )  # fmt: skip
-"""In the order in which their issues are listed: the first one gives the reason."""
+"""In the order in which their issues are listed; the first issue is the reason in the sidecar."""
 
 KINDS: Mapping[str, IssueKind] = {
     kind.code: kind
@@ -26,6 +26,6 @@ KINDS: Mapping[str, IssueKind] = {
 
 
 def issues_of(evidence: Evidence[FixedPx]) -> tuple[Issue, ...]:
-    """Every reason for not accepting a result; none where it passes verification."""
+    """Return every reason for not accepting a result; empty if it passes verification."""
     result = tuple(i for check in CHECKS if not check.is_costly for i in check.issues(evidence))
     return result or tuple(i for check in CHECKS if check.is_costly for i in check.issues(evidence))

@@ -1,6 +1,6 @@
-"""Check of the joint optimisation: the descriptors recognise held-out patches, and the corners are certain.
+"""Check of the joint optimisation: retrieval of held-out patches, and standard errors of the corners.
 
-Where they recognise nothing, a result by windows is checked by the windows left out of its fit, more strictly.
+A result that was fitted to windows may instead be confirmed by the windows that were left out of the fit.
 """
 
 from collections.abc import Iterator
@@ -16,20 +16,20 @@ CORNER_STD_PX = IssueKind(
     "corner_std_px", "the standard error at the corners of the image is {value:.1f} px", TEXTURELESS
 )  # fmt: skip
 _MAX_CORNER_STD_PX = 2.0
-"""Standard deviation of the least certain mapped corner: beyond, the windows in the middle verify nothing there."""
+"""Maximum standard error of the least certain mapped corner: windows near the centre do not verify the corners."""
 BY_WINDOWS = "windows"
-"""Recipe of a result that is fitted to windows; its residual is that of the windows left out of the fit."""
+"""Recipe of a result that is fitted to windows; its residual contains the windows that were left out of the fit."""
 _MIN_HELD_OUT = 12
-"""Of these, windows with a measured shift: of unrelated images, one in a thousand is within a px by chance."""
+"""Minimum number of held-out windows with a measured shift; in unrelated images one in a thousand is within 1 px."""
 _MIN_COVERAGE = 0.8
-"""Share of these in which a shift can be measured: the windows are the only evidence."""
+"""Minimum share of held-out windows with a measured shift, as they are the only evidence."""
 
 
 def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     joint = evidence.joint
     minimum = max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * joint.chance)
     is_confirmed = joint.recipe == BY_WINDOWS and _is_confirmed(evidence)
-    # Both are written so that nan does not pass.
+    # The negations also reject NaN.
     if not (joint.retrieval >= minimum or is_confirmed):
         yield Issue(RETRIEVAL, joint.retrieval, minimum)
     if not joint.corner_std_px <= _MAX_CORNER_STD_PX:

@@ -1,6 +1,6 @@
-"""Displacement fields over a homography, for parallax: smooth, fitted to the residual shifts of windows.
+"""Smooth displacement fields in addition to a homography, fitted to the residual shifts of windows.
 
-A field is kept only where it explains windows that it was not fitted to, and where it does not fold the image.
+A field is accepted if it reduces the residuals of windows that were left out of the fit and does not fold the image.
 """
 
 import math
@@ -27,103 +27,106 @@ from agalign.verify.residuals import FixedWindows
 
 @dataclass(frozen=True)
 class FieldScale:
-    """How fine a displacement field is, px."""
+    """Resolution of a displacement field."""
 
     window_px: int
     """Side of the windows in which shifts are measured; they overlap by half."""
     lattice_px: int
     """Spacing of the field's nodes."""
     verification_px: int = 48
-    """Side of the windows in which the field is verified: small enough to be close to windows that take part in the
-    fit, since none that shares a pixel does."""
+    """Side of the windows in which the field is verified. Windows of the fit share no pixels with these, so small ones
+    are closer to the nearest windows of the fit."""
 
 
 LENS = FieldScale(window_px=48, lattice_px=96)
-"""For what lenses leave under a relief: it changes over hundreds of pixels."""
+"""For residual lens distortion in addition to a relief, which varies over hundreds of pixels."""
 COARSE = FieldScale(window_px=64, lattice_px=48)
 FINE = FieldScale(window_px=32, lattice_px=24, verification_px=32)
-"""For plants and walls that are too high above the ground for the coarse field to follow."""
+"""For plants and walls with parallax that varies too quickly for the coarse field."""
 
 _MAX_WINDOWS = 4000
-"""In larger images the windows are farther apart: it bounds the time, and a field is smooth."""
-_MIN_LATTICE_SHARE = 0.75
-"""Spacing of the nodes relative to that of the windows, at least: more nodes would follow nothing that was measured."""
+"""The spacing of the windows grows in larger images, which limits the time; the field is smooth."""
+_MIN_NODE_SPACING = 0.75
+"""Minimum spacing of the nodes relative to that of the windows: the windows do not determine more nodes."""
 _SMOOTHNESS = (0.3, 1.0, 4.0, 16.0, 64.0)
-"""Weights of the field's second differences relative to the shift of one window; cross-validation chooses."""
-_PULL = 0.003
-"""Weight of the field's own length, likewise: it decides only where nothing was measured."""
-_MIN_SPREAD_PX, _OUTLIER_SPREADS = 0.05, 4.0
-"""A window has half its weight at four times the typical misfit: only wrong peaks are farther out. Misfits below 0.05
-px are the noise of shifts."""
+"""Weights of the field's second differences relative to one window; selected by cross-validation."""
+_DAMPING = 0.003
+"""Weight of the field's length, relative to one window; it matters only far from all windows."""
+_MIN_SCALE_PX = 0.05
+"""Minimum residual scale: the noise of the shifts."""
+_CAUCHY_SCALES = 4.0
+"""Residual at which the robust weight is one half, in residual scales; only wrong peaks have larger ones."""
 _REWEIGHTINGS = 4
-"""A fixed number, enough for the weights to settle."""
-_ROUNDS, _SETTLED_PX, _MAX_ROUNDS = 2, 0.2, 4
-"""Shifts are measured twice, and again, up to four times, while their median is above 0.2 px: long shifts are found in
-steps."""
+"""Iterations after which the robust weights have converged."""
+_MIN_ROUNDS, _MAX_ROUNDS, _CONVERGED_PX = 2, 4, 0.2
+"""Shifts are measured again with the field of the previous round until their median is at most 0.2 px, because large
+shifts are measured in steps."""
 _MIN_WINDOWS = 24
-"""Windows with a shift without which no field is fitted; a fit without a fold may have half as many."""
+"""Minimum number of windows with a shift; a fit without one fold may have half as many."""
 _MIN_GAIN_SIGMA = 4.0
-"""A field is kept where the squared shifts of held-out windows fall by as many standard errors."""
-_FAR_PX = 0.1
-"""Scale on which residual shifts are compared: several times the noise of a shift."""
+"""Minimum decrease of the squared shifts of held-out windows, in standard errors of the decrease."""
+_LOSS_SCALE_PX = 0.1
+"""Scale of the robust loss by which fields are compared: several times the noise of a shift."""
 _MIN_CAPTURES, _COMMON_FOLDS = 3, 4
-"""A field of the lenses needs captures to leave out; four folds leave out a quarter at a time."""
+"""Minimum number of captures for a common field, and number of folds of its cross-validation."""
 _COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
-"""As `_SMOOTHNESS`, relative to one window of each capture, for the field that the lenses cause."""
+"""As `_SMOOTHNESS`, relative to one window of each capture."""
 _MIN_COMMON_GAIN_SIGMA, _MAX_COMMON_P95_GROWTH = 2.5, 1.05
-"""Less strict than within one capture: whole captures that are left out share only their lenses."""
-_ITSELF_PX = 1.0
-"""Two windows of one grid that are nearer are the same."""
+"""Less strict than within one capture: captures that are left out have only their lenses in common with the others."""
+_SAME_WINDOW_PX = 1.0
+"""Windows of one grid at a smaller distance are identical."""
 _ALL_FOLDS = range(16)
 _SOME_FOLDS = (0, 2, 8, 10)
-"""Far enough apart to choose the smoothness by."""
-_MIN_TRUST = 0.1
-"""Windows with a lower relative weight do not take part in the comparison: parallax within a window lowers its peak
-too."""
+"""Folds with which the smoothness is selected; their windows are far from each other."""
+_MIN_WEIGHT = 0.1
+"""Windows with a lower relative weight are excluded from the comparison of fields: parallax within a window lowers its
+peak."""
 
 
 class DisplacementEstimator:
-    """The reference cut into small, overlapping windows, ready for any number of moving bands."""
+    """Small, overlapping windows of the reference, for fields of any number of moving bands."""
 
     def __init__(self, valid: Mask, structure: Field, scale: FieldScale, windows: FixedWindows | None = None) -> None:
-        """`valid` and `structure` (height, width) are those of the reference; a field is fitted in its `windows`, by
-        default all over the image.
+        """Cut windows from the structure field (height, width) of the reference with the mask `valid`.
+
+        Fields are fitted to `windows`, by default windows of the whole image.
         """
         self._valid, self._structure, self._verification_px = valid, structure, scale.verification_px
         step_px = max(scale.window_px // 2, round((valid.size / _MAX_WINDOWS) ** 0.5))
         self.size_px = valid.shape[1], valid.shape[0]
-        self.lattice_px = max(scale.lattice_px, round(_MIN_LATTICE_SHARE * step_px))
+        self.lattice_px = max(scale.lattice_px, round(_MIN_NODE_SPACING * step_px))
         self.windows = windows or FixedWindows(valid, structure, scale.window_px, step_px)
 
     @cached_property
     def verification(self) -> FixedWindows:
-        """The windows in which a field is verified, side by side."""
+        """The windows in which a field is verified; they do not overlap."""
         return FixedWindows(self._valid, self._structure, self._verification_px)
 
     def refine(
         self, moving: Raster, mapping: PixelMapping, *, verify: bool = False
     ) -> DisplacementResult[FixedImagePx]:
-        """The field over a mapping, including the displacements that it already has, and its gain on held-out windows.
+        """Fit the displacement field of a mapping, including the field that the mapping already has.
 
-        The shifts are measured again under the field of each round: windows over steps become sharper, and long shifts
-        are found in steps. To `verify` is to leave windows out of the fit that is kept.
+        Returns no field if it does not reduce the residuals of held-out windows significantly. The shifts are measured
+        again with the field of each round, as correlation is sharper and large shifts are measured in steps. With
+        `verify` the result contains the cross-validated residual of the final field.
         """
         first = self._measure(moving, mapping)
         gain = self._best_gain(first)
-        if not gain.is_plain(_MIN_GAIN_SIGMA):
+        if not gain.is_significant(_MIN_GAIN_SIGMA):
             return DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
-        before = None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px)
-        field = before
+        initial = None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px)
+        field = initial
         for number in range(_MAX_ROUNDS):
             residual = first if number == 0 else self._measure(moving, replace(mapping, local=field))
-            more = self._field(Shifts.of(residual), gain.smoothness)
-            total = more if field is None else field.plus(more)
+            update = self._field(Shifts.of(residual), gain.smoothness)
+            total = update if field is None else field.plus(update)
             if not _is_one_to_one(total, self.size_px):
                 break
             field = total
-            if number + 1 >= _ROUNDS and residual.median_px <= _SETTLED_PX:
+            if number + 1 >= _MIN_ROUNDS and residual.median_px <= _CONVERGED_PX:
                 break
-        if field is None or field is before:
+        if field is None or field is initial:
             return DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
         result = DisplacementResult[FixedImagePx](field, gain.before_p95_px, gain.after_p95_px)
         if not verify:
@@ -133,57 +136,59 @@ class DisplacementEstimator:
     def _held_out(
         self, moving: Raster, mapping: PixelMapping, field: DisplacementField, smoothness: float
     ) -> Residual[FixedImagePx]:
-        """The residual of windows, each under a field that all windows which share a pixel with it are
-        left out of. Shifts are measured under the complete mapping, where the windows are sharp; the whole shift of
-        each is compared with the one that the others predict.
+        """Return the cross-validated residual of the verification windows.
+
+        The shifts are measured with the complete mapping, for which correlation is sharp. The total shift of each
+        window is compared with a field fitted to windows that share no pixels with it.
         """
         shifts = Shifts.of(self._measure(moving, mapping))
-        whole = replace(shifts, shifts_px=shifts.shifts_px + field(shifts.centres_px))
+        total = replace(shifts, shifts_px=shifts.shifts_px + field(shifts.centres_px))
         residual = self.verification.residuals(warped(moving, mapping, self.size_px))
-        apart_px = (self.windows.side + self.verification.side) / 2
-        predicted_px = self._left_out(whole, residual.centres_px, apart_px, smoothness)
-        left_px = residual.shifts_px + field(residual.centres_px) - predicted_px
-        return Residual.of(residual.centres_px, left_px, residual.peaks_sigma)
+        min_distance_px = (self.windows.side + self.verification.side) / 2
+        predicted_px = self._cross_predicted(total, residual.centres_px, min_distance_px, smoothness)
+        remaining_px = residual.shifts_px + field(residual.centres_px) - predicted_px
+        return Residual.of(residual.centres_px, remaining_px, residual.peaks_sigma)
 
     def _best_gain(self, first: Residual[FixedImagePx]) -> "_Gain":
-        """The gain of the first smoothness with a plain gain, from the finest upwards; else that of the last."""
-        some = [self._held_out_gain(first, s, _SOME_FOLDS, apart_px=0) for s in _SMOOTHNESS]
-        finest = min(some, key=lambda g: g.left).smoothness
-        # Held-out windows that are farther from those of the fit may only support a smoother field.
-        for smoothness in (s for s in _SMOOTHNESS if s >= finest):
-            gain = self._held_out_gain(first, smoothness, _ALL_FOLDS, apart_px=self.windows.side)
-            if gain.is_plain(_MIN_GAIN_SIGMA):
+        """Return the gain of the least smooth field with a significant gain, else that of the smoothest field."""
+        gains = [self._held_out_gain(first, s, _SOME_FOLDS, min_distance_px=0) for s in _SMOOTHNESS]
+        best = min(gains, key=lambda g: g.loss).smoothness
+        # Held-out windows at a larger distance from those of the fit may require a smoother field.
+        for smoothness in (s for s in _SMOOTHNESS if s >= best):
+            gain = self._held_out_gain(first, smoothness, _ALL_FOLDS, min_distance_px=self.windows.side)
+            if gain.is_significant(_MIN_GAIN_SIGMA):
                 break
         return gain
 
     def _held_out_gain(
-        self, residual: Residual[FixedImagePx], smoothness: float, folds: Iterable[int], apart_px: float
+        self, residual: Residual[FixedImagePx], smoothness: float, folds: Iterable[int], min_distance_px: float
     ) -> "_Gain":
-        """Leaves windows out in turn, and with them those nearer to one of them than `apart_px`."""
+        """Return the cross-validated gain of a field, without windows nearer than `min_distance_px` in the fit."""
         shifts = Shifts.of(residual)
         if len(shifts) < _MIN_WINDOWS:
             return _Gain(smoothness)
-        predicted = self._left_out(shifts, shifts.centres_px, apart_px, smoothness, folds)
+        predicted = self._cross_predicted(shifts, shifts.centres_px, min_distance_px, smoothness, folds)
         return _gain_of(shifts, np.linalg.norm(shifts.shifts_px - predicted, axis=1), smoothness)
 
-    def _left_out(
+    def _cross_predicted(
         self,
         shifts: "Shifts",
         centres_px: Points,
-        apart_px: float,
+        min_distance_px: float,
         smoothness: float,
         folds: Iterable[int] = _ALL_FOLDS,
     ) -> Points:
-        """(n, 2) shifts at centres (n, 2), each by a field through those of the windows that are at least `apart_px`
-        away along one axis; NaN in folds not tried.
+        """Predict the shifts (n, 2) at centres (n, 2) by fields fitted to windows at a minimum distance.
+
+        The distance is the maximum norm. NaN in other folds and where too few windows are left.
         """
         fold = _folds(centres_px)
         result = np.full((len(centres_px), 2), np.nan)
         for k in folds:
-            out = fold == k
-            kept = ~_near(shifts.centres_px, centres_px[out], max(apart_px, _ITSELF_PX))
-            if kept.sum() >= _MIN_WINDOWS // 2:
-                result[out] = self._field(shifts.some(kept), smoothness)(centres_px[out])
+            is_held_out = fold == k
+            is_fitted = ~_near(shifts.centres_px, centres_px[is_held_out], max(min_distance_px, _SAME_WINDOW_PX))
+            if is_fitted.sum() >= _MIN_WINDOWS // 2:
+                result[is_held_out] = self._field(shifts.subset(is_fitted), smoothness)(centres_px[is_held_out])
         return result
 
     def _field(self, shifts: "Shifts", smoothness: float) -> DisplacementField:
@@ -195,33 +200,36 @@ class DisplacementEstimator:
 
 @dataclass(frozen=True)
 class Shifts:
-    """The windows with a measured shift."""
+    """The measured shifts of windows."""
 
     centres_px: Points
+    """(n, 2)"""
     shifts_px: Points
-    trust: NDArray[np.float64]
-    """(n,) relative weights, 1 in the median: inverse variances, as the error of a shift falls with the square of its
-    peak's height."""
+    """(n, 2)"""
+    weights: NDArray[np.float64]
+    """(n,) relative inverse variances, median 1: the error of a shift is inversely proportional to the square of the
+    peak height."""
     peaks_sigma: NDArray[np.float64]
     """(n,) heights of the peaks, standard deviations."""
 
     @classmethod
     def of(cls, residual: Residual[FixedImagePx]) -> "Shifts":
-        known = np.isfinite(residual.shifts_px[:, 0])
-        sigma = residual.peaks_sigma[known]
-        trust = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
-        return cls(residual.centres_px[known], residual.shifts_px[known], trust, sigma)
+        measured = np.isfinite(residual.shifts_px[:, 0])
+        sigma = residual.peaks_sigma[measured]
+        weights = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
+        return cls(residual.centres_px[measured], residual.shifts_px[measured], weights, sigma)
 
     @classmethod
-    def together(cls, several: Sequence["Shifts"]) -> "Shifts":
-        """The windows of several captures in one."""
+    def joined(cls, several: Sequence["Shifts"]) -> "Shifts":
+        """Concatenate the shifts of several captures."""
         return cls(
             np.concatenate([s.centres_px for s in several]), np.concatenate([s.shifts_px for s in several]),
-            np.concatenate([s.trust for s in several]), np.concatenate([s.peaks_sigma for s in several]),
+            np.concatenate([s.weights for s in several]), np.concatenate([s.peaks_sigma for s in several]),
         )  # fmt: skip
 
-    def some(self, which: NDArray[np.bool_]) -> "Shifts":
-        return Shifts(self.centres_px[which], self.shifts_px[which], self.trust[which], self.peaks_sigma[which])
+    def subset(self, mask: NDArray[np.bool_]) -> "Shifts":
+        """Return the shifts where `mask` (n,) is True."""
+        return Shifts(self.centres_px[mask], self.shifts_px[mask], self.weights[mask], self.peaks_sigma[mask])
 
     def __len__(self) -> int:
         return len(self.centres_px)
@@ -232,59 +240,61 @@ _UNKNOWN_PX = FixedImagePx(math.nan)
 
 @dataclass(frozen=True)
 class _Gain:
-    """The gain of a field on windows left out of its fit."""
+    """Decrease of the residuals of held-out windows by a field."""
 
     smoothness: float
     before_p95_px: FixedImagePx = _UNKNOWN_PX
     after_p95_px: FixedImagePx = _UNKNOWN_PX
-    left: float = math.inf
-    """Mean log(1 + (shift / 0.1 px)^2) of the remaining shifts, weighted by trust: wrong peaks and the edges of trees,
-    which no smooth field follows, hardly count."""
+    loss: float = math.inf
+    """Weighted mean of log(1 + (shift / 0.1 px)^2) of the remaining shifts, which is robust to wrong peaks and depth
+    edges."""
     sigma: float = 0.0
-    """Mean fall of the squared shifts, in standard errors of that mean."""
+    """Mean decrease of the squared shifts, in standard errors."""
 
-    def is_plain(self, min_sigma: float) -> bool:
-        """True where a field helps on the whole and does not make the worst windows worse."""
+    def is_significant(self, min_sigma: float) -> bool:
+        """Return True if a field reduces the squared shifts significantly and does not increase their p95."""
         return self.sigma >= min_sigma and self.after_p95_px <= self.before_p95_px
 
 
-def _gain_of(shifts: Shifts, left: NDArray[np.float64], smoothness: float) -> _Gain:
-    """From the lengths `left` (n,) of the remaining shifts, px, nan for windows that were not left out."""
-    tried = np.isfinite(left) & (shifts.trust >= _MIN_TRUST)
-    if not tried.any():
+def _gain_of(shifts: Shifts, remaining_px: NDArray[np.float64], smoothness: float) -> _Gain:
+    """Return the gain from the lengths (n,) of the remaining shifts, NaN for windows that were not held out."""
+    is_compared = np.isfinite(remaining_px) & (shifts.weights >= _MIN_WEIGHT)
+    if not is_compared.any():
         return _Gain(smoothness)
-    before, after = np.linalg.norm(shifts.shifts_px[tried], axis=1), left[tried]
-    # Wrong peaks must not decide: a length counts up to twice the 95th percentile.
+    before, after = np.linalg.norm(shifts.shifts_px[is_compared], axis=1), remaining_px[is_compared]
+    # Clipping at twice p95 limits the influence of wrong peaks.
     maximum = 2 * np.percentile(before, 95)
-    fall = np.minimum(before, maximum) ** 2 - np.minimum(after, maximum) ** 2
-    sigma = fall.mean() / max(fall.std() / math.sqrt(len(fall)), 1e-12)
-    left_over = float(np.average(np.log1p((after / _FAR_PX) ** 2), weights=shifts.trust[tried]))
+    decrease = np.minimum(before, maximum) ** 2 - np.minimum(after, maximum) ** 2
+    sigma = decrease.mean() / max(decrease.std() / math.sqrt(len(decrease)), 1e-12)
+    loss = float(np.average(np.log1p((after / _LOSS_SCALE_PX) ** 2), weights=shifts.weights[is_compared]))
     before_p95, after_p95 = (FixedImagePx(np.percentile(lengths, 95)) for lengths in (before, after))
-    return _Gain(smoothness, before_p95, after_p95, left_over, float(sigma))
+    return _Gain(smoothness, before_p95, after_p95, loss, float(sigma))
 
 
 def _folds(centres_px: Points) -> NDArray[np.int64]:
-    """(n,) the fold in which each window is left out: every fourth along both axes, so that between two of them there
-    is one that overlaps neither.
+    """Return the fold (n,) of each window.
+
+    A fold contains every fourth window along both axes: between two of them is a window that overlaps neither.
     """
     column, row = (np.unique(centres_px[:, axis], return_inverse=True)[1] for axis in (0, 1))
     return np.asarray(column % 4 + 4 * (row % 4))
 
 
-def _near(centres_px: Points, others_px: Points, apart_px: float) -> NDArray[np.bool_]:
-    """(n,) True for windows (n, 2) nearer than this, along both axes, to one of the others (m, 2): two windows share a
-    pixel where they are nearer than their side.
+def _near(centres_px: Points, others_px: Points, distance_px: float) -> NDArray[np.bool_]:
+    """Return (n,) True for centres (n, 2) nearer than a distance to one of the others (m, 2), in the maximum norm.
+
+    Two windows share pixels if this distance is less than their side.
     """
     if not len(others_px):
         return np.zeros(len(centres_px), dtype=bool)
     nearest, _ = cKDTree(others_px).query(centres_px, p=np.inf)
-    return np.asarray(nearest < apart_px)
+    return np.asarray(nearest < distance_px)
 
 
 def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int, int]) -> DisplacementField | None:
-    """The smooth field that the windows of several captures have in common, on an image (width, height).
+    """Fit the displacement field that several captures have in common, on an image (width, height).
 
-    None where it does not explain captures that are left out of its fit: the lenses are the same in all.
+    None if it does not reduce the residuals of captures that are left out of the fit.
     """
     captures = [s for s in map(Shifts.of, residuals) if len(s)]
     if len(captures) < _MIN_CAPTURES:
@@ -293,16 +303,16 @@ def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int
     folds = [captures[k::count] for k in range(count)]
 
     def fitted(some: Sequence[Shifts], smoothness: float) -> DisplacementField:
-        return fitted_field(Shifts.together(some), smoothness * len(some), COARSE.lattice_px, size_px)
+        return fitted_field(Shifts.joined(some), smoothness * len(some), COARSE.lattice_px, size_px)
 
     def gain(smoothness: float) -> _Gain:
-        left = []
+        remaining_px = []
         for fold in folds:
             field = fitted([c for other in folds if other is not fold for c in other], smoothness)
-            left += [np.linalg.norm(c.shifts_px - field(c.centres_px), axis=1) for c in fold]
-        return _gain_of(Shifts.together([c for fold in folds for c in fold]), np.concatenate(left), smoothness)
+            remaining_px += [np.linalg.norm(c.shifts_px - field(c.centres_px), axis=1) for c in fold]
+        return _gain_of(Shifts.joined([c for fold in folds for c in fold]), np.concatenate(remaining_px), smoothness)
 
-    best = min(map(gain, _COMMON_SMOOTHNESS), key=lambda g: g.left)
+    best = min(map(gain, _COMMON_SMOOTHNESS), key=lambda g: g.loss)
     if best.sigma < _MIN_COMMON_GAIN_SIGMA or best.after_p95_px > _MAX_COMMON_P95_GROWTH * best.before_p95_px:
         return None
     field = fitted([c for fold in folds for c in fold], best.smoothness)
@@ -310,61 +320,65 @@ def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int
 
 
 def fitted_field(shifts: Shifts, smoothness: float, lattice_px: int, size_px: tuple[int, int]) -> DisplacementField:
-    """The smooth field d through shifts s at centres x: on a lattice,
+    """Fit a smooth field d to shifts s at centres x on a grid of nodes:
 
-        min sum_i t_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + pull |d|^2
+        min sum_i t_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + damping |d|^2
 
-    with trust t, second differences D2, and Cauchy weights w against wrong peaks. The pull to 0 is small: it decides
-    where nothing was measured.
+    t are the weights of the shifts, D2 second differences, and w Cauchy weights, which reduce the influence of wrong
+    peaks. The small damping makes the problem well-posed far from all windows.
 
-    The normal equations couple nodes at most two rows apart, so they are solved as a banded matrix, which is filled
-    directly: with sparse matrices, their construction took most of the time of an alignment.
+    The normal equations couple nodes at most two rows apart. Their banded matrix is filled directly, because the
+    construction of sparse matrices takes longer than the solution.
     """
-    # The nodes are numbered along the shorter side of the image: the time grows with the square of their number there.
+    # Nodes are numbered along the shorter side of the image, because the time is quadratic in their number there.
     columns, rows = (int(np.ceil(n / lattice_px)) + 1 for n in sorted(size_px))
     order = np.argsort(size_px, kind="stable")
-    nodes, weights = _interpolation(shifts.centres_px[:, order] / lattice_px, columns, rows)
-    penalty = smoothness * _bending(columns, rows)
-    penalty[0] += _PULL
+    nodes, bilinear = _interpolation(shifts.centres_px[:, order] / lattice_px, columns, rows)
+    penalty = smoothness * _second_difference_form(columns, rows)
+    penalty[0] += _DAMPING
     first, second = np.triu_indices(len(nodes))
-    places = (nodes[second] - nodes[first]) * (rows * columns) + nodes[first]
-    products = weights[first] * weights[second]
-    trust = shifts.trust
+    elements = (nodes[second] - nodes[first]) * (rows * columns) + nodes[first]
+    products = bilinear[first] * bilinear[second]
+    weights = shifts.weights
     for _ in range(_REWEIGHTINGS):
-        normal = penalty + _sums(places, products * trust, penalty.size).reshape(penalty.shape)
-        right = [_sums(nodes, weights * trust * s, rows * columns) for s in shifts.shifts_px.T]
-        field = solveh_banded(normal, np.stack(right, axis=-1), overwrite_ab=True, lower=True, check_finite=False)
-        fitted = (weights[..., None] * field[nodes]).sum(axis=0)
-        off = np.linalg.norm(shifts.shifts_px - fitted, axis=1)
-        spread = max(MAD_TO_STD * float(np.median(off)), _MIN_SPREAD_PX)
-        trust = shifts.trust * cauchy_weights(off, _OUTLIER_SPREADS * spread)
+        normal = penalty + _sums(elements, products * weights, penalty.size).reshape(penalty.shape)
+        right_side = [_sums(nodes, bilinear * weights * s, rows * columns) for s in shifts.shifts_px.T]
+        field = solveh_banded(normal, np.stack(right_side, axis=-1), overwrite_ab=True, lower=True, check_finite=False)
+        fitted = (bilinear[..., None] * field[nodes]).sum(axis=0)
+        residuals_px = np.linalg.norm(shifts.shifts_px - fitted, axis=1)
+        scale_px = max(MAD_TO_STD * float(np.median(residuals_px)), _MIN_SCALE_PX)
+        weights = shifts.weights * cauchy_weights(residuals_px, _CAUCHY_SCALES * scale_px)
     lattice = field.reshape(rows, columns, 2)
     return DisplacementField(float(lattice_px), lattice if order[0] == 0 else lattice.transpose(1, 0, 2).copy())
 
 
 def _interpolation(points: Points, columns: int, rows: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(4, n) each: the nodes around points in steps of the lattice, in ascending order, and their bilinear weights."""
+    """Return the four nodes around points (n, 2), in ascending order, and their bilinear weights, each (4, n).
+
+    The points are in units of the node spacing.
+    """
     cell = np.clip(np.floor(points).astype(np.int64), 0, (columns - 2, rows - 2))
     (x, y), (column, row) = (points - cell).T, cell.T
     nodes = row * columns + column + np.array([0, 1, columns, columns + 1])[:, None]
     return nodes, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y])
 
 
-def _sums(places: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """(count,): the sum of the values at each place."""
-    return np.asarray(np.bincount(places.ravel(), values.ravel(), count), np.float64)
+def _sums(indices: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return (count,) the sum of the values of each index."""
+    return np.asarray(np.bincount(indices.ravel(), values.ravel(), count), np.float64)
 
 
 @lru_cache(maxsize=8)
-def _bending(columns: int, rows: int) -> NDArray[np.float64]:
-    """(1 + 2 columns, rows columns): the quadratic form of the squared second differences along both axes, as the main
-    diagonal and those below it, each from its first element.
+def _second_difference_form(columns: int, rows: int) -> NDArray[np.float64]:
+    """Return the quadratic form of the squared second differences along both axes as a lower banded matrix.
+
+    Shape (1 + 2 columns, rows columns), as `scipy.linalg.solveh_banded` expects it.
     """
-    bend = vstack([
+    differences = vstack([
         kron(identity(rows), _second_differences(columns)), kron(_second_differences(rows), identity(columns)),
     ])  # fmt: skip
-    form = (bend.T @ bend).tocsr()
-    diagonals = [form.diagonal(-below) for below in range(2 * columns + 1)]
+    form = (differences.T @ differences).tocsr()
+    diagonals = [form.diagonal(-k) for k in range(2 * columns + 1)]
     return np.stack([np.pad(d, (0, rows * columns - len(d))) for d in diagonals])
 
 
@@ -373,10 +387,10 @@ def _second_differences(count: int) -> dia_matrix:
 
 
 def _is_one_to_one(field: DisplacementField, size_px: tuple[int, int]) -> bool:
-    """True where x + d(x) folds nowhere: its Jacobian is positive at four points a step of the lattice."""
+    """Return True if x + d(x) does not fold: its Jacobian determinant is positive at four points per node spacing."""
     x = np.arange(0.0, size_px[0], field.step_px / 4)
     y = np.arange(0.0, size_px[1], field.step_px / 4)
     points = np.stack(np.meshgrid(x, y), axis=-1)
     displaced = points + field(points)
-    by_x, by_y = np.diff(displaced, axis=1)[:-1], np.diff(displaced, axis=0)[:, :-1]
-    return bool((by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0] > 0).all())
+    dx, dy = np.diff(displaced, axis=1)[:-1], np.diff(displaced, axis=0)[:, :-1]
+    return bool((dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0] > 0).all())

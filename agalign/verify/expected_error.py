@@ -1,6 +1,4 @@
-"""The expected error of a band at every pixel: from the uncertainty of its mapping, and from the residual of the
-windows around.
-"""
+"""Expected error of a band at every pixel, from the uncertainty of its mapping and the residual shifts of windows."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,56 +11,56 @@ from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.lens_shapes import over_corners_and_lens
 
 _NEIGHBOURS = 8
-"""Windows that the error at a place is estimated from, those nearer with more weight."""
-_FAR_WINDOWS = 3.0
-"""Distance from all windows, in units of their spacing, beyond which they do not show the ground."""
+"""Number of windows from which the error at a point is estimated, weighted by their distance."""
+_FAR_SPACINGS = 3.0
+"""Range of distances beyond one spacing of windows over which p95 replaces the residuals of the nearest windows."""
 
 
 def expected_error_px(
     alignment: Alignment[FixedFilePx], size_px: tuple[int, int], points_px: Points
 ) -> NDArray[np.float64]:
-    """Root mean square error to be expected at points (n, 2) of the reference (width, height), raw px, (n,).
+    """Return the expected RMS error, px, at points (n, 2) of the reference (width, height), raw px.
 
-        error^2 = trace of D(x) C D(x)^T + mean square of the windows around + (1 - near) p95^2
+        error^2 = trace(D(x) C D(x)^T) + (1 - far) * local mean square + far * p95^2
 
-    with the covariance C of the corners and D as in `geometry.over_corners`, with the lens shapes where the mapping is
-    extrapolated. For a band that a rig predicts, the first term is the square of its standard error. The weight of the
-    windows falls with the distance; far from all of them the plane may miss the ground by as much as it does in the
-    worst twentieth of the windows. Infinite where nothing is known.
+    C is the covariance of the corners and D the Jacobian `geometry.over_corners`, with lens shapes if the mapping is
+    extrapolated. For a band that is predicted by a rig, the first term is the squared standard error. The local mean
+    square is that of the residual shifts of the nearest windows; `far` grows from 0 to 1 with the distance from them.
+    Infinite where the error is unknown.
     """
-    square = _of_the_mapping(alignment, size_px, points_px)
+    square = _mapping_px2(alignment, size_px, points_px)
     residual = alignment.residual
     if residual is None or not np.isfinite(residual.shifts_px[:, 0]).any():
         return np.sqrt(square)
-    return np.asarray(np.sqrt(square + _of_the_windows(residual, points_px)))
+    return np.asarray(np.sqrt(square + _windows_px2(residual, points_px)))
 
 
-def _of_the_mapping(
-    alignment: Alignment[FixedFilePx], size_px: tuple[int, int], points_px: Points
-) -> NDArray[np.float64]:
+def _mapping_px2(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], points_px: Points) -> NDArray[np.float64]:
+    """Return the variance of the mapping at points, (n,)."""
     if alignment.status == "predicted" and alignment.prediction is not None:
-        # A standard error is in px of the moving file.
-        ratio = abs(float(geometry.local_scale(alignment.fixed_to_moving, *size_px)[-1]))
         if alignment.prediction.covariance_px2 is not None:
-            over = over_corners_and_lens(points_px, size_px)
-            return np.asarray(np.einsum("nki,ij,nkj->n", over, alignment.prediction.covariance_px2, over))
+            jacobian = over_corners_and_lens(points_px, size_px)
+            return np.asarray(np.einsum("nki,ij,nkj->n", jacobian, alignment.prediction.covariance_px2, jacobian))
+        # The standard error is in px of the moving file.
+        ratio = abs(float(geometry.local_scale(alignment.fixed_to_moving, *size_px)[-1]))
         return np.full(len(points_px), (alignment.prediction.std_px / ratio) ** 2)
     joint = alignment.joint
     if alignment.status != "aligned" or joint is None or joint.corner_covariance_px2 is None:
         return np.full(len(points_px), 0.0 if joint is None and alignment.status == "aligned" else np.inf)
-    over = geometry.over_corners(points_px, *size_px)
-    return np.asarray(np.einsum("nki,ij,nkj->n", over, joint.corner_covariance_px2, over))
+    jacobian = geometry.over_corners(points_px, *size_px)
+    return np.asarray(np.einsum("nki,ij,nkj->n", jacobian, joint.corner_covariance_px2, jacobian))
 
 
-def _of_the_windows(residual: Residual[FixedFilePx], points_px: Points) -> NDArray[np.float64]:
-    some = np.isfinite(residual.shifts_px[:, 0])
-    centres, squares = residual.centres_px[some], (residual.shifts_px[some] ** 2).sum(axis=1)
+def _windows_px2(residual: Residual[FixedFilePx], points_px: Points) -> NDArray[np.float64]:
+    """Return the expected squared residual shift at points, (n,)."""
+    measured = np.isfinite(residual.shifts_px[:, 0])
+    centres, squares = residual.centres_px[measured], (residual.shifts_px[measured] ** 2).sum(axis=1)
     count = min(_NEIGHBOURS, len(centres))
-    distance, which = cKDTree(centres).query(points_px, k=count)
-    distance, which = distance.reshape(-1, count), which.reshape(-1, count)
-    all_apart, _ = cKDTree(residual.centres_px).query(residual.centres_px, k=min(2, len(residual.centres_px)))
-    apart = max(float(np.median(all_apart.reshape(len(residual.centres_px), -1)[:, -1])), 1.0)
-    nearness = np.exp(-0.5 * (distance / apart) ** 2) + 1e-12
-    around = (nearness * squares[which]).sum(axis=1) / nearness.sum(axis=1)
-    far = np.clip((distance[:, 0] / apart - 1) / _FAR_WINDOWS, 0, 1)
-    return np.asarray((1 - far) * around + far * max(residual.p95_px**2, float(squares.mean())))
+    distance, index = cKDTree(centres).query(points_px, k=count)
+    distance, index = distance.reshape(-1, count), index.reshape(-1, count)
+    nearest, _ = cKDTree(residual.centres_px).query(residual.centres_px, k=min(2, len(residual.centres_px)))
+    spacing = max(float(np.median(nearest.reshape(len(residual.centres_px), -1)[:, -1])), 1.0)
+    weight = np.exp(-0.5 * (distance / spacing) ** 2) + 1e-12
+    local_px2 = (weight * squares[index]).sum(axis=1) / weight.sum(axis=1)
+    far = np.clip((distance[:, 0] / spacing - 1) / _FAR_SPACINGS, 0, 1)
+    return np.asarray((1 - far) * local_px2 + far * max(residual.p95_px**2, float(squares.mean())))

@@ -1,4 +1,4 @@
-"""Check that the windows show every quarter of the image: elsewhere the mapping is extrapolated."""
+"""Check that shifts were measured in every quarter of the image; elsewhere the mapping is extrapolated."""
 
 import numpy as np
 
@@ -18,30 +18,33 @@ EXTRAPOLATED = IssueKind(
         "--error-map writes the expected error of each pixel",
     ),
 )
-"""Not in `CHECKS`: the result stays, as a prediction with the error of the extrapolation."""
+"""Not in `CHECKS`: the result is kept as a prediction with the error of the extrapolation."""
 _INNER_SHARE = 1 / 8
-"""Windows nearer to an axis of the image than this share of its side do not show a quarter: from there, the mapping is
-extrapolated over most of it."""
+"""Windows within this share of the side from the image's axes are not counted for a quarter, as most of it would still
+be extrapolated."""
 _MIN_WINDOWS = 2
-"""Measured windows in a quarter: a single one may be a wrong peak."""
+"""Minimum number of measured windows in a quarter; a single one may be a wrong peak."""
 _MIN_SHARE_IN_FRAME = 0.5
-"""A quarter counts where the moving image covers this share of it: elsewhere there is nothing to align."""
+"""Quarters are only checked if the moving image covers at least this share of them."""
 _LATTICE = 24, 18
-"""Columns and rows of the points by which that share is measured."""
+"""Columns and rows of the points with which that share is measured."""
 _QUARTERS = (("top left", -1, -1), ("top right", 1, -1), ("bottom right", 1, 1), ("bottom left", -1, 1))
 
 
 def points_in_frame(mapping: PixelMapping, size_px: tuple[int, int], moving_size_px: tuple[int, int]) -> Points:
-    """The points (n, 2) of a lattice over the reference that are mapped into the moving image (width, height each)."""
+    """Return the points (n, 2) of a grid over the reference that are mapped into the moving image.
+
+    Sizes are (width, height).
+    """
     points = geometry.lattice(*size_px, *_LATTICE)
     mapped = mapping(points)
     return points[((mapped >= -0.5) & (mapped <= np.subtract(moving_size_px, 0.5))).all(axis=1)]
 
 
-def unseen_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_px: Points | None = None) -> list[str]:
-    """The quarters of an image (width, height) in which fewer than two of the windows with these centres (n, 2) are.
+def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_px: Points | None = None) -> list[str]:
+    """Return the quarters of an image (width, height) with fewer than _MIN_WINDOWS of the centres (n, 2).
 
-    `in_frame_px` limits them to the part that the moving image covers; None is the whole image.
+    `in_frame_px` are the points of the image that the moving image covers, all of them by default.
     """
     lattice = geometry.lattice(*size_px, *_LATTICE)
     covered = lattice if in_frame_px is None else in_frame_px
@@ -56,13 +59,13 @@ def unseen_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_px: P
 def issues_of_extrapolation(
     residual: Residual[FixedPx], size_px: tuple[int, int], in_frame_px: Points
 ) -> tuple[Issue, ...]:
-    """One where the measured windows leave out a quarter of what the moving image covers."""
-    unseen = unseen_quarters(residual.measured_px, size_px, in_frame_px)
-    return (Issue(EXTRAPOLATED, float(len(unseen)), 0.0, " and ".join(unseen)),) if unseen else ()
+    """Return an issue if a quarter of the area that the moving image covers has no measured windows."""
+    quarters = unobserved_quarters(residual.measured_px, size_px, in_frame_px)
+    return (Issue(EXTRAPOLATED, float(len(quarters)), 0.0, " and ".join(quarters)),) if quarters else ()
 
 
 def _count(points_px: Points, size_px: tuple[int, int], sides: list[int]) -> int:
-    """How many points (n, 2) are in the outer part of the quarter on these sides (x, y) of the centre."""
+    """Count the points (n, 2) in the outer part of the quarter with signs `sides` (x, y) relative to the centre."""
     size = np.array(size_px, dtype=np.float64)
     from_centre = (points_px - (size - 1) / 2) / size * np.array(sides)
     return int((from_centre > _INNER_SHARE).all(axis=1).sum())

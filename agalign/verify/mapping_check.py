@@ -1,4 +1,4 @@
-"""Check of the homography itself: an image of a flat scene is neither folded nor stretched by much."""
+"""Check of the homography: it does not fold the image, and its magnification varies by a limited ratio."""
 
 from collections.abc import Iterator
 
@@ -9,12 +9,12 @@ from agalign.verify.check import Check, Evidence
 
 FOLDS = IssueKind("folds", "the mapping folds or stretches the image", UNLIKE)
 _MAX_STRETCH = 4.0
-"""Largest over smallest magnification within an image: more is a degenerate homography, not a perspective."""
+"""Maximum ratio of the largest and the smallest magnification: beyond it, a homography is degenerate."""
 
 
 def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     scale = geometry.local_scale(evidence.joint.fixed_to_moving, *evidence.size_px)
-    # Written so that nan does not pass.
+    # The negation also rejects NaN.
     if not (scale.min() > 0 and scale.max() <= _MAX_STRETCH * scale.min()):
         yield Issue(FOLDS, float(scale.max() / scale.min()), _MAX_STRETCH)
 

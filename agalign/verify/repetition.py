@@ -1,4 +1,4 @@
-"""Check for a repetitive scene, where another place fits as well: orchards on a lattice, panels, greenhouse roofs."""
+"""Check for aliasing in repetitive scenes: orchards on a grid, solar panels, greenhouse roofs."""
 
 import math
 from collections.abc import Iterator
@@ -21,28 +21,28 @@ REPEATS = IssueKind(
     ),
 )
 MAX_ALIAS_PEAK = 0.75
-"""Height of the next correlation peak over that of the result, from which the scene counts as repetitive."""
-_SAME_PX = 3
-"""Radius of a correlation peak, px of the reduced images: anything nearer is its own flank."""
+"""Ratio of the heights of the next correlation peak and that of the result, above which the scene is repetitive."""
+_PEAK_RADIUS_PX = 3
+"""Radius of a correlation peak, px of the reduced images."""
 
 
 @dataclass(frozen=True)
 class AliasPeak:
-    """The highest correlation peak apart from that of the result."""
+    """The highest correlation peak after that of the result."""
 
     shift_px: tuple[float, float]
-    """(x, y) from the result, px of the reduced images."""
-    share: float
-    """Its height over that of the result's peak."""
+    """(x, y) relative to the result, px of the reduced images."""
+    ratio: float
+    """Its height relative to that of the result."""
 
 
 def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
-    """One where another place fits nearly as well and nothing known beforehand rules it out."""
+    """Yield an issue if another shift fits nearly as well and no prior information excludes it."""
     images = evidence.images
     if images is None:
         return
     alias = alias_peak(*images.reduced_spectra())
-    if alias.share <= MAX_ALIAS_PEAK:
+    if alias.ratio <= MAX_ALIAS_PEAK:
         return
     x_px, y_px = (shift / scale for shift, scale in zip(alias.shift_px, images.reduced_scale, strict=True))
     if not images.is_expected() or images.is_expected((x_px, y_px)):
@@ -50,17 +50,17 @@ def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
 
 
 def alias_peak(fixed: Field, moving: Field) -> AliasPeak:
-    """The highest peak apart from that at no shift, of windowed spectra (height, width) of two images on one grid."""
+    """Return the highest peak except that at zero shift; `fixed` and `moving` are windowed spectra (height, width)."""
     surface = np.fft.fftshift(correlation_surfaces(fixed, moving))
     height, width = surface.shape
-    row, column = height // 2, width // 2
-    near = np.s_[row - _SAME_PX : row + _SAME_PX + 1, column - _SAME_PX : column + _SAME_PX + 1]
-    own_height = float(surface[near].max())
-    surface[near] = -np.inf
+    row, column, radius = height // 2, width // 2, _PEAK_RADIUS_PX
+    centre = np.s_[row - radius : row + radius + 1, column - radius : column + radius + 1]
+    centre_peak = float(surface[centre].max())
+    surface[centre] = -np.inf
     index = int(surface.argmax())
     shift_px = float(index % width - column), float(index // width - row)
-    height_there = float(surface.flat[index])
-    return AliasPeak(shift_px, height_there / own_height if own_height > 0 else float("inf"))
+    other_peak = float(surface.flat[index])
+    return AliasPeak(shift_px, other_peak / centre_peak if centre_peak > 0 else float("inf"))
 
 
 CHECK = Check((REPEATS,), _issues, is_costly=True)

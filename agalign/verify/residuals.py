@@ -1,4 +1,4 @@
-"""Residual shifts between the structures of two bands on one grid, window by window."""
+"""Residual shifts of windows between the structures of two bands on one grid."""
 
 import math
 from collections.abc import Sequence
@@ -23,30 +23,30 @@ from agalign.values.pixel_units import FixedImagePx, FixedPx
 _Origin = tuple[int, int]
 
 _WINDOW_PX = 112
-"""Side of the windows: large enough for a plain peak over crops, small enough to localise what is not aligned."""
+"""Side of the windows: large enough for a clear peak over crops, small enough to localise misalignment."""
 _MIN_WINDOW_PX = 32
-"""Smaller windows of small images have no reliable peak."""
+"""Minimum side of the windows in small images; smaller windows have no reliable peak."""
 _MIN_STRENGTH = 0.05
-"""Mean structure, of at most 1, below which a window shows only noise."""
+"""Minimum mean amplitude of the structure field, which is at most 1; weaker windows contain only noise."""
 _MIN_PEAK_SIGMA = 7.0
-"""Correlation peak, in standard deviations of its surface, from which a shift counts: lower peaks are chance."""
+"""Minimum correlation peak of a measured shift, in standard deviations of its surface; lower peaks may be chance."""
 _FIELD_PX = 128
 """Side of the fields of a chessboard: twice that of a window."""
 _MIN_VALID = 0.9
-"""Share of a window's pixels that must be valid in both images."""
+"""Minimum share of a window's pixels that are valid in both images."""
 
 
 class FixedWindows:
-    """The reference cut into windows, ready to be compared with any number of moving bands."""
+    """Windows of the reference, whose shifts can be measured in any number of moving bands."""
 
     def __init__(
         self, valid: Mask, structure: Field, side_px: int = _WINDOW_PX, step_px: int | None = None,
         origins: Sequence[_Origin] | None = None,
     ) -> None:  # fmt: skip
-        """`valid` and `structure` (height, width) are those of the reference.
+        """Cut the structure field (height, width) of the reference into windows.
 
-        Windows have a side of `side_px`, less on images smaller than four windows, and start every `step_px`, by
-        default side by side; or they start at `origins` (x, y).
+        `valid` (height, width) is its mask. Windows have a side of `side_px`, less on images smaller than four windows,
+        and a spacing of `step_px`, by default without overlap; or their top left pixels are `origins` (x, y).
         """
         self.valid = valid
         height, width = valid.shape
@@ -59,9 +59,9 @@ class FixedWindows:
 
     @classmethod
     def on_chessboard(cls, valid: Mask, structure: Field, side_px: int, *, white: bool) -> "FixedWindows":
-        """Three by three windows inside each of the black, or of the white, fields of a chessboard.
+        """Create 3 x 3 windows in each of the black or white fields of a chessboard.
 
-        Those of one colour share no pixel with those of the other: the ones can be fitted, the others verify.
+        Windows of different colours share no pixels, so those of one colour can verify a fit to the other.
         """
         height, width = valid.shape
         starts = range(0, _FIELD_PX - side_px + 1, (_FIELD_PX - side_px) // 2)
@@ -76,25 +76,24 @@ class FixedWindows:
         return cls(valid, structure, side_px, origins=origins)
 
     def residuals(self, moving: Raster, min_valid: float = _MIN_VALID) -> Residual[FixedImagePx]:
-        """The shift of each window's content, px; nan where no correlation peak stands out.
+        """Measure the shift of each window in a moving band on the reference grid, px; NaN without a clear peak.
 
-        Windows with a smaller share of valid pixels than `min_valid` are left out. An invalid area has no structure,
-        but its outline biases the shift: by some tenths of a px in windows of 64 px with a twentieth missing.
+        Windows with a smaller share of valid pixels than `min_valid` are omitted: the outline of an invalid area biases
+        the shift, by some tenths of a px in windows of 64 px with a twentieth of invalid pixels.
         """
-        both = self.valid & moving.valid
+        valid = self.valid & moving.valid
         field = structure_field(moving)
-        minimum = min_valid * self.side**2
-        valid = [o for o in self.origins if np.count_nonzero(self._cut(both, o)) >= minimum]
-        origins, windows = self._strong(field, valid)
+        min_count = min_valid * self.side**2
+        usable = [o for o in self.origins if np.count_nonzero(self._cut(valid, o)) >= min_count]
+        origins, windows = self._strong(field, usable)
         rows = {o: i for i, o in enumerate(self.origins)}
-        tried = self.spectra if len(origins) == len(rows) else self.spectra[[rows[o] for o in origins]]
-        cross = whitened_cross_spectra(tried, windowed_spectra(windows))
-        result, sigma = _peaks(cross)
-        return Residual.of(self._centres_px(origins), result, sigma)
+        fixed = self.spectra if len(origins) == len(rows) else self.spectra[[rows[o] for o in origins]]
+        shifts_px, sigma = _peaks(whitened_cross_spectra(fixed, windowed_spectra(windows)))
+        return Residual.of(self._centres_px(origins), shifts_px, sigma)
 
     @property
     def centres_px(self) -> NDArray[np.float64]:
-        """(n, 2) of the windows with structure."""
+        """(n, 2) centres of the windows with structure."""
         return self._centres_px(self.origins)
 
     def _centres_px(self, origins: Sequence[_Origin]) -> NDArray[np.float64]:
@@ -105,50 +104,51 @@ class FixedWindows:
         return image[y : y + self.side, x : x + self.side]
 
     def _strong(self, field: Field, origins: list[_Origin]) -> tuple[list[_Origin], Field]:
-        """(origins of the windows with structure; their content (n, side, side), each without its mean).
+        """Return the origins of the windows with structure, and the windows (n, side, side) minus their means.
 
-        The mean orientation of a row crop is the same everywhere and does not distinguish places.
+        The mean orientation of a row crop is the same everywhere and contains no information on the position.
         """
-        cut = np.empty((len(origins), self.side, self.side), np.complex64)
-        for window, origin in zip(cut, origins, strict=True):
+        windows = np.empty((len(origins), self.side, self.side), np.complex64)
+        for window, origin in zip(windows, origins, strict=True):
             window[:] = self._cut(field, origin)
-        strong = np.abs(cut[:, ::2, ::2]).mean(axis=(1, 2)) >= _MIN_STRENGTH
-        if not strong.all():
-            cut = cut[strong]
-        cut -= cut.mean(axis=(1, 2), keepdims=True)
-        return [o for o, s in zip(origins, strong, strict=True) if s], cut
+        is_strong = np.abs(windows[:, ::2, ::2]).mean(axis=(1, 2)) >= _MIN_STRENGTH
+        if not is_strong.all():
+            windows = windows[is_strong]
+        windows -= windows.mean(axis=(1, 2), keepdims=True)
+        return [o for o, strong in zip(origins, is_strong, strict=True) if strong], windows
 
 
 def residual_under(residual: Residual[FixedPx], before: PixelMapping, after: PixelMapping) -> Residual[FixedPx]:
-    """The residual of windows measured under one mapping, as it is under another one that is all but equal.
+    """Convert the residual of windows measured with the mapping `before` to a mapping `after` that is nearly equal.
 
-    The content at p + s of the fixed image under `before` is at p + s - d under `after`, with before(p + s) =
-    after(p + s - d); d to first order in the difference of the two.
+    A point p + s of the fixed image, mapped by `before`, corresponds to p + s - d, mapped by `after`, with
+    before(p + s) = after(p + s - d). d is computed to first order in the difference of the mappings.
     """
     shifts = residual.shifts_px
-    at = residual.centres_px + np.nan_to_num(shifts)
-    slopes = np.stack([before(at + e) - before(at - e) for e in 0.5 * np.eye(2)], axis=-1)
-    farther = np.linalg.solve(slopes, (after(at) - before(at))[..., None])[..., 0]
-    return Residual.of(residual.centres_px, shifts - farther, residual.peaks_sigma)
+    points = residual.centres_px + np.nan_to_num(shifts)
+    jacobians = np.stack([before(points + e) - before(points - e) for e in 0.5 * np.eye(2)], axis=-1)
+    difference = np.linalg.solve(jacobians, (after(points) - before(points))[..., None])[..., 0]
+    return Residual.of(residual.centres_px, shifts - difference, residual.peaks_sigma)
 
 
 def _starts(length: int, side: int, step: int | None) -> list[int]:
+    """Return the first pixels of equally spaced windows along an axis; without `step` they cover it once."""
     count = max(1, math.ceil(length / side) if step is None else 1 + math.ceil((length - side) / step))
     return [round(v) for v in np.linspace(0, max(0, length - side), count)]
 
 
 def _peaks(cross: Field) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """((n, 2) shifts, nan where no peak stands out; (n,) heights in standard deviations) of cross spectra."""
+    """Return the shifts (n, 2) px of cross spectra, NaN without a clear peak, and the peak heights (n,) in sigma."""
     count, height, width = cross.shape
     surfaces = inverse_transform(cross).real.reshape(count, height * width)
     highest = surfaces.argmax(axis=1)
-    # Their means are 0: the windows have none.
-    spread = np.sqrt(np.einsum("ni,ni->n", surfaces, surfaces) / (height * width))
-    sigma = surfaces[np.arange(count), highest] / np.where(spread > 0, spread, np.inf)
+    # The surfaces have mean 0, because the windows have.
+    std = np.sqrt(np.einsum("ni,ni->n", surfaces, surfaces) / (height * width))
+    sigma = surfaces[np.arange(count), highest] / np.where(std > 0, std, np.inf)
     row, column = np.divmod(highest, width)
     # Shifts are circular: beyond half a window they are negative.
-    at = np.stack([(column + width // 2) % width - width // 2, (row + height // 2) % height - height // 2], axis=1)
-    result = np.full((count, 2), np.nan)
-    plain = sigma >= _MIN_PEAK_SIGMA
-    result[plain] = peak_positions(cross[plain], at[plain].astype(np.float64))
-    return result, sigma.astype(np.float64)
+    coarse = np.stack([(column + width // 2) % width - width // 2, (row + height // 2) % height - height // 2], axis=1)
+    shifts_px = np.full((count, 2), np.nan)
+    is_clear = sigma >= _MIN_PEAK_SIGMA
+    shifts_px[is_clear] = peak_positions(cross[is_clear], coarse[is_clear].astype(np.float64))
+    return shifts_px, sigma.astype(np.float64)

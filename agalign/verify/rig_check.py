@@ -1,4 +1,4 @@
-"""Check against the flight's rig: in a repetitive scene the images may agree whole periods away."""
+"""Check against the flight's rig, which detects aliasing in repetitive scenes."""
 
 from collections.abc import Iterator
 
@@ -14,9 +14,9 @@ UNEXPECTED_PX = IssueKind(
     ),
 )  # fmt: skip
 MAX_UNEXPECTED_PX = 3.0
-"""Distance from the prediction, px of the moving file, that is always accepted: relief alone causes as much."""
+"""Distance from the prediction, px of the moving file, that is always accepted, as relief may cause it."""
 _MAX_UNEXPECTED_STD = 5.0
-"""The same in standard errors of the prediction, where these are large."""
+"""Larger distances are accepted up to this multiple of the prediction's standard error."""
 
 
 def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
@@ -24,7 +24,7 @@ def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     if prediction is None or prediction.off_px is None:
         return
     limit_px = max(MAX_UNEXPECTED_PX, _MAX_UNEXPECTED_STD * prediction.std_px)
-    # Written so that nan does not pass.
+    # The negation also rejects NaN.
     if not prediction.off_px <= limit_px:
         yield Issue(UNEXPECTED_PX, prediction.off_px, limit_px)
 

@@ -1,4 +1,4 @@
-"""Check of the residual shifts of windows, which do not depend on how the alignment was estimated."""
+"""Check of the residual shifts of windows, which are independent of the estimation."""
 
 from collections.abc import Iterator
 
@@ -26,20 +26,20 @@ CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misal
 RESIDUAL_PX = IssueKind("residual_px", "the median residual shift is {value:.1f} px", UNLIKE)
 
 _MIN_WINDOWS = 4
-"""Windows with structure without which nothing can be verified: fewer leave a corner of the image unseen."""
+"""Minimum number of windows with structure: fewer cannot cover all corners of the image."""
 _MIN_COVERAGE = 0.6
-"""Share of the windows with structure in which a shift can be measured: few windows of unrelated images have a peak."""
+"""Minimum share of the windows with structure that have a measured shift; it is small for unrelated images."""
 _MAX_MEDIAN_PX = 1.0
-"""Median length of the residual shifts: beyond, an index mixes neighbouring pixels everywhere."""
+"""Maximum median residual shift: beyond it, a spectral index mixes neighbouring pixels."""
 _CLOSE_PX = 1.0
-"""Residual shift up to which a single window counts as aligned."""
+"""Maximum residual shift of an aligned window."""
 _MIN_CLOSE = 0.9
-"""Share of the measured windows that must be close: a few scattered wrong peaks are normal."""
-_MIN_CLUSTER, _MAX_CLUSTER = 5, 0.04
-"""Adjacent windows that are not close, as a count and as a share of those measured, from which a part of the image is
-not aligned: wrong peaks are scattered, parallax is not. Both must be reached."""
-_NEIGHBOUR = 1.6
-"""Distance of adjacent windows in units of their spacing: diagonal neighbours (1.41) count."""
+"""Minimum share of aligned windows among the measured ones: a few wrong peaks are normal."""
+_MIN_CLUSTER, _MAX_CLUSTER_SHARE = 5, 0.04
+"""Size of a cluster of adjacent misaligned windows, as a count and as a share of the measured windows, from which it is
+an issue; both must be reached. Wrong peaks are scattered, windows with parallax are adjacent."""
+_MAX_NEIGHBOUR_SPACINGS = 1.6
+"""Maximum distance of adjacent windows in units of their spacing; includes diagonal neighbours (1.41)."""
 
 
 def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
@@ -47,7 +47,7 @@ def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     if len(residual.centres_px) < _MIN_WINDOWS:
         yield Issue(FEW_WINDOWS, len(residual.centres_px), _MIN_WINDOWS)
         return
-    # Each is written so that nan does not pass.
+    # The negations also reject NaN.
     if not residual.coverage >= _MIN_COVERAGE:
         yield Issue(COVERAGE, residual.coverage, _MIN_COVERAGE)
     yield from _issues_of_outliers(residual, evidence.file_px)
@@ -59,24 +59,24 @@ def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
 def _issues_of_outliers(residual: Residual[FixedPx], file_px: float) -> Iterator[Issue]:
     measured = np.isfinite(residual.shifts_px[:, 0])
     count = max(int(measured.sum()), 1)
-    off = measured & (np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _CLOSE_PX * file_px)
-    close = 1 - float(off.sum()) / count
+    misaligned = measured & (np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _CLOSE_PX * file_px)
+    close = 1 - float(misaligned.sum()) / count
     if not close >= _MIN_CLOSE:
         yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE, f"{_CLOSE_PX:g} px")
-    cluster = _largest_cluster(residual.centres_px[off], residual.centres_px)
-    maximum = max(_MIN_CLUSTER, round(_MAX_CLUSTER * int(measured.sum())))
-    if not cluster < maximum:
-        yield Issue(CLUSTER, cluster / count, maximum / count)
+    cluster = _largest_cluster(residual.centres_px[misaligned], residual.centres_px)
+    limit = max(_MIN_CLUSTER, round(_MAX_CLUSTER_SHARE * int(measured.sum())))
+    if not cluster < limit:
+        yield Issue(CLUSTER, cluster / count, limit / count)
 
 
-def _largest_cluster(off_px: Points, all_px: Points) -> int:
-    """Size of the largest group of adjacent windows (n, 2) among those of the grid of all windows (m, 2)."""
-    if len(off_px) == 0 or len(all_px) < 2:
-        return len(off_px)
+def _largest_cluster(centres_px: Points, all_px: Points) -> int:
+    """Return the size of the largest group of adjacent centres (n, 2); the grid of windows is `all_px` (m, 2)."""
+    if len(centres_px) == 0 or len(all_px) < 2:
+        return len(centres_px)
     spacing, _ = cKDTree(all_px).query(all_px, k=2)
-    reach = _NEIGHBOUR * float(np.median(spacing[:, 1]))
-    adjacent = cKDTree(off_px).sparse_distance_matrix(cKDTree(off_px), reach)
-    _, labels = connected_components(adjacent.tocsr() + identity(len(off_px)), directed=False)
+    radius_px = _MAX_NEIGHBOUR_SPACINGS * float(np.median(spacing[:, 1]))
+    adjacent = cKDTree(centres_px).sparse_distance_matrix(cKDTree(centres_px), radius_px)
+    _, labels = connected_components(adjacent.tocsr() + identity(len(centres_px)), directed=False)
     return int(np.bincount(labels).max())
 
 

@@ -128,11 +128,11 @@ def test_no_window_is_explained_by_one_that_shares_a_pixel_with_it() -> None:
 
 
 def test_a_field_that_makes_the_worst_windows_worse_is_not_kept() -> None:
-    better = _Gain(1.0, before_p95_px=1.62, after_p95_px=1.59, left=0.1, sigma=9.0)
-    worse = _Gain(1.0, before_p95_px=1.59, after_p95_px=1.62, left=0.1, sigma=9.0)
-    assert better.is_plain(4.0)
-    assert not worse.is_plain(4.0)
-    assert not _Gain(1.0).is_plain(4.0)
+    better = _Gain(1.0, before_p95_px=1.62, after_p95_px=1.59, loss=0.1, sigma=9.0)
+    worse = _Gain(1.0, before_p95_px=1.59, after_p95_px=1.62, loss=0.1, sigma=9.0)
+    assert better.is_significant(4.0)
+    assert not worse.is_significant(4.0)
+    assert not _Gain(1.0).is_significant(4.0)
 
 
 def of_captures(count: int, height: float, seed: int) -> list[Residual]:
@@ -185,7 +185,7 @@ def test_a_field_that_fits_unrelated_windows_explains_none_that_were_left_out(ch
     valid = np.ones(SIZE[::-1], bool)
     estimator = DisplacementEstimator(valid, structure_field(Raster(textured_image(*SIZE), valid)), scale)
     gain = estimator._best_gain(residual)
-    assert not gain.is_plain(4.0)
+    assert not gain.is_significant(4.0)
     field = estimator._field(Shifts.of(residual), 0.001)
     explained = np.linalg.norm(shifts - field(at), axis=1)
     assert np.median(explained) < 0.8 * np.median(np.linalg.norm(shifts, axis=1))
@@ -200,7 +200,7 @@ def test_what_is_reported_of_a_field_was_left_out_of_its_fit() -> None:
     estimator = DisplacementEstimator(valid, structure_field(Raster(textured_image(*SIZE), valid)), COARSE)
     own, others = (
         np.median(np.linalg.norm(shifts.shifts_px - prediction, axis=1))
-        for prediction in (estimator._field(shifts, 0.3)(at), estimator._left_out(shifts, at, 64, 0.3))
+        for prediction in (estimator._field(shifts, 0.3)(at), estimator._cross_predicted(shifts, at, 64, 0.3))
     )
     assert others > 1.1 * own
     assert others == pytest.approx(np.median(np.linalg.norm(jumps, axis=1)), rel=0.25)
@@ -215,8 +215,8 @@ def test_no_window_that_shares_a_pixel_takes_part_in_a_prediction() -> None:
     moved = quiet.shifts_px.copy()
     moved[np.abs(at - at[one]).max(axis=1) < 64] += 3.0
     loud = replace(quiet, shifts_px=moved)
-    before, after = (estimator._left_out(s, at, 64, 1.0)[one] for s in (quiet, loud))
+    before, after = (estimator._cross_predicted(s, at, 64, 1.0)[one] for s in (quiet, loud))
     np.testing.assert_allclose(before, after, atol=1e-9)
     neighbour = int(np.argmin(np.linalg.norm(at - at[one] - (96, 0), axis=1)))
-    changed = (estimator._left_out(s, at, 64, 1.0)[neighbour] for s in (quiet, loud))
+    changed = (estimator._cross_predicted(s, at, 64, 1.0)[neighbour] for s in (quiet, loud))
     assert np.linalg.norm(next(changed) - next(changed)) > 0.02

@@ -11,7 +11,7 @@ from agalign.verify.extrapolation_check import (
     EXTRAPOLATED,
     issues_of_extrapolation,
     points_in_frame,
-    unseen_quarters,
+    unobserved_quarters,
 )
 
 SIZE = 1000, 800
@@ -20,28 +20,28 @@ WHOLE = geometry.lattice(*SIZE, 24, 18)
 
 
 def test_windows_everywhere_leave_out_nothing() -> None:
-    assert unseen_quarters(CENTRES, SIZE) == []
+    assert unobserved_quarters(CENTRES, SIZE) == []
 
 
 def test_windows_that_end_near_the_middle_do_not_show_the_other_half() -> None:
     # 612 px, an eighth of the width beyond the middle
-    assert unseen_quarters(CENTRES[CENTRES[:, 0] < 620], SIZE) == ["top right", "bottom right"]
-    assert unseen_quarters(CENTRES[CENTRES[:, 0] < 680], SIZE) == []
-    assert unseen_quarters(CENTRES[CENTRES[:, 1] > 400], SIZE) == ["top left", "top right"]
-    assert unseen_quarters(CENTRES[(CENTRES < 400).any(axis=1)], SIZE) == ["bottom right"]
+    assert unobserved_quarters(CENTRES[CENTRES[:, 0] < 620], SIZE) == ["top right", "bottom right"]
+    assert unobserved_quarters(CENTRES[CENTRES[:, 0] < 680], SIZE) == []
+    assert unobserved_quarters(CENTRES[CENTRES[:, 1] > 400], SIZE) == ["top left", "top right"]
+    assert unobserved_quarters(CENTRES[(CENTRES < 400).any(axis=1)], SIZE) == ["bottom right"]
 
 
 def test_one_window_is_too_few() -> None:
     others = CENTRES[(CENTRES < 400).any(axis=1)]
-    assert unseen_quarters(np.vstack([others, [[800.0, 700.0]]]), SIZE) == ["bottom right"]
-    assert unseen_quarters(np.vstack([others, [[800.0, 700.0], [900.0, 700.0]]]), SIZE) == []
+    assert unobserved_quarters(np.vstack([others, [[800.0, 700.0]]]), SIZE) == ["bottom right"]
+    assert unobserved_quarters(np.vstack([others, [[800.0, 700.0], [900.0, 700.0]]]), SIZE) == []
 
 
 def test_what_the_moving_image_does_not_cover_needs_no_window() -> None:
     left = CENTRES[CENTRES[:, 0] < 450]
     frame = points_in_frame(PixelMapping(geometry.translation(500, 0)), SIZE, SIZE)
     assert frame[:, 0].max() < 500
-    assert unseen_quarters(left, SIZE, frame) == []
+    assert unobserved_quarters(left, SIZE, frame) == []
     assert len(points_in_frame(PixelMapping(np.eye(3)), SIZE, SIZE)) == len(WHOLE)
 
 

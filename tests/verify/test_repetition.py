@@ -28,7 +28,7 @@ def spectrum(image: np.ndarray) -> np.ndarray:
 
 def test_a_rival_lies_a_period_away() -> None:
     rival = alias_peak(spectrum(planted((0, 0), 1)), spectrum(planted((0, 0), 2, -1.0)))
-    assert rival.share > 0.8
+    assert rival.ratio > 0.8
     periods = np.array(rival.shift_px) / PERIOD
     assert np.abs(periods - periods.round()).max() < 0.1
     assert np.abs(periods).max() >= 1
@@ -37,7 +37,7 @@ def test_a_rival_lies_a_period_away() -> None:
 def test_what_is_like_nothing_else_has_no_rival() -> None:
     image = textured_image(400, 300)
     other = cv2.GaussianBlur(-image, (0, 0), 0.7)
-    assert alias_peak(spectrum(image), spectrum(other)).share < 0.4
+    assert alias_peak(spectrum(image), spectrum(other)).ratio < 0.4
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0), (2.0, 1.0), (PERIOD, 0.0)])
