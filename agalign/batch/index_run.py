@@ -14,7 +14,7 @@ from agalign.products.index_bands import bands_of, unit_of
 from agalign.products.index_rasters import IndexReport, write_rasters
 from agalign.products.index_table import IndexRow, row_of, update_table
 from agalign.products.indices import Index
-from agalign.products.sidecar_file import read_result, run_sidecars
+from agalign.products.sidecar_file import read_result, run_sidecars, update_products
 from agalign.values.cores import usable_cores
 from agalign.values.process_pool import ProcessPool
 from agalign.values.processes import follow_parent, threads_of_children, worker_context
@@ -113,6 +113,9 @@ def do_indices(task: IndexTask) -> CaptureIndices:
     try:
         bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
         reports = write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)
+        if task.target == task.out:
+            rasters = [r.path for r in reports if r.path is not None and not r.kept]
+            update_products(task.sidecar, [p for path in rasters for p in (path, path.with_suffix(".png"))])
     except AgalignError as error:
         reports = list(_failed(task, str(error)).reports)
     return CaptureIndices(reports, [row_of(r, sidecar, folder.as_posix(), task.target) for r in reports])

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,7 +11,7 @@ from pydantic import ValidationError
 from agalign.errors import InputError, SidecarError
 from agalign.products.json_file import compact_lists
 from agalign.products.sidecar import SCHEMA, CaptureResult, Sidecar
-from agalign.values.files import open_regular, write_text
+from agalign.values.files import file_checksum, open_regular, write_text
 
 _MAX_BYTES = 1 << 26
 """Limit of a file that is read: ten times the sidecar of many bands."""
@@ -26,6 +27,23 @@ def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
     complete = sidecar.model_copy(update={"checksum": checksum})
     write_text(path, compact_lists(complete.model_dump_json(by_alias=True, indent=1)))
     return complete
+
+
+def update_products(path: Path, files: Sequence[Path]) -> None:
+    """Update size and checksum of those `files` that the sidecar at `path` lists, after a later command replaced them.
+
+    Raises SidecarError, OutputError.
+    """
+    replaced = {file.name: file for file in files}
+    if not any(part.file in replaced for part in read_result(path).products):
+        return
+    sidecar = read_sidecar(path)
+    products = [
+        part.model_copy(update={"bytes": file.stat().st_size, "sha256": file_checksum(file)})
+        if (file := replaced.get(part.file)) is not None else part
+        for part in sidecar.products
+    ]  # fmt: skip
+    write_sidecar(path, sidecar.model_copy(update={"products": products}))
 
 
 def content_checksum(text: str | bytes) -> str:

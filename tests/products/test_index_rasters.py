@@ -16,6 +16,9 @@ from agalign.products.index_rasters import IndexReport
 from agalign.products.index_table import read_table
 from agalign.products.indices import INDICES, Index, index_named, index_of_formula
 from agalign.products.report import write_pages
+from agalign.products.sidecar import ProductPart
+from agalign.products.sidecar_file import read_sidecar, write_sidecar
+from agalign.products.verify_outputs import verify_outputs
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 NDVI, NDRE = INDICES["ndvi"], INDICES["ndre"]
@@ -155,6 +158,19 @@ def test_one_damaged_stack_costs_only_its_own_indices(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_the_sidecar_has_the_checksums_of_replaced_rasters(tmp_path: Path) -> None:
+    """`agalign indices` after `agalign align --index` replaces files that the sidecar lists."""
+    make_aligned(tmp_path, 1)
+    path = tmp_path / "0000SET" / "IMG_0001.json"
+    old = [ProductPart(kind="index", file=f"IMG_0001_ndvi{end}", bytes=1, sha256="0" * 64) for end in (".tif", ".png")]
+    write_sidecar(path, read_sidecar(path).model_copy(update={"products": old}))
+    run(tmp_path, NDVI, target=tmp_path / "elsewhere")
+    assert read_sidecar(path).products == old
+    run(tmp_path, NDVI, NDRE)
+    assert list(verify_outputs(tmp_path)) == [(path, [])]
+    assert [part.file for part in read_sidecar(path).products] == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png"]
+
+
 def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
     make_aligned(tmp_path, 20)
     serial = {r.capture: r.statistics for r in run(tmp_path, target=tmp_path / "a")}
