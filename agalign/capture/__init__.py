@@ -1,1 +1,1 @@
-"""One capture: the seed of each band pair, its alignment, and the verification of the result."""
+"""Alignment of one capture: seed of each band pair, estimation, verification."""

@@ -1,4 +1,4 @@
-"""The band pairs of one capture: seeded, aligned together, and each one verified."""
+"""Alignment of the band pairs of one capture: seeds, joint estimation, verification of each pair."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,38 +28,40 @@ from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
 
 PairProgress = Callable[[str, str, float], None]
-"""Called with the band's name, the stage, and the share of the stage that is done."""
+"""Called with the name of the band, the stage and its completed share, 0 to 1."""
 Start = tuple[BandPair, Seed]
 _Align = Callable[[ImageGroup, Callable[[str, float], None]], Results]
 
 
 class _Timer:
-    """Seconds by band; time spent on several bands together is divided among them."""
+    """Processing time by band; time for several bands is divided equally among them."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, float] = {}
 
     @contextmanager
     def measure(self, names: Sequence[str]) -> Iterator[None]:
-        """Count the time of a block as that of these bands."""
-        since = time.perf_counter()
+        """Measure the time of a block for these bands."""
+        start = time.perf_counter()
         yield
         for name in names:
-            self._seconds[name] = self._seconds.get(name, 0.0) + (time.perf_counter() - since) / len(names)
+            self._seconds[name] = self._seconds.get(name, 0.0) + (time.perf_counter() - start) / len(names)
 
     def added_to(self, result: dict[str, Alignment[FixedImagePx]]) -> dict[str, Alignment[FixedImagePx]]:
+        """Return the alignments with the measured times added."""
         return {name: replace(a, seconds=a.seconds + self._seconds.get(name, 0.0)) for name, a in result.items()}
 
 
 def align_capture_bands(
     capture: Capture, settings: Settings, model: FlightModel | None, progress: PairProgress
 ) -> dict[str, Alignment[FixedFilePx]]:
-    """Align every moving band of a capture, by name; a band that cannot be read is `failed` and stops no other.
+    """Align every moving band of a capture; return the alignments by band, px of the files.
 
-    Raises UnreadableFileError where the reference cannot be read.
+    A band that cannot be read is `failed`; the others are aligned. Raises UnreadableFileError if the reference cannot
+    be read.
     """
     progress(capture.reference.name, "reading", 0.0)
-    pairs, left_out = read_pairs(capture, settings.seed, model)
+    pairs, unusable = read_pairs(capture, settings.seed, model)
     aligned = align_pairs(pairs, settings, progress, model, capture)
     if model is not None and model.rig is not None and not settings.seed.only:
         aligned = with_predictions(pairs, aligned, model.rig, capture)
@@ -68,21 +70,21 @@ def align_capture_bands(
     aligned = _with_metrics(pairs, aligned, progress)
     result: dict[str, Alignment[FixedFilePx]] = {}
     for band in capture.bands_of_the_references_lens:
-        unmoved = Seed("identity", geometry.identity(), 0.0)
-        result[band.name] = Alignment(unmoved.fixed_to_moving, "pixel", "aligned", (), unmoved, None, None, 0.0)
+        identity = Seed("identity", geometry.identity(), 0.0)
+        result[band.name] = Alignment(identity.fixed_to_moving, "pixel", "aligned", (), identity, None, None, 0.0)
     for pair in pairs:
         result |= _between_files(capture, pair, aligned[pair.name])
     for band in capture.moving:
-        if band.name in left_out:
+        if band.name in unusable:
             overlay = Seed("identity", geometry.overlay(capture.reference.size_px, band.size_px), 0.0)
-            result[band.name] = without_result(overlay, "pixel", left_out[band.name])
+            result[band.name] = without_result(overlay, "pixel", unusable[band.name])
     return {band.name: result[band.name] for band in capture.moving}
 
 
 def _between_files(
     capture: Capture, pair: BandPair, aligned: Alignment[FixedImagePx]
 ) -> dict[str, Alignment[FixedFilePx]]:
-    """The alignment of a pair as one between the files of each of its bands, refined on them where they have more."""
+    """Convert the alignment of a pair to px of the files of its bands; refine it if the files have more pixels."""
     alignment = aligned.in_file_px(pair.scales)
     if pair.is_reduced and alignment.status == "aligned":
         alignment = at_full_resolution(capture.reference, pair.bands[0], alignment)
@@ -93,7 +95,7 @@ def _between_files(
 def _with_metrics(
     pairs: Sequence[BandPair], result: dict[str, Alignment[FixedImagePx]], progress: PairProgress
 ) -> dict[str, Alignment[FixedImagePx]]:
-    """The alignments with their similarity metrics."""
+    """Return the alignments with similarity metrics."""
     timer, measured = _Timer(), {}
     for pair in pairs:
         progress(pair.name, "measuring", 0.0)
@@ -107,10 +109,10 @@ def align_pairs(
     pairs: Sequence[BandPair], settings: Settings, progress: PairProgress, model: FlightModel | None = None,
     capture: Capture | None = None, *, scratch: bool = True,
 ) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
-    """Align the pairs of one `capture`, which share a reference, by name.
+    """Align the pairs of one `capture`; return the alignments by name, px of the images.
 
-    The pairs that the flight's network cannot align are learnt from scratch, together: with a rig only those that it
-    does not predict, and without `scratch` only those that the network does not know.
+    Pairs that the flight's network cannot align are learnt from scratch: with a rig only those without an accurate
+    prediction, and without `scratch` only those that the network does not contain.
     """
     aligner = _PairAligner(settings, model, progress)
     starts = aligner.seed(pairs)
@@ -118,13 +120,13 @@ def align_pairs(
         aligner.keep_seeds(starts)
         return aligner.timed_result()
     aligner.refine(starts)
-    left = [s for s in starts if not aligner.is_settled(s)]
+    remaining = [s for s in starts if not aligner.is_done(s)]
     if not scratch:
-        left = [s for s in left if s[0].name not in aligner.result]
-    if left and capture is not None:
-        chosen = aligner.worth_learning(pairs, capture)
-        left = [s for s in left if s[0].name in chosen]
-    aligner.learn(left)
+        remaining = [s for s in remaining if s[0].name not in aligner.result]
+    if remaining and capture is not None:
+        names = aligner.bands_to_learn(pairs, capture)
+        remaining = [s for s in remaining if s[0].name in names]
+    aligner.learn(remaining)
     aligner.fit_windows(starts)
     return aligner.timed_result()
 
@@ -137,19 +139,20 @@ class _PairAligner:
     model: FlightModel | None
     progress: PairProgress
     result: dict[str, Alignment[FixedImagePx]] = field(default_factory=dict)
-    """By band."""
+    """Alignments by band."""
     timer: _Timer = field(default_factory=_Timer)
 
     def timed_result(self) -> dict[str, Alignment[FixedImagePx]]:
+        """Return the alignments with their processing times."""
         return self.timer.added_to(self.result)
 
-    def is_settled(self, start: Start) -> bool:
-        """True where another attempt would find nothing better."""
+    def is_done(self, start: Start) -> bool:
+        """Return True if the pair is aligned or predicted."""
         name = start[0].name
         return name in self.result and self.result[name].status in ("aligned", "predicted")
 
     def seed(self, pairs: Sequence[BandPair]) -> list[Start]:
-        """The pairs with their seeds; a pair without one has failed."""
+        """Return the pairs with a seed; the other pairs are failed."""
         starts: list[Start] = []
         with self.timer.measure([p.name for p in pairs]):
             for pair in pairs:
@@ -162,35 +165,35 @@ class _PairAligner:
         return starts
 
     def keep_seeds(self, starts: Sequence[Start]) -> None:
-        """Only the seeds were requested."""
+        """Use the seeds as results, as the user requested."""
         for pair, seed in starts:
             with self.timer.measure([pair.name]):
                 self.result[pair.name] = verified(pair, seed, Issue(SEED_ASKED_FOR), self.settings)
 
     def refine(self, starts: Sequence[Start]) -> None:
-        """With the flight's network, the pairs that it has a side for."""
+        """Align the pairs of the bands that the flight's network contains with this network."""
         model = self.model
         if model is None or self.settings.joint.recipe != "fast":
             return
         known = [s for s in starts if model.side(s[0].name) is not None]
         sides = [model.side(pair.name) or 0 for pair, _ in known]
         patches = PATCHES if model.rig is None else FLIGHT_PATCHES
-        self._attempt(
+        self._align(
             known, sides, lambda group, report: refine_with(model.net, group, self.settings.joint, report, patches)
         )
 
-    def worth_learning(self, pairs: Sequence[BandPair], capture: Capture) -> set[str]:
-        """The bands that are worth learning from scratch: without a rig, all."""
+    def bands_to_learn(self, pairs: Sequence[BandPair], capture: Capture) -> set[str]:
+        """Return the bands to learn from scratch; all without a rig."""
         if self.model is None or self.model.rig is None:
             return {pair.name for pair in pairs}
         return bands_to_learn(pairs, self.result, self.model.rig, capture, self.settings.check.accept_predicted_px)
 
     def learn(self, starts: Sequence[Start]) -> None:
-        """From scratch, together."""
-        self._attempt(starts, [], lambda group, report: align_from_scratch(group, self.settings.joint, report))
+        """Align pairs with networks that are learnt from scratch."""
+        self._align(starts, [], lambda group, report: align_from_scratch(group, self.settings.joint, report))
 
     def fit_windows(self, starts: Sequence[Start]) -> None:
-        """Align by windows the pairs with descriptors that recognise nothing."""
+        """Align by windows the pairs without retrieval of held-out patches."""
         if self.settings.joint.model_family not in ("auto", "homography"):
             return
         for pair, _ in starts:
@@ -198,33 +201,31 @@ class _PairAligner:
                 with self.timer.measure([pair.name]):
                     self.result[pair.name] = predicted_if_coarse(pair, by_windows(pair, self.result[pair.name]))
 
-    def _attempt(self, starts: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
+    def _align(self, starts: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
         with self.timer.measure([pair.name for pair, _ in starts]):
             results = _results(starts, sides, align, self.progress)
         self.result |= verify_together(starts, results, self.model, self.settings, self.progress, self.timer)
 
 
 def _quiet(band: str, stage: str, share: float) -> None:
-    """Progress that is not shown."""
+    """Ignore progress."""
 
 
 def verify_together(
     starts: Sequence[Start], results: Results, model: FlightModel | None, settings: Settings,
     progress: PairProgress = _quiet, timer: _Timer | None = None,
 ) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
-    """The alignments of a capture's pairs, by name: their results moved to the maximum a posteriori of all bands
-    together, each one verified.
-    """
+    """Combine the results of a capture by MAP estimation and verify each one; return the alignments by name."""
     timer = timer or _Timer()
     with timer.measure([pair.name for pair, _ in starts]):
         warped_pairs = [
             WarpedPair.of(pair, pair.mapping(result.fixed_to_moving)) if isinstance(result, JointResult) else None
             for (pair, _), result in zip(starts, results, strict=True)
         ]
-        improved = _estimated_together(starts, results, warped_pairs, model, settings)
+        estimates = _map_estimates(starts, results, warped_pairs, model, settings)
         progress(starts[0][0].name if starts else "", "relief", 0.0)
-        alignments = aligned_by_relief(_relief_candidates(starts, improved, warped_pairs), settings.relief.use)
-    for (pair, seed), result, warped_pair in zip(starts, improved, warped_pairs, strict=True):
+        alignments = aligned_by_relief(_relief_candidates(starts, estimates, warped_pairs), settings.relief.use)
+    for (pair, seed), result, warped_pair in zip(starts, estimates, warped_pairs, strict=True):
         if pair.name in alignments:
             continue
         progress(pair.name, "checking", 0.0)
@@ -246,13 +247,13 @@ def _relief_candidates(
 def _results(
     starts: Sequence[Start], sides: Sequence[int], align: _Align, progress: PairProgress
 ) -> list[JointResult[FixedImagePx] | Issue]:
-    """In the order of the pairs; those of one image group are aligned together, with the network's `sides`."""
+    """Align the pairs by image group, with the network's `sides`; return the results in the order of the pairs."""
     result: dict[int, JointResult[FixedImagePx] | Issue] = {}
     for indices, group in image_groups([p for p, _ in starts], [s for _, s in starts], sides):
         first = starts[indices[0]][0].name
 
         def report(stage: str, share: float, first: str = first) -> None:
-            """Pairs that advance together are reported as the first one."""
+            """Report the progress of the group with the name of its first pair."""
             progress(first, stage, share)
 
         report("refining", 0.0)
@@ -260,16 +261,16 @@ def _results(
     return [result[i] for i in range(len(starts))]
 
 
-def _estimated_together(
+def _map_estimates(
     starts: Sequence[Start], results: Results, warped_pairs: Sequence[WarpedPair | None],
     model: FlightModel | None, settings: Settings,
 ) -> list[JointResult[FixedImagePx] | Issue]:  # fmt: skip
-    """The results moved to the maximum a posteriori of all bands of the capture together."""
+    """Return the results after the MAP estimation of all bands of the capture."""
     if settings.joint.model_family not in ("auto", "homography"):
-        return list(results)  # the family that the user chose would be left
+        return list(results)  # the estimate is a homography, not of the family that the user chose
     names = [pair.name for pair, _ in starts]
     joint = {name: r for name, r in zip(names, results, strict=True) if isinstance(r, JointResult)}
     residuals = {name: w.residual for name, w in zip(names, warped_pairs, strict=True) if w is not None}
     rig = None if model is None else model.rig
-    improved = map_estimate([pair for pair, _ in starts], joint, residuals, rig)
-    return [improved[name] if isinstance(r, JointResult) else r for name, r in zip(names, results, strict=True)]
+    estimates = map_estimate([pair for pair, _ in starts], joint, residuals, rig)
+    return [estimates[name] if isinstance(r, JointResult) else r for name, r in zip(names, results, strict=True)]

@@ -1,7 +1,7 @@
-"""The prediction of a band with few pixels, such as a thermal one, by windows that are too few to verify an alignment.
+"""Prediction of bands with few pixels, such as thermal ones, from windows that are too few to verify an alignment.
 
-Warm and bright are different things: often a third of the windows of a thermal image show what another band shows.
-Where nearly all of these agree with a seed that its correlation peak confirms, the mapping and its error are known.
+Temperature and reflectance differ: often only a third of the windows of a thermal image have structure in common with
+another band. If nearly all of these agree with a trusted seed, they determine the mapping and its standard error.
 """
 
 from dataclasses import replace
@@ -18,20 +18,21 @@ from agalign.verify.lens_shapes import LensFit, fit_with_lens
 from agalign.verify.repetition import MAX_ALIAS_PEAK, alias_peak
 
 _MIN_WINDOWS = 16
-"""Measured windows, which overlap by a half: twice the unknowns of a homography."""
+"""Minimum number of measured windows, which overlap by half: twice the parameters of a homography."""
 _CLOSE_PX = 3.0
-"""Distance from the fit within which a window agrees, px of the reduced reference: one and a half px of the band. Of
-windows of 56 px and more, one in a hundred does by chance."""
+"""Maximum residual of a consistent window, px of the reduced reference: 1.5 px of the band. By chance, one in a hundred
+windows of at least 56 px has a smaller one."""
 _MIN_CLOSE = 0.85
-"""Share of the measured windows that must agree."""
+"""Minimum share of consistent windows among the measured ones."""
 _ROUNDS = 3
-"""Windows that overlap better have sharper peaks."""
+"""Rounds of warping and fitting: correlation peaks are sharper when windows overlap better."""
 
 
 def predicted_if_coarse(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx]:
-    """The alignment; of a coarse band that is not aligned, the prediction by the windows that agree with its seed.
+    """Return the prediction of a coarse band by windows that agree with its seed.
 
-    It stays as it is where the seed is not trusted, few windows agree, or the scene repeats.
+    The alignment is returned unchanged if the band is not coarse, is aligned or predicted, if its seed is not trusted,
+    few windows agree with it, or the scene is repetitive.
     """
     if not pair.is_coarse or alignment.status in ("aligned", "predicted") or not alignment.seed.trusted:
         return alignment
@@ -42,23 +43,20 @@ def predicted_if_coarse(pair: BandPair, alignment: Alignment[FixedImagePx]) -> A
         if fit is None:
             return alignment
         start = with_fit(pair, start, fit)
-    if alias_peak(*WarpedPair.of(pair, pair.mapping(start.fixed_to_moving, start.field)).reduced_spectra()).ratio > (
-        MAX_ALIAS_PEAK
-    ):
-        return alignment
-    return start
+    warped_pair = WarpedPair.of(pair, pair.mapping(start.fixed_to_moving, start.field))
+    return alignment if alias_peak(*warped_pair.reduced_spectra()).ratio > MAX_ALIAS_PEAK else start
 
 
 def _fit(pair: BandPair, mapping: PixelMapping) -> LensFit | None:
-    """The correction of a mapping by its windows; None where few were measured, or many of them disagree with it."""
+    """Return the correction of a mapping by windows; None if few are measured or consistent."""
     residual = pair.reference.overlapping_windows.residuals(pair.warped_moving(mapping))
     fit = fit_with_lens(mapping, residual, pair.fixed.size_px, calibrated=pair.space == "undistorted")
-    return fit if _agrees(fit, residual) else None
+    return fit if _is_consistent(fit, residual) else None
 
 
-def _agrees(fit: LensFit, residual: Residual[FixedImagePx]) -> bool:
+def _is_consistent(fit: LensFit, residual: Residual[FixedImagePx]) -> bool:
     measured = np.isfinite(residual.shifts_px[:, 0])
     if measured.sum() < _MIN_WINDOWS:
         return False
-    misfits_px = np.linalg.norm(fit.residuals_px(residual.centres_px[measured], residual.shifts_px[measured]), axis=1)
-    return bool((misfits_px <= _CLOSE_PX).mean() >= _MIN_CLOSE)
+    lengths_px = np.linalg.norm(fit.residuals_px(residual.centres_px[measured], residual.shifts_px[measured]), axis=1)
+    return bool((lengths_px <= _CLOSE_PX).mean() >= _MIN_CLOSE)

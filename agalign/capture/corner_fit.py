@@ -1,4 +1,4 @@
-"""The homography close to the identity that the residual shifts of many windows suggest, by its corners."""
+"""Correction of a homography from the residual shifts of windows, parametrised by displacements of the corners."""
 
 from dataclasses import dataclass, replace
 
@@ -15,40 +15,40 @@ from agalign.values.robust import MAD_TO_STD, cauchy_weights
 Array = NDArray[np.float64]
 
 _MIN_WINDOWS = 16
-"""Measured windows without which corners are not corrected: twice the eight unknowns."""
-_SPREADS = 2.0
-"""A window has half its weight at twice the typical misfit."""
-_MIN_SPREAD_PX = 0.05
-"""Smaller misfits are the noise of shifts."""
+"""Minimum number of measured windows: twice the eight parameters."""
+_CAUCHY_SCALES = 2.0
+"""Residual at which the robust weight is one half, in residual scales."""
+_MIN_SCALE_PX = 0.05
+"""Minimum residual scale: the noise of the shifts."""
 _REWEIGHTINGS = 6
-"""A fixed number, enough for the weights to settle."""
+"""Iterations after which the robust weights have converged."""
 _COMMON_STD_PX = 0.01
-"""Error along x and y that all windows have in common, in addition to what they disagree by."""
-_UNKNOWN = 1e-9
-"""Share of the total information that directions get which no window determines."""
+"""Standard error along x and y common to all windows, which their residuals do not contain."""
+_MIN_INFORMATION_SHARE = 1e-9
+"""Share of the total information that is added to directions that no window determines."""
 
 
 @dataclass(frozen=True)
 class CornerFit:
-    """The displacement of each corner, clockwise from the top left, px of the reference, and its uncertainty."""
+    """Displacements of the corners, clockwise from the top left, px of the reference."""
 
     mean_px: Array
-    """(8,): x and y of the corners in turn."""
+    """(8,) x and y of the corners in turn."""
     covariance_px2: Array
-    """(8, 8), from the disagreement of the windows."""
+    """(8, 8) sandwich covariance, from the residuals of the windows."""
 
     @property
     def max_px(self) -> float:
-        """Largest displacement of a corner along x or y."""
+        """Maximum displacement of a corner along x or y."""
         return float(np.abs(self.mean_px).max())
 
     def applied_to(self, fixed_to_moving: Matrix, size_px: tuple[int, int]) -> Matrix:
-        """A homography of an image (width, height) with its corners displaced. Raises GeometryError."""
+        """Apply the displacements to a homography of an image (width, height). Raises GeometryError."""
         return geometry.compose(fixed_to_moving, geometry.moving_corners(self.mean_px, *size_px))
 
 
 def with_corners(result: JointResult[FixedPx], fixed_to_moving: Matrix, covariance_px2: Array) -> JointResult[FixedPx]:
-    """A result with another homography and the covariance (8, 8) of its corners."""
+    """Return a result with another homography and covariance (8, 8) of the corners."""
     std = np.sqrt(np.diag(covariance_px2)).reshape(4, 2)
     return replace(
         result, fixed_to_moving=fixed_to_moving, corner_covariance_px2=covariance_px2,
@@ -59,10 +59,10 @@ def with_corners(result: JointResult[FixedPx], fixed_to_moving: Matrix, covarian
 def corner_correction(
     mapping: PixelMapping, residual: Residual[FixedPx], size_px: tuple[int, int], min_windows: int = _MIN_WINDOWS
 ) -> CornerFit | None:
-    """The correction of a mapping's homography from the residual of windows measured under that mapping.
+    """Fit the correction of a mapping's homography to the residual that was measured with this mapping.
 
-    Windows are brought to the pixels that the homography maps: through the displacement field and the lens of the
-    reference image (width, height). None where fewer than `min_windows` windows were measured.
+    The windows are converted to undistorted px of the reference (width, height). None if fewer than `min_windows`
+    windows are measured.
     """
     measured = np.isfinite(residual.shifts_px[:, 0])
     if measured.sum() < min_windows:
@@ -73,9 +73,9 @@ def corner_correction(
 
 
 def fit_corners(points_px: Array, shifts_px: Array, peaks_sigma: Array, size_px: tuple[int, int]) -> CornerFit:
-    """Least squares of shifts (n, 2) at points (n, 2) of an image (width, height).
+    """Fit corner displacements to shifts (n, 2) at points (n, 2) of an image (width, height) by robust least squares.
 
-    Weights are the fourth power of the heights (n,) of the correlation peaks, and Cauchy's against outliers.
+    Weights are the fourth power of the heights (n,) of the correlation peaks times Cauchy weights.
     """
     design = geometry.over_corners(points_px, *size_px)
     by_peak, robust = (peaks_sigma / np.median(peaks_sigma)) ** 4, np.ones(len(shifts_px))
@@ -83,13 +83,13 @@ def fit_corners(points_px: Array, shifts_px: Array, peaks_sigma: Array, size_px:
         weight = by_peak * robust
         normal = np.einsum("n,nki,nkj->ij", weight, design, design)
         mean = np.linalg.lstsq(normal, np.einsum("n,nki,nk->i", weight, design, shifts_px), rcond=None)[0]
-        misfits_px = shifts_px - design @ mean
-        lengths_px = np.linalg.norm(misfits_px, axis=1)
-        spread_px = max(MAD_TO_STD * float(np.median(lengths_px)), _MIN_SPREAD_PX)
-        robust = cauchy_weights(lengths_px, _SPREADS * spread_px)
-    score = np.einsum("n,nki,nk->ni", weight, design, misfits_px)
-    # Windows in a line agree, and do not determine the corners away from it.
-    inverse = np.linalg.inv(normal + _UNKNOWN * np.trace(normal) * np.eye(8))
-    disagreement = inverse @ (score.T @ score) @ inverse
-    covariance = np.asarray(disagreement + (_MIN_SPREAD_PX**2 / np.median(weight)) * inverse)
+        residuals_px = shifts_px - design @ mean
+        lengths_px = np.linalg.norm(residuals_px, axis=1)
+        scale_px = max(MAD_TO_STD * float(np.median(lengths_px)), _MIN_SCALE_PX)
+        robust = cauchy_weights(lengths_px, _CAUCHY_SCALES * scale_px)
+    score = np.einsum("n,nki,nk->ni", weight, design, residuals_px)
+    # Collinear windows do not determine all corners, although their residuals are small.
+    inverse = np.linalg.inv(normal + _MIN_INFORMATION_SHARE * np.trace(normal) * np.eye(8))
+    sandwich = inverse @ (score.T @ score) @ inverse
+    covariance = np.asarray(sandwich + (_MIN_SCALE_PX**2 / np.median(weight)) * inverse)
     return CornerFit(mean, covariance + _COMMON_STD_PX**2 * np.eye(8))

@@ -1,6 +1,7 @@
-"""Alignments where a part of the image shows nothing: the lenses are estimated too, and the error there is stated.
+"""Alignments that are extrapolated to a part of the image without common structure.
 
-A homography that fits half of an image misses the other half by what the lenses differ. No residual shows it there.
+Differences of lens distortion cause errors of the homography there that no residual contains. The distortion is
+estimated too, and the alignment becomes a prediction with a standard error.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,9 +24,9 @@ from agalign.verify.lens_shapes import LensFit, fit_with_lens
 def without_extrapolated(
     pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig | None = None
 ) -> dict[str, Alignment[FixedImagePx]]:
-    """The alignments; those `aligned` that are extrapolated over a quarter of the image are `predicted` there.
+    """Return the alignments; those `aligned` but extrapolated over a quarter of the image become `predicted`.
 
-    A rig that was learned over the whole image makes this unnecessary, and georeferenced files have no lens.
+    Bands that the rig covers and georeferenced files, which have no lens distortion, are not changed.
     """
     checked = dict(result)
     for pair in pairs:
@@ -42,16 +43,16 @@ def without_extrapolated(
 
 
 def _is_covered(pair: BandPair, rig: Rig | None) -> bool:
-    """True where the flight's rig shows the band's mapping over the whole image."""
-    return rig is not None and pair.has_rig_pixels and pair.is_known_to_a_rig and rig.covers(pair.name)
+    """Return True if the band's mapping in the flight's rig was observed in all parts of the image."""
+    return rig is not None and pair.has_rig_pixels and pair.has_rig and rig.covers(pair.name)
 
 
 def _extrapolated(
     pair: BandPair, alignment: Alignment[FixedImagePx], issues: tuple[Issue, ...]
 ) -> Alignment[FixedImagePx]:
-    """The maximum a posteriori estimate of homography and lens from the windows, as a prediction with its error."""
+    """Return the MAP estimate of homography and lens distortion from the windows as a prediction."""
     size_px = pair.fixed.size_px
-    # A field that was fitted to the windows is extrapolated as well: it is replaced.
+    # A displacement field that was fitted to the windows is extrapolated too and therefore replaced.
     start = replace(pair.mapping(alignment.fixed_to_moving), local=None)
     fit = fit_with_lens(
         start, WarpedPair.of(pair, start).residual, size_px, calibrated=pair.space == "undistorted"
@@ -60,7 +61,7 @@ def _extrapolated(
 
 
 def with_fit(pair: BandPair, alignment: Alignment[FixedImagePx], fit: LensFit) -> Alignment[FixedImagePx]:
-    """An alignment as `predicted` by its homography after the correction of a fit, with the error of that fit."""
+    """Return the alignment as `predicted` by the corrected homography and lens field, with the error of the fit."""
     size_px = pair.fixed.size_px
     try:
         corrected = geometry.compose(
@@ -70,10 +71,10 @@ def with_fit(pair: BandPair, alignment: Alignment[FixedImagePx], fit: LensFit) -
         corrected = alignment.fixed_to_moving
     mapping = pair.mapping(corrected, fit.field())
     std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, size_px, pair.moving.size_px)))
-    up = np.r_[np.tile(pair.scales.fixed.inverse, 4), np.full(4, pair.scales.fixed.inverse.mean)]
+    to_file_px = np.r_[np.tile(pair.scales.fixed.inverse, 4), np.full(4, pair.scales.fixed.inverse.mean)]
     prediction = Prediction(
         pair.scales.between_files(corrected), "windows", pair.in_moving_file_px(std_px, corrected),
-        covariance_px2=fit.covariance_px2 * np.outer(up, up),
+        covariance_px2=fit.covariance_px2 * np.outer(to_file_px, to_file_px),
     )  # fmt: skip
     return replace(
         alignment, status="predicted", fixed_to_moving=corrected, field=mapping.local, local=None,

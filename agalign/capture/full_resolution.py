@@ -1,8 +1,8 @@
-"""Refining an alignment of reduced images on tiles of the files themselves.
+"""Refinement of an alignment of reduced images on tiles of the files at full resolution.
 
-The residual of the reduced images shows where both bands have structure. Tiles of full resolution are read there. The
-shifts of the windows in half of them, like the black fields of a chessboard, move the homography, and those in the
-other half verify the result. Memory is that of the windows of 48 tiles, whatever the size of the files.
+Tiles are read around windows of the reduced images with a measured shift. They form a chessboard: the homography is
+fitted to the windows in the tiles of one colour and verified with those of the other. Memory is limited by the maximum
+number of tiles, independent of the size of the files.
 """
 
 import math
@@ -30,24 +30,25 @@ from agalign.verify.checks import issues_of
 from agalign.verify.residuals import FixedWindows
 
 _TILE_PX = 640
-"""Side of a tile: 36 windows, which a few pixels of error of the reduced images do not move out of it."""
+"""Side of a tile with 36 windows; an error of a few pixels of the reduced images does not move their content out of
+it."""
 _MIN_CELLS, _MAX_CELLS = (4, 3), (8, 6)
-"""(columns, rows) of the cells with a tile each: as many as tiles fit side by side, enough for eight unknowns in half
-of them, and no more than memory allows."""
+"""Minimum and maximum (columns, rows) of cells, which contain one tile each: half of them determine eight parameters,
+and all of them fit into memory."""
 _ROUNDS = 3
-"""A correction is right to first order: later rounds correct what the first leaves."""
-_REST_PX = 0.02
-"""A step that moves no corner by more is the last one: the windows' own noise is as large."""
+"""A correction is accurate to first order, so it is repeated."""
+_CONVERGED_PX = 0.02
+"""The refinement has converged if no corner moves by more than this, the noise of the windows."""
 _MAX_STEP_PX = 40.0
-"""Displacement of a corner beyond which the windows contradict the reduced images instead of refining them."""
+"""Maximum displacement of a corner; larger ones contradict the alignment of the reduced images."""
 
 
 def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[FixedFilePx]) -> Alignment[FixedFilePx]:
-    """An alignment between the files of two bands, estimated on reduced images, refined at full resolution.
+    """Refine an alignment between the files of two bands that was estimated on reduced images.
 
-    The earlier alignment stays where the tiles show too little, or where the refined one does not pass verification. A
-    moving file with an unreadable tile makes the alignment `failed`: its pixels could not be written either.
-    Raises UnreadableFileError for the reference.
+    It is returned unchanged if the tiles have too little structure or the refined one does not pass verification. It is
+    `failed` if a tile of the moving file cannot be read, because its pixels could not be written either. Raises
+    UnreadableFileError for the reference.
     """
     with open_raster(reference.path) as source:
         tiles = [_FixedTile.read(source, reference, *of_cell) for of_cell in _tiles(reference, alignment).items()]
@@ -62,7 +63,7 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[Fixed
 
 @dataclass(frozen=True)
 class _FixedTile:
-    """A tile of the reference, read and cut into windows once."""
+    """The windows of a tile of the reference."""
 
     cell: tuple[int, int]
     tile: Tile
@@ -70,17 +71,18 @@ class _FixedTile:
 
     @classmethod
     def read(cls, source: OpenRaster, reference: Band, cell: tuple[int, int], tile: Tile) -> "_FixedTile":
+        """Read a tile from the open file of the reference."""
         pixels, valid = read_window(source, reference, tile.x0, tile.y0, tile.width, tile.height)
         fixed = _raster(pixels, valid, reference)
         return cls(cell, tile, FixedWindows(fixed.valid, structure_field(fixed)))
 
     @property
     def is_for_fit(self) -> bool:
-        """True for the black fields of the chessboard; the white ones verify."""
+        """True for one colour of the chessboard; tiles of the other colour are for verification."""
         return sum(self.cell) % 2 == 0
 
     def residual(self, source: OpenRaster, moving: Band, mapping: PixelMapping) -> Residual[FixedFilePx]:
-        """The residual of its windows, px of the reference's file; `source` is the moving file."""
+        """Measure the residual of the windows, px of the reference's file; `source` is the open moving file."""
         warped = _raster(*resample_tile_of(source, moving, mapping, self.tile, "lanczos"), moving)
         in_tile = self.windows.residuals(warped)
         centres_px = in_tile.centres_px + np.array([self.tile.x0, self.tile.y0])
@@ -90,7 +92,7 @@ class _FixedTile:
 def _fitted(
     moving: Band, start: PixelMapping, tiles: Sequence[_FixedTile], size_px: tuple[int, int]
 ) -> tuple[PixelMapping, CornerFit] | None:
-    """The mapping corrected in rounds, as long as the median shift falls, and the last correction; None without any."""
+    """Correct the mapping repeatedly while the median shift decreases; return it and the last correction, or None."""
     result: tuple[PixelMapping, CornerFit] | None = None
     mapping, residual = start, _residual(moving, start, tiles)
     for _ in range(_ROUNDS):
@@ -101,11 +103,11 @@ def _fitted(
             step = replace(mapping, fixed_to_moving=fit.applied_to(mapping.fixed_to_moving, size_px))
         except GeometryError:
             break
-        again = _residual(moving, step, tiles)
-        if not again.median_px < residual.median_px:
+        next_residual = _residual(moving, step, tiles)
+        if not next_residual.median_px < residual.median_px:
             break
-        result, mapping, residual = (step, fit), step, again
-        if fit.max_px <= _REST_PX:
+        result, mapping, residual = (step, fit), step, next_residual
+        if fit.max_px <= _CONVERGED_PX:
             break
     return result
 
@@ -117,9 +119,9 @@ def _refined(
     tiles: Sequence[_FixedTile],
     size_px: tuple[int, int],
 ) -> Alignment[FixedFilePx] | None:
-    """The alignment moved to the fit of half of the tiles, with its uncertainty and the residual of the other half.
+    """Return the alignment fitted to half of the tiles, with its covariance and the residual of the other half.
 
-    None where that half does not confirm it, or any check rejects it. Raises UnreadableFileError.
+    None if the median shift of that half does not decrease or a check finds an issue. Raises UnreadableFileError.
     """
     fitted = _fitted(moving, start, [t for t in tiles if t.is_for_fit], size_px)
     if fitted is None or alignment.joint is None:
@@ -142,7 +144,7 @@ def _refined(
 
 
 def _tiles(reference: Band, alignment: Alignment[FixedFilePx]) -> dict[tuple[int, int], Tile]:
-    """By cell (column, row): a tile inside the cell, around its window with the highest peak on the reduced images."""
+    """Return, by cell (column, row), a tile around the window with the highest peak in the reduced images."""
     residual, size_px = alignment.residual, reference.size_px
     if residual is None:
         return {}
@@ -160,7 +162,7 @@ def _tiles(reference: Band, alignment: Alignment[FixedFilePx]) -> dict[tuple[int
 
 
 def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
-    """(cell, start, side) of the tile around a position, along one axis of an image, without leaving the cell."""
+    """Return (cell, start, side) of the tile around a position along one axis; the tile is inside its cell."""
     cell = min(max(int(centre_px / length_px * cells), 0), cells - 1)
     first, end = cell * length_px // cells, (cell + 1) * length_px // cells
     side = min(_TILE_PX, end - first)
@@ -168,9 +170,7 @@ def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
 
 
 def _residual(moving: Band, mapping: PixelMapping, tiles: Sequence[_FixedTile]) -> Residual[FixedFilePx]:
-    """The residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError for the moving
-    file.
-    """
+    """Measure the residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError."""
     with open_raster(moving.path) as source:
         parts = [tile.residual(source, moving, mapping) for tile in tiles]
     if not parts:
@@ -182,5 +182,5 @@ def _residual(moving: Band, mapping: PixelMapping, tiles: Sequence[_FixedTile]) 
 
 
 def _raster(pixels: np.ndarray, valid: np.ndarray, band: Band) -> Raster:
-    known = learnable(valid, pixels, band.saturation_value)
-    return Raster(np.where(known, pixels, 0).astype(np.float32), known)
+    usable = learnable(valid, pixels, band.saturation_value)
+    return Raster(np.where(usable, pixels, 0).astype(np.float32), usable)

@@ -1,16 +1,16 @@
-"""The maximum a posteriori estimate of all bands of a capture, from its images and from the flight's rig.
+"""Maximum a posteriori (MAP) estimate of all bands of a capture from its images and the flight's rig.
 
-Unknown are, for every band b, the displacements of the reference's corners relative to the mapping that the descriptors
-give, delta_b (8,), and the capture's factors nu, which all bands share. There are four sources:
+The unknowns are delta_b (8,), the displacements of the corners of band b relative to the mapping by the descriptors,
+and the factors nu of the capture, which are common to all bands. Four sources are combined:
 
     descriptors   0 = delta_b + N(0, C_b)                 the last step of the method, with its covariance
-    windows       s_i = D(x_i) delta_b + noise            residual shifts of the structure under the mapping
-    rig           delta_b = c_b + K_b nu + N(0, S_b)      the flight's mean, moved along the band's baseline
+    windows       s_i = D(x_i) delta_b + noise            residual shifts of the structure
+    rig           delta_b = c_b + K_b nu + N(0, S_b)      the flight's mean, shifted along the band's baseline
     factors       nu = N(0, F)
 
-The maximum a posteriori is a linear system. A band with little texture depends on the others and on the flight; one
-with much texture does not. A band that contradicts the rig by many standard deviations is not pulled: its weight falls
-as that of a Student's t does.
+The estimate is the solution of a linear system. Bands with little texture depend on the other bands and the rig. The
+rig's residuals have a Student's t distribution, so a band that contradicts the rig by many standard deviations is not
+biased by it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,25 +30,25 @@ from agalign.values.pixel_units import FixedImagePx
 
 Array = NDArray[np.float64]
 
-_MAX_WINDOWS_PX = 1.0
-"""Displacement of a corner beyond which windows do not correct a mapping: they contradict it."""
+_MAX_CORRECTION_PX = 1.0
+"""Maximum displacement of a corner by windows; larger ones contradict the mapping and are ignored."""
 _REWEIGHTINGS = 6
-"""A fixed number, enough for the weights to settle."""
-_FREEDOM = 4.0
-"""Of the t distribution of a band's distance from the rig: heavy tails, a band may be knocked."""
+"""Iterations after which the weights have converged."""
+_DEGREES_OF_FREEDOM = 4.0
+"""Of the t distribution of a band's distance from the rig; heavy tails, as a lens may have moved."""
 
 
 @dataclass(frozen=True)
 class InformationForm:
-    """Gaussian knowledge of delta (8,), px of the reference's image."""
+    """Gaussian distribution of delta (8,), px of the reference's image, in information (canonical) form."""
 
     information: Array
     """(8, 8) inverse covariance."""
-    pull: Array
+    vector: Array
     """(8,) information times mean."""
 
     def __add__(self, other: "InformationForm") -> "InformationForm":
-        return InformationForm(self.information + other.information, self.pull + other.pull)
+        return InformationForm(self.information + other.information, self.vector + other.vector)
 
     @classmethod
     def of(cls, mean: Array, covariance: Array) -> "InformationForm":
@@ -62,71 +62,72 @@ def map_estimate(
     residuals: Mapping[str, Residual[FixedImagePx]],
     rig: Rig | None,
 ) -> dict[str, JointResult[FixedImagePx]]:
-    """Each result, by band, moved to the maximum a posteriori of all, with its covariance.
+    """Return the results by band with the MAP estimates of the homographies and their covariances.
 
-    `residuals` are those of the windows under the results.
+    `residuals` are those of the results. Results without a covariance are returned unchanged.
     """
     known = [p for p in pairs if p.name in results and results[p.name].corner_covariance_px2 is not None]
-    own = []
+    likelihoods = []
     for pair in known:
-        windows = _of_windows(pair, results[pair.name], residuals[pair.name])
-        descriptors = _of_descriptors(results[pair.name])
-        own.append(descriptors if windows is None else descriptors + windows)
-    priors = [_expectation(pair, results[pair.name], rig) for pair in known]
-    moved = dict(results)
-    for pair, (delta, covariance) in zip(known, _solve(own, priors), strict=True):
+        windows = _from_windows(pair, results[pair.name], residuals[pair.name])
+        descriptors = _from_descriptors(results[pair.name])
+        likelihoods.append(descriptors if windows is None else descriptors + windows)
+    priors = [_prior(pair, results[pair.name], rig) for pair in known]
+    estimates = dict(results)
+    for pair, (delta, covariance) in zip(known, _solve(likelihoods, priors), strict=True):
         result, size = results[pair.name], pair.fixed.size_px
         mapping = geometry.compose(result.fixed_to_moving, geometry.moving_corners(delta, *size))
-        moved[pair.name] = with_corners(result, mapping, covariance)
-    return moved
+        estimates[pair.name] = with_corners(result, mapping, covariance)
+    return estimates
 
 
-def _solve(own: Sequence[InformationForm], priors: Sequence[Expectation | None]) -> list[tuple[Array, Array]]:
-    """(delta (8,), its covariance (8, 8)) of each band, all together."""
-    factors = 8 * len(own) + np.arange(len(FACTOR_STD_PX))
-    weights = np.ones(len(own))
+def _solve(likelihoods: Sequence[InformationForm], priors: Sequence[Expectation | None]) -> list[tuple[Array, Array]]:
+    """Return delta (8,) and its covariance (8, 8) of each band."""
+    factors = 8 * len(likelihoods) + np.arange(len(FACTOR_STD_PX))
+    weights = np.ones(len(likelihoods))
     for _ in range(_REWEIGHTINGS):
         normal = np.zeros((factors[-1] + 1, factors[-1] + 1))
-        pull = np.zeros(len(normal))
+        right_side = np.zeros(len(normal))
         normal[factors, factors] = 1 / np.square(FACTOR_STD_PX)
-        for b, (information, prior) in enumerate(zip(own, priors, strict=True)):
+        for b, (likelihood, prior) in enumerate(zip(likelihoods, priors, strict=True)):
             band = 8 * b + np.arange(8)
-            normal[np.ix_(band, band)] += information.information
-            pull[band] += information.pull
+            normal[np.ix_(band, band)] += likelihood.information
+            right_side[band] += likelihood.vector
             if prior is not None:
                 rows = np.concatenate([band, factors])
                 design = np.hstack([np.eye(8), -prior.by_factor])
                 weighted = weights[b] * design.T @ np.linalg.inv(prior.covariance)
                 normal[np.ix_(rows, rows)] += weighted @ design
-                pull[rows] += weighted @ prior.corners
+                right_side[rows] += weighted @ prior.corners
         covariance = np.linalg.inv(normal)
-        solution = covariance @ pull
+        solution = covariance @ right_side
         for b, prior in enumerate(priors):
             if prior is not None:
-                off = solution[8 * b : 8 * b + 8] - prior.corners - prior.by_factor @ solution[factors]
-                apart = float(off @ np.linalg.solve(prior.covariance, off))
-                weights[b] = (_FREEDOM + 8) / (_FREEDOM + apart)
-    blocks = [slice(8 * b, 8 * b + 8) for b in range(len(own))]
-    # The order of sums depends on the machine: their last bits must not reach the outputs.
+                residual = solution[8 * b : 8 * b + 8] - prior.corners - prior.by_factor @ solution[factors]
+                mahalanobis2 = float(residual @ np.linalg.solve(prior.covariance, residual))
+                weights[b] = (_DEGREES_OF_FREEDOM + 8) / (_DEGREES_OF_FREEDOM + mahalanobis2)
+    blocks = [slice(8 * b, 8 * b + 8) for b in range(len(likelihoods))]
+    # Rounding removes the last bits, which depend on the machine's order of summation.
     return [(np.round(solution[s], 6), np.round(covariance[s, s], 12)) for s in blocks]
 
 
-def _of_descriptors(result: JointResult[FixedImagePx]) -> InformationForm:
+def _from_descriptors(result: JointResult[FixedImagePx]) -> InformationForm:
     assert result.corner_covariance_px2 is not None
     return InformationForm.of(np.zeros(8), result.corner_covariance_px2)
 
 
-def _of_windows(
+def _from_windows(
     pair: BandPair, result: JointResult[FixedImagePx], residual: Residual[FixedImagePx]
 ) -> InformationForm | None:
-    """The corners by the windows' shifts; None where these are few or too large."""
+    """Return the distribution of delta by the windows; None if they are too few or the correction is too large."""
     fit = corner_correction(pair.mapping(result.fixed_to_moving), residual, pair.fixed.size_px)
-    if fit is None or not fit.max_px <= _MAX_WINDOWS_PX:
+    if fit is None or not fit.max_px <= _MAX_CORRECTION_PX:
         return None
     return InformationForm.of(fit.mean_px, fit.covariance_px2)
 
 
-def _expectation(pair: BandPair, result: JointResult[FixedImagePx], rig: Rig | None) -> Expectation | None:
+def _prior(pair: BandPair, result: JointResult[FixedImagePx], rig: Rig | None) -> Expectation | None:
+    """Return the prior of delta by the rig; None if it does not contain the band."""
     if rig is None or pair.name not in rig.mean or not pair.has_rig_pixels:
         return None
     return expected_corners(rig, pair.name, pair.scales.between_files(result.fixed_to_moving)).rescaled(

@@ -1,4 +1,4 @@
-"""The predictions of the flight's rig for the bands of a capture, and what follows from them."""
+"""Predictions of the flight's rig for the bands of a capture: checks, replacements, and selection of bands to learn."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,19 +19,19 @@ from agalign.verify.rig_check import MAX_UNEXPECTED_PX, UNEXPECTED_PX
 
 
 def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], capture: Capture) -> Observation:
-    """The mappings of a capture that are aligned, in the form that the rig takes."""
-    good = {p.name: (p, a) for p in pairs if (a := result[p.name]).status == "aligned" and a.joint is not None}
+    """Return the aligned mappings of a capture as an observation of the rig."""
+    aligned = {p.name: (p, a) for p in pairs if (a := result[p.name]).status == "aligned" and a.joint is not None}
     return Observation(
         capture.time_s,
-        {name: pair.scales.between_files(a.fixed_to_moving) for name, (pair, a) in good.items()},
-        {name: _std_moving_px(pair, a) for name, (pair, a) in good.items()},
+        {name: pair.scales.between_files(a.fixed_to_moving) for name, (pair, a) in aligned.items()},
+        {name: _std_moving_px(pair, a) for name, (pair, a) in aligned.items()},
         None if capture.position is None else capture.position.altitude_m,
         capture.motion,
     )
 
 
 def _std_moving_px(pair: BandPair, alignment: Alignment[FixedImagePx]) -> MovingFilePx:
-    """Standard error of a mapping, in the unit of the rig's errors."""
+    """Return the standard error of a mapping, px of the moving file."""
     assert alignment.joint is not None
     return pair.in_moving_file_px(alignment.joint.corner_std_px, alignment.fixed_to_moving)
 
@@ -39,10 +39,10 @@ def _std_moving_px(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Moving
 def with_predictions(
     pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig, capture: Capture
 ) -> dict[str, Alignment[FixedImagePx]]:
-    """Each alignment with the rig's prediction, in px of the files; bands that are not aligned take its mapping.
+    """Return the alignments with the rig's predictions, px of the files; the prediction replaces failed alignments.
 
-    A result that the rig contradicts is not aligned either: in a repetitive scene the images agree whole periods
-    away. A band with an evidently rotated or scaled image does not belong to this rig, and keeps its result.
+    It also replaces results that contradict the rig, because of aliasing in repetitive scenes. A rotated or scaled
+    image does not fit the rig; its alignment gets an issue and is not replaced.
     """
     known = observed([p for p in pairs if p.has_rig_pixels], result, capture)
     checked = dict(result)
@@ -86,22 +86,25 @@ def bands_to_learn(
     capture: Capture,
     accept_predicted_px: float,
 ) -> set[str]:
-    """The bands to be learnt from scratch where the flight's network did not align them.
+    """Return the bands to learn from scratch if the flight's network did not align them.
 
-    These have something in common with the reference, and the rig does not predict them to `accept_predicted_px`. A low
-    capture shows much that the flight has not seen; water shows nothing, and the rig predicts blurred bands.
+    Bands are skipped if the rig predicts them with a standard error of at most `accept_predicted_px`, or if they have
+    no structure in common with the reference, as over water. Learning helps, for example, in captures from a lower
+    height than those of the flight's network.
     """
     known = observed([p for p in pairs if p.has_rig_pixels and p.name in result], result, capture)
 
-    def is_given_up(pair: BandPair) -> bool:
-        tried = result.get(pair.name)
-        if tried is None or pair.name not in rig.mean or not pair.has_rig_pixels:
+    def is_skipped(pair: BandPair) -> bool:
+        alignment = result.get(pair.name)
+        if alignment is None or pair.name not in rig.mean or not pair.has_rig_pixels:
             return False
-        return predict_band(rig, pair.name, known).std_px <= accept_predicted_px or not _has_something_in_common(tried)
+        is_predicted = predict_band(rig, pair.name, known).std_px <= accept_predicted_px
+        return is_predicted or not _has_common_structure(alignment)
 
-    return {pair.name for pair in pairs if not is_given_up(pair)}
+    return {pair.name for pair in pairs if not is_skipped(pair)}
 
 
-def _has_something_in_common(alignment: Alignment[FixedImagePx]) -> bool:
+def _has_common_structure(alignment: Alignment[FixedImagePx]) -> bool:
+    """Return True for a trusted seed or a retrieval above chance."""
     joint = alignment.joint
     return alignment.seed.trusted or (joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance)

@@ -1,4 +1,4 @@
-"""The reference image of a capture, with everything that seeds, checks and metrics of all bands need, computed once."""
+"""The reference image of a capture, with cached data for the seeds, checks and metrics of all bands."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -14,18 +14,18 @@ from agalign.verify.metrics import FixedSimilarity
 from agalign.verify.residuals import FixedWindows
 
 _SEED_LONGEST_PX = 384
-"""Longer side of the images on which seeds are scored: shifts of a third of the image are found, and it is quick."""
+"""Longer side of the images on which seeds are scored; large shifts are found quickly at this resolution."""
 
 _FIT_PX = LENS.window_px
-"""Side of the windows in which planes and baselines are fitted: small enough to be on one surface."""
+"""Side of the windows to which planes and baselines are fitted; small, so that most contain a single surface."""
 _HELD_OUT_PX = 64
-"""Side of the windows that verify a relief: larger ones have less noise in their shifts."""
+"""Side of the windows that verify a relief; larger, because their shifts have less noise."""
 _SMALL_WINDOW_PX = 32
-"""Side of windows between saturated spots: the smallest with a plain correlation peak."""
+"""Side of windows between saturated areas: the smallest with a clear correlation peak."""
 
 
 class Reference:
-    """The reference image, and on demand its structure, spectrum, windows and statistics."""
+    """The reference image; its structure, spectrum, windows and statistics are computed on first use."""
 
     def __init__(self, image: Raster) -> None:
         self.image = image
@@ -33,7 +33,7 @@ class Reference:
 
     @cached_property
     def grey(self) -> Raster:
-        """(H, W): the image or the mean of its channels."""
+        """The mean of the image's channels, (H, W)."""
         return channel_mean(self.image)
 
     @cached_property
@@ -43,7 +43,7 @@ class Reference:
 
     @cached_property
     def is_textured(self) -> bool:
-        """False where the image is constant or invalid."""
+        """False if the image is constant or invalid."""
         return textured(self.image)
 
     # ---- for seeds
@@ -57,16 +57,16 @@ class Reference:
 
     @cached_property
     def seed_scale(self) -> PixelScale:
-        """Scale of these relative to the image."""
+        """Scale of the reduced images relative to the image."""
         return PixelScale.between(self.image.size_px, self.seed_size_px)
 
     @cached_property
     def seed_spectrum(self) -> Field:
-        """Windowed spectrum of the structure at that size."""
+        """Windowed spectrum of the structure of the reduced image."""
         return windowed_spectra(structure_field(shrink(self.grey, self.seed_size_px)))
 
     def landmarks(self, source: LandmarkInput) -> Landmarks:
-        """Keypoints that are recognised in a rotated or scaled moving image, raw px."""
+        """Return SIFT landmarks of the image or its edges, raw px."""
         if source not in self._landmarks:
             self._landmarks[source] = landmarks(self.image, source)
         return self._landmarks[source]
@@ -75,50 +75,50 @@ class Reference:
 
     @cached_property
     def structure(self) -> Field:
-        """At full resolution."""
+        """Structure field of the image."""
         return structure_field(self.grey)
 
     @cached_property
     def windows(self) -> FixedWindows:
-        """The windows in which an alignment is verified."""
+        """Windows for the verification of an alignment."""
         return FixedWindows(self.grey.valid, self.structure)
 
     @cached_property
     def overlapping_windows(self) -> FixedWindows:
-        """The same, each overlapping the next by a half: of an image with few pixels more of them show something."""
+        """Windows of the same size with an overlap of one half, for images with few pixels."""
         return FixedWindows(self.grey.valid, self.structure, self.windows.side, self.windows.side // 2)
 
     @cached_property
     def small_windows(self) -> FixedWindows:
-        """Windows for images with valid areas that are too small for those."""
+        """Windows for images with small valid areas."""
         return FixedWindows(self.grey.valid, self.structure, _SMALL_WINDOW_PX)
 
     @cached_property
-    def local(self) -> DisplacementEstimator:
-        """Smaller windows, to which displacement fields are fitted."""
+    def coarse_field(self) -> DisplacementEstimator:
+        """Estimator of coarse displacement fields."""
         return DisplacementEstimator(self.grey.valid, self.structure, COARSE)
 
     @cached_property
-    def finer_local(self) -> DisplacementEstimator:
-        """The smallest windows."""
+    def fine_field(self) -> DisplacementEstimator:
+        """Estimator of fine displacement fields."""
         return DisplacementEstimator(self.grey.valid, self.structure, FINE)
 
     @cached_property
     def fit_windows(self) -> FixedWindows:
-        """Windows in the black fields of a chessboard, in which planes and baselines are fitted."""
+        """Windows in the black fields of a chessboard, for the fit of planes and baselines."""
         return FixedWindows.on_chessboard(self.grey.valid, self.structure, _FIT_PX, white=False)
 
     @cached_property
     def lens_field(self) -> DisplacementEstimator:
-        """Fits what lenses leave in the same windows."""
+        """Estimator of residual lens distortion in the same windows."""
         return DisplacementEstimator(self.grey.valid, self.structure, LENS, self.fit_windows)
 
     @cached_property
     def held_out_windows(self) -> FixedWindows:
-        """Windows of another size in the white fields, which verify what was fitted in the black ones."""
+        """Windows in the white fields, for the verification of a fit to the black ones."""
         return FixedWindows.on_chessboard(self.grey.valid, self.structure, _HELD_OUT_PX, white=True)
 
     @cached_property
     def similarity(self) -> FixedSimilarity:
-        """Histogram positions and smoothed gradients."""
+        """Histogram bins and gradients for the similarity metrics."""
         return FixedSimilarity(self.grey)

@@ -1,4 +1,4 @@
-"""The seed of a pair: candidates from tags, flight and landmarks are scored on the images, and the best one is kept."""
+"""Initial alignment (seed) of a pair: candidates from tags, flight and landmarks are scored on the images."""
 
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import replace
@@ -27,42 +27,42 @@ from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.acceptance import seed_fits
 
 _CERTAIN_SIGMA = 120.0
-"""Correlation peak that only images reach which agree everywhere: images rotated by one degree have one of 60 to 120,
-by three degrees of 17."""
+"""Correlation peak of images that are aligned everywhere; a rotation of 1 degree reduces it to 60 to 120, of 3 degrees
+to 17."""
 _TRUSTED_SIGMA = 12.0
-"""Correlation peak of a seed that is good to a few pixels. Unrelated images reach 9."""
+"""Minimum correlation peak of a trusted seed, with an error of a few pixels. Unrelated images have up to 9."""
 _TRUSTED_RATIO = 1.5
-"""Ratio of a trusted seed's peak to the second highest: a repetitive scene has several of one height."""
+"""Minimum ratio of a trusted seed's peak and the second highest: a repetitive scene has several similar peaks."""
 _MIN_OVERLAP = 0.2
-"""Share of the reference that the moving image must cover: on a sliver of common area the correlation peak means
-nothing, and the correlation is circular, so that its peak may put the images next to each other."""
+"""Minimum share of the reference that the moving image covers: the correlation is circular and meaningless for small
+overlaps."""
 _MIN_SHIFT_PX = 0.25
-"""Structure shifts below this, in px of the reduced images, are noise and leave a candidate as it is."""
+"""Smaller shifts, px of the reduced images, are noise."""
 _SAME_PEAK_PX = 2.0
-"""A candidate no farther from the peak than this, in px of the reduced images, is on its flank."""
+"""Maximum distance, px of the reduced images, of a candidate from a peak that it belongs to."""
 _CLOSE_PX = 3.0
-"""95th percentile of the residual under a match, below which no better one is looked for."""
+"""p95 of the residual of a match at which the search ends."""
 _MIN_WINDOWS = 12
-"""Windows that correct a match: fewer than for an estimate, as they must agree better with the corrected one."""
+"""Minimum number of windows that correct a match; few suffice, because the corrected match is tested."""
 _MAX_ROTATION_DEGREES, _MAX_SCALE_CHANGE = 1.0, 0.02
-"""Difference of a band from its rig that temperature and mounting explain."""
-_FROM_TAGS: Set[SeedKind] = frozenset({"rig", "centre", "geo", "model", "user"})
-"""Candidates of known scale."""
+"""Maximum deviation of a band from its rig by temperature and mounting."""
+_WITH_SCALE: Set[SeedKind] = frozenset({"rig", "centre", "geo", "model", "user"})
+"""Candidates with a known scale."""
 _SCALES = tuple(1.02**k for k in range(-18, 19) if k)
-"""Scales relative to the overlay of the two images, 0.7 to 1.4: 2 % away from the right one, the correlation peak of a
-thermal and a blue image falls to three quarters."""
+"""Scales relative to the overlay of the two images, 0.7 to 1.4. An error of 2 % reduces the correlation peak of a
+thermal and a blue image to three quarters."""
 _MAX_KEYPOINTS = 1000
-"""Matching all keypoints of a full image by learnt descriptors, the last resort, takes seconds."""
+"""Limits the time of matching by learnt descriptors, which is the last step."""
 
 
 def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None = None) -> Seed | Issue:
-    """The best seed of a pair, or why it can have none. `model` has the network that a `match` is found with."""
+    """Return the best seed of a pair, or the issue that prevents one. A `match` uses the network of `model`."""
     if not pair.reference.is_textured:
         return Issue(BLANK_REFERENCE)
     if not textured(pair.moving):
         return Issue(BLANK_MOVING)
     candidates = pair.candidates
-    # A forced kind is for the captures that a flight is learned from: the others start from the flight's own mapping.
+    # With a flight's mapping, the forced kind was already used in the captures from which the flight was learned.
     force = None if "model" in candidates else settings.force
     if force == "match":
         result = match_seed(_network(pair, model), pair.fixed, pair.moving)
@@ -70,26 +70,26 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
             return Issue(NO_SUCH_SEED, detail="match")
         candidates = {"match": result}
     best = best_seed(pair, candidates, force)
-    # A mapping from the flight or the user, or a forced seed: anything found elsewhere would be wrong.
-    is_given = force is not None or pair.is_known_to_a_rig or "user" in pair.candidates
+    # A mapping by the flight or the user or a forced seed excludes other positions.
+    is_given = force is not None or pair.has_rig or "user" in pair.candidates
     if best.score >= _CERTAIN_SIGMA or is_given:
         return best
-    if not best.trusted and not _FROM_TAGS & pair.candidates.keys():
+    if not best.trusted and not _WITH_SCALE & pair.candidates.keys():
         best = max((best, *_at_other_scales(pair)), key=lambda seed: seed.score)
-    residual = _residual_under(pair, best.fixed_to_moving)
-    # A peak at the mapping of the tags verifies the middle of the image; the windows verify the corners.
+    residual = _residual_of(pair, best.fixed_to_moving)
+    # A peak at the mapping of the tags confirms the image centre, the windows confirm the corners.
     if best.trusted and pair.is_expected(best.fixed_to_moving) and seed_fits(residual):
         return best
     return _best_match(pair, model, best, residual)
 
 
 def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual: Residual[FixedImagePx]) -> Seed:
-    """A match under which the windows agree better than under the best seed so far, or that seed."""
+    """Return a match with a smaller residual than the best seed, or that seed."""
     for mapping in _matches(pair, model, by_learnt_descriptors=not best.trusted):
-        match, match_residual = _unshifted(pair, mapping), _residual_under(pair, mapping)
+        match, match_residual = _unshifted(pair, mapping), _residual_of(pair, mapping)
         corrected = _corrected(pair, mapping, match_residual)
         if corrected is not None:
-            corrected_residual = _residual_under(pair, corrected)
+            corrected_residual = _residual_of(pair, corrected)
             if corrected_residual.is_better_than(match_residual):
                 match, match_residual = _unshifted(pair, corrected), corrected_residual
         if seed_fits(match_residual) and match_residual.is_better_than(residual):
@@ -99,33 +99,33 @@ def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual:
     return best
 
 
-def find_rotated(pair: BandPair, fixed_to_moving: Matrix, under: Residual[FixedImagePx]) -> Matrix | None:
-    """A mapping by landmarks that is rotated or scaled relative to the given one, as no band of a rigid camera is.
+def find_rotated(pair: BandPair, fixed_to_moving: Matrix, given: Residual[FixedImagePx]) -> Matrix | None:
+    """Return a mapping by landmarks that is rotated or scaled relative to `fixed_to_moving`; None without one.
 
-    The windows must agree better with it than they do `under` the given mapping. None where there is none: a mapping
-    that is merely shifted may be another place of a repetitive scene.
+    Its residual is better than the residual `given` of `fixed_to_moving`. The bands of a rigid camera are not rotated
+    relative to their rig; a mapping that is only shifted may be an alias in a repetitive scene and is ignored.
     """
-    if seed_fits(under):
+    if seed_fits(given):
         return None
     for result in _matches(pair, None, by_learnt_descriptors=False):
-        residual = _residual_under(pair, result)
+        residual = _residual_of(pair, result)
         change = geometry.compose(geometry.invert(fixed_to_moving), result)
-        if seed_fits(residual) and residual.is_better_than(under) and _is_rotated_or_scaled(change, pair.fixed.size_px):
+        if seed_fits(residual) and residual.is_better_than(given) and _is_rotated_or_scaled(change, pair.fixed.size_px):
             return result
     return None
 
 
 def _is_rotated_or_scaled(matrix: Matrix, size_px: tuple[int, int]) -> bool:
-    """By the images of a step right and a step down in the middle of an image (width, height)."""
-    middle = (np.array(size_px) - 1) / 2
-    origin, right, down = geometry.apply(matrix, middle + np.array([(0, 0), (1, 0), (0, 1)]))
+    """Return True if a homography rotates or scales the centre of an image (width, height) beyond the limits."""
+    centre = (np.array(size_px) - 1) / 2
+    origin, right, down = geometry.apply(matrix, centre + np.array([(0, 0), (1, 0), (0, 1)]))
     angle = np.degrees(np.arctan2(*(right - origin)[::-1]))
     scale = np.sqrt(abs(np.linalg.det([right - origin, down - origin])))
     return bool(abs(angle) > _MAX_ROTATION_DEGREES or abs(scale - 1) > _MAX_SCALE_CHANGE)
 
 
 def _corrected(pair: BandPair, fixed_to_moving: Matrix, residual: Residual[FixedImagePx]) -> Matrix | None:
-    """A mapping corrected by the windows under it; None where these are few."""
+    """Return a mapping corrected by its residual; None if too few windows are measured."""
     fit = corner_correction(pair.mapping(fixed_to_moving), residual, pair.fixed.size_px, _MIN_WINDOWS)
     try:
         return None if fit is None else fit.applied_to(fixed_to_moving, pair.fixed.size_px)
@@ -134,7 +134,7 @@ def _corrected(pair: BandPair, fixed_to_moving: Matrix, residual: Residual[Fixed
 
 
 def _matches(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors: bool) -> Iterator[Matrix]:
-    """Mappings, however rotated, scaled or shifted, that landmarks or learnt descriptors of both images agree on."""
+    """Yield mappings from landmarks, then from learnt descriptors; any rotation, scale and shift is possible."""
     for source in LANDMARK_INPUTS:
         fixed = pair.reference.landmarks(source).undistorted(pair.fixed.lens)
         moving = landmarks(pair.moving, source).undistorted(pair.moving.lens)
@@ -147,7 +147,7 @@ def _matches(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors
             yield result
 
 
-def _residual_under(pair: BandPair, fixed_to_moving: Matrix) -> Residual[FixedImagePx]:
+def _residual_of(pair: BandPair, fixed_to_moving: Matrix) -> Residual[FixedImagePx]:
     return WarpedPair.of(pair, pair.mapping(fixed_to_moving)).residual
 
 
@@ -159,9 +159,10 @@ def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
 def image_groups(
     pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int] = ()
 ) -> list[tuple[list[int], ImageGroup]]:
-    """The inputs of the joint method: (indices of pairs with one reference image and one space, these as a group).
+    """Group the pairs with the same reference image and space for the joint method.
 
-    `sides` are the network's side for each pair, by default counted within each group.
+    Returns the indices of the pairs and the images of each group. `sides` are the network's sides of the pairs, by
+    default 1, 2, … in each group.
     """
     groups: dict[tuple[int, Space], list[int]] = {}
     for index, pair in enumerate(pairs):
@@ -181,15 +182,15 @@ def _image_group(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequen
     fields = [p.field for p in pairs]
     return ImageGroup(
         pairs[0].fixed, [p.moving for p in pairs], mappings, sides, [s.trusted for s in seeds],
-        [p.reach_px for p in pairs], fields=fields if any(f is not None for f in fields) else (),
+        [p.max_shift_px for p in pairs], fields=fields if any(f is not None for f in fields) else (),
     )  # fmt: skip
 
 
 def best_seed(pair: BandPair, candidates: Candidates, force: SeedKind | None = None) -> Seed:
-    """The candidate under which the structures agree best, or one shifted onto the peak of their correlation.
+    """Return the candidate with the highest score, or a candidate shifted to the correlation peak.
 
-    A candidate of the kind to `force` wins whatever its score. Where the flight's own mapping is trusted, the others
-    are not scored.
+    Candidates of the kind `force` are preferred to all others. If the flight's mapping is trusted, the others are not
+    scored.
     """
     scored: list[Seed] = []
     for kind, matrix in candidates.items():
@@ -202,33 +203,33 @@ def best_seed(pair: BandPair, candidates: Candidates, force: SeedKind | None = N
 
 
 def first_candidate(pair: BandPair) -> Seed:
-    """The candidate of highest trust, without a score."""
+    """Return the first candidate of a pair as a seed without a score."""
     kind, matrix = next(iter(pair.candidates.items()))
     return Seed(kind, matrix, 0.0)
 
 
 def _at_other_scales(pair: BandPair) -> Iterator[Seed]:
-    """The trusted ones among the seeds that overlay the images at other scales.
+    """Yield the trusted seeds that overlay the images at other scales.
 
-    Without tags the two fields of view are unknown: a thermal camera's may be a fifth wider than that of the others.
+    Without tags the fields of view are unknown: that of a thermal camera may be a fifth wider than the others.
     """
-    overlay, middle = pair.candidates["identity"], (np.array(pair.fixed.size_px) - 1) / 2
+    overlay, centre = pair.candidates["identity"], (np.array(pair.fixed.size_px) - 1) / 2
     for scale in _SCALES:
-        about_middle = geometry.compose(
-            geometry.translation(*middle), np.diag([scale, scale, 1.0]), geometry.translation(*-middle)
+        about_centre = geometry.compose(
+            geometry.translation(*centre), np.diag([scale, scale, 1.0]), geometry.translation(*-centre)
         )
-        yield from (s for s in _scored(pair, "structure", geometry.compose(overlay, about_middle)) if s.trusted)
+        yield from (s for s in _scored(pair, "structure", geometry.compose(overlay, about_centre)) if s.trusted)
 
 
 def _unshifted(pair: BandPair, fixed_to_moving: Matrix) -> Seed:
-    """A match as it is, with its score."""
+    """Return a match with its score, without shifting it to the correlation peak."""
     return _scored(pair, "match", fixed_to_moving)[0]
 
 
 def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[Seed]:
-    """The candidate itself first and, where the structures agree better a shift away, its `structure` variant.
+    """Return a candidate with its score, followed by the candidate shifted to the correlation peak, if different.
 
-    A candidate with too little common area scores 0.
+    The shifted candidate has the kind `structure`. A candidate with too small an overlap has score 0.
     """
     scale = pair.reference.seed_scale
     peak = _peak(pair, kind, fixed_to_moving)
@@ -241,25 +242,25 @@ def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[See
 
     if np.hypot(*peak.shift_px) < _MIN_SHIFT_PX:
         return [seed(kind, fixed_to_moving, peak.sigma, peak.runner_up_sigma)]
-    # Where the peak is another place, it is the unshifted candidate's rival.
-    rival = peak.sigma if np.hypot(*peak.shift_px) > _SAME_PEAK_PX else peak.runner_up_sigma
-    unmoved = seed(kind, fixed_to_moving, peak.sigma_at_zero, rival)
+    # If the unshifted candidate does not belong to the highest peak, that peak is its runner-up.
+    runner_up = peak.sigma if np.hypot(*peak.shift_px) > _SAME_PEAK_PX else peak.runner_up_sigma
+    unshifted = seed(kind, fixed_to_moving, peak.sigma_at_zero, runner_up)
     shift = geometry.translation(peak.shift_px[0] / scale[0], peak.shift_px[1] / scale[1])
     shifted = geometry.compose(fixed_to_moving, shift)
     points = pair.mapping(shifted)(geometry.lattice(*pair.fixed.size_px, 16, 12))
-    within = ((points >= 0) & (points <= np.subtract(pair.moving.size_px, 1))).all(axis=1)
-    if within.mean() < _MIN_OVERLAP:
-        return [unmoved]
-    return [unmoved, seed("structure", shifted, peak.sigma, peak.runner_up_sigma)]
+    is_inside = ((points >= 0) & (points <= np.subtract(pair.moving.size_px, 1))).all(axis=1)
+    if is_inside.mean() < _MIN_OVERLAP:
+        return [unshifted]
+    return [unshifted, seed("structure", shifted, peak.sigma, peak.runner_up_sigma)]
 
 
 def _peak(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> Peak | None:
-    """The correlation peak of the reduced structures under a candidate; None where too little is common to both."""
+    """Return the correlation peak of the reduced structures for a candidate; None if the overlap is too small."""
     size, scale = pair.reference.seed_size_px, pair.reference.seed_scale
     small_moving = warped(channel_mean(pair.moving), pair.mapping(fixed_to_moving), size, scale)
     if small_moving.valid.mean() < _MIN_OVERLAP:
         return None
     surface = correlation_surfaces(pair.reference.seed_spectrum, windowed_spectra(structure_field(small_moving)))
-    # Where the user knows a candidate to some px, a peak a period away is another place.
-    within_px = max(_SAME_PEAK_PX, pair.reach_px * max(scale)) if kind == "user" else np.inf
-    return find_peak(surface, exclusion_px=max(size) // 16, max_shift_px=within_px)
+    # Peaks farther from the user's candidate than its standard error allows are aliases.
+    max_shift_px = max(_SAME_PEAK_PX, pair.max_shift_px * max(scale)) if kind == "user" else np.inf
+    return find_peak(surface, exclusion_px=max(size) // 16, max_shift_px=max_shift_px)

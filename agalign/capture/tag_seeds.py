@@ -1,4 +1,4 @@
-"""Coarse mappings that a file's metadata offers, before any pixel is looked at."""
+"""Initial mappings from the metadata of the files."""
 
 from contextlib import suppress
 
@@ -15,12 +15,12 @@ _FROM_TAGS: tuple[SeedKind, ...] = ("rig", "geo", "identity")
 
 
 def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> dict[SeedKind, Matrix]:
-    """fixed_to_moving between undistorted pixels of the files, in order of trust, identity last.
+    """Return fixed_to_moving between undistorted px of the files by kind, in order of preference, identity last.
 
-    Where the settings force a kind that tags can give, only that one, or none where the tags do not give it.
+    If the settings force a kind that tags provide, only this kind is returned, or nothing if the tags lack it.
     """
     candidates: dict[SeedKind, Matrix] = {}
-    with suppress(GeometryError):  # values in the tags that do not describe a camera
+    with suppress(GeometryError):  # invalid values in the tags
         rig = rig_seed(reference, moving)
         if rig is not None:
             candidates["rig"] = rig
@@ -39,10 +39,11 @@ def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> di
 
 
 def geo_seed(reference: Band, moving: Band) -> Matrix | None:
-    """fixed_to_moving from the two files' geotransforms; None where either has none.
+    """Return fixed_to_moving from the geotransforms of two files; None if one has none.
 
-    Between two coordinate reference systems it is the homography closest to the transformation. Geotransforms refer to
-    the corner of the top-left pixel, this package to its centre: hence the half pixels. Raises GeometryError.
+    Between different coordinate reference systems it is the homography that fits the transformation best. Half pixels
+    convert between the corner of the top-left pixel, to which geotransforms refer, and its centre. Raises
+    GeometryError.
     """
     fixed, other = reference.georeference, moving.georeference
     if fixed is None or other is None:

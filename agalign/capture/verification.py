@@ -1,4 +1,4 @@
-"""Verification of a pair: its alignment with every reason for and against it, measured on the warped images."""
+"""Verification of a pair on the warped images: status and issues of its alignment."""
 
 import math
 from dataclasses import dataclass, replace
@@ -25,43 +25,43 @@ from agalign.verify.residuals import residual_under
 from agalign.verify.window_check import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX
 
 _UNCHANGED: tuple[SeedKind, ...] = ("geo", "identity")
-"""Seeds that change nothing: an input aligned already is left untouched, not resampled by a hundredth of a pixel."""
+"""Seeds of input that may be aligned already; it is then returned unchanged instead of resampled by a small shift."""
 
-_SAME_PX = 0.15
-"""Mappings no farther apart leave shifts that differ by that, to a hundredth of a px: interpolation changes the
-windows' shifts by a tenth to a quarter of their distance from whole pixels."""
+_MAX_CONVERTED_PX = 0.15
+"""Maximum difference of two mappings for which the residual is converted instead of measured again; the error is about
+0.01 px, because interpolation changes shifts by 0.1 to 0.25 of their distance from whole pixels."""
 
-_MENDABLE = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
-"""Issues that parallax causes and a displacement field removes."""
+_PARALLAX_ISSUES = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
+"""Issues caused by parallax, which a displacement field may remove."""
 
 
 def without_result(seed: Seed, space: Space, issue: Issue) -> Alignment[FixedPx]:
-    """The failed alignment of a pair that could not be tried."""
+    """Return a failed alignment without a result."""
     return Alignment(seed.fixed_to_moving, space, "failed", (issue,), seed, None, None, 0.0)
 
 
 @dataclass(frozen=True)
 class WarpedPair:
-    """A pair with the moving image on the reference's pixels, and the residual of its windows."""
+    """A pair with the warped moving image and the residual of its windows."""
 
     pair: BandPair
     mapping: PixelMapping
     warped: Raster
-    """The moving image, one channel, on the reference's pixels."""
+    """The moving image, one channel, on the grid of the reference."""
     residual: Residual[FixedImagePx]
 
     @classmethod
     def of(cls, pair: BandPair, mapping: PixelMapping) -> "WarpedPair":
-        """Warped and measured."""
+        """Warp the moving image and measure the residual."""
         warped = pair.warped_moving(mapping)
         return cls(pair, mapping, warped, _residual_of(pair, mapping, warped))
 
-    def under(self, mapping: PixelMapping) -> "WarpedPair":
-        """The pair under another mapping; where the two are all but equal, it is not measured again."""
+    def with_mapping(self, mapping: PixelMapping) -> "WarpedPair":
+        """Return the pair with another mapping; the residual is converted if the mappings are nearly equal."""
         if mapping.local is self.mapping.local:
             corners = geometry.corners(*self.pair.fixed.size_px)
-            apart_px = float(np.linalg.norm(mapping(corners) - self.mapping(corners), axis=1).max())
-            if apart_px <= _SAME_PX:
+            difference_px = float(np.linalg.norm(mapping(corners) - self.mapping(corners), axis=1).max())
+            if difference_px <= _MAX_CONVERTED_PX:
                 return replace(self, mapping=mapping, residual=residual_under(self.residual, self.mapping, mapping))
         return WarpedPair.of(self.pair, mapping)
 
@@ -71,24 +71,22 @@ class WarpedPair:
         return self.pair.reference.seed_scale
 
     def reduced_spectra(self) -> tuple[Field, Field]:
-        """Windowed spectra (height, width) of the structure of the reduced fixed image, and of the moving image."""
+        """Windowed spectra (height, width) of the structures of the reduced fixed and moving images."""
         small = shrink(self.warped, self.pair.reference.seed_size_px)
         return self.pair.reference.seed_spectrum, windowed_spectra(structure_field(small))
 
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        """True where the pair's candidates expect the mapping after a shift (x, y), px of the fixed image."""
+        """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with a candidate of the pair."""
         return self.pair.is_expected(self.mapping.fixed_to_moving, shift_px)
 
     def issues(self, joint: JointResult[FixedImagePx]) -> tuple[Issue, ...]:
-        """Of the result that this mapping is from."""
+        """Return the issues of the result with this mapping."""
         file_px = self.pair.file_px
         return issues_of(Evidence(joint, self.residual, self.pair.fixed.size_px, images=self, file_px=file_px))
 
 
 def _residual_of(pair: BandPair, mapping: PixelMapping, warped: Raster) -> Residual[FixedImagePx]:
-    """The residual of the windows; of smaller ones where the usual ones do not fit into some quarter of the common
-    frame, and the smaller ones show more quarters.
-    """
+    """Measure the residual in windows; in small windows if these cover more quarters of the overlap."""
     size_px = pair.fixed.size_px
     residual = pair.reference.windows.residuals(warped)
     in_frame_px = points_in_frame(mapping, size_px, pair.moving_image.size_px)
@@ -106,18 +104,18 @@ def verified(
     settings: Settings,
     warped_pair: WarpedPair | None = None,
 ) -> Alignment[FixedImagePx]:
-    """The alignment with its status, px of the images. A result with issues leaves the seed.
+    """Verify a result; return its alignment with status, px of the images. With issues it has the mapping of the seed.
 
-    `warped_pair` is the pair under a mapping that may be close to the result's: it saves measuring again.
+    `warped_pair` is the pair with a mapping close to the result's, if available; it avoids measuring again.
     """
     joint: JointResult[FixedImagePx] | None = None
     local: DisplacementResult[FixedImagePx] | None = None
     issues: tuple[Issue, ...] = ()
     is_displaced = False
     if isinstance(result, JointResult):
-        joint = _snapped(result, pair)
+        joint = _unchanged_if_aligned(result, pair)
         mapping = pair.mapping(joint.fixed_to_moving)
-        warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.under(mapping)
+        warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.with_mapping(mapping)
         warped_pair, issues, local = _verified(warped_pair, joint, settings.relief.use)
         is_displaced = local is not None and local.field is not None
     else:
@@ -136,8 +134,9 @@ def verified(
 
 
 def _predicted_by_windows(alignment: Alignment[FixedImagePx], pair: BandPair) -> Alignment[FixedImagePx]:
-    """An alignment by a displacement field that misses too many of the windows left out of its fit: far better than
-    the seed, with the error that these windows show.
+    """Return as `predicted` an alignment with a displacement field that has issues in its held-out windows.
+
+    The standard error is the RMS of the shifts of these windows.
     """
     assert alignment.residual is not None
     lengths = np.linalg.norm(alignment.residual.shifts_px, axis=1)
@@ -150,75 +149,76 @@ def _predicted_by_windows(alignment: Alignment[FixedImagePx], pair: BandPair) ->
 def _verified(
     warped_pair: WarpedPair, joint: JointResult[FixedImagePx], use: ReliefUse
 ) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult[FixedImagePx] | None]:
-    """(the pair under the result, with a displacement field where one is wanted and helps; its issues; the field)."""
+    """Return the pair, with a displacement field if one is accepted, its issues, and the result of the field fit."""
     issues = warped_pair.issues(joint)
-    if not _is_field_wanted(use, issues, rig_known=warped_pair.pair.is_known_to_a_rig):
+    if not _needs_field(use, issues, has_rig=warped_pair.pair.has_rig):
         return warped_pair, issues, None
-    coarse = _with_displacements(warped_pair, joint)
+    coarse = _with_field(warped_pair, joint)
     if coarse.passes or not issues:
-        return coarse.instead_of(warped_pair, issues)
-    # Close neighbours at different heights, such as the leaves of large plants, need a finer field.
-    fine = _with_displacements(warped_pair, joint, finer=True)
+        return coarse.or_without_field(warped_pair, issues)
+    # Surfaces at different heights close to each other, such as leaves of large plants, need a finer field.
+    fine = _with_field(warped_pair, joint, fine=True)
     better = fine if fine.passes or fine.p95_px < coarse.p95_px else coarse
-    return better.instead_of(warped_pair, issues)
+    return better.or_without_field(warped_pair, issues)
 
 
-def _is_field_wanted(use: ReliefUse, issues: tuple[Issue, ...], *, rig_known: bool) -> bool:
-    """True where a displacement field is to be tried for a result with these issues.
+def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) -> bool:
+    """Return True if a displacement field is fitted for a result with these issues.
 
-    `auto` tries one where parallax may be the only issue, and where no rig knows the distortion that the lenses leave.
+    With `auto`, it is fitted if all issues may be caused by parallax, and without issues if no rig contains the
+    residual lens distortion.
     """
-    mendable = all(issue.kind in _MENDABLE for issue in issues)
-    return mendable and (use == "always" or (use == "auto" and (bool(issues) or not rig_known)))
+    only_parallax = all(issue.kind in _PARALLAX_ISSUES for issue in issues)
+    return only_parallax and (use == "always" or (use == "auto" and (bool(issues) or not has_rig)))
 
 
 @dataclass(frozen=True)
-class _Displaced:
-    """A pair with a displacement field over its mapping, after verification."""
+class _FieldResult:
+    """A pair with a displacement field, after verification."""
 
     local: DisplacementResult[FixedImagePx]
     pair: WarpedPair | None = None
-    """With the residual of the windows held out; None without a field, or where checks fail that no field mends."""
+    """With the residual of held-out windows; None without a field or with issues that a field cannot remove."""
     issues: tuple[Issue, ...] = ()
-    """Of the windows held out."""
+    """Issues of the held-out windows."""
 
     @property
     def passes(self) -> bool:
+        """True if there is a field and no issue."""
         return self.pair is not None and not self.issues
 
     @property
     def p95_px(self) -> FixedImagePx:
+        """p95 of the held-out windows; infinite without a field."""
         return FixedImagePx(math.inf) if self.pair is None else self.pair.residual.p95_px
 
-    def instead_of(
+    def or_without_field(
         self, plane: WarpedPair, issues: tuple[Issue, ...]
     ) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult[FixedImagePx]]:
-        """With the field where it helps; a pair that passes without one takes only a field that passes too."""
+        """Return the pair with the field, or `plane` if there is no field or only `plane` passes verification."""
         if self.pair is None or (self.issues and not issues):
             return plane, issues, replace(self.local, field=None)
         return self.pair, self.issues, self.local
 
 
-def _with_displacements(
-    warped_pair: WarpedPair, joint: JointResult[FixedImagePx], *, finer: bool = False
-) -> _Displaced:
-    """A pair with a displacement field over its mapping."""
+def _with_field(warped_pair: WarpedPair, joint: JointResult[FixedImagePx], *, fine: bool = False) -> _FieldResult:
+    """Fit a displacement field in addition to the mapping of a pair and verify it."""
     pair, mapping = warped_pair.pair, warped_pair.mapping
-    estimator = pair.reference.finer_local if finer else pair.reference.local
+    estimator = pair.reference.fine_field if fine else pair.reference.coarse_field
     local = estimator.refine(channel_mean(pair.moving_image), mapping, verify=True)
     if local.field is None:
-        return _Displaced(local)
+        return _FieldResult(local)
     displaced = WarpedPair.of(pair, replace(mapping, local=local.field))
     held_out = displaced if local.held_out is None else replace(displaced, residual=local.held_out)
-    # All checks run again, and those of windows also on windows that the field was not fitted to.
+    # All checks run again, those of windows on all windows and on the held-out ones.
     issues = held_out.issues(joint)
-    if displaced.issues(joint) or any(issue.kind not in _MENDABLE for issue in issues):
-        return _Displaced(local)
-    return _Displaced(local, held_out, issues)
+    if displaced.issues(joint) or any(issue.kind not in _PARALLAX_ISSUES for issue in issues):
+        return _FieldResult(local)
+    return _FieldResult(local, held_out, issues)
 
 
 def as_predicted(alignment: Alignment[FixedImagePx], pair: BandPair, prediction: Prediction) -> Alignment[FixedImagePx]:
-    """The alignment of a pair by its rig's prediction: px of the images, of the files for the prediction itself."""
+    """Return the alignment, px of the images, with the mapping of a prediction, px of the files."""
     fixed_to_moving = pair.scales.between_images(prediction.fixed_to_moving)
     residual = WarpedPair.of(pair, pair.mapping(fixed_to_moving)).residual
     return replace(
@@ -228,18 +228,18 @@ def as_predicted(alignment: Alignment[FixedImagePx], pair: BandPair, prediction:
 
 
 def with_metrics(alignment: Alignment[FixedImagePx], pair: BandPair) -> Alignment[FixedImagePx]:
-    """The alignment with the similarity of the two images before, with outer edges coinciding, and after."""
+    """Return the alignment with similarity metrics before (image borders overlaid) and after alignment."""
     similarity = pair.reference.similarity
     before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
     after = pair.warped_moving(pair.mapping(alignment.fixed_to_moving, alignment.field, alignment.parallax))
     return replace(alignment, before=similarity.to(before), after=similarity.to(after))
 
 
-def _snapped(joint: JointResult[FixedImagePx], pair: BandPair) -> JointResult[FixedImagePx]:
-    """The result, or the mapping that the files came with where it does not differ from that."""
+def _unchanged_if_aligned(joint: JointResult[FixedImagePx], pair: BandPair) -> JointResult[FixedImagePx]:
+    """Replace the mapping by the one given by the files if it does not differ significantly."""
     for given in (pair.candidates[kind] for kind in _UNCHANGED if kind in pair.candidates):
         if pair.mapping(given).is_curved:
-            continue  # a lens is to be corrected: the files are not aligned as they are
+            continue  # with lens distortion the files are not aligned
         if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):
             return replace(joint, fixed_to_moving=given)
     return joint

@@ -1,4 +1,4 @@
-"""Status of a band pair from the issues of its alignment; a wrong alignment with status `aligned` is the worst error."""
+"""Status of a band pair from the issues of its alignment. The worst error is a wrong alignment called `aligned`."""
 
 from collections.abc import Sequence
 

@@ -11,7 +11,7 @@ import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture import band_pair
 from agalign.capture.align import align_capture_bands
-from agalign.capture.band_pair import BandPair, _known_to_px, longest_for, read_pairs
+from agalign.capture.band_pair import BandPair, _candidate_std_px, longest_for, read_pairs
 from agalign.capture.prediction import observed
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
@@ -115,7 +115,7 @@ def test_what_a_rig_misses_is_brought_to_px_of_the_reference(monkeypatch: pytest
     rig = Rig(size, {band: np.diag([0.1, 0.1, 1.0])}, {band: (1.0, 0.0)}, {}, {}, {}, (), (), {band: 0.5})
     monkeypatch.setattr(band_pair, "unobserved_error_px", lambda *_, **__: 0.5)
     model = FlightModel(None, "", (band,), {}, "", rig)  # type: ignore[arg-type]
-    assert _known_to_px(band, model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
+    assert _candidate_std_px(band, model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])

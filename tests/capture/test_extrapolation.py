@@ -95,7 +95,7 @@ def test_an_image_that_shows_everything_is_left_as_it_is() -> None:
 
 @pytest.mark.parametrize(("extrapolation_px", "status"), [({}, "aligned"), ({"moving": 0.7}, "predicted")])
 def test_a_rig_that_shows_the_whole_image_is_enough(extrapolation_px: dict[str, float], status: str) -> None:
-    pair = replace(pair_in(LEFT), known_to_px={"model": 1.0})
+    pair = replace(pair_in(LEFT), candidate_std_px={"model": 1.0})
     rig = Rig(
         SIZE, {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}, {"moving": 0.1}, {"moving": (0.0,) * 5},
         (), (), {"moving": 0.1}, extrapolation_px=extrapolation_px,

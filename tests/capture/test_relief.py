@@ -11,7 +11,7 @@ from synthetic_flights.relief import make_scene
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.reference import Reference
-from agalign.capture.relief import ReliefCandidate, _worse, aligned_by_relief, shows_relief
+from agalign.capture.relief import ReliefCandidate, _is_worse, aligned_by_relief, shows_relief
 from agalign.capture.verification import WarpedPair
 from agalign.relief.range import inverse_range
 from agalign.synthetic.flight import recorded
@@ -229,7 +229,7 @@ def of_lengths(median_px: float, p95_px: float) -> Residual:
 def test_a_relief_may_not_be_worse_than_its_plane(
     relief: tuple[float, float], plane: tuple[float, float], worse: bool
 ) -> None:
-    assert _worse(of_lengths(*relief), of_lengths(*plane)) == worse
+    assert _is_worse(of_lengths(*relief), of_lengths(*plane)) == worse
 
 
 # ---- what fits noise cannot pass

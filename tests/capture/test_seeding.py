@@ -120,11 +120,11 @@ def test_landmarks_find_what_is_turned_or_scaled(degrees: float, scale: float) -
     assert mean_error_px(seed.fixed_to_moving, geometry.compose(to_turned, SHIFTED), 400, 320) < 2 * scale
 
 
-def pair_turned(degrees: float, candidates: Candidates, known_to_px: dict[str, float] | None = None) -> BandPair:
+def pair_turned(degrees: float, candidates: Candidates, candidate_std_px: dict[str, float] | None = None) -> BandPair:
     fixed, moving = textured_pair(np.eye(3), 640, 480)
     image, valid, _ = turned(moving, degrees, 1.0)
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
-    return BandPair.of_images("moving", *images, candidates, known_to_px or {})  # type: ignore[arg-type]
+    return BandPair.of_images("moving", *images, candidates, candidate_std_px or {})  # type: ignore[arg-type]
 
 
 def test_tags_that_are_wrong_by_a_turn_are_found_out() -> None:

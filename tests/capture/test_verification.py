@@ -47,7 +47,7 @@ def test_what_passes_is_aligned_and_measured(pair: BandPair) -> None:
 def test_a_look_under_a_mapping_that_is_all_but_equal_is_what_looking_again_shows(pair: BandPair) -> None:
     warped_pair = WarpedPair.of(pair, pair.mapping(geometry.translation(5.95, -3.95)))
     mapping = pair.mapping(np.array([[1.0001, 0, 6.0], [0, 0.9999, -4.0], [0, 0, 1.0]]))
-    near, again = warped_pair.under(mapping), WarpedPair.of(pair, mapping)
+    near, again = warped_pair.with_mapping(mapping), WarpedPair.of(pair, mapping)
     assert near.warped is warped_pair.warped
     np.testing.assert_allclose(near.residual.shifts_px, again.residual.shifts_px, atol=0.04)
     assert near.residual.median_px == pytest.approx(again.residual.median_px, abs=0.04)
@@ -83,7 +83,9 @@ def test_the_verdict_is_asked_again_under_a_local_field(pair: BandPair, monkeypa
     wild = np.zeros((11, 14, 2))
     wild[..., 0] = 3.0
     monkeypatch.setattr(
-        pair.reference.local, "refine", lambda *_, **__: DisplacementResult(DisplacementField(32.0, wild), 1.0, 0.5)
+        pair.reference.coarse_field,
+        "refine",
+        lambda *_, **__: DisplacementResult(DisplacementField(32.0, wild), 1.0, 0.5),
     )
     results = verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
     assert results.status == "aligned"
@@ -137,13 +139,13 @@ def test_what_changes_from_plant_to_plant_is_followed_by_a_finer_field() -> None
     assert results.field.step_px == FINE.lattice_px
     # Of windows that were left out of the fit, together with those around them.
     assert results.residual.median_px < 0.4
-    assert pair.reference.local.refine(pair.moving_image, pair.mapping(np.eye(3))).field is None
+    assert pair.reference.coarse_field.refine(pair.moving_image, pair.mapping(np.eye(3))).field is None
 
 
 @pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])
 def test_what_needs_no_field_gets_none_and_with_a_rig_none_is_tried(rig_known: bool, tried: bool) -> None:
     pair = bent_pair(0.0)
-    pair = replace(pair, known_to_px={"model": 1.0} if rig_known else {})
+    pair = replace(pair, candidate_std_px={"model": 1.0} if rig_known else {})
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     plain = verified(pair, seed, result(np.eye(3)), Settings())
     assert (plain.status, plain.local is not None, plain.field) == ("aligned", tried, None)
@@ -179,7 +181,7 @@ def test_a_field_is_verified_in_windows_that_were_left_out_of_its_fit(monkeypatc
     """A field may follow the shifts of its own windows, whatever they are."""
     pair = bent_pair(2.5)
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
-    good = pair.reference.local.refine(pair.moving_image, pair.mapping(np.eye(3)), verify=True)
+    good = pair.reference.coarse_field.refine(pair.moving_image, pair.mapping(np.eye(3)), verify=True)
     assert good.field is not None
     assert good.held_out is not None
     accepted = verified(pair, seed, result(np.eye(3)), SETTINGS)
@@ -189,7 +191,7 @@ def test_a_field_is_verified_in_windows_that_were_left_out_of_its_fit(monkeypatc
     off = replace(
         good, held_out=Residual.of(good.held_out.centres_px, good.held_out.shifts_px + 1.5, good.held_out.peaks_sigma)
     )
-    for estimator in (pair.reference.local, pair.reference.finer_local):
+    for estimator in (pair.reference.coarse_field, pair.reference.fine_field):
         monkeypatch.setattr(estimator, "refine", lambda *_, **__: off)
     refused = verified(pair, seed, result(np.eye(3)), SETTINGS)
     assert refused.status == "predicted"
