@@ -52,7 +52,7 @@ def test_a_look_under_a_mapping_that_is_all_but_equal_is_what_looking_again_show
     np.testing.assert_allclose(near.residual.shifts_px, again.residual.shifts_px, atol=0.04)
     assert near.residual.median_px == pytest.approx(again.residual.median_px, abs=0.04)
     far = pair.mapping(geometry.translation(9, -4))
-    assert warped_pair.under(far).warped is not warped_pair.warped
+    assert warped_pair.with_mapping(far).warped is not warped_pair.warped
 
 
 def test_a_doubted_result_leaves_the_seed_and_its_windows(pair: BandPair) -> None:
