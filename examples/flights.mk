@@ -1,4 +1,5 @@
 # Align many flights on one machine: each folder below FLIGHTS that is not finished. A second call resumes.
+# Make splits names at spaces: the names of the folders must not contain any.
 #
 #     make -f examples/flights.mk FLIGHTS=season OUT=aligned
 #

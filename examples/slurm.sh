@@ -10,6 +10,7 @@
 set -uo pipefail
 : "${FLIGHTS:?folder with a folder for each flight}" "${OUT:?folder for the results}"
 
+trap : TERM  # at the time limit, SLURM signals this script too: wait for agalign, and requeue
 flight=$(ls -d "$FLIGHTS"/*/ | sed -n "${SLURM_ARRAY_TASK_ID:?start it with sbatch --array}p")
 name=$(basename "$flight")
 agalign "$flight" -o "$OUT/$name" --jobs "${SLURM_CPUS_PER_TASK:-1}" --radiometry auto --index ndvi

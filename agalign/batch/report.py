@@ -26,7 +26,7 @@ class CaptureReport:
     """`kept`: an earlier run with the same settings has finished the capture. `panel` and `sky`: the capture shows a
     calibration panel or the sky, and is not aligned.
     """
-    result: CaptureResult | None = None
+    result: CaptureResult | None = field(default=None, repr=False)
     """Content of the sidecar, without the long tables."""
     path: Path | None = None
     """Path of the sidecar."""
@@ -39,7 +39,7 @@ class CaptureReport:
     """Products that could not be written, and why."""
     seconds: float = 0.0
     """Processing time in this run."""
-    stages: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    stages: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
     """Processing time by (band, stage), s."""
 
     @property

@@ -52,7 +52,7 @@ def evaluate(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
-    """Evaluate descriptors and homographies on pairs with ground truth, as Dong et al. (2018)."""
+    """Evaluate descriptors and homographies on pairs with ground truth (Dong et al., 2018)."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
         check_address_space()
@@ -91,7 +91,7 @@ def surface(
     verbose: Verbose = False,
     log_json: LogJson = False,
 ) -> None:
-    """Plot the training loss over misalignments of a pair (Dong et al. 2018, Fig. 2)."""
+    """Plot the training loss over misalignments of a pair (figure 2 of Dong et al., 2018)."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):
         check_address_space()

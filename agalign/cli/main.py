@@ -163,7 +163,7 @@ def verify(
             captures, damaged = captures + 1, damaged + bool(problems)
             for text in problems:
                 terminal.problem(text)
-        terminal.result(f"{captures - damaged} of {captures} captures are what was written")
+        terminal.result(f"{captures - damaged} of {captures} captures match their checksums")
         raise typer.Exit(EXIT_PARTIAL if damaged else EXIT_OK)
 
 

@@ -108,7 +108,8 @@ def _for_odm(sidecar: Sidecar) -> list[str]:
     calibration = "none" if radiometry is not None else "camera+sun"
     return [
         "OpenDroneMap, WebODM: the bands of each capture are aligned, and have the tags of one camera.",
-        f"  --skip-band-alignment --primary-band '{reference}' --radiometric-calibration {calibration}",
+        f"  --skip-band-alignment --primary-band '{reference}' --radiometric-calibration {calibration}"
+        " --texturing-skip-global-seam-leveling",
         f"{reference} is the reference band, which is not resampled.",
         "The files contain raw numbers: camera+sun needs the light sensor's tags; without them use camera."
         if radiometry is None else f"The files contain {radiometry}: OpenDroneMap must not calibrate them again.",

@@ -53,7 +53,7 @@ class FlightMap:
             "altitude_m": None if position is None else position.altitude_m,
             "height_m": None if pose is None or pose.height_m is None else round(pose.height_m, 1),
             "height_from": None if pose is None or pose.height_m is None else pose.height_from,
-            "heading_deg": None if pose is None else round(pose.heading_deg, 1),
+            "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
             "accuracy_m": accuracy_of_footprint_m(shown) if by_pose else _georeference_accuracy_m(capture),
         }  # fmt: skip
         properties |= _of_result(result) | _links(capture, result)

@@ -64,8 +64,8 @@ class PanelPart(_Part):
         # The smallest and the largest value, or the only one.
         reflectance = " to ".join(dict.fromkeys((albedos[0], albedos[-1]))) if albedos else "not known"
         name = f"calibration panel {self.serial}".strip()
-        use = "part of a scene that is aligned" if self.in_scene else "kept out of the alignment"
-        return f"{name} (reflectance {reflectance}; seen by its {self.seen_by}): {use}"
+        use = "part of a scene that is aligned" if self.in_scene else "not aligned"
+        return f"{name} (reflectance {reflectance}; recognised by its {self.seen_by}): {use}"
 
 
 class PanelsFile(_Part):

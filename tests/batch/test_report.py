@@ -33,6 +33,7 @@ def test_progress_is_reported_and_shown(tmp_path: Path, caplog: pytest.LogCaptur
     assert isinstance(reports, FlightReports)
     assert "2 captures: 2 done" in reports._repr_html_()
     assert "<td>red</td><td>seed_only</td>" in reports[0]._repr_html_()
+    assert len(repr(reports[0]).replace(str(tmp_path), "")) < 250, "a console prints the report in a few lines"
 
 
 def test_a_table_of_many_captures_is_short() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from agalign.cameras.discover import DiscoverOptions, discover
@@ -155,3 +156,12 @@ def test_expert_options_are_a_panel_at_the_end() -> None:
     assert panels[-1] == "Expert"
     expert = "\n".join(lines[max(i for i, line in enumerate(lines) if "Expert" in line) :])
     assert all(o in expert for o in ("--sharing", "--recipe", "--rng-seed", "--model-family", "--each-alone"))
+
+
+def test_the_list_of_commands_has_whole_sentences() -> None:
+    """Their ends are found by full stops: that of an abbreviation would cut a sentence."""
+    listed = " ".join(CliRunner().invoke(app, ["--help"]).output.split())
+    for command in typer.main.get_command(app).commands.values():  # type: ignore[attr-defined]
+        if not command.hidden:
+            first_sentence = " ".join(command.help.split("\n\n")[0].split())
+            assert first_sentence in listed

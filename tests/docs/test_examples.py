@@ -2,8 +2,10 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +89,28 @@ def test_many_flights_go_on_after_exit_code_3(tmp_path: Path, code: int, ends: i
     job = yaml.safe_load((ROOT / "examples" / "kubernetes-job.yaml").read_text(encoding="utf-8"))
     (container,) = job["spec"]["template"]["spec"]["containers"]
     assert exit_code(*container["command"], *container["args"]) == ends
+
+
+@pytest.mark.skipif(os.name == "nt", reason="shell scripts")
+def test_slurm_requeues_a_flight_that_reaches_the_time_limit(tmp_path: Path) -> None:
+    """SLURM sends SIGTERM to every process of the script, and to its shell."""
+    (tmp_path / "flights" / "one").mkdir(parents=True)
+    waits = f"#!/bin/sh\ntrap 'exit 143' TERM\ntouch {tmp_path}/started\nwhile :; do sleep 0.05; done\n"
+    for name, script in (("agalign", waits), ("scontrol", f'#!/bin/sh\necho "$@" > {tmp_path}/requeued\n')):
+        (tmp_path / name).write_text(script)
+        (tmp_path / name).chmod(0o755)
+    environment = os.environ | {
+        "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}", "FLIGHTS": str(tmp_path / "flights"),
+        "OUT": str(tmp_path), "SLURM_ARRAY_TASK_ID": "1", "SLURM_JOB_ID": "7",
+    }  # fmt: skip
+    job = subprocess.Popen(["bash", str(ROOT / "examples" / "slurm.sh")], env=environment, start_new_session=True)
+    for _ in range(200):
+        if (tmp_path / "started").exists():
+            break
+        time.sleep(0.05)
+    os.killpg(job.pid, signal.SIGTERM)
+    assert job.wait(20) == 0
+    assert (tmp_path / "requeued").read_text() == "requeue 7\n"
 
 
 def test_two_arrays() -> None:

@@ -39,7 +39,7 @@ def capture(pose: Pose | None, altitude_m: float | None = 130.0) -> Capture:
 
 
 def test_the_footprint_of_a_camera_that_looks_down_has_the_size_of_its_field_of_view(tmp_path: Path) -> None:
-    known = capture(Pose(0.0, height_m=50.0, focal_length_px=1000.0))
+    known = capture(Pose(-360.0, height_m=50.0, focal_length_px=1000.0))
     on_map = FlightMap(tmp_path)
     on_map.add(known, "failed")
     path = on_map.write()
@@ -53,6 +53,7 @@ def test_the_footprint_of_a_camera_that_looks_down_has_the_size_of_its_field_of_
     facts = feature["properties"]
     assert (facts["status"], facts["height_m"], facts["height_from"]) == ("failed", 50.0, "tags")
     assert facts["stack"] is None
+    assert facts["heading_deg"] == 0.0
 
 
 def test_an_unknown_height_is_assumed_and_marked(tmp_path: Path) -> None:

@@ -62,7 +62,9 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: tuple[Path, list[Capt
     out, reports = by_panel
     folder = out / "0000SET" / "000"
     assert reports[0].panel is not None
-    assert reports[0].panel.startswith("calibration panel RP04-0000001-SY (reflectance 0.51; seen by its QR code)")
+    assert reports[0].panel.startswith(
+        "calibration panel RP04-0000001-SY (reflectance 0.51; recognised by its QR code)"
+    )
     assert reports[0].good
     assert not (folder / "IMG_0001.tif").exists()
     with Image.open(folder / "IMG_0001.panel.png") as picture:
