@@ -137,7 +137,7 @@ class AlignFlight(AgalignAlgorithm):
 
     def processAlgorithm(self, parameters, context, feedback):  # noqa: N802
         """Run the command and load what it has written."""
-        out = Path(self.parameterAsString(parameters, "OUTPUT", context))
+        out = Path(self.parameterAsString(parameters, "OUTPUT", context)).absolute()
         arguments = ["align", self.parameterAsString(parameters, "INPUT", context), "-o", out, "--log-json"]
         arguments += ["--radiometry", _RADIOMETRY[self.parameterAsEnum(parameters, "RADIOMETRY", context)]]
         indices = self.parameterAsString(parameters, "INDICES", context).strip()
@@ -199,7 +199,7 @@ class SpectralIndices(AgalignAlgorithm):
 
     def processAlgorithm(self, parameters, context, feedback):  # noqa: N802
         """Run the command and load the rasters."""
-        folder = Path(self.parameterAsString(parameters, "INPUT", context))
+        folder = Path(self.parameterAsString(parameters, "INPUT", context)).absolute()
         indices = self.parameterAsString(parameters, "INDICES", context).strip()
         formula = self.parameterAsString(parameters, "FORMULA", context).strip()
         arguments = ["indices", folder, "--log-json", "--json"]
@@ -238,7 +238,7 @@ class AlignOnto(AgalignAlgorithm):
         moving = self.parameterAsLayerList(parameters, "MOVING", context)
         if reference is None or not moving:
             raise QgsProcessingException("Choose a reference and at least one raster to align.")
-        out = Path(self.parameterAsString(parameters, "OUTPUT", context))
+        out = Path(self.parameterAsString(parameters, "OUTPUT", context)).absolute()
         arguments = ["onto", file_of(reference), *(file_of(layer) for layer in moving), "-o", out, "--log-json"]
         arguments += shlex.split(self.parameterAsString(parameters, "OPTIONS", context))
         self.run_command(arguments, feedback)

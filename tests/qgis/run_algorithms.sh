@@ -7,7 +7,7 @@
 set -euo pipefail
 root=$(cd "$(dirname "$0")/../.." && pwd)
 agalign=$1
-folder=${2:-$(mktemp -d)}
+folder=$(realpath "${2:-$(mktemp -d)}")
 [ $# -ge 2 ] || trap 'rm -rf "$folder"' EXIT
 
 # Debian's wrapper passes an option that the program does not know.
@@ -37,8 +37,10 @@ for algorithm in alignflight indices onto inspect; do
     grep -q "agalign:$algorithm" "$folder/list.log" || { echo "agalign:$algorithm is not listed" >&2; exit 1; }
 done
 
-[ -d "$folder/demo/flight" ] || agalign demo "$folder/demo" > /dev/null
-flight=$folder/demo/flight out=$folder/aligned
+# Paths are relative to the folder of qgis_process, as in docs/recipes/qgis.md.
+cd "$folder"
+[ -d demo/flight ] || agalign demo demo > /dev/null
+flight=demo/flight out=aligned
 run inspect '^CAPTURES:	3$' INPUT="$flight"
 run alignflight '^CAPTURES:	3$' INPUT="$flight" OUTPUT="$out" RADIOMETRY=1 GEOREFERENCE=true GROUND=0 QA=true
 test -s "$out/flight.geojson" && test -s "$out/index.html"
