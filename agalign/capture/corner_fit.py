@@ -10,7 +10,7 @@ from agalign.values.alignment import JointResult, Residual
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedPx
-from agalign.values.robust import MAD_TO_STD, cauchy_weights
+from agalign.values.robust import MIN_SHIFT_SCALE_PX, cauchy_weights, shift_scale_px
 
 Array = NDArray[np.float64]
 
@@ -18,8 +18,7 @@ _MIN_WINDOWS = 16
 """Minimum number of measured windows: twice the eight parameters."""
 _CAUCHY_SCALES = 2.0
 """Residual at which the robust weight is one half, in residual scales."""
-_MIN_SCALE_PX = 0.05
-"""Minimum residual scale: the noise of the shifts."""
+
 _REWEIGHTINGS = 6
 """Iterations after which the robust weights have converged."""
 _COMMON_STD_PX = 0.01
@@ -85,11 +84,10 @@ def fit_corners(points_px: Array, shifts_px: Array, peaks_sigma: Array, size_px:
         mean = np.linalg.lstsq(normal, np.einsum("n,nki,nk->i", weight, design, shifts_px), rcond=None)[0]
         residuals_px = shifts_px - design @ mean
         lengths_px = np.linalg.norm(residuals_px, axis=1)
-        scale_px = max(MAD_TO_STD * float(np.median(lengths_px)), _MIN_SCALE_PX)
-        robust = cauchy_weights(lengths_px, _CAUCHY_SCALES * scale_px)
+        robust = cauchy_weights(lengths_px, _CAUCHY_SCALES * shift_scale_px(lengths_px))
     score = np.einsum("n,nki,nk->ni", weight, design, residuals_px)
     # Collinear windows do not determine all corners, although their residuals are small.
     inverse = np.linalg.inv(normal + _MIN_INFORMATION_SHARE * np.trace(normal) * np.eye(8))
     sandwich = inverse @ (score.T @ score) @ inverse
-    covariance = np.asarray(sandwich + (_MIN_SCALE_PX**2 / np.median(weight)) * inverse)
+    covariance = np.asarray(sandwich + (MIN_SHIFT_SCALE_PX**2 / np.median(weight)) * inverse)
     return CornerFit(mean, covariance + _COMMON_STD_PX**2 * np.eye(8))

@@ -52,6 +52,7 @@ class InformationForm:
 
     @classmethod
     def of(cls, mean: Array, covariance: Array) -> "InformationForm":
+        """Convert mean (8,) and covariance (8, 8)."""
         information = np.asarray(np.linalg.inv(covariance))
         return cls(information, information @ mean)
 

@@ -33,6 +33,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.values.relief import Parallax, Relief
+from agalign.verify.residuals import decrease_sigma
 
 _MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
@@ -155,14 +156,10 @@ def _far_share(residual: Residual[FixedImagePx]) -> float:
 
 
 def _gain_sigma(before_px: NDArray[np.float64], after_px: NDArray[np.float64]) -> float:
-    """Return the mean decrease of squared shifts (n, 2) in standard errors; lengths are clipped at twice p95."""
+    """Return `decrease_sigma` of the measured shifts (n, 2); 0 for too few windows."""
     before, after = (np.linalg.norm(s, axis=1) for s in (before_px, after_px))
     measured = np.isfinite(before) & np.isfinite(after)
-    if measured.sum() < _MIN_WINDOWS:
-        return 0.0
-    limit = 2 * np.percentile(before[measured], 95)
-    decrease = np.minimum(before[measured], limit) ** 2 - np.minimum(after[measured], limit) ** 2
-    return float(decrease.mean() / max(decrease.std() / np.sqrt(len(decrease)), 1e-12))
+    return decrease_sigma(before[measured], after[measured]) if measured.sum() >= _MIN_WINDOWS else 0.0
 
 
 def _model(group: Sequence[ReliefCandidate], windows: WindowShifts) -> PlaneParallax | None:

@@ -1,5 +1,6 @@
 """Initial mappings from the metadata of the files."""
 
+from collections.abc import Callable
 from contextlib import suppress
 
 from agalign.cameras import other_rig_seed, rig_seed
@@ -12,6 +13,7 @@ from agalign.values.choices import SeedKind
 from agalign.values.geometry import Matrix
 
 _FROM_TAGS: tuple[SeedKind, ...] = ("rig", "geo", "identity")
+"""Kinds that the user can force and tags provide."""
 
 
 def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> dict[SeedKind, Matrix]:
@@ -19,19 +21,15 @@ def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> di
 
     If the settings force a kind that tags provide, only this kind is returned, or nothing if the tags lack it.
     """
+    sources: tuple[tuple[SeedKind, Callable[[Band, Band], Matrix | None]], ...] = (
+        ("rig", rig_seed), ("centre", other_rig_seed), ("geo", geo_seed),
+    )  # fmt: skip
     candidates: dict[SeedKind, Matrix] = {}
-    with suppress(GeometryError):  # invalid values in the tags
-        rig = rig_seed(reference, moving)
-        if rig is not None:
-            candidates["rig"] = rig
-    with suppress(GeometryError):
-        by_centres = other_rig_seed(reference, moving)
-        if by_centres is not None:
-            candidates["centre"] = by_centres
-    with suppress(GeometryError):
-        geo = geo_seed(reference, moving)
-        if geo is not None:
-            candidates["geo"] = geo
+    for kind, source in sources:
+        with suppress(GeometryError):  # invalid values in the tags
+            matrix = source(reference, moving)
+            if matrix is not None:
+                candidates[kind] = matrix
     candidates["identity"] = geometry.overlay(reference.size_px, moving.size_px)
     if settings.force in _FROM_TAGS:
         return {kind: matrix for kind, matrix in candidates.items() if kind == settings.force}

@@ -22,6 +22,7 @@ FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
 MIN_STD_PX = 0.05
 """Added in quadrature to the standard error of a mapping, which does not contain all errors."""
 _COLUMNS: dict[Factor, tuple[int, ...]] = {"distance": (0,), "tilt": (1, 2), "motion": (3, 4), "reference": (3, 4)}
+"""Columns of the factors (5,). `reference` is a motion of all moving bands relative to the reference."""
 _LATTICE = 7, 5
 """Columns and rows of the points at which mappings are compared."""
 _OUTLIER_PX = 0.3

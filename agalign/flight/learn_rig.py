@@ -122,6 +122,7 @@ class _Table:
     def of(
         cls, captures: Sequence[Observation], bands: tuple[str, ...], size_px: tuple[int, int], prior: Array | None
     ) -> "_Table":
+        """Compute the coefficients of the mappings of `bands` in all captures."""
         median = [median_mapping([c.mappings[b] for c in captures if b in c.mappings], size_px) for b in bands]
         differences, weights = np.zeros((len(captures), len(bands), 2, 3)), np.zeros((len(captures), len(bands)))
         for i, capture in enumerate(captures):

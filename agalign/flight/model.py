@@ -28,7 +28,9 @@ from agalign.values.geometry import Matrix, normalised
 
 _FORMAT = "agalign-model/1"
 _MAX_FILE_BYTES = 1 << 28
+"""Far above the size of a model, so that other files are not read into memory."""
 _MAX_SIDES = 512
+"""Maximum number of sides, and of channels of a side, of a network: more than any imager has bands."""
 _MAX_VALUE = 1e6
 """Weights are below 100 and mappings are in px: larger numbers indicate a damaged file."""
 

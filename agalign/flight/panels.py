@@ -19,11 +19,13 @@ Albedos = Mapping[str, float]
 _MAX_CAPTURES_WITHOUT_PANEL = 3
 """The search from either end of a flight stops after this many: panels are recorded before and after a flight."""
 _READERS = 4
+"""Threads that read captures."""
 _DETECTION_PX = 1600
 """Longer side of the images in which panels are searched."""
 _MAX_TIME_DIFFERENCE_S = 6 * 3600.0
 """A panel does not represent the illumination many hours later."""
 _MAX_SATURATED = 0.01
+"""Maximum share of saturated pixels, which bias the mean radiance."""
 _PANEL_HEIGHT_M = 1.0
 """Height of the camera above a panel when it is recorded."""
 _MIN_HEIGHT_M = 3.0

@@ -16,7 +16,9 @@ from agalign.values.capture import Band, Capture
 _MIN_ELEVATION_DEG = 20.0
 """Minimum elevation of the optical axis: half the field of view is about 20 degrees."""
 _MIN_UNSATURATED = 0.5
+"""Minimum share of unsaturated pixels for the median radiance."""
 _MIN_CUES = 2
+"""A single cue also occurs in other captures."""
 _NAMED = re.compile(r"(?:^|[-_. ])sky(?:$|[-_. ])", re.IGNORECASE)
 
 

@@ -13,7 +13,9 @@ from agalign.errors import ConfigurationError
 from agalign.values.choices import Sharing
 
 PATCH_PX = 16
+"""Side of a patch in samples."""
 DIMENSION = 256
+"""Of a descriptor."""
 REFERENCE = 0
 """Side of the network that describes the reference image; moving bands use sides from 1."""
 

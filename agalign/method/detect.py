@@ -14,6 +14,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
 MAX_KEYPOINTS = 2000
+"""Default number of keypoints per image; matching takes time proportional to its square."""
 _SPACING_PER_SIZE = 6 / PATCH_PX
 """Patches are as wide as the area that SIFT describes, 6 times the size of the keypoint."""
 

@@ -36,6 +36,7 @@ from agalign.values.alignment import MIN_RETRIEVAL
 BATCH = 128
 """Keypoints in a step on theta; each is a negative for the others."""
 LEARNING_RATE = 2e-3
+"""Of Adam."""
 _TEMPERATURE = 0.07
 """Temperature of the in-batch loss (He et al. 2020, Sec. 3.3)."""
 _LEARN_PX = 640
@@ -48,6 +49,7 @@ _SEARCH_RADIUS_SHARE = 0.22
 _SEARCH_STEP_PX = 3.0
 """Spacing of the translations that are searched, px of that level: a Gauss-Newton step can bridge it."""
 _SEARCH_PATCHES = 64
+"""Patches with which the translations are compared."""
 _OCTAVES = 1.0
 """Patch scales are drawn from [1, 2**_OCTAVES] px between samples."""
 _WARM_UP_STEPS = 50
@@ -55,6 +57,7 @@ _WARM_UP_STEPS = 50
 _FIRST_UPDATES = 5
 """Steps on psi before learnt weights are trained further; twice as many if psi converges without training."""
 _STEPS_BETWEEN_UPDATES = 10
+"""Steps on theta per capture between two steps on psi."""
 _MAX_STEPS_WITHOUT_RETRIEVAL = 30
 """A level is abandoned after this many steps if no held-out patches can be retrieved."""
 _PATCHES = 300
@@ -153,6 +156,7 @@ class _GroupAtLevel:
 
     @property
     def bands(self) -> list[MovingBand]:
+        """The moving images with their sides of the network."""
         return [MovingBand(self.net, self.level, i, self.group.sides[b]) for i, b in enumerate(self.indices)]
 
     @property

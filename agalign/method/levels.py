@@ -25,6 +25,7 @@ from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 _HELD_OUT_CELLS = 8
 """Cells along the longer side; every fifth cell, in a diagonal pattern, is held out from training."""
 _FIELD_COLUMNS = 65
+"""Columns of the grid on which displacement fields are sampled."""
 _MIN_GRADIENT_PER_PX = 0.05
 """Keypoints are drawn where the gradient of the standardised image is larger than this (paper, Sec. 5.3)."""
 _MIN_CELL_PX = 4 * FOOTPRINT_PX

@@ -2,7 +2,6 @@
 (after the paper's supplement).
 """
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from agalign.method.detect import MAX_KEYPOINTS, sift_keypoints
 from agalign.method.levels import LevelImage, make_level_image
 from agalign.method.patches import Keypoints, footprint_radius, patch_positions
 from agalign.method.starter import start_from, start_from_starter
+from agalign.pixels.landmarks import robust_homography
 from agalign.pixels.resample import shrink
 from agalign.values import geometry, lens
 from agalign.values.choices import Sharing
@@ -22,6 +22,7 @@ from agalign.values.image import Raster
 _LONGEST_SIDE_PX = 1024
 """Larger images are reduced to this; the accuracy suffices for a seed."""
 _INLIER_PX = 4.0
+"""Maximum residual of an inlier, px of the reduced image."""
 _MIN_MATCHES = 12
 """Minimum number of inliers of a homography: unrelated images have up to 7."""
 
@@ -61,11 +62,11 @@ def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MA
     xy, xy_prime = (
         k.xy[i].cpu().numpy().astype(np.float64) for k, i in ((keypoints, rows), (keypoints_prime, columns))
     )
-    matrix, inliers = cv2.findHomography(xy, xy_prime, cv2.USAC_MAGSAC, _INLIER_PX, maxIters=20_000, confidence=0.9999)
-    if matrix is None or int(inliers.sum()) < _MIN_MATCHES:
+    matrix = robust_homography(xy, xy_prime, _INLIER_PX, _MIN_MATCHES)
+    if matrix is None:
         return None
     try:
-        return geometry.rescale(geometry.normalised(matrix), image.scale.inverse, image_prime.scale.inverse)
+        return geometry.rescale(matrix, image.scale.inverse, image_prime.scale.inverse)
     except GeometryError:
         return None
 

@@ -34,6 +34,7 @@ from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedImagePx
 
 _MOVING = 1
+"""Side of the network that describes the moving image."""
 _COARSEST_PX = 80
 """Longer side of the coarsest level."""
 _OCTAVES = 4.0
@@ -41,9 +42,11 @@ _OCTAVES = 4.0
 _SPACING_PX = 0.25
 """Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. Not given in the paper."""
 _MARGIN = 1.0
+"""Of the hinge loss L1."""
 _MIN_NEGATIVE_PX = 16.0
 """tau: minimum distance of a negative from the true position. Not given in the paper."""
 _BATCH = 64
+"""Keypoints per step of SGD."""
 _MOMENTUM = 0.9
 _LEARNING_RATE = 1e-4
 """Annealed by a cosine to 0 within each level."""
@@ -163,6 +166,7 @@ class _Samples:
     """(N,) False where `x_false` is too close to the true position to serve as a negative."""
 
     def of(self, rows: Tensor) -> "_Samples":
+        """Select a batch."""
         return _Samples(self.x[rows], self.x_false[rows], self.is_negative[rows])
 
 

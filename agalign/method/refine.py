@@ -26,6 +26,7 @@ from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NOT_INVERTIBLE
 from agalign.values.pixel_units import FixedImagePx
 
 MIN_KEYPOINTS = 16
+"""Minimum number of patches in both images for a step on psi or a test of retrieval."""
 TEST_KEYPOINTS = 256
 """Keypoints that measure held-out retrieval: chance is 0.004, the standard error of the share 0.03."""
 REST_PX = 0.5
@@ -36,6 +37,7 @@ rig contributes to the estimate. Half as many are used while the steps are longe
 _FINAL_OCTAVES = 0.3
 """Range of log2 of their scales: small patches localise better."""
 _MAX_FINAL_STEPS = 10
+"""Maximum number of steps at full resolution."""
 _FINAL_REST_PX = 0.06
 """psi has converged if a step displaces no corner by more than this, px: steps shrink by more than half, so the
 remaining displacement is smaller than the systematic error."""
@@ -47,6 +49,7 @@ _DIFFERENCE_PX = 0.75
 _PRESELECTION_PATCHES, _CANDIDATE_SHIFTS = 24, 64
 """Patches with which all shifts of a search are compared, and number of best shifts compared with all patches."""
 _SHIFTS_PER_BATCH = 16
+"""Limits the memory of a search."""
 _MAX_RATIO = 0.6
 """Maximum ratio of successive steps for the extrapolation of a geometric series: above it, errors of the ratio dominate
 the sum."""

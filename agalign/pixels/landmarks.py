@@ -26,13 +26,17 @@ image."""
 _LONGEST_SIDE_PX = 640
 """Larger images are reduced to this; the accuracy suffices for a seed."""
 _MAX_KEYPOINTS = 3000
+"""The strongest keypoints; limits the time of matching."""
 _MAX_RATIO = 0.9
 """Maximum ratio of the distances of the nearest and second nearest descriptor (Lowe's ratio test)."""
 _INLIER_PX = 3.0
+"""Maximum residual of an inlier, px of the reduced image."""
 _MIN_INLIERS = 10
 """Unrelated images have up to 8."""
 _SMOOTHING_PX = 1.0
+"""Standard deviation of the Gaussian before the gradient."""
 _INVALID_MARGIN_PX = 7
+"""Width of the kernel that removes the edges of invalid areas."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +88,18 @@ def matched_homography(fixed: Landmarks, moving: Landmarks, size_px: tuple[int, 
     if len(rows) < _MIN_INLIERS:
         return None
     inlier_px = _INLIER_PX * max(1.0, max(size_px) / _LONGEST_SIDE_PX)
+    return robust_homography(fixed.xy[rows], moving.xy[forward[rows]], inlier_px, _MIN_INLIERS)
+
+
+def robust_homography(fixed_xy: Points, moving_xy: Points, inlier_px: float, min_inliers: int) -> Matrix | None:
+    """Estimate fixed_to_moving from matches (n, 2) with outliers by MAGSAC++ (Barath et al. 2020).
+
+    None with fewer than `min_inliers` inliers, with residuals of at most `inlier_px`.
+    """
     matrix, inliers = cv2.findHomography(
-        fixed.xy[rows], moving.xy[forward[rows]], cv2.USAC_MAGSAC, inlier_px, maxIters=20_000, confidence=0.9999
+        fixed_xy, moving_xy, cv2.USAC_MAGSAC, inlier_px, maxIters=20_000, confidence=0.9999
     )
-    if matrix is None or int(inliers.sum()) < _MIN_INLIERS:
+    if matrix is None or int(inliers.sum()) < min_inliers:
         return None
     try:
         return geometry.normalised(matrix)

@@ -13,6 +13,7 @@ from agalign.values.pixel_units import PixelScale
 _LONGEST_SIDE_PX = 1600
 """Larger images are reduced to this."""
 _STRETCH_PERCENTILES = 1.0, 99.5
+"""Percentiles of the image that become 0 and 255."""
 _SMOOTHING_PX = 2.0
 """Suppresses the noise of dark panels."""
 _LEVELS = 12

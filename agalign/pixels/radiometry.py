@@ -22,6 +22,7 @@ _MAX_FALLOFF = 1000.0
 """Maximum correction of the vignetting and the row gradient."""
 _MAX_LOG_FALLOFF = np.log(_MAX_FALLOFF)
 _MAX_RAW = 65535.0
+"""Of 16-bit sensors."""
 _MAX_VALUE = 1e12
 """Above any radiance or reflectance."""
 

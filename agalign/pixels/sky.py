@@ -12,6 +12,7 @@ LOOK_PX = 64
 _DEGREE = 4
 """Degree of the polynomial that models vignetting and the gradient of the sky."""
 _MIN_VALID = 0.5
+"""Minimum share of valid pixels for a texture."""
 
 
 def relative_texture(image: Raster, black_level: float = 0.0) -> float | None:

@@ -30,6 +30,7 @@ cameras without stripes have up to 0.14, white stripes of 5 % of the range 0.34,
 _SMOOTHING_PX = 1.0
 """Equal to that of the structure field: higher frequencies, such as even and odd lines that differ, do not matter."""
 _KERNEL_PX = 7
+"""Width of the smoothing kernel: three standard deviations on either side."""
 _BLOCKS = 32
 """Lines are averaged to this number before their median; 128 give the same result in twice the time."""
 _DRIFT_PX = 15.0

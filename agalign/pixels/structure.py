@@ -139,6 +139,7 @@ def peak_positions(cross: Field, near_px: NDArray[np.float64]) -> NDArray[np.flo
 
 
 _REFINEMENT_STEPS_PX = (0.5, 0.25)
+"""Spacings of the points at which a surface is evaluated."""
 
 
 def _fourier_basis(positions_px: NDArray[np.float64], length: int) -> Field:

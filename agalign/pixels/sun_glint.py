@@ -24,6 +24,7 @@ _MIN_SHARE = 0.5
 _MIN_PIXEL_NDWI = -0.2
 """Glint is as bright in green as in near infrared; vegetation and soil at a shore are not."""
 _MIN_SIDE_BLOCKS = 2
+"""Smaller images have no neighbourhood to compare with."""
 _UNKNOWN = 1e30
 """Larger than any reflectance."""
 

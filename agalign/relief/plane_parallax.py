@@ -24,14 +24,13 @@ from agalign.values.alignment import Residual
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
-from agalign.values.robust import MAD_TO_STD, cauchy_weights
+from agalign.values.robust import MIN_SHIFT_SCALE_PX, cauchy_weights, shift_scale_px
 
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
 """Enough for the baselines to converge to a relative change of 0.001."""
-_MIN_SCALE_PX = 0.05
-"""Minimum residual scale: the noise of the shifts."""
+
 _CAUCHY_SCALES = 2.0
 """Residual at which the robust weight is one half, in residual scales."""
 _PLANE_PX = 0.5
@@ -134,7 +133,7 @@ def fit_plane_parallax(
         baselines, parallax = baselines / longest, parallax * longest
         predicted = np.einsum("nki,bi->nbk", design, corners) + parallax[:, None, None] * baselines
         residuals = np.where(windows.weights > 0, np.linalg.norm(shifts - predicted, axis=2), np.nan)
-        scales = _scales_px(residuals)
+        scales = np.array([shift_scale_px(r[np.isfinite(r)]) for r in residuals.T])
         weights = windows.weights * np.nan_to_num(cauchy_weights(residuals, _CAUCHY_SCALES * scales))
         # Inverse variance of bands worse than the median, so that an inconsistent band does not determine the parallax.
         weights *= np.minimum(1, (np.median(scales) / scales) ** 2)
@@ -158,7 +157,7 @@ def _initial_baselines(windows: WindowShifts) -> Array | None:
         return None
     shifts = windows.shifts_px[complete].reshape(int(complete.sum()), -1)
     shifts = shifts - np.median(shifts, axis=0)
-    limit = _CLIP_MEDIANS * np.median(np.abs(shifts)) + _MIN_SCALE_PX
+    limit = _CLIP_MEDIANS * np.median(np.abs(shifts)) + MIN_SHIFT_SCALE_PX
     _, _, right = np.linalg.svd(np.clip(shifts, -limit, limit), full_matrices=False)
     return np.asarray(right[0].reshape(-1, 2))
 
@@ -194,9 +193,3 @@ def _bands(shifts: Array, parallax: Array, design: Array, weights: Array) -> tup
     right = np.einsum("nb,nki,nbk->bi", weights, full, shifts, optimize=True)
     solution = np.linalg.solve(normal, right[..., None])[..., 0]
     return solution[:, :8], solution[:, 8:]
-
-
-def _scales_px(residuals: Array) -> Array:
-    """Return (bands,) robust standard deviations of the residuals (n, bands)."""
-    medians = np.array([np.median(r[np.isfinite(r)]) if np.isfinite(r).any() else 0.0 for r in residuals.T])
-    return np.maximum(MAD_TO_STD * medians, _MIN_SCALE_PX)

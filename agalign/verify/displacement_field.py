@@ -21,8 +21,8 @@ from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
-from agalign.values.robust import MAD_TO_STD, cauchy_weights
-from agalign.verify.residuals import FixedWindows
+from agalign.values.robust import cauchy_weights, shift_scale_px
+from agalign.verify.residuals import FixedWindows, decrease_sigma
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class FieldScale:
 LENS = FieldScale(window_px=48, lattice_px=96)
 """For residual lens distortion in addition to a relief, which varies over hundreds of pixels."""
 COARSE = FieldScale(window_px=64, lattice_px=48)
+"""For most scenes: larger windows have less noise."""
 FINE = FieldScale(window_px=32, lattice_px=24, verification_px=32)
 """For plants and walls with parallax that varies too quickly for the coarse field."""
 
@@ -52,8 +53,7 @@ _SMOOTHNESS = (0.3, 1.0, 4.0, 16.0, 64.0)
 """Weights of the field's second differences relative to one window; selected by cross-validation."""
 _DAMPING = 0.003
 """Weight of the field's length, relative to one window; it matters only far from all windows."""
-_MIN_SCALE_PX = 0.05
-"""Minimum residual scale: the noise of the shifts."""
+
 _CAUCHY_SCALES = 4.0
 """Residual at which the robust weight is one half, in residual scales; only wrong peaks have larger ones."""
 _REWEIGHTINGS = 4
@@ -214,6 +214,7 @@ class Shifts:
 
     @classmethod
     def of(cls, residual: Residual[FixedImagePx]) -> "Shifts":
+        """Select the measured shifts of a residual."""
         measured = np.isfinite(residual.shifts_px[:, 0])
         sigma = residual.peaks_sigma[measured]
         weights = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
@@ -262,13 +263,9 @@ def _gain_of(shifts: Shifts, remaining_px: NDArray[np.float64], smoothness: floa
     if not is_compared.any():
         return _Gain(smoothness)
     before, after = np.linalg.norm(shifts.shifts_px[is_compared], axis=1), remaining_px[is_compared]
-    # Clipping at twice p95 limits the influence of wrong peaks.
-    maximum = 2 * np.percentile(before, 95)
-    decrease = np.minimum(before, maximum) ** 2 - np.minimum(after, maximum) ** 2
-    sigma = decrease.mean() / max(decrease.std() / math.sqrt(len(decrease)), 1e-12)
     loss = float(np.average(np.log1p((after / _LOSS_SCALE_PX) ** 2), weights=shifts.weights[is_compared]))
     before_p95, after_p95 = (FixedImagePx(np.percentile(lengths, 95)) for lengths in (before, after))
-    return _Gain(smoothness, before_p95, after_p95, loss, float(sigma))
+    return _Gain(smoothness, before_p95, after_p95, loss, decrease_sigma(before, after))
 
 
 def _folds(centres_px: Points) -> NDArray[np.int64]:
@@ -346,8 +343,7 @@ def fitted_field(shifts: Shifts, smoothness: float, lattice_px: int, size_px: tu
         field = solveh_banded(normal, np.stack(right_side, axis=-1), overwrite_ab=True, lower=True, check_finite=False)
         fitted = (bilinear[..., None] * field[nodes]).sum(axis=0)
         residuals_px = np.linalg.norm(shifts.shifts_px - fitted, axis=1)
-        scale_px = max(MAD_TO_STD * float(np.median(residuals_px)), _MIN_SCALE_PX)
-        weights = shifts.weights * cauchy_weights(residuals_px, _CAUCHY_SCALES * scale_px)
+        weights = shifts.weights * cauchy_weights(residuals_px, _CAUCHY_SCALES * shift_scale_px(residuals_px))
     lattice = field.reshape(rows, columns, 2)
     return DisplacementField(float(lattice_px), lattice if order[0] == 0 else lattice.transpose(1, 0, 2).copy())
 

@@ -29,6 +29,7 @@ _MIN_SHARE_IN_FRAME = 0.5
 _LATTICE = 24, 18
 """Columns and rows of the points with which that share is measured."""
 _QUARTERS = (("top left", -1, -1), ("top right", 1, -1), ("bottom right", 1, 1), ("bottom left", -1, 1))
+"""Names, and signs of x and y relative to the centre."""
 
 
 def points_in_frame(mapping: PixelMapping, size_px: tuple[int, int], moving_size_px: tuple[int, int]) -> Points:

@@ -15,7 +15,7 @@ from agalign.values.alignment import DisplacementField, Residual
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedPx
-from agalign.values.robust import MAD_TO_STD, cauchy_weights
+from agalign.values.robust import MIN_SHIFT_SCALE_PX, cauchy_weights, shift_scale_px
 
 Array = NDArray[np.float64]
 
@@ -27,8 +27,7 @@ CALIBRATED = 0.4
 """Factor on LENS_STD if both lenses are calibrated; measured on reference tie points of 45 RedEdge pairs."""
 _CORNER_STD_PX = 5.0
 """Standard deviation of the prior of a corner: the error of an extrapolated affine mapping."""
-_MIN_SCALE_PX = 0.05
-"""Minimum residual scale: the noise of the shifts."""
+
 _CORRELATED_WINDOWS = 4.0
 """Effective number of neighbouring windows with the same relief, by which the weights are divided."""
 _CAUCHY_SCALES = 2.0
@@ -107,14 +106,14 @@ def fit_with_lens(
     design = over_corners_and_lens(points_px, size_px)
     prior = np.diag(np.r_[np.full(8, _CORNER_STD_PX), lens_std_px(size_px, calibrated=calibrated)] ** -2.0)
     by_peak = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
-    robust, scale_px = np.ones(len(sigma)), _MIN_SCALE_PX
+    robust, scale_px = np.ones(len(sigma)), MIN_SHIFT_SCALE_PX
     mean, covariance = np.zeros(12), np.linalg.inv(prior)
     for _ in range(_REWEIGHTINGS if len(sigma) else 0):
         weight = by_peak * robust / (_CORRELATED_WINDOWS * scale_px**2)
         covariance = np.linalg.inv(np.einsum("n,nki,nkj->ij", weight, design, design) + prior)
         mean = covariance @ np.einsum("n,nki,nk->i", weight, design, shifts_px)
         residuals_px = np.linalg.norm(shifts_px - design @ mean, axis=1)
-        scale_px = max(MAD_TO_STD * float(np.median(residuals_px)), _MIN_SCALE_PX)
+        scale_px = shift_scale_px(residuals_px)
         robust = cauchy_weights(residuals_px, _CAUCHY_SCALES * scale_px)
     return LensFit(mean, covariance, scale_px, size_px)
 

@@ -16,14 +16,19 @@ from agalign.pixels.structure import gradient_magnitude
 from agalign.values.image import FloatImage, Mask, Raster
 
 _BINS = 32
+"""Of each axis of the joint histogram, elastix's default."""
 _RANGE_MARGIN = 0.01
 """Both ranges are widened by this share on both sides, as in elastix."""
 _SUBBINS = 64
 """Moving values are counted in subdivisions of a bin before the spline is applied; the error is at most 1/128 bin."""
 _MIN_PIXELS = 256
+"""Minimum number of common pixels for a metric."""
 _ENOUGH_PIXELS = 250_000
+"""Minimum number of pixels that are sampled from a large image."""
 _MIN_STD = 1e-9
+"""Smaller standard deviations are rounding errors of constant images."""
 _SSIM_WINDOW_PX = 11
+"""Side of the Gaussian window (Wang et al. 2004)."""
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
 """Constants of SSIM for a range of 1."""
 
@@ -167,6 +172,7 @@ class _Gradient:
 
     @classmethod
     def of(cls, image: FloatImage, grid: tuple[slice, slice]) -> "_Gradient":
+        """Compute the gradient of an image and its samples."""
         gx, gy = (cv2.Sobel(image, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
         magnitude = gradient_magnitude(gx, gy)
         mean, square = (_blur(x)[grid].ravel() for x in (magnitude, magnitude * magnitude))

@@ -131,6 +131,16 @@ def residual_under(residual: Residual[FixedPx], before: PixelMapping, after: Pix
     return Residual.of(residual.centres_px, shifts - difference, residual.peaks_sigma)
 
 
+def decrease_sigma(before_px: NDArray[np.float64], after_px: NDArray[np.float64]) -> float:
+    """Return the mean decrease of squared shifts with lengths (n,), in standard errors.
+
+    Lengths are clipped at twice the p95 of `before_px`, which limits the influence of wrong peaks.
+    """
+    limit_px = 2 * np.percentile(before_px, 95)
+    decrease = np.minimum(before_px, limit_px) ** 2 - np.minimum(after_px, limit_px) ** 2
+    return float(decrease.mean() / max(decrease.std() / math.sqrt(len(decrease)), 1e-12))
+
+
 def _starts(length: int, side: int, step: int | None) -> list[int]:
     """Return the first pixels of equally spaced windows along an axis; without `step` they cover it once."""
     count = max(1, math.ceil(length / side) if step is None else 1 + math.ceil((length - side) / step))

@@ -88,7 +88,7 @@ def bent_pair(height: float) -> tuple[Raster, Raster]:
 
 def test_displacements_between_bands_are_followed() -> None:
     fixed, moving = bent_pair(1.5)
-    result = Reference(fixed).local.refine(moving, PixelMapping(geometry.identity()))
+    result = Reference(fixed).coarse_field.refine(moving, PixelMapping(geometry.identity()))
     assert result.field is not None
     at = geometry.lattice(*SIZE, 17, 13)
     before, after = (np.linalg.norm(d, axis=1) for d in (bump(at), result.field(at) - bump(at)))
@@ -98,7 +98,7 @@ def test_displacements_between_bands_are_followed() -> None:
 
 def test_where_a_homography_is_enough_nothing_is_added() -> None:
     fixed, moving = bent_pair(0.0)
-    result = Reference(fixed).local.refine(moving, PixelMapping(geometry.identity()))
+    result = Reference(fixed).coarse_field.refine(moving, PixelMapping(geometry.identity()))
     assert result.field is None or np.abs(result.field(geometry.lattice(*SIZE, 17, 13))).max() < 0.05
 
 
