@@ -64,10 +64,12 @@ class FlightMap:
     def write(self) -> Path | None:
         """Write the file atomically and return it; None if no capture has a position. Raises OutputError.
 
-        Index rasters that `agalign indices` wrote in earlier commands are linked too.
+        Captures of earlier runs whose sidecars are still in the folder are kept, as in the report. Index rasters that
+        `agalign indices` wrote in earlier commands are linked too.
         """
-        features = [self._features[label] for label in sorted(self._features)]
-        if not any(f["geometry"] for f in features):
+        by_label = {f["id"]: f for f in _features_in(self._out) if _has_sidecar(f, self._out)} | self._features
+        features = [by_label[label] for label in sorted(by_label)]
+        if not any(f.get("geometry") for f in features):
             return None
         _write(self._out, features, read_table(self._out))
         return self._out / FLIGHT_MAP_FILE
@@ -78,13 +80,28 @@ def link_indices(out: Path, rows: Iterable[IndexRow]) -> None:
 
     Without the file, or with a file that a run did not write, nothing is changed.
     """
+    if features := _features_in(out):
+        _write(out, features, rows)
+
+
+def _features_in(out: Path) -> list[dict[str, Any]]:
+    """The features of OUT/flight.geojson; none if there is no such file, or if a run did not write it."""
     try:
         features = json.loads((out / FLIGHT_MAP_FILE).read_text(encoding="utf-8"))["features"]
-        is_of_a_run = all(isinstance(f["properties"]["indices"], list) and f["properties"]["capture"] for f in features)
+        is_of_a_run = all(
+            isinstance(f["id"], str)
+            and f["id"] == f["properties"]["capture"]
+            and isinstance(f["properties"]["indices"], list)
+            for f in features
+        )
     except (OSError, ValueError, KeyError, TypeError):
-        return
-    if is_of_a_run:
-        _write(out, features, rows)
+        return []
+    return features if is_of_a_run else []
+
+
+def _has_sidecar(feature: dict[str, Any], out: Path) -> bool:
+    sidecar = feature["properties"].get("sidecar")
+    return isinstance(sidecar, str) and (out / sidecar).is_file()
 
 
 def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexRow]) -> None:

@@ -24,6 +24,7 @@ from agalign.products.footprint import (
     with_assumed_height,
 )
 from agalign.products.indices import INDICES
+from agalign.products.sidecar_file import read_result
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Pose, Position
 
@@ -95,6 +96,23 @@ def test_index_rasters_of_a_later_command_are_linked_and_stay_linked(tmp_path: P
     (tmp_path / linked[0]).unlink()
     end_of_a_run()
     assert links() == linked[1:]
+
+
+def test_captures_of_an_earlier_run_stay_as_long_as_their_sidecars(tmp_path: Path) -> None:
+    """As the report and summary.csv, which list every sidecar of the folder."""
+    make_aligned(tmp_path, 2)
+    first, second = (replace(capture(None), name=f"IMG_000{n}", folder=Path("0000SET")) for n in (1, 2))
+
+    def labels_after(known: Capture) -> list[str]:
+        on_map = FlightMap(tmp_path)
+        on_map.add(known, "ok", read_result(tmp_path / f"{known.label}.json"))
+        on_map.write()
+        return [f["id"] for f in json.loads((tmp_path / "flight.geojson").read_text())["features"]]
+
+    assert labels_after(first) == ["0000SET/IMG_0001"]
+    assert labels_after(second) == ["0000SET/IMG_0001", "0000SET/IMG_0002"]
+    (tmp_path / "0000SET" / "IMG_0001.json").unlink()
+    assert labels_after(second) == ["0000SET/IMG_0002"]
 
 
 def test_a_map_of_another_program_is_not_changed(tmp_path: Path) -> None:
