@@ -23,6 +23,7 @@ from agalign.relief.occlusion import nearer_sign, occluded
 from agalign.relief.plane_parallax import (
     PlaneParallax,
     WindowShifts,
+    are_of_lenses,
     fit_plane_parallax,
     parallax_of,
 )
@@ -163,12 +164,18 @@ def _gain_sigma(before_px: NDArray[np.float64], after_px: NDArray[np.float64]) -
 
 
 def _model(group: Sequence[ReliefCandidate], windows: WindowShifts) -> PlaneParallax | None:
-    """Fit plane + parallax to the windows; None if a band has too few of them or the baselines are undetermined."""
+    """Fit plane + parallax to the windows; None if a band has too few of them or the baselines are not of lenses."""
     if len(windows) == 0 or (windows.weights > 0).sum(axis=0).min() < _MIN_WINDOWS:
         return None
+    layout = _layout(group)
+    model = fit_plane_parallax(windows, group[0].pair.fixed.size_px, layout)
+    return model if model is not None and are_of_lenses(model.baselines, layout) else None
+
+
+def _layout(group: Sequence[ReliefCandidate]) -> NDArray[np.float64] | None:
+    """(bands, 2) positions of the lenses relative to that of the reference; None if the tags lack one."""
     layouts = [c.pair.layout for c in group]
-    is_known = all(layout is not None for layout in layouts)
-    return fit_plane_parallax(windows, group[0].pair.fixed.size_px, np.array(layouts, float) if is_known else None)
+    return None if any(layout is None for layout in layouts) else np.array(layouts, float)
 
 
 @dataclass(frozen=True)
@@ -238,12 +245,11 @@ class _Estimate:
                     break
         except GeometryError:
             return None
+        if not are_of_lenses(np.array([b.baseline for b in bands]), _layout(group)):
+            return None
         others = [[k for k in all_bands if k != band] for band in all_bands]
         relief, *without = matching.refined([b.view() for b in bands], [all_bands, *others])
-        is_reversed = (
-            any(c.pair.layout is None for c in group)
-            and nearer_sign(matched, np.array([b.baseline for b in bands])) < 0
-        )
+        is_reversed = _layout(group) is None and nearer_sign(matched, np.array([b.baseline for b in bands])) < 0
         if is_reversed:
             bands = [replace(b, baseline=(-b.baseline[0], -b.baseline[1])) for b in bands]
             relief, without = relief.negated, [r.negated for r in without]

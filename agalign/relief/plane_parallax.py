@@ -43,6 +43,10 @@ _MIN_INFORMATION = 0.2
 """Minimum sum of weights times squared baselines for the parallax of a window to be known."""
 _CLIP_MEDIANS = 5.0
 """Shifts are clipped at this multiple of the median for the initial estimate of the baselines."""
+_MIN_LAYOUT_COSINE = 0.8
+"""Baselines of scenes with depth have 0.998 with the layout of the lenses, those fitted to noise up to 0.55."""
+_MIN_SPREAD = 0.3
+"""Of baselines, relative to the longest: at least 0.5 for real cameras, at most 0.2 where the reference is blurred."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,20 @@ def fit_plane_parallax(
     if layout is not None and np.sum(baselines * layout) < 0:
         baselines, parallax = -baselines, -parallax
     return PlaneParallax(baselines, corners, parallax, residuals)
+
+
+def are_of_lenses(baselines: Array, layout: Array | None) -> bool:
+    """Return True if baselines (bands, 2) can be those of lenses with a layout (bands, 2), None if it is not known.
+
+    Noise of the reference shifts the windows of all bands alike. It looks like parallax, and the relief of one band
+    predicts the others, but all baselines are nearly the same: no two lenses are in one place.
+    """
+    if layout is not None:
+        norms = np.linalg.norm(baselines) * np.linalg.norm(layout)
+        return bool(np.sum(baselines * layout) >= _MIN_LAYOUT_COSINE * norms > 0)
+    lengths = np.linalg.norm(baselines, axis=1)
+    from_mean = np.linalg.norm(baselines - baselines.mean(axis=0), axis=1)
+    return bool(from_mean.max() >= _MIN_SPREAD * lengths.max() > 0)
 
 
 def parallax_of(residual_px: Array, baselines: Array, weights: Array) -> Array:

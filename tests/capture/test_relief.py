@@ -197,6 +197,23 @@ def test_a_flat_scene_gets_no_relief(flat: Rendered) -> None:
     assert aligned_by_relief(candidates, "always") == {}
 
 
+@pytest.mark.parametrize("has_layout", [True, False])
+def test_what_the_reference_alone_shows_is_no_relief(flat: Rendered, has_layout: bool) -> None:
+    """Its displacements are the same in all bands: each band's relief predicts the others."""
+    width, height = flat.size_px
+    displacement = cv2.resize(
+        np.random.default_rng(3).normal(0, 2, (6, 8)), flat.size_px, interpolation=cv2.INTER_CUBIC
+    )
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    positions = (x + displacement).astype(np.float32), y.astype(np.float32)
+    image = cv2.remap(flat.images[REFERENCE.name], *positions, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    candidates = flat.candidates({REFERENCE.name: image})
+    if not has_layout:
+        candidates = [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
+    assert not shows_relief(candidates)
+    assert aligned_by_relief(candidates, "always") == {}
+
+
 @pytest.mark.parametrize(("height_px", "shown"), [(0.25, False), (1.0, True)])
 def test_parallax_as_small_as_the_noise_of_large_windows_is_no_relief(
     flat: Rendered, height_px: float, shown: bool

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.relief.plane_parallax import PlaneParallax, WindowShifts, fit_plane_parallax, parallax_of
+from agalign.relief.plane_parallax import PlaneParallax, WindowShifts, are_of_lenses, fit_plane_parallax, parallax_of
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Residual
@@ -162,3 +162,18 @@ def test_shifts_are_those_of_undistorted_pixels() -> None:
     # The whole shift from the plane has what the relief moved as well.
     whole = windows.plus(relief(windows.centres_px), np.array([[0.6, -0.8]]))
     np.testing.assert_allclose(whole.shifts_px[:, 0], expected + np.array([[3, -4]]), atol=1e-6)
+
+
+@pytest.mark.parametrize("layout", [None, BASELINES])
+@pytest.mark.parametrize("bands", [[0, 1], [0, 1, 2], [0, 1, 2, 3]])
+def test_noise_of_the_reference_is_no_parallax(layout: np.ndarray | None, bands: list[int]) -> None:
+    """It shifts the windows of all bands alike, most in the direction in which the image has little texture."""
+    rng = np.random.default_rng(2)
+    of_reference = rng.normal(0, [0.3, 1.0], (len(POINTS), 1, 2))
+    noise = of_reference + rng.normal(0, 0.2, (len(POINTS), len(BASELINES), 2))
+    for shifts_px, is_depth in ((noise, False), (shifts().shifts_px, True)):
+        windows = WindowShifts(POINTS, POINTS, shifts_px[:, bands], np.ones((len(POINTS), len(bands))))
+        known = None if layout is None else layout[bands]
+        model = fit_plane_parallax(windows, SIZE, known)
+        assert model is not None
+        assert are_of_lenses(model.baselines, known) == is_depth
