@@ -59,12 +59,12 @@ class MemoryLimitError(AgalignError):
     """The system limits the memory of this process to less than the libraries need."""
 
 
-_SAID_OF_MEMORY = (
+_MEMORY_MESSAGES = (
     "not enough memory", "can't allocate memory", "Cannot allocate memory", "bad_alloc", "Insufficient memory",
     "can't start new thread", "could not create a primitive", "out of memory",
 )  # fmt: skip
 
 
-def is_want_of_memory(error: BaseException) -> bool:
-    """True where a library says in words that memory is short, having no class for it."""
-    return isinstance(error, MemoryError) or any(said in str(error) for said in _SAID_OF_MEMORY)
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return True for MemoryError and for other errors with the message of a library that is out of memory."""
+    return isinstance(error, MemoryError) or any(message in str(error) for message in _MEMORY_MESSAGES)

@@ -22,7 +22,7 @@ _MIN_WINDOWS = 16
 _CLOSE_PX = 3.0
 """Maximum residual of a consistent window, px of the reduced reference: 1.5 px of the band. By chance, one in a hundred
 windows of at least 56 px has a smaller one."""
-_MIN_CLOSE = 0.85
+_MIN_CLOSE_SHARE = 0.85
 """Minimum share of consistent windows among the measured ones."""
 _ROUNDS = 3
 """Rounds of warping and fitting: correlation peaks are sharper when windows overlap better."""
@@ -59,4 +59,4 @@ def _is_consistent(fit: LensFit, residual: Residual[FixedImagePx]) -> bool:
     if measured.sum() < _MIN_WINDOWS:
         return False
     lengths_px = np.linalg.norm(fit.residuals_px(residual.centres_px[measured], residual.shifts_px[measured]), axis=1)
-    return bool((lengths_px <= _CLOSE_PX).mean() >= _MIN_CLOSE)
+    return bool((lengths_px <= _CLOSE_PX).mean() >= _MIN_CLOSE_SHARE)

@@ -24,7 +24,7 @@ from agalign.verify.extrapolation_check import points_in_frame, unobserved_quart
 from agalign.verify.residuals import residual_under
 from agalign.verify.window_check import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX
 
-_UNCHANGED: tuple[SeedKind, ...] = ("geo", "identity")
+_SEEDS_OF_ALIGNED_INPUT: tuple[SeedKind, ...] = ("geo", "identity")
 """Seeds of input that may be aligned already; it is then returned unchanged instead of resampled by a small shift."""
 
 _MAX_CONVERTED_PX = 0.15
@@ -237,7 +237,7 @@ def with_metrics(alignment: Alignment[FixedImagePx], pair: BandPair) -> Alignmen
 
 def _unchanged_if_aligned(joint: JointResult[FixedImagePx], pair: BandPair) -> JointResult[FixedImagePx]:
     """Replace the mapping by the one given by the files if it does not differ significantly."""
-    for given in (pair.candidates[kind] for kind in _UNCHANGED if kind in pair.candidates):
+    for given in (pair.candidates[kind] for kind in _SEEDS_OF_ALIGNED_INPUT if kind in pair.candidates):
         if pair.mapping(given).is_curved:
             continue  # with lens distortion the files are not aligned
         if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):

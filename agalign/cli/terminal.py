@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from agalign.errors import AgalignError, ConfigurationError, is_want_of_memory
+from agalign.errors import AgalignError, ConfigurationError, is_out_of_memory
 from agalign.values.choices import MAX_RNG_SEED
 from agalign.values.text import harmless
 
@@ -195,7 +195,7 @@ def _ending(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:
             return EXIT_USAGE, str(error)
         case AgalignError():
             return EXIT_NOTHING, str(error)
-        case _ if is_want_of_memory(error):
+        case _ if is_out_of_memory(error):
             return EXIT_NOTHING, _OUT_OF_MEMORY
         case ImportError():
             return EXIT_NOTHING, f"a library cannot be loaded ({error}); is memory short, or the installation damaged?"

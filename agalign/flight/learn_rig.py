@@ -93,9 +93,9 @@ class _Fit:
     offset: Array
     """(bands, 2, 3) coefficients of the means minus the median mappings, px."""
     t: Array
-    """(bands, 2)"""
+    """(bands, 2) baselines, of norm 1 together."""
     delay: Array
-    """(bands,)"""
+    """(bands,) delays, of norm 1."""
     t_std: Array
     """(bands,) standard error of each coordinate of t."""
     factors: Array

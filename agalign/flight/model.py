@@ -18,7 +18,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 
 from agalign._version import __version__
-from agalign.errors import InputError, is_want_of_memory
+from agalign.errors import InputError, is_out_of_memory
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import rig_from_json, rig_to_json
 from agalign.method.descriptor import Descriptor
@@ -83,7 +83,7 @@ def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
     except InputError:
         raise
     except Exception as error:  # damaged files raise errors of many classes
-        if is_want_of_memory(error):
+        if is_out_of_memory(error):
             raise MemoryError(str(error)) from None
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise InputError(f"{path}: cannot be read as a model ({reason})") from None

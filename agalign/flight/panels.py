@@ -24,7 +24,7 @@ _DETECTION_PX = 1600
 """Longer side of the images in which panels are searched."""
 _MAX_TIME_DIFFERENCE_S = 6 * 3600.0
 """A panel does not represent the illumination many hours later."""
-_MAX_SATURATED = 0.01
+_MAX_SATURATED_SHARE = 0.01
 """Maximum share of saturated pixels, which bias the mean radiance."""
 _PANEL_HEIGHT_M = 1.0
 """Height of the camera above a panel when it is recorded."""
@@ -207,7 +207,7 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
         radiance, saturated = _radiance(band, panel)
     except AgalignError as error:
         return BandReading(band, albedo, None, str(error))
-    if saturated > _MAX_SATURATED:
+    if saturated > _MAX_SATURATED_SHARE:
         return BandReading(band, albedo, radiance, f"{saturated:.0%} of it is saturated")
     if radiance is not None and not radiance > 0:
         return BandReading(band, albedo, radiance, "it is black")

@@ -48,11 +48,11 @@ class Expectation:
     """
 
     corners: Array
-    """(8,)"""
+    """(8,) displacements for factors of 0."""
     by_factor: Array
-    """(8, 5)"""
+    """(8, 5) derivative with respect to the factors."""
     covariance: Array
-    """(8, 8)"""
+    """(8, 8) for known factors, px squared."""
 
     def rescaled(self, scale: tuple[float, float]) -> "Expectation":
         """Convert to an image that is larger by the factors (x, y)."""

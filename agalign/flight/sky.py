@@ -1,4 +1,4 @@
-"""Captures of the sky, which surveys of water quality take to correct for its reflection."""
+"""Detection of captures of the sky, with which surveys of water quality correct for its reflection."""
 
 import re
 from collections.abc import Iterable
@@ -15,11 +15,11 @@ from agalign.values.capture import Band, Capture
 
 _MIN_ELEVATION_DEG = 20.0
 """Minimum elevation of the optical axis: half the field of view is about 20 degrees."""
-_MIN_UNSATURATED = 0.5
+_MIN_UNSATURATED_SHARE = 0.5
 """Minimum share of unsaturated pixels for the median radiance."""
 _MIN_CUES = 2
 """A single cue also occurs in other captures."""
-_NAMED = re.compile(r"(?:^|[-_. ])sky(?:$|[-_. ])", re.IGNORECASE)
+_SKY_NAME = re.compile(r"(?:^|[-_. ])sky(?:$|[-_. ])", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def sky_cues(capture: Capture) -> tuple[str, ...]:
     cues = []
     if capture.elevation_deg is not None and capture.elevation_deg > _MIN_ELEVATION_DEG:
         cues.append(f"its tags point the camera {capture.elevation_deg:.0f} degrees above the horizon")
-    if any(_NAMED.search(part) for part in (*capture.folder.parts, capture.name)):
+    if any(_SKY_NAME.search(part) for part in (*capture.folder.parts, capture.name)):
         cues.append("its folder or name contains 'sky'")
     if cues and _is_without_texture(capture):
         cues.append("no band has texture")
@@ -72,7 +72,7 @@ def sky_radiance(band: Band) -> float | None:
         pixels, valid = read_window(source, band, 0, 0, band.width_px, band.height_px)
     if band.saturation_value is not None:
         valid &= pixels.astype(np.float64) < band.saturation_value
-    if valid.mean() < _MIN_UNSATURATED:
+    if valid.mean() < _MIN_UNSATURATED_SHARE:
         return None
     return float(np.median(calibrated(pixels, band.radiometry, 0, 0)[valid]))
 

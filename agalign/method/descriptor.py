@@ -35,7 +35,7 @@ class _FirstLayer(nn.Module):
         self.half_rectified = half_rectified
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, C, 16, 16) -> (N, 32, 6, 6)."""
+        """Compute the responses of the layer, (N, C, 16, 16) -> (N, 32, 6, 6)."""
         x = self.convolution(x.contiguous(memory_format=torch.channels_last))
         if self.half_rectified:
             # In place: copying this tensor, the largest, takes longer than the convolution.

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 from torch.nn import functional
 
-from agalign.errors import ConfigurationError, is_want_of_memory
+from agalign.errors import ConfigurationError, is_out_of_memory
 
 
 def choose_device(name: str) -> torch.device:
@@ -85,7 +85,7 @@ def _problem(name: str) -> str:
     return ""
 
 
-def exact(tensor: Tensor) -> Tensor:
+def to_float64(tensor: Tensor) -> Tensor:
     """Return the tensor as float64, on the CPU if its device (Apple's MPS) has no float64."""
     return (tensor if _has_float64(tensor.device) else tensor.cpu()).double()
 
@@ -168,4 +168,4 @@ def _is_out_of_memory(error: cv2.error | RuntimeError) -> bool:
     if isinstance(error, cv2.error):
         return error.code == cv2.Error.STS_NO_MEM
     # On the CPU torch raises a plain RuntimeError.
-    return isinstance(error, torch.cuda.OutOfMemoryError) or is_want_of_memory(error)
+    return isinstance(error, torch.cuda.OutOfMemoryError) or is_out_of_memory(error)

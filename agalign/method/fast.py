@@ -19,8 +19,8 @@ from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.levels import Level
 from agalign.method.patches import far_apart, patch_positions, translation
 from agalign.method.refine import (
+    CONVERGED_PX,
     MIN_KEYPOINTS,
-    REST_PX,
     TEST_KEYPOINTS,
     MovingBand,
     Solver,
@@ -99,8 +99,8 @@ def learn(
 
         for scale in scales:
             at_level = [
-                _GroupAtLevel(own, net, group, bands, own.level(group, scale, bands), schedule)
-                for own, group in zip(states, groups, strict=True)
+                _GroupAtLevel(own_state, net, group, bands, own_state.level(group, scale, bands), schedule)
+                for own_state, group in zip(states, groups, strict=True)
                 if (bands := _bands_at(group, is_finest=scale == scales[-1]))
             ]
             if not at_level:
@@ -143,7 +143,7 @@ class _GroupAtLevel:
     h: list[Tensor] = field(init=False)
     """(3, 3) fixed_to_moving of each moving image, px of the level."""
     converged: list[bool] = field(init=False)
-    """True after the first step on psi shorter than REST_PX; psi is updated further while others have not converged."""
+    """True after the first step on psi shorter than CONVERGED_PX; updates continue until all psi have converged."""
     distinguished: list[bool] = field(init=False)
     """True once held-out retrieval has reached MIN_RETRIEVAL, which steps on psi require."""
     retrieved: list[float] = field(init=False)
@@ -284,5 +284,5 @@ def _update_psi(g: _GroupAtLevel) -> bool:
         with suppress(NotEnoughTextureError):
             step = solver.step(band, g.h[i], reference_patches)
             g.h[i] = updated(g.h[i], step)
-            g.converged[i] |= g.retrieved[i] > g.schedule.enough_retrieval and step.length_px < REST_PX
+            g.converged[i] |= g.retrieved[i] > g.schedule.enough_retrieval and step.length_px < CONVERGED_PX
     return all(g.converged)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from agalign.method.device import exact
+from agalign.method.device import to_float64
 from agalign.method.patches import ALPHA, FAMILY_PARAMETERS, Keypoints, homography_from_psi, transform
 from agalign.values import geometry
 from agalign.values.choices import ModelFamily
@@ -66,7 +66,7 @@ def shift_over_psi(xy: Tensor, width_px: int, height_px: int) -> Tensor:
     `geometry.over_corners` is the Jacobian with respect to the displacements of the corners, in numpy. This function
     runs on the device of the descriptors.
     """
-    x, y = exact(xy).unbind(dim=1)
+    x, y = to_float64(xy).unbind(dim=1)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
     along_x = [x, y, zero, zero, one * width_px, zero, -x * x / width_px, -x * y / height_px]
     along_y = [zero, zero, x, y, zero, one * height_px, -x * y / width_px, -y * y / height_px]
@@ -85,11 +85,11 @@ class PatchEquations:
     xy: Tensor
     """(N, 2) centres, px."""
     gradient: Tensor
-    """(N, 2)"""
+    """(N, 2) per px."""
     hessian: Tensor
-    """(N, 2, 2)"""
+    """(N, 2, 2) per px squared."""
     energy: Tensor
-    """(N,)"""
+    """(N,) squared residual at s = 0."""
     size_px: tuple[int, int]
     """(width, height) of the fixed image."""
 
@@ -101,10 +101,10 @@ class PatchEquations:
 
         The mean residual of all patches is removed: it is the constant difference between the modalities.
         """
-        centred, g = exact(residual - residual.mean(dim=0)), exact(shift_gradient)
+        centred, g = to_float64(residual - residual.mean(dim=0)), to_float64(shift_gradient)
         gradient = torch.einsum("ndk,nd->nk", g, centred)
         hessian = torch.einsum("ndk,ndl->nkl", g, g)
-        return cls(exact(keypoints.xy), gradient, hessian, centred.square().sum(dim=1), size_px)
+        return cls(to_float64(keypoints.xy), gradient, hessian, centred.square().sum(dim=1), size_px)
 
     @property
     def cell(self) -> Tensor:

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from agalign.errors import NotEnoughTextureError
 from agalign.method.descriptor import REFERENCE, Descriptor, distance
-from agalign.method.device import exact
+from agalign.method.device import to_float64
 from agalign.method.levels import Level, Pool
 from agalign.method.patches import (
     FAMILY_PARAMETERS,
@@ -124,7 +124,7 @@ def descend(
     NotEnoughTextureError.
     """
     size_px = level.fixed.size_px
-    psi = psi_from_homography(exact(level.homography(start, 0)), *size_px).to(level.fixed.image).requires_grad_()
+    psi = psi_from_homography(to_float64(level.homography(start, 0)), *size_px).to(level.fixed.image).requires_grad_()
     is_free = torch.zeros_like(psi)
     if move:
         is_free[list(FAMILY_PARAMETERS[state.family or "homography"])] = 1.0

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from agalign.errors import GeometryError, NotEnoughTextureError
 from agalign.method.descriptor import REFERENCE, Descriptor, distance, retrieval
-from agalign.method.device import exact
+from agalign.method.device import to_float64
 from agalign.method.gauss_newton import PatchEquations, Step, shift_gradient, solve
 from agalign.method.levels import Level, footprints_inside, footprints_inside_moving
 from agalign.method.patches import Keypoints, far_apart, patch_positions, transform
@@ -29,16 +29,16 @@ MIN_KEYPOINTS = 16
 """Minimum number of patches in both images for a step on psi or a test of retrieval."""
 TEST_KEYPOINTS = 256
 """Keypoints that measure held-out retrieval: chance is 0.004, the standard error of the share 0.03."""
-REST_PX = 0.5
+CONVERGED_PX = 0.5
 """While learning, psi has converged if a step displaces no corner by more than this, px of the level."""
 PATCHES, FLIGHT_PATCHES = 400, 256
 """Patches in a Gauss-Newton step at full resolution: for a single capture, and for a capture of a flight, where the
-rig contributes to the estimate. Half as many are used while the steps are longer than REST_PX."""
+rig contributes to the estimate. Half as many are used while the steps are longer than CONVERGED_PX."""
 _FINAL_OCTAVES = 0.3
 """Range of log2 of their scales: small patches localise better."""
 _MAX_FINAL_STEPS = 10
 """Maximum number of steps at full resolution."""
-_FINAL_REST_PX = 0.06
+_FINAL_CONVERGED_PX = 0.06
 """psi has converged if a step displaces no corner by more than this, px: steps shrink by more than half, so the
 remaining displacement is smaller than the systematic error."""
 _SYSTEMATIC_STD_PX = 0.035
@@ -136,7 +136,7 @@ class Solver:
         return solve(equations, self.family)
 
     def converge(self, band: MovingBand, start: Tensor, reference_patches: ReferencePatches) -> tuple[Tensor, Step]:
-        """Take steps until no corner moves by more than `_FINAL_REST_PX`; return (homography, last step).
+        """Take steps until no corner moves by more than `_FINAL_CONVERGED_PX`; return (homography, last step).
 
         Long steps use half of the patches. Steps with all patches shrink by a constant ratio, so every second one is
         extended by the sum of the geometric series (Aitken 1926). A step of infinite length is the last one and is
@@ -149,10 +149,10 @@ class Solver:
                 break
             ratio = min(step.length_px / previous_px, _MAX_RATIO)
             h = updated(h, step, 1 / (1 - ratio))
-            if step.length_px < _FINAL_REST_PX and patches is reference_patches:
+            if step.length_px < _FINAL_CONVERGED_PX and patches is reference_patches:
                 break
             previous_px = step.length_px if patches is reference_patches and ratio == 0 else math.inf
-            if step.length_px < REST_PX:
+            if step.length_px < CONVERGED_PX:
                 patches = reference_patches
         return h, step
 
@@ -160,7 +160,7 @@ class Solver:
 def updated(homography: Tensor, step: Step, factor: float = 1.0) -> Tensor:
     """Return H @ change, (3, 3) float32, with the change of psi, which is linear in it, scaled by a factor."""
     identity = torch.eye(3, dtype=step.change.dtype, device=step.change.device)
-    return (exact(homography) @ (identity + factor * (step.change - identity))).to(homography)
+    return (to_float64(homography) @ (identity + factor * (step.change - identity))).to(homography)
 
 
 @torch.no_grad()

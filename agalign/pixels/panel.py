@@ -21,17 +21,17 @@ _LEVELS = 12
 _LEVEL_PERCENTILES = 5.0, 99.5
 _CORNER_TOLERANCE = 0.04
 """Maximum distance of a contour from a quadrilateral, relative to the length of the contour."""
-_INNER = 0.5
+_AREA_RATIO = 0.5
 """Side of the measured area, relative to that of the panel."""
-_RING = 1.15, 1.4
+_RING_RATIOS = 1.15, 1.4
 """Inner and outer side of the surrounding ring used for comparison, relative to that of the panel."""
-_CODE_AREAS = 0.3, 6.0
+_CODE_AREA_RATIOS = 0.3, 6.0
 """Minimum and maximum area of the panel, relative to that of its code."""
 _MAX_CODE_DISTANCE = 3.0
 """Maximum distance between the centres of panel and code, in sides of the code."""
-_SHARE_OF_IMAGE = 0.004, 0.3
+_IMAGE_SHARES = 0.004, 0.3
 """Minimum and maximum area of a panel without a code."""
-_MIN_FILLED = 0.02
+_MIN_PANEL_SHARE = 0.02
 """Minimum share of the image that a panel covers from 1 m above; 0.03 on a RedEdge-M."""
 _MAX_OFF_CENTRE = 1 / 6
 """A camera that is aimed at a panel has its centre in the middle third of the image."""
@@ -80,12 +80,12 @@ def _is_in_scene(square: Corners, image: NDArray[np.uint8]) -> bool:
     """Return True if a panel or its code is small and outside the middle third of the image."""
     size = np.array(image.shape[::-1], np.float64)
     off_centre = np.abs((square.mean(axis=0) - (size - 1) / 2) / size).max()
-    return bool(off_centre > _MAX_OFF_CENTRE and _area(square) < _MIN_FILLED * image.size)
+    return bool(off_centre > _MAX_OFF_CENTRE and _area(square) < _MIN_PANEL_SHARE * image.size)
 
 
 def _largest_panel(image: NDArray[np.uint8], code: Corners | None) -> Corners | None:
     """Return the largest square that may be a panel, next to the code if there is one; None without any."""
-    limits = _SHARE_OF_IMAGE if code is None else tuple(share * _area(code) / image.size for share in _CODE_AREAS)
+    limits = _IMAGE_SHARES if code is None else tuple(share * _area(code) / image.size for share in _CODE_AREA_RATIOS)
     squares = _quadrilaterals(image, limits[0] * image.size, limits[1] * image.size)
     squares = [s for s in squares if (code is None or _is_next_to(s, code)) and _is_panel(image, s)]
     return max(squares, key=_area, default=None)
@@ -152,7 +152,7 @@ def _quadrilaterals(image: NDArray[np.uint8], min_area: float, max_area: float) 
 
 def _is_panel(image: NDArray[np.uint8], square: Corners) -> bool:
     """Return True if a square is homogeneous and brighter than the ring around it."""
-    inner, edge, outer = (inside(_scaled(square, factor), image.shape) for factor in (_INNER, *_RING))
+    inner, edge, outer = (inside(_scaled(square, factor), image.shape) for factor in (_AREA_RATIO, *_RING_RATIOS))
     area, ring = image[inner].astype(np.float64), image[outer & ~edge]
     if not len(area) or not len(ring):
         return False
@@ -169,6 +169,6 @@ def _area(corners: Corners) -> float:
     return float(cv2.contourArea(corners.astype(np.float32)))
 
 
-def _scaled(square: Corners, factor: float = _INNER) -> Corners:
+def _scaled(square: Corners, factor: float = _AREA_RATIO) -> Corners:
     centre = square.mean(axis=0)
     return np.asarray(centre + factor * (square - centre))

@@ -119,7 +119,7 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
         # Some classes of rasterio's errors are not public.
         if not isinstance(error, UnicodeDecodeError) and not type(error).__module__.startswith("rasterio."):
             raise
-        text = why(error).replace(str(path), "").strip(" :'")
+        text = innermost_cause(error).replace(str(path), "").strip(" :'")
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
 
 
@@ -129,7 +129,7 @@ def _is_south_up(dataset: rasterio.DatasetReader) -> bool:
     return dataset.crs is not None and not transform.is_identity and transform.determinant > 0
 
 
-def why(error: BaseException) -> str:
+def innermost_cause(error: BaseException) -> str:
     """Return the first line of the innermost cause, GDAL's message; rasterio's own message is generic."""
     while error.__cause__ is not None:
         error = error.__cause__
@@ -288,7 +288,7 @@ def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDAr
         x, y = warp.transform(
             rasterio.CRS.from_user_input(from_crs), rasterio.CRS.from_user_input(to_crs), points[:, 0], points[:, 1]
         )
-    except Exception as error:  # GDAL's own errors have no public class
+    except Exception as error:  # GDAL's errors have no public class
         raise GeometryError(f"coordinates cannot be transformed ({error})") from None
     return np.stack([x, y], axis=-1)
 

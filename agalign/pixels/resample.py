@@ -20,7 +20,7 @@ from agalign.values.image import Mask, Raster, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
-_FLAGS: dict[str, int] = {
+_INTERPOLATION_FLAGS: dict[str, int] = {
     "nearest": cv2.INTER_NEAREST,
     "bilinear": cv2.INTER_LINEAR,
     "cubic": cv2.INTER_CUBIC,
@@ -104,7 +104,7 @@ def resample(
     map_xy = positions.astype(np.float32, copy=False)
     all_valid = bool(valid.all())
     source = _for_remap(pixels if all_valid else _filled(pixels, valid), interpolation)
-    sampled = cv2.remap(source, map_xy, None, _FLAGS[interpolation], borderMode=cv2.BORDER_REPLICATE)
+    sampled = cv2.remap(source, map_xy, None, _INTERPOLATION_FLAGS[interpolation], borderMode=cv2.BORDER_REPLICATE)
     half = 0.5 if interpolation == "nearest" else 0.0
     inside = _between(map_xy, np.subtract(sensor_start, half), np.subtract(sensor_end, 1 - half))
     if not all_valid:

@@ -11,7 +11,7 @@ LOOK_PX = 64
 """Longest side to which images are averaged: it suppresses noise and keeps textures of one hundredth of the image."""
 _DEGREE = 4
 """Degree of the polynomial that models vignetting and the gradient of the sky."""
-_MIN_VALID = 0.5
+_MIN_VALID_SHARE = 0.5
 """Minimum share of valid pixels for a texture."""
 
 
@@ -22,7 +22,7 @@ def relative_texture(image: Raster, black_level: float = 0.0) -> float | None:
     not above the black level.
     """
     pixels, valid = image.pixels, image.valid
-    if pixels.ndim != 2 or valid.mean() < _MIN_VALID:
+    if pixels.ndim != 2 or valid.mean() < _MIN_VALID_SHARE:
         return None
     mean = float(pixels[valid].mean()) - black_level
     if mean <= 0:

@@ -19,7 +19,7 @@ _NEIGHBOURHOOD_BLOCKS = 5
 """Side of the square of blocks in which the darkest value is searched; it contains the dark faces of waves."""
 _DARK_PERCENTILE = 10
 """Dark value of a block; less noisy than the minimum."""
-_MIN_SHARE = 0.5
+_MIN_GLINT_SHARE = 0.5
 """Minimum share of glint in the green light."""
 _MIN_PIXEL_NDWI = -0.2
 """Glint is as bright in green as in near infrared; vegetation and soil at a shore are not."""
@@ -54,7 +54,7 @@ def sun_glint(green: FloatImage, nir: FloatImage) -> Mask:
         is_water = cv2.resize(blocks.astype(np.uint8), size_px, interpolation=cv2.INTER_NEAREST) > 0
         glint = nir - cv2.resize(nir_dark, size_px, interpolation=cv2.INTER_NEAREST)
         is_flat = (green - nir) / (green + nir) > _MIN_PIXEL_NDWI
-        return np.asarray(is_water & is_flat & (glint > _MIN_SHARE * green))
+        return np.asarray(is_water & is_flat & (glint > _MIN_GLINT_SHARE * green))
 
 
 def _connected(candidates: Mask, seeds: Mask) -> Mask:

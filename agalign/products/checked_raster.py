@@ -16,7 +16,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from agalign.errors import OutputError
-from agalign.pixels.raster import GDAL_ENVIRONMENT, why, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, innermost_cause, without_warnings
 from agalign.products.quiet_libtiff import without_libtiff_messages
 from agalign.values import geometry
 from agalign.values.capture import Georeference
@@ -77,7 +77,7 @@ def checked_raster(
                 check_complete(partial)
             raster.verify(partial)
     except (RasterioError, tifffile.TiffFileError) as error:
-        raise OutputError(f"{path}: cannot be written ({why(error)})") from None
+        raise OutputError(f"{path}: cannot be written ({innermost_cause(error)})") from None
 
 
 def check_complete(path: Path) -> None:

@@ -15,7 +15,7 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from agalign.errors import InputError
-from agalign.pixels.raster import open_raster, why
+from agalign.pixels.raster import innermost_cause, open_raster
 from agalign.products.sidecar import CaptureResult, is_delivered
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 from agalign.values.quality import UNUSABLE
@@ -152,4 +152,4 @@ def _read(
     try:
         return np.asarray((source.read_masks if masks else source.read)(index, window=window, out_shape=shape))
     except RasterioError as error:
-        raise InputError(f"{source.name}: cannot be read ({why(error)}); run again") from None
+        raise InputError(f"{source.name}: cannot be read ({innermost_cause(error)}); run again") from None

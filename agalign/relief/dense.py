@@ -61,7 +61,7 @@ _MEDIAN_PX = 5
 """Window of the median filters, which remove isolated wrong pixels."""
 _NODE_STEP_PX = 8
 """Spacing of the grid on which lenses and homographies are evaluated."""
-_NO_STRUCTURE = 1e-3
+_MIN_ENERGY = 1e-3
 """Energy added to that of a window, so that windows without structure have no correlation."""
 
 
@@ -201,7 +201,7 @@ class _Matcher:
         warped = cv2.remap(self.moving[band], positions, None, cv2.INTER_LINEAR)
         real, imaginary, energy = cv2.split(warped)
         product = cv2.add(cv2.multiply(self.fixed[0], real), cv2.multiply(self.fixed[1], imaginary))
-        norm = cv2.max(cv2.multiply(self.fixed[2], energy), _NO_STRUCTURE)
+        norm = cv2.max(cv2.multiply(self.fixed[2], energy), _MIN_ENERGY)
         return np.asarray(cv2.divide(cv2.boxFilter(product, -1, (self.window_px, self.window_px)), norm))
 
     def _moving_size_px(self, view: View) -> tuple[int, int]:
@@ -217,7 +217,7 @@ class _Matcher:
         """
         field = structure_field(raster)
         energy = cv2.boxFilter(field.real**2 + field.imag**2, -1, (self.window_px, self.window_px))
-        return np.dstack([field.real, field.imag, np.sqrt(energy + np.float32(_NO_STRUCTURE))]).astype(np.float32)
+        return np.dstack([field.real, field.imag, np.sqrt(energy + np.float32(_MIN_ENERGY))]).astype(np.float32)
 
     def _parabola(
         self, mapping: PixelMapping, baseline: NDArray[np.float64]

@@ -16,7 +16,7 @@ _MIN_AREA_PX = 16
 """Minimum size of an occluded area: smaller ones are single pixels with wrong parallax."""
 _MIN_OCCLUDED_SHARE = 0.002
 """Minimum share of occluded pixels: fewer may be wrong matches."""
-_MIN_DIFFERENCE = 0.03
+_MIN_CORRELATION_DIFFERENCE = 0.03
 """Minimum difference of the mean correlations: smaller ones may be chance."""
 
 
@@ -32,7 +32,7 @@ def nearer_sign(relief: Relief, baselines: NDArray[np.float64]) -> int:
         if np.count_nonzero(hidden) < _MIN_OCCLUDED_SHARE * hidden.size:
             return 0
         means.append(float(relief.confidence[hidden].mean()))
-    if abs(means[0] - means[1]) < _MIN_DIFFERENCE:
+    if abs(means[0] - means[1]) < _MIN_CORRELATION_DIFFERENCE:
         return 0
     return 1 if means[0] < means[1] else -1
 

@@ -18,7 +18,7 @@ class AlignedImages(Protocol):
         """Scale of the reduced images relative to the fixed image."""
 
     def reduced_spectra(self) -> tuple[Field, Field]:
-        """Windowed spectra (height, width) of the structure of the reduced fixed image, and of the moving image."""
+        """Windowed spectra (height, width) of the structures of the reduced fixed and moving images."""
 
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
         """True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or user."""

@@ -19,7 +19,7 @@ _MAX_CORNER_STD_PX = 2.0
 """Maximum standard error of the least certain mapped corner: windows near the centre do not verify the corners."""
 BY_WINDOWS = "windows"
 """Recipe of a result that is fitted to windows; its residual contains the windows that were left out of the fit."""
-_MIN_HELD_OUT = 12
+_MIN_HELD_OUT_WINDOWS = 12
 """Minimum number of held-out windows with a measured shift; in unrelated images one in a thousand is within 1 px."""
 _MIN_COVERAGE = 0.8
 """Minimum share of held-out windows with a measured shift, as they are the only evidence."""
@@ -39,7 +39,7 @@ def _issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
 def _is_confirmed(evidence: Evidence[FixedPx]) -> bool:
     residual = evidence.residual
     measured = int(np.isfinite(residual.shifts_px[:, 0]).sum())
-    return measured >= _MIN_HELD_OUT and residual.coverage >= _MIN_COVERAGE
+    return measured >= _MIN_HELD_OUT_WINDOWS and residual.coverage >= _MIN_COVERAGE
 
 
 CHECK = Check((CORNER_STD_PX,), _issues)

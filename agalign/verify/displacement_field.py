@@ -210,7 +210,7 @@ class Shifts:
     """(n,) relative inverse variances, median 1: the error of a shift is inversely proportional to the square of the
     peak height."""
     peaks_sigma: NDArray[np.float64]
-    """(n,) heights of the peaks, standard deviations."""
+    """(n,) peak heights, in standard deviations of the correlation surface."""
 
     @classmethod
     def of(cls, residual: Residual[FixedImagePx]) -> "Shifts":

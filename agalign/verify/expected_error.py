@@ -10,7 +10,7 @@ from agalign.values.geometry import Points
 from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.lens_shapes import over_corners_and_lens
 
-_NEIGHBOURS = 8
+_NEAREST_WINDOWS = 8
 """Number of windows from which the error at a point is estimated, weighted by their distance."""
 _FAR_SPACINGS = 3.0
 """Range of distances beyond one spacing of windows over which p95 replaces the residuals of the nearest windows."""
@@ -55,7 +55,7 @@ def _windows_px2(residual: Residual[FixedFilePx], points_px: Points) -> NDArray[
     """Return the expected squared residual shift at points, (n,)."""
     measured = np.isfinite(residual.shifts_px[:, 0])
     centres, squares = residual.centres_px[measured], (residual.shifts_px[measured] ** 2).sum(axis=1)
-    count = min(_NEIGHBOURS, len(centres))
+    count = min(_NEAREST_WINDOWS, len(centres))
     distance, index = cKDTree(centres).query(points_px, k=count)
     distance, index = distance.reshape(-1, count), index.reshape(-1, count)
     nearest, _ = cKDTree(residual.centres_px).query(residual.centres_px, k=min(2, len(residual.centres_px)))

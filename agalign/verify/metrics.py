@@ -17,7 +17,7 @@ from agalign.values.image import FloatImage, Mask, Raster
 
 _BINS = 32
 """Of each axis of the joint histogram, elastix's default."""
-_RANGE_MARGIN = 0.01
+_RANGE_MARGIN_SHARE = 0.01
 """Both ranges are widened by this share on both sides, as in elastix."""
 _SUBBINS = 64
 """Moving values are counted in subdivisions of a bin before the spline is applied; the error is at most 1/128 bin."""
@@ -120,7 +120,7 @@ def _range(image: FloatImage, valid: Mask) -> tuple[float, float]:
 def _bin_position(values: NDArray[np.float32], limits: tuple[float, float], padding: int) -> NDArray[np.float32]:
     """Return the positions of values in units of bins, with empty bins (`padding`) at both ends."""
     low, high = limits
-    margin = _RANGE_MARGIN * (high - low)
+    margin = _RANGE_MARGIN_SHARE * (high - low)
     low, high = low - margin, high + margin
     bin_size = max((high - low) / (_BINS - 2 * padding - 1), 1e-12)
     return np.asarray(values * np.float32(1 / bin_size) - np.float32(low / bin_size - padding))

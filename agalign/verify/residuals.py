@@ -32,7 +32,7 @@ _MIN_PEAK_SIGMA = 7.0
 """Minimum correlation peak of a measured shift, in standard deviations of its surface; lower peaks may be chance."""
 _FIELD_PX = 128
 """Side of the fields of a chessboard: twice that of a window."""
-_MIN_VALID = 0.9
+_MIN_VALID_SHARE = 0.9
 """Minimum share of a window's pixels that are valid in both images."""
 
 
@@ -75,7 +75,7 @@ class FixedWindows:
         ]
         return cls(valid, structure, side_px, origins=origins)
 
-    def residuals(self, moving: Raster, min_valid: float = _MIN_VALID) -> Residual[FixedImagePx]:
+    def residuals(self, moving: Raster, min_valid: float = _MIN_VALID_SHARE) -> Residual[FixedImagePx]:
         """Measure the shift of each window in a moving band on the reference grid, px; NaN without a clear peak.
 
         Windows with a smaller share of valid pixels than `min_valid` are omitted: the outline of an invalid area biases

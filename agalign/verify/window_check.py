@@ -33,7 +33,7 @@ _MAX_MEDIAN_PX = 1.0
 """Maximum median residual shift: beyond it, a spectral index mixes neighbouring pixels."""
 _CLOSE_PX = 1.0
 """Maximum residual shift of an aligned window."""
-_MIN_CLOSE = 0.9
+_MIN_CLOSE_SHARE = 0.9
 """Minimum share of aligned windows among the measured ones: a few wrong peaks are normal."""
 _MIN_CLUSTER, _MAX_CLUSTER_SHARE = 5, 0.04
 """Size of a cluster of adjacent misaligned windows, as a count and as a share of the measured windows, from which it is
@@ -61,8 +61,8 @@ def _issues_of_outliers(residual: Residual[FixedPx], file_px: float) -> Iterator
     count = max(int(measured.sum()), 1)
     misaligned = measured & (np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _CLOSE_PX * file_px)
     close = 1 - float(misaligned.sum()) / count
-    if not close >= _MIN_CLOSE:
-        yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE, f"{_CLOSE_PX:g} px")
+    if not close >= _MIN_CLOSE_SHARE:
+        yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE_SHARE, f"{_CLOSE_PX:g} px")
     cluster = _largest_cluster(residual.centres_px[misaligned], residual.centres_px)
     limit = max(_MIN_CLUSTER, round(_MAX_CLUSTER_SHARE * int(measured.sum())))
     if not cluster < limit:

@@ -14,7 +14,7 @@ from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError
 from agalign.flight.model import load_model, save_model
 from agalign.method import device
-from agalign.method.device import choose_device, exact, one_memory_error, one_thread
+from agalign.method.device import choose_device, one_memory_error, one_thread, to_float64
 from agalign.method.fast import Schedule
 from agalign.method.joint import align_from_scratch
 from agalign.method.paper import Training
@@ -70,10 +70,10 @@ def test_threads_that_overlap_leave_torch_as_the_first_one_found_it() -> None:
 
 def test_without_float64_on_the_device_psi_is_solved_for_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     tensor = torch.ones(3, dtype=torch.float32)
-    assert exact(tensor).dtype == torch.float64
+    assert to_float64(tensor).dtype == torch.float64
     monkeypatch.setattr(device, "_has_float64", lambda _: False)
-    assert exact(tensor).device.type == "cpu"
-    assert exact(tensor).dtype == torch.float64
+    assert to_float64(tensor).device.type == "cpu"
+    assert to_float64(tensor).dtype == torch.float64
 
 
 def test_want_of_memory_has_one_name() -> None:

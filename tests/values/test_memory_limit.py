@@ -2,7 +2,7 @@
 
 import pytest
 
-from agalign.errors import MemoryLimitError, is_want_of_memory
+from agalign.errors import MemoryLimitError, is_out_of_memory
 from agalign.values.memory_limit import MIN_ADDRESS_SPACE_BYTES, check_address_space
 
 resource = pytest.importorskip("resource", reason="address space is limited on POSIX only")
@@ -22,4 +22,4 @@ def test_too_little_address_space_is_refused_with_both_sizes(monkeypatch: pytest
 
 @pytest.mark.parametrize("text", ["can't start new thread", "could not create a primitive"])
 def test_what_libraries_raise_when_memory_is_short(text: str) -> None:
-    assert is_want_of_memory(RuntimeError(text))
+    assert is_out_of_memory(RuntimeError(text))
