@@ -173,7 +173,7 @@ def _model(group: Sequence[ReliefCandidate], windows: WindowShifts) -> PlanePara
 
 
 def _layout(group: Sequence[ReliefCandidate]) -> NDArray[np.float64] | None:
-    """(bands, 2) positions of the lenses relative to that of the reference; None if the tags lack one."""
+    """Return the layouts (bands, 2) of the pairs; None if the tags lack one."""
     layouts = [c.pair.layout for c in group]
     return None if any(layout is None for layout in layouts) else np.array(layouts, float)
 

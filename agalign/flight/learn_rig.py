@@ -43,7 +43,7 @@ _CONVERGED_PX, _CONVERGED = 1e-4, 1e-5
 _MAX_FOLDS = 12
 """Of the cross-validation: more folds take longer and change the errors little."""
 _MAX_ERROR_RATIO = 0.9
-"""Further factors are accepted if they reduce the cross-validated error at least by this ratio."""
+"""A set of factors is preferred to the previous one if the ratio of the cross-validated errors is smaller."""
 
 
 def learn_rig(
@@ -76,7 +76,7 @@ def learn_rig(
 
 
 def _select_factors(table: "_Table", *, with_motion: bool) -> tuple[tuple[Factor, ...], dict[str, MovingFilePx]]:
-    """Return the factors with the smallest cross-validated error, and that error by band, px."""
+    """Select the factors by cross-validation; return them and their RMS error by band, px."""
     best, *others = _FACTOR_SETS_WITH_MOTION if with_motion else _FACTOR_SETS
     errors_px = table.cross_validated_px(best)
     for candidate in others if len(table.bands) > 1 else ():

@@ -152,8 +152,11 @@ def _captures_of_panels(half: Sequence[Capture], without_code: bool) -> list[Cap
         # Mosaics contain no panels and take long to read.
         is_known = capture.panel is not None or capture.reference.georeference is not None
         examined = capture if is_known else _with_detected_panel(capture, without_code)
-        result += [] if examined.panel is None else [examined]
-        without_panel = 0 if examined.panel is not None else without_panel + 1
+        if examined.panel is not None:
+            result.append(examined)
+            without_panel = 0
+            continue
+        without_panel += 1
         if without_panel == _MAX_CAPTURES_WITHOUT_PANEL:
             break
     return result

@@ -32,11 +32,11 @@ _ALTITUDE_SLOPE_STD_PX_PER_M = 1.5
 _MIN_ALTITUDE_SCATTER_PX = 0.5
 """Minimum scatter of the distance factor around its linear regression on the altitude."""
 _MAX_MEDIAN_RATIO, _MIN_MEDIAN_PX = 6.0, 3.0
-"""A capture is an outlier if a factor exceeds this ratio times the flight's median, or times the minimum if larger."""
+"""A capture is an outlier if a factor exceeds the ratio times the flight's median, or times the minimum median."""
 _MAX_GAP_RATIO = 2.0
 """An estimate is validated on captures with a gap of at most this ratio to the gap of the predicted capture."""
 _MIN_CAPTURES_TO_SELECT = 6
-"""With fewer captures, the best of several estimators is best by chance."""
+"""With fewer captures, the estimator with the smallest error would be selected by chance."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ class _FirstLayer(nn.Module):
 
     Both orders are equal because tanh is increasing; this one computes a quarter of the tanh.
 
-    `half_rectified` replaces tanh by |tanh| = tanh(|x|) in the second half of the channels, so that an edge and the
-    same edge with reversed contrast have equal responses, as vegetation has in visible and near-infrared bands.
+    `half_rectified` replaces tanh by |tanh| = tanh(|x|) in the second half of the channels. The responses to an edge
+    then do not depend on its sign, which is reversed, for example, between visible and near-infrared bands of plants.
     """
 
     def __init__(self, channels: int, half_rectified: bool) -> None:

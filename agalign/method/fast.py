@@ -61,7 +61,7 @@ _STEPS_BETWEEN_UPDATES = 10
 _MAX_STEPS_WITHOUT_RETRIEVAL = 30
 """A level is abandoned after this many steps if no held-out patches can be retrieved."""
 _PATCHES = 300
-"""Patches in a Gauss-Newton step: its cost grows linearly with their number, its error falls with the square root."""
+"""Patches in a Gauss-Newton step. Its cost is proportional to their number n, its error to 1 / sqrt(n)."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -203,7 +204,8 @@ def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
     shape = reduced_size_px(band.size_px, reduction)[::-1]
     with open_raster(band.path) as dataset:
         pixels = _reduced(dataset, band, shape) if reduction > 1 else dataset.read(band.band_index)
-        valid = data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.band_index, shape)
+        valid = data_mask(pixels, band.nodata)
+        valid &= _dataset_mask(dataset, band.band_index, out_shape=shape, resampling=Resampling.nearest)
     if band.nodata is None:
         valid &= ~undeclared_fill(pixels)
     valid = learnable(valid, pixels, band.saturation_value)
@@ -228,10 +230,7 @@ def read_window(
     """Read a window inside the image: pixels in the type of the file and their mask, each (height, width)."""
     window = Window(x0, y0, width, height)
     pixels = dataset.read(band.band_index, window=window)
-    valid = data_mask(pixels, band.nodata)
-    if MaskFlags.per_dataset in dataset.mask_flag_enums[band.band_index - 1]:
-        valid = valid & (dataset.read_masks(band.band_index, window=window) > 0)
-    return pixels, valid
+    return pixels, data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.band_index, window=window)
 
 
 def read_tile(band: Band, tile: Tile) -> tuple[NDArray[np.generic], Mask]:
@@ -293,11 +292,11 @@ def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDAr
     return np.stack([x, y], axis=-1)
 
 
-def _dataset_mask(dataset: rasterio.DatasetReader, index: int, shape: tuple[int, int]) -> Mask:
+def _dataset_mask(dataset: rasterio.DatasetReader, index: int, **reading: Any) -> Mask | np.bool_:
+    """Return the mask of a file, read with these options of `read_masks`; True for a file without a mask."""
     if MaskFlags.per_dataset not in dataset.mask_flag_enums[index - 1]:
-        return np.ones(shape, dtype=bool)
-    mask = dataset.read_masks(index, out_shape=shape, resampling=Resampling.nearest)
-    return np.asarray(mask > 0)
+        return np.True_
+    return np.asarray(dataset.read_masks(index, **reading) > 0)
 
 
 def _georeference(dataset: rasterio.DatasetReader) -> Georeference | None:

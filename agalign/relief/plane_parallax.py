@@ -44,9 +44,10 @@ _MIN_INFORMATION = 0.2
 _CLIP_MEDIANS = 5.0
 """Shifts are clipped at this multiple of the median for the initial estimate of the baselines."""
 _MIN_LAYOUT_COSINE = 0.8
-"""Baselines of scenes with depth have 0.998 with the layout of the lenses, those fitted to noise up to 0.55."""
+"""Minimum cosine similarity of the baselines and the lens layout: 0.998 for scenes with depth, up to 0.55 for noise."""
 _MIN_SPREAD = 0.3
-"""Of baselines, relative to the longest: at least 0.5 for real cameras, at most 0.2 where the reference is blurred."""
+"""Minimum distance of a baseline from the mean, relative to the longest: at least 0.5 for real cameras, at most 0.2 for
+a blurred reference."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class WindowShifts:
     def plus(self, parallax: Array, baselines: Array) -> "WindowShifts":
         """Add the parallax (n,) of the relief with which the windows were measured, along the baselines (bands, 2).
 
-        The result are shifts relative to the reference plane.
+        The results are shifts relative to the reference plane.
         """
         return replace(self, shifts_px=self.shifts_px + parallax[:, None, None] * baselines)
 
@@ -147,10 +148,10 @@ def fit_plane_parallax(
 
 
 def are_of_lenses(baselines: Array, layout: Array | None) -> bool:
-    """Return True if baselines (bands, 2) can be those of lenses with a layout (bands, 2), None if it is not known.
+    """Return True if baselines (bands, 2) are plausible for lenses with a layout (bands, 2), None if unknown.
 
-    Noise of the reference shifts the windows of all bands alike. It looks like parallax, and the relief of one band
-    predicts the others, but all baselines are nearly the same: no two lenses are in one place.
+    Noise of the reference shifts the windows of all bands equally. It resembles parallax that is common to the bands,
+    but all baselines are nearly equal, which those of different lenses are not.
     """
     if layout is not None:
         norms = np.linalg.norm(baselines) * np.linalg.norm(layout)

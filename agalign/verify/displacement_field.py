@@ -39,7 +39,7 @@ class FieldScale:
 
 
 LENS = FieldScale(window_px=48, lattice_px=96)
-"""For residual lens distortion in addition to a relief, which varies over hundreds of pixels."""
+"""For residual lens distortion, which varies over hundreds of pixels, in addition to a relief."""
 COARSE = FieldScale(window_px=64, lattice_px=48)
 """For most scenes: larger windows have less noise."""
 FINE = FieldScale(window_px=32, lattice_px=24, verification_px=32)
