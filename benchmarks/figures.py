@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 import agalign
 from agalign.config import JointSettings
 from agalign.evaluation.image_pairs import read_image
-from agalign.evaluation.methods import Task, method_named
+from agalign.evaluation.methods import PairTask, method_named
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.method.detect import sift_keypoints, to_8_bit, visible_in_both
 from agalign.method.paper import Training
@@ -53,7 +53,7 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
     drawn = rng.choice(len(keypoints), DRAWN, replace=False)
     rows = []
     for name, title in (("fast:pseudo-siamese", "learnt on this pair"), ("sift", "SIFT")):
-        describe = method_named(name)(Task(fixed, moving, start, seeding=False)).describe
+        describe = method_named(name)(PairTask(fixed, moving, start, seeding=False)).describe
         assert describe is not None
         f, f_prime = describe(keypoints, truth)
         nearest = ((f[:, None] - f_prime[None]) ** 2).sum(-1).argmin(1).numpy()

@@ -1,10 +1,10 @@
-"""Learns the network that recipe fast starts from, on synthetic flights, and writes agalign/method/starter.safetensors.
+"""Learn the initial network of recipe fast on synthetic flights and write agalign/method/starter.safetensors.
 
     python tools/learn_starter.py [scenes, by default 40]
 
-The program's own method on its own generator: one siamese network, one capture of each of many fields, in-batch
-negatives, no labels. Runs in about a quarter of an hour on one core; the same scenes give the same network.
-benchmarks/starter.py compares it with random weights.
+One siamese network is learnt with in-batch negatives, without labels, on one capture of each of many synthetic fields.
+It takes about a quarter of an hour on one core; equal numbers of scenes give equal networks. benchmarks/starter.py
+compares the network with random weights.
 """
 
 import sys
@@ -14,16 +14,27 @@ from pathlib import Path
 import torch
 
 import agalign
-from agalign.batch.learn import read_subject
 from agalign.cameras.discover import discover
-from agalign.config import JointSettings, Settings
+from agalign.capture.band_pair import read_pairs
+from agalign.capture.seeding import find_seed, image_groups
+from agalign.config import JointSettings, SeedSettings
 from agalign.method.fast import Schedule, learn
 from agalign.method.starter import save_starter
-from agalign.method.state import JointState
+from agalign.method.state import ImageGroup, JointState
 from agalign.synthetic.flight import make_flight
+from agalign.values.alignment import Seed
+from agalign.values.capture import Capture
 
 SCHEDULE = ((2e-3, 100), (5e-4, 50))
-"""Learning rates, and the steps a scene at each."""
+"""Learning rates, and the steps per scene at each."""
+
+
+def read_group(capture: Capture) -> ImageGroup:
+    """Read the images of a synthetic capture, which all have the same reference, with their seeds."""
+    pairs, _ = read_pairs(capture, SeedSettings())
+    seeds = [seed for pair in pairs if isinstance(seed := find_seed(pair, SeedSettings()), Seed)]
+    ((_, group),) = image_groups(pairs, seeds)
+    return group
 
 
 def main() -> None:
@@ -36,9 +47,9 @@ def main() -> None:
             folder = Path(temporary) / str(number)
             make_flight(folder, 1, rng_seed=1000 + number)
             captures += discover(folder).captures
-        groups = [read_subject(c, Settings())[0] for c in captures]
+        groups = [read_group(c) for c in captures]
     for rate, steps in SCHEDULE:
-        # psi may move as always, but nothing is ever learnt well enough to stop.
+        # A retrieval of 1 is never exceeded, so that no level ends before `max_steps`.
         schedule = Schedule(learning_rate=rate, max_steps=steps, enough_retrieval=1.0)
         settings = JointSettings(sharing="siamese")
         state = JointState(settings, lambda _, share, rate=rate: print(f"rate {rate:g}: {share:.0%}", flush=True))
