@@ -77,6 +77,14 @@ WithRgb = Annotated[
     bool,
     of_input("--with-rgb", help="Also align the camera's colour photograph (JPEG), as three bands."),
 ]
+Include = Annotated[
+    list[str] | None,
+    of_input(show_default=False, help="Use only files that match this glob by path or name; repeatable."),
+]
+Exclude = Annotated[
+    list[str] | None,
+    of_input(show_default=False, help="Ignore files that match this glob, such as '*/test/*'; repeatable."),
+]
 
 
 _EXAMPLES = examples(
@@ -102,14 +110,8 @@ def align(
     with_rgb: WithRgb = False,
     pattern: Pattern = None,
     ignore_metadata: IgnoreMetadata = False,
-    include: Annotated[
-        list[str] | None,
-        of_input(show_default=False, help="Use only files that match this glob by path or name; repeatable."),
-    ] = None,
-    exclude: Annotated[
-        list[str] | None,
-        of_input(show_default=False, help="Ignore files that match this glob, such as '*/test/*'; repeatable."),
-    ] = None,
+    include: Include = None,
+    exclude: Exclude = None,
     align_panels: Annotated[
         bool,
         of_input("--align-panels", help="Also align captures of calibration panels and of the sky."),

@@ -10,7 +10,9 @@ import typer
 
 from agalign.cli.align import (
     BandNames,
+    Exclude,
     IgnoreMetadata,
+    Include,
     Order,
     Pattern,
     Reference,
@@ -53,6 +55,8 @@ def info(
     order: Order = "index",
     with_rgb: WithRgb = False,
     ignore_metadata: IgnoreMetadata = False,
+    include: Include = None,
+    exclude: Exclude = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
     options: Annotated[
         bool, typer.Option("--options", help="Print a --config file with all options of 'agalign align'.")
@@ -75,7 +79,10 @@ def info(
         from agalign.flight.panels import with_panels
         from agalign.flight.sky import sky_captures
 
-        wanted = DiscoverOptions(pattern, reference, ignore_metadata, with_rgb, band_names(bands), order)
+        wanted = DiscoverOptions(
+            pattern, reference, ignore_metadata, with_rgb, band_names(bands), order, include=tuple(include or ()),
+            exclude=tuple(exclude or ()),
+        )  # fmt: skip
         flight = find_captures(folder, wanted, terminal, silent=as_json, required=False)
         if not flight.captures and not as_json:
             _show_unused(flight, terminal)

@@ -150,6 +150,13 @@ def test_globs_choose_files(tmp_path: Path) -> None:
         discover(tmp_path, DiscoverOptions(include=("*.jpg",)))
 
 
+def test_info_shows_what_the_globs_of_a_run_choose(tmp_path: Path) -> None:
+    for capture in ("IMG_0001", "IMG_0002"):
+        write_bands(tmp_path / "in", capture=capture)
+    done = CliRunner().invoke(app, ["info", str(tmp_path / "in"), "--json", "--exclude", "*_0002_*"])
+    assert [c["label"] for c in json.loads(done.stdout)["captures"]] == ["IMG_0001"]
+
+
 def test_expert_options_are_a_panel_at_the_end() -> None:
     lines = CliRunner().invoke(app, ["align", "--help"], env={"COLUMNS": "160"}).stdout.splitlines()
     panels = [line.split("─ ")[1].split(" ─")[0] for line in lines if line.startswith("╭")]

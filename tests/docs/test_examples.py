@@ -47,6 +47,9 @@ def test_the_notebook(tmp_path: Path) -> None:
     pytest.importorskip("ipykernel")
     notebook = nbformat.read(ROOT / "examples" / "flight.ipynb", as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "outputs are not kept in the repository"
+    first, *others = (cell.source for cell in notebook.cells if cell.cell_type == "code")
+    assert "import agalign\n" not in first, "own flights skip the first cell"
+    assert "IMG_" not in "".join(others), "other flights have other names"
     nbclient.NotebookClient(notebook, timeout=60, resources={"metadata": {"path": str(tmp_path)}}).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     text = "".join(o.get("text", "") + o.get("data", {}).get("text/plain", "") for o in outputs)
