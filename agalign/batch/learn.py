@@ -106,7 +106,7 @@ def _learn_network(
 
     try:
         # The network that learning would start from is often good enough.
-        results = refined() if net.learnt and all(all(group.trusted) for group in groups) else []
+        results = refined() if net.is_trained and all(all(group.trusted) for group in groups) else []
         if not results or not all(map(_is_good_enough, results)):
             for group, of_group in zip(groups, results, strict=False):
                 _move_to(group, of_group)

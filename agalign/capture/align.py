@@ -111,7 +111,7 @@ def align_pairs(
 ) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
     """Align the pairs of one `capture`; return the alignments by name, px of the images.
 
-    Pairs that the flight's network cannot align are learnt from scratch: with a rig only those without an accurate
+    Pairs that the flight's network cannot align are learned from scratch: with a rig only those without an accurate
     prediction, and without `scratch` only those that the network does not contain.
     """
     aligner = _PairAligner(settings, model, progress)
@@ -189,7 +189,7 @@ class _PairAligner:
         return bands_to_learn(pairs, self.result, self.model.rig, capture, self.settings.check.accept_predicted_px)
 
     def learn(self, starts: Sequence[Start]) -> None:
-        """Align pairs with networks that are learnt from scratch."""
+        """Align pairs with networks that are learned from scratch."""
         self._align(starts, [], lambda group, report: align_from_scratch(group, self.settings.joint, report))
 
     def fit_windows(self, starts: Sequence[Start]) -> None:

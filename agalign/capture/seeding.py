@@ -52,7 +52,7 @@ _SCALES = tuple(1.02**k for k in range(-18, 19) if k)
 """Scales relative to the overlay of the two images, 0.7 to 1.4. An error of 2 % reduces the correlation peak of a
 thermal and a blue image to three quarters."""
 _MAX_KEYPOINTS = 1000
-"""Limits the time of matching by learnt descriptors, which is the last step."""
+"""Limits the time of matching by learned descriptors, which is the last step."""
 
 
 def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None = None) -> Seed | Issue:
@@ -85,7 +85,7 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
 
 def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual: Residual[FixedImagePx]) -> Seed:
     """Return a match with a smaller residual than the best seed, or that seed."""
-    for mapping in _matches(pair, model, by_learnt_descriptors=not best.trusted):
+    for mapping in _matches(pair, model, by_learned_descriptors=not best.trusted):
         match, match_residual = _unshifted(pair, mapping), _residual_of(pair, mapping)
         corrected = _corrected(pair, mapping, match_residual)
         if corrected is not None:
@@ -107,7 +107,7 @@ def find_rotated(pair: BandPair, fixed_to_moving: Matrix, given: Residual[FixedI
     """
     if seed_fits(given):
         return None
-    for result in _matches(pair, None, by_learnt_descriptors=False):
+    for result in _matches(pair, None, by_learned_descriptors=False):
         residual = _residual_of(pair, result)
         change = geometry.compose(geometry.invert(fixed_to_moving), result)
         if seed_fits(residual) and residual.is_better_than(given) and _is_rotated_or_scaled(change, pair.fixed.size_px):
@@ -133,15 +133,15 @@ def _corrected(pair: BandPair, fixed_to_moving: Matrix, residual: Residual[Fixed
         return None
 
 
-def _matches(pair: BandPair, model: FlightModel | None, *, by_learnt_descriptors: bool) -> Iterator[Matrix]:
-    """Yield mappings from landmarks, then from learnt descriptors; any rotation, scale and shift is possible."""
+def _matches(pair: BandPair, model: FlightModel | None, *, by_learned_descriptors: bool) -> Iterator[Matrix]:
+    """Yield mappings from landmarks, then from learned descriptors; any rotation, scale and shift is possible."""
     for source in LANDMARK_INPUTS:
         fixed = pair.reference.landmarks(source).undistorted(pair.fixed.lens)
         moving = landmarks(pair.moving, source).undistorted(pair.moving.lens)
         result = matched_homography(fixed, moving, pair.fixed.size_px)
         if result is not None:
             yield result
-    if by_learnt_descriptors:
+    if by_learned_descriptors:
         result = match_seed(_network(pair, model), pair.fixed, pair.moving, _MAX_KEYPOINTS)
         if result is not None:
             yield result

@@ -37,17 +37,17 @@ _MAX_VALUE = 1e6
 
 @dataclass(frozen=True)
 class FlightModel:
-    """A learnt network, the mappings of the bands and the rig of one camera."""
+    """A learned network, the mappings of the bands and the rig of one camera."""
 
     net: Descriptor
     camera: str
-    """`groups.flight_camera` of the captures; empty if it was learnt on pairs of several cameras."""
+    """`groups.flight_camera` of the captures; empty if it was learned on pairs of several cameras."""
     bands: tuple[str, ...]
     """Names of the moving bands, in the order of the network's sides from 1."""
     mappings: Mapping[str, Matrix]
     """Median fixed_to_moving of each band that passed held-out retrieval, undistorted px of the files."""
     fingerprint: str
-    """Hash of the captures and settings from which it was learnt."""
+    """Hash of the captures and settings from which it was learned."""
     rig: Rig | None = None
     """Geometry of the camera; None if too few captures determine it."""
 
@@ -97,7 +97,7 @@ def _read_model(path: Path) -> FlightModel:
         raise ValueError(f"invalid numbers of channels: {channels[:8]}")
     net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
     net.load_state_dict(_with_prefix("theta.", tensors))
-    net.learnt = True
+    net.is_trained = True
     fields = {band: values.numpy() for band, values in _with_prefix("field.", tensors).items()}
     mappings = {band: normalised(matrix.numpy()) for band, matrix in _with_prefix("mapping.", tensors).items()}
     bands = tuple(map(str, json.loads(facts["bands"])))

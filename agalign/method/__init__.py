@@ -1,1 +1,1 @@
-"""The method of Dong et al. (2018): a descriptor is learnt on the images while their homographies are optimised."""
+"""The method of Dong et al. (2018): a descriptor is learned on the images while their homographies are optimised."""

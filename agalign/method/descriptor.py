@@ -89,7 +89,7 @@ class Descriptor(nn.Module):
             )
         self.sharing = sharing
         self.channels = tuple(channels)
-        self.learnt = False
+        self.is_trained = False
         """False for random weights, which are trained before the first step on psi."""
         self.unit_length = unit_length
         first_channels = channels if sharing != "siamese" else channels[:1]

@@ -40,8 +40,8 @@ LEARNING_RATE = 2e-3
 _TEMPERATURE = 0.07
 """Temperature of the in-batch loss (He et al. 2020, Sec. 3.3)."""
 _LEARN_PX = 640
-"""Longer side of the images on which theta is learnt, but at least half of the full resolution: weights learnt at this
-scale also serve at full resolution, at a quarter of the cost."""
+"""Longer side of the images on which theta is learned, but at least half of the full resolution. These weights are also
+used at full resolution; learning there costs four times as much."""
 _COARSEST_PX = 200
 """The longer side of the coarsest level, where an untrusted seed starts, is between this and twice this."""
 _SEARCH_RADIUS_SHARE = 0.22
@@ -55,7 +55,7 @@ _OCTAVES = 1.0
 _WARM_UP_STEPS = 50
 """Steps on random weights before the first step on psi."""
 _FIRST_UPDATES = 5
-"""Steps on psi before learnt weights are trained further; twice as many if psi converges without training."""
+"""Steps on psi before learned weights are trained further; twice as many if psi converges without training."""
 _STEPS_BETWEEN_UPDATES = 10
 """Steps on theta per capture between two steps on psi."""
 _MAX_STEPS_WITHOUT_RETRIEVAL = 30
@@ -105,9 +105,9 @@ def learn(
             ]
             if not at_level:
                 continue
-            if scale == scales[0] and net.learnt:
+            if scale == scales[0] and net.is_trained:
                 list(pool.map(_search, at_level))
-            if not net.learnt or not _converges(at_level, update_psi):
+            if not net.is_trained or not _converges(at_level, update_psi):
                 level_steps, loss = _train(state, net, at_level, schedule, update_psi)
                 steps += level_steps
             for group in at_level:
@@ -121,7 +121,7 @@ def _bands_at(group: ImageGroup, *, is_finest: bool) -> list[int]:
 
 
 def learn_scales(longer_side_px: int) -> list[float]:
-    """Return the scales of the levels on which theta is learnt, coarse to fine; 1 is full resolution."""
+    """Return the scales of the levels on which theta is learned, coarse to fine; 1 is full resolution."""
     scales = [min(1.0, max(0.5, _LEARN_PX / longer_side_px))]
     while scales[0] * longer_side_px >= 2 * _COARSEST_PX:
         scales.insert(0, scales[0] / 2)
@@ -216,7 +216,7 @@ def _train(
     """
     loss_value, count = math.nan, len(at_level)
     max_steps = schedule.max_steps * count
-    warm_up = 0 if net.learnt else _WARM_UP_STEPS
+    warm_up = 0 if net.is_trained else _WARM_UP_STEPS
     optimiser = Adam(net.parameters(), schedule.learning_rate)
     for step in range(1, max_steps + 1):
         loss = _loss(at_level[step % count])
@@ -230,7 +230,7 @@ def _train(
             break
         if step >= warm_up + _MAX_STEPS_WITHOUT_RETRIEVAL * count and not any(any(g.distinguished) for g in at_level):
             break
-    net.learnt = True
+    net.is_trained = True
     return step, loss_value
 
 

@@ -1,4 +1,4 @@
-"""Initial alignment for large displacements: SIFT keypoints, learnt descriptors, mutual nearest neighbours, MAGSAC++
+"""Initial alignment for large displacements: SIFT keypoints, learned descriptors, mutual nearest neighbours, MAGSAC++
 (after the paper's supplement).
 """
 
@@ -27,12 +27,12 @@ _MIN_MATCHES = 12
 """Minimum number of inliers of a homography: unrelated images have up to 7."""
 
 
-def matching_network(learnt: Descriptor, side: int, channels: tuple[int, int]) -> Descriptor:
-    """Return a two-sided network with the weights of the reference side and of moving side `side` of a learnt one."""
-    sharing: Sharing = "unshared" if learnt.sharing == "unshared" else "pseudo-siamese"
+def matching_network(learned: Descriptor, side: int, channels: tuple[int, int]) -> Descriptor:
+    """Return a two-sided network with the weights of the reference side and of moving side `side` of a learned one."""
+    sharing: Sharing = "unshared" if learned.sharing == "unshared" else "pseudo-siamese"
     net = Descriptor(sharing, channels, half_rectified=True, unit_length=True)
-    start_from(net, learnt.state_dict(), (REFERENCE, side))
-    return net.to(next(learnt.parameters()).device)
+    start_from(net, learned.state_dict(), (REFERENCE, side))
+    return net.to(next(learned.parameters()).device)
 
 
 def starter_for_matching(channels: tuple[int, int]) -> Descriptor:

@@ -120,7 +120,7 @@ def descend(
 ) -> Descent:  # fmt: skip
     """Minimise sum L0(x; psi, theta) + sum L1(x, x'; theta) over theta and psi (paper, Eq. 5).
 
-    Keypoints x are drawn from `pool`. Without `move`, psi is constant and only theta is learnt (paper, Eq. 3). Raises
+    Keypoints x are drawn from `pool`. Without `move`, psi is constant and only theta is learned (paper, Eq. 3). Raises
     NotEnoughTextureError.
     """
     size_px = level.fixed.size_px

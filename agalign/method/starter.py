@@ -1,4 +1,4 @@
-"""Initial weights of recipe fast, learnt by the same method on synthetic flights (tools/learn_starter.py).
+"""Initial weights of recipe fast, learned by the same method on synthetic flights (tools/learn_starter.py).
 
 They are those of a siamese network. Every side of a pseudo-siamese network starts with its first layer.
 """
@@ -34,7 +34,7 @@ def start_from(net: Descriptor, weights: Mapping[str, Tensor], sides: Sequence[i
             weight = weight.sum(dim=1, keepdim=True).expand_as(value) / value.shape[1]
         state[name] = weight
     net.load_state_dict(state)
-    net.learnt = True
+    net.is_trained = True
 
 
 def start_from_starter(net: Descriptor) -> None:

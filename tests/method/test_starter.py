@@ -24,7 +24,7 @@ def test_every_side_starts_alike(sharing: Sharing) -> None:
     here, there, elsewhere = (net(PATCHES, side) for side in range(3))
     torch.testing.assert_close(here, there)
     torch.testing.assert_close(here, elsewhere)
-    assert net.learnt
+    assert net.is_trained
 
 
 def test_three_equal_channels_are_described_as_one() -> None:
