@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     import xarray
 
 _RAW_UNIT = "count"
+_ROTATED_AXES = ("xc", "yc")
+"""Map coordinates of every pixel that rioxarray adds to rotated grids."""
 _SUFFIX = re.compile(r"(?:\.stac)?\.json$|\.tiff?$", re.IGNORECASE)
 """Suffix of a sidecar, a STAC item or a stack."""
 _COORDINATES = ("latitude", "longitude", "altitude_m")
@@ -28,7 +30,8 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """Return the aligned bands of a capture, read lazily with dask, given its sidecar, stack or STAC item.
 
     Dimensions are y and x, at pixel centres: map coordinates if the capture is georeferenced (`.rio.crs`), else px of
-    the output, with (0, 0) the centre of the top-left pixel. A variable has the name of its band and the attributes
+    the output, with (0, 0) the centre of the top-left pixel. On a rotated grid, as `--georeference` writes it, the map
+    coordinates are `xc` and `yc`, of every pixel. A variable has the name of its band and the attributes
     `wavelength_nm`, `units` and `status`. Values are float32 with nan for nodata. With `masked=False` they have the
     type of the file, with its nodata value as `_FillValue`; differences of unsigned integers then wrap around.
     Bands without pixels are left out. A capture with a relief has the variable `parallax` (px along a baseline of
@@ -162,7 +165,7 @@ def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str, *
 def _in_pixels(dataset: "xarray.Dataset") -> "xarray.Dataset":
     """The dataset with pixel coordinates instead of map coordinates."""
     px = {axis: range(dataset.sizes[axis]) for axis in ("y", "x")}
-    return dataset.drop_vars("spatial_ref", errors="ignore").assign_coords(px)
+    return dataset.drop_vars(["spatial_ref", *_ROTATED_AXES], errors="ignore").assign_coords(px)
 
 
 def _time(sidecar: Sidecar) -> Any:

@@ -76,6 +76,17 @@ def test_a_place_on_the_map_and_masked_pixels_follow(tmp_path: Path) -> None:
     assert np.isnan(masked.red.values[:40, :40]).all()
 
 
+def test_captures_on_rotated_grids_are_stacked(tmp_path: Path) -> None:
+    make_flight(tmp_path / "in", 2, (480, 360), rng_seed=3)
+    write = WriteSettings(georeference=True, ground_elevation_m=0.0)
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=SEEDED.model_copy(update={"write": write}))
+    one = agalign.open_capture(tmp_path / "out" / "0000SET" / "000" / "IMG_0001.json")
+    assert one.xc.shape == (one.sizes["y"], one.sizes["x"])
+    flight = agalign.open_flight(tmp_path / "out")
+    assert (flight.sizes["capture"], float(flight.x[0]), float(flight.y[0])) == (2, 0.0, 0.0)
+    assert "xc" not in flight.coords
+
+
 def test_what_cannot_be_opened_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no aligned captures"):
         agalign.open_flight(tmp_path)
