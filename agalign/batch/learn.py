@@ -30,10 +30,10 @@ from agalign.method.starter import start_from
 from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
-from agalign.values.alignment import MIN_RETRIEVAL, JointResult, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
-from agalign.values.pixel_units import FixedFilePx, MovingFilePx
+from agalign.values.pixel_units import FixedFilePx, FixedImagePx, MovingFilePx
 from agalign.verify.displacement_field import common_field
 from agalign.verify.extrapolation_check import unobserved_quarters
 from agalign.verify.lens_shapes import unmodelled_std_px
@@ -304,13 +304,17 @@ class _Shown:
 
 def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Refined | None) -> _Shown:
     """Raises UnreadableFileError where the reference cannot be read."""
-    if known is None:
-        pairs, _ = read_pairs(capture, settings.seed, model)
-        result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
-    else:
+    result: Mapping[str, Alignment[FixedImagePx]] = {}
+    if known is not None:
         pairs = known.loaded.pairs
         starts = list(zip(pairs, known.loaded.seeds, strict=True))
         result = verify_together(starts, known.results, model, settings)
+    if not result or any(
+        a.status != "aligned" and a.joint is not None and a.joint.retrieval >= MIN_RETRIEVAL for a in result.values()
+    ):
+        # The model's mappings are better initial alignments than those that the network was learned from.
+        pairs, _ = read_pairs(capture, settings.seed, model)
+        result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
     pairs = [p for p in pairs if p.has_rig_pixels]
     in_file_px = {p.name: result[p.name].in_file_px(p.scales) for p in pairs}
     good = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
