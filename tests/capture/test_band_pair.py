@@ -35,7 +35,7 @@ def test_a_seed_that_tags_do_not_give_is_not_replaced_by_another(flight: Path, k
     assert {a.reason for a in result.values()} == {f"this band has no {kind} seed; omit --seed"}
 
 
-def test_the_reference_is_worked_out_once_for_all_bands(flight: Path) -> None:
+def test_the_reference_is_computed_once_for_all_bands(flight: Path) -> None:
     pairs, left_out = read_pairs(discover(flight).captures[0], SeedSettings())
     assert not left_out
     assert len(pairs) == 4
@@ -62,7 +62,7 @@ def test_without_one_lens_neither_is_corrected(flight: Path) -> None:
     ("ratio", "longest"),
     [(1.0, 2700), (2.0, 2700), (0.5, 2700), (0.25, 640), (0.0775, 198), (0.01, 128), (0.0, 2700)],
 )
-def test_for_a_band_of_few_pixels_the_reference_is_reduced(ratio: float, longest: int) -> None:
+def test_the_reference_is_reduced_for_a_coarse_band(ratio: float, longest: int) -> None:
     band = Band("Green", Path("x.tif"), 1, 1280, 960, "uint16")
     mapping = np.diag([abs(ratio), ratio, 1.0])
     assert longest_for(band, mapping) == longest
@@ -110,7 +110,7 @@ def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
     assert known.std_px[pair.name] == pytest.approx(0.02)
 
 
-def test_what_a_rig_misses_is_brought_to_px_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_a_rig_is_converted_to_px_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     band, size = "LWIR", (800, 600)
     rig = Rig(size, {band: np.diag([0.1, 0.1, 1.0])}, {band: (1.0, 0.0)}, {}, {}, {}, (), (), {band: 0.5})
     monkeypatch.setattr(band_pair, "unobserved_error_px", lambda *_, **__: 0.5)

@@ -55,7 +55,7 @@ def scene() -> np.ndarray:
 
 
 @pytest.mark.parametrize("other_share", [0.2, 0.5])
-def test_a_band_of_another_field_of_view_is_predicted_with_its_error(scene: np.ndarray, other_share: float) -> None:
+def test_a_band_with_another_field_of_view_is_predicted_with_its_error(scene: np.ndarray, other_share: float) -> None:
     pair, result = tried(scene[100:340, 100:420], thermal(scene, other_share))
     assert result.status == "predicted"
     assert result.prediction is not None
@@ -73,13 +73,13 @@ def test_an_unrelated_image_is_not_predicted(scene: np.ndarray) -> None:
     assert (result.status, result.prediction) == ("failed", None)
 
 
-def test_a_scene_that_repeats_is_not_predicted() -> None:
+def test_a_repetitive_scene_is_not_predicted() -> None:
     tile = np.tile(textured_image(40, 40, seed=4), (11, 13))
     _, result = tried(tile[100:340, 100:420], thermal(tile, 0.2))
     assert (result.status, result.prediction) == ("failed", None)
 
 
-def test_a_band_of_the_usual_resolution_is_left_as_it_is(scene: np.ndarray) -> None:
+def test_a_band_of_full_resolution_is_unchanged(scene: np.ndarray) -> None:
     pair, result = tried(scene[100:340, 100:420], thermal(scene, 0.2))
     failed = replace(result, status="failed", prediction=None)
     assert predicted_if_coarse(replace(pair, is_coarse=False), failed) is failed

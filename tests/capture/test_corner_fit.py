@@ -29,7 +29,7 @@ def test_the_windows_correct_the_homography_through_the_displacement_field() -> 
         np.testing.assert_allclose(geometry.apply(corrected, [300.0, 200.0]), [305.0 + expected_px, 202.5], atol=0.02)
 
 
-def test_what_all_windows_share_is_part_of_the_uncertainty() -> None:
+def test_the_common_error_of_windows_is_part_of_the_uncertainty() -> None:
     fit = corner_correction(PixelMapping(np.eye(3)), residual((0.3, 0.0), 60, 40), SIZE)
     assert fit is not None
     std_px = np.sqrt(np.diag(fit.covariance_px2))
@@ -41,7 +41,7 @@ def test_too_few_windows_correct_nothing() -> None:
     assert corner_correction(PixelMapping(np.eye(3)), residual((1.0, 0.0), 4, 4), SIZE) is not None
 
 
-def test_windows_with_a_wrong_peak_do_not_move_the_corners() -> None:
+def test_windows_with_a_wrong_peak_do_not_bias_the_corners() -> None:
     some = residual((0.4, -0.2))
     shifts = some.shifts_px + np.random.default_rng(0).normal(0, 0.03, some.shifts_px.shape)
     clean = fit_corners(some.centres_px, shifts, some.peaks_sigma, SIZE)
@@ -54,7 +54,7 @@ def test_windows_with_a_wrong_peak_do_not_move_the_corners() -> None:
     assert np.trace(fit.covariance_px2) > np.trace(clean.covariance_px2)
 
 
-def test_windows_with_low_peaks_hardly_count() -> None:
+def test_windows_with_low_peaks_have_little_weight() -> None:
     some = residual((0.0, 0.0), 16, 12)
     shifts, peaks = some.shifts_px.copy(), some.peaks_sigma.copy()
     low = np.random.default_rng(2).permutation(192)[:96]
@@ -65,7 +65,7 @@ def test_windows_with_low_peaks_hardly_count() -> None:
     np.testing.assert_allclose(fit.mean_px[0::2].mean(), 0.1 / 17, atol=0.002)
 
 
-def test_the_covariance_is_what_repeated_fits_scatter_by() -> None:
+def test_the_covariance_equals_the_scatter_of_repeated_fits() -> None:
     rng = np.random.default_rng(3)
     some = residual((0.0, 0.0), 16, 12)
     fits = [fit_corners(some.centres_px, rng.normal(0, 0.1, (192, 2)), some.peaks_sigma, SIZE) for _ in range(200)]

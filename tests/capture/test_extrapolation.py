@@ -66,7 +66,7 @@ def errors_px(alignment: Alignment, points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(mapping(points) - truth, axis=1)
 
 
-def test_half_of_the_image_is_extrapolated_with_the_lens_and_the_error_is_stated() -> None:
+def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error() -> None:
     pair = pair_in(LEFT)
     before = aligned(pair)
     after = without_extrapolated([pair], {"moving": before})["moving"]
@@ -87,14 +87,14 @@ def test_half_of_the_image_is_extrapolated_with_the_lens_and_the_error_is_stated
     assert (errors_px(after, points) < 3 * expected).mean() > 0.95
 
 
-def test_an_image_that_shows_everything_is_left_as_it_is() -> None:
+def test_a_fully_covered_image_is_unchanged() -> None:
     pair = pair_in((slice(None), slice(None)))
     before = aligned(pair)
     assert without_extrapolated([pair], {"moving": before})["moving"] is before
 
 
 @pytest.mark.parametrize(("extrapolation_px", "status"), [({}, "aligned"), ({"moving": 0.7}, "predicted")])
-def test_a_rig_that_shows_the_whole_image_is_enough(extrapolation_px: dict[str, float], status: str) -> None:
+def test_a_rig_of_the_whole_image_prevents_extrapolation(extrapolation_px: dict[str, float], status: str) -> None:
     pair = replace(pair_in(LEFT), candidate_std_px={"model": 1.0})
     rig = Rig(
         SIZE, {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}, {"moving": 0.1}, {"moving": (0.0,) * 5},
@@ -104,7 +104,7 @@ def test_a_rig_that_shows_the_whole_image_is_enough(extrapolation_px: dict[str, 
     assert without_extrapolated([pair], {"moving": before}, rig)["moving"].status == status
 
 
-def test_georeferenced_files_and_failed_pairs_are_left_as_they_are() -> None:
+def test_georeferenced_files_and_failed_pairs_are_unchanged() -> None:
     pair = pair_in(LEFT)
     before = aligned(pair)
     mosaic = replace(pair, candidates={"geo": np.eye(3)})
@@ -114,7 +114,7 @@ def test_georeferenced_files_and_failed_pairs_are_left_as_they_are() -> None:
 
 
 @pytest.mark.slow
-def test_arrays_of_which_a_half_is_masked_are_predicted() -> None:
+def test_half_masked_arrays_are_predicted() -> None:
     fixed, moving = bent_images()
     result = agalign.align(fixed, moving, fixed_valid=valid_in(RIGHT), moving_valid=valid_in(RIGHT))
     assert result.status == "predicted"

@@ -52,7 +52,7 @@ def found_together(red: JointResult, nir: JointResult, the_rig: Rig | None) -> d
     return map_estimate(pairs(), result, dict.fromkeys(result, NOTHING), the_rig)
 
 
-def test_corners_without_evidence_lie_where_the_rig_has_them_and_say_how_well() -> None:
+def test_corners_without_texture_follow_the_rig_with_its_error() -> None:
     off = np.array([[0.0, 0.0], [2.5, -1.5], [-2.0, 3.0], [0.0, 0.0]])
     known = np.array([[0.03] * 2, [4.0] * 2, [4.0] * 2, [0.03] * 2])
     both = found_together(result(np.zeros((4, 2)), np.full((4, 2), 0.03)), result(off, known), rig())
@@ -62,7 +62,7 @@ def test_corners_without_evidence_lie_where_the_rig_has_them_and_say_how_well() 
     assert ((std[[1, 2]] > 0.05) & (std[[1, 2]] < 0.3)).all()
 
 
-def test_the_ground_s_distance_is_learnt_from_the_band_that_shows_it() -> None:
+def test_the_distance_is_estimated_from_the_band_with_texture() -> None:
     """Red moved by 3 px along its baseline: near infra-red, which says nothing, by as much along its own."""
     red = result(np.tile([3.0, 0.0], (4, 1)), np.full((4, 2), 0.03))
     blind = result(np.zeros((4, 2)), np.full((4, 2), 50.0))
@@ -71,7 +71,7 @@ def test_the_ground_s_distance_is_learnt_from_the_band_that_shows_it() -> None:
     np.testing.assert_allclose(corners_beside_the_mean(both["red"]), np.tile([3.0, 0.0], (4, 1)), atol=0.02)
 
 
-def test_a_band_that_is_sure_of_another_place_is_free_of_the_rig() -> None:
+def test_a_certain_band_is_not_biased_by_the_rig() -> None:
     there = np.array([[1.2, 0.0], [0.0, 1.4], [-1.2, 0.0], [1.0, 1.0]])
     both = found_together(
         result(np.zeros((4, 2)), np.full((4, 2), 0.03)), result(there, np.full((4, 2), 0.03)), rig(0.05)
@@ -79,7 +79,7 @@ def test_a_band_that_is_sure_of_another_place_is_free_of_the_rig() -> None:
     np.testing.assert_allclose(corners_beside_the_mean(both["nir"]), there, atol=0.05)
 
 
-def test_without_a_rig_what_was_found_stays() -> None:
+def test_without_a_rig_the_results_are_unchanged() -> None:
     there = np.array([[0.2, 0.0], [0.0, 0.1], [-0.3, 0.0], [0.0, 0.0]])
     red = result(there, np.full((4, 2), 0.05))
     both = found_together(red, replace(red), None)
@@ -87,7 +87,7 @@ def test_without_a_rig_what_was_found_stays() -> None:
     np.testing.assert_allclose(both["red"].corner_std_xy_px, red.corner_std_xy_px, atol=1e-6)
 
 
-def test_windows_mend_what_the_descriptors_left() -> None:
+def test_windows_correct_the_result_of_the_descriptors() -> None:
     truth = geometry.translation(5.0, -3.0)
     fixed, moving = textured_pair(truth, *SIZE)
     images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, moving))
@@ -104,7 +104,7 @@ def test_windows_mend_what_the_descriptors_left() -> None:
     assert after.corner_std_px < 0.1
 
 
-def test_windows_in_a_line_say_nothing_of_what_lies_beside_it() -> None:
+def test_collinear_windows_do_not_determine_corners_away_from_the_line() -> None:
     x = np.linspace(40.0, 600.0, 20)
     centres = np.column_stack([x, np.full(20, 240.0)])
     rng = np.random.default_rng(0)
@@ -117,7 +117,7 @@ def test_windows_in_a_line_say_nothing_of_what_lies_beside_it() -> None:
     assert results.corner_std_px > 0.5
 
 
-def test_a_band_that_few_captures_show_does_not_cost_the_others() -> None:
+def test_a_band_in_few_captures_does_not_affect_the_others() -> None:
     """The rig of 25 captures, of which three show near infra-red, twelve captures apart."""
     rng = np.random.default_rng(2)
     shown = []

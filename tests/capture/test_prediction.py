@@ -62,13 +62,13 @@ def error_px(five: Path, capture: str, file: str, matrix: np.ndarray) -> float:
     return geometry.corner_error_px(matrix, np.array(truth["fixed_to_moving"]), 400, 300)
 
 
-def test_the_rig_of_the_flight_is_learnt(model: FlightModel) -> None:
+def test_the_rig_of_the_flight_is_learned(model: FlightModel) -> None:
     assert model.rig is not None
     assert "distance" in model.rig.factors
     assert set(model.rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
 
 
-def test_a_model_that_still_holds_is_kept_and_one_that_does_not_is_learnt_anew(five: Path, model: FlightModel) -> None:
+def test_a_valid_model_is_kept_and_an_outdated_one_is_learned_again(five: Path, model: FlightModel) -> None:
     captures = discover(five).captures
     again = learn_flight(captures, Settings(), lambda *_: None, start=model)
     assert again is not None
@@ -83,7 +83,7 @@ def test_a_model_that_still_holds_is_kept_and_one_that_does_not_is_learnt_anew(f
     assert anew.rig is not moved.rig
 
 
-def test_a_lost_band_is_predicted_with_an_error_bar_and_never_called_aligned(five: Path, model: FlightModel) -> None:
+def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, model: FlightModel) -> None:
     capture = discover(five).captures[2]
     result = align_capture_bands(capture, Settings(), model, lambda *_: None)
     assert {b: a.status for b, a in result.items()} == {
@@ -98,7 +98,7 @@ def test_a_lost_band_is_predicted_with_an_error_bar_and_never_called_aligned(fiv
     assert result["Red"].prediction.off_px is not None
 
 
-def test_a_capture_over_water_costs_little_and_is_written(run: Run) -> None:
+def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
     out, reports = run
     water = reports["IMG_0005"].sidecar
     assert water is not None
@@ -119,7 +119,7 @@ def test_a_capture_over_water_costs_little_and_is_written(run: Run) -> None:
     assert "; predicted from " in (out / "index.html").read_text()
 
 
-def test_an_alignment_where_the_rig_cannot_be_is_not_believed(five: Path, model: FlightModel) -> None:
+def test_an_alignment_that_contradicts_the_rig_is_rejected(five: Path, model: FlightModel) -> None:
     """The images agree a period away; the other bands say that it is impossible."""
     assert model.rig is not None
     moved = {
@@ -136,7 +136,7 @@ def test_an_alignment_where_the_rig_cannot_be_is_not_believed(five: Path, model:
 @pytest.mark.parametrize(
     ("std_px", "away_px", "source"), [(0.001, 0.0, "windows"), (50.0, 0.0, "bands"), (0.001, 40.0, "bands")]
 )
-def test_what_windows_predict_stays_where_it_is_better_and_agrees(
+def test_a_more_accurate_prediction_by_windows_is_kept(
     five: Path, model: FlightModel, std_px: float, away_px: float, source: str
 ) -> None:
     """A displacement field with many windows off by more than a pixel is predicted, too; the rig knows no relief."""
@@ -155,9 +155,7 @@ def test_what_windows_predict_stays_where_it_is_better_and_agrees(
     assert (checked.status, checked.prediction.source) == ("predicted", source)
 
 
-def test_a_band_that_shows_itself_turned_is_not_placed_by_the_rig(
-    five: Path, model: FlightModel, tmp_path: Path
-) -> None:
+def test_a_rotated_band_is_not_predicted_by_the_rig(five: Path, model: FlightModel, tmp_path: Path) -> None:
     """No rig turns a lens: where the rig says is not where such an image lies, and it must not count as delivered."""
     copy = tmp_path / "five"
     shutil.copytree(five, copy)

@@ -132,7 +132,7 @@ def near(mask: Mask) -> Mask:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
-def test_occluded_pixels_are_found(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
+def test_occluded_pixels_are_detected(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
     in_all = np.logical_and.reduce([t.inside for t in boxes.truth.bands.values()])
     found, true, found_right, true_found = 0, 0, 0, 0
     for band in MOVING:
@@ -172,7 +172,9 @@ def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequenc
     assert np.corrcoef(parallax.relief(boxes.pixels).ravel(), boxes.truth.range_m.ravel())[0, 1] < -0.5
 
 
-def test_bands_that_were_measured_in_windows_of_different_sizes(candidates: Sequence[ReliefCandidate]) -> None:
+def test_bands_measured_in_windows_of_different_sizes_have_common_residuals(
+    candidates: Sequence[ReliefCandidate],
+) -> None:
     """They are compared in windows that all of them have."""
     counts = {len(c.warped.residual.centres_px) for c in candidates}
     assert len(counts) > 1
@@ -198,7 +200,7 @@ def test_a_flat_scene_gets_no_relief(flat: Rendered) -> None:
 
 
 @pytest.mark.parametrize("has_layout", [True, False])
-def test_what_the_reference_alone_shows_is_no_relief(flat: Rendered, has_layout: bool) -> None:
+def test_noise_of_the_reference_is_not_relief(flat: Rendered, has_layout: bool) -> None:
     """Its displacements are the same in all bands: each band's relief predicts the others."""
     width, height = flat.size_px
     displacement = cv2.resize(
@@ -215,9 +217,7 @@ def test_what_the_reference_alone_shows_is_no_relief(flat: Rendered, has_layout:
 
 
 @pytest.mark.parametrize(("height_px", "shown"), [(0.25, False), (1.0, True)])
-def test_parallax_as_small_as_the_noise_of_large_windows_is_no_relief(
-    flat: Rendered, height_px: float, shown: bool
-) -> None:
+def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float, shown: bool) -> None:
     """However well the bands agree on it."""
     result = []
     for candidate, band in zip(flat.candidates(), MOVING, strict=True):
@@ -271,7 +271,7 @@ def unrelated(size_px: tuple[int, int], seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["noise", "unrelated", "scrambled"])
-def test_a_band_of_something_else_is_not_aligned(boxes: Rendered, kind: str) -> None:
+def test_an_unrelated_band_is_not_aligned(boxes: Rendered, kind: str) -> None:
     makers = {"noise": noise(boxes.size_px, 7), "unrelated": unrelated(boxes.size_px, 7)}
     nir = makers[kind] if kind in makers else scrambled(boxes.images["NIR"], 3)
     result = aligned_by_relief(boxes.candidates({"NIR": nir}), "always")
@@ -282,7 +282,7 @@ def test_a_band_of_something_else_is_not_aligned(boxes: Rendered, kind: str) -> 
 
 
 @pytest.mark.parametrize("kind", ["noise", "unrelated", "scrambled"])
-def test_nothing_but_something_else(boxes: Rendered, kind: str) -> None:
+def test_unrelated_bands_are_not_aligned(boxes: Rendered, kind: str) -> None:
     def instead(name: str, number: int) -> np.ndarray:
         if kind == "scrambled":
             return scrambled(boxes.images[name], number)

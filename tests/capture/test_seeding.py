@@ -30,14 +30,14 @@ def best(images: tuple[Raster, Raster], candidates: Candidates, force: SeedKind 
     return best_seed(BandPair.of_images("moving", *images, candidates), candidates, force)
 
 
-def test_structure_finds_a_shift_that_nothing_told() -> None:
+def test_structure_finds_an_unknown_shift() -> None:
     seed = best(rasters(SHIFTED), {"identity": np.eye(3)})
     assert seed.kind == "structure"
     assert seed.trusted
     assert mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 3
 
 
-def test_the_true_rig_wins_over_a_wrong_one_and_is_kept_as_it_is() -> None:
+def test_the_true_rig_is_preferred_to_a_wrong_one_and_unchanged() -> None:
     wrong = geometry.translation(-40, 25)
     seed = best(rasters(SHIFTED), {"rig": SHIFTED, "geo": wrong, "identity": np.eye(3)})
     assert seed.kind == "rig"
@@ -88,7 +88,7 @@ def test_geo_seed_maps_the_same_ground_to_the_same_ground() -> None:
         geo_seed(band(100, 100, fine), band(50, 50, other))
 
 
-def test_the_flights_mapping_is_enough_where_it_leaves_no_doubt() -> None:
+def test_a_trusted_mapping_of_the_flight_suffices() -> None:
     near = geometry.compose(SHIFTED, geometry.translation(0.3, 0.1))
     seed = best(rasters(SHIFTED), {"model": near, "identity": np.eye(3)})
     assert seed.kind in ("model", "structure")
@@ -109,7 +109,7 @@ def turned(image: np.ndarray, degrees: float, scale: float) -> tuple[np.ndarray,
 
 
 @pytest.mark.parametrize(("degrees", "scale"), [(3, 1.0), (45, 1.0), (180, 1.0), (10, 0.6), (-90, 1.5)])
-def test_landmarks_find_what_is_turned_or_scaled(degrees: float, scale: float) -> None:
+def test_landmarks_align_rotated_and_scaled_images(degrees: float, scale: float) -> None:
     fixed, moving = textured_pair(SHIFTED)
     image, valid, to_turned = turned(moving, degrees, scale)
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
@@ -127,7 +127,7 @@ def pair_turned(degrees: float, candidates: Candidates, candidate_std_px: dict[s
     return BandPair.of_images("moving", *images, candidates, candidate_std_px or {})  # type: ignore[arg-type]
 
 
-def test_tags_that_are_wrong_by_a_turn_are_found_out() -> None:
+def test_a_wrong_rotation_in_the_tags_is_detected() -> None:
     """The middle lies where they say, and the peak of the structures agrees: the corners do not."""
     _, _, truth = turned(np.zeros((480, 640), np.float32), 3.0, 1.0)
     middle = np.array([(639 / 2, 479 / 2)])
@@ -144,7 +144,7 @@ def test_tags_that_are_wrong_by_a_turn_are_found_out() -> None:
 
 
 @pytest.mark.slow
-def test_a_turn_that_no_rig_has_is_told_from_a_shift() -> None:
+def test_a_rotation_is_distinguished_from_a_shift() -> None:
     _, _, truth = turned(np.zeros((480, 640), np.float32), 4.0, 1.0)
     pair = pair_turned(4.0, {"identity": np.eye(3)})
 
@@ -159,7 +159,7 @@ def test_a_turn_that_no_rig_has_is_told_from_a_shift() -> None:
     assert turned_beside(shifted) is None, "a scene that repeats looks so too"
 
 
-def test_what_a_user_knows_is_not_left_for_landmarks() -> None:
+def test_the_user_s_seed_is_not_replaced_by_landmarks() -> None:
     fixed, moving = textured_pair(np.eye(3))
     image, valid, to_turned = turned(moving, 10, 1.0)
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
@@ -178,7 +178,7 @@ def test_unrelated_images_have_no_landmarks_in_common() -> None:
         assert matched_homography(landmarks(one, view), landmarks(other, view), (400, 320)) is None
 
 
-def test_a_match_that_is_some_px_off_is_sharpened_by_the_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_inaccurate_match_is_corrected_by_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     fixed, moving = textured_pair(SHIFTED)
     image, valid, to_turned = turned(moving, 45, 1.0)
     truth = geometry.compose(to_turned, SHIFTED)

@@ -22,7 +22,7 @@ def stripes(light: Field, _rng: np.random.Generator) -> Field:
     return np.asarray(light + (high - low) * pattern, np.float32)
 
 
-def test_a_capture_whose_bands_share_stripes_is_aligned(tmp_path: Path) -> None:
+def test_a_capture_with_common_stripes_is_aligned(tmp_path: Path) -> None:
     poses, ground, rng = plan_flight(1, SIZE_PX, rng_seed=3)
     truth = write_shots(tmp_path, [Shot(poses[0], ground, stripes)], SIZE_PX, REDEDGE, rng)
     reports = agalign.align_folder(tmp_path, tmp_path / "out")

@@ -35,7 +35,7 @@ def pair() -> BandPair:
     return pair_of(*textured_pair(geometry.translation(6, -4)))
 
 
-def test_what_passes_is_aligned_and_measured(pair: BandPair) -> None:
+def test_a_result_that_passes_is_aligned_and_measured(pair: BandPair) -> None:
     results = verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
     assert (results.status, results.issues, results.reason) == ("aligned", (), None)
     assert results.residual.median_px < 0.1
@@ -44,7 +44,7 @@ def test_what_passes_is_aligned_and_measured(pair: BandPair) -> None:
     assert measured.after["mattes_mi"] < measured.before["mattes_mi"]
 
 
-def test_a_look_under_a_mapping_that_is_all_but_equal_is_what_looking_again_shows(pair: BandPair) -> None:
+def test_a_converted_residual_equals_a_new_measurement(pair: BandPair) -> None:
     warped_pair = WarpedPair.of(pair, pair.mapping(geometry.translation(5.95, -3.95)))
     mapping = pair.mapping(np.array([[1.0001, 0, 6.0], [0, 0.9999, -4.0], [0, 0, 1.0]]))
     near, again = warped_pair.with_mapping(mapping), WarpedPair.of(pair, mapping)
@@ -55,7 +55,7 @@ def test_a_look_under_a_mapping_that_is_all_but_equal_is_what_looking_again_show
     assert warped_pair.with_mapping(far).warped is not warped_pair.warped
 
 
-def test_a_doubted_result_leaves_the_seed_and_its_windows(pair: BandPair) -> None:
+def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
     results = verified(pair, SEED, result(geometry.translation(6, -4), retrieval=0.01), SETTINGS)
     assert results.status == "seed_only"
     assert results.issues[0].code == "retrieval"
@@ -63,13 +63,13 @@ def test_a_doubted_result_leaves_the_seed_and_its_windows(pair: BandPair) -> Non
     assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.15)
 
 
-def test_no_result_at_all_is_told_in_its_own_words(pair: BandPair) -> None:
+def test_a_missing_result_has_its_own_reason(pair: BandPair) -> None:
     result = verified(pair, SEED, Issue(FEW_KEYPOINTS, 3, 16), SETTINGS)
     assert result.status == "seed_only"
     assert result.reason == "only 3 keypoints are in the area that both bands show; the rig seed is used unchanged"
 
 
-def test_an_unrelated_image_is_failed_seed_or_not() -> None:
+def test_an_unrelated_image_is_failed_with_or_without_a_seed() -> None:
     results = verified(
         pair_of(textured_image(400, 320), textured_image(400, 320, 9)), SEED, result(np.eye(3), 0.01), SETTINGS
     )
@@ -78,7 +78,7 @@ def test_an_unrelated_image_is_failed_seed_or_not() -> None:
     assert results.reason.endswith("but the seed does not fit either")
 
 
-def test_the_verdict_is_asked_again_under_a_local_field(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
     """A field that is kept though the windows then lie apart must not be written."""
     wild = np.zeros((11, 14, 2))
     wild[..., 0] = 3.0
@@ -95,7 +95,7 @@ def test_the_verdict_is_asked_again_under_a_local_field(pair: BandPair, monkeypa
     assert verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS).local.field is not None
 
 
-def test_residuals_of_a_reduced_image_are_given_in_px_of_the_file() -> None:
+def test_residuals_of_a_reduced_image_are_in_px_of_the_file() -> None:
     at_quarter = PairScales(PixelScale(0.25, 0.25), PixelScale(0.25, 0.25))
     residual = Residual.of(np.array([[10.0, 20.0]]), np.array([[0.5, 0.0]]), np.array([9.0])).in_file_px(at_quarter)
     np.testing.assert_allclose(residual.centres_px, [[41.5, 81.5]])
@@ -121,7 +121,7 @@ def bent_pair(height_px: float, apart_px: float | None = None) -> BandPair:
 
 
 @pytest.mark.parametrize(("use", "status"), [("auto", "aligned"), ("always", "aligned"), ("never", "seed_only")])
-def test_a_field_starts_by_itself_where_a_part_of_the_image_lies_apart(use: str, status: str) -> None:
+def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: str, status: str) -> None:
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     settings = Settings(relief=ReliefSettings(use=use))
     results = verified(bent_pair(4.0), seed, result(np.eye(3)), settings)
@@ -130,7 +130,7 @@ def test_a_field_starts_by_itself_where_a_part_of_the_image_lies_apart(use: str,
 
 
 @pytest.mark.slow
-def test_what_changes_from_plant_to_plant_is_followed_by_a_finer_field() -> None:
+def test_quickly_varying_parallax_needs_a_fine_field() -> None:
     """Waves of 200 px: the first field's windows show half of them each."""
     pair, seed = bent_pair(2.5, apart_px=200.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     results = verified(pair, seed, result(np.eye(3)), Settings())
@@ -143,7 +143,7 @@ def test_what_changes_from_plant_to_plant_is_followed_by_a_finer_field() -> None
 
 
 @pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])
-def test_what_needs_no_field_gets_none_and_with_a_rig_none_is_tried(rig_known: bool, tried: bool) -> None:
+def test_a_field_is_tried_without_a_rig_and_rejected_without_need(rig_known: bool, tried: bool) -> None:
     pair = bent_pair(0.0)
     pair = replace(pair, candidate_std_px={"model": 1.0} if rig_known else {})
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
@@ -151,7 +151,7 @@ def test_what_needs_no_field_gets_none_and_with_a_rig_none_is_tried(rig_known: b
     assert (plain.status, plain.local is not None, plain.field) == ("aligned", tried, None)
 
 
-def test_what_a_field_cannot_mend_is_named(pair: BandPair) -> None:
+def test_issues_that_a_field_cannot_remove_are_reported(pair: BandPair) -> None:
     """A third of the image 15 px off."""
     fixed, moving = textured_pair(geometry.translation(6, -4))
     torn = moving.copy()
@@ -177,7 +177,7 @@ def test_smaller_windows_are_measured_where_valid_areas_are_small() -> None:
     assert len(usual.centres_px) == len(whole.reference.windows.origins)
 
 
-def test_a_field_is_verified_in_windows_that_were_left_out_of_its_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_field_is_verified_in_held_out_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """A field may follow the shifts of its own windows, whatever they are."""
     pair = bent_pair(2.5)
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
@@ -200,7 +200,7 @@ def test_a_field_is_verified_in_windows_that_were_left_out_of_its_fit(monkeypatc
 
 
 @pytest.mark.parametrize("kind", ["noise", "structure"])
-def test_no_field_makes_something_else_aligned(kind: str) -> None:
+def test_no_field_aligns_an_unrelated_image(kind: str) -> None:
     fixed = textured_image(480, 360)
     other = (
         np.random.default_rng(3).normal(size=fixed.shape).astype(np.float32)

@@ -43,7 +43,7 @@ def unaligned(pair: BandPair, issue: Issue = SILENT) -> Alignment:
     return result
 
 
-def test_windows_are_enough_where_descriptors_are_silent(pair: BandPair) -> None:
+def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
     before = unaligned(pair)
     after = by_windows(pair, before)
     assert after.status == "aligned"
@@ -58,7 +58,7 @@ def test_windows_are_enough_where_descriptors_are_silent(pair: BandPair) -> None
     assert 0.4 < len(after.residual.centres_px) / len(before.residual.centres_px) < 0.6
 
 
-def test_windows_do_not_overrule_descriptors_or_other_failures(pair: BandPair) -> None:
+def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair) -> None:
     for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0)):
         before = unaligned(pair, issue)
         assert by_windows(pair, before) is before
@@ -66,7 +66,7 @@ def test_windows_do_not_overrule_descriptors_or_other_failures(pair: BandPair) -
     assert by_windows(pair, aligned) is aligned
 
 
-def test_windows_that_were_left_out_must_agree() -> None:
+def test_held_out_windows_must_confirm_the_fit() -> None:
     fixed, moving = textured_pair(TRUTH, *SIZE)
     other, _ = textured_pair(TRUTH, *SIZE, seed=5)
     moving[:, 480:] = other[:, 480:]  # the part beyond shows something else
@@ -75,7 +75,7 @@ def test_windows_that_were_left_out_must_agree() -> None:
     assert by_windows(pair, before) is before
 
 
-def test_a_seed_too_far_off_is_not_refined(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_seed_with_a_large_error_is_not_refined(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
     before = unaligned(pair)
     monkeypatch.setattr(window_estimate, "_MAX_STEP_PX", 0.5)
     assert by_windows(pair, before) is before
@@ -93,7 +93,7 @@ def windows(count: int, measured: float = 1.0) -> Residual:
     [("windows", windows(20), True), ("fast", windows(20), False), ("windows", windows(11), False),
      ("windows", windows(12), True), ("windows", windows(30, 0.7), False), ("windows", windows(30, 0.8), True)],
 )  # fmt: skip
-def test_without_descriptors_more_windows_are_asked_for(recipe: str, residual: Residual, is_accepted: bool) -> None:
+def test_without_descriptors_more_windows_are_required(recipe: str, residual: Residual, is_accepted: bool) -> None:
     joint = JointResult(
         np.eye(3), 0.1, 0.05, 0.004, 0, (1.0,), recipe, "homography", 0.01, ((0.1, 0.1),) * 4
     )  # fmt: skip

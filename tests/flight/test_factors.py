@@ -31,7 +31,7 @@ def test_the_mask_has_the_columns_of_each_factor() -> None:
     assert factor_mask(("reference",)).tolist() == [0, 0, 0, 1, 1]
 
 
-def test_a_design_moves_a_band_along_its_baseline_and_by_its_delay() -> None:
+def test_a_design_shifts_a_band_along_its_baseline_and_by_its_delay() -> None:
     change = factor_design(np.array([0.6, -0.8]), 0.5) @ np.array([1.0, 2.0, 3.0, 4.0, 5.0])
     np.testing.assert_allclose(change, [[0.6 + 0.5 * 4, 1.2, 1.8], [-0.8 + 0.5 * 5, -1.6, -2.4]])
 
@@ -55,7 +55,7 @@ def test_a_displaced_mapping_differs_by_its_coefficients() -> None:
     assert distance_px(mean, mean, SIZE) == 0
 
 
-def test_the_median_mapping_ignores_one_that_is_wrong() -> None:
+def test_the_median_mapping_ignores_an_outlier() -> None:
     matrices = [geometry.translation(x, 2.0) for x in (3.0, 3.0, 90.0)]
     np.testing.assert_allclose(median_mapping(matrices, SIZE), geometry.translation(3.0, 2.0), atol=1e-6)
     assert median_mapping(matrices[2:], SIZE) is matrices[2]
@@ -72,7 +72,7 @@ def test_factors_are_recovered_from_all_bands() -> None:
     np.testing.assert_allclose(covariance[0], np.linalg.inv(normal), rtol=1e-3)
 
 
-def test_factors_that_do_not_count_are_0_and_certain() -> None:
+def test_unused_factors_are_0_without_variance() -> None:
     differences = np.einsum("bakf,cf->cbak", DESIGNS, np.array([[3.0, 0, 0, 0, 0]]))
     result, covariance = solve_factors(differences, DESIGNS, np.full((1, 3), 1e4), factor_mask(("distance",)))
     assert result[0, 0] == pytest.approx(3.0, abs=1e-3)
@@ -81,7 +81,7 @@ def test_factors_that_do_not_count_are_0_and_certain() -> None:
     assert covariance[0, 0, 0] > 0
 
 
-def test_one_band_that_disagrees_hardly_moves_the_factors() -> None:
+def test_an_outlier_band_hardly_changes_the_factors() -> None:
     factors = np.array([[3.0, 0.0, 0.0, 0.0, 0.0]])
     differences = np.einsum("bakf,cf->cbak", DESIGNS, factors)
     differences[0, 2, :, 0] += 5.0

@@ -11,7 +11,7 @@ from agalign.flight.fingerprint import fingerprint, hashed
 from agalign.values.capture import Georeference
 
 
-def test_how_numpy_prints_changes_nothing(flight: Path) -> None:
+def test_print_options_of_numpy_do_not_matter(flight: Path) -> None:
     capture = discover(flight).captures[0]
     before = fingerprint(capture, Settings())
     with np.printoptions(precision=2, threshold=3, suppress=True):
@@ -43,7 +43,7 @@ def test_every_fact_that_a_result_depends_on_changes_it(flight: Path) -> None:
     assert len(set(fingerprints)) == len(fingerprints)
 
 
-def test_a_file_that_is_written_again_is_another_file(flight: Path, tmp_path: Path) -> None:
+def test_a_file_that_is_written_again_changes_the_fingerprint(flight: Path, tmp_path: Path) -> None:
     copied = tmp_path / "copy"
     shutil.copytree(flight, copied)
     capture = discover(copied).captures[0]

@@ -66,7 +66,7 @@ def error_px(rig: Rig, band: str, known: Observation, truth: np.ndarray) -> tupl
     return distance_px(prediction.fixed_to_moving, truth, SIZE), prediction.std_px
 
 
-def test_the_baselines_are_found_up_to_a_factor() -> None:
+def test_the_baselines_are_estimated_up_to_a_factor() -> None:
     rig = usual_rig()
     assert rig.factors == ("distance",)
     result, wanted = (np.array([b[name] for name in BASELINES]) for b in (rig.baselines, BASELINES))
@@ -75,7 +75,7 @@ def test_the_baselines_are_found_up_to_a_factor() -> None:
     assert np.linalg.norm(result) == pytest.approx(1)
 
 
-def test_a_band_without_evidence_is_where_the_others_say() -> None:
+def test_a_band_is_predicted_from_the_others() -> None:
     rig = usual_rig()
     low = observation(9.0, 4.0, without=("NIR",))
     error, std = error_px(rig, "NIR", low, mappings(4.0)["NIR"])
@@ -86,7 +86,7 @@ def test_a_band_without_evidence_is_where_the_others_say() -> None:
 
 
 @pytest.mark.slow
-def test_tilt_counts_where_the_ground_tilts() -> None:
+def test_tilt_is_selected_where_the_ground_tilts() -> None:
     rng = np.random.default_rng(3)
     tilted = [observation(float(k), rng.normal(), tuple(2 * rng.normal(size=2))) for k in range(10)]
     rig = learn_rig(tilted, SIZE, {})
@@ -96,7 +96,7 @@ def test_tilt_counts_where_the_ground_tilts() -> None:
     assert error_px(rig, "Red", known, mappings(0.5, (3.0, -2.0))["Red"])[0] < 0.3
 
 
-def test_where_nothing_is_shared_no_factor_is() -> None:
+def test_without_common_variation_no_factor_is_selected() -> None:
     still = [observation(float(k), 0.0, noise=0.05, seed=k) for k in range(8)]
     rig = learn_rig(still, SIZE, {})
     assert rig is not None
@@ -104,7 +104,7 @@ def test_where_nothing_is_shared_no_factor_is() -> None:
     assert predict_band(rig, "Red", observation(3.5, 0.0, without=("Red",))).source == "flight"
 
 
-def test_a_known_layout_is_enough_for_a_height_that_nobody_has_seen() -> None:
+def test_a_known_layout_predicts_captures_at_an_unseen_height() -> None:
     level = [observation(float(k), 0.2 * np.sin(k), noise=0.05, seed=k) for k in range(4)]
     low = observation(9.0, 9.0, without=("NIR",))
     truth = mappings(9.0)["NIR"]
@@ -120,7 +120,7 @@ def test_a_known_layout_is_enough_for_a_height_that_nobody_has_seen() -> None:
 
 
 @pytest.mark.slow
-def test_a_band_whole_periods_away_does_not_carry_the_others() -> None:
+def test_an_aliased_band_does_not_bias_the_others() -> None:
     rig = usual_rig()
     known = observation(9.0, 1.0)
     wrong = geometry.compose(geometry.translation(40.0, 0.0), known.mappings["Blue"])
@@ -131,7 +131,7 @@ def test_a_band_whole_periods_away_does_not_carry_the_others() -> None:
 
 
 @pytest.mark.slow
-def test_a_capture_without_evidence_lies_between_its_neighbours() -> None:
+def test_a_capture_without_bands_is_interpolated_between_its_neighbours() -> None:
     """A drone that sinks steadily: the captures before and after say more than the flight's mean."""
     rig = sinking_rig()
     nothing = Observation(35.0, {}, {})
@@ -140,12 +140,12 @@ def test_a_capture_without_evidence_lies_between_its_neighbours() -> None:
     assert distance_px(prediction.fixed_to_moving, mappings(1.75)["NIR"], SIZE) < 0.3
 
 
-def test_few_captures_are_no_rig() -> None:
+def test_too_few_captures_give_no_rig() -> None:
     assert learn_rig(flight(2), SIZE, {}) is None
     assert learn_rig([], SIZE, BASELINES) is None
 
 
-def test_written_and_read_it_is_the_same(tmp_path: Path) -> None:
+def test_a_rig_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     rig = usual_rig()
     field = DisplacementField(32.0, np.random.default_rng(0).normal(size=(31, 41, 2)))
     rig = replace(rig, fields={"Red": field}, extrapolation_px={"Red": 0.7})
@@ -157,7 +157,7 @@ def test_written_and_read_it_is_the_same(tmp_path: Path) -> None:
         assert getattr(again, name) == getattr(rig, name)
 
 
-def test_an_altitude_that_nobody_has_seen_widens_the_error_bar() -> None:
+def test_an_unseen_altitude_increases_the_standard_error() -> None:
     level = [
         replace(observation(float(k), 0.2 * np.sin(k), noise=0.05, seed=k), altitude_m=100.0 + 0.5 * k)
         for k in range(5)
@@ -170,7 +170,7 @@ def test_an_altitude_that_nobody_has_seen_widens_the_error_bar() -> None:
     assert bars[2] < 0.6
 
 
-def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:
+def test_the_median_mapping_ignores_one_outlier_of_three() -> None:
     good = geometry.translation(10, 5)
     wrong = geometry.translation(-80, 90)
     near = geometry.translation(10.1, 5.1)
@@ -178,7 +178,7 @@ def test_the_median_mapping_is_not_carried_away_by_one_of_three() -> None:
     assert geometry.corner_error_px(result, good, 400, 300) < 0.2
 
 
-def test_the_error_bar_holds_what_captures_left_out_missed() -> None:
+def test_the_standard_error_covers_the_errors_of_captures_left_out() -> None:
     rig = usual_rig()
     worse = replace(rig, from_bands_px={**rig.from_bands_px, "NIR": 2.0})
     known = observation(9.0, 0.5, without=("NIR",))
@@ -186,7 +186,7 @@ def test_the_error_bar_holds_what_captures_left_out_missed() -> None:
     assert predict_band(worse, "NIR", known).std_px >= 2.0
 
 
-def test_the_error_bar_grows_where_the_other_bands_of_a_capture_disagree() -> None:
+def test_inconsistent_bands_increase_the_standard_error() -> None:
     rig = usual_rig()
     alike, unlike = (observation(9.0, 0.5, without=("NIR",), noise=noise, seed=3) for noise in (0.0, 3.0))
     assert predict_band(rig, "NIR", alike).std_px < 0.2
@@ -220,7 +220,7 @@ def headings_rig(*, known_layout: bool) -> Rig:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("known_layout", [False, True])
-def test_delays_are_told_from_baselines(known_layout: bool) -> None:
+def test_delays_are_distinguished_from_baselines(known_layout: bool) -> None:
     rig = headings_rig(known_layout=known_layout)
     assert "motion" in rig.factors
     result, wanted = (np.array([d[name] for name in DELAYS]) for d in (rig.delays, DELAYS))
@@ -231,7 +231,7 @@ def test_delays_are_told_from_baselines(known_layout: bool) -> None:
 
 
 @pytest.mark.slow
-def test_a_capture_without_evidence_on_the_other_heading_lies_where_its_speed_says() -> None:
+def test_a_capture_on_another_heading_is_predicted_from_its_motion() -> None:
     rig = headings_rig(known_layout=True)
     for moment, sign in ((7.5, -1), (7.5, 1)):  # at a turn, where the captures before and after disagree
         truth = passing(moment, (0.0, sign * 16.0))
@@ -244,7 +244,7 @@ def test_a_capture_without_evidence_on_the_other_heading_lies_where_its_speed_sa
 
 
 @pytest.mark.slow
-def test_between_captures_that_differ_nothing_is_known_for_sure() -> None:
+def test_interpolation_between_different_captures_has_an_error() -> None:
     """A panel a metre below the camera was taken just before: in time it is near, in height it is not."""
     panel = replace(observation(0.0, 100.0), altitude_m=1.0)
     others = [replace(observation(10.0 * k, 0.1 * (k % 3)), altitude_m=28.0 + 0.1 * (k % 3)) for k in range(1, 9)]
@@ -260,7 +260,7 @@ def test_between_captures_that_differ_nothing_is_known_for_sure() -> None:
     assert error < 3 * std
 
 
-def test_what_is_expected_of_a_band_of_large_pixels_is_told_in_px_of_the_reference() -> None:
+def test_expectations_of_a_coarse_band_are_in_px_of_the_reference() -> None:
     rig = usual_rig()
     mean = rig.mean["NIR"]
     coarse = replace(rig, mean={**rig.mean, "NIR": geometry.compose(np.diag([0.1, 0.1, 1.0]), mean)})
@@ -280,7 +280,7 @@ def test_a_capture_without_a_time_is_not_between_captures_in_time() -> None:
 
 
 @pytest.mark.parametrize("known_times", [0, 1, 2])
-def test_too_few_known_times_say_nothing_of_a_capture_between_them(known_times: int) -> None:
+def test_too_few_known_times_have_the_typical_error(known_times: int) -> None:
     sinking = [observation(10.0 * k if k < known_times else None, 0.5 * k, altitude_m=90.0 - k) for k in range(9)]
     rig = learn_rig(sinking, SIZE, {})
     assert rig is not None
@@ -305,7 +305,7 @@ def rarely_shown() -> list[Observation]:
     ]
 
 
-def test_a_band_that_few_captures_show_has_a_finite_error() -> None:
+def test_a_band_in_few_captures_has_a_finite_error() -> None:
     rig = learn_rig(rarely_shown(), SIZE, {})
     assert rig is not None
     assert set(rig.mean) == set(BASELINES)
@@ -320,7 +320,7 @@ def test_a_band_that_few_captures_show_has_a_finite_error() -> None:
     assert PredictionPart.model_validate_json(part.model_dump_json()) == part
 
 
-def test_the_extremes_of_a_flight_without_a_typical_capture_are_its_most_typical_one() -> None:
+def test_extremes_of_outliers_are_the_least_outlying_capture() -> None:
     rig = learn_rig(flight(3), SIZE, {})
     assert rig is not None
     outliers = [(90.0, 0.0, 0.0, 0.0, 0.0), (0.0, 50.0, 0.0, 0.0, 0.0), (0.0, 0.0, 70.0, 0.0, 0.0)]

@@ -64,7 +64,7 @@ def test_a_model_is_read_back_as_it_was_written(model: FlightModel, tmp_path: Pa
     assert rig.captures == model.rig.captures
 
 
-def test_the_same_model_is_the_same_bytes_and_may_have_no_rig(model: FlightModel, tmp_path: Path) -> None:
+def test_equal_models_have_equal_bytes_with_and_without_a_rig(model: FlightModel, tmp_path: Path) -> None:
     one, other, plain = (tmp_path / f"{n}.safetensors" for n in ("one", "other", "plain"))
     save_model(model, one)
     save_model(model, other)
@@ -79,7 +79,7 @@ def test_sides_are_counted_from_1(model: FlightModel) -> None:
 
 
 @pytest.mark.parametrize("part", ["weight", "fact"])
-def test_a_model_that_was_changed_is_damaged(model: FlightModel, tmp_path: Path, part: str) -> None:
+def test_a_changed_model_is_reported_as_damaged(model: FlightModel, tmp_path: Path, part: str) -> None:
     path = tmp_path / "m.safetensors"
     save_model(model, path)
     contents = bytearray(path.read_bytes())
@@ -101,9 +101,7 @@ def test_a_model_that_was_changed_is_damaged(model: FlightModel, tmp_path: Path,
         ({"channels": "[0, 1, 1]"}, "invalid numbers of channels"),
     ],
 )
-def test_facts_that_no_model_has_are_refused(
-    model: FlightModel, tmp_path: Path, change: dict[str, str], said: str
-) -> None:
+def test_invalid_metadata_is_an_error(model: FlightModel, tmp_path: Path, change: dict[str, str], said: str) -> None:
     path = tmp_path / "m.safetensors"
     save_model(model, path)
     contents = path.read_bytes()
@@ -119,7 +117,7 @@ def test_facts_that_no_model_has_are_refused(
         load_model(path, cpu)
 
 
-def test_a_model_without_a_checksum_is_refused(model: FlightModel, tmp_path: Path) -> None:
+def test_a_model_without_a_checksum_is_an_error(model: FlightModel, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     save_model(model, path)
     contents = path.read_bytes()
@@ -132,7 +130,7 @@ def test_a_model_without_a_checksum_is_refused(model: FlightModel, tmp_path: Pat
         load_model(path, cpu)
 
 
-def test_weights_beyond_all_reason_are_refused(model: FlightModel, tmp_path: Path) -> None:
+def test_too_large_weights_are_an_error(model: FlightModel, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     with torch.no_grad():
         next(model.net.parameters()).mul_(1e30)
@@ -141,7 +139,7 @@ def test_weights_beyond_all_reason_are_refused(model: FlightModel, tmp_path: Pat
         load_model(path, cpu)
 
 
-def test_a_pipe_is_no_model(tmp_path: Path) -> None:
+def test_a_pipe_is_an_error(tmp_path: Path) -> None:
     """Opened like a file, it would be waited for without end."""
     os.mkfifo(tmp_path / "m.safetensors")
     with pytest.raises(InputError, match="not a regular file"):
@@ -150,7 +148,7 @@ def test_a_pipe_is_no_model(tmp_path: Path) -> None:
         read_rig(tmp_path / "m.safetensors")
 
 
-def test_numbers_that_are_not_finite_are_refused(model: FlightModel, tmp_path: Path) -> None:
+def test_values_that_are_not_finite_are_an_error(model: FlightModel, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     save_model(replace(model, mappings={"Red": np.full((3, 3), np.nan)}), path)
     with pytest.raises(InputError, match="cannot be read as a model"):
@@ -162,7 +160,7 @@ def test_numbers_that_are_not_finite_are_refused(model: FlightModel, tmp_path: P
         read_rig(path)
 
 
-def test_facts_are_sorted_in_the_file(model: FlightModel, tmp_path: Path) -> None:
+def test_metadata_is_sorted_in_the_file(model: FlightModel, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     save_model(model, path)
     with safe_open(path, framework="np") as file:

@@ -33,13 +33,13 @@ def reading(moment: str, factor: float, band: Band | None = None) -> PanelReadin
     return PanelReading(capture(band, moment), (BandReading(band, 0.5, 0.5 / factor),))
 
 
-def test_what_a_panel_reflects_is_what_its_radiance_is_worth(tmp_path: Path) -> None:
+def test_the_factor_is_reflectance_over_radiance(tmp_path: Path) -> None:
     (result,) = read_panel(capture(panel_file(tmp_path / "a.tif")), {}).bands
     assert result.radiance == pytest.approx(1.0)
     assert (result.albedo, result.factor) == (0.4, pytest.approx(0.4))
 
 
-def test_a_user_s_reflectance_goes_before_the_tags(tmp_path: Path) -> None:
+def test_the_user_s_reflectance_overrides_the_tags(tmp_path: Path) -> None:
     shown = capture(panel_file(tmp_path / "a.tif"))
     assert read_panel(shown, {"": 0.6}).bands[0].factor == pytest.approx(0.6)
     assert read_panel(shown, {"": 0.6, "green": 0.7}).bands[0].factor == pytest.approx(0.7)
@@ -47,13 +47,13 @@ def test_a_user_s_reflectance_goes_before_the_tags(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("level", "problem"), [(65535, "saturated"), (900, "black")])
-def test_a_panel_that_cannot_be_measured_tells_nothing(tmp_path: Path, level: int, problem: str) -> None:
+def test_a_panel_that_cannot_be_measured_has_no_factor(tmp_path: Path, level: int, problem: str) -> None:
     (result,) = read_panel(capture(panel_file(tmp_path / "a.tif", level)), {}).bands
     assert problem in result.problem
     assert result.factor is None
 
 
-def test_between_panels_the_light_is_linear_in_time_and_beyond_them_as_the_nearest_has_it() -> None:
+def test_illumination_is_interpolated_in_time_and_constant_outside() -> None:
     panels = [reading("2026-06-21T10:00:00", 2.0), reading("2026-06-21T11:00:00", 4.0)]
     of = panels[0].capture.bands[0]
 
@@ -67,7 +67,7 @@ def test_between_panels_the_light_is_linear_in_time_and_beyond_them_as_the_neare
     assert reflectance_factors(replace(capture(of), camera=CameraIdentity("a", "b", "2")), panels) == {}
 
 
-def test_a_panel_on_the_ground_tells_how_high_the_others_are() -> None:
+def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:
     band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
     held = replace(band, panel=Panel("look"))
     ground = PanelReading(capture(held, position=Position(52.0, 5.0, 93.0)), ())
@@ -83,7 +83,7 @@ def test_a_panel_on_the_ground_tells_how_high_the_others_are() -> None:
     assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
 
 
-def test_the_ends_of_a_flight_are_looked_at_until_three_in_a_row_show_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_search_for_panels_ends_after_three_captures_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
     band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
     flight = [replace(capture(band, f"2026-06-21T10:00:{k:02d}"), name=f"{k}") for k in range(20)]
     looked: list[str] = []
@@ -106,7 +106,7 @@ def test_the_ends_of_a_flight_are_looked_at_until_three_in_a_row_show_none(monke
 
 
 @pytest.mark.slow
-def test_the_first_and_last_captures_are_looked_at(tmp_path: Path) -> None:
+def test_panels_are_searched_in_the_first_and_last_captures(tmp_path: Path) -> None:
     make_flight_between_panels(tmp_path, 7, (640, 480))
     result = with_panels(discover(tmp_path).captures)
     assert [c.panel is not None for c in result] == [True, *[False] * 7, True]
@@ -158,7 +158,7 @@ def test_one_unknown_time_leaves_the_captures_of_a_flight_in_their_order(monkeyp
         ("", True, (False, False)),
     ],
 )
-def test_a_square_in_a_scene_is_a_panel_by_its_code_alone(
+def test_a_square_in_a_scene_is_a_panel_only_with_a_code(
     monkeypatch: pytest.MonkeyPatch, code: str, in_scene: bool, expected: tuple[bool, bool]
 ) -> None:
     """A roof looks like a panel too. Only a capture of a panel is left out."""

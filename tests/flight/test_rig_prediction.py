@@ -48,7 +48,7 @@ def showing(rig: Rig, band: str, distance_px: float, std_px: float = 0.01) -> Ob
     return Observation(None, {band: mapping}, {band: MovingFilePx(std_px)})
 
 
-def test_a_band_moves_along_its_baseline_with_the_other_band() -> None:
+def test_a_band_is_predicted_along_its_baseline() -> None:
     some = rig(capture(1.0), capture(-1.0), capture(0.0))
     predicted = predict_band(some, "NIR", showing(some, "Red", 2.0))
     assert predicted.source == "bands"
@@ -56,7 +56,7 @@ def test_a_band_moves_along_its_baseline_with_the_other_band() -> None:
     assert distance_px(predicted.fixed_to_moving, geometry.translation(-12, 8 + 0.8 * 2.0), SIZE) < 0.01
 
 
-def test_a_band_of_which_no_capture_shows_a_quarter_has_the_error_of_the_lenses_too() -> None:
+def test_an_unobserved_quarter_adds_the_error_of_the_lenses() -> None:
     some = rig(capture(1.0), capture(-1.0), capture(0.0))
     half = replace(some, extrapolation_px={"NIR": MovingFilePx(0.7)})
     assert some.covers("NIR")
@@ -77,7 +77,7 @@ def test_the_mean_square_of_few_captures_is_inflated() -> None:
     assert error_px == pytest.approx(np.sqrt((3 + 1) / (3 - 1) * mean_square + FROM_BANDS_PX**2))
 
 
-def test_factors_beyond_those_learned_add_the_error_of_the_baseline() -> None:
+def test_factors_outside_the_learned_range_add_the_error_of_the_baseline() -> None:
     captures = capture(1.0), capture(-1.0), capture(2.0)
     exact, rough = rig(*captures), rig(*captures, baseline_std=0.05)
     far, near = showing(exact, "Red", 10.0), showing(exact, "Red", 1.0)
@@ -95,7 +95,7 @@ def test_an_uncertain_mapping_makes_the_prediction_uncertain() -> None:
     assert unsure == pytest.approx(0.8 / 0.6 / np.sqrt(2), rel=0.5)
 
 
-def test_bands_that_leave_more_than_usual_make_the_prediction_uncertain() -> None:
+def test_excess_residuals_of_bands_make_the_prediction_uncertain() -> None:
     some = rig(capture(1.0), capture(-1.0), capture(0.0))
     known = showing(some, "Red", 1.0)
     across = geometry.compose(geometry.translation(0.0, 3.0), known.mappings["Red"])
@@ -125,7 +125,7 @@ def test_errors_of_unobserved_captures() -> None:
     assert unobserved_error_px(line, "Red", by_neighbours=True) == pytest.approx(expected)
 
 
-def test_factors_are_interpolated_in_time_with_the_error_of_a_random_walk() -> None:
+def test_factors_are_interpolated_in_time_with_the_error_of_a_brownian_bridge() -> None:
     known = [capture(4.0, seconds=30.0), capture(0.0, seconds=10.0)]
     guess = interpolated_in_time(capture(0.0, seconds=15.0), known)
     assert guess is not None
@@ -152,7 +152,7 @@ def test_the_distance_is_interpolated_in_height_and_the_rest_in_time() -> None:
     assert interpolated_in_height(capture(0.0, seconds=1.0), known) is None
 
 
-def test_steps_are_a_linear_function_of_the_motion() -> None:
+def test_shifts_are_a_linear_function_of_the_motion() -> None:
     known = [capture(7.0, 0.0, motion=(x, y), steps_px=(1 + 2 * x, 3 * y)) for x, y in ((0, 0), (1, 0), (0, 1), (2, 2))]
     guess = regressed_on_motion(capture(0.0, 0.0, motion=(3.0, 1.0)), known)
     assert guess is not None
@@ -163,7 +163,7 @@ def test_steps_are_a_linear_function_of_the_motion() -> None:
     assert regressed_on_motion(capture(0.0), known) is None
 
 
-def test_an_altitude_that_no_capture_has_adds_the_error_of_a_climb() -> None:
+def test_an_unseen_altitude_adds_an_error() -> None:
     captures = [capture(0.5 * k, altitude_m=60.0 + k) for k in range(3)]
     here = predict_band(rig(*captures), "Red", Observation(None, {}, {}, altitude_m=61.0)).std_px
     above = predict_band(rig(*captures), "Red", Observation(None, {}, {}, altitude_m=66.0)).std_px
@@ -173,7 +173,7 @@ def test_an_altitude_that_no_capture_has_adds_the_error_of_a_climb() -> None:
     assert np.sqrt(above**2 - here**2) == pytest.approx(climb_px, rel=1e-6)
 
 
-def test_with_few_captures_there_is_no_choice_of_guesses() -> None:
+def test_with_few_captures_only_two_estimators_are_used() -> None:
     """Heights would tell these captures exactly; with five of them that may be chance."""
     captures = [capture(float(k % 3), seconds=float(k * 7 % 6), altitude_m=50.0 + k % 3) for k in range(6)]
     known = Observation(2.5, {}, {}, altitude_m=51.0)
@@ -183,7 +183,7 @@ def test_with_few_captures_there_is_no_choice_of_guesses() -> None:
     assert six < 0.5 * five
 
 
-def test_expected_corners_are_those_of_the_rig_from_any_mapping() -> None:
+def test_expected_corners_equal_those_of_the_rig_for_any_mapping() -> None:
     some = rig(capture(1.0), capture(-1.0), capture(0.0))
     expectation = expected_corners(some, "Red", geometry.translation(28, -5))
     np.testing.assert_allclose(expectation.corners, [2.0, 0.0] * 4, atol=1e-9)
@@ -200,7 +200,7 @@ def test_expected_corners_are_those_of_the_rig_from_any_mapping() -> None:
     np.testing.assert_allclose(double.covariance, up @ expectation.covariance @ up)
 
 
-def test_the_extremes_leave_out_a_capture_unlike_all_others() -> None:
+def test_the_extremes_exclude_outliers() -> None:
     captures = [capture(d) for d in (-2.0, 0.5, 3.0, 1.0, 100.0)]
     ends = extreme_mappings(rig(*captures), "Red")
     offsets = sorted(round(float(m[0, 2]), 6) for m in ends)

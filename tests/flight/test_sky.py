@@ -61,14 +61,14 @@ def test_one_band_with_texture_or_that_cannot_be_read_is_not_the_sky(tmp_path: P
 @pytest.mark.parametrize(
     ("pitch", "roll", "elevation_deg"), [(0.0, 0.0, -90.0), (-0.87, 3.09, 40.1), (0.3, -0.4, -61.6)]
 )
-def test_the_light_sensor_shows_where_the_camera_looks(pitch: float, roll: float, elevation_deg: float) -> None:
+def test_the_light_sensor_gives_the_direction_of_the_camera(pitch: float, roll: float, elevation_deg: float) -> None:
     tags = Tags(make="MicaSense", xmp={(DLS, "Pitch"): (str(pitch),), (DLS, "Roll"): (str(roll),)})
     assert MicaSense().elevation_deg(tags) == pytest.approx(elevation_deg, abs=0.1)
     assert MicaSense().elevation_deg(Tags(make="MicaSense")) is None
 
 
 @pytest.mark.real
-def test_no_real_scene_is_taken_for_the_sky_wherever_its_tags_point(real_data: Path) -> None:
+def test_no_real_scene_is_classified_as_sky_whatever_its_tags(real_data: Path) -> None:
     found = discover(real_data / "flights").captures
     sky, _ = sky_captures(found)
     assert [s.capture.label for s in sky] == ["water/sky/IMG_0003"]

@@ -4,7 +4,7 @@ from torch import nn
 from agalign.method.adam import Adam
 
 
-def test_every_step_is_that_of_torch() -> None:
+def test_every_step_equals_that_of_torch() -> None:
     torch.manual_seed(0)
     ours = nn.ModuleList([nn.Linear(5, 3), nn.Linear(5, 3)])
     theirs = nn.ModuleList([nn.Linear(5, 3), nn.Linear(5, 3)])

@@ -19,7 +19,7 @@ def parameters_of(net: Descriptor) -> dict[str, set[int]]:
 
 
 @pytest.mark.parametrize(("sharing", "shared"), [("siamese", 6), ("pseudo-siamese", 4), ("unshared", 0)])
-def test_what_is_shared(sharing: str, shared: int) -> None:
+def test_sides_share_weights_by_the_kind_of_sharing(sharing: str, shared: int) -> None:
     ids = parameters_of(Descriptor(sharing))
     assert len(ids["fixed"]) == len(ids["moving"]) == 6
     assert len(ids["fixed"] & ids["moving"]) == shared
@@ -34,7 +34,7 @@ def test_the_paper_network_is_conv_tanh_pool_conv_tanh_fc() -> None:
     ]  # fmt: skip
 
 
-def test_half_rectified_layer_is_half_blind_to_contrast_reversal() -> None:
+def test_half_of_a_half_rectified_layer_ignores_contrast_reversal() -> None:
     net = Descriptor(half_rectified=True)
     nn.init.zeros_(net.first[0].convolution.bias)
     one, other = net.first[0](PATCHES), net.first[0](-PATCHES)
@@ -55,7 +55,7 @@ def test_channels_may_differ_between_the_sides() -> None:
 
 
 @pytest.mark.parametrize("sharing", ["siamese", "pseudo-siamese", "unshared"])
-def test_several_sides_at_once_are_the_sides_one_by_one(sharing: str) -> None:
+def test_describing_several_sides_equals_describing_each_side(sharing: str) -> None:
     net = Descriptor(sharing, (1, 1, 1), unit_length=True)
     together = net.describe([PATCHES, PATCHES[:5], PATCHES[3:]], [0, 1, 2])
     for result, (patches, side) in zip(together, ((PATCHES, 0), (PATCHES[:5], 1), (PATCHES[3:], 2)), strict=True):

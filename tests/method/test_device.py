@@ -29,7 +29,7 @@ from ..conftest import textured_pair
 from .pretended_device import NAME, PretendedDevice
 
 
-def test_a_device_that_is_not_there_is_a_configuration_error() -> None:
+def test_an_unavailable_device_is_a_configuration_error() -> None:
     assert choose_device("cpu").type == "cpu"
     assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
     for name in ("nonsense", "cuda:99", "hpu", "xpu:99"):
@@ -37,7 +37,7 @@ def test_a_device_that_is_not_there_is_a_configuration_error() -> None:
             choose_device(name)
 
 
-def test_threads_that_overlap_leave_torch_as_the_first_one_found_it() -> None:
+def test_overlapping_contexts_restore_the_threads_of_torch() -> None:
     """A worker of a cluster does several captures at a time in threads of one process."""
     before = torch.get_num_threads()
     torch.set_num_threads(3)
@@ -76,7 +76,7 @@ def test_without_float64_on_the_device_psi_is_solved_for_on_the_cpu(monkeypatch:
     assert to_float64(tensor).dtype == torch.float64
 
 
-def test_want_of_memory_has_one_name() -> None:
+def test_out_of_memory_is_always_a_memory_error() -> None:
     with pytest.raises(MemoryError, match="not enough memory"), one_memory_error():
         raise RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory")
     with pytest.raises(MemoryError, match="MPS"), one_memory_error():

@@ -35,7 +35,7 @@ def linear_problem(
     return p, residual + noise * torch.randn(count, 256, generator=rng, dtype=torch.float64), gradient
 
 
-def test_shift_over_psi_is_that_of_finite_differences() -> None:
+def test_shift_over_psi_equals_finite_differences() -> None:
     p = scattered(10).xy
     jacobian = shift_over_psi(p, WIDTH, HEIGHT)
     for k in range(8):
@@ -46,7 +46,7 @@ def test_shift_over_psi_is_that_of_finite_differences() -> None:
         torch.testing.assert_close(jacobian[:, :, k], (plus - minus) / 2e-5, atol=1e-5, rtol=1e-5)
 
 
-def test_shift_over_psi_is_the_derivative_over_corners_in_other_parameters() -> None:
+def test_shift_over_psi_equals_over_corners_in_other_parameters() -> None:
     """The homography's derivative is written twice, in torch and in numpy: they must agree."""
     p = scattered(10).xy
     corners = torch.from_numpy(geometry.corners(WIDTH, HEIGHT))
@@ -78,7 +78,7 @@ def test_a_small_change_is_recovered(family: str) -> None:
     torch.testing.assert_close(transform(step.change, corner), transform(change, corner), atol=0.02, rtol=0)
 
 
-def test_a_third_of_wrong_patches_does_not_carry_it_away() -> None:
+def test_a_third_of_wrong_patches_does_not_bias_the_step() -> None:
     change = torch.eye(3, dtype=torch.float64)
     change[0, 2] = 0.5
     p, residual, gradient = linear_problem(change, 300, noise=0.05)
@@ -96,7 +96,7 @@ def test_long_steps_are_cut() -> None:
     assert float(step.change[0, 2]) == pytest.approx(4, abs=0.1)
 
 
-def test_the_family_is_as_rich_as_the_patches_allow() -> None:
+def test_the_family_has_as_many_parameters_as_the_patches_determine() -> None:
     still = torch.eye(3, dtype=torch.float64)
     p, residual, gradient = linear_problem(still, 300, noise=0.5)
     rich = solve(p, residual, gradient, None, 0.5, 4.0)
@@ -108,7 +108,7 @@ def test_the_family_is_as_rich_as_the_patches_allow() -> None:
     assert poor.family != "homography"
 
 
-def test_the_uncertainty_is_that_of_repeated_trials() -> None:
+def test_the_standard_error_equals_the_scatter_of_repeated_trials() -> None:
     still = torch.eye(3, dtype=torch.float64)
     errors, claimed = [], []
     for seed in range(60):

@@ -60,7 +60,7 @@ def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> 
     assert not np.array_equal(one.fixed_to_moving, other.fixed_to_moving)
 
 
-def test_the_global_random_state_is_left_alone() -> None:
+def test_the_global_random_state_is_unchanged() -> None:
     torch.manual_seed(1)
     before = torch.get_rng_state()
     run(JointSettings(), start="random", schedule=Schedule(max_steps=50))
@@ -96,7 +96,7 @@ def test_rgb_against_a_single_band() -> None:
     assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
 
 
-def test_nothing_to_learn_from() -> None:
+def test_images_without_contrast_or_overlap_have_an_issue() -> None:
     fixed, moving = rasters(TRUTH)
     flat = Raster(np.zeros_like(fixed.pixels), fixed.valid)
     assert scratch(flat, moving, NEAR, JointSettings()) == Issue(NO_CONTRAST)
@@ -106,7 +106,7 @@ def test_nothing_to_learn_from() -> None:
     assert result.code == "few_keypoints"
 
 
-def test_one_network_for_two_bands_and_one_that_does_not_belong() -> None:
+def test_one_network_for_two_bands_and_an_unrelated_one() -> None:
     fixed, moving = rasters(TRUTH)
     stranger = Raster(textured_image(400, 320, 9), fixed.valid)
     other = Raster(np.tanh(fixed.pixels), fixed.valid)
@@ -119,7 +119,7 @@ def test_one_network_for_two_bands_and_one_that_does_not_belong() -> None:
 
 
 @pytest.mark.parametrize(("sharing", "left"), [("siamese", 0.35), ("pseudo-siamese", 0.35), ("unshared", 0.9)])
-def test_paper_recipe_lowers_the_error(sharing: str, left: float) -> None:
+def test_paper_recipe_reduces_the_error(sharing: str, left: float) -> None:
     # Fully unshared networks learn slowest, as the paper expects; three epochs are few.
     settings = JointSettings(recipe="paper", sharing=sharing)
     fixed, moving = textured_pair(TRUTH)
@@ -138,7 +138,7 @@ def test_levels_halve_down_to_the_coarsest() -> None:
     assert learn_scales(1280) == [0.25, 0.5]
 
 
-def test_a_start_far_off_is_searched_for_along_the_loss() -> None:
+def test_a_distant_start_is_found_by_searching_the_loss() -> None:
     """An eighth of the image off, and no seeding: beyond what a step on psi can see."""
     truth = geometry.translation(6.0, -4.0)
     fixed, moving = rasters(truth)

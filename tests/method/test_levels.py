@@ -49,7 +49,7 @@ def test_keypoints_never_touch_invalid_pixels() -> None:
         assert valid[(y + dy).clamp(max=239), (x + dx).clamp(max=319)].all()
 
 
-def test_no_held_out_patch_shares_a_pixel_with_one_that_is_learnt_from() -> None:
+def test_held_out_patches_share_no_pixel_with_training_patches() -> None:
     level = level_of(*rasters())
     assert len(level.held_out) > 500
     seen = []
@@ -65,7 +65,7 @@ def test_no_held_out_patch_shares_a_pixel_with_one_that_is_learnt_from() -> None
     assert not train & held
 
 
-def test_keypoints_lie_where_there_is_contrast() -> None:
+def test_keypoints_are_drawn_where_there_is_contrast() -> None:
     fixed, moving = rasters()
     flat = fixed.pixels.copy()
     flat[:, :160] = 0.3
@@ -82,7 +82,7 @@ def test_points_beyond_the_horizon_are_outside() -> None:
     assert not bool(footprints_inside(level, 0, p, singular)[0])
 
 
-def test_keypoints_that_lie_in_the_most_images_come_first() -> None:
+def test_keypoints_in_most_images_come_first() -> None:
     fixed, moving = rasters()
     level = level_of(fixed, moving, moving)
     near, far = torch.eye(3), torch.tensor([[1.0, 0, 200.0], [0, 1.0, 0], [0, 0, 1.0]])
@@ -108,14 +108,14 @@ def test_patches_are_sampled_through_the_lens() -> None:
     torch.testing.assert_close(result, positions[..., 0], atol=0.02, rtol=0)
 
 
-def test_level_matrices_go_to_full_resolution_and_back() -> None:
+def test_level_matrices_are_converted_to_full_resolution_and_back() -> None:
     matrix = np.array([[1.01, 0.02, 5.0], [-0.01, 0.99, -3.0], [1e-5, -2e-5, 1.0]])
     fixed, moving = rasters()
     level = make_level(fixed, [moving], [matrix], 0.5, torch.Generator().manual_seed(0), CPU)
     np.testing.assert_allclose(level.full_matrix(level.homography(matrix, 0), 0), matrix, atol=1e-4)
 
 
-def test_positions_are_displaced_by_the_field_of_their_place() -> None:
+def test_positions_are_displaced_by_the_local_value_of_the_field() -> None:
     """The rig's own field lies on the full image: at half the resolution it is half as long."""
     fixed, moving = rasters()
     nodes = np.stack(np.meshgrid(np.arange(12) * 32.0, np.arange(9) * 32.0), axis=-1)

@@ -19,7 +19,7 @@ def test_distance_and_its_gradient_at_zero() -> None:
     assert torch.isfinite(x.grad).all()
 
 
-def test_contrastive_is_the_papers_sum() -> None:
+def test_contrastive_loss_is_the_sum_in_the_paper() -> None:
     positive, negative = torch.tensor([0.2, 0.5]), torch.tensor([0.4, 1.7])
     assert float(contrastive_loss(positive, negative)) == pytest.approx(0.7 + 0.6)
 
@@ -33,7 +33,7 @@ def test_in_batch_is_symmetric_cross_entropy() -> None:
     assert float(in_batch_loss(f, f_prime, ALL)) == pytest.approx((forward.mean() + backward.mean()) / 2)
 
 
-def test_forbidden_negatives_do_not_count() -> None:
+def test_excluded_negatives_are_ignored() -> None:
     none = torch.eye(30, dtype=torch.bool) & False
     f = torch.nn.functional.normalize(F, dim=1)
     assert float(in_batch_loss(f, f, none)) == pytest.approx(0.0)

@@ -36,14 +36,14 @@ def test_psi_round_trip(psi: torch.Tensor) -> None:
     torch.testing.assert_close(psi_from_homography(3 * h, 320, 240), psi, atol=1e-9, rtol=1e-9)
 
 
-def test_psi_is_the_papers_vector() -> None:
+def test_psi_is_the_vector_in_the_paper() -> None:
     h = torch.tensor([[1.1, 0.2, 32.0], [0.3, 0.9, -24.0], [1e-3, -2e-3, 1.0]], dtype=torch.float64)
     expected = ALPHA * torch.tensor([0.1, 0.2, 0.3, -0.1, 0.1, -0.1, 0.32, -0.48], dtype=torch.float64)
     torch.testing.assert_close(psi_from_homography(h, 320, 240), expected)
     torch.testing.assert_close(homography_from_psi(torch.zeros(8), 320, 240), torch.eye(3))
 
 
-def test_keypoint_warp_is_the_finite_difference_of_an_affinity() -> None:
+def test_keypoint_warp_equals_finite_differences_of_an_affine_mapping() -> None:
     # For an affinity the paper's v' is exact: compare with a real difference of two warped points.
     h = torch.tensor([[1.1, 0.1, 5.0], [-0.2, 0.9, -3.0], [0, 0, 1.0]], dtype=torch.float64)
     p = keypoints()
@@ -83,7 +83,7 @@ def test_patch_agrees_with_kornias_rotated_crop() -> None:
     torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)  # kornia normalises with an epsilon
 
 
-def test_gradient_over_psi_is_that_of_finite_differences() -> None:
+def test_gradient_over_psi_equals_finite_differences() -> None:
     # A smooth image, so that bilinear interpolation's kinks do not matter.
     y, x = torch.meshgrid(torch.arange(120.0).double(), torch.arange(140.0).double(), indexing="ij")
     image = (torch.sin(x / 9) * torch.cos(y / 11))[None]

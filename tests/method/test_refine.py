@@ -25,7 +25,7 @@ class Halving(Solver):
         return Step(change, abs(left) / 2, ((0.0, 0.0),) * 4, "homography", torch.zeros(8, 8, dtype=torch.float64))
 
 
-def test_steps_that_fall_by_a_constant_ratio_are_summed_to_their_end() -> None:
+def test_steps_with_a_constant_ratio_are_extrapolated() -> None:
     points = Keypoints(torch.zeros(4, 2), torch.zeros(4), torch.ones(4))
     reference_patches = ReferencePatches(points, torch.zeros(4, 256), torch.zeros(4, 256, 2))
     result, last = Halving("homography").converge(None, torch.eye(3), reference_patches)  # type: ignore[arg-type]
@@ -58,7 +58,7 @@ def test_a_step_of_infinite_length_ends_with_a_finite_homography(
     assert last.length_px == math.inf
 
 
-def test_a_pair_whose_last_step_is_infinite_has_unknown_corners(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_infinite_last_step_means_unknown_corners(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("agalign.method.gauss_newton.transform", lambda _h, points: points * math.nan)
     fixed, moving = textured_pair(np.eye(3))
     valid = np.ones(fixed.shape, bool)

@@ -19,7 +19,7 @@ def started(sharing: Sharing, channels: tuple[int, ...]) -> Descriptor:
 
 
 @pytest.mark.parametrize("sharing", get_args(Sharing))
-def test_every_side_starts_alike(sharing: Sharing) -> None:
+def test_every_side_starts_with_equal_weights(sharing: Sharing) -> None:
     net = started(sharing, (1, 1, 1))
     here, there, elsewhere = (net(PATCHES, side) for side in range(3))
     torch.testing.assert_close(here, there)
@@ -27,19 +27,19 @@ def test_every_side_starts_alike(sharing: Sharing) -> None:
     assert net.is_trained
 
 
-def test_three_equal_channels_are_described_as_one() -> None:
+def test_three_equal_channels_have_the_descriptor_of_one() -> None:
     net = started("pseudo-siamese", (3, 1))
     torch.testing.assert_close(net(PATCHES.repeat(1, 3, 1, 1), REFERENCE), net(PATCHES, 1))
 
 
-def test_patches_are_distinguished_and_contrast_does_not_matter_much() -> None:
+def test_patches_are_distinguished_despite_reversed_contrast() -> None:
     net = started("siamese", (1,))
     f, reversed_f = net(PATCHES, REFERENCE), net(-PATCHES, REFERENCE)
     d = torch.cdist(f, f) + 10 * torch.eye(len(f))
     assert (f - reversed_f).norm(dim=1).median() < d.min(dim=1).values.median()
 
 
-def test_the_recipe_starts_from_it_by_default() -> None:
+def test_recipe_fast_starts_from_the_starter_by_default() -> None:
     def first(*start: ThetaStart) -> torch.Tensor:
         state = JointState(JointSettings(device="cpu"), lambda *_: None)
         return state.fast_descriptor([1, 1], *start)(PATCHES, 1)

@@ -7,13 +7,13 @@ RGB = np.stack([np.full((2, 3), value, np.float32) for value in (10.0, 20.0, 60.
 VALID = np.ones((2, 3), bool)
 
 
-def test_luma_weighs_red_green_and_blue() -> None:
+def test_luma_is_the_weighted_mean_of_red_green_and_blue() -> None:
     np.testing.assert_allclose(luma(RGB), np.full((2, 3), 0.299 * 10 + 0.587 * 20 + 0.114 * 60), rtol=1e-6)
     np.testing.assert_allclose(luma(RGB[:2]), np.full((2, 3), 15.0))
     np.testing.assert_array_equal(luma(RGB[0]), RGB[0])
 
 
-def test_channel_mean_weighs_all_channels_alike() -> None:
+def test_channel_mean_has_equal_weights() -> None:
     result = channel_mean(Raster(RGB, VALID))
     np.testing.assert_allclose(result.pixels, np.full((2, 3), 30.0))
     assert result.pixels.dtype == np.float32

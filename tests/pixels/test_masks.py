@@ -12,7 +12,7 @@ def test_data_mask() -> None:
     assert data_mask(np.array([[1.0, np.nan]]), float("nan")).tolist() == [[True, False]]
 
 
-def test_fill_runs_in_from_the_border_only() -> None:
+def test_only_constant_areas_at_the_border_are_fill() -> None:
     image = np.full((60, 80), 100, np.uint8)
     image[:, :10] = 0
     image[30:34, 40:44] = 0  # shadow in the middle
@@ -30,7 +30,7 @@ def test_a_few_dark_pixels_at_the_border_are_content() -> None:
     assert not undeclared_fill(image).any()
 
 
-def test_saturated_areas_and_their_neighbours_are_not_learnt_from() -> None:
+def test_saturated_areas_and_their_neighbours_are_masked() -> None:
     pixels = np.full((30, 30), 100, np.uint16)
     pixels[5:15, 5:15] = 65520
     pixels[22, 22:27] = 65520  # a glint
@@ -42,7 +42,7 @@ def test_saturated_areas_and_their_neighbours_are_not_learnt_from() -> None:
 
 
 @pytest.mark.parametrize("fill", [-9999, -32767, -32768, -99999, 1e20, -1e20, -3.4028235e38, 9.96921e36])
-def test_what_programs_fill_floats_with_is_no_data(fill: float) -> None:
+def test_common_fill_values_of_floats_are_masked(fill: float) -> None:
     pixels = np.array([[0.2, fill, -3.0, 60_000.0]], np.float32)
     assert data_mask(pixels, None).tolist() == [[True, False, True, True]]
     # Where a value is declared, nothing is guessed; and integers are what they are.

@@ -28,7 +28,7 @@ def raster(pixels: np.ndarray) -> Raster:
     return Raster((5000 + 40000 * (pixels + noise)).astype(np.float32), np.ones(pixels.shape, bool))
 
 
-def test_a_panel_is_found_by_its_code_and_its_grey_is_inside_the_area(panel: np.ndarray) -> None:
+def test_a_panel_is_detected_by_its_code(panel: np.ndarray) -> None:
     result = find_panel(raster(panel))
     assert result is not None
     assert result.code == PANEL_CODE
@@ -38,7 +38,7 @@ def test_a_panel_is_found_by_its_code_and_its_grey_is_inside_the_area(panel: np.
     assert within.std() < 0.01
 
 
-def test_a_square_without_a_code_counts_only_where_asked_for(panel: np.ndarray) -> None:
+def test_a_square_without_a_code_is_detected_only_on_request(panel: np.ndarray) -> None:
     bare = np.where(panel > 0.6, 0.05, panel)  # no label
     assert find_panel(raster(bare)) is None
     result = find_panel(raster(bare), without_code=True)
@@ -48,7 +48,7 @@ def test_a_square_without_a_code_counts_only_where_asked_for(panel: np.ndarray) 
 
 
 @pytest.mark.parametrize(("at", "in_scene"), [((0, 0), True), ((540, 405), True), ((270, 200), False)])
-def test_a_panel_away_from_the_middle_of_a_wider_image_is_part_of_a_scene(
+def test_a_small_panel_far_from_the_centre_is_part_of_a_scene(
     panel: np.ndarray, at: tuple[int, int], in_scene: bool
 ) -> None:
     held = find_panel(raster(panel))
@@ -65,7 +65,7 @@ def test_a_panel_away_from_the_middle_of_a_wider_image_is_part_of_a_scene(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("without_code", [False, True])
-def test_a_field_shows_no_panel(without_code: bool) -> None:
+def test_no_panel_is_detected_in_a_field(without_code: bool) -> None:
     pose = Pose(28.0, 25.0, 0.0, 0.0, 0.0, 0.0)
     ground = paint_ground(np.random.default_rng(3), [pose], SIZE)
     for band in REDEDGE.bands:
@@ -75,7 +75,7 @@ def test_a_field_shows_no_panel(without_code: bool) -> None:
     assert find_panel(raster(np.full(SIZE[::-1], 0.3)), without_code=without_code) is None
 
 
-def test_codes_tell_reflectance_along_a_line() -> None:
+def test_codes_give_reflectance_linear_in_the_wavelength() -> None:
     """The real panel's code; its camera's tags say 0.5105 at 475 nm and 0.508067 at 840 nm."""
     code = "RP04-1826246-SC_04005111000507"
     assert albedo_of(code, 475.0) == pytest.approx(0.5105)

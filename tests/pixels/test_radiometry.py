@@ -17,7 +17,7 @@ from agalign.values.capture import Band, Capture, Radiometry
 from agalign.values.choices import RadiometryChoice
 
 
-def test_every_term_has_its_place() -> None:
+def test_every_term_of_the_calibration_is_applied() -> None:
     radiometry = Radiometry("radiance", 1000.0, 65536.0, 2.0, (3.0, 4.0), (0.1, 0, 0, 0, 0, 0), True, 0.01)
     raw = np.full((10, 12), 3000, np.uint16)
     result = calibrated(raw, radiometry, 0, 0)
@@ -29,7 +29,7 @@ def test_every_term_has_its_place() -> None:
     assert times[4, 8] == pytest.approx(signal * 1.5 / 1.04, rel=1e-6)
 
 
-def test_a_window_is_a_part_of_the_whole() -> None:
+def test_a_calibrated_window_equals_a_part_of_the_image() -> None:
     radiometry = Radiometry("radiance", 1000.0, 65536.0, 2.0, (30.0, 20.0), (1e-3, -1e-5, 0, 0, 0, 0), True, 0.001)
     raw = np.random.default_rng(0).integers(2000, 60000, (50, 60)).astype(np.uint16)
     whole = calibrated(raw, radiometry, 0, 0)
@@ -74,7 +74,7 @@ def by(path: Path, choice: RadiometryChoice, factors: dict[str, float] | None = 
     return with_radiometry(Capture("IMG_0001", Path(), bands, 0), choice, factors or {}).bands[0]
 
 
-def test_radiometry_is_what_was_chosen(tmp_path: Path) -> None:
+def test_the_chosen_radiometry_is_applied(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
     path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
     raw, camera, sun = (by(path, choice).radiometry for choice in ("off", "camera", "sun"))
@@ -93,7 +93,7 @@ def test_radiometry_is_what_was_chosen(tmp_path: Path) -> None:
     assert by(path, "auto").radiometry == sun
 
 
-def test_a_colour_photograph_stands_in_nobody_s_way() -> None:
+def test_rgb_companions_do_not_prevent_reflectance() -> None:
     green = Band("Green", Path("g.tif"), 1, 64, 48, "uint16", radiometry=Radiometry("radiance", 0.0, 1.0, 2.0))
     colour = Band("RGB Red", Path("c.jpg"), 1, 64, 48, "uint8", companion=True)
     capture = with_radiometry(Capture("a", Path(), (green, colour), 0), "auto", {"Green": 3.0})
@@ -101,7 +101,7 @@ def test_a_colour_photograph_stands_in_nobody_s_way() -> None:
     assert (WriteSettings(radiometry=True).radiometry, WriteSettings(radiometry=False).radiometry) == ("auto", "off")
 
 
-def test_temperatures_stay_temperatures_whatever_is_chosen() -> None:
+def test_thermal_bands_are_not_converted() -> None:
     kelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)
     band = Band("LWIR", Path("IMG_0001_6.tif"), 1, 160, 120, "uint16", radiometry=kelvin)
     for choice in ("auto", "camera", "sun", "panel"):
@@ -111,7 +111,7 @@ def test_temperatures_stay_temperatures_whatever_is_chosen() -> None:
 
 
 @pytest.mark.parametrize("value", ["-5", "0", "nan"])
-def test_a_light_that_cannot_be_is_none(tmp_path: Path, value: str) -> None:
+def test_an_implausible_light_sensor_value_is_ignored(tmp_path: Path, value: str) -> None:
     synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
     path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
     tags = read_tags(path)
@@ -139,7 +139,7 @@ def test_without_a_light_sensor_it_is_radiance(tmp_path: Path) -> None:
         {"vignetting_centre_px": (math.nan, 0.0)}, {"row_gradient": -0.01},
     ],
 )  # fmt: skip
-def test_calibrations_that_cannot_be(change: dict[str, object]) -> None:
+def test_implausible_calibrations_are_rejected(change: dict[str, object]) -> None:
     good = Radiometry("radiance", 4800.0, 65536.0, 0.02, (640.0, 480.0), (1e-5, -2e-7))
     assert is_physical(good, (1280, 960))
     assert not is_physical(replace(good, **change), (1280, 960))  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ from ..conftest import textured_image
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
-def test_a_photograph_is_averaged_down(tmp_path: Path) -> None:
+def test_a_photograph_is_reduced_by_averaging(tmp_path: Path) -> None:
     scene = (128 + 30 * textured_image(640, 480)).clip(1, 254).astype(np.uint8)
     path = tmp_path / "a.jpg"
     cv2.imwrite(str(path), np.stack([scene, scene // 2, scene // 3], axis=-1), [cv2.IMWRITE_JPEG_QUALITY, 98])
@@ -40,7 +40,7 @@ def test_codes_of_coordinate_systems() -> None:
         transformed(np.zeros((1, 2)), "EPSG:0", "EPSG:4326")
 
 
-def test_a_file_says_what_it_holds(tmp_path: Path) -> None:
+def test_metadata_of_a_file_is_read(tmp_path: Path) -> None:
     profile = {"driver": "GTiff", "width": 8, "height": 6, "count": 2, "dtype": "uint16"}
     with rasterio.open(tmp_path / "a.tif", "w", **profile) as file:
         file.update_tags(2, wavelength="0.84", wavelength_units="micrometers")

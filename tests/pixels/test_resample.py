@@ -42,7 +42,7 @@ def test_source_positions_are_the_mapping(flight: Path) -> None:
         np.testing.assert_allclose(positions, mapping(np.stack([x, y], axis=-1)), atol=1e-3)
 
 
-def test_undistorted_pixels_of_the_reference_reach_the_same_place() -> None:
+def test_undistorted_reference_pixels_are_mapped_to_the_same_position() -> None:
     own, other = (cameras.BANDS[k].lens(480, 360) for k in (1, 3))
     straight = np.array([[50.0, 60.0], [400.0, 300.0]])
     raw = lens.distort(own, straight)
@@ -101,7 +101,7 @@ def test_tiles_join_without_a_seam(tmp_path: Path) -> None:
         assert np.abs(part - whole[window])[valid].max() < 0.5  # 0.005 of the contrast: spline knots differ by tile
 
 
-def test_outside_is_invalid_and_nodata_does_not_bleed(tmp_path: Path) -> None:
+def test_pixels_outside_are_invalid_and_nodata_is_not_interpolated(tmp_path: Path) -> None:
     pixels = np.full((100, 140), 500, np.uint16)
     pixels[40:50, 60:70] = 0
     band = write_band(tmp_path / "b.tif", pixels, nodata=0)
@@ -112,7 +112,7 @@ def test_outside_is_invalid_and_nodata_does_not_bleed(tmp_path: Path) -> None:
     assert (got[valid] == 500).all()
 
 
-def test_far_away_nothing_is_valid(tmp_path: Path) -> None:
+def test_no_pixel_is_valid_far_outside(tmp_path: Path) -> None:
     band = write_band(tmp_path / "b.tif", np.ones((100, 140), np.uint16))
     got, valid = resample_tile(band, PixelMapping(geometry.translation(500, 0)), Tile(0, 0, 30, 20), "cubic")
     assert got.shape == (20, 30)
@@ -149,7 +149,7 @@ def test_largest_rectangle_is_the_largest(cells: np.ndarray) -> None:
         assert (bottom - top) * (right - left) == best
 
 
-def test_common_area_lies_inside_every_band() -> None:
+def test_the_common_area_is_inside_every_band() -> None:
     bands = [
         (PixelMapping(geometry.translation(*t)), Band("b", Path("b"), 1, 200, 150, "uint8")) for t in ((12, 0), (-5, 7))
     ]
@@ -171,7 +171,7 @@ def test_the_source_file_is_read_once_as_it_is(tmp_path: Path) -> None:
     assert valid.all()
 
 
-def test_warped_shows_the_moving_image_on_the_fixed_grid() -> None:
+def test_the_moving_image_is_warped_to_the_fixed_grid() -> None:
     shifted = np.array([[1.01, 0.01, 31.0], [-0.01, 1.0, -18.0], [0, 0, 1.0]])
     images = textured_pair(shifted)
     fixed, moving = (Raster(image, np.ones(image.shape, bool)) for image in images)
@@ -182,7 +182,7 @@ def test_warped_shows_the_moving_image_on_the_fixed_grid() -> None:
     assert half.size_px == (200, 160)
 
 
-def test_an_identity_between_grids_of_two_scales_is_not_taken_for_nothing() -> None:
+def test_an_identity_between_grids_of_different_scales_is_warped() -> None:
     """The moving image has as many pixels as the reduced grid, and shows but a quarter of the fixed image."""
     image = textured_image(200, 160)
     moving = Raster(image, np.ones(image.shape, bool))

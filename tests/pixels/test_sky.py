@@ -14,7 +14,7 @@ def gradient() -> np.ndarray:
     return np.asarray(20000 * (1 + 0.4 * y - 0.2 * x * y) * (1 - 0.3 * (x**2 + y**2)))
 
 
-def test_vignetting_and_a_gradient_are_no_texture_and_faint_waves_are() -> None:
+def test_vignetting_is_not_texture_but_faint_waves_are() -> None:
     rng = np.random.default_rng(0)
     smooth = gradient() * (1 + 0.004 * rng.standard_normal((48, 64)))
     assert relative_texture(image(smooth)) == pytest.approx(0.004, rel=0.2)
@@ -30,7 +30,7 @@ def test_texture_is_relative_to_the_light_above_the_black_level() -> None:
     assert plain == pytest.approx(lifted, rel=1e-3)
 
 
-def test_what_is_mostly_saturated_or_black_has_no_known_texture() -> None:
+def test_saturated_or_black_images_have_no_texture_value() -> None:
     bright = image(gradient())
     assert relative_texture(Raster(bright.pixels, np.arange(48 * 64).reshape(48, 64) % 3 == 0)) is None
     assert relative_texture(image(np.zeros((48, 64)))) is None

@@ -66,7 +66,7 @@ def test_bands_peak_at_their_offset_once_the_common_pattern_is_removed(
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_of_a_pattern_a_tenth_remains(axis: int) -> None:
+def test_most_of_a_pattern_is_removed(axis: int) -> None:
     clean = bands()
     result = without_common_stripes(striped(clean, pattern(axis)))
     for k, (before, after) in enumerate(zip(clean, result, strict=True)):
@@ -97,7 +97,7 @@ def test_crop_rows_along_the_columns_are_not_removed(
     assert ("co-registered" in caplog.text) == (offsets is REGISTERED)
 
 
-def test_invalid_pixels_stay_out_of_the_estimate_and_at_0() -> None:
+def test_invalid_pixels_are_excluded_and_stay_0() -> None:
     clean = bands()
     valid = EVERYWHERE.copy()
     valid[:, 100:160] = valid[200:230] = False

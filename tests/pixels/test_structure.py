@@ -31,7 +31,7 @@ def test_the_peak_is_at_the_shift(shift: tuple[float, float]) -> None:
     assert peak.sigma > 3 * peak.runner_up_sigma
 
 
-def test_unrelated_images_have_no_outstanding_peak() -> None:
+def test_unrelated_images_have_no_significant_peak() -> None:
     fields = [structure_field(Raster(textured_image(320, 240, s), EVERYWHERE)) for s in (1, 2)]
     peak = find_peak(correlation_surface(*fields), 16)
     assert peak.sigma < 8
@@ -74,7 +74,7 @@ def at_offset(image: np.ndarray, offset: int) -> np.ndarray:
     return placed
 
 
-def test_the_magnitude_does_not_depend_on_where_the_image_lies_in_memory() -> None:
+def test_the_magnitude_does_not_depend_on_memory_alignment() -> None:
     gx, gy = textured_image(471, 353, 1), textured_image(471, 353, 2)
     result = {gradient_magnitude(at_offset(gx, k), at_offset(gy, (5 * k) % 128)).tobytes() for k in range(0, 128, 4)}
     assert len(result) == 1

@@ -30,16 +30,16 @@ def shadow(box: tuple[slice, slice], dx: int, dy: int) -> Mask:
 
 
 @pytest.mark.parametrize("baseline", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -0.5), (0.5, -1.0), (-0.5, 1 / 3)])
-def test_a_nearer_box_hides_the_ground_next_to_it(baseline: tuple[float, float]) -> None:
+def test_a_nearer_box_occludes_the_ground_next_to_it(baseline: tuple[float, float]) -> None:
     dx, dy = (round(b * NEAR_PX) for b in baseline)
     np.testing.assert_array_equal(occluded(layers(), baseline), shadow(BOX, dx, dy))
 
 
-def test_a_band_without_a_baseline_sees_everything() -> None:
+def test_a_band_without_a_baseline_has_no_occlusions() -> None:
     assert not occluded(layers(), (0.0, 0.0)).any()
 
 
-def test_a_hole_is_hidden_by_its_edge() -> None:
+def test_a_hole_is_occluded_by_its_edge() -> None:
     """The edge at which the ground comes over the hole, on the side that it moves from."""
     hidden = occluded(layers(near_px=-NEAR_PX), (1.0, 0.0))
     rows, columns = BOX
@@ -49,12 +49,12 @@ def test_a_hole_is_hidden_by_its_edge() -> None:
     np.testing.assert_array_equal(hidden, expected)
 
 
-def test_only_differences_of_parallax_count() -> None:
+def test_only_differences_of_parallax_matter() -> None:
     raised = layers(near_px=NEAR_PX + 4, far_px=4)
     np.testing.assert_array_equal(occluded(raised, (1.0, 0.0)), occluded(layers(), (1.0, 0.0)))
 
 
-def test_low_relief_of_a_surface_hides_nothing() -> None:
+def test_low_relief_of_a_surface_occludes_nothing() -> None:
     slope = np.linspace(0, 20, WIDTH, dtype=np.float32)[None, :].repeat(HEIGHT, axis=0)
     for baseline in ((1.0, 0.0), (-0.7, 0.7)):
         assert not occluded(Relief(slope, np.ones_like(slope)), baseline).any()
@@ -65,7 +65,7 @@ def test_low_relief_of_a_surface_hides_nothing() -> None:
     (slice(0, 15), slice(0, 12)), (slice(45, HEIGHT), slice(80, WIDTH)), (slice(0, HEIGHT), slice(0, 8)),
 ])  # fmt: skip
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_box_at_the_border_hides_only_what_is_inside(box: tuple[slice, slice], sign: int) -> None:
+def test_a_box_at_the_border_occludes_only_pixels_inside(box: tuple[slice, slice], sign: int) -> None:
     """Pixels that leave the image hide nothing, neither each other nor those at the other side."""
     hidden = occluded(layers(box), (sign * 1.0, 0.0))
     expected = shadow(box, sign * NEAR_PX, 0)
@@ -105,15 +105,15 @@ BASELINES = np.array([[1.0, 0.0], [0.0, 0.6]])
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_what_matches_is_nearer_than_what_does_not(sign: int) -> None:
+def test_pixels_that_match_are_nearer(sign: int) -> None:
     assert nearer_sign(matched(sign, BASELINES), BASELINES) == sign
 
 
-def test_where_hidden_pixels_match_as_well_nothing_is_known() -> None:
+def test_the_sign_is_unknown_if_occluded_pixels_match_too() -> None:
     assert nearer_sign(matched(1, BASELINES, behind=0.9), BASELINES) == 0
 
 
-def test_without_occlusions_nothing_is_known() -> None:
+def test_the_sign_is_unknown_without_occlusions() -> None:
     flat = layers(near_px=0.0)
     assert nearer_sign(flat, BASELINES) == 0
     small = Relief(layers((slice(20, 22), slice(30, 32))).parallax_px, matched(1, BASELINES).confidence)

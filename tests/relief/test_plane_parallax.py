@@ -56,7 +56,7 @@ def assert_recovered(model: PlaneParallax | None, sign: int = 1, tolerance_px: f
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.001, 40.0])
-def test_everything_is_recovered_through_noise_and_wrong_peaks(unit: float) -> None:
+def test_the_model_is_recovered_despite_noise_and_wrong_peaks(unit: float) -> None:
     """Whatever the unit of the layout."""
     model = fit_plane_parallax(shifts(), SIZE, BASELINES * unit)
     assert_recovered(model)
@@ -64,7 +64,7 @@ def test_everything_is_recovered_through_noise_and_wrong_peaks(unit: float) -> N
     assert 0.1 < (model.residuals_px > 2).mean() < 0.25
 
 
-def test_windows_that_some_bands_do_not_show() -> None:
+def test_windows_may_be_missing_in_some_bands() -> None:
     some = shifts(missing=0.3)
     model = fit_plane_parallax(some, SIZE, BASELINES)
     assert_recovered(model)
@@ -72,7 +72,7 @@ def test_windows_that_some_bands_do_not_show() -> None:
 
 
 @pytest.mark.parametrize("layout", [BASELINES, None])
-def test_a_band_that_shows_something_else_does_not_decide_for_the_others(layout: np.ndarray | None) -> None:
+def test_an_unrelated_band_does_not_bias_the_others(layout: np.ndarray | None) -> None:
     windows = shifts(wrong=0.0)
     windows.shifts_px[:, 0] = np.random.default_rng(2).uniform(-20, 20, (len(POINTS), 2))
     model = fit_plane_parallax(windows, SIZE, layout)
@@ -82,23 +82,23 @@ def test_a_band_that_shows_something_else_does_not_decide_for_the_others(layout:
     np.testing.assert_allclose(others, wanted / np.linalg.norm(wanted, axis=1).max(), atol=0.03)
 
 
-def test_the_layout_may_be_wrong_but_for_its_sign() -> None:
+def test_only_the_sign_of_the_layout_must_be_right() -> None:
     rough = BASELINES + np.random.default_rng(5).normal(0, 0.15, BASELINES.shape)
     assert_recovered(fit_plane_parallax(shifts(), SIZE, rough))
 
 
-def test_the_layout_decides_the_sign() -> None:
+def test_the_layout_determines_the_sign() -> None:
     assert_recovered(fit_plane_parallax(shifts(), SIZE, BASELINES))
     assert_recovered(fit_plane_parallax(shifts(), SIZE, -BASELINES), sign=-1)
 
 
-def test_without_a_layout_all_but_the_sign_is_found() -> None:
+def test_without_a_layout_only_the_sign_is_unknown() -> None:
     model = fit_plane_parallax(shifts(), SIZE)
     assert model is not None
     assert_recovered(model, sign=1 if (model.baselines * BASELINES).sum() > 0 else -1)
 
 
-def test_the_reference_plane_is_the_one_that_most_windows_are_on() -> None:
+def test_the_reference_plane_contains_most_windows() -> None:
     """Adding a plane to the parallax and taking it from the homographies changes no shift."""
     tilted = shifts()
     tilt = 0.01 * (POINTS[:, 0] - 320) - 0.02 * (POINTS[:, 1] - 240) + 5
@@ -108,7 +108,7 @@ def test_the_reference_plane_is_the_one_that_most_windows_are_on() -> None:
     assert np.percentile(np.abs(model.parallax_px - heights()), 75) < 0.15
 
 
-def test_too_few_windows_are_no_model() -> None:
+def test_too_few_windows_give_no_model() -> None:
     windows = shifts()
     few = WindowShifts(POINTS[:7], POINTS[:7], windows.shifts_px[:7], windows.weights[:7])
     assert fit_plane_parallax(few, SIZE) is None
@@ -166,7 +166,7 @@ def test_shifts_are_those_of_undistorted_pixels() -> None:
 
 @pytest.mark.parametrize("layout", [None, BASELINES])
 @pytest.mark.parametrize("bands", [[0, 1], [0, 1, 2], [0, 1, 2, 3]])
-def test_noise_of_the_reference_is_no_parallax(layout: np.ndarray | None, bands: list[int]) -> None:
+def test_noise_of_the_reference_is_not_parallax(layout: np.ndarray | None, bands: list[int]) -> None:
     """It shifts the windows of all bands alike, most in the direction in which the image has little texture."""
     rng = np.random.default_rng(2)
     of_reference = rng.normal(0, [0.3, 1.0], (len(POINTS), 1, 2))

@@ -31,7 +31,7 @@ def test_four_paths(labels: int, small: int, large: int) -> None:
     np.testing.assert_array_equal(costs, given)
 
 
-def test_an_edge_stays_sharp_and_noise_goes() -> None:
+def test_edges_are_preserved_and_noise_is_removed() -> None:
     rng = np.random.default_rng(0)
     truth = np.where(np.arange(30)[None, :] < 13, 2, 6).repeat(20, axis=0).reshape(20, 30)
     costs = rng.integers(60, 100, (9, 20, 30)).astype(np.int16)

@@ -21,7 +21,7 @@ def kinds(joint: JointResult = GOOD_JOINT, residual: Residual = GOOD_RESIDUAL) -
     return [d.code for d in issues_of(Evidence(joint, residual, SIZE))]
 
 
-def test_all_well() -> None:
+def test_a_good_result_has_no_issues() -> None:
     assert kinds() == []
     assert status_of((), GOOD_RESIDUAL, seed=False) == "aligned"
 
@@ -51,7 +51,7 @@ NAN = float("nan")
         (replace(GOOD_JOINT, retrieval=0.1), replace(GOOD_RESIDUAL, median_px=2.5), ["retrieval", "residual_px"]),
     ],
 )
-def test_any_doubt_is_enough_and_each_is_named(joint: JointResult, residual: Residual, expected: list[str]) -> None:
+def test_every_issue_is_sufficient_and_listed(joint: JointResult, residual: Residual, expected: list[str]) -> None:
     assert kinds(joint, residual) == expected
     issues = issues_of(Evidence(joint, residual, SIZE))
     assert status_of(issues, GOOD_RESIDUAL, seed=True) == "seed_only"
@@ -59,7 +59,7 @@ def test_any_doubt_is_enough_and_each_is_named(joint: JointResult, residual: Res
     assert all(sentence(d) for d in issues)
 
 
-def test_a_doubt_has_its_value_and_limit() -> None:
+def test_an_issue_has_its_value_and_limit() -> None:
     (issue,) = issues_of(Evidence(replace(GOOD_JOINT, retrieval=0.1), GOOD_RESIDUAL, SIZE))
     assert issue == Issue(RETRIEVAL, 0.1, 0.2)
     assert "0.10" in sentence(issue)
@@ -74,7 +74,7 @@ def test_a_seed_that_does_not_fit_is_not_used() -> None:
     assert "rig seed is used unchanged, but the seed does not fit either" in failed.reason
 
 
-def test_an_aligned_input_is_left_as_it_is() -> None:
+def test_an_aligned_input_is_unchanged() -> None:
     within = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.1, 0.1))
     beyond = replace(GOOD_JOINT, fixed_to_moving=geometry.translation(0.4, 0.1))
     precise = replace(within, corner_std_xy_px=((0.01, 0.0),) * 4)
@@ -92,7 +92,7 @@ def windows(off: np.ndarray) -> Residual:
     return Residual(centres, shifts, 0.05, 0.2, 1.0)
 
 
-def test_a_part_of_the_image_that_lies_apart_is_a_doubt_and_scattered_windows_are_none() -> None:
+def test_misaligned_clusters_are_an_issue_but_scattered_windows_are_not() -> None:
     scattered, corner, third = (np.zeros((9, 12), bool) for _ in range(3))
     scattered[::4, ::3] = True
     scattered[0, 0] = scattered[8, 9] = False
@@ -103,7 +103,7 @@ def test_a_part_of_the_image_that_lies_apart_is_a_doubt_and_scattered_windows_ar
     assert kinds(residual=windows(third)) == ["close_windows", "cluster"]
 
 
-def test_windows_that_could_not_be_measured_are_no_tail() -> None:
+def test_windows_without_a_measurement_are_not_misaligned() -> None:
     residual = windows(np.zeros((9, 12), bool))
     residual.shifts_px[:20] = np.nan
     assert kinds(residual=residual) == []
@@ -181,7 +181,7 @@ def test_the_windows_of_a_cluster_are_counted(total: int, allowed: int) -> None:
         assert kinds(residual=residual) == ([] if count == allowed else ["cluster"]), (total, count)
 
 
-def test_windows_a_gap_apart_are_no_cluster() -> None:
+def test_windows_with_a_gap_are_not_a_cluster() -> None:
     residual = shifted(0, 0.0)
     residual.shifts_px[10:20:2, 0] = 2.0
     assert kinds(residual=residual) == []

@@ -56,7 +56,7 @@ def test_a_result_far_from_the_rig_is_an_issue(off_px: float | None, std_px: flo
     assert codes(replace(GOOD, prediction=replace(PREDICTION, off_px=off_px, std_px=std_px))) == expected
 
 
-def test_a_repetitive_scene_is_an_issue_unless_other_places_are_ruled_out() -> None:
+def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded() -> None:
     (issue,) = issues_of(replace(GOOD, images=RepetitiveImages()))
     assert issue.code == "repeats"
     assert issue.value is not None

@@ -45,7 +45,7 @@ def weights(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.ones(len(at)), np.full(len(at), 20.0)
 
 
-def test_a_smooth_field_is_found_through_noise_and_wrong_peaks() -> None:
+def test_a_smooth_field_is_fitted_despite_noise_and_wrong_peaks() -> None:
     rng = np.random.default_rng(0)
     at = centres()
     shifts = bump(at) + 0.08 * rng.normal(size=at.shape)
@@ -57,7 +57,7 @@ def test_a_smooth_field_is_found_through_noise_and_wrong_peaks() -> None:
     assert np.linalg.norm(bump(at), axis=1).max() > 1.2
 
 
-def test_far_from_all_measurements_the_field_goes_to_nothing() -> None:
+def test_the_field_vanishes_far_from_all_measurements() -> None:
     at = centres()
     near = at[at[:, 0] < 200]
     field = fitted_field(Shifts(near, np.tile([2.0, 0.0], (len(near), 1)), *weights(near)), 1.0, 48, (6400, 480))
@@ -65,7 +65,7 @@ def test_far_from_all_measurements_the_field_goes_to_nothing() -> None:
     assert abs(field(np.array([[6000.0, 240.0]]))[0]).max() < 0.2
 
 
-def test_folding_is_seen() -> None:
+def test_folding_is_detected() -> None:
     flat = np.zeros((16, 21, 2))
     assert _is_one_to_one(DisplacementField(32.0, flat), SIZE)
     steep = flat.copy()
@@ -96,7 +96,7 @@ def test_displacements_between_bands_are_followed() -> None:
     assert result.after_p95_px < result.before_p95_px
 
 
-def test_where_a_homography_is_enough_nothing_is_added() -> None:
+def test_no_field_is_added_where_a_homography_suffices() -> None:
     fixed, moving = bent_pair(0.0)
     result = Reference(fixed).coarse_field.refine(moving, PixelMapping(geometry.identity()))
     assert result.field is None or np.abs(result.field(geometry.lattice(*SIZE, 17, 13))).max() < 0.05
@@ -115,7 +115,7 @@ def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:
     np.testing.assert_allclose(dense, direct, atol=0.01)
 
 
-def test_no_window_is_explained_by_one_that_shares_a_pixel_with_it() -> None:
+def test_windows_are_predicted_without_those_that_share_pixels() -> None:
     at = centres()
     fold = _folds(at)
     assert set(fold) == set(range(16))
@@ -127,7 +127,7 @@ def test_no_window_is_explained_by_one_that_shares_a_pixel_with_it() -> None:
         assert apart.min() >= 64
 
 
-def test_a_field_that_makes_the_worst_windows_worse_is_not_kept() -> None:
+def test_a_field_that_increases_p95_is_rejected() -> None:
     better = _Gain(1.0, before_p95_px=1.62, after_p95_px=1.59, loss=0.1, sigma=9.0)
     worse = _Gain(1.0, before_p95_px=1.59, after_p95_px=1.62, loss=0.1, sigma=9.0)
     assert better.is_significant(4.0)
@@ -143,7 +143,7 @@ def of_captures(count: int, height: float, seed: int) -> list[Residual]:
     return [Residual(at, s, 0.1, 0.3, 1.0, np.full(len(at), 15.0)) for s in shifts]
 
 
-def test_what_captures_have_in_common_is_the_lenses() -> None:
+def test_the_common_field_of_captures_is_that_of_the_lenses() -> None:
     field = common_field(of_captures(6, 0.4, 1), SIZE)
     assert field is not None
     at = geometry.lattice(*SIZE, 17, 13)
@@ -156,7 +156,7 @@ def test_what_captures_have_in_common_is_the_lenses() -> None:
     assert common_field(own, SIZE) is None
 
 
-def test_cross_validation_smooths_by_the_captures_in_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_smoothness_is_relative_to_the_number_of_captures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Smoothness is per capture: a fit without some captures must not be stiffer than the final one."""
     captures = of_captures(5, 0.4, 1)
     fits: list[tuple[int, float]] = []
@@ -177,7 +177,7 @@ def test_cross_validation_smooths_by_the_captures_in_the_fit(monkeypatch: pytest
 
 @pytest.mark.parametrize("chance", range(3))
 @pytest.mark.parametrize("scale", [COARSE, FINE])
-def test_a_field_that_fits_unrelated_windows_explains_none_that_were_left_out(chance: int, scale: FieldScale) -> None:
+def test_a_field_fitted_to_noise_does_not_predict_held_out_windows(chance: int, scale: FieldScale) -> None:
     """Random shifts, which a fine enough field follows where it was fitted."""
     rng, at = np.random.default_rng(chance), centres()
     shifts = rng.uniform(-4, 4, at.shape)
@@ -191,7 +191,7 @@ def test_a_field_that_fits_unrelated_windows_explains_none_that_were_left_out(ch
     assert np.median(explained) < 0.8 * np.median(np.linalg.norm(shifts, axis=1))
 
 
-def test_what_is_reported_of_a_field_was_left_out_of_its_fit() -> None:
+def test_the_reported_residual_is_cross_validated() -> None:
     """Smooth displacements with jumps of their own at each window: the field follows both, and predicts one."""
     rng, at = np.random.default_rng(0), centres()
     jumps = rng.normal(0, 0.7, at.shape)
@@ -206,7 +206,7 @@ def test_what_is_reported_of_a_field_was_left_out_of_its_fit() -> None:
     assert others == pytest.approx(np.median(np.linalg.norm(jumps, axis=1)), rel=0.25)
 
 
-def test_no_window_that_shares_a_pixel_takes_part_in_a_prediction() -> None:
+def test_predictions_exclude_windows_that_share_pixels() -> None:
     """A window that is far off does not change what is predicted at it, however much it weighs."""
     at = centres()
     estimator = DisplacementEstimator(np.ones(SIZE[::-1], bool), np.zeros(SIZE[::-1], np.complex64), COARSE)

@@ -26,12 +26,12 @@ def windows(columns: int, shift_px: float) -> Residual:
     return Residual(centres, shifts, shift_px, 2.0, 1.0)
 
 
-def test_the_corners_covariance_is_what_the_corners_show() -> None:
+def test_the_expected_error_at_the_corners_is_their_covariance() -> None:
     result = expected_error_px(alignment([0.1, 0.5, 0.5, 0.1], None), SIZE, np.array([[0.0, 0.0], [639.0, 0.0]]))
     np.testing.assert_allclose(result, np.sqrt(2) * np.array([0.1, 0.5]), rtol=1e-6)
 
 
-def test_windows_tell_of_their_places_and_far_from_all_of_them_the_worst_is_to_be_expected() -> None:
+def test_the_error_near_windows_is_their_residual_and_far_from_them_p95() -> None:
     known = alignment([0.01] * 4, windows(3, 0.3))
     assert 0.25 < expected_error_px(known, SIZE, LEFT)[0] < 0.35
     assert 1.9 < expected_error_px(known, SIZE, RIGHT)[0] < 2.1
@@ -39,7 +39,7 @@ def test_windows_tell_of_their_places_and_far_from_all_of_them_the_worst_is_to_b
     assert 0.25 < expected_error_px(everywhere, SIZE, RIGHT)[0] < 0.35
 
 
-def test_a_prediction_is_as_good_as_it_says_and_a_seed_says_nothing() -> None:
+def test_predictions_have_their_standard_error_and_seeds_none() -> None:
     known = alignment([0.01] * 4, None)
     predicted = replace(known, status="predicted", prediction=Prediction(np.eye(3), "bands", 0.4))
     np.testing.assert_allclose(expected_error_px(predicted, SIZE, LEFT), 0.4)

@@ -19,11 +19,11 @@ CENTRES = np.stack(np.meshgrid(np.arange(50.0, 1000, 100), np.arange(50.0, 800, 
 WHOLE = geometry.lattice(*SIZE, 24, 18)
 
 
-def test_windows_everywhere_leave_out_nothing() -> None:
+def test_windows_everywhere_cover_all_quarters() -> None:
     assert unobserved_quarters(CENTRES, SIZE) == []
 
 
-def test_windows_that_end_near_the_middle_do_not_show_the_other_half() -> None:
+def test_windows_that_end_near_the_centre_do_not_cover_the_other_half() -> None:
     # 612 px, an eighth of the width beyond the middle
     assert unobserved_quarters(CENTRES[CENTRES[:, 0] < 620], SIZE) == ["top right", "bottom right"]
     assert unobserved_quarters(CENTRES[CENTRES[:, 0] < 680], SIZE) == []
@@ -37,7 +37,7 @@ def test_one_window_is_too_few() -> None:
     assert unobserved_quarters(np.vstack([others, [[800.0, 700.0], [900.0, 700.0]]]), SIZE) == []
 
 
-def test_what_the_moving_image_does_not_cover_needs_no_window() -> None:
+def test_areas_outside_the_moving_image_need_no_window() -> None:
     left = CENTRES[CENTRES[:, 0] < 450]
     frame = points_in_frame(PixelMapping(geometry.translation(500, 0)), SIZE, SIZE)
     assert frame[:, 0].max() < 500

@@ -87,7 +87,7 @@ def test_the_field_is_the_displacement_of_the_shapes() -> None:
     np.testing.assert_allclose(fit.field()(inside), lens_shapes(inside, SIZE) @ fit.mean_px[8:], atol=0.02)
 
 
-def test_a_homography_of_one_half_leaves_more_of_the_lenses_and_calibrated_lenses_leave_less() -> None:
+def test_unmodelled_distortion_grows_with_extrapolation_and_shrinks_with_calibration() -> None:
     whole, half = (unmodelled_std_px(c, SIZE, calibrated=False) for c in (CENTRES, LEFT))
     assert 0.1 < whole < 0.25
     assert 0.5 < half < 1.0

@@ -55,7 +55,7 @@ def elastix_mattes(fixed: np.ndarray, moving: np.ndarray) -> float:
     return total
 
 
-def test_mattes_is_that_of_the_definition() -> None:
+def test_mattes_mi_equals_its_definition() -> None:
     fixed = textured_image(90, 70).ravel().astype(np.float64)
     moving = np.sin(fixed) + 0.3 * textured_image(90, 70, 1).ravel()
     bins = fixed_bins(fixed.astype(np.float32), (float(fixed.min()), float(fixed.max())))
@@ -65,7 +65,7 @@ def test_mattes_is_that_of_the_definition() -> None:
     assert mine == pytest.approx(elastix_mattes(fixed, moving), rel=1e-3)
 
 
-def test_mattes_is_close_to_itks_whose_bins_lie_a_little_differently() -> None:
+def test_mattes_mi_is_close_to_that_of_itk() -> None:
     fixed, moving = textured_pair(np.eye(3))
     method = sitk.ImageRegistrationMethod()
     method.SetMetricAsMattesMutualInformation(numberOfHistogramBins=32)
@@ -118,7 +118,7 @@ def test_structure_ssim_agrees_with_scikit_image() -> None:
     assert mine == pytest.approx(full[5:-5, 5:-5].mean(), abs=5e-3)
 
 
-def test_similarity_sees_only_valid_pixels() -> None:
+def test_similarity_uses_only_valid_pixels() -> None:
     fixed, moving = textured_pair(np.eye(3))
     valid = np.ones(fixed.shape, bool)
     valid[:, :100] = False
@@ -151,7 +151,7 @@ def test_tile_residuals_of_unrelated_images_are_large_or_unmeasured() -> None:
     assert residual.coverage < 0.6 or residual.median_px > 3
 
 
-def test_tiles_without_structure_are_not_tried() -> None:
+def test_tiles_without_structure_are_skipped() -> None:
     fixed, moving = textured_pair(np.eye(3))
     valid = np.ones(fixed.shape, bool)
     valid[:, 200:] = False
@@ -160,7 +160,7 @@ def test_tiles_without_structure_are_not_tried() -> None:
     assert residual.centres_px[:, 0].max() < 200
 
 
-def test_windows_that_are_nowhere_valid_say_nothing() -> None:
+def test_windows_without_valid_pixels_are_skipped() -> None:
     one, other = textured_pair(np.eye(3))
     nowhere = Raster(other, np.zeros(other.shape, bool))
     result = tile_residuals(Raster(one, np.ones(one.shape, bool)), nowhere)

@@ -26,7 +26,7 @@ def spectrum(image: np.ndarray) -> np.ndarray:
     return windowed_spectra(structure_field(Raster(image, np.ones(image.shape, bool))))
 
 
-def test_a_rival_lies_a_period_away() -> None:
+def test_the_alias_peak_is_one_period_away() -> None:
     rival = alias_peak(spectrum(planted((0, 0), 1)), spectrum(planted((0, 0), 2, -1.0)))
     assert rival.ratio > 0.8
     periods = np.array(rival.shift_px) / PERIOD
@@ -34,14 +34,14 @@ def test_a_rival_lies_a_period_away() -> None:
     assert np.abs(periods).max() >= 1
 
 
-def test_what_is_like_nothing_else_has_no_rival() -> None:
+def test_a_unique_scene_has_no_alias_peak() -> None:
     image = textured_image(400, 300)
     other = cv2.GaussianBlur(-image, (0, 0), 0.7)
     assert alias_peak(spectrum(image), spectrum(other)).ratio < 0.4
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0), (2.0, 1.0), (PERIOD, 0.0)])
-def test_a_scene_that_repeats_is_not_aligned_where_nothing_says_which_place(off: tuple[float, float]) -> None:
+def test_a_repetitive_scene_without_prior_information_is_not_aligned(off: tuple[float, float]) -> None:
     truth = geometry.translation(9.0, -6.0)
     images = planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7)
     result = agalign.align(*images, seed=geometry.compose(truth, geometry.translation(*off)))
@@ -50,7 +50,7 @@ def test_a_scene_that_repeats_is_not_aligned_where_nothing_says_which_place(off:
     assert "px fits nearly as well" in (result.reason or "")
 
 
-def test_a_seed_that_is_known_to_less_than_half_a_period_decides() -> None:
+def test_a_seed_with_an_error_below_half_a_period_resolves_aliases() -> None:
     truth = geometry.translation(9.0, -6.0)
     near = geometry.compose(truth, geometry.translation(3.0, 2.0))
     result = agalign.align(planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7), seed=near, seed_std_px=3.0)
