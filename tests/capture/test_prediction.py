@@ -3,6 +3,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import rasterio
 import torch
 
 import agalign
-from agalign.batch import CaptureReport
+from agalign.batch import CaptureReport, learn
 from agalign.batch.learn import learn_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align import align_capture_bands, align_pairs
@@ -22,7 +23,7 @@ from agalign.flight.model import FlightModel, load_model
 from agalign.products.fill_sidecar import capture_status
 from agalign.synthetic import make_flight
 from agalign.values import geometry
-from agalign.values.alignment import Prediction
+from agalign.values.alignment import Alignment, Prediction
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 Run = tuple[Path, dict[str, CaptureReport]]
@@ -81,6 +82,25 @@ def test_a_valid_model_is_kept_and_an_outdated_one_is_learned_again(five: Path, 
     anew = learn_flight(captures, Settings(), lambda *_: None, start=moved)
     assert anew is not None
     assert anew.rig is not moved.rig
+
+
+def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
+    five: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a capture is lower than the others, its bands start too far off; the model's mappings are nearer."""
+    verify_together = learn.verify_together
+
+    def not_nir(*arguments: Any) -> dict[str, Alignment]:
+        return {
+            name: replace(a, status="seed_only") if name == "NIR" else a
+            for name, a in verify_together(*arguments).items()
+        }
+
+    monkeypatch.setattr(learn, "verify_together", not_nir)
+    model = learn_flight(discover(five).captures, Settings(), lambda *_: None)
+    assert model is not None
+    assert model.rig is not None
+    assert "NIR" in model.rig.mean
 
 
 def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, model: FlightModel) -> None:
