@@ -90,12 +90,12 @@ def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path
     capture = discover(tmp_path).captures[0]
     pairs, _ = read_pairs(capture, SeedSettings())
     assert [(p.name, p.is_coarse, p.is_reduced) for p in pairs] == [("NIR", False, False), ("LWIR", True, False)]
-    assert 270 < pairs[1].fixed.size_px[0] < 310  # about two of its pixels to one of the thermal band's
+    assert 270 < pairs[1].fixed.size_px[0] < 310  # about two pixels per pixel of the thermal band
     assert pairs[1].reference_file_px == (800, 600)
 
 
 def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
-    """Of a band whose pixels are ten times as large a mapping known to 0.2 px of the reference is known to 0.02."""
+    """A standard error of 0.2 px of the reference is 0.02 px of a band with pixels ten times as large."""
     pairs, _ = read_pairs(discover(flight).captures[0], SeedSettings())
     pair = pairs[0]
     joint = JointResult(
@@ -120,7 +120,7 @@ def test_the_error_of_a_rig_is_converted_to_px_of_the_reference(monkeypatch: pyt
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
 def test_the_tolerance_of_a_candidate_is_in_px_of_the_fixed_image_at_any_scale(scale: float) -> None:
-    """A candidate known to 4 px (1 sigma) admits mappings within 12 px of the fixed image."""
+    """A candidate with a standard error of 4 px accepts mappings within 12 px of the fixed image."""
     fixed, moving = (Raster(np.zeros(shape, np.float32), np.ones(shape, bool)) for shape in ((300, 400), (30, 40)))
     candidate = geometry.compose(np.diag([scale, scale, 1.0]), geometry.translation(7.0, -5.0))
     pair = BandPair.of_images("nir", fixed, moving, {"rig": candidate}, {"rig": 4.0})

@@ -1,4 +1,4 @@
-"""A band with few pixels, of which a part shows something else: predicted with an honest error, or not at all."""
+"""Bands with few pixels and little common structure: predicted with a correct standard error, or failed."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ FIXED_PX, MOVING_PX = (320, 240), (160, 120)
 TRUTH = geometry.compose(
     geometry.translation(83.0, 57.0), np.diag([0.43, 0.43, 1.0]), geometry.translation(-159.5, -119.5)
 )
-"""A field of view a sixth wider than the overlay of the images assumes."""
+"""A field of view a sixth wider than in an overlay of the images."""
 
 
 def raster(pixels: np.ndarray) -> Raster:
@@ -29,7 +29,7 @@ def raster(pixels: np.ndarray) -> Raster:
 
 
 def thermal(scene: np.ndarray, other_share: float) -> np.ndarray:
-    """The scene as a thermal camera sees it: inverted, and in a share of the image something else."""
+    """The scene in a thermal camera: inverted, with unrelated content in a share of the image."""
     large = cv2.GaussianBlur(scene, (0, 0), 1.2)
     to_moving = geometry.compose(TRUTH, geometry.translation(-100.0, -100.0))
     seen = cv2.warpPerspective(large, to_moving, MOVING_PX, flags=cv2.INTER_LINEAR)

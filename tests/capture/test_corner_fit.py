@@ -16,7 +16,7 @@ def residual(shift_px: tuple[float, float], columns: int = 8, rows: int = 6) -> 
 
 
 def test_the_windows_correct_the_homography_through_the_displacement_field() -> None:
-    """A field that stretches the image by a fifth along x: 1 px of the raw image is 1.2 px for the homography."""
+    """The field stretches the image by 1.2 along x: 1 px of the raw image is 1.2 px for the homography."""
     nodes = np.zeros((12, 15, 2))
     nodes[..., 0] = 0.2 * 48.0 * np.arange(15)
     plain = PixelMapping(geometry.translation(5.0, 3.0))
@@ -50,7 +50,7 @@ def test_windows_with_a_wrong_peak_do_not_bias_the_corners() -> None:
     fit = fit_corners(some.centres_px, wrong, some.peaks_sigma, SIZE)
     np.testing.assert_allclose(fit.mean_px, np.tile([0.4, -0.2], 4), atol=0.08)
     np.testing.assert_allclose(clean.mean_px, np.tile([0.4, -0.2], 4), atol=0.05)
-    # A fifth of the windows less: the corners are less certain.
+    # With a fifth fewer windows the standard errors are larger.
     assert np.trace(fit.covariance_px2) > np.trace(clean.covariance_px2)
 
 

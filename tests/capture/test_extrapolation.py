@@ -1,4 +1,4 @@
-"""Images of which a half shows nothing: what is delivered is a prediction that states the error of the other half."""
+"""Images without structure in one half: the result is a prediction with the error of that half."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def pair_in(part: tuple[slice, slice]) -> BandPair:
 
 
 def aligned(pair: BandPair) -> Alignment:
-    """As by a homography that is fitted to the common part."""
+    """An alignment with a homography fitted to the common part."""
     points = geometry.lattice(*SIZE, 40, 30)
     seen = points[pair.fixed.valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
     truth = geometry.apply(MATRIX, seen + lens_shapes(seen, SIZE) @ LENS_PX)

@@ -38,7 +38,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def aligned_on_reduced_images(off_px: float = 1.2) -> Alignment:
-    """An alignment between the files that is off by some px of the file, as one of reduced images may be."""
+    """An alignment of reduced images with an error of several px of the files."""
     off = geometry.compose(TRUTH, geometry.translation(off_px, -off_px / 2))
     centres = geometry.lattice(*SIZE, 12, 9) * 0.9 + np.array(SIZE) * 0.05
     residual = Residual.of(centres, np.zeros_like(centres), np.full(len(centres), 20.0))

@@ -1,4 +1,4 @@
-"""What a capture's images and its flight's rig say together."""
+"""MAP estimates of a capture from its images and the flight's rig."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def pairs() -> list[BandPair]:
 
 
 def result(corners_px: np.ndarray, std_px: np.ndarray) -> JointResult:
-    """One whose corners lie beside the rig's mean and are known so well, both (4, 2) px of the reference."""
+    """A result with given distances of the corners from the rig's mean and standard errors, (4, 2) px."""
     moved = geometry.compose(MEAN, geometry.moving_corners(corners_px.ravel(), *SIZE))
     covariance = np.diag(std_px.ravel() ** 2)
     std = tuple((float(x), float(y)) for x, y in std_px)
@@ -63,7 +63,7 @@ def test_corners_without_texture_follow_the_rig_with_its_error() -> None:
 
 
 def test_the_distance_is_estimated_from_the_band_with_texture() -> None:
-    """Red moved by 3 px along its baseline: near infra-red, which says nothing, by as much along its own."""
+    """Red is shifted by 3 px along its baseline; NIR without texture must shift equally along its own."""
     red = result(np.tile([3.0, 0.0], (4, 1)), np.full((4, 2), 0.03))
     blind = result(np.zeros((4, 2)), np.full((4, 2), 50.0))
     both = found_together(red, blind, rig())
@@ -118,7 +118,7 @@ def test_collinear_windows_do_not_determine_corners_away_from_the_line() -> None
 
 
 def test_a_band_in_few_captures_does_not_affect_the_others() -> None:
-    """The rig of 25 captures, of which three show near infra-red, twelve captures apart."""
+    """The rig of 25 captures, three of them with NIR, twelve captures apart."""
     rng = np.random.default_rng(2)
     shown = []
     for k in range(25):

@@ -31,7 +31,7 @@ Run = tuple[Path, dict[str, CaptureReport]]
 
 @pytest.fixture(scope="module")
 def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five captures of which the third has lost its NIR to noise, and the fifth lies over water."""
+    """Five captures: the NIR of the third is noise, the fifth is over water."""
     folder = tmp_path_factory.mktemp("five")
     make_flight(folder, captures=5, size_px=(400, 300), rng_seed=5, altitude_m=(12.0, 30.0))
     rng = np.random.default_rng(0)
@@ -46,7 +46,7 @@ def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(five: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """The output folder of the five captures, and the report of each; no prediction is good enough here."""
+    """The output folder and the reports of the five captures, without accepted predictions."""
     out = tmp_path_factory.mktemp("run")
     settings = Settings(check=CheckSettings(accept_predicted_px=0.0))
     return out, {r.label[-8:]: r for r in agalign.align_folder(five, out, settings=settings)}
@@ -127,7 +127,7 @@ def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
     assert (out / "0000SET" / "000" / "IMG_0005.tif").is_file()
     # Nothing was learned from scratch for it.
     assert {b.joint.recipe for b in water.bands if b.joint} <= {"flight"}
-    # What counts as delivered is the user's choice: here no prediction is good enough.
+    # The user's limit decides which predictions are accepted; here none is.
     assert [reports[f"IMG_000{k}"].sidecar.status for k in (1, 3, 5)] == ["ok", "degraded", "degraded"]
     bands = reports["IMG_0003"].sidecar.bands
     assert capture_status(bands, 0.0) == "degraded"
@@ -140,7 +140,7 @@ def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
 
 
 def test_an_alignment_that_contradicts_the_rig_is_rejected(five: Path, model: FlightModel) -> None:
-    """The images agree a period away; the other bands say that it is impossible."""
+    """The images match with a shift of one period, which contradicts the other bands."""
     assert model.rig is not None
     moved = {
         b: geometry.compose(geometry.translation(25, 0), m) if b == "NIR" else m for b, m in model.rig.mean.items()
@@ -159,7 +159,7 @@ def test_an_alignment_that_contradicts_the_rig_is_rejected(five: Path, model: Fl
 def test_a_more_accurate_prediction_by_windows_is_kept(
     five: Path, model: FlightModel, std_px: float, away_px: float, source: str
 ) -> None:
-    """A displacement field with many windows off by more than a pixel is predicted, too; the rig knows no relief."""
+    """A displacement field with many misaligned windows is `predicted` too; the rig does not contain relief."""
     capture = discover(five).captures[0]
     settings = Settings()
     pairs, _ = read_pairs(capture, settings.seed, model)
@@ -176,7 +176,7 @@ def test_a_more_accurate_prediction_by_windows_is_kept(
 
 
 def test_a_rotated_band_is_not_predicted_by_the_rig(five: Path, model: FlightModel, tmp_path: Path) -> None:
-    """No rig turns a lens: where the rig says is not where such an image lies, and it must not count as delivered."""
+    """A rotated lens contradicts the rig; neither its prediction nor the result may be accepted."""
     copy = tmp_path / "five"
     shutil.copytree(five, copy)
     path = copy / "0000SET" / "000" / "IMG_0001_3.tif"

@@ -53,7 +53,7 @@ class Rendered:
         return Raster(images[band.name], np.ones(self.size_px[::-1], bool), band.lens(*self.size_px))
 
     def plane(self, band: BandSpec) -> Matrix:
-        """The homography of the plane that most of the scene is on, as the joint optimisation finds it."""
+        """The homography of the dominant plane, as the joint optimisation estimates it."""
         known = self.truth.bands[band.name]
         some = np.argwhere(known.scored)[::101]
         here, there = some[:, ::-1].astype(float), known.moving_px[some[:, 0], some[:, 1]].astype(float)
@@ -63,7 +63,7 @@ class Rendered:
         return np.asarray(matrix)
 
     def candidates(self, instead: Mapping[str, np.ndarray] | None = None) -> list[ReliefCandidate]:
-        """Of all moving bands, some of which show something else `instead`."""
+        """Candidates of all moving bands, some with other images `instead`."""
         images = {**self.images, **(instead or {})}
         reference = Reference(self.raster(REFERENCE, images))
         result = []
@@ -82,7 +82,7 @@ class Rendered:
         return PixelMapping(alignment.fixed_to_moving, *lenses, local=alignment.field, parallax=alignment.parallax)
 
     def error_px(self, band: BandSpec, mapping: PixelMapping) -> np.ndarray:
-        """(n,) distance from the truth of all pixels that the band shows."""
+        """Return (n,) errors of all pixels that are visible in the band."""
         known = self.truth.bands[band.name]
         return np.asarray(np.linalg.norm(mapping(self.pixels) - known.moving_px, axis=-1)[known.visible])
 
@@ -122,7 +122,7 @@ def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[s
         assert np.median(errors) < 0.2
         assert np.percentile(errors, 90) < 0.6
         assert np.percentile(plane, 90) > 3
-        # What verification reports is measured under the relief of the other bands.
+        # The reported residual is measured with the relief from the other bands.
         assert alignment.residual is not None
         assert alignment.residual.median_px < 0.25
 
@@ -158,12 +158,12 @@ def test_range_is_right_to_two_percent(boxes: Rendered, aligned: Mapping[str, Al
     )  # fmt: skip
     ratio = 1 / inverse_m / boxes.truth.range_m
     assert np.median(np.abs(ratio - 1)) < 0.02
-    # Nearer is positive: the range falls as the parallax rises.
+    # Positive parallax is nearer: the range decreases with the parallax.
     assert np.corrcoef(parallax.relief(boxes.pixels).ravel(), boxes.truth.range_m.ravel())[0, 1] < -0.9
 
 
 def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[ReliefCandidate]) -> None:
-    """From what occludes. The reference plane may be another one than with a layout."""
+    """The sign follows from occlusions. The reference plane may differ from the one with a layout."""
     unknown = [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
     result = aligned_by_relief(unknown, "auto")
     assert len(result) == len(MOVING)
@@ -175,7 +175,7 @@ def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequenc
 def test_bands_measured_in_windows_of_different_sizes_have_common_residuals(
     candidates: Sequence[ReliefCandidate],
 ) -> None:
-    """They are compared in windows that all of them have."""
+    """Their residuals are compared in the same windows."""
     counts = {len(c.warped.residual.centres_px) for c in candidates}
     assert len(counts) > 1
     without = [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
@@ -185,7 +185,7 @@ def test_bands_measured_in_windows_of_different_sizes_have_common_residuals(
 
 def test_use(candidates: Sequence[ReliefCandidate]) -> None:
     assert aligned_by_relief(candidates, "never") == {}
-    # One moving band has no other to verify it; a coarse one has another reference.
+    # One moving band cannot be verified with others; a coarse one has another reference.
     assert aligned_by_relief(candidates[:1], "always") == {}
     coarse = [replace(c, pair=replace(c.pair, is_coarse=True)) for c in candidates[1:]]
     assert aligned_by_relief([candidates[0], *coarse], "always") == {}
@@ -195,13 +195,13 @@ def test_a_flat_scene_gets_no_relief(flat: Rendered) -> None:
     candidates = flat.candidates()
     assert not shows_relief(candidates)
     assert aligned_by_relief(candidates, "auto") == {}
-    # Where one is asked for, it is no better than the homographies.
+    # A forced relief is not better than the homographies and therefore rejected.
     assert aligned_by_relief(candidates, "always") == {}
 
 
 @pytest.mark.parametrize("has_layout", [True, False])
 def test_noise_of_the_reference_is_not_relief(flat: Rendered, has_layout: bool) -> None:
-    """Its displacements are the same in all bands: each band's relief predicts the others."""
+    """Its displacements are equal in all bands, so the relief of each band predicts the others."""
     width, height = flat.size_px
     displacement = cv2.resize(
         np.random.default_rng(3).normal(0, 2, (6, 8)), flat.size_px, interpolation=cv2.INTER_CUBIC
@@ -218,7 +218,7 @@ def test_noise_of_the_reference_is_not_relief(flat: Rendered, has_layout: bool) 
 
 @pytest.mark.parametrize(("height_px", "shown"), [(0.25, False), (1.0, True)])
 def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float, shown: bool) -> None:
-    """However well the bands agree on it."""
+    """Even if it is consistent between the bands."""
     result = []
     for candidate, band in zip(flat.candidates(), MOVING, strict=True):
         at = candidate.pair.reference.windows.centres_px
@@ -237,7 +237,7 @@ def of_lengths(median_px: float, p95_px: float) -> Residual:
 
 @pytest.mark.parametrize(("relief", "plane", "worse"), [
     ((0.10, 0.30), (0.20, 0.50), False),
-    ((0.13, 0.33), (0.08, 6.30), False),  # most windows are on the plane, and some far from it
+    ((0.13, 0.33), (0.08, 6.30), False),  # Most windows are on the plane and some far from it.
     ((0.08, 0.25), (0.04, 0.12), True),  # a flat scene
     ((0.30, 0.40), (0.10, 0.50), True),
     ((0.10, 0.60), (0.30, 0.50), True),
@@ -257,7 +257,7 @@ def noise(size_px: tuple[int, int], seed: int) -> np.ndarray:
 
 
 def scrambled(image: np.ndarray, rng_seed: int) -> np.ndarray:
-    """The image in pieces, each displaced by itself: windows have shifts, and no parallax explains them."""
+    """Parts of the image are displaced independently: the shifts of windows are not parallax."""
     rng, result = np.random.default_rng(rng_seed), image.copy()
     for y in range(0, image.shape[0], 64):
         for x in range(0, image.shape[1], 64):

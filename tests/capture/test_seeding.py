@@ -98,7 +98,7 @@ def test_a_trusted_mapping_of_the_flight_suffices() -> None:
 
 
 def turned(image: np.ndarray, degrees: float, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(an image turned and scaled about its centre, on a canvas that holds all of it; its mask; old px to new ones)."""
+    """Rotate and scale an image on a larger canvas; return it, its mask, and the mapping of its pixels."""
     height, width = image.shape
     cos, sin = np.cos(np.radians(degrees)) * scale, np.sin(np.radians(degrees)) * scale
     size = round(width * abs(cos) + height * abs(sin)), round(width * abs(sin) + height * abs(cos))
@@ -128,7 +128,7 @@ def pair_turned(degrees: float, candidates: Candidates, candidate_std_px: dict[s
 
 
 def test_a_wrong_rotation_in_the_tags_is_detected() -> None:
-    """The middle lies where they say, and the peak of the structures agrees: the corners do not."""
+    """The image centre agrees with the tags and the correlation peak, the corners do not."""
     _, _, truth = turned(np.zeros((480, 640), np.float32), 3.0, 1.0)
     middle = np.array([(639 / 2, 479 / 2)])
     ((dx, dy),) = geometry.apply(truth, middle) - middle

@@ -16,7 +16,7 @@ SIZE_PX = (480, 360)
 
 
 def stripes(light: Field, _rng: np.random.Generator) -> Field:
-    """White column stripes, the same in all bands, of 20 % of the light's range up and down."""
+    """White column stripes, equal in all bands, of +-20 % of the range."""
     low, high = np.percentile(light, (1, 99))
     pattern = np.random.default_rng(5).uniform(-0.2, 0.2, light.shape[1]).astype(np.float32)
     return np.asarray(light + (high - low) * pattern, np.float32)

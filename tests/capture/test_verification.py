@@ -79,7 +79,7 @@ def test_an_unrelated_image_is_failed_with_or_without_a_seed() -> None:
 
 
 def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A field that is kept though the windows then lie apart must not be written."""
+    """A field that leaves the windows misaligned must not be accepted."""
     wild = np.zeros((11, 14, 2))
     wild[..., 0] = 3.0
     monkeypatch.setattr(
@@ -103,7 +103,7 @@ def test_residuals_of_a_reduced_image_are_in_px_of_the_file() -> None:
 
 
 def bent_pair(height_px: float, apart_px: float | None = None) -> BandPair:
-    """A pair of which the middle is displaced by a smooth bump, or all of it by waves: no homography explains it."""
+    """A pair with a smooth bump in the centre or waves everywhere, which no homography represents."""
     fixed, moving = textured_pair(np.eye(3), 640, 480, seed=4)
     grid = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
 
@@ -131,13 +131,13 @@ def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: str, sta
 
 @pytest.mark.slow
 def test_quickly_varying_parallax_needs_a_fine_field() -> None:
-    """Waves of 200 px: the first field's windows show half of them each."""
+    """Waves of 200 px: a window of the coarse field contains a large part of a wave."""
     pair, seed = bent_pair(2.5, apart_px=200.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     results = verified(pair, seed, result(np.eye(3)), Settings())
     assert results.status == "aligned"
     assert results.field is not None
     assert results.field.step_px == FINE.lattice_px
-    # Of windows that were left out of the fit, together with those around them.
+    # The residual is that of held-out windows.
     assert results.residual.median_px < 0.4
     assert pair.reference.coarse_field.refine(pair.moving_image, pair.mapping(np.eye(3))).field is None
 
@@ -178,7 +178,7 @@ def test_smaller_windows_are_measured_where_valid_areas_are_small() -> None:
 
 
 def test_a_field_is_verified_in_held_out_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A field may follow the shifts of its own windows, whatever they are."""
+    """A field may fit any shifts of its own windows."""
     pair = bent_pair(2.5)
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     good = pair.reference.coarse_field.refine(pair.moving_image, pair.mapping(np.eye(3)), verify=True)

@@ -1,4 +1,4 @@
-"""Results by windows, where descriptors recognise nothing: confirmed by the windows that were left out of the fit."""
+"""Results by windows where descriptors fail, confirmed by held-out windows."""
 
 from dataclasses import replace
 
@@ -54,7 +54,7 @@ def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
     assert after.joint.recipe == "windows"
     assert after.residual is not None
     assert before.residual is not None
-    # Only the windows that were left out of the fit verify it.
+    # Only held-out windows verify the fit.
     assert 0.4 < len(after.residual.centres_px) / len(before.residual.centres_px) < 0.6
 
 
@@ -69,7 +69,7 @@ def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair) -
 def test_held_out_windows_must_confirm_the_fit() -> None:
     fixed, moving = textured_pair(TRUTH, *SIZE)
     other, _ = textured_pair(TRUTH, *SIZE, seed=5)
-    moving[:, 480:] = other[:, 480:]  # the part beyond shows something else
+    moving[:, 480:] = other[:, 480:]  # the part beyond has unrelated content
     pair = pair_of(fixed, moving)
     before = unaligned(pair)
     assert by_windows(pair, before) is before

@@ -1,4 +1,4 @@
-"""The factors that the bands of a capture share, estimated from mappings that are known exactly."""
+"""Factors of a capture, estimated from exactly known mappings."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_a_displaced_mapping_differs_by_its_coefficients() -> None:
     coefficients = np.array([[2.0, 0.3, -0.1], [-1.0, 0.2, 0.4]])
     moved = displaced(mean, coefficients, SIZE)
     np.testing.assert_allclose(affine_difference(mean, moved, SIZE), coefficients, atol=1e-5)
-    # The columns of g are orthonormal in the mean: the norm is the root mean square distance.
+    # The columns of g are orthonormal, so the norm is the RMS distance.
     assert distance_px(mean, moved, SIZE) == pytest.approx(np.linalg.norm(coefficients), rel=1e-6)
     assert distance_px(mean, mean, SIZE) == 0
 

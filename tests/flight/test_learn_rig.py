@@ -16,11 +16,11 @@ from agalign.values.alignment import DisplacementField
 
 SIZE = 1280, 960
 BASELINES = {"Blue": (0.9, 0.0), "Red": (0.0, 0.65), "NIR": (0.9, 0.7), "Red edge": (0.4, 0.35)}
-"""As a RedEdge-M's lenses stand, in any unit."""
+"""Lens layout of a RedEdge-M, in any unit."""
 
 
 def mappings(distance_px: float, tilt: tuple[float, float] = (0.0, 0.0), noise: float = 0.0, seed: int = 0) -> dict:
-    """Homographies of a rig over a plane: A_b + e_b nu^T, the baselines in px at the image's middle."""
+    """Return the homographies A_b + e_b nu^T of a rig over a plane; baselines are in px at the image centre."""
     rng = np.random.default_rng(seed)
     result = {}
     for k, (name, (bx, by)) in enumerate(BASELINES.items()):
@@ -47,7 +47,7 @@ def flight(count: int = 8, spread_px: float = 1.0, noise: float = 0.03) -> list[
 
 @cache
 def usual_rig() -> Rig:
-    """The rig of `flight`, learned once: it takes a second, and a rig does not change."""
+    """The rig of `flight`, learned once for all tests."""
     rig = learn_rig(flight(), SIZE, {})
     assert rig is not None
     return rig
@@ -55,7 +55,7 @@ def usual_rig() -> Rig:
 
 @cache
 def sinking_rig() -> Rig:
-    """The rig of a drone that sinks steadily from the mean."""
+    """The rig of a drone that descends steadily."""
     rig = learn_rig([observation(10.0 * k, 0.5 * k) for k in range(9)], SIZE, {})
     assert rig is not None
     return rig
@@ -114,7 +114,7 @@ def test_a_known_layout_predicts_captures_at_an_unseen_height() -> None:
     error, std = error_px(with_layout, "NIR", low, truth)
     assert error < 1.0
     assert error < 2 * std
-    # Without it the prediction may be wrong by pixels, and says so.
+    # Without the layout, the error and its standard error may be several pixels.
     error, std = error_px(without, "NIR", low, truth)
     assert error < 2.5 * std
 
@@ -132,7 +132,7 @@ def test_an_aliased_band_does_not_bias_the_others() -> None:
 
 @pytest.mark.slow
 def test_a_capture_without_bands_is_interpolated_between_its_neighbours() -> None:
-    """A drone that sinks steadily: the captures before and after say more than the flight's mean."""
+    """The drone descends steadily: interpolation is more accurate than the flight's mean."""
     rig = sinking_rig()
     nothing = Observation(35.0, {}, {})
     prediction = predict_band(rig, "NIR", nothing)
@@ -197,14 +197,14 @@ DELAYS = {"Blue": 0.0, "Red": 0.4, "NIR": 1.0, "Red edge": 0.7}
 
 
 def passing(seconds: float, motion: tuple[float, float], distance_px: float = 0.0, seed: int = 0) -> Observation:
-    """A capture of a rig that exposes its bands one after another, while the ground passes."""
+    """A capture of a rig that exposes its bands one after another during image motion."""
     result = mappings(distance_px, noise=0.03, seed=seed)
     moved = {b: geometry.compose(geometry.translation(*(DELAYS[b] * np.array(motion))), m) for b, m in result.items()}
     return Observation(seconds, moved, dict.fromkeys(moved, 0.05), motion=(motion[0] / 50, motion[1] / 50))
 
 
 def two_headings() -> list[Observation]:
-    """Lines flown to and fro, the camera always facing one way, at speeds and heights that vary."""
+    """Parallel flight lines with a constant camera heading, at varying speeds and heights."""
     rng = np.random.default_rng(4)
     there = [(float(0.5 * rng.normal()), (-1) ** (k // 4) * 16.0 + float(rng.normal())) for k in range(16)]
     return [passing(float(k), motion, float(rng.normal()), seed=k) for k, motion in enumerate(there)]
@@ -212,7 +212,7 @@ def two_headings() -> list[Observation]:
 
 @cache
 def headings_rig(*, known_layout: bool) -> Rig:
-    """The rig of `two_headings`, learned with the baselines of the tags or without."""
+    """The rig of `two_headings`, learned with or without the baselines in the tags."""
     rig = learn_rig(two_headings(), SIZE, BASELINES if known_layout else {})
     assert rig is not None
     return rig
@@ -233,7 +233,7 @@ def test_delays_are_distinguished_from_baselines(known_layout: bool) -> None:
 @pytest.mark.slow
 def test_a_capture_on_another_heading_is_predicted_from_its_motion() -> None:
     rig = headings_rig(known_layout=True)
-    for moment, sign in ((7.5, -1), (7.5, 1)):  # at a turn, where the captures before and after disagree
+    for moment, sign in ((7.5, -1), (7.5, 1)):  # at a turn, where the captures before and after differ
         truth = passing(moment, (0.0, sign * 16.0))
         nothing = Observation(moment, {}, {}, motion=truth.motion)
         prediction = predict_band(rig, "NIR", nothing)
@@ -245,7 +245,7 @@ def test_a_capture_on_another_heading_is_predicted_from_its_motion() -> None:
 
 @pytest.mark.slow
 def test_interpolation_between_different_captures_has_an_error() -> None:
-    """A panel a metre below the camera was taken just before: in time it is near, in height it is not."""
+    """A capture of a panel from one metre precedes the flight: its time is similar, its height is not."""
     panel = replace(observation(0.0, 100.0), altitude_m=1.0)
     others = [replace(observation(10.0 * k, 0.1 * (k % 3)), altitude_m=28.0 + 0.1 * (k % 3)) for k in range(1, 9)]
     rig = learn_rig([panel, *others], SIZE, BASELINES)
@@ -254,7 +254,7 @@ def test_interpolation_between_different_captures_has_an_error() -> None:
     error, std = error_px(rig, "NIR", lost, mappings(0.1)["NIR"])
     assert error < 1.0
     assert error < 3 * std
-    # Where no height is known, the error bar says how little the two tell.
+    # Without the height, the standard error contains the difference of the two captures.
     error, std = error_px(rig, "NIR", replace(lost, altitude_m=None), mappings(0.1)["NIR"])
     assert std > 10
     assert error < 3 * std
@@ -270,7 +270,7 @@ def test_expectations_of_a_coarse_band_are_in_px_of_the_reference() -> None:
 
 
 def test_a_capture_without_a_time_is_not_between_captures_in_time() -> None:
-    """The drone sinks from the mean: time 0 would be its first capture, which is far from a capture of unknown time."""
+    """The drone descends: a capture of unknown time must not be treated as one at time 0."""
     rig = sinking_rig()
     prediction = predict_band(rig, "NIR", Observation(None, {}, {}))
     assert prediction.source == "flight"
@@ -288,16 +288,16 @@ def test_too_few_known_times_have_the_typical_error(known_times: int) -> None:
     assert [s.seconds for s in again.captures] == [s.seconds for s in rig.captures] == [c.seconds for c in sinking]
     for band in BASELINES:
         unseen = predict_band(rig, band, Observation(35.0, {}, {}))
-        # Without the times the error is the typical one of the flight, not what few captures happen to show.
+        # Without the times the error is that of the flight, not that of few captures.
         assert unseen.std_px > 0.5 * unobserved_error_px(rig, band, by_neighbours=False)
-    # The height is known without the time, and predicts the capture.
+    # The capture is predicted from its height, which is known.
     by_height = predict_band(rig, "NIR", Observation(None, {}, {}, altitude_m=86.5))
     assert by_height.source == "neighbours"
     assert distance_px(by_height.fixed_to_moving, mappings(1.75)["NIR"], SIZE) < 0.3
 
 
 def rarely_shown() -> list[Observation]:
-    """25 captures of which three show NIR: twelve apart, as far as the folds of the cross-validation are."""
+    """25 captures, three of them with NIR, twelve apart like the folds of the cross-validation."""
     rng = np.random.default_rng(1)
     return [
         observation(float(k), float(rng.normal()), noise=0.03, seed=k, without=() if k % 12 == 0 else ("NIR",))
@@ -313,7 +313,7 @@ def test_a_band_in_few_captures_has_a_finite_error() -> None:
     error, std = error_px(rig, "NIR", observation(30.0, 0.5, without=("NIR",)), mappings(0.5)["NIR"])
     assert error < 0.3
     assert error < 3 * std < 1.0
-    # Neither the model's file nor the sidecar holds anything but finite numbers.
+    # Model files and sidecars contain only finite numbers.
     assert "Infinity" not in rig_to_json(rig)
     prediction = predict_band(rig, "NIR", observation(30.0, 0.5, without=("NIR",)))
     part = PredictionPart(source=prediction.source, std_px=prediction.std_px, off_px=prediction.off_px)

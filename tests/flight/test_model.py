@@ -1,4 +1,4 @@
-"""The file of a model: what is written is read back, and what is damaged is refused with the file's name."""
+"""Model files are read back as written; damaged ones are errors with the name of the file."""
 
 import json
 import os
@@ -140,7 +140,7 @@ def test_too_large_weights_are_an_error(model: FlightModel, tmp_path: Path) -> N
 
 
 def test_a_pipe_is_an_error(tmp_path: Path) -> None:
-    """Opened like a file, it would be waited for without end."""
+    """Opening it like a file would block."""
     os.mkfifo(tmp_path / "m.safetensors")
     with pytest.raises(InputError, match="not a regular file"):
         load_model(tmp_path / "m.safetensors", cpu)

@@ -117,7 +117,7 @@ def test_panels_are_searched_in_the_first_and_last_captures(tmp_path: Path) -> N
 
 
 def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
-    """A camera without a fix starts its clock at 1970: its panel is not of the hours of captures without a time."""
+    """Without a GPS fix the clock starts in 1970; such a panel does not match captures without a time."""
     undated, of_1970 = reading("", 2.0), reading("1970-01-01T01:00:00", 2.0)
     of = undated.capture.bands[0]
     assert (undated.capture.time_s, of_1970.capture.time_s) == (None, 3600.0)
@@ -161,7 +161,7 @@ def test_one_unknown_time_leaves_the_captures_of_a_flight_in_their_order(monkeyp
 def test_a_square_in_a_scene_is_a_panel_only_with_a_code(
     monkeypatch: pytest.MonkeyPatch, code: str, in_scene: bool, expected: tuple[bool, bool]
 ) -> None:
-    """A roof looks like a panel too. Only a capture of a panel is left out."""
+    """A roof resembles a panel. Only captures of a panel are excluded."""
     monkeypatch.setattr("agalign.flight.panels._detect", lambda *_, **__: DetectedPanel(code, AREA, in_scene))
     (result,) = with_panels([capture(Band("Green", Path("x.tif"), 1, 64, 48, "uint16"))], without_code=True)
     assert (result.panel is not None, result.is_of_a_panel) == expected

@@ -1,4 +1,4 @@
-"""Predictions of a rig that is written down by hand: each term of their errors by itself."""
+"""Predictions of a simple rig: each term of the standard error separately."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def capture(
 
 
 def rig(*captures: CaptureFactors, baseline_std: float = 0.0) -> Rig:
-    """Two bands with baselines along x and y; only the distance counts."""
+    """Two bands with baselines along x and y; the distance is the only factor."""
     bands = ("Red", "NIR")
     return Rig(
         SIZE, {"Red": geometry.translation(30, -5), "NIR": geometry.translation(-12, 8)},
@@ -52,7 +52,7 @@ def test_a_band_is_predicted_along_its_baseline() -> None:
     some = rig(capture(1.0), capture(-1.0), capture(0.0))
     predicted = predict_band(some, "NIR", showing(some, "Red", 2.0))
     assert predicted.source == "bands"
-    # The factor's prior is wide: it pulls by a thousandth.
+    # The wide prior biases the factor by one thousandth.
     assert distance_px(predicted.fixed_to_moving, geometry.translation(-12, 8 + 0.8 * 2.0), SIZE) < 0.01
 
 
@@ -90,7 +90,7 @@ def test_an_uncertain_mapping_makes_the_prediction_uncertain() -> None:
     some = rig(capture(1.0), capture(-1.0), capture(0.0))
     sure = predict_band(some, "NIR", showing(some, "Red", 1.0, std_px=0.05)).std_px
     unsure = predict_band(some, "NIR", showing(some, "Red", 1.0, std_px=1.0)).std_px
-    # One px of Red, of which a factor moves it by 0.6, moves NIR by 0.8 / 0.6 of that.
+    # The baselines are 0.6 and 0.8: 1 px in Red corresponds to 0.8 / 0.6 px in NIR.
     assert sure < 0.2
     assert unsure == pytest.approx(0.8 / 0.6 / np.sqrt(2), rel=0.5)
 
@@ -102,7 +102,7 @@ def test_excess_residuals_of_bands_make_the_prediction_uncertain() -> None:
     disagreeing = replace(known, mappings={"Red": across})
     usual, unusual = (predict_band(some, "NIR", k).std_px for k in (known, disagreeing))
     assert usual < 0.2
-    # The excess itself, and a factor that is less certain as the band's weight falls.
+    # The excess, and the larger variance of the factor because the weight of the band is smaller.
     assert np.sqrt(3.0**2 - FROM_BANDS_PX**2) < unusual < 3.6
 
 
@@ -120,7 +120,7 @@ def test_errors_of_unobserved_captures() -> None:
     squares = [0.6**2 * k**2 for k in range(5)]
     expected = np.sqrt(np.mean(squares) + FROM_BANDS_PX**2)
     assert unobserved_error_px(line, "Red", by_neighbours=False) == pytest.approx(expected)
-    # Between neighbours a line is exact; its ends take their neighbour's factors.
+    # Linear interpolation is exact between neighbours and constant at the ends.
     expected = np.sqrt(0.6**2 * (1 + 0 + 0 + 0 + 1) / 5 + FROM_BANDS_PX**2)
     assert unobserved_error_px(line, "Red", by_neighbours=True) == pytest.approx(expected)
 
@@ -174,7 +174,7 @@ def test_an_unseen_altitude_adds_an_error() -> None:
 
 
 def test_with_few_captures_only_two_estimators_are_used() -> None:
-    """Heights would tell these captures exactly; with five of them that may be chance."""
+    """Heights would predict these captures exactly; with five captures that may be chance."""
     captures = [capture(float(k % 3), seconds=float(k * 7 % 6), altitude_m=50.0 + k % 3) for k in range(6)]
     known = Observation(2.5, {}, {}, altitude_m=51.0)
     assert predict_band(rig(*captures), "NIR", known).source == "neighbours"
@@ -204,7 +204,7 @@ def test_the_extremes_exclude_outliers() -> None:
     captures = [capture(d) for d in (-2.0, 0.5, 3.0, 1.0, 100.0)]
     ends = extreme_mappings(rig(*captures), "Red")
     offsets = sorted(round(float(m[0, 2]), 6) for m in ends)
-    # The factors that do not count are the same in all captures: their ends are the first of these.
+    # Unused factors are equal in all captures: their extremes are the first capture.
     assert offsets == [pytest.approx(30 - 0.6 * 2), pytest.approx(30 + 0.6 * 3)]
     assert len(extreme_mappings(replace(rig(*captures), factors=()), "Red")) == 1
 

@@ -1,4 +1,4 @@
-"""A scene is never left out for one cue alone: a tag, a name, or an image without texture."""
+"""No capture is classified as sky by a single cue: a tag, a name, or an image without texture."""
 
 from dataclasses import replace
 from pathlib import Path

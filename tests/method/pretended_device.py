@@ -48,7 +48,7 @@ class OnDevice(Tensor):
 
 
 class PretendedDevice(TorchDispatchMode):
-    """Runs each operation of the device on the values of its tensors."""
+    """Run each operation of the device on the values of its tensors."""
 
     def __init__(self, *, has_float64: bool) -> None:
         super().__init__()
@@ -101,7 +101,7 @@ def _tensors(nested: Any) -> Iterator[Tensor]:
 
 
 def _mapped(function: Callable[[Any], Any], nested: Any) -> Any:
-    """The function of each item of nested lists and tuples."""
+    """Apply a function to each item of nested lists and tuples."""
     if isinstance(nested, list | tuple):
         return type(nested)(_mapped(function, item) for item in nested)
     return function(nested)

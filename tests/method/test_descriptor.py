@@ -9,7 +9,7 @@ PATCHES = torch.randn(12, 1, 16, 16, generator=torch.Generator().manual_seed(0))
 
 
 def parameters_of(net: Descriptor) -> dict[str, set[int]]:
-    """Which parameters a side's descriptor depends on, by their gradients."""
+    """Return the parameters with a gradient of a side's descriptor."""
     result = {}
     for name, side in (("fixed", 0), ("moving", 1)):
         net.zero_grad()

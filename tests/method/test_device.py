@@ -38,7 +38,7 @@ def test_an_unavailable_device_is_a_configuration_error() -> None:
 
 
 def test_overlapping_contexts_restore_the_threads_of_torch() -> None:
-    """A worker of a cluster does several captures at a time in threads of one process."""
+    """A worker of a cluster processes several captures in threads of one process."""
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     first_is_in, second_is_in, first_is_out = (threading.Event() for _ in range(3))
@@ -61,7 +61,7 @@ def test_overlapping_contexts_restore_the_threads_of_torch() -> None:
             t.start()
         for t in threads:
             t.join(10)
-        # OpenMP's own number is each thread's: what counts is the one that torch hands to the next.
+        # OpenMP has one number per thread; new threads take the number of torch.
         assert device._active == 0
         assert device._torch_threads_outside == 3
     finally:
@@ -90,7 +90,7 @@ GPU = Callable[[bool], PretendedDevice]
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> GPU:
-    """The context of a device with float64, or without as Apple's, and of all work in one thread."""
+    """Pretend a device with or without float64, as Apple's, with all work in one thread."""
     monkeypatch.setattr(ThreadPoolExecutor, "map", lambda _self, function, *items: map(function, *items))
 
     def of_kind(has_float64: bool) -> PretendedDevice:
@@ -129,7 +129,7 @@ def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64
 
 @pytest.mark.slow
 def test_a_flight_on_a_gpu_has_the_result_of_the_cpu(gpu: GPU, flight: Path, tmp_path: Path) -> None:
-    """Learning, the file of the model, keypoint matching and the refinement by the frozen network."""
+    """Learning, the model file, keypoint matching and refinement with the frozen network."""
     captures = discover(flight, DiscoverOptions(bands=("Green", "NIR"))).captures
 
     def align(name: str) -> JointResult:

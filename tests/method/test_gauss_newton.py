@@ -26,7 +26,7 @@ def scattered(count: int, seed: int = 0) -> Keypoints:
 def linear_problem(
     change: torch.Tensor, count: int = 200, noise: float = 0.0, seed: int = 0
 ) -> tuple[Keypoints, torch.Tensor, torch.Tensor]:
-    """Descriptors that are linear in position: the residual of a known change is exactly G times its shifts."""
+    """Descriptors that are linear in the position: the residual of a change is exactly G times its shifts."""
     rng = torch.Generator().manual_seed(seed)
     p = scattered(count, seed)
     gradient = torch.randn(count, 256, 2, generator=rng, dtype=torch.float64)
@@ -47,7 +47,7 @@ def test_shift_over_psi_equals_finite_differences() -> None:
 
 
 def test_shift_over_psi_equals_over_corners_in_other_parameters() -> None:
-    """The homography's derivative is written twice, in torch and in numpy: they must agree."""
+    """The Jacobian is implemented in torch and in numpy; both must agree."""
     p = scattered(10).xy
     corners = torch.from_numpy(geometry.corners(WIDTH, HEIGHT))
     of_corners = shift_over_psi(corners, WIDTH, HEIGHT).reshape(8, 8).numpy()
@@ -74,7 +74,7 @@ def test_a_small_change_is_recovered(family: str) -> None:
     p, residual, gradient = linear_problem(change)
     step = solve(p, residual, gradient, family, 1.0, 10.0)
     corner = torch.tensor([[0.0, 0], [WIDTH - 1, HEIGHT - 1]], dtype=torch.float64)
-    # The residual's mean over the patches is removed, and the damping is 1e-4: hence not exact.
+    # Not exact, because the mean residual is removed and the damping is 1e-4.
     torch.testing.assert_close(transform(step.change, corner), transform(change, corner), atol=0.02, rtol=0)
 
 
@@ -102,7 +102,7 @@ def test_the_family_has_as_many_parameters_as_the_patches_determine() -> None:
     rich = solve(p, residual, gradient, None, 0.5, 4.0)
     assert rich.family == "homography"
     corner = p.xy.clone()
-    corner[:] = corner * 0.1  # all patches in one corner: the far ones cannot be known
+    corner[:] = corner * 0.1  # All patches are in one corner and do not determine the others.
     near = Keypoints(corner, p.angle, p.scale)
     poor = solve(near, residual, gradient, None, 0.05, 4.0)
     assert poor.family != "homography"

@@ -120,10 +120,10 @@ def test_one_network_for_two_bands_and_an_unrelated_one() -> None:
 
 @pytest.mark.parametrize(("sharing", "left"), [("siamese", 0.35), ("pseudo-siamese", 0.35), ("unshared", 0.9)])
 def test_paper_recipe_reduces_the_error(sharing: str, left: float) -> None:
-    # Fully unshared networks learn slowest, as the paper expects; three epochs are few.
+    # Unshared networks learn most slowly, as the paper expects; three epochs are few.
     settings = JointSettings(recipe="paper", sharing=sharing)
     fixed, moving = textured_pair(TRUTH)
-    # The paper's siamese network is for one modality: give it the same contrast.
+    # The siamese network is for one modality, so the contrast is not reversed.
     valid = np.ones(fixed.shape, bool)
     moving = -moving if sharing == "siamese" else moving
     result = scratch(Raster(fixed, valid), Raster(moving, valid), NEAR, settings, training=Training(2000, 3))
@@ -139,7 +139,7 @@ def test_levels_halve_down_to_the_coarsest() -> None:
 
 
 def test_a_distant_start_is_found_by_searching_the_loss() -> None:
-    """An eighth of the image off, and no seeding: beyond what a step on psi can see."""
+    """An offset of an eighth of the image, too large for steps on psi alone."""
     truth = geometry.translation(6.0, -4.0)
     fixed, moving = rasters(truth)
     state = JointState(JointSettings(device="cpu"), lambda *_: None)

@@ -59,7 +59,7 @@ def test_held_out_patches_share_no_pixel_with_training_patches() -> None:
         assert len(p) > 100
         assert float(p.scale.max()) > 1.5
         pixels = patch_positions(p).reshape(-1, 2)
-        # A sample between pixels takes of all four.
+        # Bilinear interpolation uses four pixels.
         seen.append({(x + dx, y + dy) for x, y in pixels.floor().int().tolist() for dx in (0, 1) for dy in (0, 1)})
     train, held = seen
     assert not train & held
@@ -96,7 +96,7 @@ def test_keypoints_in_most_images_come_first() -> None:
 
 
 def test_patches_are_sampled_through_the_lens() -> None:
-    # A raw image whose value is its own undistorted x coordinate: undistorted positions must find their x there.
+    # The values of the raw image are undistorted x coordinates, so a sample must equal its undistorted x.
     model = Lens(300.0, 300.0, 158.0, 121.0, (-0.1, 0.15, 0.0004, -0.0003, -0.03))
     x, y = np.meshgrid(np.arange(320.0), np.arange(240.0))
     raw = lens.undistort(model, np.stack([x, y], axis=-1))[..., 0].astype(np.float32)
@@ -116,7 +116,7 @@ def test_level_matrices_are_converted_to_full_resolution_and_back() -> None:
 
 
 def test_positions_are_displaced_by_the_local_value_of_the_field() -> None:
-    """The rig's own field lies on the full image: at half the resolution it is half as long."""
+    """The rig's field is in px of the full image; at half the resolution displacements are half as long."""
     fixed, moving = rasters()
     nodes = np.stack(np.meshgrid(np.arange(12) * 32.0, np.arange(9) * 32.0), axis=-1)
     field = DisplacementField(32.0, np.stack([0.01 * nodes[..., 0], -0.02 * nodes[..., 1]], axis=-1))

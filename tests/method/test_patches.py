@@ -44,7 +44,7 @@ def test_psi_is_the_vector_in_the_paper() -> None:
 
 
 def test_keypoint_warp_equals_finite_differences_of_an_affine_mapping() -> None:
-    # For an affinity the paper's v' is exact: compare with a real difference of two warped points.
+    # For an affine mapping the paper's v' equals the difference of two warped points.
     h = torch.tensor([[1.1, 0.1, 5.0], [-0.2, 0.9, -3.0], [0, 0, 1.0]], dtype=torch.float64)
     p = keypoints()
     v = p.scale[:, None] * torch.stack([p.angle.cos(), p.angle.sin()], dim=1)
@@ -84,7 +84,7 @@ def test_patch_agrees_with_kornias_rotated_crop() -> None:
 
 
 def test_gradient_over_psi_equals_finite_differences() -> None:
-    # A smooth image, so that bilinear interpolation's kinks do not matter.
+    # The image is smooth, so that the kinks of bilinear interpolation do not matter.
     y, x = torch.meshgrid(torch.arange(120.0).double(), torch.arange(140.0).double(), indexing="ij")
     image = (torch.sin(x / 9) * torch.cos(y / 11))[None]
     p = keypoints(20)

@@ -16,7 +16,7 @@ from ..conftest import textured_pair
 
 
 class Halving(Solver):
-    """Every step goes half of the way that is left to a shift of 1 px."""
+    """Each step covers half of the remaining distance to a shift of 1 px."""
 
     def step(self, _band: object, homography: torch.Tensor, _anchors: ReferencePatches) -> Step:  # type: ignore[override]
         left = 1.0 - float(homography[0, 2])
@@ -34,7 +34,7 @@ def test_steps_with_a_constant_ratio_are_extrapolated() -> None:
 
 
 class Unbounded(Solver):
-    """After some regular steps, one that sends a corner to infinity, as `gauss_newton.solve` reports it."""
+    """Some regular steps, then one of infinite length, as `gauss_newton.solve` returns it."""
 
     regular_steps = 0
 

@@ -45,6 +45,6 @@ def test_saturated_areas_and_their_neighbours_are_masked() -> None:
 def test_common_fill_values_of_floats_are_masked(fill: float) -> None:
     pixels = np.array([[0.2, fill, -3.0, 60_000.0]], np.float32)
     assert data_mask(pixels, None).tolist() == [[True, False, True, True]]
-    # Where a value is declared, nothing is guessed; and integers are what they are.
+    # Fill values are only assumed for floats without a declared nodata value.
     assert data_mask(np.array([[-9999.0, 7.0]]), 7.0).tolist() == [[True, False]]
     assert data_mask(np.array([[-9999]], np.int16), None).all()

@@ -17,7 +17,7 @@ HELD = Pose(1.0, 25.0, 2.0, -3.0, 0.0, 0.0)
 
 @pytest.fixture(scope="module")
 def panel() -> np.ndarray:
-    """Green, from a metre up, turned by 25 degrees: reflectances (720, 960)."""
+    """Synthetic green band from one metre, rotated by 25 degrees: reflectances (720, 960)."""
     ground = with_panel(paint_ground(np.random.default_rng(0), [HELD], SIZE))
     green = REDEDGE.bands[REDEDGE.reference]
     return view(reflectance(ground, green), ground, green, HELD, SIZE)
@@ -76,7 +76,7 @@ def test_no_panel_is_detected_in_a_field(without_code: bool) -> None:
 
 
 def test_codes_give_reflectance_linear_in_the_wavelength() -> None:
-    """The real panel's code; its camera's tags say 0.5105 at 475 nm and 0.508067 at 840 nm."""
+    """The code of a real panel; the tags of its camera have 0.5105 at 475 nm and 0.508067 at 840 nm."""
     code = "RP04-1826246-SC_04005111000507"
     assert albedo_of(code, 475.0) == pytest.approx(0.5105)
     assert albedo_of(code, 840.0) == pytest.approx(0.5080667, abs=1e-6)

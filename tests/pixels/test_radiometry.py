@@ -50,7 +50,7 @@ def test_reflectance_of_the_synthetic_flight_is_the_truth(tmp_path: Path) -> Non
         raw = synthetic.render(bright, ground, spec, pose, (320, 240), rng)
         result = calibrated(raw, band.radiometry, 0, 0)
         np.testing.assert_allclose(np.median(result), bright[0, 0], rtol=0.01)
-        # Vignetting is gone: the corners are as bright as the middle.
+        # Vignetting is removed: the corners are as bright as the centre.
         assert np.median(result[:40, :40]) == pytest.approx(np.median(result[100:140, 140:180]), rel=0.02)
 
 
@@ -69,7 +69,7 @@ def test_without_its_tags_there_is_no_radiometry(tmp_path: Path, missing: str) -
 
 
 def by(path: Path, choice: RadiometryChoice, factors: dict[str, float] | None = None) -> Band:
-    """A file's band with the radiometry that was chosen."""
+    """Return the band of a file with the chosen radiometry."""
     bands = MicaSense().bands(path, read_tags(path), probe(path))
     return with_radiometry(Capture("IMG_0001", Path(), bands, 0), choice, factors or {}).bands[0]
 

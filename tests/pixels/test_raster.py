@@ -26,7 +26,7 @@ def test_a_photograph_is_reduced_by_averaging(tmp_path: Path) -> None:
     half = read_for_alignment(band, 320)
     assert half.size_px == (320, 240)
     np.testing.assert_allclose(half.pixels, whole.reshape(240, 2, 320, 2).mean((1, 3)), atol=0.51)
-    # One with a mask is GDAL's to average; it takes the photograph's own reductions, which differ by little.
+    # GDAL averages images with a mask; it uses the reductions of the JPEG decoder, which differ slightly.
     masked = read_for_alignment(replace(band, has_mask=True), 320)
     assert np.abs(half.pixels - masked.pixels).mean() < 1.5
 

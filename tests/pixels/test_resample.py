@@ -92,7 +92,7 @@ def test_the_type_is_kept_rounded_and_clipped(tmp_path: Path, dtype: str) -> Non
 def test_tiles_join_without_a_seam(tmp_path: Path) -> None:
     band = write_band(tmp_path / "b.tif", (textured_image(300, 220) * 100).astype(np.float32))
     mapping = PixelMapping(H, cameras.BANDS[1].lens(300, 220), cameras.BANDS[3].lens(300, 220))
-    # Not lanczos: there OpenCV rounds positions to 1/32 px, and a thousandth more or less tips it over.
+    # Not lanczos: OpenCV rounds its positions to 1/32 px, so tiny differences may change a result.
     whole, whole_valid = resample_tile(band, mapping, Tile(0, 0, 300, 220), "cubic")
     for tile in tiles(Tile(0, 0, 300, 220), 64):
         window = np.s_[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
@@ -183,7 +183,7 @@ def test_the_moving_image_is_warped_to_the_fixed_grid() -> None:
 
 
 def test_an_identity_between_grids_of_different_scales_is_warped() -> None:
-    """The moving image has as many pixels as the reduced grid, and shows but a quarter of the fixed image."""
+    """The moving image has as many pixels as the reduced grid, but covers a quarter of the fixed image."""
     image = textured_image(200, 160)
     moving = Raster(image, np.ones(image.shape, bool))
     there = warped(moving, PixelMapping(np.eye(3)), (200, 160), PixelScale(0.5, 0.5))

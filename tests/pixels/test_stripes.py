@@ -14,12 +14,12 @@ from ..conftest import textured_image
 WIDTH, HEIGHT = 400, 320
 EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
 OFFSETS = ((0, 0), (13, -8), (-21, 5), (9, 17))
-"""Of what each of four bands sees, px."""
+"""Offsets of the four bands, px."""
 REGISTERED = ((0, 0),) * len(OFFSETS)
 
 
 def bands(offsets: Sequence[tuple[int, int]] = OFFSETS, scene: np.ndarray | None = None) -> list[Raster]:
-    """Views of one scene, every second one contrast-reversed, each with its own brightness and noise."""
+    """Images of one scene, every second one with reversed contrast, with different brightness and noise."""
     scene = textured_image(WIDTH + 80, HEIGHT + 80) if scene is None else scene
     rng = np.random.default_rng(1)
     result = []
@@ -31,14 +31,14 @@ def bands(offsets: Sequence[tuple[int, int]] = OFFSETS, scene: np.ndarray | None
 
 
 def pattern(axis: int, share: float = 0.2, seed: int = 5) -> np.ndarray:
-    """White stripes along columns (axis 0) or rows, peak to peak a share of the range that `bands` has per unit."""
+    """White stripes along columns (axis 0) or rows, relative to the range of `bands`."""
     length = WIDTH if axis == 0 else HEIGHT
     one = share * 5 * np.random.default_rng(seed).uniform(-0.5, 0.5, length).astype(np.float32)
     return np.broadcast_to(one[None] if axis == 0 else one[:, None], (HEIGHT, WIDTH))
 
 
 def striped(images: Sequence[Raster], *patterns: np.ndarray) -> list[Raster]:
-    """With the same pattern, in each image as strong as its contrast."""
+    """Add the same pattern to each image, scaled to its contrast."""
     total = np.sum(patterns, axis=0)
     return [Raster(i.pixels + 100 * (k + 1) * total, i.valid) for k, i in enumerate(images)]
 

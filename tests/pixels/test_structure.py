@@ -26,7 +26,7 @@ def test_the_peak_is_at_the_shift(shift: tuple[float, float]) -> None:
     crop = np.s_[80:320, 80:400]
     fields = [structure_field(Raster(i[crop], EVERYWHERE)) for i in (big, moved)]
     peak = find_peak(correlation_surface(*fields), 16)
-    # cv2.WARP_INVERSE_MAP reads moved(p) = big(p - shift): content at p lies at p + shift.
+    # With cv2.WARP_INVERSE_MAP, moved(p) = big(p - shift): content at p is moved to p + shift.
     np.testing.assert_allclose(peak.shift_px, shift, atol=0.15)
     assert peak.sigma > 3 * peak.runner_up_sigma
 
@@ -66,7 +66,7 @@ def test_textured() -> None:
 
 
 def at_offset(image: np.ndarray, offset: int) -> np.ndarray:
-    """The same image so many bytes behind a multiple of 128 in memory."""
+    """Return a copy of an image at an offset in bytes from a multiple of 128 in memory."""
     room = np.empty(image.nbytes + 256, np.uint8)
     start = -room.ctypes.data % 128 + offset
     placed = room[start : start + image.nbytes].view(image.dtype).reshape(image.shape)

@@ -1,4 +1,4 @@
-"""What a nearer layer hides, compared with what geometry says."""
+"""Occlusions, compared with the exact geometry."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def layers(box: tuple[slice, slice] = BOX, near_px: float = NEAR_PX, far_px: flo
 
 
 def shadow(box: tuple[slice, slice], dx: int, dy: int) -> Mask:
-    """The box where a band sees it, without the box itself."""
+    """The area of the box in a band, without the box itself."""
     result = np.zeros((HEIGHT + 40, WIDTH + 40), bool)
     rows, columns = box
     result[rows.start + 20 + dy : rows.stop + 20 + dy, columns.start + 20 + dx : columns.stop + 20 + dx] = True
@@ -40,7 +40,7 @@ def test_a_band_without_a_baseline_has_no_occlusions() -> None:
 
 
 def test_a_hole_is_occluded_by_its_edge() -> None:
-    """The edge at which the ground comes over the hole, on the side that it moves from."""
+    """The edge at which the ground occludes the hole."""
     hidden = occluded(layers(near_px=-NEAR_PX), (1.0, 0.0))
     rows, columns = BOX
     expected = np.zeros_like(hidden)
@@ -66,18 +66,18 @@ def test_low_relief_of_a_surface_occludes_nothing() -> None:
 ])  # fmt: skip
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_box_at_the_border_occludes_only_pixels_inside(box: tuple[slice, slice], sign: int) -> None:
-    """Pixels that leave the image hide nothing, neither each other nor those at the other side."""
+    """Pixels displaced out of the image occlude nothing, neither each other nor pixels at the other side."""
     hidden = occluded(layers(box), (sign * 1.0, 0.0))
     expected = shadow(box, sign * NEAR_PX, 0)
     np.testing.assert_array_equal(hidden, expected)
 
 
 def test_a_magnified_surface_has_no_gaps() -> None:
-    """A steep bank, displaced pixels of which are 1.5 px apart, hides all of the ground below it."""
+    """The displaced pixels of a steep slope are 1.5 px apart and occlude the ground below without gaps."""
     z = np.clip(np.arange(WIDTH, dtype=np.float32)[None, :].repeat(HEIGHT, axis=0) * 0.5 - 10, 0, 20)
     z[:, 60:] = 0
     hidden = occluded(Relief(z, np.ones_like(z)), (1.0, 0.0))
-    # Its edge at x = 59 has z = 19.5 and is seen at 78 or 79.
+    # Its edge at x = 59 has z = 19.5 and is displaced to 78 or 79.
     inner = slice(2, -2)
     assert hidden[inner, 61:78].all()
     assert not hidden[:, 81:].any()
@@ -85,7 +85,7 @@ def test_a_magnified_surface_has_no_gaps() -> None:
 
 
 def test_a_reduced_relief() -> None:
-    """A raster of half the size keeps its parallax in px of the image."""
+    """A relief of half the size has its parallax in px of the image."""
     half = layers()
     full = Relief(half.parallax_px * 2, half.confidence, PixelScale(0.5, 0.5))
     np.testing.assert_array_equal(occluded(full, (1.0, 0.0)), shadow(BOX, NEAR_PX, 0))
@@ -93,7 +93,7 @@ def test_a_reduced_relief() -> None:
 
 
 def matched(sign: int, baselines: np.ndarray, shown: float = 0.9, behind: float = 0.2) -> Relief:
-    """The relief as matching finds it: hidden ground correlates little. With sign -1 all parallax is reversed."""
+    """A relief with low correlation of occluded pixels; with sign -1 all parallax is reversed."""
     z = layers().parallax_px
     hidden = np.logical_or.reduce([occluded(layers(), (x, y)) for x, y in (sign * baselines).tolist()])
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Planes, baselines and parallax from shifts of windows that are calculated from them."""
+"""Planes, baselines and parallax, recovered from synthetic shifts of windows."""
 
 from dataclasses import replace
 
@@ -14,12 +14,12 @@ from agalign.values.relief import Parallax, Relief
 
 SIZE = 640, 480
 BASELINES = np.array([[-0.8, 0.0], [0.0, -0.6], [-0.8, -0.6], [-0.4, -0.3]])
-"""The longest of length 1; pixels move against the places of the lenses."""
+"""The longest has length 1; points move opposite to the positions of the lenses."""
 POINTS = np.stack(np.meshgrid(np.arange(24, 640, 24.0), np.arange(24, 480, 24.0)), axis=-1).reshape(-1, 2)
 
 
 def heights() -> np.ndarray:
-    """Parallax (n,) of the windows: most on the ground, some on a bench and some on boxes, and a few below."""
+    """Parallax (n,) of the windows: most on the ground, some on a bench, on boxes and below the ground."""
     z = np.zeros(len(POINTS))
     z[(POINTS[:, 0] > 250) & (POINTS[:, 0] < 400)] = 4
     z[(POINTS[:, 0] > 300) & (POINTS[:, 0] < 370) & (POINTS[:, 1] > 200) & (POINTS[:, 1] < 330)] = 11
@@ -33,7 +33,7 @@ def corners() -> np.ndarray:
 
 
 def shifts(noise_px: float = 0.06, wrong: float = 0.2, missing: float = 0.0) -> WindowShifts:
-    """Of all windows in all bands, with wrong peaks anywhere within 20 px."""
+    """Shifts of all windows in all bands, with wrong peaks of up to 20 px."""
     rng = np.random.default_rng(0)
     planes = np.einsum("nki,bi->nbk", geometry.over_corners(POINTS, *SIZE), corners())
     result = planes + heights()[:, None, None] * BASELINES
@@ -99,7 +99,7 @@ def test_without_a_layout_only_the_sign_is_unknown() -> None:
 
 
 def test_the_reference_plane_contains_most_windows() -> None:
-    """Adding a plane to the parallax and taking it from the homographies changes no shift."""
+    """Moving a plane between parallax and homographies does not change the shifts."""
     tilted = shifts()
     tilt = 0.01 * (POINTS[:, 0] - 320) - 0.02 * (POINTS[:, 1] - 240) + 5
     tilted = replace(tilted, shifts_px=tilted.shifts_px + tilt[:, None, None] * BASELINES)
@@ -112,7 +112,7 @@ def test_too_few_windows_give_no_model() -> None:
     windows = shifts()
     few = WindowShifts(POINTS[:7], POINTS[:7], windows.shifts_px[:7], windows.weights[:7])
     assert fit_plane_parallax(few, SIZE) is None
-    # Eight windows are enough, and none of them may be missing in a band.
+    # Eight windows suffice if they are measured in all bands.
     nothing = replace(windows, weights=np.where(np.arange(4) == 2, 0.0, windows.weights))
     assert fit_plane_parallax(nothing, SIZE) is None
     assert fit_plane_parallax(windows, SIZE, np.zeros((4, 2))) is None
@@ -141,14 +141,14 @@ def test_windows_are_matched_by_their_centres() -> None:
     windows = WindowShifts.of([one, other], [plain, plain])
     np.testing.assert_array_equal(windows.centres_px, at)
     np.testing.assert_array_equal(windows.shifts_px[..., 0], [[1, 4], [2, np.nan], [np.nan, 3]])
-    # Higher peaks weigh more, up to a limit; what was not measured has no weight.
+    # Weights grow with the peak height up to a limit; windows without a measurement have weight 0.
     np.testing.assert_allclose(windows.weights, [[0.25, 2], [0.25, 0], [0, 2]])
     assert WindowShifts.of([residual(at, np.full((3, 2), np.nan))], [plain]).weights.tolist() == [[0.0]] * 3
     assert len(WindowShifts.of([residual(at[:0], at[:0])], [plain])) == 0
 
 
 def test_shifts_are_those_of_undistorted_pixels() -> None:
-    """A shift near a corner of a distorted image, measured under a relief."""
+    """A shift near a corner of a distorted image, measured with a relief."""
     lens = cameras.BANDS[1].lens(*SIZE)
     relief = Relief(np.full(SIZE[::-1], 5.0, np.float32), np.ones(SIZE[::-1], np.float32))
     mapping = PixelMapping(np.eye(3), lens, None, parallax=Parallax(relief, (0.6, -0.8)))
@@ -159,7 +159,7 @@ def test_shifts_are_those_of_undistorted_pixels() -> None:
     expected = plane.undistorted(centre + shift) - plane.undistorted(centre)
     np.testing.assert_allclose(windows.shifts_px[:, 0], expected, atol=1e-6)
     assert np.abs(expected - shift).max() > 0.05
-    # The whole shift from the plane has what the relief moved as well.
+    # The shift relative to the plane includes the displacement by the relief.
     whole = windows.plus(relief(windows.centres_px), np.array([[0.6, -0.8]]))
     np.testing.assert_allclose(whole.shifts_px[:, 0], expected + np.array([[3, -4]]), atol=1e-6)
 
@@ -167,7 +167,7 @@ def test_shifts_are_those_of_undistorted_pixels() -> None:
 @pytest.mark.parametrize("layout", [None, BASELINES])
 @pytest.mark.parametrize("bands", [[0, 1], [0, 1, 2], [0, 1, 2, 3]])
 def test_noise_of_the_reference_is_not_parallax(layout: np.ndarray | None, bands: list[int]) -> None:
-    """It shifts the windows of all bands alike, most in the direction in which the image has little texture."""
+    """It shifts the windows of all bands equally, mostly in the direction with little texture."""
     rng = np.random.default_rng(2)
     of_reference = rng.normal(0, [0.3, 1.0], (len(POINTS), 1, 2))
     noise = of_reference + rng.normal(0, 0.2, (len(POINTS), len(BASELINES), 2))

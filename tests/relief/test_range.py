@@ -1,4 +1,4 @@
-"""The range of two planes, seen through the lenses of a rig with known places and angles."""
+"""Range of two planes from a rig with known positions and orientations of the lenses."""
 
 import numpy as np
 import pytest
@@ -13,11 +13,11 @@ SIZE = 320, 240
 REFERENCE = Lens(400.0, 402.0, 158.0, 121.0)
 DISTORTED = Lens(400.0, 402.0, 158.0, 121.0, (-0.1, 0.03, 0.001, -0.0005, 0.0))
 PLACES_M = np.array([[0.03, 0.0], [0.0, 0.02], [0.03, 0.021]])
-"""Of the moving lenses, right of and below the reference's."""
+"""Positions of the moving lenses, right of and below the reference."""
 FOCAL_PX = (395.0, 405.0, 401.0)
 ANGLES = ((0.004, -0.01, 0.02), (-0.006, 0.008, -0.01), (0.01, 0.002, 0.005))
 PLANE_M, NEAR_M, SLOPE = 2.0, 1.1, 0.25
-"""Range of the plane at the centre, that of a box, and the plane's slope: it is not parallel to the image."""
+"""Range of the plane at the centre and of a box, and the slope of the plane relative to the image."""
 
 
 def camera_matrix(focal_px: float) -> np.ndarray:
@@ -62,7 +62,7 @@ def test_range_of_a_plane_and_a_box(reference: Lens, bands: int) -> None:
         # X' = R (X - place); on the plane 1 = normal . X / PLANE_M.
         by_plane = there @ turn @ (np.eye(3) - np.outer(translation, normal) / PLANE_M) @ np.linalg.inv(K)
         infinite.append(there @ turn @ np.linalg.inv(K))
-        # H (x + t z) ~ K' R (X - place) for all points of the line of sight where t is this.
+        # With this t, H (x + t z) ~ K' R (X - place) for all points of the line of sight.
         baseline = -K[:2, :2] @ place / unit / (1 - normal @ translation / PLANE_M)
         parallax = Parallax(
             Relief(parallax_px.astype(np.float32), np.ones(SIZE[::-1], np.float32)), (baseline[0], baseline[1])

@@ -1,4 +1,4 @@
-"""Semi-global matching, compared with its definition written out in loops."""
+"""Semi-global matching, compared with a direct implementation of its definition."""
 
 import numpy as np
 import pytest

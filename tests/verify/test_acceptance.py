@@ -81,12 +81,12 @@ def test_an_aligned_input_is_unchanged() -> None:
     assert is_unchanged(within, np.eye(3), SIZE)
     assert not is_unchanged(beyond, np.eye(3), SIZE)
     assert not is_unchanged(precise, np.eye(3), SIZE)
-    # A quarter of a pixel of the file is less of an image that was reduced to a third.
+    # The limit is in px of the file: in an image reduced to a third it is a third as large.
     assert not is_unchanged(within, np.eye(3), SIZE, scale=1 / 3)
 
 
 def windows(off: np.ndarray) -> Residual:
-    """12 x 9 windows, 112 px apart, of which some lie 3 px off."""
+    """12 x 9 windows with a spacing of 112 px, some with a shift of 3 px."""
     centres = np.stack(np.meshgrid(np.arange(12), np.arange(9)), axis=-1).reshape(-1, 2) * 112.0 + 56
     shifts = np.where(off.reshape(-1, 1), [3.0, 0.0], [0.05, 0.0])
     return Residual(centres, shifts, 0.05, 0.2, 1.0)
@@ -110,7 +110,7 @@ def test_windows_without_a_measurement_are_not_misaligned() -> None:
 
 
 def shifted(count_off: int, off_px: float, total: int = 100, spacing_px: float = 100.0) -> Residual:
-    """Windows in a row, of which some at scattered places are off."""
+    """A row of windows, some of them misaligned at scattered positions."""
     centres = np.stack([np.arange(total) * spacing_px, np.zeros(total)], axis=1)
     shifts = np.zeros((total, 2))
     shifts[: 3 * count_off : 3, 0] = off_px
@@ -174,7 +174,7 @@ def test_the_limit_is_a_pixel_of_the_file_where_the_images_are_reduced() -> None
 
 @pytest.mark.parametrize(("total", "allowed"), [(100, 4), (125, 4), (150, 5), (200, 7)])
 def test_the_windows_of_a_cluster_are_counted(total: int, allowed: int) -> None:
-    """Five adjacent windows, or a twenty-fifth of those measured where that is more."""
+    """The limit is five adjacent windows or 4 % of the measured ones, whichever is larger."""
     for count in (allowed, allowed + 1):
         residual = shifted(0, 0.0, total)
         residual.shifts_px[10 : 10 + count, 0] = 2.0

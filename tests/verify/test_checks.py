@@ -1,4 +1,4 @@
-"""The list of checks, and the rules by which it runs them."""
+"""The list of checks and the order in which they run."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ PREDICTION = Prediction(np.eye(3), "bands", std_px=0.2)
 
 
 class RepetitiveImages:
-    """Images that agree as well 16 px to the right."""
+    """Images that also match with a shift of 16 px to the right."""
 
     reduced_scale = (0.5, 0.5)
 

@@ -1,4 +1,4 @@
-"""Windows that verify what others were fitted in share no pixel with them."""
+"""Windows of verification share no pixels with windows of the fit."""
 
 import numpy as np
 import pytest

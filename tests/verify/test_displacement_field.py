@@ -31,7 +31,7 @@ SIZE = 640, 480
 
 
 def bump(points: np.ndarray, height: float = 1.5) -> np.ndarray:
-    """A smooth hill of displacement around (300, 220)."""
+    """A smooth displacement with its maximum at (300, 220)."""
     fall = np.exp(-(((points - (300, 220)) / 90) ** 2).sum(-1))
     return height * fall[..., None] * np.array([1.0, -0.6])
 
@@ -41,7 +41,7 @@ def centres() -> np.ndarray:
 
 
 def weights(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(trust, heights of the peaks), the same for all windows."""
+    """Return equal weights and peak heights for all windows."""
     return np.ones(len(at)), np.full(len(at), 20.0)
 
 
@@ -74,12 +74,12 @@ def test_folding_is_detected() -> None:
 
 
 def bent_pair(height: float) -> tuple[Raster, Raster]:
-    """A pair whose moving image is displaced by the bump, and that bump as local displacement of the reference."""
+    """A pair with a moving image displaced by the bump, and the bump as a displacement field of the reference."""
     import cv2
 
     fixed, moving = textured_pair(geometry.translation(0, 0), *SIZE, seed=4)
     grid = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1).astype(np.float64)
-    # moving(x + d(x)) shows what fixed(x) does: sample the other way round, to first order twice.
+    # moving(x + d(x)) = fixed(x): the inverse of x + d(x) is computed by two iterations.
     back = grid - bump(grid - bump(grid, height), height)
     bent = cv2.remap(moving, back.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     valid = np.ones(fixed.shape, bool)
@@ -136,7 +136,7 @@ def test_a_field_that_increases_p95_is_rejected() -> None:
 
 
 def of_captures(count: int, height: float, seed: int) -> list[Residual]:
-    """Windows of several captures that have a bump in common, each with noise of its own."""
+    """Windows of several captures with a common bump and independent noise."""
     at = centres()
     rng = np.random.default_rng(seed)
     shifts = [bump(at, height) + 0.1 * rng.normal(size=at.shape) for _ in range(count)]
@@ -151,13 +151,13 @@ def test_the_common_field_of_captures_is_that_of_the_lenses() -> None:
     assert np.sqrt((left**2).mean()) < 0.5 * np.sqrt((bump(at, 0.4) ** 2).sum(-1).mean())
     assert common_field(of_captures(6, 0.0, 1), SIZE) is None
     assert common_field(of_captures(2, 0.4, 1), SIZE) is None
-    # What each capture has of its own is none of the lenses'.
+    # Displacements that differ between captures are not caused by the lenses.
     own = [of_captures(1, h, k)[0] for k, h in enumerate((0.4, -0.4, 0.4, -0.4))]
     assert common_field(own, SIZE) is None
 
 
 def test_smoothness_is_relative_to_the_number_of_captures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Smoothness is per capture: a fit without some captures must not be stiffer than the final one."""
+    """Smoothness is per capture: fits without a fold must not be smoother than the final one."""
     captures = of_captures(5, 0.4, 1)
     fits: list[tuple[int, float]] = []
 
@@ -178,7 +178,7 @@ def test_smoothness_is_relative_to_the_number_of_captures(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("chance", range(3))
 @pytest.mark.parametrize("scale", [COARSE, FINE])
 def test_a_field_fitted_to_noise_does_not_predict_held_out_windows(chance: int, scale: FieldScale) -> None:
-    """Random shifts, which a fine enough field follows where it was fitted."""
+    """Random shifts: a fine field fits them, but does not predict others."""
     rng, at = np.random.default_rng(chance), centres()
     shifts = rng.uniform(-4, 4, at.shape)
     residual = Residual.of(at, shifts, np.full(len(at), 20.0))
@@ -192,7 +192,7 @@ def test_a_field_fitted_to_noise_does_not_predict_held_out_windows(chance: int, 
 
 
 def test_the_reported_residual_is_cross_validated() -> None:
-    """Smooth displacements with jumps of their own at each window: the field follows both, and predicts one."""
+    """Smooth displacements plus noise of each window: the field fits both and predicts the first."""
     rng, at = np.random.default_rng(0), centres()
     jumps = rng.normal(0, 0.7, at.shape)
     shifts = Shifts(at, bump(at, 6.0) + jumps, *weights(at))
@@ -207,7 +207,7 @@ def test_the_reported_residual_is_cross_validated() -> None:
 
 
 def test_predictions_exclude_windows_that_share_pixels() -> None:
-    """A window that is far off does not change what is predicted at it, however much it weighs."""
+    """An outlier does not change the prediction at its own position, whatever its weight."""
     at = centres()
     estimator = DisplacementEstimator(np.ones(SIZE[::-1], bool), np.zeros(SIZE[::-1], np.complex64), COARSE)
     quiet = Shifts(at, bump(at), *weights(at))

@@ -1,4 +1,4 @@
-"""What is to be expected where there is evidence, and where there is none."""
+"""Expected errors near windows and far from them, of predictions and of seeds."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def test_predictions_have_their_standard_error_and_seeds_none() -> None:
     known = alignment([0.01] * 4, None)
     predicted = replace(known, status="predicted", prediction=Prediction(np.eye(3), "bands", 0.4))
     np.testing.assert_allclose(expected_error_px(predicted, SIZE, LEFT), 0.4)
-    # Of a thermal band it is in pixels that are ten times as large.
+    # The standard error of a thermal band is in its own pixels, which are ten times as large.
     thermal = replace(predicted, fixed_to_moving=np.diag([0.1, 0.1, 1.0]))
     np.testing.assert_allclose(expected_error_px(thermal, SIZE, LEFT), 4.0)
     assert np.isinf(expected_error_px(replace(known, status="seed_only"), SIZE, LEFT)).all()

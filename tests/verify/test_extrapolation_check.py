@@ -24,7 +24,7 @@ def test_windows_everywhere_cover_all_quarters() -> None:
 
 
 def test_windows_that_end_near_the_centre_do_not_cover_the_other_half() -> None:
-    # 612 px, an eighth of the width beyond the middle
+    # 612 px, an eighth of the width beyond the centre
     assert unobserved_quarters(CENTRES[CENTRES[:, 0] < 620], SIZE) == ["top right", "bottom right"]
     assert unobserved_quarters(CENTRES[CENTRES[:, 0] < 680], SIZE) == []
     assert unobserved_quarters(CENTRES[CENTRES[:, 1] > 400], SIZE) == ["top left", "top right"]

@@ -1,4 +1,4 @@
-"""The lens shapes: their size, what windows in a part of the image determine of them, and the error of the rest."""
+"""Lens shapes: their size, their estimation from a part of the image, and the error elsewhere."""
 
 import cv2
 import numpy as np
@@ -43,7 +43,7 @@ def test_the_radial_shapes_are_those_of_opencv_and_1_long_at_the_corners() -> No
     half_diagonal = float(np.linalg.norm(centre))
     camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
     rays = np.column_stack([(EVERYWHERE - centre) / focal, np.ones(len(EVERYWHERE))])
-    # k1, k2, p1, p2 that move a corner by one px each
+    # k1, k2, p1, p2 that displace a corner by 1 px each
     k = [focal**2 / half_diagonal**3, focal**4 / half_diagonal**5, focal / half_diagonal**2 / 3]
     for shape, coefficients in enumerate([(k[0], 0, 0, 0), (0, k[1], 0, 0), (0, 0, 0, k[2]), (0, 0, k[2], 0)]):
         moved = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera, np.array(coefficients))[0][:, 0]
@@ -56,7 +56,7 @@ def test_windows_in_one_half_determine_the_other_half_to_the_stated_error() -> N
         fit = fit_with_lens(IDENTITY, windows(TRUTH_PX, LEFT, 0.05, seed), SIZE, calibrated=False)
         error = over_corners_and_lens(RIGHT, SIZE) @ (fit.mean_px - TRUTH_PX)
         ratios.append(rms(error) / fit.std_px(RIGHT))
-    # Windows are taken to share their errors, so that independent ones do better than stated.
+    # Errors of windows are assumed to be correlated; independent ones have smaller errors.
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.0
     assert fit.std_px(LEFT) < 0.15 < fit.std_px(RIGHT)
 

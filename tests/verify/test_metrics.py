@@ -29,7 +29,7 @@ def tile_residuals(fixed: Raster, moving: Raster) -> Residual:
 
 
 def elastix_mattes(fixed: np.ndarray, moving: np.ndarray) -> float:
-    """Mattes MI as elastix computes it, pixel by pixel: an oracle that shares no code with the package."""
+    """Mattes MI as defined by elastix, pixel by pixel, independent of the package."""
     bins = 32
     density = np.zeros((bins, bins))
 

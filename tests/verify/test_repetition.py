@@ -14,7 +14,7 @@ PERIOD = 26.0
 
 
 def planted(shift: tuple[float, float], seed: int, sign: float = 1.0) -> np.ndarray:
-    """Plants on a lattice, (300, 400), seen from elsewhere, with noise of their own."""
+    """Two images (300, 400) of plants on a grid, from different positions, with independent noise."""
     y, x = np.mgrid[:300, :400].astype(np.float64)
     across, along = (np.cos(2 * np.pi * (v - s) / PERIOD) for v, s in zip((x, y), shift, strict=True))
     plants = np.exp(3 * (across + along) - 6)
