@@ -46,7 +46,7 @@ def doctor(
             for text in problems:
                 terminal.problem(text)
             if not problems:
-                terminal.result("nothing is in the way")
+                terminal.result("no problems found")
         raise typer.Exit(EXIT_NOTHING if problems else EXIT_OK)
 
 
@@ -135,6 +135,6 @@ def _show(facts: dict[str, Any], terminal: Terminal) -> None:
     terminal.result(table)
     table = Table("Extra", "What it adds", "")
     for row in facts["extras"]:
-        how = f"pip install 'agalign[{row['extra']}]'" if row["missing"] else "there"
+        how = f"pip install 'agalign[{row['extra']}]'" if row["missing"] else "installed"
         table.add_row(row["extra"], row["adds"], shown(how))
     terminal.result(table)

@@ -36,10 +36,12 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     type of the file, with its nodata value as `_FillValue`; differences of unsigned integers then wrap around.
     Bands without pixels are left out. A capture with a relief has the variable `parallax` (px along a baseline of
     length 1, larger for nearer objects) and, if the run wrote them, `confidence` and `range` (m).
-    Raises SidecarError, UnreadableFileError, and ConfigurationError if xarray is not installed.
+    Raises SidecarError, UnreadableFileError, InputError for a folder, and ConfigurationError without xarray.
     """
     import_xarray()
     given = Path(path)
+    if given.is_dir():
+        raise InputError(f"{given}: is a folder; give the sidecar of a capture, or use open_flight")
     sidecar_path = given.with_name(_SUFFIX.sub("", given.name) + ".json")
     return _dataset(read_sidecar(sidecar_path), sidecar_path.parent, masked=masked)
 

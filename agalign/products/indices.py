@@ -93,7 +93,9 @@ def index_named(name: str) -> Index:
     catalogue = _catalogue()
     if wanted in catalogue:
         return _of_catalogue(wanted, catalogue[wanted])
-    more = "or a name in spyndex" if catalogue else "or install more with pip install 'agalign[indices]'"
+    more = (
+        "or a name in the catalogue of spyndex" if catalogue else "or install more with pip install 'agalign[indices]'"
+    )
     raise ConfigurationError(f"unknown index '{name}'; choose from {', '.join(INDICES)}, {more}")
 
 

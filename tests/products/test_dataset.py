@@ -92,6 +92,8 @@ def test_what_cannot_be_opened_is_named(tmp_path: Path) -> None:
         agalign.open_flight(tmp_path)
     with pytest.raises(AgalignError, match=r"missing\.json"):
         agalign.open_capture(tmp_path / "missing.tif")
+    with pytest.raises(InputError, match="is a folder; give the sidecar of a capture, or use open_flight"):
+        agalign.open_capture(tmp_path)
 
 
 def test_captures_of_different_sizes_make_no_stack(tmp_path: Path) -> None:
