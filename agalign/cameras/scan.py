@@ -13,7 +13,7 @@ class DiscoverOptions:
     """Options of `discover`."""
 
     pattern: str | None = None
-    """Pattern of file names, as '{capture}_{band}.tif', for naming schemes that agalign does not know."""
+    """Pattern of file names of other cameras, as '{capture}_{band}.tif'."""
     reference: str | None = None
     """Name of the reference band; None for the default of the camera."""
     ignore_metadata: bool = False

@@ -48,7 +48,7 @@ FolderArgument = Annotated[
 ]
 Pattern = Annotated[
     str | None,
-    of_input(help="Pattern of file names that agalign does not know, as '{capture}_{band}.tif'."),
+    of_input(help="Pattern of file names of other cameras, as '{capture}_{band}.tif'."),
 ]
 Reference = Annotated[str | None, of_input(help="Name of the reference band; by default green.")]
 Jobs = Annotated[

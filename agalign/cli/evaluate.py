@@ -35,7 +35,7 @@ def evaluate(
             "--method",
             "-m",
             show_default=False,
-            help="fast:pseudo-siamese, paper:siamese, …:grey, sift, daisy, elastix, or a network file; repeatable.",
+            help="RECIPE:SHARING as fast:siamese (with :grey: on grey images), sift, daisy, elastix, network file; repeatable.",
         ),
     ] = None,
     shift: Annotated[

@@ -353,8 +353,8 @@ class OutputPart(_Part):
     scale: tuple[float, float] = (1.0, 1.0)
     """Output pixels per reference pixel along x and y."""
     nodata: float | str | None
-    """Nodata value of the stack, or of all single bands; null if they differ; `"nan"` for NaN. 0 if no valid pixel is
-    0, else a value that no pixel has.
+    """Nodata value of the stack, or of all single bands; null if they differ; `"nan"` for NaN. Integers without a
+    nodata value in the input: 0, or another value that no valid pixel has.
     """
 
 

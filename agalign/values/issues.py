@@ -55,8 +55,8 @@ def explanation(issues: Sequence[Issue]) -> str | None:
 
 TEXTURELESS = Remedy(
     "too little common structure: water, fog, blur or noise in one of the bands",
-    "align all bands together, with the default reference; such bands are predicted once three captures of the flight "
-    "have texture, or with --model OUT/models/… of an earlier flight",
+    "align all bands together, with the default reference: such bands are predicted if three captures of the flight "
+    "have texture; otherwise give --model OUT/models/… of an earlier flight",
 )
 UNLIKE = Remedy(
     "the bands do not show the same scene",
@@ -75,7 +75,7 @@ _ASKED = Remedy("only the seed was requested", "omit --seed and --only-seed")
 
 UNREADABLE = IssueKind(
     "unreadable", "{detail}",
-    Remedy("a file cannot be read", "copy it from the card again; the other bands do not need it"),
+    Remedy("a file cannot be read", "copy it from the card again; the other bands are aligned without it"),
 )  # fmt: skip
 BLANK_REFERENCE = IssueKind("blank_reference", "the reference band is constant or all invalid", _BLANK)
 BLANK_MOVING = IssueKind("blank_moving", "the moving band is constant or all invalid", _BLANK)
