@@ -31,6 +31,7 @@ from agalign.products.layout import Layer, output_layers
 from agalign.products.nodata import with_nodata
 from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import GEOTIFF, predictor, write_raster
+from agalign.products.sidecar import is_delivered
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
@@ -68,7 +69,7 @@ class PanSharpened(Product):
             )
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
-        """Write <capture>.pan.tif; nothing if the panchromatic band is not aligned."""
+        """Write <capture>.pan.tif; nothing if the panchromatic band is not delivered."""
         fine = {"resolution": "finest", "format": "gtiff", "compression": "none"}
         settings, path = context.write_settings.model_copy(update=fine), context.paths.file(self.suffix)
         sources = _sources(context, settings)
@@ -99,12 +100,15 @@ class _Sources:
 
 
 def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | None:
-    """None if the panchromatic band is not aligned, or no band is within its spectral range."""
-    pan = panchromatic(context.capture)
-    placed = {n: a for n, a in context.usable.items() if a.status in ("aligned", "predicted")}
-    if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *placed}:
+    """None if the panchromatic band is not delivered, or no band is within its spectral range."""
+    pan, limit_px = panchromatic(context.capture), context.settings.check.accept_predicted_px
+    delivered = {
+        name: a for name, a in context.usable.items()
+        if is_delivered(a.status, None if a.prediction is None else a.prediction.std_px, limit_px)
+    }  # fmt: skip
+    if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *delivered}:
         return None
-    layers, grid = output_layers(context.capture, placed, settings, context.rig)
+    layers, grid = output_layers(context.capture, delivered, settings, context.rig)
     bands = [layer for layer in layers if _is_multispectral(layer, pan)]
     is_sharpened = [_is_in_range(layer.band, pan) for layer in bands]
     if not any(is_sharpened):

@@ -1,4 +1,5 @@
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,9 +13,18 @@ from agalign.cameras.discover import DiscoverOptions
 from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.pixels.raster import open_raster
 from agalign.products.layout import Layer
-from agalign.products.pan_sharpen import _is_in_range, _sharpen, _Sources, brovey_ratio, panchromatic, weights_of
+from agalign.products.pan_sharpen import (
+    _is_in_range,
+    _sharpen,
+    _Sources,
+    _sources,
+    brovey_ratio,
+    panchromatic,
+    weights_of,
+)
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
 
 from ..conftest import textured_image
@@ -124,6 +134,25 @@ def test_gaps_keep_the_nodata_value_and_what_is_not_seen_is_not_sharpened(
     assert (result[:, :20] == nodata).all()
     assert result[0, 30:].std() > 100
     assert (result[1, 20:] == 2000).all()
+
+
+@pytest.mark.parametrize(("status", "std_px", "sharpens"), [
+    ("aligned", None, True), ("predicted", 0.9, True), ("predicted", 1.9, False), ("seed_only", None, False),
+])  # fmt: skip
+def test_a_panchromatic_band_that_is_not_delivered_sharpens_nothing(
+    monkeypatch: pytest.MonkeyPatch, status: str, std_px: float | None, sharpens: bool
+) -> None:
+    def placed(_: Capture, alignments: dict[str, object], *__: object) -> tuple[list[Layer], OutputGrid]:
+        own = PixelMapping(np.eye(3))
+        return [Layer(b, own) for b in bands if b is bands[0] or b.name in alignments], OutputGrid(0, 0, 64, 48)
+
+    bands = [Band(name, Path(name), 1, 64, 48, "uint16") for name in ("Green", "Panchro")]
+    monkeypatch.setattr("agalign.products.pan_sharpen.output_layers", placed)
+    prediction = None if std_px is None else SimpleNamespace(std_px=std_px)
+    usable = {"Panchro": SimpleNamespace(status=status, prediction=prediction)}
+    capture = Capture("a", Path("in"), tuple(bands), 0)
+    context = SimpleNamespace(capture=capture, usable=usable, settings=Settings(), rig=None)
+    assert (_sources(context, WriteSettings()) is not None) == sharpens  # type: ignore[arg-type]
 
 
 def test_a_photograph_sharpens_no_infra_red_alone(tmp_path: Path) -> None:
