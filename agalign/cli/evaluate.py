@@ -35,7 +35,8 @@ def evaluate(
             "--method",
             "-m",
             show_default=False,
-            help="RECIPE:SHARING as fast:siamese (with :grey: on grey images), sift, daisy, elastix, network file; repeatable.",
+            help="Recipe and sharing (fast:siamese; fast:siamese:grey for grey images), sift, daisy, elastix, or a "
+            "network file; repeatable.",
         ),
     ] = None,
     shift: Annotated[
