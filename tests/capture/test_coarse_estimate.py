@@ -83,5 +83,5 @@ def test_a_band_of_full_resolution_is_unchanged(scene: np.ndarray) -> None:
     pair, result = tried(scene[100:340, 100:420], thermal(scene, 0.2))
     failed = replace(result, status="failed", prediction=None)
     assert predicted_if_coarse(replace(pair, is_coarse=False), failed) is failed
-    doubtful = replace(failed, seed=replace(failed.seed, trusted=False))
-    assert predicted_if_coarse(pair, doubtful) is doubtful
+    untrusted = replace(failed, seed=replace(failed.seed, trusted=False))
+    assert predicted_if_coarse(pair, untrusted) is untrusted

@@ -26,8 +26,8 @@ LENS_PX = np.array([0.8, 0.0, 0.4, 0.0])
 LEFT, RIGHT = (slice(None), slice(None, 320)), (slice(None), slice(320, None))
 
 
-def bent_images() -> tuple[np.ndarray, np.ndarray]:
-    """A pair whose lenses differ by up to 1.2 px."""
+def distorted_images() -> tuple[np.ndarray, np.ndarray]:
+    """A pair of lenses with a difference of up to 1.2 px."""
     fixed, moving = textured_pair(MATRIX, *SIZE)
     pixels = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1).reshape(-1, 2).astype(np.float64)
     away = (pixels + lens_shapes(pixels, SIZE) @ LENS_PX).reshape(SIZE[1], SIZE[0], 2).astype(np.float32)
@@ -41,7 +41,7 @@ def valid_in(part: tuple[slice, slice]) -> np.ndarray:
 
 
 def pair_in(part: tuple[slice, slice]) -> BandPair:
-    fixed, moving = bent_images()
+    fixed, moving = distorted_images()
     images = (raster_of(image, valid_in(part), "image") for image in (fixed, moving))
     return BandPair.of_images("moving", *images, {"identity": np.eye(3)})
 
@@ -115,7 +115,7 @@ def test_georeferenced_files_and_failed_pairs_are_unchanged() -> None:
 
 @pytest.mark.slow
 def test_half_masked_arrays_are_predicted() -> None:
-    fixed, moving = bent_images()
+    fixed, moving = distorted_images()
     result = agalign.align(fixed, moving, fixed_valid=valid_in(RIGHT), moving_valid=valid_in(RIGHT))
     assert result.status == "predicted"
     assert result.prediction is not None

@@ -42,7 +42,7 @@ def result(corners_px: np.ndarray, std_px: np.ndarray) -> JointResult:
     return JointResult(moved, 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, std, covariance)
 
 
-def corners_beside_the_mean(result: JointResult) -> np.ndarray:
+def corners_near_the_mean(result: JointResult) -> np.ndarray:
     points = geometry.corners(*SIZE)
     return np.asarray(geometry.apply(result.fixed_to_moving, points) - geometry.apply(MEAN, points))
 
@@ -56,7 +56,7 @@ def test_corners_without_texture_follow_the_rig_with_its_error() -> None:
     off = np.array([[0.0, 0.0], [2.5, -1.5], [-2.0, 3.0], [0.0, 0.0]])
     known = np.array([[0.03] * 2, [4.0] * 2, [4.0] * 2, [0.03] * 2])
     both = found_together(result(np.zeros((4, 2)), np.full((4, 2), 0.03)), result(off, known), rig())
-    assert np.abs(corners_beside_the_mean(both["nir"])).max() < 0.15
+    assert np.abs(corners_near_the_mean(both["nir"])).max() < 0.15
     std = np.array(both["nir"].corner_std_xy_px)
     assert (std[[0, 3]] < 0.04).all()
     assert ((std[[1, 2]] > 0.05) & (std[[1, 2]] < 0.3)).all()
@@ -67,8 +67,8 @@ def test_the_distance_is_estimated_from_the_band_with_texture() -> None:
     red = result(np.tile([3.0, 0.0], (4, 1)), np.full((4, 2), 0.03))
     blind = result(np.zeros((4, 2)), np.full((4, 2), 50.0))
     both = found_together(red, blind, rig())
-    np.testing.assert_allclose(corners_beside_the_mean(both["nir"]), np.tile([0.0, 4.0], (4, 1)), atol=0.1)
-    np.testing.assert_allclose(corners_beside_the_mean(both["red"]), np.tile([3.0, 0.0], (4, 1)), atol=0.02)
+    np.testing.assert_allclose(corners_near_the_mean(both["nir"]), np.tile([0.0, 4.0], (4, 1)), atol=0.1)
+    np.testing.assert_allclose(corners_near_the_mean(both["red"]), np.tile([3.0, 0.0], (4, 1)), atol=0.02)
 
 
 def test_a_certain_band_is_not_biased_by_the_rig() -> None:
@@ -76,7 +76,7 @@ def test_a_certain_band_is_not_biased_by_the_rig() -> None:
     both = found_together(
         result(np.zeros((4, 2)), np.full((4, 2), 0.03)), result(there, np.full((4, 2), 0.03)), rig(0.05)
     )
-    np.testing.assert_allclose(corners_beside_the_mean(both["nir"]), there, atol=0.05)
+    np.testing.assert_allclose(corners_near_the_mean(both["nir"]), there, atol=0.05)
 
 
 def test_without_a_rig_the_results_are_unchanged() -> None:

@@ -79,9 +79,9 @@ def test_a_valid_model_is_kept_and_an_outdated_one_is_learned_again(five: Path, 
     apart_px = dict(zip(model.bands, (12.0, -12.0, 9.0, -9.0), strict=True))
     elsewhere = {b: geometry.translation(apart_px[b], apart_px[b] / 3) @ m for b, m in model.rig.mean.items()}
     moved = replace(model, rig=replace(model.rig, mean=elsewhere), mappings=elsewhere)
-    anew = learn_flight(captures, Settings(), lambda *_: None, start=moved)
-    assert anew is not None
-    assert anew.rig is not moved.rig
+    relearned = learn_flight(captures, Settings(), lambda *_: None, start=moved)
+    assert relearned is not None
+    assert relearned.rig is not moved.rig
 
 
 def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(

@@ -93,11 +93,11 @@ def test_a_trusted_mapping_of_the_flight_suffices() -> None:
     seed = best(rasters(SHIFTED), {"model": near, "identity": np.eye(3)})
     assert seed.kind in ("model", "structure")
     assert mean_error_px(seed.fixed_to_moving, SHIFTED, 400, 320) < 1
-    lost = best(rasters(SHIFTED), {"model": geometry.translation(300, 0), "rig": SHIFTED})
-    assert mean_error_px(lost.fixed_to_moving, SHIFTED, 400, 320) < 1
+    failed = best(rasters(SHIFTED), {"model": geometry.translation(300, 0), "rig": SHIFTED})
+    assert mean_error_px(failed.fixed_to_moving, SHIFTED, 400, 320) < 1
 
 
-def turned(image: np.ndarray, degrees: float, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rotated(image: np.ndarray, degrees: float, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotate and scale an image on a larger canvas; return it, its mask, and the mapping of its pixels."""
     height, width = image.shape
     cos, sin = np.cos(np.radians(degrees)) * scale, np.sin(np.radians(degrees)) * scale
@@ -111,30 +111,30 @@ def turned(image: np.ndarray, degrees: float, scale: float) -> tuple[np.ndarray,
 @pytest.mark.parametrize(("degrees", "scale"), [(3, 1.0), (45, 1.0), (180, 1.0), (10, 0.6), (-90, 1.5)])
 def test_landmarks_align_rotated_and_scaled_images(degrees: float, scale: float) -> None:
     fixed, moving = textured_pair(SHIFTED)
-    image, valid, to_turned = turned(moving, degrees, scale)
+    image, valid, to_rotated = rotated(moving, degrees, scale)
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
     overlay = geometry.overlay(images[0].size_px, images[1].size_px)
     seed = find_seed(BandPair.of_images("moving", *images, {"identity": overlay}), SeedSettings())
     assert isinstance(seed, Seed)
     assert (seed.kind, seed.trusted) == ("match", True)
-    assert mean_error_px(seed.fixed_to_moving, geometry.compose(to_turned, SHIFTED), 400, 320) < 2 * scale
+    assert mean_error_px(seed.fixed_to_moving, geometry.compose(to_rotated, SHIFTED), 400, 320) < 2 * scale
 
 
-def pair_turned(degrees: float, candidates: Candidates, candidate_std_px: dict[str, float] | None = None) -> BandPair:
+def rotated_pair(degrees: float, candidates: Candidates, candidate_std_px: dict[str, float] | None = None) -> BandPair:
     fixed, moving = textured_pair(np.eye(3), 640, 480)
-    image, valid, _ = turned(moving, degrees, 1.0)
+    image, valid, _ = rotated(moving, degrees, 1.0)
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
     return BandPair.of_images("moving", *images, candidates, candidate_std_px or {})  # type: ignore[arg-type]
 
 
 def test_a_wrong_rotation_in_the_tags_is_detected() -> None:
     """The image centre agrees with the tags and the correlation peak, the corners do not."""
-    _, _, truth = turned(np.zeros((480, 640), np.float32), 3.0, 1.0)
+    _, _, truth = rotated(np.zeros((480, 640), np.float32), 3.0, 1.0)
     middle = np.array([(639 / 2, 479 / 2)])
     ((dx, dy),) = geometry.apply(truth, middle) - middle
-    told: Candidates = {"rig": geometry.translation(dx, dy)}
-    pair = pair_turned(3.0, told, {"rig": 8.0})
-    first = best_seed(pair, told)
+    tags: Candidates = {"rig": geometry.translation(dx, dy)}
+    pair = rotated_pair(3.0, tags, {"rig": 8.0})
+    first = best_seed(pair, tags)
     assert first.trusted, "by the peak alone it looks right"
     assert pair.is_expected(first.fixed_to_moving)
     result = find_seed(pair, SeedSettings())
@@ -145,30 +145,30 @@ def test_a_wrong_rotation_in_the_tags_is_detected() -> None:
 
 @pytest.mark.slow
 def test_a_rotation_is_distinguished_from_a_shift() -> None:
-    _, _, truth = turned(np.zeros((480, 640), np.float32), 4.0, 1.0)
-    pair = pair_turned(4.0, {"identity": np.eye(3)})
+    _, _, truth = rotated(np.zeros((480, 640), np.float32), 4.0, 1.0)
+    pair = rotated_pair(4.0, {"identity": np.eye(3)})
 
-    def turned_beside(mapping: np.ndarray) -> np.ndarray | None:
+    def found_rotated(mapping: np.ndarray) -> np.ndarray | None:
         return find_rotated(pair, mapping, WarpedPair.of(pair, pair.mapping(mapping)).residual)
 
-    result = turned_beside(np.eye(3))
+    result = found_rotated(np.eye(3))
     assert result is not None
     assert mean_error_px(result, truth, 640, 480) < 2
-    assert turned_beside(truth) is None, "where it fits there is nothing to be found"
+    assert found_rotated(truth) is None, "the given mapping is right"
     shifted = geometry.compose(truth, geometry.translation(60, 25))
-    assert turned_beside(shifted) is None, "a scene that repeats looks so too"
+    assert found_rotated(shifted) is None, "a shift may be an alias"
 
 
 def test_the_user_s_seed_is_not_replaced_by_landmarks() -> None:
     fixed, moving = textured_pair(np.eye(3))
-    image, valid, to_turned = turned(moving, 10, 1.0)
+    image, valid, to_rotated = rotated(moving, 10, 1.0)
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)
     elsewhere = geometry.translation(5, 5)
     pair = BandPair.of_images("moving", *images, {"user": elsewhere}, {"user": 3.0})
     seed = find_seed(pair, SeedSettings())
     assert isinstance(seed, Seed)
     assert seed.kind in ("user", "structure")
-    assert mean_error_px(seed.fixed_to_moving, to_turned, 400, 320) > 5
+    assert mean_error_px(seed.fixed_to_moving, to_rotated, 400, 320) > 5
 
 
 def test_unrelated_images_have_no_landmarks_in_common() -> None:
@@ -180,8 +180,8 @@ def test_unrelated_images_have_no_landmarks_in_common() -> None:
 
 def test_an_inaccurate_match_is_corrected_by_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     fixed, moving = textured_pair(SHIFTED)
-    image, valid, to_turned = turned(moving, 45, 1.0)
-    truth = geometry.compose(to_turned, SHIFTED)
+    image, valid, to_rotated = rotated(moving, 45, 1.0)
+    truth = geometry.compose(to_rotated, SHIFTED)
     off = geometry.compose(truth, geometry.moving_corners([3.0, -2.0, -2.0, 2.0, 3.0, 2.0, -2.0, -3.0], 400, 320))
     monkeypatch.setattr("agalign.capture.seeding._matches", lambda *_, **__: iter([off]))
     images = Raster(fixed, np.ones(fixed.shape, bool)), Raster(image, valid)

@@ -102,7 +102,7 @@ def test_residuals_of_a_reduced_image_are_in_px_of_the_file() -> None:
     assert (residual.median_px, residual.shifts_px[0, 0]) == (2.0, 2.0)
 
 
-def bent_pair(height_px: float, apart_px: float | None = None) -> BandPair:
+def displaced_pair(height_px: float, apart_px: float | None = None) -> BandPair:
     """A pair with a smooth bump in the centre or waves everywhere, which no homography represents."""
     fixed, moving = textured_pair(np.eye(3), 640, 480, seed=4)
     grid = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
@@ -115,8 +115,8 @@ def bent_pair(height_px: float, apart_px: float | None = None) -> BandPair:
         return height_px * fall[..., None] * np.array([1.0, -0.6])
 
     back = grid - bump(grid - bump(grid))
-    bent = cv2.remap(moving, back.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, bent))
+    displaced_image = cv2.remap(moving, back.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    images = (Raster(image, np.ones(image.shape, bool)) for image in (fixed, displaced_image))
     return BandPair.of_images("nir", *images, {"rig": np.eye(3)})
 
 
@@ -124,7 +124,7 @@ def bent_pair(height_px: float, apart_px: float | None = None) -> BandPair:
 def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: str, status: str) -> None:
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     settings = Settings(relief=ReliefSettings(use=use))
-    results = verified(bent_pair(4.0), seed, result(np.eye(3)), settings)
+    results = verified(displaced_pair(4.0), seed, result(np.eye(3)), settings)
     assert results.status == status
     assert (results.field is not None) == (status == "aligned")
 
@@ -132,7 +132,7 @@ def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: str, sta
 @pytest.mark.slow
 def test_quickly_varying_parallax_needs_a_fine_field() -> None:
     """Waves of 200 px: a window of the coarse field contains a large part of a wave."""
-    pair, seed = bent_pair(2.5, apart_px=200.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
+    pair, seed = displaced_pair(2.5, apart_px=200.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     results = verified(pair, seed, result(np.eye(3)), Settings())
     assert results.status == "aligned"
     assert results.field is not None
@@ -144,7 +144,7 @@ def test_quickly_varying_parallax_needs_a_fine_field() -> None:
 
 @pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])
 def test_a_field_is_tried_without_a_rig_and_rejected_without_need(rig_known: bool, tried: bool) -> None:
-    pair = bent_pair(0.0)
+    pair = displaced_pair(0.0)
     pair = replace(pair, candidate_std_px={"model": 1.0} if rig_known else {})
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     plain = verified(pair, seed, result(np.eye(3)), Settings())
@@ -154,9 +154,9 @@ def test_a_field_is_tried_without_a_rig_and_rejected_without_need(rig_known: boo
 def test_issues_that_a_field_cannot_remove_are_reported(pair: BandPair) -> None:
     """A third of the image 15 px off."""
     fixed, moving = textured_pair(geometry.translation(6, -4))
-    torn = moving.copy()
-    torn[:, 270:] = np.roll(moving, 15, axis=0)[:, 270:]
-    results = verified(pair_of(fixed, torn), SEED, result(geometry.translation(6, -4)), Settings())
+    partly_shifted = moving.copy()
+    partly_shifted[:, 270:] = np.roll(moving, 15, axis=0)[:, 270:]
+    results = verified(pair_of(fixed, partly_shifted), SEED, result(geometry.translation(6, -4)), Settings())
     assert results.status != "aligned"
     assert {"close_windows", "cluster"} & {d.code for d in results.issues}
     assert "of the windows" in (results.reason or "")
@@ -179,7 +179,7 @@ def test_smaller_windows_are_measured_where_valid_areas_are_small() -> None:
 
 def test_a_field_is_verified_in_held_out_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """A field may fit any shifts of its own windows."""
-    pair = bent_pair(2.5)
+    pair = displaced_pair(2.5)
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     good = pair.reference.coarse_field.refine(pair.moving_image, pair.mapping(np.eye(3)), verify=True)
     assert good.field is not None

@@ -250,12 +250,12 @@ def test_interpolation_between_different_captures_has_an_error() -> None:
     others = [replace(observation(10.0 * k, 0.1 * (k % 3)), altitude_m=28.0 + 0.1 * (k % 3)) for k in range(1, 9)]
     rig = learn_rig([panel, *others], SIZE, BASELINES)
     assert rig is not None
-    lost = Observation(6.0, {}, {}, 28.1)
-    error, std = error_px(rig, "NIR", lost, mappings(0.1)["NIR"])
+    unobserved = Observation(6.0, {}, {}, 28.1)
+    error, std = error_px(rig, "NIR", unobserved, mappings(0.1)["NIR"])
     assert error < 1.0
     assert error < 3 * std
     # Without the height, the standard error contains the difference of the two captures.
-    error, std = error_px(rig, "NIR", replace(lost, altitude_m=None), mappings(0.1)["NIR"])
+    error, std = error_px(rig, "NIR", replace(unobserved, altitude_m=None), mappings(0.1)["NIR"])
     assert std > 10
     assert error < 3 * std
 
@@ -296,7 +296,7 @@ def test_too_few_known_times_have_the_typical_error(known_times: int) -> None:
     assert distance_px(by_height.fixed_to_moving, mappings(1.75)["NIR"], SIZE) < 0.3
 
 
-def rarely_shown() -> list[Observation]:
+def with_rare_band() -> list[Observation]:
     """25 captures, three of them with NIR, twelve apart like the folds of the cross-validation."""
     rng = np.random.default_rng(1)
     return [
@@ -306,7 +306,7 @@ def rarely_shown() -> list[Observation]:
 
 
 def test_a_band_in_few_captures_has_a_finite_error() -> None:
-    rig = learn_rig(rarely_shown(), SIZE, {})
+    rig = learn_rig(with_rare_band(), SIZE, {})
     assert rig is not None
     assert set(rig.mean) == set(BASELINES)
     assert all(0 < rig.from_bands_px[band] < 0.3 for band in BASELINES)

@@ -78,8 +78,8 @@ def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:
     assert with_height(high, []) == high
     in_scene = replace(band, panel=Panel("QR code", in_scene=True))
     assert with_height(high, [PanelReading(capture(in_scene, position=Position(52.0, 5.0, 93.0)), ())]) == high
-    told = replace(high, pose=Pose(30.0, height_m=25.0))
-    assert with_height(told, [ground]) == told
+    with_tags = replace(high, pose=Pose(30.0, height_m=25.0))
+    assert with_height(with_tags, [ground]) == with_tags
     assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
 
 

@@ -9,11 +9,11 @@ def test_every_step_equals_that_of_torch() -> None:
     ours = nn.ModuleList([nn.Linear(5, 3), nn.Linear(5, 3)])
     theirs = nn.ModuleList([nn.Linear(5, 3), nn.Linear(5, 3)])
     theirs.load_state_dict(ours.state_dict())
-    mine, reference = Adam(ours.parameters(), 0.01), torch.optim.Adam(theirs.parameters(), 0.01)
+    actual, reference = Adam(ours.parameters(), 0.01), torch.optim.Adam(theirs.parameters(), 0.01)
     for step in range(20):
         which = step % 2  # the other half has no gradient and must stay
         x = torch.randn(8, 5)
-        mine.step(ours[which](x).square().mean())
+        actual.step(ours[which](x).square().mean())
         reference.zero_grad()
         theirs[which](x).square().mean().backward()
         reference.step()

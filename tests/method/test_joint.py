@@ -100,17 +100,17 @@ def test_images_without_contrast_or_overlap_have_an_issue() -> None:
     fixed, moving = rasters(TRUTH)
     flat = Raster(np.zeros_like(fixed.pixels), fixed.valid)
     assert scratch(flat, moving, NEAR, JointSettings()) == Issue(NO_CONTRAST)
-    apart = geometry.translation(390, 0)
-    result = scratch(fixed, moving, apart, JointSettings())
+    without_overlap = geometry.translation(390, 0)
+    result = scratch(fixed, moving, without_overlap, JointSettings())
     assert isinstance(result, Issue)
     assert result.code == "few_keypoints"
 
 
 def test_one_network_for_two_bands_and_an_unrelated_one() -> None:
     fixed, moving = rasters(TRUTH)
-    stranger = Raster(textured_image(400, 320, 9), fixed.valid)
+    unrelated_image = Raster(textured_image(400, 320, 9), fixed.valid)
     other = Raster(np.tanh(fixed.pixels), fixed.valid)
-    group = ImageGroup(fixed, [moving, stranger, other], [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
+    group = ImageGroup(fixed, [moving, unrelated_image, other], [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
     result = align_from_scratch(group, JointSettings(), lambda *_: None)
     assert [type(r) for r in result] == [JointResult, Issue, JointResult]
     assert mean_error_px(result[0].fixed_to_moving, TRUTH, 400, 320) < 0.1

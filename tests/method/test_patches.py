@@ -74,13 +74,13 @@ def test_bilinear_is_linear_interpolation_at_pixel_centres() -> None:
 def test_patch_agrees_with_kornias_rotated_crop() -> None:
     image = torch.randn(1, 1, 100, 100, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     p = Keypoints(torch.tensor([[50.0, 47.0]]).double(), torch.tensor([0.6]).double(), torch.tensor([1.3]).double())
-    mine = bilinear(image[0], patch_positions(p))[0, 0]
+    actual = bilinear(image[0], patch_positions(p))[0, 0]
     cos, sin = 1.3 * np.cos(0.6), 1.3 * np.sin(0.6)
     # Patch pixel (u, v) -> image pixel, as a 3x3; kornia warps with the map from source to destination.
     to_image = np.array([[cos, -sin, 50 - 7.5 * (cos - sin)], [sin, cos, 47 - 7.5 * (sin + cos)], [0, 0, 1.0]])
     to_patch = torch.from_numpy(np.linalg.inv(to_image))[None]
     theirs = kornia.geometry.warp_perspective(image, to_patch, (16, 16), align_corners=True)[0, 0]
-    torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)  # kornia normalises with an epsilon
+    torch.testing.assert_close(actual, theirs, atol=1e-5, rtol=1e-5)  # kornia normalises with an epsilon
 
 
 def test_gradient_over_psi_equals_finite_differences() -> None:

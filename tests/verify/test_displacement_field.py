@@ -73,7 +73,7 @@ def test_folding_is_detected() -> None:
     assert not _is_one_to_one(DisplacementField(32.0, steep), SIZE)
 
 
-def bent_pair(height: float) -> tuple[Raster, Raster]:
+def displaced_pair(height: float) -> tuple[Raster, Raster]:
     """A pair with a moving image displaced by the bump, and the bump as a displacement field of the reference."""
     import cv2
 
@@ -81,13 +81,13 @@ def bent_pair(height: float) -> tuple[Raster, Raster]:
     grid = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1).astype(np.float64)
     # moving(x + d(x)) = fixed(x): the inverse of x + d(x) is computed by two iterations.
     back = grid - bump(grid - bump(grid, height), height)
-    bent = cv2.remap(moving, back.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    displaced_image = cv2.remap(moving, back.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     valid = np.ones(fixed.shape, bool)
-    return Raster(fixed, valid), Raster(bent, valid)
+    return Raster(fixed, valid), Raster(displaced_image, valid)
 
 
 def test_displacements_between_bands_are_followed() -> None:
-    fixed, moving = bent_pair(1.5)
+    fixed, moving = displaced_pair(1.5)
     result = Reference(fixed).coarse_field.refine(moving, PixelMapping(geometry.identity()))
     assert result.field is not None
     at = geometry.lattice(*SIZE, 17, 13)
@@ -97,7 +97,7 @@ def test_displacements_between_bands_are_followed() -> None:
 
 
 def test_no_field_is_added_where_a_homography_suffices() -> None:
-    fixed, moving = bent_pair(0.0)
+    fixed, moving = displaced_pair(0.0)
     result = Reference(fixed).coarse_field.refine(moving, PixelMapping(geometry.identity()))
     assert result.field is None or np.abs(result.field(geometry.lattice(*SIZE, 17, 13))).max() < 0.05
 

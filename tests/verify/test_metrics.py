@@ -59,10 +59,10 @@ def test_mattes_mi_equals_its_definition() -> None:
     fixed = textured_image(90, 70).ravel().astype(np.float64)
     moving = np.sin(fixed) + 0.3 * textured_image(90, 70, 1).ravel()
     bins = fixed_bins(fixed.astype(np.float32), (float(fixed.min()), float(fixed.max())))
-    mine = mutual_information(
+    actual = mutual_information(
         joint_histogram(bins, moving.astype(np.float32), (float(moving.min()), float(moving.max())))
     )
-    assert mine == pytest.approx(elastix_mattes(fixed, moving), rel=1e-3)
+    assert actual == pytest.approx(elastix_mattes(fixed, moving), rel=1e-3)
 
 
 def test_mattes_mi_is_close_to_that_of_itk() -> None:
@@ -73,9 +73,9 @@ def test_mattes_mi_is_close_to_that_of_itk() -> None:
     method.SetInterpolator(sitk.sitkLinear)
     method.SetInitialTransform(sitk.TranslationTransform(2))
     theirs = method.MetricEvaluate(sitk.GetImageFromArray(fixed), sitk.GetImageFromArray(moving))
-    mine = similarity(fixed, moving, np.ones(fixed.shape, bool))["mattes_mi"]
-    assert mine < 0
-    assert mine == pytest.approx(theirs, rel=0.05)
+    actual = similarity(fixed, moving, np.ones(fixed.shape, bool))["mattes_mi"]
+    assert actual < 0
+    assert actual == pytest.approx(theirs, rel=0.05)
 
 
 def test_nmi_is_two_for_a_copy_and_one_for_independence() -> None:
@@ -114,8 +114,8 @@ def test_structure_ssim_agrees_with_scikit_image() -> None:
         use_sample_covariance=False,
         full=True,
     )
-    mine = similarity(a, b.astype(np.float32), EVERYWHERE)["structure_ssim"]
-    assert mine == pytest.approx(full[5:-5, 5:-5].mean(), abs=5e-3)
+    actual = similarity(a, b.astype(np.float32), EVERYWHERE)["structure_ssim"]
+    assert actual == pytest.approx(full[5:-5, 5:-5].mean(), abs=5e-3)
 
 
 def test_similarity_uses_only_valid_pixels() -> None:

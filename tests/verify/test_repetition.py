@@ -27,9 +27,9 @@ def spectrum(image: np.ndarray) -> np.ndarray:
 
 
 def test_the_alias_peak_is_one_period_away() -> None:
-    rival = alias_peak(spectrum(planted((0, 0), 1)), spectrum(planted((0, 0), 2, -1.0)))
-    assert rival.ratio > 0.8
-    periods = np.array(rival.shift_px) / PERIOD
+    alias = alias_peak(spectrum(planted((0, 0), 1)), spectrum(planted((0, 0), 2, -1.0)))
+    assert alias.ratio > 0.8
+    periods = np.array(alias.shift_px) / PERIOD
     assert np.abs(periods - periods.round()).max() < 0.1
     assert np.abs(periods).max() >= 1
 
