@@ -21,7 +21,7 @@ class AlignedImages(Protocol):
         """Windowed spectra (height, width) of the structures of the reduced fixed and moving images."""
 
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        """True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or user."""
+        """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or user."""
 
 
 @dataclass(frozen=True)
