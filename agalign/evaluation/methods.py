@@ -73,10 +73,11 @@ Method = Callable[[PairTask], Outcome]
 
 
 def method_named(name: str) -> Method:
-    """The method of a name as the command line takes it.
+    """Return the method of a name on the command line.
 
-    * `fast` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`): learnt on the pair by that
-      recipe. `:grey` after it leaves colour aside, `:random` the starter (recipe paper never has one).
+    * `fast` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`): learned on the pair by that
+      recipe. `:grey` added: on grey images; `:random` added: random weights instead of the starter network (recipe
+      paper always uses random weights).
     * `sift`, `daisy`, `elastix`.
     * FILE.safetensors: a network of this program. FILE.pt: a TorchScript module that takes (N, 1, P, P) in [0, 1]; P is
       32, or what follows an @, as in hardnet.pt@32.
@@ -148,7 +149,7 @@ def _by_network(net: Descriptor, state: JointState, one: Raster, other: Raster) 
 
 
 def _saved_network(path: Path) -> Method:
-    """A network of `agalign learn` or of an earlier run; images of other channels than it learnt are made grey."""
+    """Return a network of `agalign learn` or of an earlier run; images with another number of channels become grey."""
     model = load_model(path, lambda: torch.device("cpu"))
 
     def method(task: PairTask) -> Outcome:

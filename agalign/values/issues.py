@@ -37,7 +37,7 @@ class Issue:
 
     @property
     def code(self) -> str:
-        """Of the kind."""
+        """Code of the kind."""
         return self.kind.code
 
 
@@ -47,7 +47,7 @@ def sentence(issue: Issue) -> str:
 
 
 def explanation(issues: Sequence[Issue]) -> str | None:
-    """The first of some issues, the most telling one, in words; None where there is none."""
+    """Return the first of the issues in words; None if there is none."""
     return sentence(issues[0]) if issues else None
 
 
