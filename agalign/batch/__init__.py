@@ -1,4 +1,4 @@
-"""Many captures: discovered ones aligned on as many workers as there are, and what became of each."""
+"""Runs over many captures: learning flights, workers, resuming and reports."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what defines a name when it is first used (PEP 562): indices and locks need no torch."""
+    """Import the module of a name at its first use (PEP 562): indices and locks need no torch."""
     if name not in _MODULES:
         raise AttributeError(f"module 'agalign.batch' has no attribute '{name}'")
     return getattr(import_module(f"agalign.batch.{_MODULES[name]}"), name)

@@ -1,4 +1,4 @@
-"""One capture, start to end: its pairs aligned, its products and its sidecar written."""
+"""Align one capture and write its products and its sidecar."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -36,24 +36,25 @@ class CaptureOutcome:
     sidecar: Sidecar
     path: Path
     shortcomings: tuple[str, ...] = ()
-    """What was not written though the capture is done, and why."""
+    """Messages about optional products that could not be written."""
 
 
 def process_capture(
     capture: Capture, out: Path, settings: Settings, progress: PairProgress = quiet,
     model: FlightModel | None = None, max_preview_bytes: int = preview_bytes(1),
 ) -> CaptureOutcome:  # fmt: skip
-    """Align a capture and write its products and sidecar; a band that cannot be aligned does not stop the others.
+    """Align a capture, write its products and its sidecar, and return the sidecar with its path.
 
-    Its bands' radiometry is what was chosen for them (`with_radiometry`). With the flight's `model` only what it cannot
-    align is learned from scratch. Its preview has at most about `max_preview_bytes`.
-    Raises UnreadableFileError where the reference itself cannot be read, InputError or ConfigurationError where the
-    capture or the installation lacks what a product needs, and OutputError.
+    The other bands are aligned where one cannot be. The bands already have the chosen radiometry (`with_radiometry`).
+    With the `model` of the flight, a network is learned from scratch only for bands that the model cannot align. The
+    preview has at most about `max_preview_bytes`.
+    Raises UnreadableFileError if the reference cannot be read, InputError or ConfigurationError if the capture or the
+    installation lacks what a product needs, and OutputError.
     """
     paths = CapturePaths.of(capture, out)
     _refuse_to_overwrite(capture, out, settings.write)
     if settings.write.radiometry != "off":
-        _need_radiometry(capture, settings.write.radiometry)
+        _require_radiometry(capture, settings.write.radiometry)
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
@@ -63,7 +64,7 @@ def process_capture(
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
     sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures)))
-    # Once, where two products need the same file.
+    # Products that need the same file fail with the same message.
     return CaptureOutcome(sidecar, paths.sidecar, tuple(dict.fromkeys(failures.values())))
 
 
@@ -80,7 +81,7 @@ def _context(
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:
-    """Write what the settings ask for; {kind: why} of what failed and is not required. Raises as `Product.write`."""
+    """Write the enabled products; return {kind: message} of optional ones that failed. Raises like `Product.write`."""
     failures: dict[str, str] = {}
     for product in PRODUCTS:
         if not product.is_enabled(context.write_settings) or (product.needs_layers and not context.layers):
@@ -95,7 +96,7 @@ def _write_products(context: ProductContext) -> dict[str, str]:
 
 
 def paths_written(capture: Capture, out: Path, settings: WriteSettings) -> list[Path]:
-    """Every file that a run with these settings may write or remove for a capture."""
+    """Return the paths of all files that a run with these settings may write or remove for a capture."""
     paths = CapturePaths.of(capture, out)
     return [paths.sidecar, *(p for product in PRODUCTS for p in product.paths(capture, paths, settings))]
 
@@ -109,10 +110,10 @@ def _refuse_to_overwrite(capture: Capture, out: Path, settings: WriteSettings) -
 
 
 def discard_outputs(capture: Capture, out: Path, settings: WriteSettings) -> None:
-    """Remove what an earlier run wrote for a capture, and the indices that were calculated from it.
+    """Remove the outputs of an earlier run for a capture, and the indices calculated from them.
 
-    Otherwise a sidecar could describe other rasters than those next to it, and bands on an old grid could stay next to
-    new ones. A file that cannot be removed is overwritten later, or the writer reports it.
+    Otherwise a sidecar could describe rasters of another run, and bands on an old grid could remain among new ones.
+    Files that cannot be removed are overwritten later, or their writer reports the error.
     """
     paths = CapturePaths.of(capture, out)
     old = paths_written(capture, out, settings)
@@ -133,7 +134,7 @@ _REMEDIES: Mapping[RadiometryChoice, str] = {
 }
 
 
-def _need_radiometry(capture: Capture, choice: RadiometryChoice) -> None:
+def _require_radiometry(capture: Capture, choice: RadiometryChoice) -> None:
     without = [b.name for b in capture.bands if b.radiometry is None and not b.companion]
     if without:
         raise InputError(f"{capture.reference.path}: {_REMEDIES[choice].format(bands=', '.join(without))}")

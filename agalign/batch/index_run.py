@@ -1,4 +1,4 @@
-"""Spectral indices of all captures of a run: one after another, in processes of this machine, or on an executor."""
+"""Spectral indices of all captures of a run: serially, in processes of this machine, or on an executor."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
@@ -20,40 +20,40 @@ from agalign.values.process_pool import ProcessPool
 from agalign.values.processes import follow_parent, threads_of_children, worker_context
 
 _CAPTURES_WORTH_A_PROCESS = 8
-"""To start a process takes as long as these."""
+"""Starting a process takes as long as the indices of this many captures."""
 _CAPTURES_A_PROCESS = 500
 _MAX_WAITING_TASKS = 1000
 
 
 @dataclass(frozen=True)
 class IndexOptions:
-    """How indices are calculated: nothing here changes their values."""
+    """How to calculate indices; no option changes their values."""
 
     overwrite: bool = False
-    """Calculate again what an earlier command wrote of the same bands."""
+    """Calculate indices again that an earlier command wrote from the same bands."""
     jobs: int = 0
-    """Captures at a time, in as many processes; 0 is one for each core."""
+    """Number of processes, each for one capture at a time; 0 is one per core."""
     executor: Executor | None = None
-    """Where the captures are done instead; its workers see the same folders."""
+    """Executor that processes the captures instead; its workers need the same folders."""
 
 
 @dataclass(frozen=True)
 class IndexTask:
-    """The indices of one capture, as they travel to a worker."""
+    """The indices to calculate for one capture, as sent to a worker."""
 
     out: Path
     """The output folder of the run."""
     sidecar: Path
     target: Path
-    """The folder that the indices are written below: `out`, unless another one was given."""
+    """Root folder of the indices: `out`, unless another one was given."""
     indices: tuple[Index, ...]
     overwrite: bool
     mask_qa: bool = False
-    """Leave out the pixels that the quality raster flags as unusable."""
+    """Mask pixels that the quality raster flags as unusable."""
 
     @property
     def folder(self) -> Path:
-        """The capture's, relative to `out`."""
+        """Folder of the capture, relative to `out`."""
         return self.sidecar.parent.relative_to(self.out)
 
     @property
@@ -64,7 +64,7 @@ class IndexTask:
 
 @dataclass(frozen=True)
 class CaptureIndices:
-    """What became of the indices of one capture."""
+    """Reports and table rows of the indices of one capture."""
 
     reports: Sequence[IndexReport]
     rows: Sequence[IndexRow] = ()
@@ -73,12 +73,12 @@ class CaptureIndices:
 def index_tasks(
     out: Path, indices: Sequence[Index], target: Path, *, overwrite: bool = False, mask_qa: bool = False
 ) -> list[IndexTask]:
-    """Return a task for each capture of a run. Raises InputError where there is no run."""
+    """Return a task for each capture of a run. Raises InputError if the folder contains no run."""
     return [IndexTask(out, path, target, tuple(indices), overwrite, mask_qa) for path in run_sidecars(out)]
 
 
 def unit_of_run(tasks: Sequence[IndexTask]) -> str:
-    """Return what the numbers of the first capture with aligned bands are; empty where none can be read."""
+    """Return the unit of the first capture with aligned bands that can be read; empty if there is none."""
     for task in tasks:
         with suppress(AgalignError):
             if unit := unit_of(bands_of(read_result(task.sidecar), task.sidecar.parent)):
@@ -87,10 +87,10 @@ def unit_of_run(tasks: Sequence[IndexTask]) -> str:
 
 
 def run_indices(tasks: Sequence[IndexTask], options: IndexOptions | None = None) -> Iterator[CaptureIndices]:
-    """Write the indices of all captures, yielding each one as it is done, and then the table indices.csv.
+    """Write the indices of all captures, yield the reports of each, and finally write the table indices.csv.
 
-    A capture that fails is reported and stops no other. Raises WorkerError where no worker process can be started,
-    OutputError for the table.
+    A failed capture is reported and does not stop the others. Raises WorkerError if no worker process can be started,
+    and OutputError if the table cannot be written.
     """
     options = options or IndexOptions()
     rows: list[IndexRow] = []
@@ -99,12 +99,12 @@ def run_indices(tasks: Sequence[IndexTask], options: IndexOptions | None = None)
             rows += done.rows
             yield done
     finally:
-        if rows:  # also of what is finished before an interruption
+        if rows:  # also after an interruption
             link_indices(tasks[0].target, update_table(tasks[0].target, rows))
 
 
 def do_indices(task: IndexTask) -> CaptureIndices:
-    """Write the indices of one capture; what can go wrong with it is in the reports."""
+    """Write the indices of one capture and return the reports, which include errors."""
     folder, base = task.folder, task.target / task.folder / task.sidecar.stem
     try:
         sidecar = read_result(task.sidecar)
@@ -147,7 +147,7 @@ def _in_processes(tasks: Sequence[IndexTask], processes: int) -> Iterator[Captur
 
 
 def _on_executor(executor: Executor, tasks: Sequence[IndexTask]) -> Iterator[CaptureIndices]:
-    from agalign.batch.workers import DaskExecutor, finished_by  # they load torch
+    from agalign.batch.workers import DaskExecutor, finished_by  # imports torch
 
     def submit(task: IndexTask) -> "Future[CaptureIndices]":
         return executor.submit(do_indices, task)
@@ -158,7 +158,7 @@ def _on_executor(executor: Executor, tasks: Sequence[IndexTask]) -> Iterator[Cap
 
 
 def _absolute(tasks: Sequence[IndexTask]) -> list[IndexTask]:
-    """With absolute paths: workers may have another working folder."""
+    """Return the tasks with absolute paths: workers may have another working folder."""
     return [replace(t, out=t.out.absolute(), sidecar=t.sidecar.absolute(), target=t.target.absolute()) for t in tasks]
 
 

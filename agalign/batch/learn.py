@@ -1,4 +1,4 @@
-"""Learning a flight: one network on a few of its captures, to be frozen for all of them."""
+"""Learn the model of a flight: one network for all its captures, from a few of them, and its rig."""
 
 import logging
 from collections import Counter
@@ -40,11 +40,12 @@ from agalign.verify.lens_shapes import unmodelled_std_px
 
 _LOG = logging.getLogger(__name__)
 _NETWORK_CAPTURES = 3
-"""The network is learned on so many captures: what two do not show, a third mostly does, and each one costs seconds."""
-_RIG_SHARE = 8
-"""The rig is learned on one capture of so many: neighbours see the same heights and speeds,"""
+"""Number of captures that the network is learned from; each takes seconds. A third capture mostly shows the structure
+that two lack."""
+_CAPTURES_PER_RIG_CAPTURE = 8
+"""The rig is learned from one of this many captures: neighbours have about the same height and speed."""
 _MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48
-"""but on no fewer than its factors need, and on no more than make it better."""
+"""The factors of the rig need the minimum; more than the maximum do not improve it."""
 
 
 @one_thread()
@@ -54,21 +55,21 @@ def learn_flight(
     captures: Sequence[Capture], settings: Settings, progress: Progress, start: FlightModel | None = None,
     at_once: int = 1,
 ) -> FlightModel | None:  # fmt: skip
-    """Learn one network on a few captures spread over the flight; None where none of them could be aligned.
+    """Return a model learned from a few captures spread over the flight; None if none of them could be aligned.
 
-    So many captures are worked on at a time, each in a thread; on how many, nothing depends. `start` is the flight's
-    model where some captures are aligned by it as its rig expects; else its network is where theta starts, and its last
-    side where bands start that it does not know.
+    `at_once` captures are processed at a time, each in a thread; the result does not depend on it. `start` is an
+    earlier model. It is returned if it still aligns captures of this flight as its rig predicts. Otherwise its network
+    initialises theta; weights of bands that it lacks start from those of its last band.
     """
     keep_freed_memory()
     fingerprint_now = learning_fingerprint(captures, settings)
-    # Displacements of single captures are neither the network's nor the rig's.
-    plain = settings.model_copy(update={"relief": settings.relief.model_copy(update={"use": "never"})})
-    if start is not None and _still_holds(start, captures, plain, at_once):
+    # Neither the network nor the rig models the displacements of single captures.
+    without_relief = settings.model_copy(update={"relief": settings.relief.model_copy(update={"use": "never"})})
+    if start is not None and _still_holds(start, captures, without_relief, at_once):
         return replace(start, fingerprint=fingerprint_now)
     bands = flight_lenses(captures)
-    loaded = _load(captures, bands, plain, start, at_once)
-    network = _learn_network(loaded, bands, plain, progress, start, at_once)
+    loaded = _load(captures, bands, without_relief, start, at_once)
+    network = _learn_network(loaded, bands, without_relief, progress, start, at_once)
     if network is None:
         return None
     net, known = network
@@ -77,7 +78,8 @@ def learn_flight(
     if not mappings:
         return None
     model = FlightModel(net, flight_camera(captures), bands, mappings, fingerprint_now)
-    rig = _learn_rig(captures, plain, model, {r.loaded.capture.label: r for r in known}, progress, at_once)
+    refined = {r.loaded.capture.label: r for r in known}
+    rig = _learn_rig(captures, without_relief, model, refined, progress, at_once)
     if rig is None:
         rig = None if start is None else start.rig
     return replace(model, rig=rig, mappings=mappings if rig is None else {**mappings, **rig.mean})
@@ -87,14 +89,14 @@ def _learn_network(
     loaded: Sequence["_Loaded"], bands: Sequence[str], settings: Settings, progress: Progress,
     start: FlightModel | None, at_once: int,
 ) -> tuple[Descriptor, list["_Refined"]] | None:  # fmt: skip
-    """(the network, the captures with their mappings refined by it); None where it cannot be learned from them."""
+    """Return (the network, the captures with mappings refined by it); None if learning fails."""
     if not loaded:
         return None
     state = JointState(settings.joint, progress)
     groups = [group for one in loaded for _, group in one.groups]
     net = state.fast_descriptor([1] * (1 + len(bands)))
     if start is not None:
-        # A model of this camera may have bands that the flight lacks: weights go to the bands of the same names.
+        # A model of this camera may have bands that the flight lacks: match the weights by band name.
         sides = [0, *(start.side(band) or len(start.bands) for band in bands)] if start.camera else None
         start_from(net, start.net.state_dict(), sides)
 
@@ -105,36 +107,36 @@ def _learn_network(
             return list(pool.map(lambda group: refine_with(net, group, settings.joint, progress, patches), groups))
 
     try:
-        # The network that learning would start from is often good enough.
+        # The initial network is often good enough.
         results = refined() if net.is_trained and all(all(group.trusted) for group in groups) else []
         if not results or not all(map(_is_good_enough, results)):
             for group, of_group in zip(groups, results, strict=False):
                 _move_to(group, of_group)
             learn(state, groups, net, at_once)
             results = refined()
-    except Exception as why_not:
-        # What one capture does to the others' learning must not cost the flight: each is learned alone then.
-        _only_logged("the flight cannot be learned from", why_not)
+    except Exception as error:
+        # One capture may make learning from all of them fail; a network is then learned for each capture alone.
+        _log_failure("the flight cannot be learned from", error)
         return None
     in_turn = iter(results)
     return net, [_Refined(one, one.in_order(in_turn)) for one in loaded]
 
 
 def _is_good_enough(results: Results) -> bool:
-    """True where a network needs no learning for a capture with these results."""
+    """True if a network needs no more learning for a capture with these results."""
     enough = DEFAULT_SCHEDULE.enough_retrieval
     return all(isinstance(result, JointResult) and result.retrieval > enough for result in results)
 
 
 def _move_to(group: ImageGroup, results: Results) -> None:
-    """Start the pairs of a group with distinguishable patches where the network has moved them."""
+    """Set the initial mappings of a group's pairs with distinguishable patches to the results of the network."""
     for band, result in enumerate(results):
         if isinstance(result, JointResult) and result.retrieval >= MIN_RETRIEVAL:
             group.mappings[band] = result.fixed_to_moving
 
 
 def _recognised(refined: Sequence["_Refined"]) -> dict[str, list[Matrix]]:
-    """The mappings of each band, between files, in the captures with distinguishable held-out patches."""
+    """Return the mappings (file px) of each band, from captures with distinguishable held-out patches."""
     mappings: dict[str, list[Matrix]] = {}
     for one in refined:
         for pair, result in zip(one.loaded.pairs, one.results, strict=True):
@@ -144,21 +146,21 @@ def _recognised(refined: Sequence["_Refined"]) -> dict[str, list[Matrix]]:
 
 
 def _still_holds(model: FlightModel, captures: Sequence[Capture], settings: Settings, at_once: int) -> bool:
-    """True where captures of a flight can be aligned, and a model's rig predicts each of their bands from the others
-    well enough for a lost one to count as delivered.
+    """True if two captures of the flight can be aligned, and the model's rig predicts each aligned band from the
+    others with a standard error of at most `accept_predicted_px`.
     """
     rig, bands = model.rig, flight_lenses(captures)
     if rig is None or not set(bands) <= set(model.bands):
         return False
 
     def fits(capture: Capture) -> tuple[int, int]:
-        """(bands that are aligned, those among them that the rig predicts)."""
+        """Return the number of aligned bands, and of those among them that the rig predicts."""
         try:
             pairs, _ = read_pairs(capture, settings.seed, model)
             result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
             checked = with_predictions(pairs, result, rig, capture)
-        except Exception as why_not:
-            _only_logged(f"{capture.label} is not aligned by the model", why_not)
+        except Exception as error:
+            _log_failure(f"{capture.label} is not aligned by the model", error)
             return 0, 0
         aligned = [checked[name] for name, a in result.items() if a.status == "aligned"]
         limit_px = settings.check.accept_predicted_px
@@ -175,15 +177,15 @@ def _learn_rig(
     captures: Sequence[Capture], settings: Settings, model: FlightModel, known: Mapping[str, "_Refined"],
     progress: Progress, at_once: int,
 ) -> Rig | None:  # fmt: skip
-    """What captures spread over the flight, refined with its network, have in common; some, by label, are already."""
+    """Return the rig of captures spread over the flight; `known` are those, by label, that the network has refined."""
     if len(captures) < MIN_CAPTURES:
         return None
-    shown = _shown_by_enough(captures, settings, model, known, progress, at_once)
+    observations = _observe_rig(captures, settings, model, known, progress, at_once)
     size = captures[0].reference.size_px
-    rig = learn_rig([s.observation for s in shown], size, _layout(captures))
+    rig = learn_rig([o.observation for o in observations], size, _layout(captures))
     if rig is None:
         return None
-    residuals = {band: [s.residuals[band] for s in shown if band in s.residuals] for band in rig.mean}
+    residuals = {band: [o.residuals[band] for o in observations if band in o.residuals] for band in rig.mean}
     with ThreadPoolExecutor(at_once) as pool:
         fields = list(pool.map(lambda of_band: common_field(of_band, size), residuals.values()))
     extrapolation_px = _extrapolation_px(rig, residuals, calibrated=captures[0].reference.lens is not None)
@@ -200,7 +202,10 @@ def _learn_rig(
 def _extrapolation_px(
     rig: Rig, residuals: Mapping[str, Sequence[Residual[FixedFilePx]]], *, calibrated: bool
 ) -> dict[str, MovingFilePx]:
-    """What the lenses may leave in bands with a quarter of the image that no capture shows, px of their files."""
+    """Return the standard error (px of the band's file) from the lens in a quarter of the image without measurements.
+
+    Only bands with such a quarter are in the result.
+    """
     result: dict[str, MovingFilePx] = {}
     for band, of_band in residuals.items():
         centres_px = np.concatenate([r.measured_px for r in of_band])
@@ -211,31 +216,31 @@ def _extrapolation_px(
     return result
 
 
-def _shown_by_enough(
+def _observe_rig(
     captures: Sequence[Capture], settings: Settings, model: FlightModel, known: Mapping[str, "_Refined"],
     progress: Progress, at_once: int,
-) -> list["_Shown"]:  # fmt: skip
-    """What captures show of the rig, until enough of them have shown every band that any of them has."""
-    count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(captures) // _RIG_SHARE))
+) -> list["_RigObservation"]:  # fmt: skip
+    """Return observations of the rig, until every observed band is in enough of them."""
+    count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(captures) // _CAPTURES_PER_RIG_CAPTURE))
 
-    def look_at(capture: Capture) -> "_Shown | None":
+    def observe(capture: Capture) -> "_RigObservation | None":
         try:
-            return _shown(capture, settings, model, known.get(capture.label))
-        except Exception as why_not:
-            _only_logged(f"{capture.label} does not determine the rig", why_not)
+            return _rig_observation(capture, settings, model, known.get(capture.label))
+        except Exception as error:
+            _log_failure(f"{capture.label} does not determine the rig", error)
             return None
 
-    result: list[_Shown] = []
+    result: list[_RigObservation] = []
     counts: Counter[str] = Counter()
     with ThreadPoolExecutor(at_once) as pool:
-        # The network's captures cost less than others: they come first where they may be enough, else last.
+        # Captures that the network was learned from take less time: they come first if there may be enough of them.
         quick = [c for c in captures if c.label in known]
         slow = [c for c in _spread(captures, count) if c.label not in known]
-        for shown in pool.map(look_at, [*quick, *slow] if len(captures) > count else [*slow, *quick]):
-            if shown is None:
+        for observation in pool.map(observe, [*quick, *slow] if len(captures) > count else [*slow, *quick]):
+            if observation is None:
                 continue
-            result.append(shown)
-            counts.update(list(shown.residuals))
+            result.append(observation)
+            counts.update(list(observation.residuals))
             progress("the rig", min(1.0, len(result) / count))
             if counts and min(counts.values()) >= count:
                 break
@@ -243,24 +248,24 @@ def _shown_by_enough(
 
 
 def _spread(captures: Sequence[Capture], count: int) -> list[Capture]:
-    """So many captures all over a flight, then as many between them, for where some of the first show nothing."""
+    """Return `count` captures evenly spread over the flight, then those halfway between them as replacements."""
     places = np.unique(np.linspace(0, len(captures) - 1, 2 * count - 1).round().astype(int))
     return [captures[i] for i in (*places[::2], *places[1::2])]
 
 
 def _layout(captures: Iterable[Capture]) -> dict[str, tuple[float, float]]:
-    """Where the lenses are relative to the reference's, as far as the camera has it."""
+    """Return the positions of the lenses relative to the reference's, where the metadata contains them."""
     result: dict[str, tuple[float, float]] = {}
     for capture in captures:
-        here = capture.reference.parallax
+        reference = capture.reference.parallax
         for band in capture.moving:
-            if here is not None and band.parallax is not None:
-                result.setdefault(band.name, (band.parallax[0] - here[0], band.parallax[1] - here[1]))
+            if reference is not None and band.parallax is not None:
+                result.setdefault(band.name, (band.parallax[0] - reference[0], band.parallax[1] - reference[1]))
     return result
 
 
 def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:
-    """Changes when the captures that would be learnt from, or the settings, do."""
+    """Return a hash of everything that a learned model depends on: the captures and the settings."""
     stages = settings.joint, settings.seed, settings.flight
     return hashed(flight_camera(captures), *(fingerprint(c, *stages) for c in captures))
 
@@ -271,39 +276,41 @@ class _Loaded:
 
     capture: Capture
     groups: list[tuple[list[int], ImageGroup]]
-    """Each with the places of its pairs."""
+    """Groups of images, each with the indices of its pairs in `pairs`."""
     pairs: list[BandPair]
     seeds: list[Seed]
 
     def in_order(self, refined: Iterator[Results]) -> Results:
-        """The results of its pairs, from those of its subjects."""
+        """The results in the order of `pairs`, from those of `groups`."""
         result = {i: r for places, _ in self.groups for i, r in zip(places, next(refined), strict=True)}
         return [result[i] for i in range(len(self.pairs))]
 
     @property
-    def shows(self) -> float:
-        """How plainly its bands show the same, in standard deviations of their seeds' peaks."""
+    def similarity_sigma(self) -> float:
+        """Median height of the correlation peaks of the seeds, in standard deviations."""
         return float(np.median([s.peak_sigma for s in self.seeds]))
 
 
 @dataclass(frozen=True)
 class _Refined:
-    """A capture that was learnt from, with what was found."""
+    """A capture that the network was learned from, with its refined mappings."""
 
     loaded: _Loaded
     results: Results
 
 
 @dataclass(frozen=True)
-class _Shown:
+class _RigObservation:
     """Observation of the rig by one capture: its mappings, and the residual shifts of its windows."""
 
     observation: Observation
     residuals: dict[str, Residual[FixedFilePx]]
 
 
-def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Refined | None) -> _Shown:
-    """Raises UnreadableFileError where the reference cannot be read."""
+def _rig_observation(
+    capture: Capture, settings: Settings, model: FlightModel, known: _Refined | None
+) -> _RigObservation:
+    """Observe the rig in one capture. Raises UnreadableFileError if the reference cannot be read."""
     result: Mapping[str, Alignment[FixedImagePx]] = {}
     if known is not None:
         pairs = known.loaded.pairs
@@ -318,21 +325,21 @@ def _shown(capture: Capture, settings: Settings, model: FlightModel, known: _Ref
     pairs = [p for p in pairs if p.has_rig_pixels]
     in_file_px = {p.name: result[p.name].in_file_px(p.scales) for p in pairs}
     good = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
-    return _Shown(observed(pairs, result, capture), good)
+    return _RigObservation(observed(pairs, result, capture), good)
 
 
 def _load(
     captures: Sequence[Capture], bands: Sequence[str], settings: Settings, start: FlightModel | None, at_once: int
 ) -> list[_Loaded]:
-    """Of each stretch of the flight, one capture: the first of three with bands that plainly show the same, else the
-    one that shows it best. Water and fog teach nothing.
+    """Return one capture from each third of the flight: the first of three with trusted seeds for all bands, else the
+    one with the highest correlation peaks. Captures without common structure, as of water or fog, are not usable.
     """
 
     def best_of(stretch: NDArray[np.intp]) -> _Loaded | None:
         best: _Loaded | None = None
         for k in dict.fromkeys((len(stretch) // 2, 0, len(stretch) - 1)):
             result = _read(captures[stretch[k]], bands, settings, start)
-            if result is not None and (best is None or result.shows > best.shows):
+            if result is not None and (best is None or result.similarity_sigma > best.similarity_sigma):
                 best = result
             if best is not None and all(s.trusted for s in best.seeds):
                 break
@@ -344,9 +351,9 @@ def _load(
 
 
 def _read(capture: Capture, bands: Sequence[str], settings: Settings, start: FlightModel | None) -> _Loaded | None:
-    """None where there is nothing that can be read. The network's side of a band is its place among `bands`.
+    """Read a capture and find its seeds; None if no band can be used.
 
-    `start` is the network with which a seed of kind `match` is found.
+    Bands have their index in `bands` as index in the network. Seeds of kind `match` use the network of `start`.
     """
     try:
         pairs, _ = read_pairs(capture, settings.seed)
@@ -356,15 +363,13 @@ def _read(capture: Capture, bands: Sequence[str], settings: Settings, start: Fli
             return None
         usable, seeds = [p for p, _ in result], [seed for _, seed in result]
         return _Loaded(capture, image_groups(usable, seeds, [bands.index(p.name) + 1 for p in usable]), usable, seeds)
-    except Exception as why_not:
-        _only_logged(f"{capture.label} cannot be learned from", why_not)
+    except Exception as error:
+        _log_failure(f"{capture.label} cannot be learned from", error)
         return None
 
 
-def _only_logged(what: str, why_not: Exception) -> None:
-    """A capture that cannot be learned from costs the flight nothing, whatever is wrong with it: it is reported when it
-    is aligned. Raises MemoryError, which is the machine's.
-    """
-    if isinstance(why_not, MemoryError):
-        raise why_not
-    _LOG.debug("%s: %s", what, why_not, exc_info=not isinstance(why_not, AgalignError))
+def _log_failure(message: str, error: Exception) -> None:
+    """Log why a capture cannot be used for learning; it is reported when it is aligned. Raises MemoryError again."""
+    if isinstance(error, MemoryError):
+        raise error
+    _LOG.debug("%s: %s", message, error, exc_info=not isinstance(error, AgalignError))

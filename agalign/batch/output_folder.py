@@ -1,4 +1,4 @@
-"""The output folder of a run: made, held by one run at a time, and rid of what a killed one left."""
+"""The output folder of a run: creation, lock, and removal of partial files of killed runs."""
 
 import errno
 import logging
@@ -17,12 +17,12 @@ from agalign.values.files import remove_partial_files
 _LOCK_FILE = ".agalign.lock"
 _MIN_FREE_BYTES = 1 << 20
 _NO_LOCKS = errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP
-"""What file systems without locks answer, as NFS without its lock daemon."""
+"""Errors of file systems without locks, such as NFS without its lock daemon."""
 _LOG = logging.getLogger(__name__)
 
 
 def prepare_output(out: Path) -> None:
-    """Make the output folder. Raises OutputError where it cannot be made or written to."""
+    """Create the output folder. Raises OutputError if it cannot be created or written to."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         if not os.access(out, os.W_OK):
@@ -35,13 +35,13 @@ def prepare_output(out: Path) -> None:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """The output folder, made and for this run alone. Raises OutputError, also where another run holds it.
+    """Create the output folder and lock it for this run. Raises OutputError, also if another run has locked it.
 
-    The system lets go of the lock of a process that ends, however it does: one that was killed does not block others.
+    The system releases the lock when the process ends, also when it is killed.
     """
     prepare_output(out)
     path = out / _LOCK_FILE
-    # A file that merely exists would keep everybody out after its owner was killed.
+    # The existence of a file as lock (`SoftFileLock`) would outlast a killed process.
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)
     try:
         lock.acquire(blocking=False)
@@ -52,19 +52,19 @@ def locked(out: Path) -> Iterator[None]:
             raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
         _LOG.warning("%s: its file system has no locks; make sure that no other run writes there", out)
     try:
-        with suppress(OSError):  # a full disk is reported by what needs it
+        with suppress(OSError):  # a full disk is reported where a product is written
             path.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
         remove_partial_files(out)
         yield
     finally:
-        remove_partial_files(out)  # of workers that were lost
+        remove_partial_files(out)  # of killed workers
         with suppress(OSError):
             path.unlink(missing_ok=True)
         lock.release()
 
 
 def is_full(out: Path) -> bool:
-    """True where nothing more can be written: what follows would fare no better."""
+    """True if the disk of the output folder is full."""
     try:
         return shutil.disk_usage(out).free < _MIN_FREE_BYTES
     except OSError:

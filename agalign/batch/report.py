@@ -1,4 +1,4 @@
-"""The report of one capture, and the clock that measures its stages."""
+"""The report of one capture, and the timer of its stages."""
 
 import time
 from collections import Counter, defaultdict
@@ -14,7 +14,7 @@ from agalign.products.sidecar_file import read_sidecar
 from agalign.values.text import counted
 
 _MAX_ROWS = 20
-"""Captures that a notebook shows."""
+"""Maximum number of captures in the table of a notebook."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class FlightReports(list[CaptureReport]):
 
 
 class StageClock:
-    """Forwards progress, and adds the time between two calls to the stage that the first of them began."""
+    """Progress callback that forwards its calls and adds up the time of each stage."""
 
     def __init__(self, progress: PairProgress) -> None:
         self._progress = progress
@@ -111,7 +111,7 @@ class StageClock:
         self._since = self._started = time.perf_counter()
 
     def __call__(self, band: str, stage: str, share: float) -> None:
-        """The signature of `PairProgress`."""
+        """Report progress as `PairProgress`; a new band or stage ends the previous one."""
         if (band, stage) != self._current:
             self._book()
             self._current = band, stage
@@ -119,11 +119,11 @@ class StageClock:
 
     @property
     def seconds(self) -> float:
-        """Since it began."""
+        """Seconds since this timer was created."""
         return time.perf_counter() - self._started
 
     def stages(self) -> Mapping[tuple[str, str], float]:
-        """Seconds by (band, stage), the current one included."""
+        """Seconds by (band, stage), including the current stage."""
         self._book()
         return dict(self._seconds)
 

@@ -1,4 +1,4 @@
-"""Many captures: which are still to be done, what their flight learns first, and each one done."""
+"""A run over many captures: select those to process, learn the model of each flight, process them."""
 
 import stat
 import time
@@ -40,7 +40,7 @@ from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
 
 _MAX_THREADS = 4
-"""Threads that learn a flight: more wait for the interpreter."""
+"""Maximum number of threads for learning a flight; more wait for the interpreter's lock."""
 
 
 @dataclass(frozen=True)
@@ -81,25 +81,25 @@ def run_flight(
     flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None,
     listener: Listener | None = None, model: Path | None = None,
 ) -> Iterator[CaptureReport]:  # fmt: skip
-    """Align the captures, yielding each as it is done; those done before are kept.
+    """Align the captures and yield the report of each; captures finished by an earlier run are kept.
 
-    A network is learnt for every camera and flight first and saved below OUT/models; `model` is one to start from.
-    One capture's failure never stops the others, and no result depends on the order in which they are done. What the
-    run was is in OUT/agalign-run.json.
-    Raises OutputError where the output folder cannot be used, another run writes there or the disk is full, WorkerError
-    where no worker process can be started or they end one after another, InputError or ConfigurationError for `model`,
-    ConfigurationError for a device.
+    First a model is learned for every camera and flight, starting from `model` if given, and saved below OUT/models. A
+    failed capture does not stop the others, and results do not depend on the order of the captures. The run is recorded
+    in OUT/agalign-run.json.
+    Raises OutputError if the output folder cannot be used, another run writes there or the disk is full, WorkerError if
+    no worker process can be started or worker processes end one after another, InputError or ConfigurationError for
+    `model`, ConfigurationError for a device.
     """
     options, listener = options or RunOptions(), listener or Listener()
     choose_device(settings.joint.device)
     check_indices(flight.captures, settings.write)
     _refuse_to_overwrite(flight, out, settings.write)
-    known = None if model is None else _given_model(model, flight, settings)
-    if known is not None:
-        used = settings.flight.model_copy(update={"start": known.fingerprint})
-        settings = settings.model_copy(update={"flight": used})
+    given = None if model is None else _given_model(model, flight, settings)
+    if given is not None:
+        flight_settings = settings.flight.model_copy(update={"start": given.fingerprint})
+        settings = settings.model_copy(update={"flight": flight_settings})
     with locked(out), _recorded(flight, out, settings, options.command) as tally:
-        for report in _reports(flight, out, settings, options, _with_seconds(listener, tally), known):
+        for report in _reports(flight, out, settings, options, _with_seconds(listener, tally), given):
             tally.add(report.label, report.state, report.result, report.problems)
             if report.state == "done":
                 tally.capture_seconds[report.label] = report.seconds
@@ -112,7 +112,7 @@ def run_flight(
 
 @contextmanager
 def _recorded(flight: FolderScan, out: Path, settings: Settings, command: str) -> Iterator[Tally]:
-    """A tally that is written at the beginning and at the end of a run, however it ends."""
+    """Write the run record at the beginning and at the end of a run, also after an interruption."""
     tally, began = Tally(), time.monotonic()
     tally.captures["found"] = len(flight.captures)
     tally.problems += [problem_of(str(p.path), p.text) for p in flight.problems]
@@ -141,58 +141,59 @@ def _with_seconds(listener: Listener, tally: Tally) -> Listener:
 
 def _reports(
     flight: FolderScan, out: Path, settings: Settings, options: RunOptions, listener: Listener,
-    known: FlightModel | None,
+    given: FlightModel | None,
 ) -> Iterator[CaptureReport]:  # fmt: skip
     sky, captures = _sky(flight.captures, options)
-    on_map = FlightMap(out)
-    for left_out, facts in zip(sky, write_sky(sky, out), strict=True):
-        discard_outputs(left_out.capture, out, settings.write)
-        on_map.add(left_out.capture, "sky")
-        yield CaptureReport(left_out.capture.label, "sky", sky=facts.sentence)
+    flight_map = FlightMap(out)
+    for excluded, facts in zip(sky, write_sky(sky, out), strict=True):
+        discard_outputs(excluded.capture, out, settings.write)
+        flight_map.add(excluded.capture, "sky")
+        yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence)
     panels, captures = _panels(captures, settings.write, options)
     for reading, part in zip(panels, write_panels(panels, out), strict=True):
         if not reading.capture.is_of_a_panel:
             continue
         discard_outputs(reading.capture, out, settings.write)
-        on_map.add(reading.capture, "panel")
+        flight_map.add(reading.capture, "panel")
         yield CaptureReport(reading.capture.label, "panel", panel=part.sentence)
-    left: list[tuple[Sequence[Capture], str, list[Capture]]] = []
+    # Captures of each flight, name of its model, and those captures that must be processed.
+    unfinished: list[tuple[Sequence[Capture], str, list[Capture]]] = []
     captures = [_calibrated(capture, panels, settings.write) for capture in captures]
-    _need_georeference(captures, settings.write)
+    _require_georeference(captures, settings.write)
     groups = flights_of(captures)
     for group, name in zip(groups, model_names(groups), strict=True):
-        mine = []
+        pending = []
         for capture in group:
             kept = _kept(capture, out, settings, options)
             if kept is None:
-                mine.append(capture)
+                pending.append(capture)
             else:
-                on_map.add(capture, kept.status, kept)
+                flight_map.add(capture, kept.status, kept)
                 yield CaptureReport(capture.label, "kept", kept, CapturePaths.of(capture, out).sidecar)
-        if mine:
-            left.append((group, name, mine))
-    count, cores = sum(len(mine) for _, _, mine in left), _cores(options, settings)
+        if pending:
+            unfinished.append((group, name, pending))
+    count, cores = sum(len(pending) for _, _, pending in unfinished), _cores(options, settings)
     with choose_runner(
         count, cores, options.executor, options.timeout_s, listener.on_start, listener.on_pair
     ) as runner:
         tasks: list[Task] = []
-        for whole, name, mine in left:
-            path = _learn(whole, out / "models" / name, settings, listener, known, min(_MAX_THREADS, cores))
-            tasks += [Task(c, out, settings, path, preview_bytes(len(flight.captures))) for c in mine]
+        for of_flight, name, pending in unfinished:
+            path = _learn(of_flight, out / "models" / name, settings, listener, given, min(_MAX_THREADS, cores))
+            tasks += [Task(c, out, settings, path, preview_bytes(len(flight.captures))) for c in pending]
         by_label = {c.label: c for c in captures}
         for report in runner.reports(tasks):
             status = "failed" if report.result is None else report.result.status
-            on_map.add(by_label[report.label], status, report.result)
+            flight_map.add(by_label[report.label], status, report.result)
             yield report
-    on_map.write()
+    flight_map.write()
     if settings.write.stac:
         write_collections(captures, out)
 
 
 def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None) -> dict[str, str]:
-    """Return what `run_flight` would do with each capture, by its label, and write nothing.
+    """Return what `run_flight` would do with each capture, by label. Writes nothing.
 
-    Raises ConfigurationError as `run_flight` does.
+    Raises ConfigurationError like `run_flight` does.
     """
     options = options or RunOptions()
     choose_device(settings.joint.device)
@@ -209,8 +210,8 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
 
 
 def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
-    """The capture with the radiometry to be written, its height above the ground where the ground's elevation or a
-    panel shows it, and the georeference that this allows where it was asked for.
+    """Return the capture with its radiometry, its height above the ground if the elevation of the ground or a panel
+    determines it, and its approximate georeference if `settings` ask for it.
     """
     capture = with_radiometry(capture, settings.radiometry, reflectance_factors(capture, panels))
     if settings.ground_elevation_m is not None:
@@ -219,8 +220,8 @@ def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: Writ
     return with_approximate_georeference(capture) if settings.georeference else capture
 
 
-def _need_georeference(captures: Sequence[Capture], settings: WriteSettings) -> None:
-    """Raise ConfigurationError where an approximate georeference was asked for and no capture can have one."""
+def _require_georeference(captures: Sequence[Capture], settings: WriteSettings) -> None:
+    """Raise ConfigurationError if an approximate georeference is asked for and no capture has the metadata for it."""
     if settings.georeference and captures and all(c.reference.georeference is None for c in captures):
         raise ConfigurationError(
             "--georeference: no capture has position, altitude, yaw and focal length in its tags, and a height above "
@@ -229,20 +230,20 @@ def _need_georeference(captures: Sequence[Capture], settings: WriteSettings) -> 
 
 
 def _kept(capture: Capture, out: Path, settings: Settings, options: RunOptions) -> CaptureResult | None:
-    """The result of an earlier run; None where the capture is to be done (again)."""
+    """Return the result of an earlier run; None if the capture must be processed (again)."""
     earlier = None if options.overwrite else finished_before(capture, out, settings)
     return None if earlier is None or (options.retry_failed and earlier.status != "ok") else earlier
 
 
 def _sky(captures: Sequence[Capture], options: RunOptions) -> tuple[list[SkyCapture], list[Capture]]:
-    """(the captures of the sky, the other captures)."""
+    """Return (captures of the sky, other captures)."""
     return ([], list(captures)) if options.align_panels else sky_captures(captures)
 
 
 def _panels(
     captures: Sequence[Capture], settings: WriteSettings, options: RunOptions
 ) -> tuple[list[PanelReading], list[Capture]]:
-    """(the readings of calibration panels, the captures to align: a scene that contains a panel is one of them)."""
+    """Return (readings of calibration panels, captures to align); a scene that contains a panel is in both."""
     if options.align_panels:
         return [], list(captures)
     albedos = dict(settings.panel_albedo)
@@ -252,33 +253,33 @@ def _panels(
 
 
 def _cores(options: RunOptions, settings: Settings) -> int:
-    """How many captures are worked on at a time where that costs nothing: one where a GPU does the work."""
+    """Return how many captures to process at a time by default: one per core, or one on a GPU."""
     on_cpu = choose_device(settings.joint.device).type == "cpu"
     return options.jobs or (usable_cores() if on_cpu else 1)
 
 
 def _given_model(path: Path, flight: FolderScan, settings: Settings) -> FlightModel:
-    """The model to start from. Raises ConfigurationError where it is of no use here."""
+    """Load the model to start from. Raises ConfigurationError if it does not fit the settings or the cameras."""
     if not settings.learns_flights:
-        raise ConfigurationError("a model is of use only where one network is learnt for a flight, by recipe fast")
+        raise ConfigurationError("a model needs one network per flight, which only recipe fast learns")
     model = load_model(path, lambda: choose_device(settings.joint.device))
     if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
-        raise ConfigurationError(f"{path}: was learnt unshared; add --sharing unshared")
+        raise ConfigurationError(f"{path}: was learned unshared; add --sharing unshared")
     flights = flights_of(flight.captures)
     if flights and not any(is_flight_of(captures, model.camera) for captures in flights):
         here = flight_camera(flights[0])
-        raise ConfigurationError(f"{path}: was learnt for {model.camera}; the images here are of {here}")
+        raise ConfigurationError(f"{path}: was learned for {model.camera}; the images here are of {here}")
     return model
 
 
 def _learn(
-    captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, known: FlightModel | None,
+    captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, given: FlightModel | None,
     at_once: int,
 ) -> Path | None:  # fmt: skip
-    """The path of the flight's model, learnt now or found from an earlier run; None where none could be learnt."""
+    """Return the path of the flight's model, from this or an earlier run; None if no model could be learned."""
     if not settings.learns_flights:
         return None
-    start = known if known is not None and is_flight_of(captures, known.camera) else None
+    start = given if given is not None and is_flight_of(captures, given.camera) else None
     device = settings.joint.device
     if path.is_file():
         with suppress(AgalignError):
@@ -298,17 +299,17 @@ def _learn(
 
 
 def _refuse_to_overwrite(flight: FolderScan, out: Path, settings: WriteSettings) -> None:
-    """Neither an input nor what another capture writes. Raises ConfigurationError."""
+    """Raise ConfigurationError if an output would replace an input image or an output of another capture."""
     if out.resolve() == flight.folder.resolve():
         raise ConfigurationError(f"{out}: is the folder of the images; choose another output folder with -o")
     sources = {band.path.resolve() for capture in flight.captures for band in capture.bands}
-    there: dict[Path, Path] = {}
+    resolved: dict[Path, Path] = {}
     written: dict[str, Capture] = {}
     for capture in flight.captures:
         for path in paths_written(capture, out, settings):
-            if path.parent not in there:
-                there[path.parent] = path.parent.resolve()
-            if there[path.parent] / path.name in sources:
+            if path.parent not in resolved:
+                resolved[path.parent] = path.parent.resolve()
+            if resolved[path.parent] / path.name in sources:
                 raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder with -o")
             other = written.setdefault(str(path).lower(), capture)
             if other is not capture:
@@ -318,7 +319,7 @@ def _refuse_to_overwrite(flight: FolderScan, out: Path, settings: WriteSettings)
 
 
 def finished_before(capture: Capture, out: Path, settings: Settings) -> CaptureResult | None:
-    """Result of an earlier run with the same settings and bands, if its outputs still exist."""
+    """Return the result of an earlier run with the same settings and bands if all its outputs exist, else None."""
     path = CapturePaths.of(capture, out).sidecar
     try:
         sidecar = read_result(path)
@@ -326,11 +327,11 @@ def finished_before(capture: Capture, out: Path, settings: Settings) -> CaptureR
         return None
     if sidecar.settings != fingerprint(capture, settings):
         return None
-    return sidecar if not sidecar.not_written and _outputs_are_there(sidecar, path.parent) else None
+    return sidecar if not sidecar.not_written and _outputs_exist(sidecar, path.parent) else None
 
 
-def _outputs_are_there(sidecar: CaptureResult, folder: Path) -> bool:
-    """True where every file that the sidecar lists is there, with its size: checksums would take minutes."""
+def _outputs_exist(sidecar: CaptureResult, folder: Path) -> bool:
+    """True if every file that the sidecar lists exists with its size; checksums would take minutes."""
     try:
         states = [((folder / name).stat(), size) for name, size in sidecar.files.items()]
     except OSError:

@@ -1,6 +1,4 @@
-"""The ways to do the captures of a run: one after another, in threads, in processes, or on an executor such as
-Dask's.
-"""
+"""Runners for the captures of a run: serial, threads, processes, or an executor such as Dask's."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -16,15 +14,15 @@ from agalign.values.capture import Capture
 from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
 
 _MAX_WAITING_TASKS = 1000
-"""In an executor: enough for any cluster, and little memory."""
+"""Maximum number of tasks submitted to an executor at a time: enough for any cluster, and little memory."""
 _MAX_THREADS = 4
-"""More wait for the interpreter's lock."""
+"""More threads wait for the interpreter's lock."""
 _MAX_READ_AHEAD_BYTES = 64 << 20
-"""Larger files would push what the current capture reads out of the system's cache."""
+"""Larger files could displace files of the current capture from the page cache."""
 
 
 class Runner(Protocol):
-    """A way to do captures. Processes start when it is entered, and have ended when it is left."""
+    """Processes captures. Worker processes start on `__enter__` and end on `__exit__`."""
 
     name: str
 
@@ -33,7 +31,7 @@ class Runner(Protocol):
     def __exit__(self, *reason: object) -> None: ...
 
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
-        """The report of each task, as it is done."""
+        """Yield the report of each task as it completes."""
         ...
 
 
@@ -52,7 +50,7 @@ class SerialRunner:
         pass
 
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
-        """As `Runner` has it; the listeners are called."""
+        """Yield the report of each task in order, and call the listeners."""
         with ThreadPoolExecutor(1) as reader:
             for number, task in enumerate(tasks, start=1):
                 self._on_start(task.capture)
@@ -62,7 +60,7 @@ class SerialRunner:
 
 
 class ProcessRunner:
-    """Captures in processes of this machine, which load what they need while the flight is learned."""
+    """Captures in processes of this machine, which import their libraries while the flight is learned."""
 
     name = "processes"
 
@@ -78,12 +76,12 @@ class ProcessRunner:
         self._stack.__exit__(*reason)  # type: ignore[arg-type]
 
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
-        """As `Runner` has it."""
+        """Yield the report of each task as it completes."""
         return done_in(self._pool, [task.absolute() for task in tasks], self._timeout_s)
 
 
 class ExecutorRunner:
-    """Captures on an executor of the caller's, which stays open."""
+    """Captures on an executor of the caller, which is not shut down."""
 
     name = "executor"
 
@@ -97,7 +95,7 @@ class ExecutorRunner:
         pass
 
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
-        """As `Runner` has it."""
+        """Yield the report of each task as it completes."""
         absolute = [task.absolute() for task in tasks]
         loss = self._executor.loss if isinstance(self._executor, DaskExecutor) else str
         return done_by(
@@ -106,7 +104,7 @@ class ExecutorRunner:
 
 
 class ThreadRunner(ExecutorRunner):
-    """A few captures in threads of this process, which takes less time than to start processes for them."""
+    """Captures in threads of this process: for a few captures faster than starting processes."""
 
     name = "threads"
 
@@ -115,7 +113,7 @@ class ThreadRunner(ExecutorRunner):
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        # Filters of warnings are of the whole process: threads that change them restore each other's.
+        # Warning filters are global: threads that change and restore them would interfere.
         self._stack.enter_context(without_warnings())
         self._stack.enter_context(self._executor)
         return self
@@ -128,8 +126,10 @@ def choose_runner(
     captures: int, cores: int, executor: Executor | None, timeout_s: float | None, on_start: OnStart,
     on_pair: PairProgress,
 ) -> Runner:  # fmt: skip
-    """The executor, where there is one; processes where there are captures enough for two, or where a timeout may have
-    to end one; else threads, or for one core or capture none.
+    """Return the runner for this number of captures and cores.
+
+    Captures run on the executor if there is one; in processes if there are enough captures for two, or for a timeout
+    (threads cannot be killed); else in threads, or serially with one core or capture.
     """
     if executor is not None:
         return ExecutorRunner(executor, timeout_s)
@@ -143,7 +143,7 @@ def choose_runner(
 
 
 def _read_ahead(capture: Capture) -> None:
-    """Bring the files of a capture into the system's cache."""
+    """Read the files of a capture into the page cache."""
     for path in {b.path for b in capture.bands}:
         with suppress(OSError):
             if path.stat().st_size <= _MAX_READ_AHEAD_BYTES:

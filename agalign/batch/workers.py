@@ -1,4 +1,4 @@
-"""One capture as a task, and who does it: this process, others, or the workers of a cluster."""
+"""Processing a capture as a task: in this process, in worker processes, or on the workers of a cluster."""
 
 import logging
 import os
@@ -38,18 +38,18 @@ from agalign.values.processes import follow_parent, threads_of_children, worker_
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 _LOG = logging.getLogger(__name__)
-_DASK_ANSWERS_WITHIN_S = 10
-_LOOKS_EVERY_S = 5.0
-"""How often the state of a cluster is checked while no task is done."""
-_GIVEN_UP_EXIT_CODE = 75
+_DASK_TIMEOUT_S = 10
+_POLL_INTERVAL_S = 5.0
+"""Interval at which the state of a cluster is checked while no task completes."""
+_TIMEOUT_EXIT_CODE = 75
 _OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
 _CAPTURES_A_PROCESS = 500
-"""Libraries keep some kilobytes of each; then a process makes room for a new one."""
+"""Number of captures after which a process is replaced: libraries leak some kilobytes per capture."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One capture to be done, as it travels to a worker."""
+    """One capture to process, as sent to a worker."""
 
     capture: Capture
     out: Path
@@ -58,7 +58,7 @@ class Task:
     max_preview_bytes: int = preview_bytes(1)
 
     def absolute(self) -> "Task":
-        """With absolute paths: workers elsewhere have another working folder."""
+        """Return the task with absolute paths: workers may have another working folder."""
         bands = tuple(replace(b, path=b.path.absolute()) for b in self.capture.bands)
         model = None if self.model is None else self.model.absolute()
         return replace(self, capture=replace(self.capture, bands=bands), out=self.out.absolute(), model=model)
@@ -72,7 +72,7 @@ OnStart = Callable[[Capture], None]
 
 
 def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
-    """Do one capture; what can go wrong with it is in the report."""
+    """Process one capture and return its report, which includes errors."""
     label, clock = task.capture.label, StageClock(on_pair)
     keep_freed_memory()
     try:
@@ -85,7 +85,7 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     except MemoryError:
         problem = _OUT_OF_MEMORY
     except _FAULTS as error:
-        # A fault of this program: it must not cost the captures that follow.
+        # A defect of agalign in one capture must not stop the others.
         problem = f"agalign failed on it ({type(error).__name__}: {error}); please report this"
         _LOG.debug("%s: %s", label, problem, exc_info=True)
     else:
@@ -100,7 +100,7 @@ def done_by(
     submit: Submit[Task, CaptureReport], tasks: Sequence[Task], maximum: int, timeout_s: float | None = None,
     loss: Callable[[], str] = str,
 ) -> Iterator[CaptureReport]:  # fmt: skip
-    """The report of each task, as an executor does them. Raises WorkerError as `finished_by` does."""
+    """Yield the report of each task of an executor. Raises WorkerError like `finished_by`."""
     for task, result in finished_by(submit, tasks, maximum, loss):
         yield _report_of(result, task, timeout_s)
 
@@ -108,10 +108,10 @@ def done_by(
 def finished_by(
     submit: Submit[T, R], tasks: Sequence[T], maximum: int, loss: Callable[[], str] = str
 ) -> Iterator[tuple[T, Callable[[], R]]]:
-    """Each task and what returns or raises its result, as an executor does them.
+    """Yield each task of an executor as it completes, with a function that returns or raises its result.
 
-    Never more than `maximum` are handed over at a time, so that a season's captures do not wait in memory. `loss`
-    returns why no task can be done any more, or nothing. Raises WorkerError with that reason.
+    At most `maximum` tasks are submitted at a time, which limits memory. `loss` returns the reason why no task can
+    complete any more, or an empty string. Raises WorkerError with that reason.
     """
     futures: dict[Future[R], T] = {}
     remaining = iter(tasks)
@@ -119,7 +119,7 @@ def finished_by(
         for task in islice(remaining, maximum):
             futures[_submitted(submit, task)] = task
         while futures:
-            done, _ = wait(futures, _LOOKS_EVERY_S, FIRST_COMPLETED)
+            done, _ = wait(futures, _POLL_INTERVAL_S, FIRST_COMPLETED)
             if not done and (reason := loss()):  # futures of a lost cluster may never be done
                 raise WorkerError(reason)
             for future in done:
@@ -135,17 +135,17 @@ def finished_by(
 
 
 def _submitted(submit: Submit[T, R], task: T) -> "Future[R]":
-    """The future of a task; an executor that lost its processes refuses it, which is this task's outcome."""
+    """Submit a task and return its future; if the executor is broken, its error is the outcome of the task."""
     try:
         return submit(task)
     except BrokenExecutor as error:
-        refused: Future[R] = Future()
-        refused.set_exception(error)
-        return refused
+        failed: Future[R] = Future()
+        failed.set_exception(error)
+        return failed
 
 
 def done_in(pool: CapturePool, tasks: Sequence[Task], timeout_s: float | None = None) -> Iterator[CaptureReport]:
-    """The report of each task, as worker processes do them. Raises WorkerError where they cannot."""
+    """Yield the report of each task of a process pool. Raises WorkerError if no worker process can be started."""
 
     def report(outcome: Outcome[Task, CaptureReport]) -> CaptureReport:
         return _report_of(outcome.value, outcome.argument, timeout_s)
@@ -159,7 +159,7 @@ def _report_of(result: Callable[[], CaptureReport], task: Task, timeout_s: float
 
 
 def result_or_problem(result: Callable[[], R], timeout_s: float | None = None) -> tuple[R | None, str]:
-    """Result of a task, or None and one line about its failure."""
+    """Return (result of a task, ""), or (None, one line about its failure)."""
     try:
         return result(), ""
     except TimeoutError:
@@ -175,17 +175,17 @@ def result_or_problem(result: Callable[[], R], timeout_s: float | None = None) -
     except AgalignError as error:
         problem = str(error)
     except (Exception, CancelledError) as error:
-        said = next(iter(str(error).splitlines()), type(error).__name__)
+        first_line = next(iter(str(error).splitlines()), type(error).__name__)
         if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
-            problem = f"the cluster lost it ({said}); run again to process the remaining captures"
+            problem = f"the cluster lost it ({first_line}); run again to process the remaining captures"
         else:
-            problem = f"agalign failed on it ({type(error).__name__}: {said}); please report this"
+            problem = f"agalign failed on it ({type(error).__name__}: {first_line}); please report this"
     return None, problem
 
 
 @contextmanager
 def own_processes(jobs: int) -> Iterator[CapturePool]:
-    """So many processes of our own, which load what they need while the caller does something else."""
+    """Start a pool of `jobs` worker processes, which import their libraries in the background."""
     threads = max(1, usable_cores() // jobs)
     context = worker_context(__name__)
     with (
@@ -198,18 +198,17 @@ def own_processes(jobs: int) -> Iterator[CapturePool]:
 
 
 LOCAL = "local"
-"""In place of a scheduler's address: a cluster of worker processes on this machine."""
+"""Value of `--dask` instead of a scheduler's address: start worker processes on this machine."""
 
 
 @contextmanager
 def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -> Iterator[Executor]:
-    """The workers of a Dask cluster as an executor. Each needs this package and sees the same folders.
+    """Connect to a Dask cluster as an executor. Its workers need this version of agalign and the same folders.
 
-    `address` is a scheduler's, such as tcp://host:8786, or `local` for so many worker processes here, 0 being one a
-    core. What a lost worker was doing is done by another. A capture that takes longer than the timeout ends its worker,
-    which its nanny replaces; the scheduler tries it on other workers, as often as its setting `allowed-failures` has
-    it, before it is abandoned. Raises ConfigurationError where Dask is not installed, the scheduler does not answer, or
-    a worker lacks this version of the package.
+    `address` is that of a scheduler, such as tcp://host:8786, or `local` for `jobs` worker processes on this machine; 0
+    is one per core. Tasks of a lost worker are repeated by another. A capture that exceeds the timeout ends its worker,
+    which its nanny restarts; the scheduler retries the capture as often as its setting `allowed-failures` permits.
+    Raises ConfigurationError if Dask is not installed, the scheduler does not answer, or a worker has another version.
     """
     try:
         import dask
@@ -220,30 +219,30 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
         stack.enter_context(_quiet_dask())
         try:
             if address == LOCAL:
-                # Without a dashboard nobody sees the profile, which costs a few percent.
+                # The profile appears on the dashboard only, and takes a few percent of the time.
                 stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
                 cluster = LocalCluster(
                     n_workers=jobs or usable_cores(), threads_per_worker=1, processes=True, dashboard_address=None
                 )
                 address = stack.enter_context(cluster).scheduler_address
-            client = Client(address, set_as_default=False, timeout=_DASK_ANSWERS_WITHIN_S)
+            client = Client(address, set_as_default=False, timeout=_DASK_TIMEOUT_S)
         except RuntimeError as error:
             raise ConfigurationError(f"no Dask cluster can be started here ({error})") from None
         except (OSError, ValueError) as error:
             raise ConfigurationError(f"no Dask scheduler answers at {address} ({error})") from None
         _check_versions(stack.enter_context(client))
-        # Workers import the libraries of a capture while the flight is learned here.
+        # Workers import their libraries while this process learns the flight.
         for worker in client.ncores():
             fire_and_forget(client.submit(import_module, __name__, workers=[worker], pure=False))
         yield DaskExecutor(client, timeout_s)
 
 
 def _check_versions(client: Any) -> None:
-    """Raise ConfigurationError where a worker cannot load this version of the package.
+    """Raise ConfigurationError if a worker has no or another version of agalign.
 
-    A worker without the package ends when it receives a task, and the run would wait for other workers.
+    A worker without agalign ends when it receives a task, and the run would wait for other workers.
     """
-    # Workers without the package know the built-in functions only.
+    # A built-in function, because a worker without agalign cannot unpickle one of this package.
     versions = client.run(eval, "__import__('agalign._version', fromlist=['_']).__version__", on_error="return")
     if not versions:
         _LOG.warning("agalign: no worker is connected to the Dask scheduler; the run waits for one")
@@ -259,7 +258,7 @@ def _check_versions(client: Any) -> None:
 
 @contextmanager
 def _quiet_dask() -> Iterator[None]:
-    """What Dask logs of a lost scheduler is a traceback; the run reports it in one line."""
+    """Silence the tracebacks that Dask logs for a lost scheduler; the run reports it in one line."""
     loggers = [logging.getLogger(name) for name in ("distributed.client", "distributed.deploy.spec", "tornado")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -272,7 +271,7 @@ def _quiet_dask() -> Iterator[None]:
 
 
 class DaskExecutor(Executor):
-    """The workers of a Dask cluster. A task that takes too long ends its worker."""
+    """The workers of a Dask cluster. A task that exceeds the timeout ends its worker."""
 
     def __init__(self, client: Any, timeout_s: float | None) -> None:
         self._client, self._executor, self._timeout_s = client, client.get_executor(pure=False), timeout_s
@@ -281,7 +280,7 @@ class DaskExecutor(Executor):
         return self._executor.submit(_within, self._timeout_s, _on_worker, __version__, function, *arguments, **named)
 
     def loss(self) -> str:
-        """Return why no task can be done any more; nothing while the scheduler answers."""
+        """Return why no task can complete any more; empty while the scheduler answers."""
         if self._client.status == "running":
             return ""
         return (
@@ -291,9 +290,9 @@ class DaskExecutor(Executor):
 
 
 def _on_worker(version: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Call a function in one thread, as Dask sets OMP_NUM_THREADS for libraries that read it.
+    """Call a function in one thread; OMP_NUM_THREADS, which Dask sets, does not limit all libraries.
 
-    Raises ConfigurationError on a worker of another version, which may have joined during the run.
+    Raises ConfigurationError on a worker with another version, which may have joined during the run.
     """
     if version != __version__:
         raise ConfigurationError(f"a Dask worker has agalign {__version__}; install agalign {version} there")
@@ -302,10 +301,10 @@ def _on_worker(version: str, function: Callable[..., Any], *arguments: Any, **na
 
 
 def _within(timeout_s: float | None, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """What hangs in a library hears nothing: only the end of its process ends it."""
+    """Call a function; end this process if it takes longer: code that hangs in a library cannot be interrupted."""
     if timeout_s is None:
         return function(*arguments, **named)
-    alarm = threading.Timer(timeout_s, os._exit, (_GIVEN_UP_EXIT_CODE,))
+    alarm = threading.Timer(timeout_s, os._exit, (_TIMEOUT_EXIT_CODE,))
     alarm.start()
     try:
         return function(*arguments, **named)
@@ -314,13 +313,13 @@ def _within(timeout_s: float | None, function: Callable[..., Any], *arguments: A
 
 
 def start_worker(threads: int) -> None:
-    """What a worker process does first."""
+    """Initialise a worker process."""
     follow_parent()
     limit_threads(threads)
 
 
 def stamp(path: Path) -> int:
-    """Workers live longer than runs: a model that was learned again has the same path and another stamp."""
+    """Return the modification time of a model, ns: it changes when the model is learned again."""
     with suppress(OSError):
         return path.stat().st_mtime_ns
     return 0
@@ -328,5 +327,5 @@ def stamp(path: Path) -> int:
 
 @lru_cache(maxsize=8)
 def loaded_model(path: Path, device: str, _stamp: int) -> FlightModel:
-    """The model of a flight, read once by each worker. Raises InputError."""
+    """Return the model in a file, which each worker reads once per `stamp`. Raises InputError."""
     return load_model(path, lambda: choose_device(device))

@@ -1,4 +1,4 @@
-"""What alignment finds of a band pair, and how sure it is."""
+"""Results of aligning a band pair, and their uncertainty."""
 
 import dataclasses
 import math
@@ -25,10 +25,10 @@ from agalign.values.pixel_units import (
 from agalign.values.relief import Parallax
 
 MIN_RETRIEVAL = 0.2
-"""Held-out retrieval below which descriptors do not match: psi does not move and no result is accepted. Chance is below
-0.01, unrelated images reach 0.05."""
+"""Minimum held-out retrieval: below it psi is not updated and no result is accepted. Chance is below 0.01; unrelated
+images reach 0.05."""
 MIN_TIMES_CHANCE = 5.0
-"""The same as a multiple of chance: it decides where few keypoints can be drawn and chance is high."""
+"""The same limit as a multiple of chance, which is high where few keypoints can be drawn."""
 
 
 @dataclass(frozen=True)
@@ -54,18 +54,18 @@ class JointResult(Generic[FixedPx]):
     fixed_to_moving: Matrix
     loss: float
     retrieval: float
-    """Share of held-out patches with the right one as nearest descriptor in the other image."""
+    """Share of held-out patches with the corresponding patch as nearest descriptor in the other image."""
     chance: float
     """The retrieval that guessing would give."""
     iterations: int
     levels: tuple[float, ...]
-    """Resolutions worked at, coarse to fine; 1 is full."""
+    """Resolutions of the image pyramid, coarse to fine; 1 is full."""
     recipe: str
     model_family: ModelFamily
     last_step_px: float
     corner_std_xy_px: tuple[tuple[float, float], ...]
     """Standard deviations along x and y of the mapping at the corners of the reference, clockwise from the top left,
-    px of the reference: from the curvature at the solution and what the patches disagree by."""
+    px of the reference: from the curvature at the solution and the scatter of the patches."""
     corner_covariance_px2: NDArray[np.float64] | None = None
     """(8, 8) of (x, y) of those corners, for a homography whatever the family; None where it is not known."""
 
@@ -106,7 +106,7 @@ class Residual(Generic[FixedPx]):
     def of(
         cls, centres_px: NDArray[np.float64], shifts_px: NDArray[np.float64], peaks_sigma: NDArray[np.float64]
     ) -> "Residual[FixedPx]":
-        """The statistics of shifts (n, 2); peaks (n,) are their correlation peaks in standard deviations."""
+        """Return the statistics of shifts (n, 2) with correlation peaks (n,) in standard deviations."""
         measured = np.isfinite(shifts_px[:, 0])
         length = np.linalg.norm(shifts_px[measured], axis=1)
         median, p95 = np.percentile(length, (50, 95)) if len(length) else (np.inf, np.inf)
@@ -144,7 +144,7 @@ class DisplacementField:
     """Size of that image relative to the one on which the field is evaluated."""
 
     def __call__(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The displacement (..., 2) at points (..., 2), by cubic splines; beyond the lattice that of its edge."""
+        """The displacement (..., 2) at points (..., 2), by cubic splines; outside the lattice that of its edge."""
         points = np.asarray(points_px)
         on_lattice = points if self.scale == SAME_PIXELS else self.scale.positions(points)
         at = on_lattice.reshape(-1, 2)[:, ::-1].T / self.step_px
@@ -169,13 +169,13 @@ class DisplacementField:
 
 @dataclass(frozen=True)
 class DisplacementResult(Generic[FixedPx]):
-    """A field of displacements, where it gains something, and what it gains on windows it was not fitted to."""
+    """A displacement field, and its effect on the residual of held-out windows; no field if it does not reduce it."""
 
     field: DisplacementField | None
     before_p95_px: FixedPx
     after_p95_px: FixedPx
     held_out: "Residual[FixedPx] | None" = None
-    """Of windows under fields that they, and windows that overlap them, were left out of."""
+    """Residual of held-out windows: each field is fitted without the window and those that overlap it."""
 
     def in_file_px(self: "DisplacementResult[FixedImagePx]", scales: "PairScales") -> "DisplacementResult[FixedFilePx]":
         """The same on the grid of the reference band's file."""
@@ -204,7 +204,7 @@ class PairScales:
 
 
 SAME_SCALES = PairScales()
-"""Both images are those of their files."""
+"""Both images have the pixels of their files."""
 
 _SOURCES: dict[PredictionSource, str] = {
     "bands": "the capture's other bands", "neighbours": "the captures around it", "flight": "the flight's mean",

@@ -1,4 +1,4 @@
-"""What a camera's files hold, as their tags say: the bands of a moment, their lenses and places."""
+"""Captures and their bands, with the metadata from the tags of the files."""
 
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -13,18 +13,18 @@ from agalign.values.lens import Lens
 @dataclass(frozen=True)
 class Georeference:
     """Georeference of a raster: `transform` maps (column, row, 1) with (0, 0) the CORNER of the top-left pixel,
-    as GDAL and rasterio have it, to map units of `crs_wkt`.
+    as in GDAL and rasterio, to map units of `crs_wkt`.
     """
 
     transform: Matrix
     crs_wkt: str
     accuracy_m: float | None = None
-    """Expected error (1 sigma, metres) where it was calculated from the camera's pose; None for a file's own."""
+    """Expected error (1 sigma, metres) if it was calculated from the camera's pose; None if it is from the file."""
 
 
 Quantity = Literal["radiance", "relative radiance", "reflectance", "relative reflectance", "temperature"]
-"""Radiance in W / m^2 / sr / nm, reflectance 0 to 1, each of the two up to a factor that all bands share, and
-temperature in degrees Celsius.
+"""Radiance in W / m^2 / sr / nm, reflectance 0 to 1, temperature in degrees Celsius; `relative` is up to a factor that
+all bands share.
 """
 
 
@@ -33,7 +33,7 @@ RadiometrySource = Literal["camera calibration", "light sensor", "panel"]
 
 @dataclass(frozen=True)
 class Radiometry:
-    """What turns a band's raw numbers into a physical quantity; `pixels.radiometry` has the equation."""
+    """Radiometric calibration of a band's raw values; `pixels.radiometry` has the equation."""
 
     quantity: Quantity
     black_level: float
@@ -44,15 +44,15 @@ class Radiometry:
     """k1 ... k6, per px, px^2 ..."""
     vignetting_divides: bool = True
     row_gradient: float = 0.0
-    """Share of the signal that each row has more than the one above it."""
+    """Relative increase of the signal from each row to the next."""
     by_sun: tuple[float, Quantity] | None = None
-    """What radiance is to be multiplied by for reflectance, by the light sensor, and which kind of it that gives."""
+    """Factor from radiance to reflectance by the light sensor, and the resulting quantity."""
     source: RadiometrySource = "camera calibration"
-    """What made reflectance of radiance, if anything did."""
+    """Source of the factor from radiance to reflectance."""
 
     @property
     def is_of_light(self) -> bool:
-        """True for what reflectance can be made of."""
+        """True for radiance, which can be converted to reflectance."""
         return self.quantity in ("radiance", "relative radiance")
 
 
@@ -66,16 +66,16 @@ class Panel:
     seen_by: PanelSource
     serial: str = ""
     albedo: float | None = None
-    """Its reflectance in the band, 0 to 1, where that is known."""
+    """Its reflectance in the band, 0 to 1, if known."""
     corners_px: tuple[tuple[float, float], ...] = ()
-    """Of an area within it, raw pixels of the file; none where it was not found."""
+    """Corners of an area within it, raw px of the file; empty if it was not found."""
     in_scene: bool = False
-    """The camera was not aimed at it: the image shows a scene that contains a panel."""
+    """The image shows a scene that contains the panel, instead of the panel alone."""
 
 
 @dataclass(frozen=True)
 class Band:
-    """One band of a capture: where its pixels are, and its metadata."""
+    """One band of a capture: its file and its metadata."""
 
     name: str
     path: Path
@@ -90,27 +90,27 @@ class Band:
     wavelength_nm: float | None = None
     bandwidth_nm: float | None = None
     saturation_value: float | None = None
-    """Raw value at and above which a pixel is taken as saturated."""
+    """Raw value at and above which a pixel counts as saturated."""
     lens: Lens | None = None
     to_rig: Matrix | None = None
     """Homography from this file's undistorted pixels (raw ones without a lens model) to a plane that all bands of the
-    rig share, as far as the tags tell."""
+    rig share, from the tags."""
     other_to_rig: Matrix | None = None
-    """The same as other tags of the file have it, where makers give two."""
+    """The same from other tags of the file, if the maker writes both."""
     parallax: tuple[float, float] | None = None
-    """Direction in which its pixels move as the ground comes nearer, right and down, relative to the rig's other bands;
+    """Direction (right, down) in which its pixels move as the range decreases, relative to the other bands of the rig,
     in any unit."""
     lens_offset_m: tuple[float, float] | None = None
-    """Position of the lens right of and below the rig's origin, metres; None where the tags do not give it."""
+    """Position of the lens right of and below the rig's origin, metres; None if the tags do not contain it."""
     one_lens: bool = False
-    """The file's bands come through one lens and are aligned as one."""
+    """The bands of the file share one lens and are aligned as one."""
     companion: bool = False
     """Part of a colour photograph: used only on request."""
     georeference: Georeference | None = None
     scale_offset: tuple[float, float] = (1.0, 0.0)
-    """Factor for the numbers of the file, and offset to add then."""
+    """(scale, offset): value = scale * number in the file + offset."""
     overviews: tuple[int, ...] = ()
-    """Reductions at which the file holds the band too."""
+    """Reduction factors of the overviews in the file."""
     radiometry: Radiometry | None = None
     panel: Panel | None = None
 
@@ -121,13 +121,13 @@ class Band:
 
     @property
     def address(self) -> str:
-        """The file's name, with the band's index where the file has several."""
+        """The file's name, followed by the band's index unless that is 1."""
         return self.path.name if self.band_index == 1 else f"{self.path.name}[{self.band_index}]"
 
 
 @dataclass(frozen=True)
 class Position:
-    """Where the camera was: WGS 84, degrees, and metres as the camera has them."""
+    """Position of the camera: WGS 84 in degrees, altitude in metres above the datum of the camera."""
 
     latitude: float
     longitude: float
@@ -139,25 +139,25 @@ HeightSource = Literal["tags", "panel", "ground elevation", "assumed"]
 
 @dataclass(frozen=True)
 class Pose:
-    """How the camera hung when a capture was taken."""
+    """Orientation of the camera, and its height."""
 
     heading_deg: float
-    """Of the image's upward direction, clockwise from north."""
+    """Direction of the image's top, clockwise from north."""
     pitch_deg: float = 0.0
-    """By how much it looked ahead of straight down."""
+    """Angle of the optical axis ahead of nadir."""
     roll_deg: float = 0.0
-    """How far it looked to the left of that: positive if the right side of the aircraft is down."""
+    """Angle of the optical axis to the left of nadir: positive if the right side of the aircraft is down."""
     height_m: float | None = None
-    """Above the ground."""
+    """Height above the ground."""
     focal_length_px: float | None = None
-    """Of the reference."""
+    """Focal length of the reference, px."""
     height_from: HeightSource = "tags"
-    """What `height_m` was derived from."""
+    """Source of `height_m`."""
 
 
 @dataclass(frozen=True)
 class CameraIdentity:
-    """What made the images, as far as their tags say."""
+    """The camera, from the tags of the images."""
 
     make: str = ""
     model: str = ""
@@ -170,7 +170,7 @@ class Capture:
 
     name: str
     folder: Path
-    """Folder below the input folder, relative to it: where the outputs go below the output folder."""
+    """Folder relative to the input folder; outputs are written to the same folder below the output folder."""
     bands: tuple[Band, ...]
     reference_index: int
     camera: CameraIdentity = field(default_factory=CameraIdentity)
@@ -180,10 +180,10 @@ class Capture:
     position: Position | None = None
     pose: Pose | None = None
     motion: tuple[float, float] | None = None
-    """How fast the ground passes through the image, right and down, focal lengths a second, as far as the tags tell."""
+    """Velocity of the ground in the image (right, down), focal lengths per second; None if unknown."""
     missing_bands: tuple[str, ...] = ()
     elevation_deg: float | None = None
-    """Angle of the optical axis above the horizon: -90 straight down; None where the tags do not give it."""
+    """Angle of the optical axis above the horizon: -90 straight down; None if the tags do not contain it."""
 
     @property
     def reference(self) -> Band:
@@ -197,7 +197,7 @@ class Capture:
 
     @property
     def moving_lenses(self) -> list[tuple[Band, ...]]:
-        """The moving bands, those together that one lens took; without those that the reference's own lens took."""
+        """The moving bands grouped by lens, without those that share the lens of the reference."""
         groups: dict[object, list[Band]] = {}
         for index, band in enumerate(self.moving):
             if not self._is_of_the_references_lens(band):
@@ -206,7 +206,7 @@ class Capture:
 
     @property
     def bands_of_the_references_lens(self) -> list[Band]:
-        """Moving bands that lie on the reference by construction."""
+        """Moving bands that share the lens of the reference, and need no alignment."""
         return [b for b in self.moving if self._is_of_the_references_lens(b)]
 
     def _is_of_the_references_lens(self, band: Band) -> bool:
@@ -214,17 +214,17 @@ class Capture:
 
     @property
     def panel(self) -> Panel | None:
-        """The calibration panel in it, as the first band that shows it has it."""
+        """The calibration panel, from the first band with one; None without a panel."""
         return next((b.panel for b in self.bands if b.panel is not None), None)
 
     @property
     def is_of_a_panel(self) -> bool:
-        """True for a capture that was taken of a calibration panel; False where a scene contains one."""
+        """True for an image of a calibration panel alone; False for a scene that contains one."""
         return self.panel is not None and not self.panel.in_scene
 
     @property
     def time_s(self) -> float | None:
-        """Seconds from 1970 to the capture, UTC where `captured_at` names no time zone; None where it is unknown."""
+        """Unix time of the capture, s; UTC is assumed if `captured_at` has no time zone. None if it is unknown."""
         with suppress(ValueError):
             moment = datetime.fromisoformat(self.captured_at)
             return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()

@@ -1,4 +1,4 @@
-"""The words that options, settings, results and files have in common."""
+"""Values of options, settings, results and files."""
 
 from typing import Literal
 
@@ -7,7 +7,7 @@ MAX_PIXELS = 250_000_000
 """Default limit for one image: more than any camera has."""
 MAX_MOSAIC_PIXELS = 20_000_000_000
 SeedKind = Literal["user", "match", "model", "rig", "centre", "geo", "structure", "identity"]
-"""`centre` is by the optical centres that DJI writes, where `rig` is by its calibrated homographies."""
+"""`centre` is from the optical centres in DJI's tags, `rig` from their calibrated homographies."""
 SeedChoice = Literal["auto", "rig", "geo", "structure", "match", "identity"]
 Recipe = Literal["fast", "paper"]
 Sharing = Literal["siamese", "pseudo-siamese", "unshared"]

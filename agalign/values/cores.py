@@ -19,8 +19,9 @@ def usable_cores() -> int:
 
 
 def limit_default_threads() -> None:
-    """Let libraries that are loaded later start no more threads than the quota allows: they count the cores of the
-    affinity. What the user has set stays.
+    """Limit the threads of libraries that are imported later to the quota of the control group, which they do not read.
+
+    Environment variables that the user has set are kept.
     """
     quota = cgroup_quota() if sys.platform == "linux" else None
     if quota is not None:
@@ -31,15 +32,14 @@ def limit_default_threads() -> None:
 def cgroup_quota(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float | None:
     """Return the smallest quota of this process's control group and those above it, in cores; None for no limit.
 
-    Version 2 has `cpu.max` ("200000 100000": the first number of microseconds in each period of the second), version
-    1 two files.
+    Version 2 has the file `cpu.max` ("200000 100000": quota and period in microseconds), version 1 one file for each.
     """
     quotas = [q for folder in _folders(root, own) if (q := _quota_in(folder)) is not None]
     return min(quotas, default=None)
 
 
 def _folders(root: Path, own: Path) -> list[Path]:
-    """The folders of this process's control groups, and those above; in a container they begin at the root."""
+    """Return the folders of this process's control groups and their parents; a container sees its own as the root."""
     result = [root, root / "cpu"]
     for line in _text(own).splitlines():
         _, _, rest = line.partition(":")

@@ -1,4 +1,4 @@
-"""Files that are complete or not there, and the names that they may have."""
+"""Atomic writing of files, partial files of killed processes, and checks of paths."""
 
 import errno
 import hashlib
@@ -14,33 +14,33 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from agalign.errors import OutputError
 
 RUN_FILE = "agalign-run.json"
-"""What a run is, in its output folder: there before anything else is, so that the folder is known by it."""
-_LONGEST_HOST = 40
-"""Of the letters of a host's name: names of files have at most 255 bytes."""
+"""Name of the run record. It is written first, and identifies an output folder."""
+_MAX_HOST_LENGTH = 40
+"""Maximum length of the host in names of partial files, because file names have at most 255 bytes."""
 _PARTIAL = ".agalign-part-"
-"""Start of the names of files that are being written: host, process and a random part follow."""
+"""Prefix of partial files; host, process id and a random part follow."""
 
 
 @contextmanager
 def complete_file(path: Path) -> Iterator[Path]:
-    """A path to write to next to `path`: renamed to it if the block succeeds, else removed.
+    """Yield a temporary path to write to, which is renamed to `path` if the block succeeds, and else removed.
 
-    What was written has reached the disk before it takes the name: where the power fails, either the old file is there
-    or the whole new one. Raises OutputError for an OSError.
+    The contents are flushed to disk before the renaming: after a power failure, `path` is either the old file or the
+    complete new one. Raises OutputError for an OSError.
     """
     with scratch_file(path) as partial:
         yield partial
-        _to_disk(partial)
+        _flush_to_disk(partial)
         partial.replace(path)
-        _to_disk(path.parent)
+        _flush_to_disk(path.parent)
 
 
 @contextmanager
 def scratch_file(neighbour: Path) -> Iterator[Path]:
-    """A path to write to next to another; it is removed when the block ends.
+    """Yield a temporary path in the folder of `neighbour`, which is created; the file is removed after the block.
 
-    It has the same suffix, by which some libraries choose a format, and a name that no other process, here or on
-    another machine that sees the folder, takes; being hidden, it is not taken for an image. The folder is made.
+    The file has the suffix of `neighbour`, because some libraries choose the format by it. Its name is unique among
+    processes on all machines that share the folder, and hidden, so that it is not read as an image.
     Raises OutputError for an OSError.
     """
     scratch = neighbour.with_name(f"{_PARTIAL}{_host()}-{os.getpid()}-{secrets.token_hex(8)}{neighbour.suffix}")
@@ -55,13 +55,13 @@ def scratch_file(neighbour: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically, the same on every system. Raises OutputError."""
+    """Write a UTF-8 text file atomically, with line feeds on every system. Raises OutputError."""
     with complete_file(path) as partial:
         partial.write_text(text, encoding="utf-8", newline="\n")
 
 
 def file_checksum(path: Path) -> str:
-    """Return the SHA-256 of a file that was written a moment ago. Raises OutputError."""
+    """Return the SHA-256 of an output file as hexadecimal digits. Raises OutputError."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -70,18 +70,18 @@ def file_checksum(path: Path) -> str:
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """The file, open for reading. Raises OSError, also for a pipe, a socket or a device: these may never answer."""
+    """Open a regular file for reading. Raises OSError, also for pipes, sockets and devices, which could block."""
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(errno.EINVAL, "it is not a regular file")
-    return open(descriptor, "rb")  # noqa: PTH123 - what was checked is what is read
+    return open(descriptor, "rb")  # noqa: PTH123 - the descriptor that was checked
 
 
 def remove_partial_files(folder: Path) -> None:
-    """What processes of this machine that have ended left of `scratch_file` below a folder, and what this one left.
+    """Remove partial files below a folder, from this process and from processes of this machine that have ended.
 
-    The output folders of other runs in it, and files of processes that live or ran elsewhere, are left alone.
+    Partial files in output folders of other runs, of running processes and of other machines are kept.
     """
     for parent, folders, names in os.walk(folder):
         folders[:] = [f for f in folders if not Path(parent, f, RUN_FILE).exists()]
@@ -100,7 +100,7 @@ def _is_left_over(partial: str) -> bool:
 
 
 def _is_alive(process: int) -> bool:
-    """True for a process of this machine. Windows has no such question: its open files cannot be removed anyway."""
+    """True if a process of this machine runs; False on Windows, where open files cannot be removed anyway."""
     if os.name == "nt":
         return False
     try:
@@ -113,19 +113,19 @@ def _is_alive(process: int) -> bool:
 
 
 def _host() -> str:
-    """The name of this machine, of letters and digits."""
-    return "".join(c for c in platform.node() if c.isalnum())[:_LONGEST_HOST] or "host"
+    """Return the letters and digits of the host name."""
+    return "".join(c for c in platform.node() if c.isalnum())[:_MAX_HOST_LENGTH] or "host"
 
 
 def is_inside(name: str) -> bool:
-    """True for the relative path of a file that no reading of it puts outside the folder it is relative to."""
+    """True for a relative path that stays inside its folder on POSIX and on Windows."""
     posix, windows = PurePosixPath(name), PureWindowsPath(name)
     anchored = posix.is_absolute() or bool(windows.drive or windows.root)
     return bool(name) and not anchored and ".." not in windows.parts and "\0" not in name
 
 
-def _to_disk(path: Path) -> None:
-    """A folder's entries are written to disk like a file's contents, where system and file system have that."""
+def _flush_to_disk(path: Path) -> None:
+    """Flush a file, or the entries of a folder where the system supports that, to disk (fsync)."""
     folder = path.is_dir()
     if folder and os.name == "nt":
         return
@@ -133,7 +133,9 @@ def _to_disk(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if not (folder and error.errno in (errno.EINVAL, errno.ENOTSUP)):  # as some network drives report for a folder
+        if not (
+            folder and error.errno in (errno.EINVAL, errno.ENOTSUP)
+        ):  # network file systems without fsync of folders
             raise
     finally:
         os.close(descriptor)

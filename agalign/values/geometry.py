@@ -42,7 +42,7 @@ def normalised(matrix: ArrayLike) -> Matrix:
 
 
 def _is_singular(h: Matrix) -> bool:
-    """Whatever the units of either side: rows and columns are brought to one length first."""
+    """True for a singular matrix; rows and columns are normalised first, so that units of pixels do not matter."""
     for axis in (0, 1, 0, 1):
         lengths = np.linalg.norm(h, axis=axis, keepdims=True)
         if not lengths.all():
@@ -127,16 +127,17 @@ def local_scale(matrix: Matrix, width_px: int, height_px: int) -> Points:
 
 
 def over_corners(points_px: ArrayLike, width_px: int, height_px: int) -> NDArray[np.float64]:
-    """How far points (n, 2) move with the image's corners under a homography close to the identity: (n, 2, 8), the
-    derivative over (dx, dy) of each corner, clockwise from the top left (DeTone et al. 2016, Sec. 3).
+    """Return the Jacobian (n, 2, 8) of points (n, 2) over the displacements of the image's corners, for a homography
+    close to the identity: (dx, dy) of each corner, clockwise from the top left (DeTone et al. 2016, Sec. 3).
     """
     of_corners = _over_elements(corners(width_px, height_px), width_px, height_px).reshape(8, 8)
     return np.asarray(_over_elements(np.asarray(points_px), width_px, height_px) @ np.linalg.inv(of_corners))
 
 
 def moving_corners(displacements_px: ArrayLike, width_px: int, height_px: int) -> Matrix:
-    """The homography close to the identity that moves an image's corners so, (8,) as in `over_corners`; to first order:
-    half a px at most is right to 0.001 px.
+    """Return the homography close to the identity that displaces an image's corners by (8,) px, as in `over_corners`.
+
+    First order: for displacements up to 0.5 px the error is below 0.001 px.
     """
     of_corners = _over_elements(corners(width_px, height_px), width_px, height_px).reshape(8, 8)
     e = np.linalg.solve(of_corners, np.asarray(displacements_px, dtype=np.float64))
@@ -146,7 +147,7 @@ def moving_corners(displacements_px: ArrayLike, width_px: int, height_px: int) -
 
 
 def _over_elements(points_px: Points, width_px: int, height_px: int) -> NDArray[np.float64]:
-    """Derivative (n, 2, 8) of points over a homography's elements but the last, in units of the image's sides."""
+    """Return the Jacobian (n, 2, 8) of points over the first eight elements of a homography of normalised positions."""
     u, v = points_px[:, 0] / width_px, points_px[:, 1] / height_px
     zero, one = np.zeros_like(u), np.ones_like(u)
     along_x = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], axis=1) * width_px

@@ -1,4 +1,4 @@
-"""Images as the estimation sees them, and the pixel grids they lie on."""
+"""Images for the estimation, and grids of pixels."""
 
 from dataclasses import dataclass
 
@@ -13,20 +13,20 @@ Mask = NDArray[np.bool_]
 
 
 def reduced_size_px(size_px: tuple[int, int], reduction: float) -> tuple[int, int]:
-    """(width, height) of an image after a reduction: at least a pixel each, also of a line of 100,000 pixels."""
+    """(width, height) of an image after a reduction, at least 1 px each."""
     return max(1, round(size_px[0] / reduction)), max(1, round(size_px[1] / reduction))
 
 
 @dataclass(frozen=True)
 class Raster:
-    """Pixels with their validity, as the estimation sees them."""
+    """Pixels for the estimation, with their mask."""
 
     pixels: FloatImage
     """(height, width) float32, or (channels, height, width)."""
     valid: Mask
     """(height, width), False where a pixel is nodata, saturated or outside the sensor."""
     lens: Lens | None = None
-    """Of the camera that took it, in these pixels; None where positions are not to be corrected."""
+    """Lens of the camera in these pixels; None if positions are not corrected for distortion."""
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -51,18 +51,18 @@ class Tile:
 
 @dataclass(frozen=True)
 class OutputGrid:
-    """The pixels that are written: a rectangle, from (x0, y0) on, of the reference's pixels at a scale."""
+    """Grid of the output: a rectangle, from (x0, y0) on, of the reference's grid at a scale."""
 
     x0: int
     y0: int
     width: int
     height: int
     scale: PixelScale = SAME_PIXELS
-    """Written pixels for a pixel of the reference; each side has a whole number of pixels."""
+    """Output pixels per pixel of the reference; each side has a whole number of pixels."""
     undistorted: bool = False
     """The lens-corrected grid of the reference."""
     has_gaps: bool = True
-    """Some of its pixels may lie outside the image of some band that is written."""
+    """Some pixels may be outside the image of a band."""
 
     @property
     def tile(self) -> Tile:
@@ -70,10 +70,10 @@ class OutputGrid:
         return Tile(self.x0, self.y0, self.width, self.height)
 
     def px(self, x: float, y: float) -> tuple[float, float]:
-        """The written pixel at a position of the reference."""
+        """Position (x, y) on this grid of a position of the reference."""
         on_grid_x, on_grid_y = self.scale.positions((x, y)).tolist()
         return on_grid_x - self.x0, on_grid_y - self.y0
 
     def reference_positions(self, positions_px: ArrayLike) -> NDArray[np.float64]:
-        """Positions (..., 2) among the written pixels as positions in the reference's file."""
+        """Positions (..., 2) in the reference's file of positions on this grid."""
         return self.scale.inverse.positions(np.asarray(positions_px) + np.array([self.x0, self.y0]))

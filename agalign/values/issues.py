@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Remedy:
-    """The common cause of some kinds of issues, and what a user may do about it."""
+    """Cause of some kinds of issues, and a suggestion for the user."""
 
     cause: str
     advice: str
@@ -14,10 +14,10 @@ class Remedy:
 
 @dataclass(frozen=True)
 class IssueKind:
-    """What issues of one kind have in common. `verify.checks.KINDS` has all of them by code."""
+    """A kind of issue. `verify.checks.KINDS` has all of them by code."""
 
     code: str
-    """Identifies the kind in sidecars: a contract."""
+    """Identifies the kind in sidecars; it must not change."""
     sentence: str
     """Template of the reason, without a full stop: `value`, `limit` and `detail` are filled in."""
     remedy: Remedy
@@ -29,9 +29,9 @@ class Issue:
 
     kind: IssueKind
     value: float | None = None
-    """What was measured, in the unit of the kind: px, a share, a count."""
+    """Measured value, in the unit of the kind: px, a share, a count."""
     limit: float | None = None
-    """What it should have been at least, or at most."""
+    """Minimum or maximum accepted value."""
     detail: str = ""
     """A file's error, the seed that was requested, or the distance that a share refers to."""
 
@@ -42,12 +42,12 @@ class Issue:
 
 
 def sentence(issue: Issue) -> str:
-    """An issue in words, without a full stop."""
+    """Return the reason in words, without a full stop."""
     return issue.kind.sentence.format(value=issue.value, limit=issue.limit, detail=issue.detail)
 
 
 def explanation(issues: Sequence[Issue]) -> str | None:
-    """Return the first of the issues in words; None if there is none."""
+    """Return the reason of the first, most important issue in words; None without issues."""
     return sentence(issues[0]) if issues else None
 
 

@@ -1,4 +1,4 @@
-"""Camera models: between raw pixels of a file and the pixels that a camera without distortion would have given.
+"""Lens models: conversion between raw pixels of a file and pixels without lens distortion.
 
 Brown-Conrady in OpenCV's convention, on normalised coordinates x = (u - cx) / fx, y = (v - cy) / fy, r^2 = x^2 + y^2:
 
@@ -6,8 +6,8 @@ Brown-Conrady in OpenCV's convention, on normalised coordinates x = (u - cx) / f
     x_d = x radial + 2 p1 x y + p2 (r^2 + 2 x^2)
     y_d = y radial + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-The undistorted image has the same camera matrix K as the raw one. Fisheyes are expressed the same way: for the angles
-that drone cameras see the quotient follows them to a hundredth of a pixel (`radial_coefficients`).
+The undistorted image has the camera matrix K of the raw one. Fisheye lenses are converted to this model; within the
+field of view of drone cameras the error is below 0.01 px (`radial_coefficients`).
 """
 
 from collections.abc import Callable
@@ -28,8 +28,8 @@ _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-1
 class Lens:
     """A camera's intrinsics in raw pixels: x_px = fx * x / z + cx, after Brown-Conrady distortion.
 
-    `distortion` is k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order and for normalised coordinates; those omitted at
-    the end is 0, and empty means none.
+    `distortion` is k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order and for normalised coordinates; coefficients
+    omitted at the end are 0, and empty means no distortion.
     """
 
     fx_px: float
@@ -50,7 +50,7 @@ def is_distorting(lens: Lens | None) -> bool:
 
 
 def distort(lens: Lens | None, undistorted_px: ArrayLike) -> Points:
-    """Raw pixel positions of undistorted ones, both (..., 2); None is a lens without distortion."""
+    """Return the raw positions of undistorted ones, both (..., 2) px; None is a lens without distortion."""
     points = np.asarray(undistorted_px, dtype=np.float64)
     if lens is None or not is_distorting(lens):
         return points
@@ -72,14 +72,14 @@ def distorted(lens: Lens, u: Any, v: Any) -> tuple[Any, Any]:
 
 
 def undistort(lens: Lens | None, raw_px: ArrayLike) -> Points:
-    """Undistorted pixel positions of raw ones, both (..., 2): the inverse of `distort`, by iteration."""
+    """Return the undistorted positions of raw ones, both (..., 2) px: the inverse of `distort`, by iteration."""
     points = np.asarray(raw_px, dtype=np.float64)
     if lens is None or not is_distorting(lens) or points.size == 0:
         return points
     flat = np.ascontiguousarray(points.reshape(-1, 1, 2))
     coefficients = np.array(_eight(lens))
-    straight = cv2.undistortPoints(flat, lens.matrix, coefficients, P=lens.matrix, criteria=_UNDISTORT_CRITERIA)
-    return np.asarray(straight, dtype=np.float64).reshape(points.shape)
+    undistorted = cv2.undistortPoints(flat, lens.matrix, coefficients, P=lens.matrix, criteria=_UNDISTORT_CRITERIA)
+    return np.asarray(undistorted, dtype=np.float64).reshape(points.shape)
 
 
 def rescaled(lens: Lens | None, scale: PixelScale) -> Lens | None:
@@ -90,14 +90,14 @@ def rescaled(lens: Lens | None, scale: PixelScale) -> Lens | None:
     return replace(lens, fx_px=lens.fx_px * scale.x, fy_px=lens.fy_px * scale.y, cx_px=cx_px, cy_px=cy_px)
 
 
-def radial_coefficients(bent: Callable[[Points], Points], reach: float) -> tuple[float, ...]:
-    """The distortion (k1, k2, 0, 0, k3, k4, k5, k6) of a lens that puts a ray at distance r from the axis, in focal
-    lengths, to `bent(r)`; fitted for r up to `reach`.
+def radial_coefficients(distorted_radius: Callable[[Points], Points], max_radius: float) -> tuple[float, ...]:
+    """Return the distortion (k1, k2, 0, 0, k3, k4, k5, k6) of a lens with distorted radius `distorted_radius(r)`.
 
-    bent(r) / r (1 + k4 r^2 + k5 r^4 + k6 r^6) = 1 + k1 r^2 + k2 r^4 + k3 r^6 is linear in k.
+    r is the distance from the optical axis in focal lengths, and the fit is for r up to `max_radius`. The equation
+    distorted_radius(r) / r (1 + k4 r^2 + k5 r^4 + k6 r^6) = 1 + k1 r^2 + k2 r^4 + k3 r^6 is linear in k.
     """
-    r = np.linspace(reach / 256, reach, 256)
-    ratio = bent(r) / r
+    r = np.linspace(max_radius / 256, max_radius, 256)
+    ratio = distorted_radius(r) / r
     powers = np.stack([r**2, r**4, r**6], axis=1)
     k = np.linalg.lstsq(np.hstack([powers, -ratio[:, None] * powers]), ratio - 1.0, rcond=None)[0]
     k1, k2, k3, k4, k5, k6 = k.tolist()

@@ -1,4 +1,4 @@
-"""The complete mapping between the raw pixels of two images, and where it sends every pixel of a grid."""
+"""The complete mapping between the raw pixels of two images, and its fast evaluation on a grid."""
 
 import math
 from collections.abc import Callable
@@ -19,9 +19,9 @@ from agalign.values.pixel_units import FixedFilePx, PixelScale
 from agalign.values.relief import Parallax, between_levels
 
 _KNOT_STEP_PX = 32
-"""Curved mappings are evaluated this far apart and splined between: with real lenses below 0.0001 px of error."""
+"""Distance of the knots of interpolated curved mappings: the error with real lenses is below 0.0001 px."""
 _FIELD_KNOT_STEP_PX = 12
-"""The same at least where displacements change from place to place: four for a step of their lattice."""
+"""Minimum distance of the knots with a displacement field, which has four knots per step of its lattice."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class PixelMapping:
     fixed_lens: Lens | None = None
     moving_lens: Lens | None = None
     pre_distortion: Lens | None = None
-    """Lens through which the given pixels go first, where they are undistorted ones of the reference."""
+    """Lens that distorts the given positions first, if these are undistorted px of the reference."""
     local: DisplacementField | None = None
-    """Displacements of raw reference px before anything else."""
+    """Displacements of raw reference px, applied first."""
     parallax: Parallax | None = None
     """Displacements of undistorted reference px, by the parallax at the raw ones."""
 
@@ -85,7 +85,7 @@ class PixelMapping:
         return self.at_crossings(_along(tile.x0, tile.width), _along(tile.y0, tile.height), dtype)
 
     def at_crossings(self, x_px: Points, y_px: Points, dtype: DTypeLike = np.float64) -> Points:
-        """The same for pixels of the columns x (n,) and the rows y (m,), in ascending order: (m, n, 2)."""
+        """Positions (m, n, 2) in the moving image, raw px, of columns x (n,) and rows y (m,), both ascending."""
         if self.parallax is not None:
             return self._with_parallax(self.parallax, x_px, y_px, dtype)
         if self.is_curved:
@@ -99,7 +99,7 @@ class PixelMapping:
         return result
 
     def _with_parallax(self, parallax: Parallax, x_px: Points, y_px: Points, dtype: DTypeLike) -> Points:
-        """`at_crossings` where the parallax jumps from pixel to pixel."""
+        """`at_crossings` with parallax, which is not smooth and cannot be interpolated between knots."""
         plane, baseline = self.of_the_plane, np.array(parallax.baseline)
 
         def at_level(parallax_px: float) -> Points:
@@ -151,8 +151,8 @@ def splined(
 ) -> Points:  # fmt: skip
     """A smooth mapping of points (..., 2) at all crossings of columns x (n,) and rows y (m,): (m, n, 2).
 
-    It is a bicubic spline through the mapping's values on a lattice, and linear in those values: two products of
-    matrices. The last one, by far the larger, is in `dtype`.
+    A bicubic spline through the mapping's values on a lattice is linear in those values: two matrix products. The
+    second one, by far the larger, is in `dtype`.
     """
     (knots_x, weights_x), (knots_y, weights_y) = (
         _spline_weights(np.asarray(at, np.float64).tobytes(), step_px) for at in (x_px, y_px)
@@ -167,10 +167,11 @@ def splined(
 
 @lru_cache(maxsize=32)
 def _spline_weights(at_px: bytes, step_px: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(knots (k,), weights (length, k)): what each place takes of the value at each knot. All bands of all captures of
-    a flight are asked for the same places (float64, as bytes).
+    """Return (knots (k,), weights (n, k)) of cubic interpolation at positions (n,), given as bytes of float64.
+
+    Cached, because all bands of all captures of a flight have the same positions.
     """
-    places = np.frombuffer(at_px)
-    first, length = places[0], places[-1] - places[0]
+    positions = np.frombuffer(at_px)
+    first, length = positions[0], positions[-1] - positions[0]
     knots = np.linspace(first, first + max(length, 3), max(4, 1 + math.ceil(length / step_px)))
-    return knots, np.asarray(CubicSpline(knots, np.eye(len(knots)))(places))
+    return knots, np.asarray(CubicSpline(knots, np.eye(len(knots)))(positions))

@@ -1,15 +1,15 @@
-"""The limit that the system sets on the address space of this process."""
+"""Check of the limit on the address space of this process."""
 
 import sys
 
 from agalign.errors import MemoryLimitError
 
 MIN_ADDRESS_SPACE_BYTES = 1_800_000_000
-"""Below about 1.6 GB the libraries crash, abort or never return, each time in another place; nothing can catch that."""
+"""Below about 1.6 GB the libraries crash, abort or hang, which cannot be caught."""
 
 
 def check_address_space() -> None:
-    """Raise MemoryLimitError where the address space (`ulimit -v`) is too small for the libraries."""
+    """Raise MemoryLimitError if the address space (`ulimit -v`) is too small for the libraries."""
     if sys.platform == "win32":
         return
     import resource

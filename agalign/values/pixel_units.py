@@ -1,12 +1,12 @@
 """Lengths in pixels, one type for each pixel grid of a band pair, and the scale between two grids.
 
-A band pair has four pixel grids. The *files* of the fixed (reference) and of the moving band; and the *images* that
-estimation works on: the files themselves, or reductions of them where the files are large. A moving pixel may cover
+A band pair has four pixel grids: those of the *files* of the fixed (reference) and of the moving band, and those of the
+*images* that the estimation uses, which are reductions of large files. A moving pixel may cover
 several times the ground of a fixed one, so a limit in fixed px must never be compared with a distance in moving px.
-The types below let mypy reject that. At run time a length is a plain float: arithmetic costs what it costs for floats.
+With the types below mypy rejects that. At run time a length is a plain float.
 
 Positions count from the CENTRE of the top-left pixel, (0, 0). Two images of the same area share their outer EDGES, so
-a position x of one is (x + 0.5) * scale - 0.5 in the other. `PixelScale` is the only place that knows this formula.
+a position x of one is (x + 0.5) * scale - 0.5 in the other. Only `PixelScale` implements this formula.
 """
 
 import math
@@ -40,7 +40,7 @@ class Px(float):
 
 
 class FixedImagePx(Px):
-    """Pixels of the reference image that estimation works on."""
+    """Pixels of the reference image that the estimation uses."""
 
     __slots__ = ()
 
@@ -52,7 +52,7 @@ class FixedFilePx(Px):
 
 
 class MovingImagePx(Px):
-    """Pixels of the moving image that estimation works on."""
+    """Pixels of the moving image that the estimation uses."""
 
     __slots__ = ()
 
@@ -64,7 +64,7 @@ class MovingFilePx(Px):
 
 
 FixedPx = TypeVar("FixedPx", FixedImagePx, FixedFilePx)
-"""The grid that a result is given on: of the images, or of the files."""
+"""Grid of a result: of the images, or of the files."""
 
 FixedImagePoints = NewType("FixedImagePoints", NDArray[np.float64])
 """(..., 2) positions in the reference image."""
@@ -77,14 +77,14 @@ MovingFilePoints = NewType("MovingFilePoints", NDArray[np.float64])
 
 
 class PixelScale(NamedTuple):
-    """Pixels of one image for a pixel of another that shows the same area: 0.5 halves the resolution."""
+    """Pixels of one image per pixel of another that shows the same area: 0.5 halves the resolution."""
 
     x: float
     y: float
 
     @classmethod
     def between(cls, full_size_px: Size, size_px: Size) -> "PixelScale":
-        """From an image of one (width, height) to one of another."""
+        """Return the scale from an image of one (width, height) to one of another."""
         return cls(size_px[0] / full_size_px[0], size_px[1] / full_size_px[1])
 
     @property
@@ -102,18 +102,18 @@ class PixelScale(NamedTuple):
         return math.sqrt(self.x * self.y)
 
     def positions(self, positions_px: ArrayLike) -> NDArray[np.float64]:
-        """Where positions (..., 2) of the one image are in the other."""
+        """Return positions (..., 2) of the first image as positions of the second."""
         return np.asarray((np.asarray(positions_px, np.float64) + 0.5) * self - 0.5)
 
     def displacements(self, displacements_px: ArrayLike) -> NDArray[np.float64]:
-        """Displacements (..., 2) of the one image as those of the other."""
+        """Return displacements (..., 2) of the first image as displacements of the second."""
         return np.asarray(np.asarray(displacements_px, np.float64) * self)
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """The homography (3, 3) that does to positions what `positions` does."""
+        """`positions` as a homography (3, 3)."""
         return np.array([[self.x, 0.0, 0.5 * self.x - 0.5], [0.0, self.y, 0.5 * self.y - 0.5], [0.0, 0.0, 1.0]])
 
 
 SAME_PIXELS = PixelScale(1.0, 1.0)
-"""An image that is its file's own."""
+"""Scale of an image with the pixels of its file."""

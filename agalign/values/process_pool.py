@@ -1,7 +1,7 @@
-"""Tasks done by worker processes that share no lock: none that is killed or stopped can hold up another.
+"""A pool of worker processes that share no lock: a killed or stopped worker cannot block the others.
 
-No library does this: concurrent.futures, loky, multiprocess, billiard, mpire and pebble have their workers share a
-queue or a lock, and most stop all workers when one is killed.
+In concurrent.futures, loky, multiprocess, billiard, mpire and pebble, workers share a queue or a lock, and most stop
+all workers when one is killed.
 """
 
 import pickle
@@ -19,17 +19,17 @@ from agalign.values.processes import REIMPORTED_EXIT_CODE
 from agalign.values.worker_process import ENDS_WITHIN_S, LOST_SERVER_EXIT_CODE, Worker, is_out_of_memory
 
 _MAX_DEATHS = 3
-"""In a row without a finished task between them: more would be lost, one by one, to what ends the workers."""
+"""Maximum number of workers that end in a row without a finished task between them; then the run ends."""
 _MAX_TRIES = 2
-"""A worker may be killed by a signal for other reasons than its task, such as a lack of memory."""
-_STARTS_WITHIN_S = 120.0
-"""To load torch from a cold disk on a network takes up to a minute."""
-_SENDS_ON_WITHIN_S = 1.0
-"""Between two chunks of a result. Whoever asks for outcomes may look away until a worker that sends is late."""
-_LOOKS_EVERY_S = 1.0
-"""On Windows the interrupt key is heard only between two waits."""
+"""A signal may kill a worker for reasons other than its task, such as a lack of memory."""
+_START_TIMEOUT_S = 120.0
+"""Importing torch from a network drive takes up to a minute."""
+_CHUNK_TIMEOUT_S = 1.0
+"""Extension of a deadline after each chunk of a result: the caller may take time over outcomes while a worker sends."""
+_POLL_INTERVAL_S = 1.0
+"""On Windows, SIGINT is handled only between two waits."""
 _MAX_WINDOWS_PROCESSES = 30
-"""Windows waits for 63 things at most; a worker is two."""
+"""Windows waits for at most 63 objects; a worker has two."""
 
 A = TypeVar("A")
 R = TypeVar("R")
@@ -50,14 +50,14 @@ class WorkerDiedError(Exception):
 
 @dataclass(frozen=True)
 class Outcome(Generic[A, R]):
-    """What became of a task: a result, or why there is none."""
+    """The result of a task, or its error."""
 
     number: int
-    """The place of the argument among those given, from 0."""
+    """Index of the argument, from 0."""
     argument: A
     result: R | None = None
     error: Exception | None = None
-    """What the function raised, TimeoutError after the time limit, or WorkerDiedError."""
+    """Exception of the function, TimeoutError after the time limit, or WorkerDiedError."""
 
     def value(self) -> R:
         """The result. Raises the error."""
@@ -75,7 +75,7 @@ class _Task(Generic[A]):
 
 @dataclass(eq=False)
 class _Place(Generic[A]):
-    """A worker, and what it is given to do."""
+    """A worker and its current task."""
 
     worker: Worker
     deadline_s: float | None
@@ -87,11 +87,9 @@ class _Place(Generic[A]):
         return self.worker.ready and self.task is None
 
     @property
-    def late_s(self) -> float:
-        """When its worker is to be ended, by the monotonic clock."""
-        return (
-            float("inf") if self.deadline_s is None else max(self.deadline_s, self.worker.heard_s + _SENDS_ON_WITHIN_S)
-        )
+    def kill_time_s(self) -> float:
+        """Time at which the worker is killed, monotonic clock."""
+        return float("inf") if self.deadline_s is None else max(self.deadline_s, self.worker.heard_s + _CHUNK_TIMEOUT_S)
 
 
 _ADVICE = "close other programs, or try --jobs 1"
@@ -101,11 +99,10 @@ _UNGUARDED = (
 
 
 class ProcessPool(Generic[A, R]):
-    """A function done by worker processes, each argument in one of them. They start at once, in the background.
+    """Applies a function to arguments in worker processes, which start in the background at once.
 
-    A worker that is killed by a signal costs its task nothing the first time: it is tried again, last. A worker that
-    cannot be started, or fails in `initializer`, is one less. A worker makes room for a new one after
-    `max_tasks_per_worker`.
+    If a signal kills a worker, its task is tried again once, after the others. A worker that cannot be started, or
+    fails in `initializer`, reduces the size of the pool. A worker is replaced after `max_tasks_per_worker` tasks.
     """
 
     def __init__(
@@ -113,7 +110,7 @@ class ProcessPool(Generic[A, R]):
         initializer: Callable[..., object], arguments: tuple[Any, ...] = (), *, max_tasks_per_worker: int = sys.maxsize,
     ) -> None:  # fmt: skip
         self._function, self._max_tasks = function, max_tasks_per_worker
-        self._how = context, initializer, arguments
+        self._worker_arguments = context, initializer, arguments
         self._size = min(processes, _MAX_WINDOWS_PROCESSES) if sys.platform == "win32" else processes
         self._places: list[_Place[A]] = []
         self._leaving: list[Worker] = []
@@ -125,7 +122,7 @@ class ProcessPool(Generic[A, R]):
         return self
 
     def __exit__(self, *_reason: object) -> None:
-        """No process is left: idle ones end, and the others are killed."""
+        """End all processes: close the pipes of idle ones, kill the others."""
         workers = [*self._leaving, *(place.worker for place in self._places)]
         for place in self._places:
             if place.task is None:
@@ -141,18 +138,18 @@ class ProcessPool(Generic[A, R]):
         self._places, self._leaving = [], []
 
     def run(self, arguments: Iterable[A], timeout_s: float | None = None) -> Iterator[Outcome[A, R]]:
-        """The outcome of each task, as it is done. A task that takes longer than the timeout ends its worker.
+        """Yield the outcome of each task as it completes. The worker of a task that exceeds the timeout is killed.
 
-        Raises WorkerError where no worker can be started, or where workers end one after another.
+        Raises WorkerError if no worker can be started, or if workers end one after another.
         """
         self._waiting.extend(_Task(number, argument) for number, argument in enumerate(arguments))
         while self._is_unfinished():
-            outcomes = [*self._hand_over(timeout_s)]
+            outcomes = [*self._assign(timeout_s)]
             if not outcomes:
                 self._wait()
                 for place in list(self._places):
-                    outcomes += self._look_after(place)
-                outcomes += self._hand_over(timeout_s)  # before whoever asks for the outcomes takes time over them
+                    outcomes += self._check(place)
+                outcomes += self._assign(timeout_s)  # before the caller takes time over the outcomes
             yield from outcomes
             if self._given_up and self._is_unfinished():
                 raise WorkerError(self._given_up)
@@ -163,20 +160,20 @@ class ProcessPool(Generic[A, R]):
     def _start(self, count: int) -> None:
         for _ in range(count):
             try:
-                worker = Worker(*self._how)
+                worker = Worker(*self._worker_arguments)
             except (OSError, RuntimeError, MemoryError) as error:
                 self._one_less(f"{type(error).__name__}: {error}")
             else:
-                self._places.append(_Place(worker, worker.created_s + _STARTS_WITHIN_S))
+                self._places.append(_Place(worker, worker.created_s + _START_TIMEOUT_S))
 
     def _one_less(self, problem: str) -> None:
-        """A worker could not be started; when none can, the run ends."""
+        """Reduce the size of the pool after a worker could not be started; at size 0 the run ends."""
         self._size -= 1
         if self._size == 0:
             self._given_up = f"no worker process can be started ({problem}); {_ADVICE}"
 
-    def _hand_over(self, timeout_s: float | None) -> Iterator[Outcome[A, R]]:
-        """Give waiting tasks to idle workers, and replace those that are gone where there are tasks for them.
+    def _assign(self, timeout_s: float | None) -> Iterator[Outcome[A, R]]:
+        """Send waiting tasks to idle workers, and start new workers for the remaining tasks.
 
         Yields the outcome of tasks that cannot be sent.
         """
@@ -190,7 +187,7 @@ class ProcessPool(Generic[A, R]):
                     continue
                 try:
                     place.worker.send(message)
-                except OSError:  # it ended while it was idle: the task has not been tried
+                except OSError:  # the worker ended while it was idle
                     self._waiting.appendleft(task)
                     self._remove(place)
                 else:
@@ -201,33 +198,33 @@ class ProcessPool(Generic[A, R]):
             self._start(min(self._size - len(self._places), len(self._waiting) - coming))
 
     def _wait(self) -> None:
-        """Until a worker sends something, ends or is late."""
-        left_s = min((place.late_s for place in self._places), default=0.0) - time.monotonic()
-        things = [thing for place in self._places for thing in place.worker.waits_for()]
-        wait(things, min(max(left_s, 0.0), _LOOKS_EVERY_S))
+        """Wait until a worker sends a message, ends, or exceeds its deadline."""
+        left_s = min((place.kill_time_s for place in self._places), default=0.0) - time.monotonic()
+        objects = [o for place in self._places for o in place.worker.waits_for()]
+        wait(objects, min(max(left_s, 0.0), _POLL_INTERVAL_S))
 
-    def _look_after(self, place: _Place[A]) -> list[Outcome[A, R]]:
-        """Take what a worker has sent; see whether it has ended or is late."""
+    def _check(self, place: _Place[A]) -> list[Outcome[A, R]]:
+        """Receive a message of a worker; check whether it has ended or exceeds its deadline."""
         worker, task = place.worker, place.task
         message = worker.receive()
         if message is not None:
             return self._take(place, message)
         if worker.has_ended():
             return self._remove(place)
-        if time.monotonic() < place.late_s:
+        if time.monotonic() < place.kill_time_s:
             return []
         self._end(place)
         if task is not None:
             return [Outcome(task.number, task.argument, error=TimeoutError())]
-        self._one_less(f"not ready after {_STARTS_WITHIN_S:g} s")
+        self._one_less(f"not ready after {_START_TIMEOUT_S:g} s")
         return []
 
     def _take(self, place: _Place[A], message: bytes) -> list[Outcome[A, R]]:
-        """A worker is ready, or cannot be, or has done its task."""
+        """Process a message of a worker: it is ready, its start has failed, or it returns the result of its task."""
         try:
             good, value = pickle.loads(message)
-        except Exception as unreadable:
-            good, value = False, unreadable
+        except Exception as error:
+            good, value = False, error
         place.deadline_s, task, place.task = None, place.task, None
         if task is None:
             place.worker.ready = good
@@ -239,17 +236,18 @@ class ProcessPool(Generic[A, R]):
         place.finished += 1
         if place.finished >= self._max_tasks:
             self._end(place)
-        result, error = (value, None) if good else (None, value)
-        return [Outcome(task.number, task.argument, result, error)]
+        if good:
+            return [Outcome(task.number, task.argument, value)]
+        return [Outcome(task.number, task.argument, error=value)]
 
     def _end(self, place: _Place[A]) -> None:
-        """Part from a worker, which may take a moment to end."""
+        """Remove a worker from the pool and end it, without waiting for that."""
         self._places.remove(place)
         place.worker.let_end() if place.idle else place.worker.kill()
         self._leaving = [worker for worker in [*self._leaving, place.worker] if worker.exit_code(0) is None]
 
     def _remove(self, place: _Place[A]) -> list[Outcome[A, R]]:
-        """A worker has ended by itself, or was ended by others."""
+        """Remove a worker that has ended; return the outcome of its task unless that is tried again."""
         worker, task = place.worker, place.task
         code = worker.exit_code()
         self._end(place)
@@ -261,7 +259,7 @@ class ProcessPool(Generic[A, R]):
             self._one_less(worker.problem or f"ended with exit code {code}")
             return []
         error: Exception = MemoryError() if is_out_of_memory(code) else WorkerDiedError(code)
-        # Several that were killed at once count once: those that came after the last one that counted.
+        # Workers killed at the same time count once: count only workers created after the last counted death.
         if worker.created_s > self._last_death_s:
             self._deaths, self._last_death_s = self._deaths + 1, time.monotonic()
         if self._deaths >= _MAX_DEATHS:

@@ -1,4 +1,4 @@
-"""Processes of our own: they end with the one that started them, and leave the interrupt key to it."""
+"""Worker processes: start method, number of threads, SIGINT, and end with their parent."""
 
 import os
 import signal
@@ -12,26 +12,26 @@ from multiprocessing.context import BaseContext
 
 
 def follow_parent() -> None:
-    """In a new process: it ends with the process that started it, however that ends."""
+    """In a worker process: ignore SIGINT, and end when the parent process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     if parent is None:
         return
 
-    def follow() -> None:
+    def end_with_parent() -> None:
         parent.join()
         os._exit(1)
 
-    threading.Thread(target=follow, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 REIMPORTED_EXIT_CODE = 72
-"""Of a worker in which the calling script began to run again."""
+"""Exit code of a worker that imports the calling script again."""
 
 
 def end_if_reimported() -> None:
-    """End a worker process in which the calling script runs again: without `if __name__ == "__main__":` around its
-    calls, each worker that imports it would start workers of its own.
+    """End a worker process that imports the calling script again: without `if __name__ == "__main__":` around the
+    calls of the script, each worker would start workers.
     """
     if getattr(current_process(), "_inheriting", False):  # the test that `multiprocessing` itself uses
         os._exit(REIMPORTED_EXIT_CODE)
@@ -39,13 +39,13 @@ def end_if_reimported() -> None:
 
 @contextmanager
 def without_interrupt_key() -> Iterator[None]:
-    """Processes started inside, and theirs, inherit not to hear it, from their first moment on."""
+    """Block SIGINT; processes started inside the block inherit that."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        resource_tracker.ensure_running()  # which, when it starts, lets the thread that starts it hear the key again
+        resource_tracker.ensure_running()  # unblocks SIGINT in this thread
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         yield
     finally:
@@ -53,11 +53,11 @@ def without_interrupt_key() -> Iterator[None]:
 
 
 def worker_context(preload: str) -> BaseContext:
-    """How processes are started: forked from one that has loaded the module `preload`, where the system allows, else as
-    new interpreters.
+    """Return the start method of worker processes: forked from a fork server that has imported the module `preload`, or
+    spawned.
 
-    On macOS a copy of a process that has loaded Apple's libraries may crash or hang. The fork server needs a socket in
-    a temporary folder, which a service account may not have.
+    Processes are spawned on macOS, where a fork of a process with Apple's libraries may crash or hang, and without a
+    temporary folder, in which the fork server needs a socket.
     """
     if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not _has_temporary_folder():
         return get_context("spawn")
@@ -67,19 +67,19 @@ def worker_context(preload: str) -> BaseContext:
 
 
 CAPTURES_WORTH_A_PROCESS = 2
-"""A process takes as long to start as to align one capture; its start overlaps with the learning of the flight."""
+"""Minimum number of captures per process: starting one takes the time of one capture, while a flight is learned."""
 
 
 def start_server_ahead(preload: str, captures: int, cores: int) -> None:
-    """Start the process that workers will be forked from, if a run of so many captures will have any: it loads what
-    they need while this process loads the same.
+    """Start the fork server early if a run of this many captures will use workers: it imports `preload` while this
+    process imports the same.
     """
     processes = min(cores, captures // CAPTURES_WORTH_A_PROCESS)
     if processes < 2 or worker_context(preload).get_start_method() != "forkserver":
         return
     from multiprocessing import forkserver
 
-    # Where it cannot be started now, the workers report why.
+    # If it cannot be started, the workers report the reason.
     with suppress(OSError, RuntimeError), threads_of_children(max(1, cores // processes)), without_interrupt_key():
         forkserver.ensure_running()
 
@@ -94,8 +94,9 @@ def _has_temporary_folder() -> bool:
 
 @contextmanager
 def threads_of_children(count: int) -> Iterator[None]:
-    """Libraries read these once, when they are loaded: threads of several processes that wait for each other's cores
-    take twice the time.
+    """Set the number of threads that libraries in child processes start. Libraries read it once, at their import.
+
+    More threads than cores, over all processes, double the time.
     """
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}

@@ -4,7 +4,7 @@ from enum import IntFlag
 
 
 class Quality(IntFlag):
-    """What limits the use of a pixel; each flag is one bit."""
+    """Limitations of a pixel; each flag is one bit."""
 
     OUTSIDE = 1
     """Outside the image of the band."""
@@ -27,6 +27,6 @@ class Quality(IntFlag):
 
 
 MEANINGS = " ".join(str(flag.name).lower() for flag in Quality)
-"""Names of the flags from the lowest bit, as the CF conventions have them in `flag_meanings`."""
+"""Names of the flags from the lowest bit, in the format of `flag_meanings` of the CF conventions."""
 UNUSABLE = Quality(sum(Quality)) & ~(Quality.PREDICTED | Quality.ERROR_OVER_HALF_PX)
-"""Flags of pixels that `agalign indices --mask-qa` leaves out."""
+"""Flags of pixels that `agalign indices --mask-qa` masks."""

@@ -1,4 +1,4 @@
-"""The relief of a capture: one parallax for each pixel, which moves all bands along their baselines.
+"""The relief of a capture: one parallax for each pixel, which displaces all bands along their baselines.
 
 Plane + parallax (Irani & Anandan 1996; Hartley & Zisserman 2004, Sec. 13.2): an undistorted pixel x of the reference
 maps to
@@ -37,7 +37,7 @@ class Relief:
     def __call__(self, points_px: ArrayLike) -> NDArray[np.float64]:
         """Parallax (...) at points (..., 2), px of the image on which it is evaluated.
 
-        Beyond the raster that of its edge.
+        Outside the raster that of its edge.
         """
         points = self.scale.positions(points_px)
         rows_columns = points.reshape(-1, 2)[:, ::-1].T
@@ -45,8 +45,8 @@ class Relief:
         return np.asarray(values * self.unit, np.float64).reshape(points.shape[:-1])
 
     def at_crossings(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> FloatImage:
-        """The same at all crossings of columns x (n,) and rows y (m,): (m, n), quicker."""
-        if self.scale == SAME_PIXELS and self._is_own(x_px, 1) and self._is_own(y_px, 0):
+        """Parallax (m, n) at all crossings of columns x (n,) and rows y (m,), faster than at points."""
+        if self.scale == SAME_PIXELS and self._are_pixels(x_px, 1) and self._are_pixels(y_px, 0):
             values = self.parallax_px[int(y_px[0]) : int(y_px[-1]) + 1, int(x_px[0]) : int(x_px[-1]) + 1]
         else:
             (x, _), (_, y) = (self.scale.positions(np.column_stack([v, v])).astype(np.float32).T for v in (x_px, y_px))
@@ -56,15 +56,15 @@ class Relief:
             )
         return values if self.unit == 1.0 else np.asarray(values * np.float32(self.unit))
 
-    def _is_own(self, places_px: NDArray[np.float64], axis: int) -> bool:
+    def _are_pixels(self, positions_px: NDArray[np.float64], axis: int) -> bool:
         """True for consecutive pixels of the raster along an axis."""
-        first, last = places_px[0], places_px[-1]
+        first, last = positions_px[0], positions_px[-1]
         inside = first >= 0 and last < self.parallax_px.shape[axis]
-        return bool(inside and first == int(first) and last - first == len(places_px) - 1)
+        return bool(inside and first == int(first) and last - first == len(positions_px) - 1)
 
     @property
     def negated(self) -> "Relief":
-        """With the opposite sign."""
+        """The relief with the opposite sign."""
         return replace(self, parallax_px=-self.parallax_px)
 
     def rescaled(self, scale: PixelScale) -> "Relief":
@@ -83,7 +83,7 @@ class Parallax:
     """On the raster of the relief: pixels that nearer parts of the scene occlude in this band. None hides nothing."""
 
     def hides(self, points_px: NDArray[np.float64]) -> Mask:
-        """(...) True where the band does not show a raw point (..., 2) of the reference."""
+        """(...) True where a raw point (..., 2) of the reference is occluded in the band."""
         if self.hidden is None:
             return np.zeros(points_px.shape[:-1], dtype=bool)
         at = np.rint(self.relief.scale.positions(points_px)).astype(np.intp)
@@ -103,10 +103,10 @@ class Parallax:
 def between_levels(
     at_level: Callable[[float], NDArray[np.floating]], parallax_px: FloatImage
 ) -> NDArray[np.floating]:  # fmt: skip
-    """A smooth function of the parallax and of the pixel, (height, width, 2), at each pixel's own parallax.
+    """Return a smooth function of parallax and pixel, (height, width, 2), at the parallax of each pixel.
 
-    `at_level` evaluates it everywhere at one parallax. A parabola through three levels is exact to 0.001 px: the
-    function is a homography after a shift, and a lens.
+    `at_level` evaluates the function for all pixels at one parallax. It is a homography after a shift, followed by a
+    lens, and a parabola through three levels interpolates it to 0.001 px.
     """
     low, high = float(parallax_px.min()), float(parallax_px.max())
     if high - low < _SAME_LEVEL_PX:

@@ -1,4 +1,4 @@
-"""Texts from files, shown where some characters would do something."""
+"""Escaping of texts from files for terminals and spreadsheets."""
 
 import unicodedata
 
@@ -6,13 +6,13 @@ _FORMULA = ("=", "+", "-", "@")
 
 
 def counted(number: int, what: str) -> str:
-    """A number of things: 1 capture, 2 captures."""
+    """Return a number with its noun: 1 capture, 2 captures."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
 def harmless(text: str) -> str:
-    r"""The text on one line, with what a terminal would act on (escape sequences, turns of the writing's direction)
-    written out: `\x1b`.
+    r"""Return the text on one line, with control characters (terminal escapes, changes of text direction) escaped as
+    `\x1b`.
     """
     if text.isprintable():
         return text
@@ -20,12 +20,12 @@ def harmless(text: str) -> str:
 
 
 def without_controls(text: str) -> str:
-    """The text without control characters, as a tag is meant that has some."""
+    """Return the text of a tag without control characters."""
     return text if text.isprintable() else "".join(c for c in text if unicodedata.category(c) not in ("Cc", "Cs"))
 
 
 def without_formula(value: object) -> object:
-    """A value for a table: a text that a spreadsheet would calculate is quoted, as names come from cards."""
+    """Return a value for a table; a text that a spreadsheet would evaluate as a formula is quoted."""
     if not isinstance(value, str):
         return value
     text = harmless(value)

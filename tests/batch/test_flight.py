@@ -119,7 +119,7 @@ def test_a_model_is_used_again_and_refused_for_another_camera(
     reports = list(run_flight(discover(flight), tmp_path / "out", SETTINGS, model=path))
     assert [r.good for r in reports] == [True, True]
     save_model(replace(model, camera="Another 1 [Green 10x10]"), path)
-    with pytest.raises(ConfigurationError, match=r"m\.safetensors: was learnt for Another 1"):
+    with pytest.raises(ConfigurationError, match=r"m\.safetensors: was learned for Another 1"):
         list(run_flight(discover(flight), tmp_path / "out2", SETTINGS, model=path))
 
 
@@ -181,7 +181,7 @@ def test_a_model_of_no_use_is_refused(flight: Path, model: FlightModel, tmp_path
     path = tmp_path / "m.safetensors"
     save_model(model, path)
     alone = Settings(flight=FlightSettings(together=False))
-    with pytest.raises(ConfigurationError, match="of use only where one network is learnt"):
+    with pytest.raises(ConfigurationError, match="needs one network per flight"):
         list(run_flight(discover(flight), tmp_path / "out", alone, model=path))
 
 

@@ -58,7 +58,7 @@ def without_seconds(result: CaptureResult) -> CaptureResult:
 
 
 def test_a_scheduler_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_DASK_ANSWERS_WITHIN_S", 0.5)
+    monkeypatch.setattr(workers, "_DASK_TIMEOUT_S", 0.5)
     with (
         pytest.raises(ConfigurationError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "),
         dask_executor("tcp://127.0.0.1:1"),
@@ -187,7 +187,7 @@ def test_a_lost_dask_scheduler_ends_the_run_in_one_line(
     ends: bool, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Futures of a lost scheduler are cancelled, or never end."""
-    monkeypatch.setattr(workers, "_LOOKS_EVERY_S", 0.01)
+    monkeypatch.setattr(workers, "_POLL_INTERVAL_S", 0.01)
     executor = DaskExecutor(Client({}, "connecting"), None)
 
     def submit(_: Task) -> "Future[CaptureReport]":

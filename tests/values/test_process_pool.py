@@ -258,7 +258,7 @@ def test_a_system_that_is_short_of_something(what: str, monkeypatch: pytest.Monk
 
 
 def test_a_worker_that_stops_while_it_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process_pool, "_STARTS_WITHIN_S", 1.0)
+    monkeypatch.setattr(process_pool, "_START_TIMEOUT_S", 1.0)
     stopping = pool(tasks.received, initializer=tasks.stop_for_ever)
     with stopping as workers, pytest.raises(WorkerError, match="not ready after 1 s"):
         list(workers.run([1]))
