@@ -117,7 +117,7 @@ class WriteSettings(Stage):
     ground_elevation_m: float | None = None
     """Elevation of the ground in the height system of the camera's GPS, if neither tags nor a panel give the height."""
     statistics: bool = False
-    """Store minimum, maximum, mean and standard deviation of each band in the rasters."""
+    """Store minimum, maximum, mean and standard deviation of the aligned bands in their files."""
     qa: bool = False
     """Write a raster of quality flags."""
     stac: bool = False

@@ -221,7 +221,8 @@ def align(
     statistics: Annotated[
         bool,
         of_output(
-            "--statistics", help="Store minimum, maximum, mean and standard deviation of each band (gdalinfo -stats)."
+            "--statistics",
+            help="Store minimum, maximum, mean and standard deviation in aligned bands (gdalinfo -stats).",
         ),
     ] = False,
     stac: Annotated[
