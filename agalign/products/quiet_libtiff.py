@@ -9,8 +9,8 @@ from contextlib import contextmanager, suppress
 _LIBTIFF_LINE = re.compile(rb"^_?(?:tiff|TIFF)\w+: .*\n?", re.MULTILINE)
 _MAX_BYTES = 1 << 16
 """Capacity of a pipe on Linux: what exceeds it is lost."""
-_REDIRECTED = threading.Lock()
-"""File descriptor 2 belongs to the process: one thread redirects it at a time."""
+_REDIRECTED = threading.RLock()
+"""File descriptor 2 belongs to the process: one thread redirects it, and others wait before they write."""
 
 
 @contextmanager
@@ -18,10 +18,7 @@ def without_libtiff_messages() -> Iterator[None]:
     """Drop what libtiff prints to standard error inside the block, such as for a full disk; other text is printed at
     its end. `checked_raster` detects and reports the incomplete file itself.
     """
-    if not _REDIRECTED.acquire(blocking=False):
-        yield  # another thread has redirected the descriptor
-        return
-    try:
+    with _REDIRECTED:
         read_end, write_end = os.pipe()
         os.set_blocking(read_end, False)
         os.set_blocking(write_end, False)
@@ -39,5 +36,3 @@ def without_libtiff_messages() -> Iterator[None]:
             os.close(read_end)
             with suppress(OSError):
                 os.write(2, _LIBTIFF_LINE.sub(b"", printed))
-    finally:
-        _REDIRECTED.release()

@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 
 import pytest
 
@@ -22,20 +23,25 @@ def test_an_error_inside_gives_the_descriptor_back(capfd: pytest.CaptureFixture[
     assert capfd.readouterr().err == "after\n"
 
 
-def test_two_threads_do_not_take_the_descriptor_from_each_other(capfd: pytest.CaptureFixture[str]) -> None:
-    inside, done = threading.Event(), threading.Event()
+def test_the_lines_of_two_threads_are_kept_back(capfd: pytest.CaptureFixture[str]) -> None:
+    first_is_inside = threading.Event()
 
-    def writes() -> None:
+    def first() -> None:
         with without_libtiff_messages():
-            inside.set()
-            done.wait(10)
+            first_is_inside.set()
+            time.sleep(0.2)  # the second thread tries to enter
+            os.write(2, b"_tiffWriteProc: File too large.\nkept\n")
 
-    thread = threading.Thread(target=writes)
-    thread.start()
-    inside.wait(10)
-    with without_libtiff_messages():
-        os.write(2, b"kept\n")
-    done.set()
-    thread.join()
+    def second() -> None:
+        first_is_inside.wait(10)
+        with without_libtiff_messages(), without_libtiff_messages():
+            time.sleep(0.4)  # the first thread has left
+            os.write(2, b"_tiffWriteProc: File too large.\nalso kept\n")
+
+    threads = [threading.Thread(target=each) for each in (first, second)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
     os.write(2, b"after\n")
-    assert capfd.readouterr().err == "kept\nafter\n"
+    assert capfd.readouterr().err == "kept\nalso kept\nafter\n"
