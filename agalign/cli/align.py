@@ -1,4 +1,4 @@
-"""The command that aligns a folder, and what `demo` shares with it."""
+"""The command `agalign align`, and options that other commands share with it."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,7 @@ import typer
 
 from agalign.cli.config_file import load_config
 from agalign.cli.terminal import (
-    GOES_ON,
+    INTERRUPTED,
     RAW_NUMBERS,
     LogJson,
     Quiet,
@@ -98,7 +98,7 @@ _EXAMPLES = examples(
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
+    """Add the command to the application."""
     app.command(epilog=_EXAMPLES)(align)
 
 
@@ -271,7 +271,7 @@ def align(
         of_running(min=1, help="Seconds after which a capture is abandoned; by default unlimited."),
     ] = None,
     dry_run: Annotated[bool, of_running("--dry-run", help="Print what would be done, and write nothing.")] = False,
-    config: Annotated[  # noqa: ARG001 - its callback does all
+    config: Annotated[  # noqa: ARG001 - its callback applies the file
         Path | None,
         of_running(
             is_eager=True,
@@ -302,7 +302,7 @@ def align(
 ) -> None:
     """Align every capture below FOLDER."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(terminal, GOES_ON):
+    with exits(terminal, INTERRUPTED):
         check_address_space()
         from agalign.cameras.discover import DiscoverOptions
         from agalign.cli.run import conclude, find_captures, load_ahead, print_plan, run
@@ -318,8 +318,8 @@ def align(
         from agalign.products.stac import need_stac
         from agalign.values.processes import start_server_ahead
 
-        whole = folder.resolve()
-        target = out or whole.parent / f"{whole.name}-aligned"
+        source = folder.resolve()
+        target = out or source.parent / f"{source.name}-aligned"
         settings = Settings(
             seed=SeedSettings(force=None if seed == "auto" else seed, only=only_seed),
             joint=JointSettings(
@@ -350,21 +350,21 @@ def align(
             start_server_ahead("agalign.batch.workers", len(flight.captures), jobs or usable_cores())
         from agalign.batch import RunOptions
 
-        how = RunOptions(
+        run_options = RunOptions(
             overwrite, jobs, align_panels, retry_failed=retry_failed, timeout_s=timeout, command=command_line()
         )
         if index and radiometry == "off" and any(b.dtype[0] in "ui" for c in flight.captures for b in c.bands):
             terminal.problem(RAW_NUMBERS)
         if dry_run:
-            raise typer.Exit(print_plan(flight, target, settings, how, terminal))
-        totals = run(flight, target, settings, terminal, how, dask=dask, model=model)
+            raise typer.Exit(print_plan(flight, target, settings, run_options, terminal))
+        totals = run(flight, target, settings, terminal, run_options, dask=dask, model=model)
         raise typer.Exit(conclude(totals, target, terminal))
 
 
 def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
-    """(band in lower case, reflectance) of a list 'Blue=0.51,NIR=0.49', or of one number for all, with an empty name.
+    """Return (band in lower case, reflectance) from 'Blue=0.51,NIR=0.49', or ("", reflectance) from one number.
 
-    Raises ConfigurationError.
+    Raises ConfigurationError for a reflectance that is not in (0, 1].
     """
     result = []
     for part in band_names(text):
@@ -380,5 +380,5 @@ def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
 
 
 def band_names(text: str | None) -> tuple[str, ...]:
-    """The names in a list separated by commas."""
+    """Return the names in a list separated by commas."""
     return tuple(name.strip() for name in (text or "").split(",") if name.strip())

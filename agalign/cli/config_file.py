@@ -1,4 +1,4 @@
-"""Options from a file: `--config agalign.toml`, with the options' names as keys without the dashes."""
+"""Options from a TOML file (`--config agalign.toml`); its keys are the long options without the leading dashes."""
 
 from difflib import get_close_matches
 from pathlib import Path
@@ -6,12 +6,11 @@ from typing import Any
 
 import typer
 
-_NEVER = {"help", "config", "dry-run"}
-"""Not for a file: they are about one call."""
+_COMMAND_LINE_ONLY = {"help", "config", "dry-run"}
 
 
 def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
-    """Take the file's values as the defaults of the command's options: what the command line says comes first.
+    """Use the values of a file as defaults of the command's options; the command line takes precedence.
 
     Raises BadParameter for a file that is not TOML, and for an unknown key.
     """
@@ -34,14 +33,14 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
             raise typer.BadParameter(f"{path}: no option '{key}'" + (f"; did you mean '{near[0]}'?" if near else ""))
         if isinstance(value, dict) or (isinstance(value, list) and not options[name].multiple):
             raise typer.BadParameter(f"{path}: '{key}' takes one value")
-        # A repeatable option with one value.
-        defaults[options[name].name] = [value] if options[name].multiple and not isinstance(value, list) else value
+        single = options[name].multiple and not isinstance(value, list)
+        defaults[options[name].name] = [value] if single else value
     ctx.default_map = {**(ctx.default_map or {}), **defaults}
     return path
 
 
 def config_text(command: Any) -> str:
-    """A file of all options of a command with their defaults, each as a comment."""
+    """Return a configuration file with all options of a command and their defaults as comments."""
     lines = ["# Options of 'agalign align', for --config. Remove the # in front of what you set."]
     for name, option in _options(command).items():
         lines += ["", f"# {' '.join((option.help or '').split())}", f"# {name} = {_toml(option.default)}"]
@@ -49,9 +48,9 @@ def config_text(command: Any) -> str:
 
 
 def _options(command: Any) -> dict[str, Any]:
-    """The options of a command by their long names without dashes."""
+    """Return the options of a command by their long names without the leading dashes."""
     named = {max(p.opts, key=len).lstrip("-"): p for p in command.params if p.param_type_name == "option"}
-    return {name: option for name, option in named.items() if name not in _NEVER}
+    return {name: option for name, option in named.items() if name not in _COMMAND_LINE_ONLY}
 
 
 def _toml(value: Any) -> str:

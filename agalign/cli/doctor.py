@@ -1,4 +1,4 @@
-"""The command that checks this machine for what the program needs."""
+"""The command `agalign doctor`: checks whether this machine meets the requirements."""
 
 import json
 import os
@@ -21,12 +21,12 @@ EXTRAS = {
     "stac": "STAC items and collections (--stac)",
     "xarray": "a flight as one lazily read Dataset (agalign.open_flight)",
 }
-_LITTLE_DISK_GB = 5.0
+_MIN_FREE_DISK_GB = 5.0
 _GB = 1e9
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
+    """Add the command to the application."""
     app.command()(doctor)
 
 
@@ -77,10 +77,10 @@ def _memory_gb() -> float | None:
 
 
 def _disk(folder: Path) -> dict[str, Any]:
-    here = next((p for p in (folder.absolute(), *folder.absolute().parents) if p.is_dir()), Path.cwd())
+    existing = next((p for p in (folder.absolute(), *folder.absolute().parents) if p.is_dir()), Path.cwd())
     return {
-        "folder": str(here), "free_gb": round(shutil.disk_usage(here).free / _GB, 1),
-        "writable": os.access(here, os.W_OK),
+        "folder": str(existing), "free_gb": round(shutil.disk_usage(existing).free / _GB, 1),
+        "writable": os.access(existing, os.W_OK),
     }  # fmt: skip
 
 
@@ -91,20 +91,20 @@ def _devices() -> list[dict[str, Any]]:
 
 
 def _extras() -> list[dict[str, Any]]:
-    """Of each extra what it adds, and which of its libraries are missing."""
+    """Return the purpose and the missing libraries of each extra."""
     result = []
     for name, adds in EXTRAS.items():
-        missing = [d for d in _needs(name) if _version(d) is None]
+        missing = [d for d in _requirements(name) if _version(d) is None]
         result.append({"extra": name, "adds": adds, "missing": missing})
     return result
 
 
-def _needs(extra: str) -> list[str]:
-    """Distributions that an extra asks for, by the package's own metadata."""
+def _requirements(extra: str) -> list[str]:
+    """Return the distributions that an extra requires, from the metadata of the package."""
     from importlib import metadata
 
-    asked = [r for r in metadata.requires("agalign") or [] if f"extra == '{extra}'" in r.replace('"', "'")]
-    return ["".join(c if c.isalnum() or c in "-_." else " " for c in r).split()[0] for r in asked]
+    requirements = [r for r in metadata.requires("agalign") or [] if f"extra == '{extra}'" in r.replace('"', "'")]
+    return ["".join(c if c.isalnum() or c in "-_." else " " for c in r).split()[0] for r in requirements]
 
 
 def _problems(facts: dict[str, Any]) -> list[str]:
@@ -115,7 +115,7 @@ def _problems(facts: dict[str, Any]) -> list[str]:
     ]
     if not disk["writable"]:
         problems.append(f"{disk['folder']}: may not be written to; choose another folder with -o")
-    if disk["free_gb"] < _LITTLE_DISK_GB:
+    if disk["free_gb"] < _MIN_FREE_DISK_GB:
         problems.append(f"{disk['folder']}: {disk['free_gb']:.1f} GB are free; a thousand captures take 10 GB or more")
     return problems
 
@@ -135,6 +135,6 @@ def _show(facts: dict[str, Any], terminal: Terminal) -> None:
     terminal.result(table)
     table = Table("Extra", "What it adds", "")
     for row in facts["extras"]:
-        how = f"pip install 'agalign[{row['extra']}]'" if row["missing"] else "installed"
-        table.add_row(row["extra"], row["adds"], shown(how))
+        state = f"pip install 'agalign[{row['extra']}]'" if row["missing"] else "installed"
+        table.add_row(row["extra"], row["adds"], shown(state))
     terminal.result(table)

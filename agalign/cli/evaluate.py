@@ -1,4 +1,4 @@
-"""The commands around the paper's experiments: evaluate, surface, and learn."""
+"""The commands for the experiments of Dong et al. (2018): evaluate, surface, and learn."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,7 +22,7 @@ Device = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1 …")]
 
 
 def register(app: typer.Typer) -> None:
-    """Add these commands to the program."""
+    """Add the commands to the application."""
     for command in (evaluate, surface, learn):
         app.command(rich_help_panel="Descriptors")(command)
 
@@ -147,7 +147,7 @@ def learn(
         try:
             joint = JointSettings.model_validate({"sharing": sharing, "device": device, "rng_seed": rng_seed})
         except ValidationError:
-            raise ConfigurationError(f"'{sharing}' is none of siamese, pseudo-siamese, unshared") from None
+            raise ConfigurationError(f"'{sharing}' is unknown; choose from siamese, pseudo-siamese, unshared") from None
         aligned = 0
 
         def on_pair(lesson: Lesson) -> None:
@@ -160,7 +160,7 @@ def learn(
         result = read_rough_pairs(pairs)
         model = learn_descriptor(result, settings, steps_a_pair=steps, on_pair=on_pair)
         save_model(model, out)
-        terminal.event("learnt", f"{out}: learnt from {aligned} of {len(result)} pairs", file=str(out))
+        terminal.event("learnt", f"{out}: learned from {aligned} of {len(result)} pairs", file=str(out))
 
 
 def _shares(text: str) -> tuple[float, ...]:

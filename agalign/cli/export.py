@@ -1,4 +1,4 @@
-"""`agalign export`: what a run has aligned, in the form that another program takes."""
+"""The command `agalign export`: aligned captures in the formats of other programs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +27,7 @@ _MAX_LISTED = 10
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
+    """Add the command to the application."""
     app.command("export", epilog=_EXAMPLES)(export)
 
 
@@ -55,11 +55,11 @@ def export(
     with exits(terminal):
         from agalign.products.export import export as run_export
 
-        whole = out.resolve()
-        folder = target or whole.parent / f"{whole.name}-{program}"
+        run_folder = out.resolve()
+        folder = target or run_folder.parent / f"{run_folder.name}-{program}"
         report = run_export(out, folder, program, copy=copy, source=source)
-        for label, why in report.left_out[:_MAX_LISTED]:
-            terminal.problem(f"{label}: left out: {why}", capture=label)
+        for label, reason in report.left_out[:_MAX_LISTED]:
+            terminal.problem(f"{label}: left out: {reason}", capture=label)
         if len(report.left_out) > _MAX_LISTED:
             terminal.problem(f"{len(report.left_out) - _MAX_LISTED} more captures are left out")
         for line in report.notes:

@@ -1,4 +1,4 @@
-"""`agalign indices`, also called `ndvi`: spectral indices of what a run has aligned."""
+"""The command `agalign indices` (alias `ndvi`): spectral indices of aligned captures."""
 
 import json
 import math
@@ -37,11 +37,11 @@ _EXAMPLES = examples(
     ("agalign indices aligned/ --index ndvi,ndre,savi -o indices/", "three indices, into another folder"),
     ("agalign indices aligned/ --formula 'mine=(N-RE)/(N+RE)'", "a formula of the bands B, G, R, RE and N"),
 )
-_GOES_ON = "interrupted; written indices are kept, and the same command resumes the run"
+_INTERRUPTED = "interrupted; written indices are kept, and the same command resumes the run"
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command, and its older name, to the program."""
+    """Add the command and its alias to the application."""
     app.command("indices", epilog=_EXAMPLES)(indices)
     app.command("ndvi", epilog=_EXAMPLES, hidden=True)(indices)
 
@@ -81,7 +81,7 @@ def indices(
 ) -> None:  # fmt: skip
     """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics."""
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(terminal, _GOES_ON):
+    with exits(terminal, _INTERRUPTED):
         from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run
         from agalign.batch.output_folder import locked
         from agalign.products.index_bands import RAW
@@ -116,16 +116,16 @@ def indices(
 
 
 def chosen_indices(names: str | None, formulas: Sequence[str]) -> "list[Index]":
-    """The indices of a list of names and of formulas; ndvi where neither is given. Raises ConfigurationError."""
+    """Return the indices of a list of names and of formulas; ndvi if neither is given. Raises ConfigurationError."""
     from agalign.errors import ConfigurationError
     from agalign.products.indices import index_named, index_of_formula
 
-    given = (names or ("" if formulas else "ndvi")).split(",")
-    chosen = [index_named(name) for name in given if name.strip()] + [index_of_formula(f) for f in formulas]
-    twice = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
-    if twice or not chosen:
-        what = f"'{twice[0]}' is given twice" if twice else "--index is empty"
-        raise ConfigurationError(f"{what}; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
+    requested = (names or ("" if formulas else "ndvi")).split(",")
+    chosen = [index_named(name) for name in requested if name.strip()] + [index_of_formula(f) for f in formulas]
+    repeated = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
+    if repeated or not chosen:
+        problem = f"'{repeated[0]}' is given twice" if repeated else "--index is empty"
+        raise ConfigurationError(f"{problem}; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
     return chosen
 
 
@@ -147,7 +147,7 @@ def _print(report: "IndexReport", terminal: Terminal) -> None:
 
 
 def _facts(report: "IndexReport") -> dict[str, Any]:
-    """A report as JSON; unknown values are null."""
+    """Return a report as a JSON object; unknown values are null."""
     return {
         "capture": report.capture, "index": report.index, "path": None if report.path is None else str(report.path),
         **report.statistics.as_json(), "raw_numbers": report.raw_numbers, "kept": report.kept,
@@ -156,7 +156,7 @@ def _facts(report: "IndexReport") -> dict[str, Any]:
 
 
 def _rebuild_report(out: Path, terminal: Terminal) -> None:
-    """The report of the run shows the indices."""
+    """Rebuild the report of the run, which shows the indices, if there is one."""
     from agalign.products.report import REPORT_FILE, write_pages
 
     if (out / REPORT_FILE).is_file():
@@ -165,7 +165,7 @@ def _rebuild_report(out: Path, terminal: Terminal) -> None:
 
 @contextmanager
 def _progress(terminal: Terminal, captures: int) -> Iterator[Callable[[str], None]]:
-    """One line on a terminal, nothing elsewhere."""
+    """Show a progress line on a terminal; yield the function that advances it by one capture."""
     if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
         yield lambda _: None
         return
@@ -188,7 +188,7 @@ def _progress(terminal: Terminal, captures: int) -> Iterator[Callable[[str], Non
 
 
 def _table(names: Sequence[str], reports: "Sequence[IndexReport]") -> "Table":
-    """A row per index: the medians of its captures."""
+    """Return a table with a row per index: statistics of the medians of its captures."""
     from statistics import median
 
     from rich.table import Table

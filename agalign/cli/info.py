@@ -1,4 +1,4 @@
-"""The command that shows what was found: the captures of a folder, or what a model contains."""
+"""The command `agalign info`: the captures of a folder, or the contents of a model."""
 
 import json
 from collections import Counter
@@ -37,7 +37,7 @@ _MODEL_SUFFIX = ".safetensors"
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
+    """Add the command to the application."""
     app.command()(info)
 
 
@@ -79,21 +79,21 @@ def info(
         from agalign.flight.panels import with_panels
         from agalign.flight.sky import sky_captures
 
-        wanted = DiscoverOptions(
+        discover_options = DiscoverOptions(
             pattern, reference, ignore_metadata, with_rgb, band_names(bands), order, include=tuple(include or ()),
             exclude=tuple(exclude or ()),
         )  # fmt: skip
-        flight = find_captures(folder, wanted, terminal, silent=as_json, required=False)
+        flight = find_captures(folder, discover_options, terminal, silent=as_json, required=False)
         if not flight.captures and not as_json:
             _show_unused(flight, terminal)
             raise typer.Exit(EXIT_NOTHING)
         sky, others = sky_captures(flight.captures)
-        left_out = {s.capture.label: list(s.cues) for s in sky}
-        in_order = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
+        sky_cues = {s.capture.label: list(s.cues) for s in sky}
+        by_label = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
         unreadable = _unreadable_files(flight)
         rows = [
-            _facts(in_order[c.label])
-            | {"sky": left_out.get(c.label, []), "unreadable_files": [p.name for p in unreadable.get(c.label, [])]}
+            _facts(by_label[c.label])
+            | {"sky": sky_cues.get(c.label, []), "unreadable_files": [p.name for p in unreadable.get(c.label, [])]}
             for c in flight.captures
         ]
         cameras = camera_overviews(flight.captures)
@@ -130,8 +130,8 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
             terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip() + where))
         if row["sky"]:
             terminal.result(shown(f"{row['label']}: shows the sky ({', '.join(row['sky'])}); not aligned"))
-    in_all = sum(len(r["bands"]) for r in rows)
-    parts = counted(len(rows), "capture"), counted(in_all, "band"), counted(problems, "problem")
+    total_bands = sum(len(r["bands"]) for r in rows)
+    parts = counted(len(rows), "capture"), counted(total_bands, "band"), counted(problems, "problem")
     terminal.result(", ".join(parts))
 
 
@@ -140,15 +140,15 @@ def _missing(row: dict[str, Any]) -> list[str]:
 
 
 def _unreadable_files(flight: "FolderScan") -> dict[str, list[Path]]:
-    """The files that cannot be read of each capture, by its label: those with a name that begins like the capture's."""
+    """Return the unreadable files of each capture by label: those with names that begin with the capture's name."""
     result: dict[str, list[Path]] = {}
     for problem in flight.problems:
         if not isinstance(problem.error, UnreadableFileError):
             continue
-        near = [c for c in flight.captures if c.reference.path.parent == problem.path.parent]
-        mine = [c for c in near if problem.path.name.startswith(c.name)]
-        if mine:
-            label = max(mine, key=lambda c: len(c.name)).label
+        in_folder = [c for c in flight.captures if c.reference.path.parent == problem.path.parent]
+        candidates = [c for c in in_folder if problem.path.name.startswith(c.name)]
+        if candidates:
+            label = max(candidates, key=lambda c: len(c.name)).label
             result.setdefault(label, []).append(problem.path)
     return result
 
@@ -170,7 +170,7 @@ def _show_unused(flight: "FolderScan", terminal: Terminal) -> None:
 
 
 def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
-    """Contents of a model. Raises InputError where it is none."""
+    """Print the contents of a model. Raises InputError if the file is not a model."""
     from rich.table import Table
 
     from agalign.flight.model import load_model
@@ -187,10 +187,17 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
         return
     terminal.result(shown(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}"))
     if not rows:
-        terminal.result("no rig: too few captures said something of it")
+        terminal.result("no rig: too few captures were aligned")
         return
     table = Table("Band", title="The rig: offset of each band, and error of its prediction (RMS, px)")
-    for name in ("Offset of the middle", "Baseline", "By bands", "By neighbours", "By the flight", "Lens field up to"):
+    for name in (
+        "Offset at the centre",
+        "Baseline",
+        "By bands",
+        "By neighbours",
+        "By the flight",
+        "Largest lens displacement",
+    ):
         table.add_column(name, justify="right")
     for row in rows:
         (dx, dy), (bx, by) = row["offset_px"], row["baseline"]
@@ -199,11 +206,11 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
         table.add_row(shown(row["band"]), f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field)
     terminal.result(table)
     shared = ", ".join(factors) or "nothing"
-    terminal.result(f"rig learnt on {captures} captures; what the bands of a capture share: {shared}")
+    terminal.result(f"rig learned from {captures} captures; variations that the bands of a capture share: {shared}")
 
 
 def _facts(capture: "Capture") -> dict[str, Any]:
-    """What `info` shows of a capture."""
+    """Return what `info` prints about a capture, as a JSON object."""
     from agalign.capture.tag_seeds import seed_candidates
     from agalign.config import SeedSettings
 

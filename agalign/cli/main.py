@@ -1,4 +1,4 @@
-"""The command line: parses, calls the library, prints."""
+"""The application: its commands and its entry point."""
 
 import json
 import logging
@@ -25,7 +25,7 @@ from agalign.cli.terminal import (
     EXIT_OK,
     EXIT_PARTIAL,
     EXIT_USAGE,
-    GOES_ON,
+    INTERRUPTED,
     LogJson,
     Quiet,
     RngSeed,
@@ -83,7 +83,7 @@ def demo(
     from rich.table import Table
 
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
-    with exits(terminal, GOES_ON):
+    with exits(terminal, INTERRUPTED):
         check_address_space()
         from agalign.batch import CaptureReport, RunOptions, prepare_output
         from agalign.cameras.discover import DiscoverOptions
@@ -98,11 +98,11 @@ def demo(
         flight = find_captures(source, DiscoverOptions(), terminal)
         settings = Settings(joint=JointSettings(device=device, rng_seed=rng_seed))
         reports: list[CaptureReport] = []
-        how = RunOptions(overwrite=True, jobs=jobs)
-        totals = run(flight, target, settings, terminal, how, each=reports.append)
+        options = RunOptions(overwrite=True, jobs=jobs)
+        totals = run(flight, target, settings, terminal, options, each=reports.append)
         reports.sort(key=lambda r: r.label)
-        table = Table("Capture", "Band", "Status", title="Error against the truth, px")
-        for name in ("before", "median", "95 %"):
+        table = Table("Capture", "Band", "Status", title="Error relative to the ground truth, px")
+        for name in ("before", "median", "p95"):
             table.add_column(name, justify="right")
         for s in score_against_truth(reports, truth):
             table.add_row(s.capture, s.band, s.status, f"{s.before_px:.1f}", f"{s.median_px:.3f}", f"{s.p95_px:.3f}")
@@ -176,7 +176,7 @@ _COMMANDS = {command.name or getattr(command.callback, "__name__", "") for comma
 
 
 def main() -> None:
-    """Entry point: a first argument that is not a command is the folder to align."""
+    """Run the application; if the first argument is not a command, it is the folder to align."""
     arguments = sys.argv[1:]
     if arguments and not arguments[0]:
         Terminal(quiet=False, verbose=False, log_json=False).problem("the name of the folder is empty")
@@ -186,9 +186,9 @@ def main() -> None:
         _refuse_misspelt(arguments[0])
         arguments = ["align", *arguments]
     _rename(arguments, "--local", "--relief")
-    _give_value(arguments, "--relief", get_args(ReliefUse), "always")
-    _give_value(arguments, "--radiometry", get_args(RadiometryChoice), "auto")
-    # Threads that spin while they wait cost a multiple of the time where another program wants the same cores.
+    _insert_value(arguments, "--relief", get_args(ReliefUse), "always")
+    _insert_value(arguments, "--radiometry", get_args(RadiometryChoice), "auto")
+    # Threads that spin while they wait slow down other programs on the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # The matrices here are small: a second BLAS thread only spins.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -199,16 +199,16 @@ def main() -> None:
 
 
 def _refuse_misspelt(first: str) -> None:
-    """A word that is nearly a command is a typing error, not a missing folder. Raises SystemExit."""
-    meant = get_close_matches(first, _COMMANDS, 1, cutoff=0.7)
-    if meant and not Path(first).exists():
+    """Raise SystemExit for a misspelt command, instead of reporting a missing folder."""
+    similar = get_close_matches(first, _COMMANDS, 1, cutoff=0.7)
+    if similar and not Path(first).exists():
         terminal = Terminal(quiet=False, verbose=False, log_json=False)
-        terminal.problem(f"'{first}' is neither a command nor a folder; did you mean '{meant[0]}'?")
+        terminal.problem(f"'{first}' is neither a command nor a folder; did you mean '{similar[0]}'?")
         raise SystemExit(EXIT_USAGE)
 
 
 def _refuse_files(arguments: Sequence[str]) -> None:
-    """A glob such as flight/*.tif is expanded by the shell. Raises SystemExit."""
+    """Raise SystemExit for several files instead of a folder: the shell expands a glob such as flight/*.tif."""
     files = [Path(a) for a in arguments if not a.startswith("-") and Path(a).is_file()]
     if len(files) > 1 and Path(arguments[0]) == files[0]:
         terminal = Terminal(quiet=False, verbose=False, log_json=False)
@@ -226,12 +226,12 @@ def _rename(arguments: list[str], old: str, new: str) -> None:
             terminal.problem(f"{old} is deprecated; use {new}")
 
 
-def _give_value(arguments: list[str], option: str, values: Sequence[str], alone: str) -> None:
-    """Options that were flags before they had values may still stand alone."""
+def _insert_value(arguments: list[str], option: str, values: Sequence[str], default: str) -> None:
+    """Insert the default value of an option that may be given as a flag, without a value."""
     if option in arguments:
         after = arguments.index(option) + 1
         if arguments[after : after + 1] not in [[value] for value in values]:
-            arguments.insert(after, alone)
+            arguments.insert(after, default)
 
 
 def _is_root_option(argument: str) -> bool:

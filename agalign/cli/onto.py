@@ -1,4 +1,4 @@
-"""`agalign onto`: georeferenced mosaics of other dates or sensors, aligned to the grid of one of them."""
+"""The command `agalign onto`: align georeferenced mosaics of other dates or sensors to the grid of a reference."""
 
 from pathlib import Path
 from typing import Annotated
@@ -74,11 +74,11 @@ def onto(
         )
         flight = FolderScan(reference.parent, tuple(captures_onto(reference, moving, band, max_pixels)), ())
         for capture in flight.captures:
-            apart_km = distance_km(capture.reference, capture.moving[0])
-            if apart_km:
+            offset_km = distance_km(capture.reference, capture.moving[0])
+            if offset_km:
                 path = capture.moving[0].path
                 terminal.problem(
-                    f"{path}: is {apart_km:,.1f} km away from the reference, by its coordinates", file=path
+                    f"{path}: is {offset_km:,.1f} km away from the reference, by its coordinates", file=path
                 )
         totals = run(flight, target, settings, terminal, RunOptions(overwrite, jobs=jobs, align_panels=True))
         raise typer.Exit(conclude(totals, target, terminal))

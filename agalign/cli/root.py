@@ -1,5 +1,5 @@
-"""The commands as a group: their list in plain text, as typer's panels take as long to load as all else, and wrong
-arguments in one line.
+"""The root command group: help as plain text, because typer's panels double the start-up time, and usage errors in one
+line.
 """
 
 import re
@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 from agalign.cli.terminal import EXIT_USAGE
 
 _UsageError: Any = typer.BadParameter.__mro__[1]
-"""Of typer or of click, wherever typer takes it from."""
+"""The class of click, or of the copy of click in typer."""
 _REWORDED = (
     (r"Value error, ", ""),
     (r"Input should be a valid integer.*", "give a whole number"),
@@ -25,12 +25,12 @@ _REWORDED = (
     (r" is not one of ", " is unknown; choose from "),
     (r"\.$", ""),
 )
-"""What libraries call wrong values, and in words of the command line."""
+"""Patterns in messages of pydantic and click about wrong values, and their replacements."""
 _PANEL = "rich_help_panel"
 
 
 class RootGroup(TyperGroup):
-    """The commands by panel, without colours; the commands' own help has typer's look."""
+    """Root group with a list of commands by panel as plain text; the help of each command is typer's."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the options before the command."""
@@ -58,7 +58,7 @@ class RootGroup(TyperGroup):
             formatter.write(f"{line.replace('[bold]', '  ').replace('[/]', '')}\n")
 
     def _commands(self, ctx: Any) -> dict[str, list[tuple[str, str]]]:
-        """(name, what it does) of the commands by panel, in the order of the first command of each."""
+        """Return (name, short help) of the commands by panel, in the order of the first command of each."""
         panels: dict[str, list[tuple[str, str]]] = {}
         for name in self.list_commands(ctx):
             command = self.get_command(ctx, name)
@@ -71,7 +71,7 @@ class RootGroup(TyperGroup):
 
 @contextmanager
 def _in_one_line(ctx: Any) -> Iterator[None]:
-    """Print what is wrong with arguments in one line, and exit with code 2."""
+    """Print usage errors in one line, and exit with code 2."""
     try:
         yield
     except _UsageError as error:

@@ -1,4 +1,4 @@
-"""A flight aligned from the command line, with a progress line, reports of captures and a summary."""
+"""Aligning a flight from the command line: progress line, reports of captures, and summary."""
 
 import gc
 import re
@@ -29,13 +29,16 @@ if TYPE_CHECKING:
     from agalign.values.capture import Capture
 
 _MAX_LISTED_FILES = 10
-"""Of those with the same problem."""
+"""Maximum number of listed files with the same problem."""
 
 
 def find_captures(
     folder: Path, options: "DiscoverOptions", terminal: Terminal, *, silent: bool = False, required: bool = True
 ) -> "FolderScan":
-    """The captures below a folder; prints what is wrong with its files. Raises where there is none, if `required`."""
+    """Return the captures below a folder, and print problems of its files.
+
+    Raises InputError or NoSuchBandError if there are no captures and they are `required`.
+    """
     from agalign.cameras.discover import discover
     from agalign.errors import InputError
 
@@ -72,14 +75,14 @@ def _eight_bit_note(flight: "FolderScan") -> str:
 
 
 def print_problems(flight: "FolderScan", terminal: Terminal) -> None:
-    """Print what is wrong with the files: at most `_MAX_LISTED_FILES` lines for each cause, and how many more it has.
+    """Print the problems of files: at most `_MAX_LISTED_FILES` lines per cause, and the number of further files.
 
-    With --log-json there is a line for each file.
+    With --log-json, print a line for each file.
     """
     counts: Counter[str] = Counter()
     listed: dict[str, str] = {}
     for problem in flight.problems:
-        # Sizes and numbers differ between files with the same cause.
+        # Group by message without numbers, because sizes differ between files with the same cause.
         cause = re.sub(r"\d+", "0", problem.text.replace(str(problem.path), "").replace(problem.path.name, ""))
         counts[cause] += 1
         if terminal.log_json or counts[cause] <= _MAX_LISTED_FILES:
@@ -93,12 +96,12 @@ def print_problems(flight: "FolderScan", terminal: Terminal) -> None:
             )
 
 
-def print_plan(flight: "FolderScan", out: Path, settings: "Settings", how: "RunOptions", terminal: Terminal) -> int:
-    """Print what a run would do with each capture, without doing it; return the exit code."""
+def print_plan(flight: "FolderScan", out: Path, settings: "Settings", options: "RunOptions", terminal: Terminal) -> int:
+    """Print what a run would do with each capture; return the exit code."""
     from agalign.batch.run import plan_run
     from agalign.flight.overview import camera_overviews
 
-    states = plan_run(flight, out, settings, how)
+    states = plan_run(flight, out, settings, options)
     for camera in camera_overviews(flight.captures):
         terminal.result(shown(camera.text))
     counts = Counter(states.values())
@@ -110,16 +113,15 @@ def print_plan(flight: "FolderScan", out: Path, settings: "Settings", how: "RunO
 
 
 def load_ahead() -> None:
-    """Begin to import torch and the other large libraries, which takes two seconds, while the files are read.
+    """Import torch and other large libraries in a thread, which takes two seconds, while the files are read.
 
-    The garbage collector pauses meanwhile, and later ignores what was imported: it would spend half a second on a
-    million objects that stay until the end.
+    The garbage collector is paused during the imports, and later ignores their million objects, which saves 0.5 s.
     """
     limit_default_threads()
 
     def load() -> None:
         gc.disable()
-        with suppress(Exception):  # reported by what needs it
+        with suppress(Exception):  # reported at the next import
             import_module("agalign.batch.run")
         gc.freeze()
         gc.enable()
@@ -135,30 +137,30 @@ def _no_failures() -> "FailureGroups":
 
 @dataclass
 class BandTotals:
-    """One band in all captures of a run."""
+    """Results of one band in all captures of a run."""
 
     statuses: Counter[str] = field(default_factory=Counter)
     residuals_px: list[float] = field(default_factory=list)
-    """Of those that are aligned."""
+    """Median residuals of the aligned pairs."""
     seconds: list[float] = field(default_factory=list)
 
 
 @dataclass
 class RunTotals:
-    """What a run has come to so far: sums, so that a season needs no more memory than a capture."""
+    """Totals of a run so far; reports are not kept, which limits memory."""
 
     states: Counter[str] = field(default_factory=Counter)
     bands: dict[str, BandTotals] = field(default_factory=dict)
     useful: bool = False
-    """Some band pair is aligned or predicted."""
+    """At least one band pair is aligned or predicted."""
     good: bool = True
-    """Nothing is left to be wished for, of captures, of files that were found and of the report."""
+    """All captures are good, no file has a problem, and the report is written."""
     radiometry: Counter[str] = field(default_factory=Counter)
-    """What was made of raw numbers, and in how many captures."""
+    """Number of captures by the quantity that raw numbers were converted to."""
     failures: "FailureGroups" = field(default_factory=_no_failures)
 
     def add(self, report: "CaptureReport") -> None:
-        """One capture more."""
+        """Add the report of a capture."""
         self.states[report.state] += 1
         self.useful |= report.useful
         self.good &= report.good
@@ -179,18 +181,21 @@ class RunTotals:
 
 
 def run(
-    flight: "FolderScan", out: Path, settings: "Settings", terminal: Terminal, how: "RunOptions", *,
+    flight: "FolderScan", out: Path, settings: "Settings", terminal: Terminal, options: "RunOptions", *,
     dask: str | None = None, model: Path | None = None, each: "Callable[[CaptureReport], None]" = lambda _: None,
 ) -> RunTotals:  # fmt: skip
-    """Align the captures, saying how far it has come. Raises OutputError or WorkerError where nothing could be done."""
+    """Align the captures, print progress, and return the totals.
+
+    Raises OutputError or WorkerError if no capture could be processed.
+    """
     from agalign.batch import Listener, run_flight
     from agalign.batch.workers import dask_executor
 
     totals = RunTotals(good=not flight.problems)
     started = time.monotonic()
-    cluster = nullcontext() if dask is None else dask_executor(dask, how.jobs, how.timeout_s)
+    cluster = nullcontext() if dask is None else dask_executor(dask, options.jobs, options.timeout_s)
     with cluster as executor, _progress(terminal, len(flight.captures)) as show:
-        options = replace(how, executor=executor)
+        options = replace(options, executor=executor)
         current: Capture | None = None
 
         def on_start(capture: "Capture") -> None:
@@ -209,9 +214,9 @@ def run(
             terminal.check()
             assert current is not None
             names = [b.name for b in current.moving]
-            place = names.index(band) if band in names else len(names)
-            behind = place + (0.85 * share if stage in ("learning", "refining") else 0.0)
-            show(totals, behind / max(len(names), 1), f"{current.label} {band}: {stage}")
+            index = names.index(band) if band in names else len(names)
+            finished = index + (0.85 * share if stage in ("learning", "refining") else 0.0)
+            show(totals, finished / max(len(names), 1), f"{current.label} {band}: {stage}")
 
         try:
             listener = Listener(on_start, on_pair, on_learning, on_learnt)
@@ -227,7 +232,7 @@ def run(
             terminal.problem(str(error))
             totals.good = False
         finally:
-            # Also after an interruption: what is finished is reported.
+            # Also after an interruption.
             if totals.states:
                 totals.good &= _write_pages(out, terminal, changed=set(totals.states) != {"kept"})
     seconds = time.monotonic() - started
@@ -236,7 +241,7 @@ def run(
 
 
 def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
-    """False where they could not be written, or lack a file that cannot be read."""
+    """Write report and summary; return False if that fails, or if a sidecar cannot be read."""
     from agalign.products.report import pages_exist, write_pages
 
     problems: list[str] = []
@@ -252,8 +257,9 @@ def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
 
 @contextmanager
 def _progress(terminal: Terminal, captures: int) -> Iterator[Callable[[RunTotals, float, str], None]]:
-    """One line for the whole flight on a terminal, nothing elsewhere: there each capture prints a plain line. It is
-    given what is done, the share of the capture that is worked on, and what is done to which.
+    """Show a progress line on a terminal; yield the function that updates it.
+
+    Its arguments are the totals, the finished share of the current capture, and a description.
     """
     if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
         yield lambda _outcome, _share, _text: None
@@ -280,18 +286,18 @@ def _progress(terminal: Terminal, captures: int) -> Iterator[Callable[[RunTotals
 
 @dataclass
 class _Pace:
-    """How many captures are done in a minute; kept ones do not count, nor does the learning before."""
+    """Captures per minute, without kept captures and the time for learning."""
 
     since: float = field(default_factory=time.monotonic)
     before: int = 0
 
     def of(self, states: Counter[str]) -> str:
-        """As text, empty while nothing is known."""
+        """Return the rate as text; empty until it is known."""
         done = states.total() - states["kept"] - states["panel"] - states["sky"]
         if done == 0:
             self.since = time.monotonic()
             return ""
-        # What was finished first was begun before anybody counted.
+        # Captures that finish first were started before the clock.
         if self.before == 0:
             self.before, self.since = done, time.monotonic()
         seconds = time.monotonic() - self.since
@@ -299,13 +305,13 @@ class _Pace:
 
 
 def _print_report(report: "CaptureReport", terminal: Terminal, number: int, count: int) -> None:
-    """Print a finished capture, and log it: with its stages and pairs where that is asked for."""
-    place = f"[{number}/{count}] {report.label}"
+    """Print or log a finished capture: its stages with --log-json, its pairs also with --verbose."""
+    heading = f"[{number}/{count}] {report.label}"
     if report.panel is not None:
-        terminal.event("panel", f"{place}: {report.panel}", capture=report.label, panel=report.panel)
+        terminal.event("panel", f"{heading}: {report.panel}", capture=report.label, panel=report.panel)
         return
     if report.sky is not None:
-        terminal.event("sky", f"{place}: {report.sky}", capture=report.label, sky=report.sky)
+        terminal.event("sky", f"{heading}: {report.sky}", capture=report.label, sky=report.sky)
         return
     for text in report.problems:
         terminal.problem(f"{report.label}: {text}", capture=report.label)
@@ -317,21 +323,21 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
         return
     pairs = [b for b in report.result.bands if b.status != "reference"]
     if terminal.verbose or terminal.log_json or not terminal.err.is_terminal:
-        _print_capture(report, report.result, pairs, terminal, place)
+        _print_capture(report, report.result, pairs, terminal, heading)
     if terminal.verbose or terminal.log_json:
         for band in pairs:
             _print_pair(report.label, band, terminal)
 
 
 def _print_capture(
-    report: "CaptureReport", result: "CaptureResult", pairs: "Sequence[BandResult]", terminal: Terminal, place: str
+    report: "CaptureReport", result: "CaptureResult", pairs: "Sequence[BandResult]", terminal: Terminal, heading: str
 ) -> None:
     aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
     also = f", {predicted} predicted" if predicted else ""
     kept = ", kept from an earlier run" if report.state == "kept" else ""
     seconds = sum(b.seconds for b in pairs)
     terminal.event(
-        "capture", f"{place}: {aligned} of {len(pairs)} aligned{also}, {seconds:.1f} s{kept}",
+        "capture", f"{heading}: {aligned} of {len(pairs)} aligned{also}, {seconds:.1f} s{kept}",
         capture=report.label, state=report.state, status=result.status, aligned=aligned, predicted=predicted,
         pairs=len(pairs), seconds=round(report.seconds, 3),
     )  # fmt: skip
@@ -350,16 +356,16 @@ def _print_pair(capture: str, band: "BandResult", terminal: Terminal) -> None:
 
 
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
-    """Print the closing table and what failed; return the exit code."""
+    """Print the table of bands and the failures; return the exit code."""
     if totals.bands:
         terminal.result(_table(totals))
     explain(totals.failures.groups(), terminal)
-    for made, count in totals.radiometry.items():
-        terminal.result(shown(f"Written as {made}: {counted(count, 'capture')}"))
+    for quantity, count in totals.radiometry.items():
+        terminal.result(shown(f"Written as {quantity}: {counted(count, 'capture')}"))
     terminal.result(shown(f"Report: {out / 'index.html'}"))
     if totals.states and set(totals.states) <= {"panel", "sky"}:
-        what = " or the sky" if totals.states["sky"] else ""
-        terminal.problem(f"all captures show calibration panels{what}; --align-panels aligns them like any other")
+        or_sky = " or the sky" if totals.states["sky"] else ""
+        terminal.problem(f"all captures show calibration panels{or_sky}; --align-panels aligns them like any other")
         return EXIT_NOTHING
     if not totals.useful:
         terminal.problem("no band pair could be aligned" if totals.bands else "no capture could be processed")
@@ -368,7 +374,7 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
 
 
 def _table(totals: RunTotals) -> Table:
-    """A row per band: how many pairs have each status, residuals, time."""
+    """Return a table with a row per band: number of pairs by status, residuals, time."""
     from statistics import median
 
     statuses = sum((band.statuses for band in totals.bands.values()), Counter[str]())

@@ -1,4 +1,4 @@
-"""How the commands speak: results, progress, complaints and exit codes."""
+"""Output of the commands: results, progress, problems, signals and exit codes."""
 
 import io
 import json
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL = 0, 1, 2, 3
-_SIGNALLED = 128
-"""What shells add to the number of the signal that ended a program: 130 for the interrupt key, 143 for a request."""
+_SIGNAL_EXIT_CODE = 128
+"""Added to the number of the signal that ended the program, as shells do: 130 for SIGINT, 143 for SIGTERM."""
 _PLAIN_WIDTH = 160
-GOES_ON = "interrupted; finished captures are kept, and the same command resumes the run"
+INTERRUPTED = "interrupted; finished captures are kept, and the same command resumes the run"
 RAW_NUMBERS = (
     "the bands are raw numbers, not reflectance: their indices are not comparable between captures or cameras, and are "
     "far from the indices of reflectance; align with --radiometry auto where the camera's tags allow it"
 )
 _OUT_OF_MEMORY = "out of memory; close other programs or try a smaller image"
-_ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
-"""As far as the system has them."""
+_STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+"""Signals that end the program; not every system has all of them."""
 
 
 class Stopped(KeyboardInterrupt):
-    """Somebody wants the program to end."""
+    """A signal requests the end of the program."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -46,19 +46,19 @@ class Stopped(KeyboardInterrupt):
 
 
 def command_line() -> str:
-    """What the user typed, as a shell would take it."""
+    """Return the command line, quoted for a shell."""
     return shlex.join(["agalign", *sys.argv[1:]])
 
 
 def shown(text: str) -> str:
-    """A text from outside as rich prints it: no markup, nothing that a terminal acts on."""
+    """Return an external text for rich, with markup and control characters escaped."""
     from rich.markup import escape
 
     return escape(harmless(text))
 
 
 def in_json(value: Any) -> Any:
-    """A field's value; JSON has no nan and no infinity, which become words."""
+    """Return a value for JSON; nan and infinity, which JSON lacks, become strings."""
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -66,17 +66,17 @@ def _console(**options: Any) -> "Console":
     """A console that ignores a closed pipe (`| head -1`): the run continues without printing."""
     from rich.console import Console
 
-    class Unbroken(Console):
+    class PipeConsole(Console):
         def on_broken_pipe(self) -> None:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self.file.fileno())
-            os.close(nowhere)
+            null_device = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null_device, self.file.fileno())
+            os.close(null_device)
 
-    return Unbroken(highlight=False, emoji=False, **options)
+    return PipeConsole(highlight=False, emoji=False, **options)
 
 
 class Terminal:
-    """How the program speaks: results to standard output, progress and complaints to standard error."""
+    """Prints results to standard output, progress and problems to standard error."""
 
     def __init__(self, *, quiet: bool, verbose: bool, log_json: bool) -> None:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
@@ -86,7 +86,7 @@ class Terminal:
         self.err = _console(stderr=True, soft_wrap=not sys.stderr.isatty())
 
     def event(self, kind: str, text: str = "", /, **fields: Any) -> None:
-        """One line of progress: JSON with --log-json, else the text unless --quiet."""
+        """Print a line of progress: JSON with --log-json, else the text unless --quiet."""
         if self.log_json:
             line = json.dumps({"event": kind, **{k: in_json(v) for k, v in fields.items()}}, default=str)
             try:
@@ -97,7 +97,7 @@ class Terminal:
             self.err.print(shown(text))
 
     def problem(self, text: str, more: Sequence[str] = (), /, **fields: Any) -> None:
-        """A complaint: shown even with --quiet, with further lines for who reads it."""
+        """Print a problem, also with --quiet, followed by indented lines of details."""
         if self.log_json:
             self.event("problem", message=text, **fields)
             return
@@ -106,32 +106,32 @@ class Terminal:
             self.err.print(f"    {shown(line)}")
 
     def result(self, thing: Any) -> None:
-        """A result on standard output, unless --quiet."""
+        """Print a result to standard output, unless --quiet or --log-json."""
         if not self.quiet and not self.log_json:
             self.out.print(thing)
 
     def check(self) -> None:
-        """Raises Stopped once somebody wanted the program to end: what a signal raises is lost where it falls into a
-        callback from a C library.
+        """Raise Stopped if a signal has requested the end: an exception from a signal handler is lost in callbacks of C
+        libraries.
         """
         if self._stopped_by is not None:
             raise Stopped(self._stopped_by)
 
     @contextmanager
     def stoppable(self) -> Iterator[None]:
-        """Signals that end a program raise Stopped inside; the second one ends it at once."""
+        """Raise Stopped in the block at the first signal; the second one ends the process at once."""
 
         def stop(number: int, _frame: object) -> None:
             if self._stopped_by is not None:
-                os._exit(_SIGNALLED + number)
+                os._exit(_SIGNAL_EXIT_CODE + number)
             self._stopped_by = number
             raise Stopped(number)
 
         before = {}
         if threading.current_thread() is threading.main_thread():
-            for name in _ENDING:
+            for name in _STOP_SIGNALS:
                 number = getattr(signal, name, None)
-                # Who started the program may want it to outlive his terminal: nohup.
+                # With nohup, SIGHUP stays ignored.
                 if number is not None and (name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN):
                     before[number] = signal.signal(number, stop)
         try:
@@ -146,11 +146,11 @@ of_alignment = partial(typer.Option, rich_help_panel="Alignment")
 of_output = partial(typer.Option, rich_help_panel="Output")
 of_running = partial(typer.Option, rich_help_panel="Running")
 of_expert = partial(typer.Option, rich_help_panel="Expert")
-"""An option in the panel of the help that it belongs to."""
+"""Options for one panel of the help."""
 
 
 def examples(*lines: tuple[str, str]) -> str:
-    """Commands and what they do, as the end of a help text."""
+    """Return the epilog of a help text from (command, description)."""
     quoted = [(command.replace("[", r"\["), what.replace("[", r"\[")) for command, what in lines]
     return "\n\n".join(["Examples:", *(f"[bold]{command}[/]  {what}" for command, what in quoted)])
 
@@ -165,17 +165,17 @@ LogJson = Annotated[bool, of_running("--log-json", help="Print one JSON object p
 
 @contextmanager
 def exits(terminal: Terminal, on_interrupt: str = "interrupted") -> Iterator[None]:
-    """Turns what can go wrong into one line and an exit code."""
+    """Convert exceptions in the block to one line and an exit code."""
     try:
         with terminal.stoppable():
             yield
     except typer.Exit:
         raise
     except BaseException as error:
-        code, text = _ending(error, on_interrupt)
+        code, text = _exit_code(error, on_interrupt)
         if code is None:
             raise
-        with suppress(OSError):  # of a full disk, the terminal's too
+        with suppress(OSError):  # standard error may be a file on a full disk
             if terminal.verbose and code == EXIT_NOTHING and not isinstance(error, AgalignError):
                 from rich.markup import escape
 
@@ -184,13 +184,13 @@ def exits(terminal: Terminal, on_interrupt: str = "interrupted") -> Iterator[Non
         raise typer.Exit(code) from None
 
 
-def _ending(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:
-    """(exit code, the line that says why); no code for what is not ours to catch."""
+def _exit_code(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:
+    """Return (exit code, message) for an exception; no code for exceptions that are not caught."""
     match error:
         case Stopped():
-            return _SIGNALLED + error.number, on_interrupt
+            return _SIGNAL_EXIT_CODE + error.number, on_interrupt
         case KeyboardInterrupt():
-            return _SIGNALLED + signal.SIGINT, on_interrupt
+            return _SIGNAL_EXIT_CODE + signal.SIGINT, on_interrupt
         case ConfigurationError():
             return EXIT_USAGE, str(error)
         case AgalignError():
@@ -208,8 +208,8 @@ def _ending(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:
 
 @contextmanager
 def printed() -> Iterator[None]:
-    """What is printed inside is out before the program ends, whatever the terminal's letters. Raises SystemExit where
-    it cannot be.
+    """Flush standard output after the block, and escape characters that its encoding lacks. Raises SystemExit if it
+    cannot be written.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

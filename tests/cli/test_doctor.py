@@ -36,8 +36,8 @@ def test_it_names_every_extra_that_a_user_may_want() -> None:
     offered = set(metadata.metadata("agalign").get_all("Provides-Extra") or [])
     assert offered - {"bench", "dev", "docs", "fuzz"} == set(doctor.EXTRAS)
     for extra in doctor.EXTRAS:
-        assert doctor._needs(extra), "what an extra needs is found in the package's own metadata"
-        assert all(re.fullmatch(r"[\w.-]+", name) for name in doctor._needs(extra))
+        assert doctor._requirements(extra), "what an extra needs is found in the package's own metadata"
+        assert all(re.fullmatch(r"[\w.-]+", name) for name in doctor._requirements(extra))
 
 
 def test_what_is_in_the_way_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
