@@ -334,10 +334,9 @@ def _print_capture(
 ) -> None:
     aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
     also = f", {predicted} predicted" if predicted else ""
-    kept = ", kept from an earlier run" if report.state == "kept" else ""
-    seconds = sum(b.seconds for b in pairs)
+    how = "kept from an earlier run" if report.state == "kept" else f"{report.seconds:.1f} s"
     terminal.event(
-        "capture", f"{heading}: {aligned} of {len(pairs)} aligned{also}, {seconds:.1f} s{kept}",
+        "capture", f"{heading}: {aligned} of {len(pairs)} aligned{also}, {how}",
         capture=report.label, state=report.state, status=result.status, aligned=aligned, predicted=predicted,
         pairs=len(pairs), seconds=round(report.seconds, 3),
     )  # fmt: skip
