@@ -92,11 +92,11 @@ _OTHER_MODULES = {
     "agalign.values.alignment": ("Alignment", "Prediction", "Residual", "Seed"),
     "agalign.values.pixel_units": ("FixedFilePx", "FixedImagePx", "MovingFilePx"),
 }
-"""Where the public names are defined that are neither settings nor errors."""
+"""Modules of the public names that are neither settings nor errors."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import what defines a public name when it is first used (PEP 562): importing torch takes seconds."""
+    """Import the module of a public name at its first use (PEP 562): importing torch takes seconds."""
     if name not in __all__:
         raise AttributeError(f"module 'agalign' has no attribute '{name}'")
     rest = "agalign.config" if name.endswith("Settings") else "agalign.errors"

@@ -1,4 +1,4 @@
-"""The program's entry: `agalign`, and `python -m agalign`."""
+"""Entry point of `agalign` and `python -m agalign`."""
 
 import os
 import sys
@@ -8,7 +8,7 @@ def main() -> None:
     """Run the command line."""
     _open_missing_streams()
     try:
-        # What it needs takes a moment to load, in which the interrupt key may come.
+        # Inside the try block, because the import takes time, in which SIGINT may arrive.
         from agalign.cli.main import main as command_line
 
         command_line()
@@ -17,12 +17,12 @@ def main() -> None:
 
 
 def _open_missing_streams() -> None:
-    """Standard streams that the caller closed (`>&-`) lead nowhere, before an output file can take their numbers."""
+    """Open the null device for standard streams that the caller closed (`>&-`), so that no file gets their numbers."""
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(number)
         except OSError:
-            # The lowest free number is taken: those below are open.
+            # `os.open` returns the lowest free descriptor, which is `number`.
             os.open(os.devnull, os.O_RDWR)
             setattr(sys, name, os.fdopen(number, mode))
 

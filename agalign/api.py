@@ -58,19 +58,19 @@ def align(
 
     Returns an Alignment. Its `fixed_to_moving` (3x3) maps a pixel of `fixed` to a pixel of `moving`: x right, y down,
     (0, 0) the centre of the top-left pixel. Check its `status`: only `aligned` has passed verification. With
-    `predicted`, the mapping is extrapolated over a part of the image that shows nothing, with the standard error
+    `predicted`, the mapping is extrapolated over a part of the image without measurements, with the standard error
     `prediction.std_px`; apply `field` before the homography. With `seed_only` and `failed`, the homography is that of
     the seed. `reason` explains each of the three.
     Raises InputError for arrays that are not images, GeometryError for a seed that is not a homography.
     """
     settings = settings or Settings()
-    one = raster_of(fixed, fixed_valid, "fixed")
-    other = raster_of(moving, moving_valid, "moving")
-    candidates: Candidates = {"identity": geometry.overlay(one.size_px, other.size_px)}
+    fixed_raster = raster_of(fixed, fixed_valid, "fixed")
+    moving_raster = raster_of(moving, moving_valid, "moving")
+    candidates: Candidates = {"identity": geometry.overlay(fixed_raster.size_px, moving_raster.size_px)}
     if seed is not None:
         candidates = {"user": geometry.normalised(seed)}
-    known: dict[SeedKind, FixedImagePx] = {} if seed_std_px is None else {"user": FixedImagePx(seed_std_px)}
-    pair = BandPair.of_images("moving", one, other, candidates, known)
+    seed_std: dict[SeedKind, FixedImagePx] = {} if seed_std_px is None else {"user": FixedImagePx(seed_std_px)}
+    pair = BandPair.of_images("moving", fixed_raster, moving_raster, candidates, seed_std)
     result = without_extrapolated([pair], align_pairs([pair], settings, quiet))
     return with_metrics(result["moving"], pair)
 
@@ -93,8 +93,8 @@ def warp_onto(
     mask = np.ones(pixels.shape, bool) if valid is None else np.asarray(valid, bool)
     mapping = PixelMapping(geometry.normalised(fixed_to_moving))
     positions = mapping.positions(Tile(0, 0, *fixed_size_px))
-    end = pixels.shape[1], pixels.shape[0]
-    return resample(pixels, mask, positions, end, (0, 0), interpolation)
+    size_px = pixels.shape[1], pixels.shape[0]
+    return resample(pixels, mask, positions, size_px, (0, 0), interpolation)
 
 
 def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureOutcome:

@@ -1,7 +1,7 @@
-"""What a user chooses: one frozen, validated object for each stage.
+"""Settings: one immutable, validated model for each stage.
 
-An unknown name or an impossible value raises pydantic's ValidationError. docs/options.md lists all settings. Other
-numbers that decide something are constants in the module that uses them, with their reasons.
+An unknown name or an invalid value raises pydantic's ValidationError. docs/options.md lists all settings. Other
+parameters are constants in the modules that use them, with their reasons.
 """
 
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ class Stage(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Print only what differs from the defaults."""
+        """Return the fields that differ from their defaults."""
         for name, field in type(self).model_fields.items():
             if (value := getattr(self, name)) != field.get_default():
                 yield name, value

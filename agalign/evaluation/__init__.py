@@ -1,1 +1,3 @@
-"""The paper's experiments on pairs of images: descriptors and homographies compared, and one learnt from many pairs."""
+"""The experiments of Dong et al. (2018) on image pairs: comparison of descriptors and homographies, and learning from
+many pairs.
+"""

@@ -1,4 +1,4 @@
-"""Pairs of images and the homography between them, in the layouts in which people have them."""
+"""Image pairs with their homographies, in the layouts of public data sets."""
 
 import csv
 import re
@@ -16,33 +16,33 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
 _HPATCHES_LEVELS = {2: "easy", 3: "easy", 4: "hard", 5: "hard", 6: "tough"}
-"""By the number of the second image: the sequences are ordered by difficulty."""
+"""Difficulty by the number of the second image."""
 _HPATCHES_KINDS = {"i": "illumination", "v": "viewpoint"}
 _IMAGE_TYPES = (".ppm", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
 
 
 @dataclass(frozen=True)
 class PairFiles:
-    """Where two images of one plane are, and the homography between them."""
+    """Files of two images of one plane, and the homography between them."""
 
     name: str
     group: str
-    """What its results are averaged with."""
+    """Group of pairs whose results are averaged."""
     fixed: Path
     moving: Path
     fixed_to_moving: Matrix | None
-    """px, pixel centres at integers; the truth or, to learn from, a rough one. None where it is not known."""
+    """Ground truth, or an approximation for learning; px, pixel centres at integers. None if it is unknown."""
 
 
 def find_pairs(source: Path) -> list[PairFiles]:
-    """The pairs of a CSV file, or of a folder in the HPatches or the Oxford layout, its sub-folders included.
+    """Return the pairs of a CSV file, or of a folder and its subfolders in the HPatches or Oxford layout.
 
     * HPatches: `i_NAME` and `v_NAME` with 1.ppm ... 6.ppm and H_1_2 ... H_1_6.
     * Oxford: any folder with img1.png ... imgK.png and H1to2p ... H1toKp; the group is the folder's name.
-    * CSV: columns fixed and moving and, where known, homography (a text file of 9 numbers, or the numbers themselves),
+    * CSV: columns fixed and moving, and optionally homography (a text file of 9 numbers, or the numbers themselves),
       name and group; paths are relative to the CSV file.
 
-    Raises InputError, naming the file, where there are none or a homography cannot be read.
+    Raises InputError with the file's name if there are no pairs or a homography cannot be read.
     """
     if source.is_file():
         result = list(_from_csv(source))

@@ -1,4 +1,4 @@
-"""Automatic descriptor learning: pairs are aligned without labels, and those that pass the checks teach one network.
+"""Descriptor learning without labels: pairs are aligned, and one network is trained on those that pass verification.
 
 The keypoints are SIFT's, the positives their patches warped by the estimated homographies (paper, Sec. 6.2).
 """
@@ -35,7 +35,7 @@ _MOVING_BAND = "moving"
 
 @dataclass(frozen=True)
 class Lesson:
-    """What became of a pair: whether it was aligned, and so teaches."""
+    """Result of aligning a training pair; the network is trained on pairs with status `aligned`."""
 
     name: str
     status: str
@@ -53,9 +53,9 @@ def learn_descriptor(
     pairs: Sequence[BandPair], settings: Settings, *, steps_a_pair: int = 200,
     on_pair: Callable[[Lesson], None] = lambda _: None,
 ) -> FlightModel:  # fmt: skip
-    """One network for all pairs; their fixed images have the same channels, and so do their moving images.
+    """Return a model with one network for all pairs, which must have the same numbers of channels.
 
-    Raises InputError where no pair can be aligned or their channels differ.
+    Raises InputError if no pair can be aligned or their channels differ.
     """
     channels = {(p.fixed.channels, p.moving.channels) for p in pairs}
     if len(channels) > 1:
@@ -87,7 +87,7 @@ def _example(state: JointState, pair: BandPair, fixed_to_moving: Matrix) -> _Exa
 
 
 def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, steps: int) -> None:
-    """Theta by Adam with psi known, a pair at a time; the rate falls to nothing along a cosine."""
+    """Optimise theta with Adam and fixed psi, one pair per step; the learning rate decreases to 0 along a cosine."""
     generator = state.sampler.generator
     optimiser = torch.optim.Adam(net.parameters(), LEARNING_RATE)
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
@@ -95,10 +95,10 @@ def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, ste
         example = examples[step % len(examples)]
         rows = torch.randint(len(example.keypoints), (BATCH,), generator=generator)
         k = example.keypoints[rows.to(state.device)]
-        # SIFT's own scale and orientation are one of many that a patch may have: the network is to know all.
-        turn = 2 * math.pi * torch.rand(len(k), generator=generator)
+        # Data augmentation: random orientations and scales in addition to those of SIFT.
+        rotation = 2 * math.pi * torch.rand(len(k), generator=generator)
         zoom = 2 ** (torch.rand(len(k), generator=generator) - 0.5)
-        k = Keypoints(k.xy, k.angle + turn.to(k.angle), k.scale * zoom.to(k.scale))
+        k = Keypoints(k.xy, k.angle + rotation.to(k.angle), k.scale * zoom.to(k.scale))
         moving = MovingBand(net, example.level, 0, 1)
         patches = [example.level.fixed.patches(patch_positions(k)), moving.patches(k, example.homography)]
         f, f_prime = net.describe(patches, [REFERENCE, moving.side])
@@ -110,8 +110,9 @@ def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, ste
 
 
 def read_rough_pairs(source: Path) -> list[BandPair]:
-    """The pairs of a CSV file or folder, as `find_pairs` has them, their homographies taken as rough ones; without one
-    alignment starts from the same outline. Raises InputError.
+    """Return the pairs of a CSV file or folder (`find_pairs`), with their homographies as seeds.
+
+    Without a homography, the seed maps the outlines of the images onto each other. Raises InputError.
     """
     result = []
     for files in find_pairs(source):

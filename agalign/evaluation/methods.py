@@ -1,6 +1,6 @@
-"""What is compared: descriptors learnt on the pair, learnt before, and made by hand; and registration by elastix.
+"""Methods to compare: descriptors learned on the pair, pretrained and hand-crafted descriptors, and elastix.
 
-A method gets a pair and a start, and gives descriptors of both images' patches, a homography, or both.
+A method returns descriptors of patches of both images, a homography, or both, from a pair and an initial homography.
 """
 
 import importlib
@@ -44,26 +44,26 @@ from agalign.values.mapping import PixelMapping
 
 @dataclass(frozen=True)
 class PairTask:
-    """Two images and where alignment starts."""
+    """Two images and the initial homography."""
 
     fixed: Raster
     moving: Raster
     start: Matrix
-    """fixed_to_moving, px."""
+    """Initial fixed_to_moving, px."""
     device: str = "auto"
     rng_seed: int = 0
     seeding: bool = True
-    """False starts from `start` as it is; True lets the structures correct it first, as a run does."""
+    """Correct `start` by the initial alignment first, as a run does."""
 
 
 Describe = Callable[[Keypoints, Matrix], tuple[Tensor, Tensor]]
-"""(f, f'), each (N, D), of the patches around keypoints of the first image and of the same patches sent to the second
-one by a homography."""
+"""Return descriptors (f, f'), each (N, D), of the patches around keypoints of the first image, and of the patches of
+the second image that a homography maps them to."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a method gives for a pair."""
+    """Result of a method for a pair."""
 
     describe: Describe | None = None
     fixed_to_moving: Matrix | None = None
@@ -82,18 +82,18 @@ def method_named(name: str) -> Method:
     * FILE.safetensors: a network of this program. FILE.pt: a TorchScript module that takes (N, 1, P, P) in [0, 1]; P is
       32, or what follows an @, as in hardnet.pt@32.
 
-    Raises ConfigurationError for any other, InputError for a file that cannot be used.
+    Raises ConfigurationError for other names, InputError for a file that cannot be used.
     """
     fixed_names: dict[str, Method] = {"sift": _sift, "daisy": _daisy, "elastix": _elastix}
     if name in _MODULES and importlib.util.find_spec(_MODULES[name]) is None:
         raise ConfigurationError(f"{name} needs more than is installed; pip install 'agalign[evaluate]'")
     if name in fixed_names:
         return fixed_names[name]
-    learnt = re.fullmatch(r"(fast|paper):([a-z-]+)(:grey)?(:random)?", name)
-    if learnt and learnt[2] in get_args(Sharing):
-        start: ThetaStart = "random" if learnt[4] else "starter"
-        settings = JointSettings.model_validate({"recipe": learnt[1], "sharing": learnt[2]})
-        return lambda task: _learnt_on_the_pair(task, settings, start, colour=learnt[3] is None)
+    learned = re.fullmatch(r"(fast|paper):([a-z-]+)(:grey)?(:random)?", name)
+    if learned and learned[2] in get_args(Sharing):
+        start: ThetaStart = "random" if learned[4] else "starter"
+        settings = JointSettings.model_validate({"recipe": learned[1], "sharing": learned[2]})
+        return lambda task: _learned_on_pair(task, settings, start, colour=learned[3] is None)
     if ".safetensors" in name:
         return _saved_network(Path(name))
     if ".pt" in name:
@@ -107,11 +107,11 @@ def method_named(name: str) -> Method:
 _MODULES = {"elastix": "itk"}
 
 
-# ---- this program's
+# ---- descriptors of agalign
 
 
-def _learnt_on_the_pair(task: PairTask, settings: JointSettings, start: ThetaStart, *, colour: bool) -> Outcome:
-    """Recipe fast or paper from the task's start."""
+def _learned_on_pair(task: PairTask, settings: JointSettings, start: ThetaStart, *, colour: bool) -> Outcome:
+    """Learn a descriptor and a homography on the pair by recipe fast or paper."""
     fixed, moving = task.fixed, task.moving
     if not colour or (settings.sharing == "siamese" and fixed.channels != moving.channels):
         fixed, moving = (_without_colour(r) for r in (fixed, moving))
@@ -164,23 +164,23 @@ def _saved_network(path: Path) -> Method:
     return method
 
 
-# ---- others'
+# ---- other methods
 
 
 def _from_patches(task: PairTask, side: int, describe_patches: Callable[[Tensor], Tensor]) -> Outcome:
-    """A descriptor of (N, 1, side, side) patches in [0, 1]."""
+    """Return the outcome of a descriptor of patches (N, 1, side, side) in [0, 1]."""
 
     def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
         grid = patch_positions(keypoints, side)
-        there = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
-        return describe_patches(grey_patches(task.fixed, grid)), describe_patches(grey_patches(task.moving, there))
+        mapped = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
+        return describe_patches(grey_patches(task.fixed, grid)), describe_patches(grey_patches(task.moving, mapped))
 
     return Outcome(describe)
 
 
 _HAND_MADE_SIDE = 64
 _MARGIN_SHARE = 8
-"""SIFT's outer cells reach an eighth of a patch beyond its edge."""
+"""SIFT's outer cells extend beyond the edge of a patch by an eighth of its side."""
 
 
 def _sift(task: PairTask) -> Outcome:
@@ -192,8 +192,8 @@ def _daisy(task: PairTask) -> Outcome:
 
 
 def _mosaic(patches: Tensor) -> tuple[NDArray[np.float32], int, int]:
-    """(image, its columns, side of a cell): square patches (N, 1, P, P) next to each other, row by row, so that OpenCV
-    and scikit-image see them all at once. Each is continued beyond its edges, so that none sees its neighbours.
+    """Return (image, its columns, side of a cell): patches (N, 1, P, P) row by row in one image for OpenCV and
+    scikit-image, each padded with its edge values.
     """
     padded = functional.pad(patches, [patches.shape[-1] // _MARGIN_SHARE] * 4, mode="replicate")
     columns = max(1, math.ceil(math.sqrt(len(patches))))
@@ -220,7 +220,7 @@ def daisy_of_patches(patches: Tensor) -> Tensor:
     from skimage.feature import daisy
 
     image, columns, side = _mosaic(patches)
-    radius = patches.shape[-1] * 3 // 8  # with the outer ring's own width it reaches the patch's edge
+    radius = patches.shape[-1] * 3 // 8  # plus the width of the outer ring: the edge of the patch
     first = side // 2 - radius
     result = daisy(image[first:, first:], step=side, radius=radius, rings=3, histograms=8, orientations=8)
     return torch.from_numpy(result[:, :columns].reshape(-1, result.shape[-1])[: len(patches)].astype(np.float32))
@@ -243,7 +243,7 @@ def _torchscript(path: Path, side: int) -> Method:
 
 
 def _elastix(task: PairTask) -> Outcome:
-    """On the pyramid of recipe paper; its own default parameters otherwise."""
+    """Register the pair by elastix with the number of pyramid levels of recipe paper."""
     moving = warped(channel_mean(task.moving), PixelMapping(task.start), task.fixed.size_px)
     levels = len(pyramid(max(task.fixed.size_px)))
     result = elastix_affinity(channel_mean(task.fixed), moving, levels)
@@ -251,9 +251,10 @@ def _elastix(task: PairTask) -> Outcome:
 
 
 def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -> Matrix | None:
-    """fixed_to_moving of two single-band images by elastix's affine registration, Mattes mutual information.
+    """Return fixed_to_moving of two single-band images by elastix's affine registration with Mattes mutual information.
 
-    None where it fails, as it does where too many samples leave the image. Its own number of levels by default.
+    None if the registration fails, for example because too many samples are outside the moving image. `levels` of the
+    pyramid are elastix's default if None.
     """
     itk = importlib.import_module("itk")
     parameters = itk.ParameterObject.New()

@@ -1,4 +1,4 @@
-"""The paper's protocol: patches around keypoints, warped by the truth; how often the nearest descriptor is right."""
+"""Evaluation protocol of Dong et al. (2018): nearest neighbours of patches that the true homography maps."""
 
 import math
 
@@ -15,14 +15,14 @@ from agalign.values.image import Raster
 
 
 def grey_patches(raster: Raster, grid: Tensor) -> Tensor:
-    """(N, 1, side, side) in [0, 1] at positions (N, side, side, 2) px."""
+    """Return grey patches (N, 1, side, side) in [0, 1] at positions (N, side, side, 2) px."""
     plane = torch.from_numpy(to_8_bit(raster).astype(np.float32) / 255)
     return bilinear(plane[None], grid)
 
 
 def average_precision(f: Tensor, f_prime: Tensor) -> float:
-    """Share of descriptors (N, D) of the first image with their own counterpart as exact L2 nearest neighbour among
-    those of the second (N, D).
+    """Return the share of descriptors (N, D) of the first image with the corresponding descriptor as exact L2 nearest
+    neighbour among those of the second (N, D); nan for N = 0.
     """
     if len(f) == 0:
         return math.nan
@@ -31,5 +31,5 @@ def average_precision(f: Tensor, f_prime: Tensor) -> float:
 
 
 def homography_error_px(result: Matrix, truth: Matrix, points: NDArray[np.float64]) -> float:
-    """Mean distance between where two homographies send the true matches (N, 2), px of the second image."""
+    """Return the mean distance of points (N, 2) mapped by two homographies, px of the second image."""
     return float(np.linalg.norm(geometry.apply(result, points) - geometry.apply(truth, points), axis=1).mean())

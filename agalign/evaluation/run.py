@@ -1,4 +1,4 @@
-"""Every method on every pair from every start, and the tables that come of it."""
+"""Evaluation of methods on pairs from several initial homographies, and tables of the results."""
 
 import csv
 import io
@@ -25,16 +25,16 @@ Key = TypeVar("Key", bound=Hashable)
 
 @dataclass(frozen=True)
 class Starts:
-    """Where alignment starts: the truth moved by a share of the image's longer side."""
+    """Initial homographies: the ground truth, shifted by a share of the image's longer side."""
 
     shifts: tuple[float, ...] = (0.05,)
     directions: int = 1
-    """Of each shift, evenly around the circle; a single one is drawn for each pair."""
+    """Number of directions for each shift, evenly spaced from a random one for each pair."""
     seeding: bool = False
-    """Let the structures correct the start first, as a run does."""
+    """Correct the initial homography by the initial alignment first, as a run does."""
 
     def of(self, truth: Matrix, longer_side_px: int, rng: np.random.Generator) -> Iterator[tuple[float, Matrix]]:
-        """(shift, fixed_to_moving) of every start."""
+        """Yield (shift, fixed_to_moving) of every initial homography."""
         first = rng.uniform(0, 2 * math.pi)
         for shift in self.shifts:
             for k in range(1 if shift == 0 else self.directions):
@@ -54,23 +54,23 @@ class Result:
     group: str
     method: str
     shift: float
-    """Share of the longer side by which the start was off."""
+    """Shift of the initial homography as a share of the longer side."""
     keypoints: int
     average_precision: float
-    """nan for a method that gives no descriptors."""
+    """nan for a method without descriptors."""
     error_px: float
-    """Mean over the true matches; nan for a method that gives no homography."""
+    """Mean over the keypoints; nan for a method without a homography."""
     error_share: float
-    """The same over the longer side of the second image."""
+    """`error_px` divided by the longer side of the second image."""
     seconds: float
 
 
 def evaluate(
     pairs: Sequence[PairFiles], methods: Mapping[str, Method], starts: Starts, device: str = "auto", rng_seed: int = 0
 ) -> Iterator[Result]:
-    """Results pair by pair. A descriptor that is not learnt on the pair depends on no start and is measured once.
+    """Yield the results pair by pair; methods without a homography do not depend on the start and are run once.
 
-    Raises InputError for a pair without a true homography or an image that cannot be read.
+    Raises InputError for a pair without a homography or an image that cannot be read.
     """
     for number, pair in enumerate(pairs):
         truth = pair.fixed_to_moving
@@ -95,7 +95,7 @@ def evaluate(
 
 
 def _scores(outcome: Outcome, keypoints: Keypoints, truth: Matrix) -> tuple[float, float]:
-    """(average precision, error in px of the second image); NaN for what a method does not give."""
+    """Return (average precision, error in px of the second image); nan for what a method does not return."""
     precision = error_px = math.nan
     if outcome.describe is not None and len(keypoints):
         precision = average_precision(*outcome.describe(keypoints, truth))
@@ -105,7 +105,7 @@ def _scores(outcome: Outcome, keypoints: Keypoints, truth: Matrix) -> tuple[floa
 
 
 def as_csv(results: Sequence[Result]) -> str:
-    """A row per result."""
+    """Return the results as CSV, one row per result."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [f.name for f in fields(Result)], lineterminator="\n")
     writer.writeheader()
@@ -152,7 +152,7 @@ def _error_row(method: str, shift: float, own: Sequence[Result]) -> list[str]:
 
 
 def _grouped(results: Sequence[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:
-    """The results by a key, in the order of the first of each."""
+    """Return the results grouped by a key, in the order of first occurrence."""
     groups: dict[Key, list[Result]] = {}
     for result in results:
         groups.setdefault(key(result), []).append(result)
@@ -160,5 +160,5 @@ def _grouped(results: Sequence[Result], key: Callable[[Result], Key]) -> dict[Ke
 
 
 def _mean_precision(results: Sequence[Result]) -> float:
-    """NaN without results."""
+    """Return the mean of the average precisions; nan without results."""
     return float(np.mean([r.average_precision for r in results])) if results else math.nan

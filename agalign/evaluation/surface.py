@@ -1,4 +1,4 @@
-"""The training loss over known misalignments (the paper's Fig. 2): why the loss can be followed to the alignment."""
+"""The training loss over known misalignments (Dong et al. 2018, Fig. 2): its minimum is at the alignment."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -24,9 +24,9 @@ def loss_surface(
     training: Training = DEFAULT_TRAINING, longer_side_px: int = 512,
     progress: Callable[[float], None] = lambda _: None,
 ) -> NDArray[np.float64]:  # fmt: skip
-    """Mean loss a keypoint at the end of training with psi held at the truth moved by (x, y), for all pairs of offsets.
+    """Return the mean loss per keypoint after training with psi fixed at the truth shifted by each (x, y): (n, n).
 
-    (n, n), rows along y; nan where too few keypoints remain. Each is learnt from the same random weights by recipe
+    Rows are along y; nan if too few keypoints remain. Each network is trained from the same random weights by recipe
     paper, at the resolution with a longer side of at most `longer_side_px`. Offsets are px of the full resolution.
     """
     scale = min(1.0, longer_side_px / max(fixed.size_px))
@@ -45,7 +45,7 @@ def loss_surface(
 
 
 def draw_surface(surface: NDArray[np.float64], offsets_px: NDArray[np.float64], path: Path) -> None:
-    """A picture of a loss surface, dark where the loss is low, with its axes in px. Raises OutputError."""
+    """Write a picture of a loss surface, dark where the loss is low, with axes in px. Raises OutputError."""
     side, margin = 440, 56
     low, high = np.nanmin(surface), np.nanmax(surface)
     shade = np.nan_to_num((surface - low) / max(high - low, 1e-12), nan=1.0) * 255
@@ -63,5 +63,5 @@ def draw_surface(surface: NDArray[np.float64], offsets_px: NDArray[np.float64], 
         write(f"{offsets_px[k]:g}", at, margin + side + 18)
         write(f"{offsets_px[k]:g}", margin // 2, at + 4)
     write("offset along x, px", margin + side // 2, margin + side + 42)
-    write(f"loss a keypoint, {low:.3f} (dark) to {high:.3f}; offset along y at the left", margin + side // 2, 32)
+    write(f"loss per keypoint, {low:.3f} (dark) to {high:.3f}; offset along y at the left", margin + side // 2, 32)
     write_png(sheet, path)

@@ -1,4 +1,4 @@
-"""The camera of the demo's flight."""
+"""The camera of the synthetic flight of `agalign demo`."""
 
 from agalign.synthetic.rig import BandSpec
 from agalign.synthetic.tags import MicaSenseCamera

@@ -1,9 +1,8 @@
-"""A synthetic flight over a farm in the files of a MicaSense-like camera, with its ground truth.
+"""A synthetic flight over a farm, in the file format of a MicaSense-like camera, with ground truth.
 
 The scene is a plane of parcels with crop rows of different directions and spacings, bare soil, tracks and trees, or
-terraces with trees on them. Each band sees it through its own lens (distortion, principal point), from
-its own place and angle in the rig, with its own spectrum: vegetation is darker than soil in the visible bands and far
-brighter in the near infra-red.
+terraces with trees on them. Each band has its own lens (distortion, principal point), position and orientation in the
+rig, and spectrum: vegetation is darker than soil in the visible bands and much brighter in the near infrared.
 """
 
 import json
@@ -33,11 +32,11 @@ from agalign.values.mapping import splined
 
 ALTITUDE_M = 22.0, 34.0
 _TIES, _TIES_OVER_RELIEF = (25, 19), (65, 49)
-_CAPTURES_A_FIELD = 4
-"""Captures over one painted ground; a longer flight gets more grounds in turn, so that memory stays constant."""
+_CAPTURES_PER_GROUND = 4
+"""Captures over one painted ground; longer flights have several grounds, one in memory at a time."""
 _WARMEST_C, _HEAT_NOISE_C = 50.0, 0.05
 VIGNETTING = 0.35
-"""Share of the light at the centre that the corners lack."""
+"""Relative decrease of the light from the centre to the corners."""
 
 
 Spoil = Callable[[Field, np.random.Generator], Field]
@@ -56,28 +55,28 @@ class Shot:
     without: tuple[str, ...] = ()
     """Bands without a file."""
     trouble: str = ""
-    """What is wrong with the capture, as truth.json names it."""
+    """Name of the fault of the capture in truth.json."""
     sun: float = 1.0
     """Sunlight as a multiple of what the light sensor measures."""
     shutter: float = 1.0
-    """Exposure time as a multiple of the usual one."""
+    """Exposure time as a multiple of the normal one."""
 
 
 def make_flight(
     folder: Path, captures: int = 3, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0,
     camera: CameraSpec = REDEDGE, relief_m: float = 0.0, altitude_m: tuple[float, float] = ALTITUDE_M,
 ) -> Path:  # fmt: skip
-    """Write `captures` captures of all bands into folder/0000SET/000 and the truth into folder/truth.json.
+    """Write captures of all bands to folder/0000SET/000, and return the path of their ground truth.
 
-    The truth is {capture: {"reference": file, "bands": {file: {"fixed_to_moving": [[...]], "ties": [[x_ref, y_ref,
-    x_mov, y_mov], ...]}}}}: the homography between undistorted pixels, and ties in raw pixels, exact to 0.001 px; the
-    centre of the top-left pixel is (0, 0). With `relief_m` the ground has terraces of that height and trees half as
-    high; the homography is then that of the plane below them, and the ties include the relief. `altitude_m` is the
-    lowest and the highest altitude above the plane. Returns the path of truth.json.
+    The ground truth, folder/truth.json, is {capture: {"reference": file, "bands": {file: {"fixed_to_moving": [[...]],
+    "ties": [[x_ref, y_ref, x_mov, y_mov], ...]}}}}: the homography between undistorted pixels, and tie points in raw
+    pixels, exact to 0.001 px; the centre of the top-left pixel is (0, 0). With `relief_m` the ground has terraces of
+    that height and trees half as high; the homography is then that of the plane below them, and the tie points include
+    the relief. `altitude_m` is the lowest and the highest altitude above the plane.
     """
     rng, truth = np.random.default_rng(rng_seed), dict[str, Any]()
-    for first in range(0, captures, _CAPTURES_A_FIELD):
-        poses = [_pose(rng, number, altitude_m) for number in range(min(_CAPTURES_A_FIELD, captures - first))]
+    for first in range(0, captures, _CAPTURES_PER_GROUND):
+        poses = [_pose(rng, number, altitude_m) for number in range(min(_CAPTURES_PER_GROUND, captures - first))]
         ground = paint_ground(rng, poses, size_px, relief_m, camera)
         truth |= _write(folder, [Shot(pose, ground) for pose in poses], size_px, camera, rng, first)
     return _write_truth(folder, truth)
@@ -86,7 +85,7 @@ def make_flight(
 def write_shots(
     folder: Path, shots: Sequence[Shot], size_px: tuple[int, int], camera: CameraSpec, rng: np.random.Generator
 ) -> Path:
-    """Write captures and their truth as `make_flight` does; the truth also has the "trouble" of each capture."""
+    """Write captures like `make_flight`, and return the path of the ground truth, which also has their faults."""
     return _write_truth(folder, _write(folder, shots, size_px, camera, rng))
 
 
@@ -94,7 +93,7 @@ def _write(
     folder: Path, shots: Sequence[Shot], size_px: tuple[int, int], camera: CameraSpec, rng: np.random.Generator,
     before: int = 0,
 ) -> dict[str, Any]:  # fmt: skip
-    """Write captures after `before` others on other fields farther south; returns their truth."""
+    """Write captures after `before` others over other grounds, and return their ground truth."""
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
     grounds = {id(shot.ground): shot.ground for shot in shots}
@@ -109,8 +108,8 @@ def _write(
             if band.name not in shot.without:
                 path = images / camera.file_name(band, number)
                 path.parent.mkdir(parents=True, exist_ok=True)
-                there = replace(shot.pose, north_m=shot.pose.north_m + before)
-                camera.write_band(path, pixels, band, Exposure(there, number, size_px, VIGNETTING, shot.shutter))
+                pose = replace(shot.pose, north_m=shot.pose.north_m + before)
+                camera.write_band(path, pixels, band, Exposure(pose, number, size_px, VIGNETTING, shot.shutter))
     return {
         camera.capture_name(number): _truth(shot, number, camera, size_px)
         for number, shot in enumerate(shots, start=before + 1)
@@ -146,7 +145,7 @@ def plan_flight(
     relief_m: float = 0.0,
     altitude_m: tuple[float, float] = ALTITUDE_M,
 ) -> tuple[list[Pose], Ground, np.random.Generator]:
-    """(poses, ground, generator of the noise that follows) of the flight that `make_flight` writes."""
+    """Return (poses, ground, generator of the noise) of the flight that `make_flight` writes."""
     rng = np.random.default_rng(rng_seed)
     poses = [_pose(rng, number, altitude_m) for number in range(captures)]
     return poses, paint_ground(rng, poses, size_px, relief_m), rng
@@ -155,50 +154,50 @@ def plan_flight(
 def true_ties(
     ground: Ground, reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]
 ) -> list[list[float]]:
-    """[x_ref, y_ref, x_mov, y_mov] in raw pixels on a lattice, where both points are inside their images."""
-    here = geometry.lattice(*reference.size_px(size_px), *(_TIES if ground.height_m is None else _TIES_OVER_RELIEF))
-    place, rays = place_and_rays(band, pose, size_px)
-    seen = on_ground(ground, reference, pose, size_px, here)
-    # The way back: a point of the ground from the band's place, as a ray of its camera.
-    straight = geometry.apply(geometry.invert(rays), (seen[:, :2] - place[:2]) / (seen[:, 2:] - place[2]))
-    there = lens.distort(band.lens(*size_px), straight)
-    inside = ((there >= 0) & (there <= np.subtract(band.size_px(size_px), 1))).all(axis=1)
-    rows: list[list[float]] = np.hstack([here, there])[inside].round(4).tolist()
+    """Return tie points [x_ref, y_ref, x_mov, y_mov], raw px, on a lattice, if both points are inside their images."""
+    fixed_px = geometry.lattice(*reference.size_px(size_px), *(_TIES if ground.height_m is None else _TIES_OVER_RELIEF))
+    position, rays = place_and_rays(band, pose, size_px)
+    points_m = on_ground(ground, reference, pose, size_px, fixed_px)
+    # Project the points on the ground into the band.
+    directions = (points_m[:, :2] - position[:2]) / (points_m[:, 2:] - position[2])
+    moving_px = lens.distort(band.lens(*size_px), geometry.apply(geometry.invert(rays), directions))
+    inside = ((moving_px >= 0) & (moving_px <= np.subtract(band.size_px(size_px), 1))).all(axis=1)
+    rows: list[list[float]] = np.hstack([fixed_px, moving_px])[inside].round(4).tolist()
     return rows
 
 
 def view(painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Field:
-    """(height, width) of a painted ground as a band's camera sees it, through its lens, without vignetting or noise.
+    """Return the image (height, width) of a painted ground in a band, with distortion, without vignetting or noise.
 
-    Where its pixels are much larger than the ground's, each is the mean of many.
+    If its pixels are much larger than those of the ground, each is the mean of several samples.
     """
     width, height = band.size_px(size_px)
-    many = max(1, round(band.view / band.size_ratio[0]))
+    samples = max(1, round(band.view / band.size_ratio[0]))
 
     def on_map(raw_px: Points) -> Points:
         return map_px(ground, on_ground(ground, band, pose, size_px, raw_px)[..., :2])
 
-    x, y = ((np.arange(n * many, dtype=np.float64) + 0.5) / many - 0.5 for n in (width, height))
+    x, y = ((np.arange(n * samples, dtype=np.float64) + 0.5) / samples - 0.5 for n in (width, height))
     if ground.height_m is None:
         positions = splined(on_map, x, y, dtype=np.float32)
     else:
         positions = on_map(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
-    seen = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    if many > 1:
-        seen = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(seen, np.float32)
+    image = cv2.remap(painted, positions, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    if samples > 1:
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(image, np.float32)
 
 
 def render(
     painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], rng: np.random.Generator,
     spoil: Spoil | None = None,
 ) -> NDArray[np.uint16]:  # fmt: skip
-    """What one camera records of the ground painted in its band: (height, width) uint16, as `recorded` returns it."""
+    """Return the sensor values (height, width) of a ground painted in the band, as `recorded`."""
     return recorded(view(painted, ground, band, pose, size_px), band, rng, spoil)
 
 
 def recorded(scene: Field, band: BandSpec, rng: np.random.Generator, spoil: Spoil | None = None) -> NDArray[np.uint16]:
-    """Return the sensor's values (height, width) for a view of reflectances, with vignetting and noise; for heat,
+    """Return the sensor values (height, width) for a view of reflectances, with vignetting and noise; for heat,
     hundredths of a kelvin.
     """
     if band.sees == "heat":

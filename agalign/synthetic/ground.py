@@ -17,11 +17,11 @@ Field = NDArray[np.float32]
 
 _TERRACE_M = 8.0
 _FINE_GRAINS_M, _MIN_GRAIN_PX = (0.02, 0.005), 3.0
-"""Clods and leaves, where the camera is low enough to see them."""
+"""Sizes of clods and leaves, which are painted if their images have at least `_MIN_GRAIN_PX`."""
 _RAY_STEPS = 40
-"""A ray falls on relief by repeated intersection with the height below its last place."""
+"""Iterations for the intersection of a ray with the relief, each with the height below the previous point."""
 _MAP_PX_PER_IMAGE_PX = 1.25
-"""Resolution of the painted ground relative to the images, so that they do not show its pixels."""
+"""Resolution of the painted ground relative to the images, in which its pixels must not be visible."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ def paint_ground(
     rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int], relief_m: float = 0.0,
     camera: CameraSpec = REDEDGE,
 ) -> Ground:  # fmt: skip
-    """Parcels, rows, tracks and trees, large and fine enough for all bands at all poses."""
+    """Return a ground with parcels, rows, tracks and trees, large and fine enough for all bands at all poses."""
     focal = FOCAL_LENGTH_MM * PIXELS_PER_MM * size_px[0] / 1280
     lowest, highest = min(p.altitude_m for p in poses), max(p.altitude_m for p in poses)
     metres_per_px = lowest / focal / camera.sharpest / _MAP_PX_PER_IMAGE_PX
     seen_m = 0.62 * highest * np.hypot(*size_px) / focal * camera.widest
-    reach_m = max(np.hypot(p.east_m, p.north_m) for p in poses) + seen_m
-    side = 2 * int(np.ceil(reach_m / metres_per_px))
+    radius_m = max(np.hypot(p.east_m, p.north_m) for p in poses) + seen_m
+    side = 2 * int(np.ceil(radius_m / metres_per_px))
     metre = 1 / metres_per_px
     count = max(6, round((side / metre / 9) ** 2))
     parcel, edge = _parcels(rng, side, count)
@@ -86,7 +86,7 @@ def paint_ground(
 
 
 def reflectance(ground: Ground, band: BandSpec) -> Field:
-    """The ground in one band: materials by their shares, crop by its vigour (the other way round in the visible)."""
+    """Return the reflectance of the ground in a band; vigour of crops raises it in infrared, lowers it in visible."""
     bright = 1 if band.wavelength_nm > 700 else -0.5
     crop = band.crop * (1 + 0.35 * bright * ground.vigour)
     soil = band.soil * ground.brightness
@@ -98,10 +98,10 @@ def reflectance(ground: Ground, band: BandSpec) -> Field:
 
 
 def on_ground(ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], raw_px: Points) -> Points:
-    """(..., 3) metres east, south and down of what raw pixels (..., 2) see."""
-    straight = lens.undistort(band.lens(*size_px), raw_px)
+    """Return the points (..., 3) on the ground, metres east, south and down, that raw pixels (..., 2) show."""
+    undistorted = lens.undistort(band.lens(*size_px), raw_px)
     place, rays = place_and_rays(band, pose, size_px)
-    direction = np.concatenate([straight, np.ones_like(straight[..., :1])], axis=-1) @ rays.T
+    direction = np.concatenate([undistorted, np.ones_like(undistorted[..., :1])], axis=-1) @ rays.T
     down = np.zeros(direction.shape[:-1])
     seen = place + direction * ((down - place[2]) / direction[..., 2])[..., None]
     for _ in range(0 if ground.height_m is None else _RAY_STEPS):
@@ -113,14 +113,14 @@ def on_ground(ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, in
 
 
 def map_px(ground: Ground, metres: Points) -> Points:
-    """Positions on the painted ground's pixels."""
+    """Return positions in metres east and south as pixels of the painted ground."""
     return metres / ground.metres_per_px + (len(ground.crop) - 1) / 2
 
 
 def _relief(rng: np.random.Generator, tree: Field, metre: float, relief_m: float) -> Field:
-    """Metres above the plane: three levels with slopes between them, and round trees upon them.
+    """Return heights above the plane, metres: three levels connected by slopes, with round trees.
 
-    No slope is so steep that a camera could not see it: where one hides another there is nothing to align.
+    Slopes are gentle enough to cause no occlusions, which cannot be aligned.
     """
     angle = rng.uniform(0, np.pi)
     axis = np.arange(len(tree)) / (_TERRACE_M * metre)
@@ -132,9 +132,9 @@ def _relief(rng: np.random.Generator, tree: Field, metre: float, relief_m: float
 
 
 def _parcels(rng: np.random.Generator, side: int, count: int) -> tuple[NDArray[np.int64], Field]:
-    """Index of each pixel's parcel, and its distance in px from the parcel's edge: a Voronoi division.
+    """Return the parcel index of each pixel, and its distance from the parcel's edge, px: a Voronoi diagram.
 
-    Computed on every fourth pixel; the tracks along the edges hide the steps.
+    Calculated on every fourth pixel; the tracks along the edges conceal the steps.
     """
     small = side // 4 + 1
     axis = np.arange(small, dtype=np.float32) * 4
@@ -159,9 +159,9 @@ def _trees(rng: np.random.Generator, side: int, metre: float) -> Field:
     for _ in range(max(3, round((side / metre / 10) ** 2))):
         radius = rng.uniform(0.5, 1.2) * metre
         column, row = rng.uniform(0, side, 2)
-        reach = 2 * radius
-        x = np.arange(max(0, int(column - reach)), min(side, int(column + reach)))
-        y = np.arange(max(0, int(row - reach)), min(side, int(row + reach)))
+        margin = 2 * radius
+        x = np.arange(max(0, int(column - margin)), min(side, int(column + margin)))
+        y = np.arange(max(0, int(row - margin)), min(side, int(row + margin)))
         window = np.ix_(y, x)
         inside = 1.2 * (1 - np.hypot(x[None, :] - column, y[:, None] - row) / radius) + ragged[window]
         cover[window] = np.maximum(cover[window], np.clip(4 * inside, 0, 1))
@@ -169,7 +169,7 @@ def _trees(rng: np.random.Generator, side: int, metre: float) -> Field:
 
 
 def _noise(rng: np.random.Generator, side: int, grain_px: float) -> Field:
-    """Gaussian noise of mean 0 and standard deviation 1 with blobs `grain_px` wide."""
+    """Return Gaussian noise (side, side) of mean 0 and standard deviation 1 with blobs `grain_px` wide."""
     reduction = max(1.0, grain_px / 2)
     small = max(8, int(np.ceil(side / reduction)))
     coarse = cv2.GaussianBlur(

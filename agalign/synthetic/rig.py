@@ -1,4 +1,4 @@
-"""A synthetic camera: the lenses, positions, angles and spectra of its bands, and their view of the ground.
+"""A synthetic camera: lenses, positions, orientations and spectra of its bands, and their homographies to the ground.
 
 `synthetic.cameras` has the camera of the demo.
 """
@@ -38,13 +38,13 @@ class BandSpec:
     distortion: tuple[float, float, float, float, float]
     """k1, k2, p1, p2, k3."""
     centre_offset_px: tuple[float, float]
-    """Of the principal point from the middle of a 1280 x 960 sensor."""
+    """Offset of the principal point from the centre of a 1280 x 960 sensor."""
     delay_s: float = 0.0
     """Delay of its exposure after the first band's."""
     sees: Literal["light", "colour", "heat"] = "light"
     """colour: one of three bands in one file; heat: the reflectances are temperatures, as shares of 50 degrees C."""
     size_ratio: tuple[float, float] = (1.0, 1.0)
-    """Width and height of its images in those of the reference."""
+    """Width and height of its images relative to those of the reference."""
     tags_off_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Error of the angles in its tags."""
     view: float = 1.0
@@ -52,20 +52,20 @@ class BandSpec:
 
     @property
     def exposure(self) -> float:
-        """Share of the full signal that a reflectance of 1 would give."""
+        """Signal of a reflectance of 1, as a share of full scale."""
         return 0.55 / max(self.soil, self.crop)
 
     @property
     def focal_length_mm(self) -> float:
-        """All sensors are 4.8 mm wide."""
+        """Focal length; all sensors are 4.8 mm wide."""
         return FOCAL_LENGTH_MM / self.view
 
     def size_px(self, camera_px: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) of its images by a camera of the given size."""
+        """(width, height) of its images for a camera with this size of the reference's images."""
         return round(camera_px[0] * self.size_ratio[0]), round(camera_px[1] * self.size_ratio[1])
 
     def lens(self, width_px: int, height_px: int) -> Lens:
-        """The lens, by a camera of the given size; smaller sensors have larger pixels."""
+        """The lens for a camera with this size of the reference's images; smaller images have larger pixels."""
         width, height = self.size_px((width_px, height_px))
         scale = width / 1280
         focal = self.focal_length_mm * PIXELS_PER_MM * scale
@@ -76,7 +76,7 @@ class BandSpec:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the rig is at a capture, and its attitude."""
+    """Position and attitude of the rig at a capture."""
 
     altitude_m: float
     yaw_deg: float
@@ -90,21 +90,21 @@ class Pose:
 
 @dataclass(frozen=True)
 class Exposure:
-    """How one image of a band was taken."""
+    """Conditions of one image of a band."""
 
     pose: Pose
     number: int
-    """Of the capture, counted from 1."""
+    """Number of the capture, from 1."""
     size_px: tuple[int, int]
     """(width, height) of the reference's images."""
     vignetting: float
-    """Share of the light that the corners lack."""
+    """Relative decrease of the light from the centre to the corners."""
     shutter: float = 1.0
-    """Exposure time as a multiple of the usual one."""
+    """Exposure time as a multiple of the normal one."""
 
     @property
     def moment(self) -> str:
-        """When, as Exif writes it."""
+        """Time in the format of Exif."""
         return f"2026:06:21 10:{self.number // 60:02d}:{self.number % 60:02d}"
 
 
@@ -122,11 +122,11 @@ class CameraSpec(ABC):
 
     @abstractmethod
     def capture_name(self, number: int) -> str:
-        """Shared part of the names of a capture's files; captures are counted from 1."""
+        """Return the shared part of the file names of a capture; numbers start at 1."""
 
     @abstractmethod
     def file_name(self, band: BandSpec, number: int) -> str:
-        """Name of a band's file, with its folder where bands have folders of their own."""
+        """Return the name of a band's file, with its folder if each band has a folder."""
 
     @abstractmethod
     def write_band(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
@@ -144,28 +144,28 @@ class CameraSpec(ABC):
 
 
 def true_homography(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
-    """fixed_to_moving between undistorted pixels: both cameras' homographies to the ground plane, chained."""
+    """Return fixed_to_moving between undistorted pixels, from the homographies of both bands to the ground plane."""
     return geometry.compose(
         geometry.invert(_pixel_to_ground(band, pose, size_px)), _pixel_to_ground(reference, pose, size_px)
     )
 
 
 def _pixel_to_ground(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
-    """Undistorted pixel -> metres east and south on the plane below: the ray from the lens, cut with the plane."""
-    place, rays = place_and_rays(band, pose, size_px)
-    # ground = place + ray * (-place_z / ray_z): linear in the homogeneous pixel once multiplied by ray_z.
-    cut = np.array([[-place[2], 0.0, place[0]], [0.0, -place[2], place[1]], [0.0, 0.0, 1.0]])
-    return geometry.normalised(cut @ rays)
+    """Return the homography from undistorted pixels to metres east and south on the ground plane."""
+    position, rays = place_and_rays(band, pose, size_px)
+    # ground = position + ray * (-position_z / ray_z); multiplied by ray_z, it is linear in the ray.
+    ray_to_ground = np.array([[-position[2], 0.0, position[0]], [0.0, -position[2], position[1]], [0.0, 0.0, 1.0]])
+    return geometry.normalised(ray_to_ground @ rays)
 
 
 def to_plane(reference: BandSpec, band: BandSpec, size_px: tuple[int, int]) -> Matrix:
-    """Undistorted pixels of a band -> those of the reference, were both lenses in one place."""
+    """Return the homography from undistorted pixels of a band to those of the reference, for lenses at one position."""
     rays = _rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
     return np.asarray(reference.lens(*size_px).matrix @ _rotation(*reference.rig_degrees).T @ rays)
 
 
 def place_and_rays(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> tuple[NDArray[np.float64], Matrix]:
-    """(where the lens is, metres east, south and down of the origin; undistorted pixel -> direction of its ray)."""
+    """Return the position of the lens (metres east, south, down) and the 3x3 matrix from undistorted pixels to rays."""
     attitude = _rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
     rays = attitude @ _rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
     flown = band.delay_s * np.array([*pose.velocity_m_s, 0.0])
@@ -174,7 +174,7 @@ def place_and_rays(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> tupl
 
 
 def _rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
-    turns = [
+    rotations = [
         cv2.Rodrigues(np.radians(angle) * axis)[0] for angle, axis in zip((a_deg, b_deg, c_deg), np.eye(3), strict=True)
     ]
-    return np.asarray(turns[0] @ turns[1] @ turns[2], np.float64)
+    return np.asarray(rotations[0] @ rotations[1] @ rotations[2], np.float64)

@@ -1,4 +1,4 @@
-"""The demo: make a synthetic flight, and score an alignment of it against its exact truth."""
+"""Score of an alignment of a synthetic flight, by its ground truth."""
 
 import json
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ __all__ = ["Score", "make_flight", "score_against_truth"]
 
 @dataclass(frozen=True)
 class Score:
-    """How far a pair is from the truth, over a lattice of known points."""
+    """Error of a band pair at the tie points of the ground truth."""
 
     capture: str
     band: str
@@ -26,7 +26,7 @@ class Score:
 
 
 def score_against_truth(reports: list[CaptureReport], truth_path: Path) -> list[Score]:
-    """Errors of every pair in px, read from the sidecars' grids as anyone else would."""
+    """Return the errors of every pair, px, from the grids in the sidecars."""
     truth = json.loads(truth_path.read_text(encoding="utf-8"))
     scores = []
     for report in reports:

@@ -253,7 +253,7 @@ def test_learn_writes_a_network_and_says_what_taught_it(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["learn", str(table), "-o", str(network), "--steps", "5", "-v"])
     assert done.exit_code == 0, done.output
     assert "3a 3b: aligned" in done.stderr
-    assert "learnt from 1 of 1 pairs" in done.stderr
+    assert "learned from 1 of 1 pairs" in done.stderr
     assert load_model(network, lambda: torch.device("cpu")).camera == ""
 
 
