@@ -1,4 +1,4 @@
-"""The algorithms: each runs one command of agalign and loads what it has written."""
+"""Processing algorithms: each runs one command of agalign and loads its outputs."""
 
 import json
 import shlex
@@ -35,7 +35,7 @@ _FINISHED = {"capture", "panel", "sky"}
 
 
 class AgalignAlgorithm(QgsProcessingAlgorithm):
-    """What the algorithms share: the run of a command, its progress, and the layers that are loaded."""
+    """Base of the algorithms: runs a command, reports its progress, and loads layers."""
 
     ID = TITLE = HELP = ""
 
@@ -44,24 +44,25 @@ class AgalignAlgorithm(QgsProcessingAlgorithm):
         self._executable_setting = executable_setting
 
     def createInstance(self):  # noqa: N802
-        """Return another one; QGIS runs each on its own."""
+        """Return a new instance; QGIS uses one per run."""
         return type(self)(self._executable_setting)
 
     def name(self):
-        """In `qgis_process` and models."""
+        """Return the identifier for `qgis_process` and models."""
         return self.ID
 
     def displayName(self):  # noqa: N802
-        """In the toolbox."""
+        """Return the name for the toolbox."""
         return self.TITLE
 
     def shortHelpString(self):  # noqa: N802
-        """Next to the parameters."""
+        """Return the help text next to the parameters."""
         return self.HELP
 
     def run_command(self, arguments, feedback, expected=0):
-        """Run agalign with arguments, followed by `--log-json` events; return the command. Raises
-        QgsProcessingException where it fails or is cancelled.
+        """Run agalign, report its `--log-json` events, and return the command.
+
+        Raises QgsProcessingException if it fails or is cancelled.
         """
         done, total = 0, expected
 
@@ -90,9 +91,9 @@ class AgalignAlgorithm(QgsProcessingAlgorithm):
         except CommandError as error:
             raise QgsProcessingException(str(error)) from None
         if code is None:
-            raise QgsProcessingException("Cancelled; the same run continues with the captures that are left.")
+            raise QgsProcessingException("Cancelled; run again to process the remaining captures.")
         if code == EXIT_PARTIAL:
-            feedback.pushWarning("Some captures are not aligned; the report says why.")
+            feedback.pushWarning("Some captures are not aligned; the report contains the reasons.")
         return command
 
     def load(self, path, name, context):
@@ -112,9 +113,9 @@ class AlignFlight(AgalignAlgorithm):
     HELP = (
         "Finds every capture of a multispectral drone camera below a folder, co-registers its bands, verifies each "
         "alignment, and writes one stack per capture with a report. Captures that an earlier run finished are kept.\n"
-        "Single captures have no place on the map unless they are georeferenced approximately: this needs position, "
-        "altitude, yaw and focal length in the tags, and a height above the ground in the tags, by a calibration panel "
-        "of the flight, or by the elevation of the ground."
+        "Single captures appear on the map only with an approximate georeference. It needs position, altitude, yaw and "
+        "focal length in the tags, and the height above the ground from the tags, a calibration panel, or the "
+        "elevation of the ground."
     )
 
     def initAlgorithm(self, configuration=None):  # noqa: ARG002, N802
@@ -136,7 +137,7 @@ class AlignFlight(AgalignAlgorithm):
         self.addOutput(QgsProcessingOutputNumber("CAPTURES", "Captures that are aligned completely"))
 
     def processAlgorithm(self, parameters, context, feedback):  # noqa: N802
-        """Run the command and load what it has written."""
+        """Run the command and load its outputs."""
         out = Path(self.parameterAsString(parameters, "OUTPUT", context)).absolute()
         arguments = ["align", self.parameterAsString(parameters, "INPUT", context), "-o", out, "--log-json"]
         arguments += ["--radiometry", _RADIOMETRY[self.parameterAsEnum(parameters, "RADIOMETRY", context)]]
@@ -158,11 +159,11 @@ class AlignFlight(AgalignAlgorithm):
         if flight.is_file():
             results["FLIGHT"] = str(flight)
             self.load(flight, "Flight", context)
-        most = self.parameterAsInt(parameters, "LOAD", context)
-        for path, sidecar in captures[:most]:
+        max_loaded = self.parameterAsInt(parameters, "LOAD", context)
+        for path, sidecar in captures[:max_loaded]:
             self._load_capture(path, sidecar, context)
-        if len(captures) > most:
-            feedback.pushInfo(f"{most} of {len(captures)} captures are loaded")
+        if len(captures) > max_loaded:
+            feedback.pushInfo(f"{max_loaded} of {len(captures)} captures are loaded")
         return results
 
     def _load_capture(self, path, sidecar, context):
@@ -270,8 +271,8 @@ class InspectFolder(AgalignAlgorithm):
         """Run the command and print the cameras."""
         folder = self.parameterAsString(parameters, "INPUT", context)
         command = self.run_command(["info", folder, "--json"], feedback)
-        found = json.loads(command.output)
-        for camera in found.get("cameras", []):
+        contents = json.loads(command.output)
+        for camera in contents.get("cameras", []):
             width, height = camera["size_px"]
             feedback.pushInfo(
                 "{camera} ({serial}): {captures} captures, {width} x {height} px, bands {names}".format(
@@ -279,25 +280,25 @@ class InspectFolder(AgalignAlgorithm):
                     **{k: camera[k] for k in ("camera", "serial", "captures")},
                 )
             )  # fmt: skip
-        return {"CAPTURES": len(found["captures"]), "JSON": command.output}
+        return {"CAPTURES": len(contents["captures"]), "JSON": command.output}
 
 
 def file_of(layer):
-    """The path of a raster layer's file, without GDAL's options after a '|'."""
+    """Return the path of a raster layer's file, without the options of GDAL after a '|'."""
     return layer.source().split("|")[0]
 
 
 def sidecars_below(folder):
     """Return (path, content) of every sidecar below a folder, sorted."""
-    found = []
+    result = []
     for path in sorted(folder.rglob("*.json")):
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             continue
         if isinstance(content, dict) and str(content.get("schema", "")).startswith("agalign/") and "status" in content:
-            found.append((path, content))
-    return found
+            result.append((path, content))
+    return result
 
 
 def _line(event):

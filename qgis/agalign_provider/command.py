@@ -1,6 +1,6 @@
-"""The command line of agalign in a process of its own: found, run, followed and cancelled.
+"""Find, run, monitor and cancel the command line of agalign in a separate process.
 
-Nothing here needs QGIS. QGIS's own Python need not have agalign or PyTorch.
+This module does not import QGIS, and the Python of QGIS does not need agalign or PyTorch.
 """
 
 import contextlib
@@ -14,19 +14,19 @@ import sys
 import threading
 from pathlib import Path
 
-_SECONDS_TO_END = 15
-"""For the program to finish the files that it is writing, once it is asked to end."""
+_TERMINATION_TIMEOUT_S = 15
+"""Time between SIGTERM and SIGKILL, in which agalign finishes the files that it is writing."""
 _POLL_S = 0.2
-_OF_QGIS = (
+_QGIS_VARIABLES = (
     "PYTHONHOME", "PYTHONPATH", "PYTHONEXECUTABLE", "PYTHONUSERBASE", "GDAL_DATA", "GDAL_DRIVER_PATH", "PROJ_LIB",
     "PROJ_DATA", "LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "DYLD_INSERT_LIBRARIES",
 )  # fmt: skip
-"""Variables that QGIS sets for its own libraries, which differ from those that agalign brings."""
+"""Environment variables that QGIS sets for its libraries, which differ from those of agalign."""
 EXIT_OK, EXIT_PARTIAL = 0, 3
 
 
 class CommandError(Exception):
-    """The program is missing, or ended with an error; the text is for the user."""
+    """agalign is not installed, or ended with an error; the text is for the user."""
 
 
 def find_executable(setting=""):
@@ -58,13 +58,13 @@ def find_executable(setting=""):
 
 
 def environment():
-    """Variables for the process: those of QGIS's own libraries are left out."""
-    return {k: v for k, v in os.environ.items() if k not in _OF_QGIS}
+    """Return the environment variables without those for the libraries of QGIS."""
+    return {k: v for k, v in os.environ.items() if k not in _QGIS_VARIABLES}
 
 
 class Command:
-    """A run of agalign. `is_canceled()` is polled; `on_event(dict)` gets each line of `--log-json`, and a line that is
-    not JSON as the event `text`.
+    """A run of agalign. `is_canceled()` is polled; `on_event(dict)` is called with each line of `--log-json`, and with
+    other lines as the event `text`.
     """
 
     def __init__(self, arguments, is_canceled, on_event):
@@ -75,14 +75,14 @@ class Command:
         self.output = ""
 
     def run(self):
-        """Return the exit code, 0 or 3 (some captures are not aligned); None where it was cancelled.
+        """Return the exit code, 0 or 3 (some captures are not aligned); None if it was cancelled.
 
-        Raises CommandError where it cannot be started or fails.
+        Raises CommandError if it cannot be started or fails.
         """
         try:
             process = subprocess.Popen(
                 self.arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                env=environment(), encoding="utf-8", errors="replace", **_own_group(),
+                env=environment(), encoding="utf-8", errors="replace", **_new_process_group(),
             )  # fmt: skip
         except OSError as error:
             raise CommandError(f"{self.arguments[0]}: cannot be started ({error.strerror or error})") from None
@@ -100,13 +100,13 @@ class Command:
                 _end(process)
                 break
         for reader in readers:
-            reader.join(timeout=_SECONDS_TO_END)
+            reader.join(timeout=_TERMINATION_TIMEOUT_S)
         self._deliver()
         if canceled:
             return None
         if process.returncode not in (EXIT_OK, EXIT_PARTIAL):
-            why = self.problems[-1] if self.problems else f"exit code {process.returncode}"
-            raise CommandError(f"agalign: {why}")
+            reason = self.problems[-1] if self.problems else f"exit code {process.returncode}"
+            raise CommandError(f"agalign: {reason}")
         return process.returncode
 
     def _read(self, stream, name):
@@ -140,23 +140,23 @@ def _event(line):
     return {"event": "text", "message": line.rstrip()}
 
 
-def _own_group():
-    """The process and its workers can be ended together, and a key pressed in QGIS's terminal does not reach them."""
+def _new_process_group():
+    """Return options of Popen for a new process group, which is ended as a whole and does not receive Ctrl+C."""
     if os.name == "nt":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
     return {"start_new_session": True}
 
 
 def _end(process):
-    """Ask the process group to end; end it by force where it does not."""
+    """Terminate the process group, and kill it if it does not end in time."""
     if os.name == "nt":
         subprocess.run(["taskkill", "/T", "/F", "/PID", str(process.pid)], capture_output=True, check=False)
         process.wait()
         return
     _signal_group(process.pid, signal.SIGTERM)
     with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(timeout=_SECONDS_TO_END)
-    # Also workers that outlive the program.
+        process.wait(timeout=_TERMINATION_TIMEOUT_S)
+    # Also kills workers that still run.
     _signal_group(process.pid, signal.SIGKILL)
     process.wait()
 

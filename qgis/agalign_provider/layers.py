@@ -1,4 +1,4 @@
-"""Styles of the layers that are loaded: natural or false colour for stacks, a colour ramp for indices, and outlines by
+"""Styles of the loaded layers: natural or false colour for stacks, a colour ramp for indices, and outlines by
 status for footprints.
 """
 
@@ -28,7 +28,7 @@ _FALSE_COLOUR = ("NIR", "Red", "Green")
 
 
 class StyleLayer(QgsProcessingLayerPostProcessorInterface):
-    """Style a layer once it is loaded, in the main thread."""
+    """Styles a loaded layer in the main thread."""
 
     def postProcessLayer(self, layer, context, feedback):  # noqa: ARG002, N802
         """Style one layer; QGIS calls this."""
@@ -38,15 +38,15 @@ class StyleLayer(QgsProcessingLayerPostProcessorInterface):
             style_footprints(layer)
 
 
-_alive = []
+_processors = []
 
 
 def styling():
-    """Return a new processor for one layer. The Processing context deletes it, so no two layers may share one; until
-    then Python must not.
+    """Return a new post-processor for one layer. The Processing context deletes it, so layers must not share one;
+    the list `_processors` keeps Python from deleting it earlier.
     """
-    _alive.append(StyleLayer())
-    return _alive[-1]
+    _processors.append(StyleLayer())
+    return _processors[-1]
 
 
 def style_raster(layer):
@@ -82,7 +82,7 @@ def index_span(path):
 
 
 def colour_bands(path):
-    """Return the band numbers for red, green and blue: of natural colour where the file has it, else false colour with
+    """Return the band numbers for red, green and blue: natural colour if the file has them, else false colour with
     near infrared as red, else the first three.
     """
     dataset = gdal.Open(path)

@@ -6,13 +6,13 @@ from .provider import AgalignProvider
 
 
 class AgalignPlugin:
-    """What QGIS loads and unloads."""
+    """The plugin object, which QGIS loads and unloads."""
 
     def __init__(self):
         self.provider = None
 
     def initProcessing(self):  # noqa: N802
-        """Add the provider; `qgis_process` calls this alone."""
+        """Add the provider; `qgis_process` calls only this method."""
         self.provider = AgalignProvider()
         QgsApplication.processingRegistry().addProvider(self.provider)
 

@@ -9,7 +9,7 @@ EXECUTABLE_SETTING = "AGALIGN_EXECUTABLE"
 
 
 def executable_setting():
-    """The path that the user has set under Settings, Options, Processing, Providers; empty by default."""
+    """Return the path that the user has set under Settings, Options, Processing, Providers; empty by default."""
     return ProcessingConfig.getSetting(EXECUTABLE_SETTING) or ""
 
 
@@ -17,15 +17,15 @@ class AgalignProvider(QgsProcessingProvider):
     """The algorithms of agalign."""
 
     def id(self):
-        """Of the provider in `qgis_process` and models."""
+        """Return the identifier for `qgis_process` and models."""
         return "agalign"
 
     def name(self):
-        """Shown in the toolbox."""
+        """Return the name for the toolbox."""
         return "agalign"
 
     def longName(self):  # noqa: N802
-        """Shown in the settings."""
+        """Return the name for the settings."""
         return "agalign: multispectral drone images"
 
     def load(self):
