@@ -1,4 +1,4 @@
-"""Aligns every capture below a folder that has reference ties, and prints accuracy and time.
+"""Aligns every capture below a folder with reference tie points, and prints accuracy and time.
 
     python benchmarks/accuracy.py DATA [align options, such as --seed identity --ignore-metadata]
 
@@ -19,7 +19,7 @@ from agalign.products.sidecar_file import find_sidecars
 
 
 def medians_and_seconds(out: Path, truth: dict[str, list[list[float]]]) -> list[tuple[str, float, float, float]]:
-    """(status, median error px, 95 % error px, seconds) of each pair that has ties."""
+    """Return (status, median error px, p95 error px, seconds) of each pair with tie points."""
     rows = []
     for path in find_sidecars(out):
         for band in json.loads(path.read_text())["bands"]:

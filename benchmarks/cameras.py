@@ -1,4 +1,4 @@
-"""Flights of cameras of which only tags and formulas are to be had, on two headings, against their truth: a table.
+"""Errors of synthetic flights on two headings, for cameras without public images with ground truth: a table.
 
 python benchmarks/cameras.py [CAPTURES] [CAMERA ...]
 
@@ -47,7 +47,7 @@ def main(captures: int, names: list[str]) -> None:
             for band, scores in by_band.items():
                 counts = [sum(s.status == status for s in scores) for status in ("aligned", "predicted")]
                 own = np.array([s.median_px for s in scores])
-                # The sidecar's grid leads to the moving file's pixels.
+                # The grid of the sidecar contains positions in the moving file.
                 there, here = own, own / coarse[band]
                 print(
                     f"| {name} | {band} | {counts[0]} | {counts[1]} | {len(scores) - sum(counts)} | "

@@ -1,4 +1,4 @@
-"""Band pairs with their truth, from folders that hold `ties.json` or a synthetic flight's `truth.json`."""
+"""Band pairs with ground truth, from folders with `ties.json` or the `truth.json` of a synthetic flight."""
 
 import json
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ Matrix = np.ndarray
 
 @dataclass(frozen=True)
 class Case:
-    """One band pair with its truth."""
+    """One band pair with its ground truth."""
 
     set_name: str
     capture: Capture | None
@@ -35,24 +35,24 @@ class Case:
 
     @property
     def rig(self) -> Matrix:
-        """The rig's mapping, or identity where no tag tells."""
+        """Mapping of the rig from the tags, or identity without tags."""
         result = rig_seed(self.reference, self.band)
         return np.eye(3) if result is None else result
 
     def straight(self) -> tuple[Raster, Raster]:
-        """Both images lens-corrected."""
+        """Both images without lens distortion."""
         return straightened(self.fixed), straightened(self.moving)
 
 
 def straightened(raster: Raster) -> Raster:
-    """An image as a lens without distortion would have taken it."""
+    """Return an image without lens distortion."""
     if not lens.is_distorting(raster.lens):
         return raster
     return warped(raster, PixelMapping(np.eye(3), None, raster.lens), raster.size_px)
 
 
 def cases(folders: list[Path]) -> Iterator[Case]:
-    """Every band pair of the folders, each of which holds ties.json or truth.json."""
+    """Return every band pair of folders with ties.json or truth.json."""
     for path in [p for folder in folders for p in (folder / "ties.json", folder / "truth.json") if p.is_file()]:
         captures = {}
         for capture in discover(path.parent).captures:

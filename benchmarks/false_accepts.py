@@ -1,4 +1,4 @@
-"""Aligns synthetic pairs, about half of which must not be called `aligned`, and prints how many were judged wrongly.
+"""Aligns synthetic pairs, about half of them without a correct alignment, and prints the number of wrong decisions.
 
     python benchmarks/false_accepts.py [pairs, by default 200] [first]
 
@@ -27,7 +27,7 @@ SIZE = (640, 480)
 
 
 def scene(rng: np.random.Generator, east_m: float = 0.0) -> tuple[Ground, Pose, Pose]:
-    """A field, a place above it, and another place `east_m` away."""
+    """Return a field, a pose above it, and a second pose `east_m` to the east."""
     here = Pose(26.0, float(rng.uniform(-180, 180)), 0.0, 0.0, 0.0, 0.0)
     there = Pose(26.0, here.yaw_deg, 0.0, 0.0, east_m, 0.0)
     return paint_ground(rng, [here, there], SIZE), here, there
@@ -39,7 +39,7 @@ def view(ground: Ground, band: int, pose: Pose, rng: np.random.Generator) -> np.
 
 
 def water(rng: np.random.Generator) -> np.ndarray:
-    """Ripples and glint: the same statistics in every image, another moment in each."""
+    """Return an image of ripples and glint: equal statistics, different realisations."""
     noise = rng.normal(size=SIZE[::-1]).astype(np.float32)
     ripples = cv2.GaussianBlur(noise, (0, 0), sigmaX=6, sigmaY=1.5)
     ripples += 0.3 * cv2.GaussianBlur(rng.normal(size=SIZE[::-1]).astype(np.float32), (0, 0), 1.0)
@@ -47,7 +47,7 @@ def water(rng: np.random.Generator) -> np.ndarray:
 
 
 def pair(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """(fixed, moving, seed, truth): truth is None where the images do not show the same."""
+    """Return (fixed, moving, seed, truth); truth is None if the images show different scenes."""
     if kind == GRID:
         fixed, moving, truth, _ = lattice(rng)
         return fixed, moving, None, truth
@@ -108,7 +108,7 @@ def main() -> None:
         result = agalign.align(fixed, moving, seed=seed)
         error = np.nan
         if truth is not None:
-            # The lenses bend the truth by a few pixels, which one homography follows only in part.
+            # Lens distortion changes the truth by a few pixels, which a homography only partly models.
             error = lens_free_error(result.fixed_to_moving, truth, fixed.shape[::-1])
         tally[kind].append((result.status, error, time.perf_counter() - began))
         print(f"{number:4d} {kind:28s} {result.status:9s} {error:7.2f} {tally[kind][-1][2]:5.1f} s", flush=True)
@@ -131,7 +131,7 @@ def main() -> None:
 
 
 def lens_free_error(result: np.ndarray, truth: np.ndarray, size: tuple[int, int]) -> float:
-    """Mean distance in px between two homographies over the middle of the image, where the lenses bend little."""
+    """Return the mean distance, px, between two homographies in the centre of the image, where distortion is small."""
     points = geometry.lattice(*size, 20, 20)
     middle = points[(np.abs(points - np.divide(size, 2)) < np.multiply(size, 0.3)).all(axis=1)]
     return float(np.linalg.norm(geometry.apply(result, middle) - geometry.apply(truth, middle), axis=1).mean())

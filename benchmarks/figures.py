@@ -35,7 +35,7 @@ GREEN, RED = (80, 200, 60), (60, 60, 230)
 
 
 def straight_pair(folder: Path) -> tuple[Raster, Raster, Matrix]:
-    """Green and near infra-red of one synthetic capture without lens distortion, and the truth between them."""
+    """Return green and near infrared of one synthetic capture without lens distortion, and the true homography."""
     straight = replace(cameras.REDEDGE, bands=tuple(replace(b, distortion=(0.0,) * 5) for b in cameras.BANDS))
     capture = json.loads(synthetic.make_flight(folder, 1, SIZE_PX, rng_seed=11, camera=straight).read_text())[
         "IMG_0001"
@@ -46,13 +46,13 @@ def straight_pair(folder: Path) -> tuple[Raster, Raster, Matrix]:
 
 
 def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
-    """Nearest neighbours of some keypoints in the space of a descriptor: green where right."""
+    """Return a picture of the nearest neighbours of some keypoints by a descriptor; correct ones are green."""
     rng = np.random.default_rng(0)
     start = geometry.compose(truth, geometry.translation(0.04 * SIZE_PX[0], 0.03 * SIZE_PX[0]))
     keypoints = visible_in_both(sift_keypoints(fixed), truth, fixed, moving)
     drawn = rng.choice(len(keypoints), DRAWN, replace=False)
     rows = []
-    for name, title in (("fast:pseudo-siamese", "learnt on this pair"), ("sift", "SIFT")):
+    for name, title in (("fast:pseudo-siamese", "learned on this pair"), ("sift", "SIFT")):
         describe = method_named(name)(PairTask(fixed, moving, start, seeding=False)).describe
         assert describe is not None
         f, f_prime = describe(keypoints, truth)
@@ -70,7 +70,7 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
 def draw_matches(
     fixed: Raster, moving: Raster, here: NDArray[np.float64], there: NDArray[np.float64], right: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:  # fmt: skip
-    """Both images beside each other, a line for every row of `here` and `there`, (N, 2)."""
+    """Return both images next to each other, with lines between corresponding rows of `here` and `there`, (N, 2)."""
     sheet = np.hstack([cv2.cvtColor(to_8_bit(r), cv2.COLOR_GRAY2BGR) for r in (fixed, moving)])
     beside = np.array([fixed.size_px[0], 0.0])
     for one, other, is_right in zip(here, there + beside, right, strict=True):
@@ -83,7 +83,7 @@ def draw_matches(
 
 
 def before_and_after(folder: Path) -> NDArray[np.uint8]:
-    """The picture that a run writes."""
+    """Write the preview of a run."""
     reports = agalign.align_folder(folder / "0000SET", folder / "aligned")
     assert all(r.good for r in reports)
     return cv2.imread(str(next((folder / "aligned").rglob("IMG_*.png"))))

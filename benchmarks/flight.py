@@ -1,4 +1,4 @@
-"""How the time of a run grows with the flight: synthetic flights of several lengths, one and two captures at a time.
+"""Time of a run by the length of the flight: synthetic flights, processed with one and two processes.
 
     python benchmarks/flight.py [lengths, by default 10,30,100] [jobs, by default 1,2]
 
@@ -19,7 +19,7 @@ import numpy as np
 
 
 def watched(command: list[str]) -> tuple[resource.struct_rusage, list[tuple[float, int]]]:
-    """(what a run used, [(GB, open files) of it and all its children, every half second])."""
+    """Return (resources of a run, [(GB, open files) of its process tree every half second])."""
     process, held = subprocess.Popen(command), []
     while True:
         pid, _, usage = os.wait4(process.pid, os.WNOHANG)
@@ -31,7 +31,7 @@ def watched(command: list[str]) -> tuple[resource.struct_rusage, list[tuple[floa
 
 
 def descendants(pid: int) -> list[int]:
-    """A process and all that it has started, as long as they run."""
+    """Return a process and its running descendants."""
     children: list[str] = []
     for thread in Path(f"/proc/{pid}/task").glob("*/children"):
         with suppress(OSError):
@@ -40,7 +40,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def holds(pid: int) -> tuple[float, int]:
-    """(GB, open files) of a process."""
+    """Return (GB, open files) of a process."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
         return pages * resource.getpagesize() / 1e9, len(os.listdir(f"/proc/{pid}/fd"))
@@ -56,7 +56,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "flight"
-        # In a process of its own: a child's memory is counted from its parent's at its start.
+        # In a separate process, because the peak memory of a child starts at that of its parent.
         make = f"from agalign.synthetic import make_flight; make_flight(Path({str(source)!r}), {max(lengths)})"
         subprocess.run([sys.executable, "-c", f"from pathlib import Path; {make}"], check=True)
         images = sorted((source / "0000SET" / "000").glob("*.tif"))

@@ -1,4 +1,4 @@
-"""Three indices of a thousand small captures with two processes: time, memory, and a run that goes on after a kill.
+"""Three indices of a thousand small captures with two processes: time, memory, and resumption after a kill.
 
 python benchmarks/indices.py [CAPTURES] [WIDTH] [HEIGHT]
 """
@@ -56,7 +56,7 @@ def show(name: str, out: Path, target: Path) -> None:
 
 
 def watch_memory(pid: int, memory_mb: list[float]) -> None:
-    """Of a process and those that it started, each second."""
+    """Record a process and its descendants every second."""
     try:
         process = psutil.Process(pid)
         while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:

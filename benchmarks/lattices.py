@@ -1,4 +1,4 @@
-"""Planted grids, which fit whole periods away: how many are wrongly called aligned, and how many a good seed saves.
+"""Planted grids, which also match at multiples of their period: wrong acceptances, and alignments from a good seed.
 
     python benchmarks/lattices.py [pairs, by default 60] [first seed]
 
@@ -21,7 +21,7 @@ MARGIN = 120
 
 
 def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """(fixed, moving, truth, period in px)."""
+    """Return (fixed, moving, truth, period in px)."""
     period = float(np.exp(rng.uniform(np.log(8), np.log(80))))
     jitter = float(rng.choice([0.0, rng.uniform(0, 0.1)]))
     angle = rng.uniform(0, np.pi)

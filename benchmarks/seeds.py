@@ -1,4 +1,4 @@
-"""How far off the coarse alignments are, per camera: the table of docs/cameras.md.
+"""Errors of the seeds of each camera: the table of docs/cameras.md.
 
     python benchmarks/seeds.py DATA
 
@@ -24,7 +24,7 @@ KINDS = ("identity", "rig", "structure", "chosen")
 
 
 def seeds_of(pair: BandPair) -> dict[str, PixelMapping]:
-    """Mappings between raw px by each kind of seed, and by the one that a run starts from."""
+    """Return the mappings between raw px of each kind of seed, and of the one that a run selects."""
     plain = geometry.overlay(pair.fixed.size_px, pair.moving.size_px)
     result = {"identity": PixelMapping(plain)}
     if "rig" in pair.candidates:
@@ -37,7 +37,7 @@ def seeds_of(pair: BandPair) -> dict[str, PixelMapping]:
 
 
 def errors(capture: Capture, ties: dict | None) -> dict[str, list[float]]:
-    """Median error of each pair in px, by kind of seed."""
+    """Return the median error of each pair, px, by kind of seed."""
     pairs, _ = read_pairs(capture, SeedSettings())
     result: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for pair in pairs:

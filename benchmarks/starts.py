@@ -1,4 +1,4 @@
-"""From which starts a pair is found, and by whom: shifts, turns and scales of the moving band, no tags used.
+"""Success of methods by initial shift, rotation and scale of the moving band, without tags.
 
     pip install -e '.[bench]' && python benchmarks/starts.py DATA... [--pairs 3] [--plot FILE]
 
@@ -33,11 +33,11 @@ STARTS = (
 
 Matrix = np.ndarray
 Aligner = Callable[[Raster, Raster], tuple[Matrix | None, bool]]
-"""A pair to (fixed_to_moving, whether it says that it is sure)."""
+"""Maps a pair to (fixed_to_moving, whether the method accepts its result)."""
 
 
 def moved(raster: Raster, shift: float, degrees: float, scale: float) -> tuple[Raster, Matrix]:
-    """(the image shifted within its frame, turned and scaled; its old pixels to the new ones)."""
+    """Return (the image shifted, rotated and scaled in its frame, the homography from old to new pixels)."""
     width, height = raster.size_px
     within = geometry.translation(shift * width, -shift * height / 2)
     turn = np.radians(degrees)
@@ -63,7 +63,7 @@ def by_sift(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
 
 
 def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
-    """On the moving image laid over the fixed one: images of other sizes are beyond it."""
+    """Register the moving image resampled to the size of the fixed one, because the method needs equal sizes."""
     overlay = geometry.overlay(fixed.size_px, moving.size_px)
     laid = cv2.warpPerspective(moving.pixels, overlay, fixed.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     result = elastix_affinity(fixed, Raster(laid, fixed.valid))
@@ -74,7 +74,7 @@ METHODS: dict[str, Aligner] = {"agalign": ours, "SIFT + RANSAC": by_sift, "elast
 
 
 def error_px(case: Case, to_moved: Matrix, result: Matrix | None) -> float:
-    """Median over the ties that lie in the moved image too, px of the moving file."""
+    """Return the median error, px of the moving file, of tie points inside the transformed image."""
     if result is None:
         return float("inf")
     there = geometry.apply(to_moved, case.ties[:, 2:])
@@ -83,7 +83,7 @@ def error_px(case: Case, to_moved: Matrix, result: Matrix | None) -> float:
 
 
 def chosen(folders: Sequence[Path], pairs: int) -> Iterator[Case]:
-    """So many pairs of each set, spread over it."""
+    """Return this number of pairs of each set, evenly spread."""
     for folder in folders:
         some = list(cases([folder]))
         yield from (some[i] for i in np.unique(np.linspace(0, len(some) - 1, pairs).round().astype(int)))
@@ -128,7 +128,7 @@ def main() -> None:
 
 
 def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path) -> None:
-    """A heat map a method: turns against shifts and scales, coloured by the share that is found."""
+    """Draw a heat map per method: share of successes by rotation, shift and scale."""
     import matplotlib as mpl
 
     mpl.use("Agg")
