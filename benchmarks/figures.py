@@ -83,7 +83,7 @@ def draw_matches(
 
 
 def before_and_after(folder: Path) -> NDArray[np.uint8]:
-    """Write the preview of a run."""
+    """Align a flight and return the preview of its first capture."""
     reports = agalign.align_folder(folder / "0000SET", folder / "aligned")
     assert all(r.good for r in reports)
     return cv2.imread(str(next((folder / "aligned").rglob("IMG_*.png"))))

@@ -56,7 +56,7 @@ def show(name: str, out: Path, target: Path) -> None:
 
 
 def watch_memory(pid: int, memory_mb: list[float]) -> None:
-    """Record a process and its descendants every second."""
+    """Append the memory of a process and its descendants, MB, every half second."""
     try:
         process = psutil.Process(pid)
         while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:

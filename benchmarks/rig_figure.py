@@ -1,4 +1,4 @@
-"""Draw the rig that a model file knows: where each lens stands, and what each lens does that its model does not say.
+"""Draw the rig of a model file: positions of the lenses, and displacements that the lens models do not include.
 
 python benchmarks/rig_figure.py MODEL.safetensors FIGURE.png
 """
@@ -18,7 +18,7 @@ from agalign.values import geometry
 
 COLOURS = {"blue": "#3465c8", "green": "#2f9e44", "red": "#d6363e", "nir": "#7a3fb0", "red edge": "#e07b1a"}
 _TIMES = 800
-"""How much longer the field's arrows are drawn."""
+"""Scale of the arrows of the displacement field."""
 
 
 def main() -> None:

@@ -63,10 +63,10 @@ def by_sift(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
 
 
 def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
-    """Register the moving image resampled to the size of the fixed one, because the method needs equal sizes."""
+    """Register the moving image, resampled to the size of the fixed one, by elastix."""
     overlay = geometry.overlay(fixed.size_px, moving.size_px)
-    laid = cv2.warpPerspective(moving.pixels, overlay, fixed.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    result = elastix_affinity(fixed, Raster(laid, fixed.valid))
+    resized = cv2.warpPerspective(moving.pixels, overlay, fixed.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    result = elastix_affinity(fixed, Raster(resized, fixed.valid))
     return None if result is None else geometry.compose(overlay, result), True
 
 

@@ -30,7 +30,7 @@ SIZE_PX = 32, 24
 
 
 def seeds(folder: Path) -> None:
-    """Files for each target to begin from."""
+    """Write the initial corpus of each target."""
     from agalign.cameras.tiff_directory import XMP, read_directories
     from agalign.synthetic.cameras import REDEDGE
     from agalign.synthetic.flight import make_flight
@@ -56,7 +56,7 @@ def seeds(folder: Path) -> None:
 
 
 def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
-    """Run libFuzzer in this process, which it ends."""
+    """Run libFuzzer in this process, and exit."""
     import atheris
 
     with atheris.instrument_imports(include=["agalign.cameras", "agalign.values", "tifffile", "defusedxml", "xml"]):

@@ -1,4 +1,4 @@
-"""The licences of what agalign is installed with: writes the table in docs/licences.md, or checks it.
+"""Write or check the table of the licences of dependencies in docs/licences.md.
 
     python tools/licences.py           # writes; everything of pyproject.toml must be installed
     python tools/licences.py --check   # exit code 1 where the page lacks a library, or one that is not permissive
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "licences.md"
 BEGIN, END = "<!-- licences -->\n", "<!-- end of licences -->\n"
 READ = {"atheris": "Apache-2.0", "exifread": "BSD-3-Clause", "odc-stac": "Apache-2.0"}
-"""Licences that the package's metadata do not tell, or not exactly, by its licence file."""
+"""Licences, from the licence file, of packages with missing or inexact metadata."""
 SPELT = {
     "Apache Software License": "Apache-2.0",
     "BSD License": "BSD",
@@ -44,13 +44,13 @@ def main() -> None:
 
 
 def requirements() -> dict[str, tuple[str, str]]:
-    """{library: (versions, what it is wanted for)}, of pyproject.toml."""
+    """Return {library: (versions, purpose)} from pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     versions: dict[str, str] = {}
     groups: dict[str, list[str]] = {}
     for group, texts in {"every run": project["dependencies"], **project["optional-dependencies"]}.items():
         for one in map(Requirement, texts):
-            # Extras may want different versions: the table has the first.
+            # Extras may require different versions: the table has the first.
             versions.setdefault(one.name.lower(), str(one.specifier))
             groups.setdefault(one.name.lower(), []).append(group if group == "every run" else f"`{group}`")
     names = sorted(versions, key=lambda name: ("every run" not in groups[name], name))
@@ -58,7 +58,7 @@ def requirements() -> dict[str, tuple[str, str]]:
 
 
 def licence(name: str) -> str:
-    """The licence of an installed library in short. Raises PackageNotFoundError."""
+    """Return the short licence of an installed library. Raises PackageNotFoundError."""
     if name in READ:
         return READ[name]
     facts = distribution(name).metadata
@@ -68,7 +68,7 @@ def licence(name: str) -> str:
 
 
 def check(wanted: dict[str, tuple[str, str]], table: str) -> list[str]:
-    """What the table lacks, and what is installed under a licence that it does not name."""
+    """Return the libraries that the table lacks or lists with another licence."""
     listed = {row.split(" | ")[0].removeprefix("| "): row for row in table.splitlines()[2:]}
     problems = [f"docs/licences.md lacks {name}: python tools/licences.py" for name in wanted if name not in listed]
     problems += [f"docs/licences.md has {name}, which nothing needs" for name in listed if name not in wanted]

@@ -84,7 +84,7 @@ def command_line_options() -> dict[str, tuple[str, str]]:
 
 
 def type_name(kind: Any) -> str:
-    """As a user writes the value."""
+    """Return the value as a user writes it."""
     kinds = [k for k in (typing.get_args(kind) or (kind,)) if k is not type(None)]
     if typing.get_origin(kind) is list:
         return "repeatable"
@@ -126,7 +126,7 @@ def json_type(field: dict[str, Any]) -> str:
 
 
 def reasons() -> str:
-    """What is reported of a band pair, its usual cause, and what to do. Numbers and details are dots."""
+    """Return a table of the reasons, causes and remedies of band pairs; numbers and details are dots."""
     grouped: dict[Any, list[str]] = {}
     for kind in KINDS.values():
         detail = "FILE: cannot be read (\0)" if kind.code == "unreadable" else "\0"
@@ -139,7 +139,7 @@ def reasons() -> str:
 
 
 def table(rows: Iterable[tuple[str, ...]]) -> str:
-    """Markdown; the first row is the header."""
+    """Return a Markdown table; the first row is the header."""
     header, *body = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
     return "\n".join([header, "|---" * (header.count(" | ") + 1) + "|", *body]) + "\n"
 
@@ -156,7 +156,7 @@ TABLES: dict[str, dict[str, Callable[[], str]]] = {
 
 
 def main() -> None:
-    """Without --check, write the pages."""
+    """Write the pages, or check them with --check."""
     for name, tables in TABLES.items():
         page = DOCS / name
         old = new = page.read_text(encoding="utf-8")

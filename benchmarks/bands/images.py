@@ -1,4 +1,4 @@
-"""The images of the sets: found on disk by their checksums, read, and spoilt in known ways."""
+"""The images of the sets: finding them by checksum, reading, and degrading them."""
 
 import hashlib
 import zlib
@@ -30,16 +30,16 @@ VARIANTS = (
 
 @dataclass(frozen=True)
 class Located:
-    """Which files of the sets are on disk."""
+    """Files of the sets that are on disk."""
 
     paths: dict[str, dict[str, Path]]
-    """By set and name; only sets of which every file is there."""
+    """Paths by set and name; complete sets only."""
     missing: dict[str, list[str]]
-    """The names that are not, by set."""
+    """Names of missing files by set."""
 
 
 def locate(folder: Path, sets: Mapping[str, Mapping[str, Any]]) -> Located:
-    """Every file below `folder` that a set wants, whatever its name and place."""
+    """Return the files below `folder` that belong to a set, by checksum."""
     sizes = {entry["bytes"] for s in sets.values() for entry in s["files"].values()}
     by_sum = {}
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
@@ -66,7 +66,7 @@ def read(path: Path) -> Image:
 
 
 def spoilt(image: Image, pair: Pair, variant: str) -> Image:
-    """The moving image of a pair as a variant has it; the same in every run."""
+    """Return the moving image of a pair in a variant; the same in every run."""
     seed = zlib.crc32("/".join((*pair.key, variant)).encode())
     rng = np.random.default_rng(seed)
     if variant in _LIGHT:
@@ -88,7 +88,7 @@ def _in_other_light(plane: Image, variant: str, rng: np.random.Generator) -> NDA
 
 
 def moved(image: Image, matrix: NDArray[np.float64]) -> Image:
-    """The image with its content moved by an affinity within its frame, black where nothing comes to lie."""
+    """Return the image transformed by an affine mapping in its frame, black outside."""
     if np.array_equal(matrix, np.eye(3)):
         return image
     shrink = np.sqrt(abs(np.linalg.det(matrix[:2, :2])))

@@ -40,7 +40,7 @@ Align = Callable[[Image, Image], Matrix | None]
 
 
 class UnavailableError(Exception):
-    """A method cannot be run here, for want of a library or of its weights."""
+    """A method cannot be run here, because a library or its weights are missing."""
 
 
 def method_named(name: str) -> Align:
@@ -191,7 +191,7 @@ def agalign_pair(fixed: Image, moving: Image) -> Matrix | None:
     return result.fixed_to_moving if result.status == "aligned" else None
 
 
-# ---- networks that others have learnt, where their weights are to be had
+# ---- pretrained networks with public weights
 
 
 def _loftr() -> Align:
@@ -263,7 +263,7 @@ def _with_weights(make: Callable[[], Any]) -> Any:
 
 
 def _as_tensors(torch: Any, fixed: Image, moving: Image, longest_px: int) -> tuple[Any, Any, list[float]]:
-    """Both images (1, 1, h, w) in [0, 1], no larger than the network was learnt at, and their scales."""
+    """Both images (1, 1, h, w) in [0, 1], no larger than the training images of the network, and their scales."""
     tensors, scales = [], []
     for image in (grey_8_bit(fixed), grey_8_bit(moving)):
         scale = min(1.0, longest_px / max(image.shape))

@@ -30,7 +30,7 @@ SETS = Path(__file__).parent / "sets"
 AS_IT_IS = "as it is"
 LOST = "lost"
 WRONG_PX = 1.0
-"""A pair that is claimed and lies further off in the median is a wrong claim."""
+"""A claimed pair with a larger median error is a wrong claim."""
 GOOD_PX = 0.5
 _LATTICE = 20
 _PAIRS_OF_A_VARIANT = 3
@@ -40,7 +40,7 @@ _LARGEST_CELL = 1 << 24
 
 @dataclass(frozen=True)
 class Pair:
-    """A band pair and where pixels of its reference lie in the moving file."""
+    """A band pair, and the true positions of pixels of its reference in the moving file."""
 
     set: str
     capture: str
@@ -61,7 +61,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Scored:
-    """What became of one pair."""
+    """Result of one pair."""
 
     set: str
     variant: str
@@ -91,11 +91,11 @@ class Score:
     under_half_px: float
     under_1_px: float
     median_px: float
-    """Of the pairs' median errors, the median."""
+    """Median of the pairs' median errors."""
     p95_px: float
-    """Of the pairs' 95 % errors, the median."""
+    """Median of the pairs' p95 errors."""
     worst_px: float
-    """Of the pairs' median errors, the largest."""
+    """Maximum of the pairs' median errors."""
     unclaimed_median_px: float
     seconds: float
     """Median over pairs."""
@@ -284,7 +284,7 @@ def _median(values: NDArray[np.float64]) -> float:
 
 
 def write_csv(scores: Sequence[Score], path: Path) -> None:
-    """Every score, with what cannot be told left empty."""
+    """Return every score as CSV; unknown values are empty."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([f.name for f in fields(Score)])

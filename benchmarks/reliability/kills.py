@@ -60,7 +60,7 @@ def files(out: Path) -> dict[str, Path]:
 
 
 def differences(out: Path, expected: dict[str, object]) -> Counter[str]:
-    """How many files are missing, left over, unreadable, different."""
+    """Return the numbers of missing, left-over, unreadable and different files."""
     result: Counter[str] = Counter()
     here = files(out)
     result["missing"] = len(expected.keys() - here.keys())
@@ -94,7 +94,7 @@ def whole_sidecars(out: Path) -> Counter[str]:
 
 
 def kill_after(seconds: float, argv: list[str], *, workers_too: bool) -> bool:
-    """True where the run was still running."""
+    """Return True if the run was still running."""
     process = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     time.sleep(seconds)
     running = process.poll() is None

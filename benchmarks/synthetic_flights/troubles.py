@@ -87,12 +87,12 @@ def _pose(rng: np.random.Generator, number: int) -> Pose:
 
 
 def _ground(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int], relief_m: float = 0.0) -> Ground:
-    """What is below one capture."""
+    """Return the ground below one capture."""
     return paint_ground(rng, [_above_the_origin(pose)], size_px, relief_m)
 
 
 def _above_the_origin(pose: Pose) -> Pose:
-    """Each capture has a ground of its own, centred on it."""
+    """Return a separate ground for each capture, centred on it."""
     return replace(pose, east_m=0.0, north_m=0.0)
 
 
@@ -175,7 +175,7 @@ def water(light: Field, rng: np.random.Generator) -> Field:
 
 
 def nothing(light: Field, _rng: np.random.Generator) -> Field:
-    """No light from the scene at all."""
+    """Return an image without light from the scene."""
     return np.full_like(light, 0.1)
 
 
@@ -185,17 +185,17 @@ def fog(light: Field, _rng: np.random.Generator) -> Field:
 
 
 def blur(light: Field, _rng: np.random.Generator) -> Field:
-    """Out of focus, by 3 px."""
+    """Defocus by 3 px."""
     return np.asarray(cv2.GaussianBlur(light, (0, 0), 3.0))
 
 
 def motion(light: Field, _rng: np.random.Generator) -> Field:
-    """Moved along x by 25 px during the exposure."""
+    """Motion blur of 25 px along x."""
     return np.asarray(cv2.filter2D(light, -1, np.full((1, 25), 1 / 25, np.float32)))
 
 
 def noise(light: Field, rng: np.random.Generator) -> Field:
-    """Noise of 30 % of the range that the light has."""
+    """Noise of 30 % of the range of the light."""
     low, high = np.percentile(light, (1, 99))
     return np.asarray(light + 0.3 * (high - low) * rng.normal(size=light.shape), np.float32)
 
