@@ -1,4 +1,4 @@
-"""What becomes of a flight on which everything goes wrong that can, and of one by a camera whose bands come late.
+"""Results for a flight with many faults, and for a camera that exposes its bands one after another.
 
     python benchmarks/flight_troubles.py [captures, by default 60] [rng seed]
 
@@ -32,7 +32,7 @@ def align(flight: Path, out: Path) -> float:
 
 
 def rows(out: Path, truth: dict) -> list[tuple[str, str, str, float, float]]:
-    """(trouble, capture and band, status, median error, error bar) of every moving band that was written."""
+    """(trouble, capture and band, status, median error, standard error) of every moving band in the output."""
     result = []
     for path in find_sidecars(out):
         sidecar = json.loads(path.read_text())

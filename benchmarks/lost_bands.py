@@ -1,4 +1,4 @@
-"""What becomes of a band whose image shows nothing, and of a capture over water, where the rest of its flight is good.
+"""Results for bands without texture, and for captures over water, in an otherwise normal flight.
 
     python benchmarks/lost_bands.py FLIGHT...
 
@@ -42,7 +42,7 @@ def align(flight: Path, out: Path) -> None:
 
 
 def rows(out: Path, truth: dict, kind: str, lost: set[str]) -> list[Row]:
-    """(kind, band, status, error, error bar) of each lost file."""
+    """Return (kind, band, status, error, standard error) of each replaced file."""
     result = []
     for path in find_sidecars(out):
         for band in json.loads(path.read_text())["bands"]:

@@ -1,4 +1,4 @@
-"""What a run makes of a capture with depth, against the exact geometry: residuals, range, occlusions."""
+"""Scores of a capture with depth by its exact geometry: residuals, range, occlusions."""
 
 import json
 from dataclasses import dataclass
@@ -51,19 +51,19 @@ class Score:
     recall: float = np.nan
     """Of the pixels without data in the stack, against the occluded ones."""
     seconds: float = np.nan
-    """Of the whole capture."""
+    """Processing time of the whole capture."""
 
 
 @dataclass(frozen=True)
 class Sidecar:
-    """What a run has written of a capture."""
+    """Outputs of a run for a capture."""
 
     path: Path
     content: dict[str, Any]
 
     @property
     def window(self) -> Window:
-        """The written rows and columns of the reference."""
+        """Rows and columns of the reference in the output."""
         x0, y0, width, height = self.content["output"]["crop"]
         return slice(y0, y0 + height), slice(x0, x0 + width)
 
@@ -122,7 +122,7 @@ def residuals(mapping: Map | None, truth: BandTruth, window: Window = WHOLE) -> 
 
 
 def is_wrong(status: str, p90_px: float) -> bool:
-    """Whether `aligned` is a false statement: the band is off, or does not show the scene."""
+    """True for a wrong acceptance: the band is misaligned, or does not show the scene."""
     return status == "aligned" and not p90_px <= WRONG_PX
 
 

@@ -1,4 +1,4 @@
-"""Where the time of a run goes, in seconds and relative to SIFT + RANSAC on the same images.
+"""Time of the stages of a run, in seconds and relative to SIFT + RANSAC on the same images.
 
     python benchmarks/stages.py FLIGHT [--peers]
 

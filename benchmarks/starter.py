@@ -1,4 +1,4 @@
-"""Does the starter network earn its place? Alignment from scratch with it and with random weights, on real images.
+"""Alignment of real images from the starter network and from random weights.
 
     python benchmarks/starter.py FOLDER...
 

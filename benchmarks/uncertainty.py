@@ -1,4 +1,4 @@
-"""Is the uncertainty that a run reports honest? Aligns a synthetic flight and compares with its exact homographies.
+"""Calibration of the reported uncertainty: aligns a synthetic flight and compares it with its exact homographies.
 
     python benchmarks/uncertainty.py [captures, by default 12] [rng seed]
 

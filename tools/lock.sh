@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Write the lock files anew from pyproject.toml and constraints.txt (wants uv: pip install uv). Of each package the
-# newest is taken that goes with the others, for every platform and for Python 3.11 and newer, each file by its hash.
+# Write the lock files from pyproject.toml and constraints.txt (needs uv: pip install uv): the newest compatible version
+# of each package, with hashes, for every platform and Python 3.11 and newer.
 #
 #     tools/lock.sh
 #
-#   locks/build.txt       what builds the wheel
-#   locks/image.txt       what the program needs in a container, but for PyTorch
-#   locks/dev.txt         what the tests and the linters need beyond these
+#   locks/build.txt       build dependencies of the wheel
+#   locks/image.txt       dependencies of the container image without PyTorch
+#   locks/dev.txt         further dependencies of tests and linters
 #   locks/torch-cuda.txt  PyTorch with CUDA and CUDA's libraries
 #   locks/torch-cpu.txt   PyTorch without: by hand, it says why
 set -euo pipefail
@@ -22,7 +22,7 @@ compile() {  # compile OUT [options of uv]
         --no-emit-index-url --no-emit-find-links --constraints constraints.txt --output-file "$out" "$@" > /dev/null
 }
 
-# PyTorch and what comes with it on Linux stand in a file of their own, so that either PyTorch goes with the rest.
+# PyTorch and its Linux dependencies have a separate file, so that CPU and CUDA versions use the same other locks.
 part() {  # part yes|no FILE
     awk -v wanted="$1" '/^[a-z]/ { own = /^(torch|triton|nvidia-[a-z0-9-]+|cuda-[a-z]+)==/ ? "yes" : "no" } own == wanted' "$2"
 }

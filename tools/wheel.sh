@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Build the sdist, and the wheel from it; look at what they hold; try the wheel by itself, away from this folder.
+# Build the sdist and the wheel from it, check their contents, and test the wheel outside this folder.
 #
 #     tools/wheel.sh [OUT]        # OUT keeps them
 #
-# The wheel is installed without what it needs, which it takes from the environment that this runs in (the dev extra):
-# to install all that anew takes minutes, and the README's command has just done it.
+# The wheel is installed without dependencies; they come from the active environment (the dev extra), because their
+# installation takes minutes.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -19,7 +19,7 @@ sdist=$out/agalign-$version.tar.gz wheel=$out/agalign-$version-py3-none-any.whl
 cmp "$wheel" "$folder/direct/$(basename "$wheel")"
 python3 -m twine check --strict "$sdist" "$wheel"
 
-# The wheel holds the package, all of it and nothing else; the sdist that and what builds it.
+# The wheel contains exactly the package; the sdist also contains the build files.
 python3 - "$sdist" "$wheel" << 'PY'
 import sys, tarfile, zipfile
 from pathlib import Path

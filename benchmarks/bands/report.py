@@ -1,4 +1,4 @@
-"""Tables and a figure of what was scored."""
+"""Tables and a figure of the scores."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -30,7 +30,7 @@ def dask(*arguments: str) -> subprocess.Popen[bytes]:
 
 
 def worker_process(nanny: subprocess.Popen[bytes]) -> psutil.Process:
-    """The process that works, below the one that looks after it."""
+    """Return the worker process below its nanny."""
     children = psutil.Process(nanny.pid).children(recursive=True)
     return max(children, key=lambda p: p.memory_info().rss)
 

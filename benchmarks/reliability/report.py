@@ -1,4 +1,4 @@
-"""What these scripts print, and where it goes in docs/reliability.md: between the marks of its section."""
+"""Output of the reliability scripts: standard output, and a marked section of docs/reliability.md."""
 
 import re
 from collections.abc import Sequence
