@@ -2,8 +2,8 @@
 
     python benchmarks/flight_troubles.py [captures, by default 60] [rng seed]
 
-The synthetic flights are aligned with the defaults. Errors are medians over a band's true ties, told beside the error
-bar that the sidecar gives; the time a capture is compared with that of an untroubled flight of as many captures.
+The synthetic flights are aligned with the defaults. Errors are medians over a band's true ties, compared with the
+standard error in the sidecar; the time per capture is compared with that of a flight of the same length without faults.
 """
 
 import json
@@ -55,7 +55,7 @@ def report(flight: Path, out: Path) -> None:
     """Print a table of one aligned flight."""
     truth = json.loads((flight / "truth.json").read_text())
     result = rows(out, truth)
-    print("| trouble | captures | bands | statuses | median error, px | worst error, px | worst error in error bars |")
+    print("| trouble | captures | bands | statuses | median error, px | worst error, px | worst error / std |")
     print("|---|---|---|---|---|---|---|")
     for trouble in dict.fromkeys(r[0] for r in result):
         some = [r for r in result if r[0] == trouble]
@@ -71,9 +71,9 @@ def report(flight: Path, out: Path) -> None:
     predicted = [r for r in result if r[2] == "predicted"]
     within = [f"{np.mean([r[3] <= k * r[4] for r in predicted]):.0%}" for k in (1, 2)] if predicted else ["-", "-"]
     print(f"{len(result)} of {wanted} bands written, {len(lost)} neither aligned nor predicted, {len(wrong)} wrongly "
-          f"aligned; of the predicted within one error bar {within[0]}, two {within[1]}")  # fmt: skip
+          f"aligned; of the predicted within one standard error {within[0]}, two {within[1]}")  # fmt: skip
     for trouble, label, status, error, bar in wrong + lost:
-        print(f"  {label} ({trouble}): {status}, {error:.2f} px, error bar {bar:.2f}")
+        print(f"  {label} ({trouble}): {status}, {error:.2f} px, standard error {bar:.2f}")
 
 
 def main() -> None:

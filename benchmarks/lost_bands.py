@@ -4,7 +4,7 @@
 
 FLIGHT holds a flight whose captures have reference ties in ties.json. In one run each capture loses another band, to
 noise; in another one whole capture is water. Errors are medians over the ties of what is written all the same, beside
-the error bar that the sidecar gives.
+the standard error that the sidecar gives.
 """
 
 import json
@@ -81,14 +81,14 @@ def main() -> None:
                     spoil(next(copy.rglob(name)), "noise" if turn < count else "water", rng)
                 align(copy, out)
                 result += rows(out, truth, f"{flight.name}, {kind}", lost)
-    print("| lost | band | what it is called | error at the ties, px | error bar, px |\n|---|---|---|---|---|")
+    print("| lost | band | what it is called | error at the ties, px | standard error, px |\n|---|---|---|---|---|")
     for kind, band, status, error, bar in result:
         print(f"| {kind} | {band} | {status} | {error:.3f} | {bar:.3f} |")
     for kind in dict.fromkeys(r[0] for r in result):
         errors, bars = (np.array([r[k] for r in result if r[0] == kind]) for k in (3, 4))
         within = [f"{np.mean(errors <= times * bars):.0%}" for times in (1, 2)]
-        print(f"{kind}: median {np.median(errors):.3f}, worst {errors.max():.3f} px; within one error bar {within[0]}, "
-              f"two {within[1]}")  # fmt: skip
+        print(f"{kind}: median {np.median(errors):.3f}, worst {errors.max():.3f} px; within 1 standard error "
+              f"{within[0]}, within 2 {within[1]}")  # fmt: skip
 
 
 if __name__ == "__main__":

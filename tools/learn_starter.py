@@ -2,7 +2,7 @@
 
     python tools/learn_starter.py [scenes, by default 40]
 
-One siamese network is learnt with in-batch negatives, without labels, on one capture of each of many synthetic fields.
+One siamese network is learned with in-batch negatives, without labels, on one capture of each of many synthetic fields.
 It takes about a quarter of an hour on one core; equal numbers of scenes give equal networks. benchmarks/starter.py
 compares the network with random weights.
 """
