@@ -35,7 +35,9 @@ def onto(
     ] = None,
     relief: Annotated[
         ReliefUse,
-        of_alignment(help="Add a smooth displacement field to the homography. auto: if left-out windows confirm it."),
+        of_alignment(
+            help="Add a smooth displacement field to the homography. auto: if windows not used in its fit confirm it."
+        ),
     ] = "auto",
     interpolation: Annotated[Interpolation, of_output(help="Resampling of the moving mosaics.")] = "lanczos",
     format: Annotated[RasterFormat, of_output(help="Tiled GeoTIFF or cloud-optimised GeoTIFF.")] = "gtiff",
@@ -54,7 +56,7 @@ def onto(
     """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.
 
     Grids, resolutions and coordinate reference systems may differ. For each MOVING, agalign writes a sidecar and a
-    raster on the grid of REFERENCE, with the compared band of REFERENCE and all bands of MOVING.
+    raster on the grid of REFERENCE, with one band of REFERENCE (--reference) and all bands of MOVING.
     """
     terminal = Terminal(quiet=quiet, verbose=verbose, log_json=log_json)
     with exits(terminal):

@@ -115,7 +115,9 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
             ) as north_up:  # fmt: skip
                 yield north_up
     except UnicodeEncodeError:
-        raise UnreadableFileError(f"{path}: its name is not in this system's letters; set LC_ALL=C.UTF-8") from None
+        raise UnreadableFileError(
+            f"{path}: the system encoding cannot represent its name; set LC_ALL=C.UTF-8"
+        ) from None
     except Exception as error:
         # Some classes of rasterio's errors are not public.
         if not isinstance(error, UnicodeDecodeError) and not type(error).__module__.startswith("rasterio."):

@@ -778,7 +778,7 @@ FAULTS = (
     Fault("the lock of a killed run", held_by_a_killed_one, 0, "", ("a", "b")),
     Fault("a terminal of ASCII", both(strange_names, in_ascii), 0, "", ("a", "b")),
     Fault("a system without letters beyond ASCII", both(strange_names, in_c), 3,
-          "its name is not in this system's letters", ("a", "b")),
+          "the system encoding cannot represent its name", ("a", "b")),
     Fault("standard output full", standard_output_full, 1, "standard output|output: No space left", ("a", "b")),
     Fault("a random seed beyond 64 bits", asking("--rng-seed", "9" * 30), 2, "--rng-seed: give", ()),
     Fault("a torch device without data", asking("--device", "meta"), 2, "device 'meta' cannot be used", ()),
