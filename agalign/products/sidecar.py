@@ -106,9 +106,9 @@ class SeedPart(_Part):
     fixed_to_moving: Matrix3x3
     """As in `homography`."""
     peak_sigma: float
-    """Height of its correlation peak above the surface, standard deviations."""
+    """Height of its correlation peak above the mean, in standard deviations."""
     runner_up_sigma: float
-    """Height above the second peak, standard deviations."""
+    """The same for the second highest peak."""
 
 
 class GridPart(_Part):
