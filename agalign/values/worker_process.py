@@ -24,7 +24,7 @@ _MORE, _LAST, _REQUEST = b"+", b".", b"?"
 _OUT_OF_MEMORY_EXIT_CODE = 71
 LOST_SERVER_EXIT_CODE = 255
 """Exit code of a worker after its fork server was killed; the worker itself may still run."""
-ENDS_WITHIN_S = 5.0
+ENDS_WITHIN_S = 10.0
 """Timeout for the end of a killed process, which takes milliseconds unless it waits for a disk or file server."""
 _PROCESS_LOCK = threading.Lock()
 """Starting a process polls all others. Two threads that poll one process get a wrong exit code."""

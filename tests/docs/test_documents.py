@@ -117,7 +117,7 @@ def test_options_in_the_documents_exist() -> None:
         known |= set(re.findall(r"--[a-z][\w-]+", done.stdout))
     names = "README.md", "docs/options.md", "docs/quickstart.md", "docs/troubleshooting.md"
     for page in (ROOT / name for name in names):
-        named = set(re.findall(r"`(--[a-z][\w-]+)", page.read_text(encoding="utf-8")))
+        named = set(re.findall(r"[` ](--[a-z][\w-]+)", page.read_text(encoding="utf-8")))
         assert named, page
         assert named <= known, page
 
