@@ -1,44 +1,48 @@
 """Learn the model of a flight: one network for all its captures, from a few of them, and its rig."""
 
-import logging
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agalign.capture.align import align_pairs, verify_together
-from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.prediction import observed, with_predictions
-from agalign.capture.seeding import find_seed, image_groups
+from agalign.batch.learning_tasks import (
+    ChooseAndRefine,
+    LearningCapture,
+    ObserveRig,
+    OneThread,
+    RigObservation,
+    TryModel,
+    initial_network,
+    load_capture,
+    log_failure,
+    portable,
+)
 from agalign.config import Settings
-from agalign.errors import AgalignError
 from agalign.flight.factors import median_mapping
-from agalign.flight.fingerprint import fingerprint, hashed
+from agalign.flight.fingerprint import hashed, refinement_key
 from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
-from agalign.flight.rig import MIN_CAPTURES, Observation, Rig
+from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
-from agalign.method.fast import DEFAULT_SCHEDULE, learn
-from agalign.method.joint import Results, refine_with
+from agalign.method.fast import learn
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
-from agalign.method.starter import start_from
 from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
+from agalign.values.alignment import RefinedPair, Residual
+from agalign.values.apply import A, Apply, R
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
-from agalign.values.pixel_units import FixedFilePx, FixedImagePx, MovingFilePx
+from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.verify.displacement_field import common_field
 from agalign.verify.extrapolation_check import unobserved_quarters
 from agalign.verify.lens_shapes import unmodelled_std_px
 
-_LOG = logging.getLogger(__name__)
 _NETWORK_CAPTURES = 3
 """Number of captures that the network is learned from; each takes seconds. A third capture mostly shows the structure
 that two lack."""
@@ -53,150 +57,183 @@ _MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48
 @without_warnings()
 def learn_flight(
     captures: Sequence[Capture], settings: Settings, progress: Progress, start: FlightModel | None = None,
-    at_once: int = 1,
+    apply: Apply = map, threads: int = 1,
 ) -> FlightModel | None:  # fmt: skip
     """Return a model learned from a few captures spread over the flight; None if none of them could be aligned.
 
-    `at_once` captures are processed at a time, each in a thread; the result does not depend on it. `start` is an
-    earlier model. It is returned if it still aligns captures of this flight as its rig predicts. Otherwise its network
-    initialises theta; weights of bands that it lacks start from those of its last band.
+    `apply` processes single captures, and `threads` train the network; the result does not depend on them. `start` is
+    an earlier model. It is returned if it still aligns captures of this flight as its rig predicts. Otherwise its
+    network initialises theta; weights of bands that it lacks start from those of its last band.
     """
     keep_freed_memory()
-    fingerprint_now = learning_fingerprint(captures, settings)
-    # Neither the network nor the rig models the displacements of single captures.
-    without_relief = settings.model_copy(update={"relief": settings.relief.model_copy(update={"use": "never"})})
-    if start is not None and _still_holds(start, captures, without_relief, at_once):
-        return replace(start, fingerprint=fingerprint_now)
-    bands = flight_lenses(captures)
-    loaded = _load(captures, bands, without_relief, start, at_once)
-    network = _learn_network(loaded, bands, without_relief, progress, start, at_once)
-    if network is None:
-        return None
-    net, known = network
-    size = captures[0].reference.size_px
-    mappings = {name: median_mapping(of, size) for name, of in _recognised(known).items()}
-    if not mappings:
-        return None
-    model = FlightModel(net, flight_camera(captures), bands, mappings, fingerprint_now)
-    refined = {r.loaded.capture.label: r for r in known}
-    rig = _learn_rig(captures, without_relief, model, refined, progress, at_once)
-    if rig is None:
-        rig = None if start is None else start.rig
-    return replace(model, rig=rig, mappings=mappings if rig is None else {**mappings, **rig.mean})
+    captures = [capture.with_absolute_paths() for capture in captures]
+
+    def in_one_thread(function: Callable[[A], R], arguments: Sequence[A]) -> Iterator[R]:
+        return apply(OneThread(function), arguments)
+
+    learned = _FlightLearner(captures, settings, progress, start, in_one_thread, threads).learned()
+    return None if learned is None else replace(learned, fingerprint=learning_fingerprint(captures, settings))
 
 
-def _learn_network(
-    loaded: Sequence["_Loaded"], bands: Sequence[str], settings: Settings, progress: Progress,
-    start: FlightModel | None, at_once: int,
-) -> tuple[Descriptor, list["_Refined"]] | None:  # fmt: skip
-    """Return (the network, the captures with mappings refined by it); None if learning fails."""
-    if not loaded:
-        return None
-    state = JointState(settings.joint, progress)
-    groups = [group for one in loaded for _, group in one.groups]
-    net = state.fast_descriptor([1] * (1 + len(bands)))
-    if start is not None:
-        # A model of this camera may have bands that the flight lacks: match the weights by band name.
-        sides = [0, *(start.side(band) or len(start.bands) for band in bands)] if start.camera else None
-        start_from(net, start.net.state_dict(), sides)
+@dataclass(frozen=True)
+class _FlightLearner:
+    """The steps of `learn_flight`."""
 
-    patches = FLIGHT_PATCHES if len(loaded) >= MIN_CAPTURES else PATCHES
+    captures: Sequence[Capture]
+    settings: Settings
+    progress: Progress
+    start: FlightModel | None
+    apply: Apply
+    threads: int
 
-    def refined() -> list[Results]:
-        with ThreadPoolExecutor(at_once) as pool:
-            return list(pool.map(lambda group: refine_with(net, group, settings.joint, progress, patches), groups))
+    def learned(self) -> FlightModel | None:
+        """Return the model, without a fingerprint."""
+        if self.start is not None:
+            refined = self._refined_by(self.start)
+            if refined is not None:
+                return replace(self.start, refined=refined)
+        network = self._network()
+        if network is None:
+            return None
+        net, known = network
+        mappings: dict[str, list[Matrix]] = {}
+        for one in known:
+            for name, matrix in one.mappings.items():
+                mappings.setdefault(name, []).append(matrix)
+        if not mappings:
+            return None
+        medians = {name: median_mapping(of, self._size_px) for name, of in mappings.items()}
+        model = FlightModel(net, flight_camera(self.captures), self._bands, medians, "")
+        observations = self._observations(model, known)
+        rig = self._rig(list(observations.values()))
+        if rig is None and self.start is not None:
+            rig = self.start.rig
+        refined = {self._key(c): observations[c.label].refined for c in self.captures if c.label in observations}
+        return replace(model, rig=rig, mappings=medians if rig is None else {**medians, **rig.mean}, refined=refined)
 
-    try:
-        # The initial network is often good enough.
-        results = refined() if net.is_trained and all(all(group.trusted) for group in groups) else []
-        if not results or not all(map(_is_good_enough, results)):
-            for group, of_group in zip(groups, results, strict=False):
-                _move_to(group, of_group)
-            learn(state, groups, net, at_once)
-            results = refined()
-    except Exception as error:
-        # One capture may make learning from all of them fail; a network is then learned for each capture alone.
-        _log_failure("the flight cannot be learned from", error)
-        return None
-    in_turn = iter(results)
-    return net, [_Refined(one, one.in_order(in_turn)) for one in loaded]
+    @property
+    def _bands(self) -> tuple[str, ...]:
+        return flight_lenses(self.captures)
 
+    @property
+    def _size_px(self) -> tuple[int, int]:
+        return self.captures[0].reference.size_px
 
-def _is_good_enough(results: Results) -> bool:
-    """True if a network needs no more learning for a capture with these results."""
-    enough = DEFAULT_SCHEDULE.enough_retrieval
-    return all(isinstance(result, JointResult) and result.retrieval > enough for result in results)
+    @property
+    def _settings_without_relief(self) -> Settings:
+        """Neither the network nor the rig models the displacements of single captures."""
+        return self.settings.model_copy(update={"relief": self.settings.relief.model_copy(update={"use": "never"})})
 
+    def _key(self, capture: Capture) -> str:
+        return refinement_key(capture, self.settings)
 
-def _move_to(group: ImageGroup, results: Results) -> None:
-    """Set the initial mappings of a group's pairs with distinguishable patches to the results of the network."""
-    for band, result in enumerate(results):
-        if isinstance(result, JointResult) and result.retrieval >= MIN_RETRIEVAL:
-            group.mappings[band] = result.fixed_to_moving
+    def _refined_by(self, model: FlightModel) -> dict[str, Mapping[str, RefinedPair]] | None:
+        """Return the refined mappings of two captures of the flight by an earlier model; None if it must be learned
+        again.
 
+        The model holds if the two captures can be aligned, and its rig predicts each aligned band from the others with
+        a standard error of at most `accept_predicted_px`.
+        """
+        if model.rig is None or not set(self._bands) <= set(model.bands):
+            return None
+        some = [self.captures[len(self.captures) * k // 3] for k in (1, 2)]
+        task = TryModel(portable(model), self._settings_without_relief)
+        tests = list(self.apply(task, some))
+        if sum(t.aligned for t in tests) < len(self._bands) or any(t.aligned != t.predicted for t in tests):
+            return None
+        return {self._key(capture): t.refined for capture, t in zip(some, tests, strict=True)}
 
-def _recognised(refined: Sequence["_Refined"]) -> dict[str, list[Matrix]]:
-    """Return the mappings (file px) of each band, from captures with distinguishable held-out patches."""
-    mappings: dict[str, list[Matrix]] = {}
-    for one in refined:
-        for pair, result in zip(one.loaded.pairs, one.results, strict=True):
-            if isinstance(result, JointResult) and result.retrieval >= MIN_RETRIEVAL:
-                mappings.setdefault(pair.name, []).append(pair.scales.between_files(result.fixed_to_moving))
-    return mappings
+    def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
+        """Return (the network, captures with mappings refined by it); None if learning fails."""
+        parts = np.array_split(np.arange(len(self.captures)), min(_NETWORK_CAPTURES, len(self.captures)))
+        stretches = [
+            tuple(self.captures[part[k]] for k in dict.fromkeys((len(part) // 2, 0, len(part) - 1))) for part in parts
+        ]
+        # All captures of a short flight determine the rig; those of a long one are easier to align with the model.
+        first = {stretch[0].label for stretch in stretches}
+        is_short = len(self.captures) <= _MIN_RIG_CAPTURES
+        others = [(c,) for c in self.captures if c.label not in first] if is_short else []
+        patches = FLIGHT_PATCHES if len(stretches) >= MIN_CAPTURES else PATCHES
+        start = None if self.start is None else portable(self.start)
+        task = ChooseAndRefine(self._bands, self._settings_without_relief, patches, start)
+        refined = []
+        for one in self.apply(task, [*stretches, *others]):
+            refined.append(one)
+            self.progress("the network", len(refined) / (len(stretches) + len(others)))
+        chosen = [one for one in refined[: len(stretches)] if one is not None]
+        if not chosen:
+            return None
+        net = initial_network(self._bands, self.settings, self.start)
+        if all(one.is_good_enough for one in chosen):
+            return net, list({one.capture.label: one for one in refined if one is not None}.values())
+        return self._trained(net, chosen, patches)
 
-
-def _still_holds(model: FlightModel, captures: Sequence[Capture], settings: Settings, at_once: int) -> bool:
-    """True if two captures of the flight can be aligned, and the model's rig predicts each aligned band from the
-    others with a standard error of at most `accept_predicted_px`.
-    """
-    rig, bands = model.rig, flight_lenses(captures)
-    if rig is None or not set(bands) <= set(model.bands):
-        return False
-
-    def fits(capture: Capture) -> tuple[int, int]:
-        """Return the number of aligned bands, and of those among them that the rig predicts."""
+    def _trained(
+        self, net: Descriptor, chosen: Sequence[LearningCapture], patches: int
+    ) -> tuple[Descriptor, list[LearningCapture]] | None:
+        """Train a network on captures, from the mappings that are already refined; None if that fails."""
+        settings = self._settings_without_relief
+        loaded = [load_capture(one.capture, self._bands, settings, self.start) for one in chosen]
+        pairs = [(one, images) for one, images in zip(chosen, loaded, strict=True) if images is not None]
+        groups: list[ImageGroup] = []
+        for one, images in pairs:
+            groups += images.groups_from({} if one.seen is None else one.seen.refined)
         try:
-            pairs, _ = read_pairs(capture, settings.seed, model)
-            result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
-            checked = with_predictions(pairs, result, rig, capture)
+            learn(JointState(settings.joint, self.progress), groups, net, self.threads)
+            with ThreadPoolExecutor(self.threads) as pool:
+                return net, list(pool.map(lambda p: p[1].refined_by(net, settings, patches), pairs))
         except Exception as error:
-            _log_failure(f"{capture.label} is not aligned by the model", error)
-            return 0, 0
-        aligned = [checked[name] for name, a in result.items() if a.status == "aligned"]
-        limit_px = settings.check.accept_predicted_px
-        predicted = [a for a in aligned if a.prediction is not None and a.prediction.std_px <= limit_px]
-        return len(aligned), len(predicted)
+            # One capture may make learning from all of them fail; a network is then learned for each capture alone.
+            log_failure("the flight cannot be learned from", error)
+            return None
 
-    with ThreadPoolExecutor(at_once) as pool:
-        some = [captures[len(captures) * k // 3] for k in (1, 2)]
-        counts = list(pool.map(fits, some))
-    return sum(aligned for aligned, _ in counts) >= len(bands) and all(a == p for a, p in counts)
+    def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> dict[str, RigObservation]:
+        """Return observations of the rig by capture, until every observed band is in enough of them.
 
+        `known` are the captures that the network has refined.
+        """
+        count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // _CAPTURES_PER_RIG_CAPTURE))
+        result = {one.capture.label: one.seen for one in known if one.seen is not None}
+        if len(self.captures) < MIN_CAPTURES:
+            return result
+        again = [c for c in self.captures if c.label in result and result[c.label].misaligned]
+        waiting = [*again, *(c for c in _spread(self.captures, count) if c.label not in result)]
+        task = ObserveRig(portable(model), self._settings_without_relief)
+        while waiting:
+            counts = Counter(band for o in result.values() for band in o.residuals)
+            missing = count - min(counts.values(), default=0)
+            if missing <= 0:
+                break
+            some, waiting = waiting[:missing], waiting[missing:]
+            # The model's mappings are better initial alignments than the seeds of the misaligned bands.
+            arguments = [(c, result[c.label].misaligned if c.label in result else None) for c in some]
+            for capture, observation in zip(some, self.apply(task, arguments), strict=True):
+                if observation is not None:
+                    earlier = result.get(capture.label)
+                    result[capture.label] = observation if earlier is None else earlier.updated(observation)
+                self.progress("the rig", min(1.0, len(result) / count))
+        return {c.label: result[c.label] for c in self.captures if c.label in result}
 
-def _learn_rig(
-    captures: Sequence[Capture], settings: Settings, model: FlightModel, known: Mapping[str, "_Refined"],
-    progress: Progress, at_once: int,
-) -> Rig | None:  # fmt: skip
-    """Return the rig of captures spread over the flight; `known` are those, by label, that the network has refined."""
-    if len(captures) < MIN_CAPTURES:
-        return None
-    observations = _observe_rig(captures, settings, model, known, progress, at_once)
-    size = captures[0].reference.size_px
-    rig = learn_rig([o.observation for o in observations], size, _layout(captures))
-    if rig is None:
-        return None
-    residuals = {band: [o.residuals[band] for o in observations if band in o.residuals] for band in rig.mean}
-    with ThreadPoolExecutor(at_once) as pool:
-        fields = list(pool.map(lambda of_band: common_field(of_band, size), residuals.values()))
-    extrapolation_px = _extrapolation_px(rig, residuals, calibrated=captures[0].reference.lens is not None)
-    return replace(
-        rig, extrapolation_px=extrapolation_px,
-        fields={
-            band: field
-            for band, field in zip(residuals, fields, strict=True)
-            if field is not None and band not in extrapolation_px
-        },
-    )  # fmt: skip
+    def _rig(self, observations: Sequence[RigObservation]) -> Rig | None:
+        """Return the rig, with the displacement fields of the lenses; None if the captures do not determine it."""
+        if len(self.captures) < MIN_CAPTURES:
+            return None
+        rig = learn_rig([o.observation for o in observations], self._size_px, _layout(self.captures), self.apply)
+        if rig is None:
+            return None
+        residuals = {band: [o.residuals[band] for o in observations if band in o.residuals] for band in rig.mean}
+        fit = partial(common_field, size_px=self._size_px)
+        fields = list(self.apply(fit, list(residuals.values())))
+        calibrated = self.captures[0].reference.lens is not None
+        extrapolation_px = _extrapolation_px(rig, residuals, calibrated=calibrated)
+        return replace(
+            rig, extrapolation_px=extrapolation_px,
+            fields={
+                band: field
+                for band, field in zip(residuals, fields, strict=True)
+                if field is not None and band not in extrapolation_px
+            },
+        )  # fmt: skip
 
 
 def _extrapolation_px(
@@ -213,37 +250,6 @@ def _extrapolation_px(
             ratio = abs(float(geometry.local_scale(rig.mean[band], *rig.size_px)[-1]))
             std_px = unmodelled_std_px(centres_px, rig.size_px, calibrated=calibrated)
             result[band] = MovingFilePx(std_px * ratio)
-    return result
-
-
-def _observe_rig(
-    captures: Sequence[Capture], settings: Settings, model: FlightModel, known: Mapping[str, "_Refined"],
-    progress: Progress, at_once: int,
-) -> list["_RigObservation"]:  # fmt: skip
-    """Return observations of the rig, until every observed band is in enough of them."""
-    count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(captures) // _CAPTURES_PER_RIG_CAPTURE))
-
-    def observe(capture: Capture) -> "_RigObservation | None":
-        try:
-            return _rig_observation(capture, settings, model, known.get(capture.label))
-        except Exception as error:
-            _log_failure(f"{capture.label} does not determine the rig", error)
-            return None
-
-    result: list[_RigObservation] = []
-    counts: Counter[str] = Counter()
-    with ThreadPoolExecutor(at_once) as pool:
-        # Captures that the network was learned from take less time: they come first if there may be enough of them.
-        quick = [c for c in captures if c.label in known]
-        slow = [c for c in _spread(captures, count) if c.label not in known]
-        for observation in pool.map(observe, [*quick, *slow] if len(captures) > count else [*slow, *quick]):
-            if observation is None:
-                continue
-            result.append(observation)
-            counts.update(list(observation.residuals))
-            progress("the rig", min(1.0, len(result) / count))
-            if counts and min(counts.values()) >= count:
-                break
     return result
 
 
@@ -266,110 +272,4 @@ def _layout(captures: Iterable[Capture]) -> dict[str, tuple[float, float]]:
 
 def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:
     """Return a hash of everything that a learned model depends on: the captures and the settings."""
-    stages = settings.joint, settings.seed, settings.flight
-    return hashed(flight_camera(captures), *(fingerprint(c, *stages) for c in captures))
-
-
-@dataclass(frozen=True)
-class _Loaded:
-    """A capture to learn from."""
-
-    capture: Capture
-    groups: list[tuple[list[int], ImageGroup]]
-    """Groups of images, each with the indices of its pairs in `pairs`."""
-    pairs: list[BandPair]
-    seeds: list[Seed]
-
-    def in_order(self, refined: Iterator[Results]) -> Results:
-        """The results in the order of `pairs`, from those of `groups`."""
-        result = {i: r for places, _ in self.groups for i, r in zip(places, next(refined), strict=True)}
-        return [result[i] for i in range(len(self.pairs))]
-
-    @property
-    def similarity_sigma(self) -> float:
-        """Median height of the correlation peaks of the seeds, in standard deviations."""
-        return float(np.median([s.peak_sigma for s in self.seeds]))
-
-
-@dataclass(frozen=True)
-class _Refined:
-    """A capture that the network was learned from, with its refined mappings."""
-
-    loaded: _Loaded
-    results: Results
-
-
-@dataclass(frozen=True)
-class _RigObservation:
-    """Observation of the rig by one capture: its mappings, and the residual shifts of its windows."""
-
-    observation: Observation
-    residuals: dict[str, Residual[FixedFilePx]]
-
-
-def _rig_observation(
-    capture: Capture, settings: Settings, model: FlightModel, known: _Refined | None
-) -> _RigObservation:
-    """Observe the rig in one capture. Raises UnreadableFileError if the reference cannot be read."""
-    result: Mapping[str, Alignment[FixedImagePx]] = {}
-    if known is not None:
-        pairs = known.loaded.pairs
-        starts = list(zip(pairs, known.loaded.seeds, strict=True))
-        result = verify_together(starts, known.results, model, settings)
-    if not result or any(
-        a.status != "aligned" and a.joint is not None and a.joint.retrieval >= MIN_RETRIEVAL for a in result.values()
-    ):
-        # The model's mappings are better initial alignments than those that the network was learned from.
-        pairs, _ = read_pairs(capture, settings.seed, model)
-        result = align_pairs(pairs, settings, lambda *_: None, model, scratch=False)
-    pairs = [p for p in pairs if p.has_rig_pixels]
-    in_file_px = {p.name: result[p.name].in_file_px(p.scales) for p in pairs}
-    good = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
-    return _RigObservation(observed(pairs, result, capture), good)
-
-
-def _load(
-    captures: Sequence[Capture], bands: Sequence[str], settings: Settings, start: FlightModel | None, at_once: int
-) -> list[_Loaded]:
-    """Return one capture from each third of the flight: the first of three with trusted seeds for all bands, else the
-    one with the highest correlation peaks. Captures without common structure, as of water or fog, are not usable.
-    """
-
-    def best_of(stretch: NDArray[np.intp]) -> _Loaded | None:
-        best: _Loaded | None = None
-        for k in dict.fromkeys((len(stretch) // 2, 0, len(stretch) - 1)):
-            result = _read(captures[stretch[k]], bands, settings, start)
-            if result is not None and (best is None or result.similarity_sigma > best.similarity_sigma):
-                best = result
-            if best is not None and all(s.trusted for s in best.seeds):
-                break
-        return best
-
-    stretches = np.array_split(np.arange(len(captures)), min(_NETWORK_CAPTURES, len(captures)))
-    with ThreadPoolExecutor(at_once) as pool:
-        return [best for best in pool.map(best_of, stretches) if best is not None]
-
-
-def _read(capture: Capture, bands: Sequence[str], settings: Settings, start: FlightModel | None) -> _Loaded | None:
-    """Read a capture and find its seeds; None if no band can be used.
-
-    Bands have their index in `bands` as index in the network. Seeds of kind `match` use the network of `start`.
-    """
-    try:
-        pairs, _ = read_pairs(capture, settings.seed)
-        seeds_of = [(p, find_seed(p, settings.seed, start)) for p in pairs if p.has_rig_pixels]
-        result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
-        if not result:
-            return None
-        usable, seeds = [p for p, _ in result], [seed for _, seed in result]
-        return _Loaded(capture, image_groups(usable, seeds, [bands.index(p.name) + 1 for p in usable]), usable, seeds)
-    except Exception as error:
-        _log_failure(f"{capture.label} cannot be learned from", error)
-        return None
-
-
-def _log_failure(message: str, error: Exception) -> None:
-    """Log why a capture cannot be used for learning; it is reported when it is aligned. Raises MemoryError again."""
-    if isinstance(error, MemoryError):
-        raise error
-    _LOG.debug("%s: %s", message, error, exc_info=not isinstance(error, AgalignError))
+    return hashed(flight_camera(captures), *(refinement_key(c, settings) for c in captures))

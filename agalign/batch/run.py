@@ -12,7 +12,7 @@ from agalign.batch.capture import discard_outputs, paths_written, quiet
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.batch.output_folder import is_full, locked
 from agalign.batch.report import CaptureReport
-from agalign.batch.runners import choose_runner
+from agalign.batch.runners import Runner, choose_runner
 from agalign.batch.workers import Task, loaded_model, stamp
 from agalign.cameras.discover import FolderScan
 from agalign.capture.align import PairProgress
@@ -40,7 +40,7 @@ from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
 
 _MAX_THREADS = 4
-"""Maximum number of threads for learning a flight; more wait for the interpreter's lock."""
+"""Maximum number of threads that train a network; more wait for the interpreter's lock."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _reports(
     ) as runner:
         tasks: list[Task] = []
         for of_flight, name, pending in unfinished:
-            path = _learn(of_flight, out / "models" / name, settings, listener, given, min(_MAX_THREADS, cores))
+            path = _learn(of_flight, out / "models" / name, settings, listener, given, runner, min(_MAX_THREADS, cores))
             tasks += [Task(c, out, settings, path, preview_bytes(len(flight.captures))) for c in pending]
         by_label = {c.label: c for c in captures}
         for report in runner.reports(tasks):
@@ -274,7 +274,7 @@ def _given_model(path: Path, flight: FolderScan, settings: Settings) -> FlightMo
 
 def _learn(
     captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, given: FlightModel | None,
-    at_once: int,
+    runner: Runner, threads: int,
 ) -> Path | None:  # fmt: skip
     """Return the path of the flight's model, from this or an earlier run; None if no model could be learned."""
     if not settings.learns_flights:
@@ -290,7 +290,7 @@ def _learn(
         listener.on_learning(path.stem, share)
 
     began = time.monotonic()
-    model = learn_flight(captures, settings, progress, start, at_once)
+    model = learn_flight(captures, settings, progress, start, runner.apply, threads)
     listener.on_learnt(path.stem, time.monotonic() - began)
     if model is None:
         return None

@@ -1,15 +1,26 @@
 """Runners for the captures of a run: serial, threads, processes, or an executor such as Dask's."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from typing import Protocol, Self
 
 from agalign.batch.capture import quiet
 from agalign.batch.report import CaptureReport
-from agalign.batch.workers import DaskExecutor, OnStart, Task, do_capture, done_by, done_in, own_processes
+from agalign.batch.workers import (
+    DaskExecutor,
+    OnStart,
+    Task,
+    applied_by,
+    applied_in,
+    do_capture,
+    done_by,
+    done_in,
+    own_processes,
+)
 from agalign.capture.align import PairProgress
 from agalign.pixels.raster import without_warnings
+from agalign.values.apply import A, R
 from agalign.values.capture import Capture
 from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
 
@@ -30,6 +41,10 @@ class Runner(Protocol):
 
     def __exit__(self, *reason: object) -> None: ...
 
+    def apply(self, function: Callable[[A], R], arguments: Sequence[A], /) -> Iterator[R]:
+        """Apply a function to arguments, as `values.apply.Apply`."""
+        ...
+
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
         """Yield the report of each task as it completes."""
         ...
@@ -49,6 +64,10 @@ class SerialRunner:
     def __exit__(self, *reason: object) -> None:
         pass
 
+    def apply(self, function: Callable[[A], R], arguments: Sequence[A], /) -> Iterator[R]:
+        """Apply a function to arguments one after another."""
+        return map(function, arguments)
+
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
         """Yield the report of each task in order, and call the listeners."""
         with ThreadPoolExecutor(1) as reader:
@@ -60,7 +79,7 @@ class SerialRunner:
 
 
 class ProcessRunner:
-    """Captures in processes of this machine, which import their libraries while the flight is learned."""
+    """Captures in processes of this machine."""
 
     name = "processes"
 
@@ -74,6 +93,10 @@ class ProcessRunner:
 
     def __exit__(self, *reason: object) -> None:
         self._stack.__exit__(*reason)  # type: ignore[arg-type]
+
+    def apply(self, function: Callable[[A], R], arguments: Sequence[A], /) -> Iterator[R]:
+        """Apply a function to arguments in the processes."""
+        return applied_in(self._pool, function, arguments)
 
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
         """Yield the report of each task as it completes."""
@@ -93,6 +116,10 @@ class ExecutorRunner:
 
     def __exit__(self, *reason: object) -> None:
         pass
+
+    def apply(self, function: Callable[[A], R], arguments: Sequence[A], /) -> Iterator[R]:
+        """Apply a function to arguments on the executor."""
+        return applied_by(self._executor, function, arguments, _MAX_WAITING_TASKS)
 
     def reports(self, tasks: Sequence[Task]) -> Iterator[CaptureReport]:
         """Yield the report of each task as it completes."""

@@ -3,7 +3,7 @@
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -14,7 +14,7 @@ from concurrent.futures import (
 )
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -33,7 +33,7 @@ from agalign.method.device import choose_device, keep_freed_memory, limit_thread
 from agalign.products.preview import preview_bytes
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
-from agalign.values.process_pool import Outcome, ProcessPool, WorkerDiedError
+from agalign.values.process_pool import ProcessPool, WorkerDiedError
 from agalign.values.processes import follow_parent, threads_of_children, worker_context
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
@@ -59,15 +59,15 @@ class Task:
 
     def absolute(self) -> "Task":
         """Return the task with absolute paths: workers may have another working folder."""
-        bands = tuple(replace(b, path=b.path.absolute()) for b in self.capture.bands)
         model = None if self.model is None else self.model.absolute()
-        return replace(self, capture=replace(self.capture, bands=bands), out=self.out.absolute(), model=model)
+        return replace(self, capture=self.capture.with_absolute_paths(), out=self.out.absolute(), model=model)
 
 
 T = TypeVar("T")
 R = TypeVar("R")
 Submit = Callable[[T], Future[R]]
-CapturePool = ProcessPool[Task, CaptureReport]
+CallPool = ProcessPool[Callable[[], Any], Any]
+"""Worker processes that call functions."""
 OnStart = Callable[[Capture], None]
 
 
@@ -144,13 +144,50 @@ def _submitted(submit: Submit[T, R], task: T) -> "Future[R]":
         return failed
 
 
-def done_in(pool: CapturePool, tasks: Sequence[Task], timeout_s: float | None = None) -> Iterator[CaptureReport]:
+def done_in(pool: CallPool, tasks: Sequence[Task], timeout_s: float | None = None) -> Iterator[CaptureReport]:
     """Yield the report of each task of a process pool. Raises WorkerError if no worker process can be started."""
+    for outcome in pool.run([partial(do_capture, task) for task in tasks], timeout_s):
+        yield _report_of(outcome.value, tasks[outcome.number], timeout_s)
 
-    def report(outcome: Outcome[Task, CaptureReport]) -> CaptureReport:
-        return _report_of(outcome.value, outcome.argument, timeout_s)
 
-    return map(report, pool.run(tasks, timeout_s))
+def applied_in(pool: CallPool, function: Callable[[T], R], arguments: Sequence[T]) -> Iterator[R]:
+    """Apply a function to arguments in a process pool, like `values.apply.Apply`."""
+    outcomes = pool.run([partial(function, argument) for argument in arguments])
+    return _in_order((outcome.number, outcome.value) for outcome in outcomes)
+
+
+def applied_by(
+    executor: Executor, function: Callable[[T], R], arguments: Sequence[T], maximum: int
+) -> Iterator[R]:  # fmt: skip
+    """Apply a function to arguments on an executor, like `values.apply.Apply`; at most `maximum` at a time."""
+    executor = executor.without_timeout() if isinstance(executor, DaskExecutor) else executor
+    loss = executor.loss if isinstance(executor, DaskExecutor) else str
+
+    def submit(number: int) -> Future[R]:
+        return executor.submit(function, arguments[number])
+
+    return _in_order(finished_by(submit, range(len(arguments)), maximum, loss))
+
+
+def _in_order(finished: Iterable[tuple[int, Callable[[], R]]]) -> Iterator[R]:
+    """Yield the results of numbered tasks in the order of the numbers. Raises WorkerError for lost workers."""
+    waiting: dict[int, Callable[[], R]] = {}
+    following = 0
+    for number, result in finished:
+        waiting[number] = result
+        while following in waiting:
+            yield _value_of(waiting.pop(following))
+            following += 1
+
+
+def _value_of(result: Callable[[], R]) -> R:
+    try:
+        return result()
+    except (AgalignError, MemoryError):
+        raise
+    except (Exception, CancelledError) as error:
+        _, problem = result_or_problem(result)
+        raise WorkerError(f"the flight cannot be learned: {problem}") from error
 
 
 def _report_of(result: Callable[[], CaptureReport], task: Task, timeout_s: float | None) -> CaptureReport:
@@ -183,16 +220,18 @@ def result_or_problem(result: Callable[[], R], timeout_s: float | None = None) -
     return None, problem
 
 
+def _call(function: Callable[[], Any]) -> Any:
+    return function()
+
+
 @contextmanager
-def own_processes(jobs: int) -> Iterator[CapturePool]:
+def own_processes(jobs: int) -> Iterator[CallPool]:
     """Start a pool of `jobs` worker processes, which import their libraries in the background."""
     threads = max(1, usable_cores() // jobs)
     context = worker_context(__name__)
     with (
         threads_of_children(threads),
-        ProcessPool(
-            do_capture, jobs, context, start_worker, (threads,), max_tasks_per_worker=_CAPTURES_A_PROCESS
-        ) as pool,
+        ProcessPool(_call, jobs, context, start_worker, (threads,), max_tasks_per_worker=_CAPTURES_A_PROCESS) as pool,
     ):
         yield pool
 
@@ -278,6 +317,10 @@ class DaskExecutor(Executor):
 
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
         return self._executor.submit(_within, self._timeout_s, _on_worker, __version__, function, *arguments, **named)
+
+    def without_timeout(self) -> "DaskExecutor":
+        """Return the same executor without a time limit."""
+        return DaskExecutor(self._client, None)
 
     def loss(self) -> str:
         """Return why no task can complete any more; empty while the scheduler answers."""

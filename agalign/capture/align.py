@@ -1,7 +1,7 @@
 """Alignment of the band pairs of one capture: seeds, joint estimation, verification of each pair."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -16,13 +16,14 @@ from agalign.capture.seeding import find_seed, first_candidate, image_groups
 from agalign.capture.verification import WarpedPair, verified, with_metrics, without_result
 from agalign.capture.window_estimate import by_windows
 from agalign.config import Settings
+from agalign.flight.fingerprint import refinement_key
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
 from agalign.method.joint import Results, align_from_scratch, refine_with
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, Seed
+from agalign.values.alignment import Alignment, JointResult, RefinedPair, Seed
 from agalign.values.capture import Capture
 from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
@@ -107,40 +108,64 @@ def _with_metrics(
 @one_thread()
 def align_pairs(
     pairs: Sequence[BandPair], settings: Settings, progress: PairProgress, model: FlightModel | None = None,
-    capture: Capture | None = None, *, scratch: bool = True,
+    capture: Capture | None = None,
 ) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
     """Align the pairs of one `capture`; return the alignments by name, px of the images.
 
-    Pairs that the flight's network cannot align are learned from scratch: with a rig only those without an accurate
-    prediction, and without `scratch` only those that the network does not contain.
+    Pairs that the flight's network cannot align are learned from scratch, with a rig only those without an accurate
+    prediction. A capture that the model was learned from has refined mappings in the model.
     """
-    aligner = _PairAligner(settings, model, progress)
-    starts = aligner.seed(pairs)
-    if settings.seed.only:
-        aligner.keep_seeds(starts)
-        return aligner.timed_result()
-    aligner.refine(starts)
-    remaining = [s for s in starts if not aligner.is_done(s)]
-    if not scratch:
-        remaining = [s for s in remaining if s[0].name not in aligner.result]
-    if remaining and capture is not None:
-        names = aligner.bands_to_learn(pairs, capture)
-        remaining = [s for s in remaining if s[0].name in names]
-    aligner.learn(remaining)
-    aligner.fit_windows(starts)
-    return aligner.timed_result()
+    aligner = PairAligner(settings, model, progress)
+    if capture is not None and model is not None:
+        known = model.refined.get(refinement_key(capture, settings), {})
+        if aligner.verify_refined(pairs, known):
+            return aligner.timed_result()
+    return aligner.align(pairs, capture)
 
 
 @dataclass
-class _PairAligner:
+class PairAligner:
     """The steps of `align_pairs`; each adds its alignments to `result`."""
 
     settings: Settings
     model: FlightModel | None
     progress: PairProgress
+    refined: dict[str, RefinedPair] = field(default_factory=dict)
+    """Results by band of the last optimisation, before they are combined with those of other bands and the rig."""
     result: dict[str, Alignment[FixedImagePx]] = field(default_factory=dict)
     """Alignments by band."""
     timer: _Timer = field(default_factory=_Timer)
+
+    def align(
+        self, pairs: Sequence[BandPair], capture: Capture | None, *, scratch: bool = True
+    ) -> dict[str, Alignment[FixedImagePx]]:
+        """Take all steps. Without `scratch`, no pair that the flight's network contains is learned from scratch."""
+        starts = self.seed(pairs)
+        if self.settings.seed.only:
+            self.keep_seeds(starts)
+            return self.timed_result()
+        self.refine(starts)
+        remaining = [s for s in starts if not self.is_done(s)]
+        if not scratch:
+            remaining = [s for s in remaining if s[0].name not in self.result]
+        if remaining and capture is not None:
+            names = self.bands_to_learn(pairs, capture)
+            remaining = [s for s in remaining if s[0].name in names]
+        self.learn(remaining)
+        self.fit_windows(starts)
+        return self.timed_result()
+
+    def verify_refined(self, pairs: Sequence[BandPair], known: Mapping[str, RefinedPair]) -> bool:
+        """Verify mappings that were refined when the flight was learned; False unless all pairs are aligned by them."""
+        if not all(p.name in known and known[p.name].sizes_px == p.sizes_px for p in pairs):
+            return False
+        starts = [(pair, known[pair.name].seed) for pair in pairs]
+        self.progress(pairs[0].name if pairs else "", "checking", 0.0)
+        self._verify(starts, [known[pair.name].result for pair in pairs])
+        if all(a.status == "aligned" for a in self.result.values()):
+            return True
+        self.result = {}
+        return False
 
     def timed_result(self) -> dict[str, Alignment[FixedImagePx]]:
         """Return the alignments with their processing times."""
@@ -204,7 +229,20 @@ class _PairAligner:
     def _align(self, starts: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
         with self.timer.measure([pair.name for pair, _ in starts]):
             results = _results(starts, sides, align, self.progress)
+        self._verify(starts, results)
+
+    def _verify(self, starts: Sequence[Start], results: Results) -> None:
+        self.refined |= refined_pairs(starts, results)
         self.result |= verify_together(starts, results, self.model, self.settings, self.progress, self.timer)
+
+
+def refined_pairs(starts: Sequence[Start], results: Results) -> dict[str, RefinedPair]:
+    """Return the refined mappings of the pairs that have one, by name."""
+    return {
+        pair.name: RefinedPair(seed, result, pair.sizes_px)
+        for (pair, seed), result in zip(starts, results, strict=True)
+        if isinstance(result, JointResult)
+    }
 
 
 def _quiet(band: str, stage: str, share: float) -> None:

@@ -125,6 +125,11 @@ class BandPair:
         return self.space == ("pixel" if self.reference.image.lens is None else "undistorted")
 
     @property
+    def sizes_px(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """(width, height) of the fixed and the moving image."""
+        return self.fixed.size_px, self.moving_image.size_px
+
+    @property
     def fixed(self) -> Raster:
         """The reference image, with its lens if the homographies are between undistorted pixels."""
         return self.reference.image if self.space == "undistorted" else self.reference.raw

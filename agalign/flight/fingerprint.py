@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from agalign._version import __version__
-from agalign.config import Stage
+from agalign.config import Settings, Stage
 from agalign.values.capture import Capture
 from agalign.values.lens import Lens
 
@@ -28,6 +28,11 @@ def fingerprint(capture: Capture, *stages: Stage) -> str:
         for b in capture.bands
     ]  # fmt: skip
     return hashed(__version__, *(s.model_dump_json() for s in stages), capture.reference_index, bands)
+
+
+def refinement_key(capture: Capture, settings: Settings) -> str:
+    """Return the hash of everything that the refined mappings of a capture depend on, apart from the network."""
+    return fingerprint(capture, settings.joint, settings.seed, settings.flight)
 
 
 def hashed(*facts: Fact) -> str:

@@ -18,6 +18,7 @@ from agalign.flight.factors import (
     solve_factors,
 )
 from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig
+from agalign.values.apply import Apply
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import MovingFilePx
 from agalign.values.robust import cauchy_weights
@@ -47,11 +48,13 @@ _MAX_ERROR_RATIO = 0.9
 
 
 def learn_rig(
-    captures: Sequence[Observation], size_px: tuple[int, int], layout: Mapping[str, tuple[float, float]]
-) -> Rig | None:
+    captures: Sequence[Observation], size_px: tuple[int, int], layout: Mapping[str, tuple[float, float]],
+    apply: Apply = map,
+) -> Rig | None:  # fmt: skip
     """Estimate the rig from captures; None if no band has a mapping in at least MIN_CAPTURES of them.
 
     `size_px` is (width, height) of the reference. `layout` has the known positions of the lenses by band, in any unit.
+    `apply` runs the cross-validations.
     """
     counts = Counter(b for c in captures for b in c.mappings)
     bands = tuple(b for b, count in counts.items() if count >= MIN_CAPTURES)
@@ -60,7 +63,7 @@ def learn_rig(
         return None
     table = _Table.of(captures, bands, size_px, _normalised_layout(layout, bands))
     with_motion = sum(c.motion is not None for c in captures) >= MIN_CAPTURES
-    factors, errors_px = _select_factors(table, with_motion=with_motion)
+    factors, errors_px = _select_factors(table, apply, with_motion=with_motion)
     fit = table.fit(np.ones(len(captures)), factors or ("distance",))
     by_band = zip(bands, table.median, fit.offset, fit.t, strict=True)
     mean, baselines = dict[str, Matrix](), dict[str, tuple[float, float]]()
@@ -75,12 +78,15 @@ def learn_rig(
     )  # fmt: skip
 
 
-def _select_factors(table: "_Table", *, with_motion: bool) -> tuple[tuple[Factor, ...], dict[str, MovingFilePx]]:
+def _select_factors(
+    table: "_Table", apply: Apply, *, with_motion: bool
+) -> tuple[tuple[Factor, ...], dict[str, MovingFilePx]]:
     """Select the factors by cross-validation; return them and their RMS error by band, px."""
-    best, *others = _FACTOR_SETS_WITH_MOTION if with_motion else _FACTOR_SETS
-    errors_px = table.cross_validated_px(best)
-    for candidate in others if len(table.bands) > 1 else ():
-        candidate_px = table.cross_validated_px(candidate)
+    candidates = _FACTOR_SETS_WITH_MOTION if with_motion else _FACTOR_SETS
+    if len(table.bands) == 1:
+        candidates = candidates[:1]
+    (best, errors_px), *others = zip(candidates, apply(table.cross_validated_px, candidates), strict=True)
+    for candidate, candidate_px in others:
         if _rms(candidate_px.values()) < _MAX_ERROR_RATIO * _rms(errors_px.values()):
             best, errors_px = candidate, candidate_px
     return best, errors_px

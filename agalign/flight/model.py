@@ -9,7 +9,7 @@ import json
 import os
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,12 @@ from safetensors.torch import save
 
 from agalign._version import __version__
 from agalign.errors import InputError, is_out_of_memory
+from agalign.flight.refined_file import refined_from_json, refined_to_json
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import rig_from_json, rig_to_json
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import matching_network
+from agalign.values.alignment import RefinedPair
 from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
 
@@ -50,6 +52,8 @@ class FlightModel:
     """Hash of the captures and settings from which it was learned."""
     rig: Rig | None = None
     """Geometry of the camera; None if too few captures determine it."""
+    refined: Mapping[str, Mapping[str, RefinedPair]] = field(default_factory=dict)
+    """Mappings by band of captures from which it was learned, by `fingerprint.refinement_key`."""
 
     def side(self, band: str) -> int | None:
         """Return the network's side of a moving band; None for an unknown band."""
@@ -69,7 +73,7 @@ def save_model(model: FlightModel, path: Path) -> None:
     facts = {
         "format": _FORMAT, "agalign": __version__, "camera": model.camera, "bands": json.dumps(model.bands),
         "sharing": model.net.sharing, "channels": json.dumps(model.net.channels), "fingerprint": model.fingerprint,
-        "rig": "" if model.rig is None else rig_to_json(model.rig),
+        "rig": "" if model.rig is None else rig_to_json(model.rig), "refined": refined_to_json(model.refined),
     }  # fmt: skip
     contents = _with_sorted_header(save(tensors, facts | {"digest": _digest(tensors, facts)}))
     with complete_file(path) as partial:
@@ -102,7 +106,8 @@ def _read_model(path: Path) -> FlightModel:
     mappings = {band: normalised(matrix.numpy()) for band, matrix in _with_prefix("mapping.", tensors).items()}
     bands = tuple(map(str, json.loads(facts["bands"])))
     rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
-    return FlightModel(net, facts["camera"], bands, mappings, facts["fingerprint"], rig)
+    refined = refined_from_json(facts.get("refined", "{}"))
+    return FlightModel(net, facts["camera"], bands, mappings, facts["fingerprint"], rig, refined)
 
 
 def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

@@ -87,6 +87,16 @@ class JointResult(Generic[FixedPx]):
 
 
 @dataclass(frozen=True)
+class RefinedPair:
+    """The seed of a pair and its mapping refined by a flight's network, from the images of this pair alone."""
+
+    seed: Seed
+    result: JointResult[FixedImagePx]
+    sizes_px: tuple[tuple[int, int], tuple[int, int]]
+    """(width, height) of the fixed and the moving image."""
+
+
+@dataclass(frozen=True)
 class Residual(Generic[FixedPx]):
     """Shifts of windows that remain after alignment, measured independently of the estimation, on the fixed grid."""
 

@@ -1,7 +1,7 @@
 """Captures and their bands, with the metadata from the tags of the files."""
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -184,6 +184,10 @@ class Capture:
     missing_bands: tuple[str, ...] = ()
     elevation_deg: float | None = None
     """Angle of the optical axis above the horizon: -90 straight down; None if the tags do not contain it."""
+
+    def with_absolute_paths(self) -> "Capture":
+        """Return the capture with absolute paths, for processes with another working folder."""
+        return replace(self, bands=tuple(replace(b, path=b.path.absolute()) for b in self.bands))
 
     @property
     def reference(self) -> Band:

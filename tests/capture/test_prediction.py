@@ -12,7 +12,7 @@ import rasterio
 import torch
 
 import agalign
-from agalign.batch import CaptureReport, learn
+from agalign.batch import CaptureReport, learning_tasks
 from agalign.batch.learn import learn_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align import align_capture_bands, align_pairs
@@ -88,7 +88,7 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
     five: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a capture is lower than the others, its bands start too far off; the model's mappings are nearer."""
-    verify_together = learn.verify_together
+    verify_together = learning_tasks.verify_together
 
     def not_nir(*arguments: Any) -> dict[str, Alignment]:
         return {
@@ -96,7 +96,7 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
             for name, a in verify_together(*arguments).items()
         }
 
-    monkeypatch.setattr(learn, "verify_together", not_nir)
+    monkeypatch.setattr(learning_tasks, "verify_together", not_nir)
     model = learn_flight(discover(five).captures, Settings(), lambda *_: None)
     assert model is not None
     assert model.rig is not None

@@ -1,6 +1,7 @@
 """Model files are read back as written; damaged ones are errors with the name of the file."""
 
 import json
+import math
 import os
 import struct
 from dataclasses import replace
@@ -17,10 +18,21 @@ from agalign.flight.rig import CaptureFactors, Rig
 from agalign.flight.rig_file import read_rig
 from agalign.method.descriptor import Descriptor
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementField
-from agalign.values.pixel_units import MovingFilePx
+from agalign.values.alignment import DisplacementField, JointResult, RefinedPair, Seed
+from agalign.values.pixel_units import FixedImagePx, MovingFilePx
 
 FIELD = DisplacementField(48.0, np.arange(24.0).reshape(3, 4, 2) / 100)
+
+SEED = Seed("structure", geometry.translation(1 / 3, 0.1), 20.0, 18.0, 2.5, trusted=True)
+RESULT = JointResult[FixedImagePx](
+    geometry.translation(1 / 7, -0.3), math.nan, 0.9, 0.004, 0, (1.0,), "flight", "homography", 0.01,
+    ((0.1, 0.2), (0.1, 0.2), (0.3, 0.2), (0.1, 1 / 3)), np.eye(8) / 3,
+)  # fmt: skip
+SIZES_PX = ((640, 480), (320, 240))
+REFINED = {
+    "key": {"Red": RefinedPair(SEED, RESULT, SIZES_PX)},
+    "other": {"NIR": RefinedPair(SEED, replace(RESULT, corner_covariance_px2=None), SIZES_PX)},
+}
 
 
 def cpu() -> torch.device:
@@ -37,7 +49,7 @@ def model() -> FlightModel:
         {"Red": (0.0,) * 5}, ("distance",), captures, {"Red": MovingFilePx(0.1)}, fields={"Red": FIELD},
     )  # fmt: skip
     mappings = {"Red": geometry.translation(3, 4), "NIR": geometry.translation(-1, 2)}
-    return FlightModel(net, "Maker Model 1 [Green 640x480]", ("Red", "NIR"), mappings, "abc", rig)
+    return FlightModel(net, "Maker Model 1 [Green 640x480]", ("Red", "NIR"), mappings, "abc", rig, REFINED)
 
 
 def test_a_model_is_read_back_as_it_was_written(model: FlightModel, tmp_path: Path) -> None:
@@ -62,6 +74,18 @@ def test_a_model_is_read_back_as_it_was_written(model: FlightModel, tmp_path: Pa
     assert camera == model.camera
     assert rig is not None
     assert rig.captures == model.rig.captures
+
+
+def test_refined_mappings_are_read_back_exactly(model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    save_model(model, path)
+    again = load_model(path, cpu).refined
+    assert {key: list(pairs) for key, pairs in again.items()} == {"key": ["Red"], "other": ["NIR"]}
+    pair = again["key"]["Red"]
+    assert pair.sizes_px == SIZES_PX
+    np.testing.assert_equal(vars(pair.seed), vars(SEED))
+    np.testing.assert_equal(vars(pair.result), vars(RESULT))
+    assert again["other"]["NIR"].result.corner_covariance_px2 is None
 
 
 def test_equal_models_have_equal_bytes_with_and_without_a_rig(model: FlightModel, tmp_path: Path) -> None:
@@ -165,7 +189,8 @@ def test_metadata_is_sorted_in_the_file(model: FlightModel, tmp_path: Path) -> N
     save_model(model, path)
     with safe_open(path, framework="np") as file:
         facts = file.metadata()
-    assert {"format", "agalign", "camera", "bands", "sharing", "channels", "fingerprint", "rig", "digest"} == set(facts)
+    names = {"format", "agalign", "camera", "bands", "sharing", "channels", "fingerprint", "rig", "refined", "digest"}
+    assert set(facts) == names
     (length,) = struct.unpack_from("<Q", path.read_bytes())
     header = json.loads(path.read_bytes()[8 : 8 + length])
     assert list(header) == sorted(header)

@@ -1,0 +1,282 @@
+"""Tasks of learning a flight: each processes one capture, in this process or on a worker."""
+
+import copy
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Generic
+
+import numpy as np
+
+from agalign.batch.capture import quiet
+from agalign.capture.align import PairAligner, refined_pairs, verify_together
+from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.prediction import observed, with_predictions
+from agalign.capture.seeding import find_seed, image_groups
+from agalign.config import Settings
+from agalign.errors import AgalignError
+from agalign.flight.model import FlightModel
+from agalign.flight.rig import Observation
+from agalign.method.descriptor import Descriptor
+from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
+from agalign.method.fast import DEFAULT_SCHEDULE
+from agalign.method.joint import Results, refine_with
+from agalign.method.starter import start_from
+from agalign.method.state import ImageGroup, JointState
+from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, RefinedPair, Residual, Seed
+from agalign.values.apply import A, R
+from agalign.values.capture import Capture
+from agalign.values.geometry import Matrix
+from agalign.values.issues import Issue
+from agalign.values.pixel_units import FixedFilePx, FixedImagePx
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class OneThread(Generic[A, R]):
+    """A function that uses one thread; memory errors of libraries are MemoryError."""
+
+    function: Callable[[A], R]
+
+    @one_thread()
+    @one_memory_error()
+    def __call__(self, argument: A) -> R:
+        keep_freed_memory()
+        return self.function(argument)
+
+
+def portable(model: FlightModel) -> FlightModel:
+    """Return the model with its network on the CPU, as a worker may have other devices."""
+    return replace(model, net=copy.deepcopy(model.net).cpu())
+
+
+def _on_device(model: FlightModel, settings: Settings) -> FlightModel:
+    return replace(model, net=model.net.to(choose_device(settings.joint.device)))
+
+
+@dataclass(frozen=True)
+class RigObservation:
+    """Observation of the rig by one capture: its mappings, and the residual shifts of its windows."""
+
+    observation: Observation
+    residuals: Mapping[str, Residual[FixedFilePx]]
+    """Of the aligned bands."""
+    refined: Mapping[str, RefinedPair]
+    """Mappings of all bands before they were combined."""
+    misaligned: frozenset[str] = frozenset()
+    """Bands with distinguishable patches that are not aligned."""
+
+    def updated(self, other: "RigObservation") -> "RigObservation":
+        """Return the observation with the bands of another one of the same capture."""
+        mine, others = self.observation, other.observation
+        mappings, std_px = {**mine.mappings, **others.mappings}, {**mine.std_px, **others.std_px}
+        return RigObservation(
+            replace(mine, mappings=mappings, std_px=std_px), {**self.residuals, **other.residuals},
+            {**self.refined, **other.refined}, other.misaligned,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LearningCapture:
+    """A capture to learn the network from, and its mappings refined by the initial network or the learned one."""
+
+    capture: Capture
+    is_good_enough: bool
+    """The network needs no more learning for it."""
+    mappings: Mapping[str, Matrix] = field(default_factory=dict)
+    """Refined mappings of bands with distinguishable held-out patches, px of the files."""
+    seen: RigObservation | None = None
+
+
+@dataclass(frozen=True)
+class LoadedCapture:
+    """The images of a capture to learn the network from, and their seeds."""
+
+    capture: Capture
+    groups: list[tuple[list[int], ImageGroup]]
+    """Groups of images, each with the indices of its pairs in `pairs`."""
+    pairs: list[BandPair]
+    seeds: list[Seed]
+
+    @property
+    def similarity_sigma(self) -> float:
+        """Median height of the correlation peaks of the seeds, in standard deviations."""
+        return float(np.median([s.peak_sigma for s in self.seeds]))
+
+    @property
+    def is_trusted(self) -> bool:
+        """True if all seeds are confirmed by the images."""
+        return all(s.trusted for s in self.seeds)
+
+    def groups_from(self, refined: Mapping[str, RefinedPair]) -> list[ImageGroup]:
+        """Return the groups with the refined mappings of pairs with distinguishable patches as initial mappings."""
+        for places, group in self.groups:
+            for k, place in enumerate(places):
+                pair = refined.get(self.pairs[place].name)
+                if pair is not None and pair.result.retrieval >= MIN_RETRIEVAL:
+                    group.mappings[k] = pair.result.fixed_to_moving
+        return [group for _, group in self.groups]
+
+    def refined_by(self, net: Descriptor, settings: Settings, patches: int) -> LearningCapture:
+        """Refine and verify the pairs by a network; return the capture without its images."""
+        of_pair: dict[int, JointResult[FixedImagePx] | Issue] = {}
+        for places, group in self.groups:
+            of_pair |= zip(places, refine_with(net, group, settings.joint, quiet, patches), strict=True)
+        results = [of_pair[i] for i in range(len(self.pairs))]
+        known = [(p, r) for p, r in zip(self.pairs, results, strict=True) if isinstance(r, JointResult)]
+        starts = list(zip(self.pairs, self.seeds, strict=True))
+        aligned = verify_together(starts, results, None, settings)
+        return LearningCapture(
+            self.capture, _are_good_enough(results),
+            {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL},
+            _observation(self.pairs, aligned, refined_pairs(starts, results), self.capture),
+        )  # fmt: skip
+
+
+def load_capture(
+    capture: Capture, bands: Sequence[str], settings: Settings, start: FlightModel | None
+) -> LoadedCapture | None:
+    """Read a capture and find its seeds; None if no band can be used.
+
+    Bands have their index in `bands` as index in the network. Seeds of kind `match` use the network of `start`.
+    """
+    try:
+        pairs, _ = read_pairs(capture, settings.seed)
+        seeds_of = [(p, find_seed(p, settings.seed, start)) for p in pairs if p.has_rig_pixels]
+        result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
+        if not result:
+            return None
+        usable, seeds = [p for p, _ in result], [seed for _, seed in result]
+        groups = image_groups(usable, seeds, [bands.index(p.name) + 1 for p in usable])
+        return LoadedCapture(capture, groups, usable, seeds)
+    except Exception as error:
+        log_failure(f"{capture.label} cannot be learned from", error)
+        return None
+
+
+def initial_network(bands: Sequence[str], settings: Settings, start: FlightModel | None) -> Descriptor:
+    """Return the network before learning: that of the package, or of `start`, an earlier model."""
+    net = JointState(settings.joint, quiet).fast_descriptor([1] * (1 + len(bands)))
+    if start is not None:
+        # A model of this camera may have bands that the flight lacks: match the weights by band name.
+        sides = [0, *(start.side(band) or len(start.bands) for band in bands)] if start.camera else None
+        start_from(net, start.net.state_dict(), sides)
+    return net
+
+
+@dataclass(frozen=True)
+class ChooseAndRefine:
+    """Task: choose the best of some captures to learn from, and refine it by the initial network.
+
+    The chosen one is the first with trusted seeds for all bands, else the one with the highest correlation peaks.
+    Captures without common structure, as of water or fog, are not usable; without any other, the result is None.
+    """
+
+    bands: tuple[str, ...]
+    settings: Settings
+    patches: int
+    start: FlightModel | None
+
+    def __call__(self, captures: Sequence[Capture]) -> LearningCapture | None:
+        start = None if self.start is None else _on_device(self.start, self.settings)
+        best: LoadedCapture | None = None
+        for capture in captures:
+            loaded = load_capture(capture, self.bands, self.settings, start)
+            if loaded is not None and (best is None or loaded.similarity_sigma > best.similarity_sigma):
+                best = loaded
+            if best is not None and best.is_trusted:
+                break
+        if best is None:
+            return None
+        net = initial_network(self.bands, self.settings, start)
+        if not (net.is_trained and best.is_trusted):
+            return LearningCapture(best.capture, is_good_enough=False)
+        try:
+            return best.refined_by(net, self.settings, self.patches)
+        except Exception as error:
+            log_failure(f"{best.capture.label} cannot be learned from", error)
+            return None
+
+
+@dataclass(frozen=True)
+class ObserveRig:
+    """Task: align a capture, or the given bands of it, by the network and the mappings of a model without a rig.
+
+    None if that fails.
+    """
+
+    model: FlightModel
+    settings: Settings
+
+    def __call__(self, argument: tuple[Capture, frozenset[str] | None]) -> RigObservation | None:
+        capture, bands = argument
+        try:
+            model = _on_device(self.model, self.settings)
+            pairs, _ = read_pairs(capture, self.settings.seed, model)
+            pairs = [p for p in pairs if p.has_rig_pixels and (bands is None or p.name in bands)]
+            aligner = PairAligner(self.settings, model, quiet)
+            return _observation(pairs, aligner.align(pairs, None, scratch=False), aligner.refined, capture)
+        except Exception as error:
+            log_failure(f"{capture.label} does not determine the rig", error)
+            return None
+
+
+@dataclass(frozen=True)
+class ModelTest:
+    """Aligned bands of a capture by a model."""
+
+    aligned: int
+    predicted: int
+    """Number of aligned bands that the rig predicts from the others."""
+    refined: Mapping[str, RefinedPair] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TryModel:
+    """Task: align a capture by an earlier model and count the aligned bands that its rig predicts."""
+
+    model: FlightModel
+    settings: Settings
+
+    def __call__(self, capture: Capture) -> ModelTest:
+        model, limit_px = _on_device(self.model, self.settings), self.settings.check.accept_predicted_px
+        assert model.rig is not None
+        try:
+            pairs, _ = read_pairs(capture, self.settings.seed, model)
+            aligner = PairAligner(self.settings, model, quiet)
+            result = aligner.align(pairs, None, scratch=False)
+            checked = with_predictions(pairs, result, model.rig, capture)
+        except Exception as error:
+            log_failure(f"{capture.label} is not aligned by the model", error)
+            return ModelTest(0, 0)
+        aligned = [checked[name] for name, a in result.items() if a.status == "aligned"]
+        predicted = [a for a in aligned if a.prediction is not None and a.prediction.std_px <= limit_px]
+        return ModelTest(len(aligned), len(predicted), aligner.refined)
+
+
+def _are_good_enough(results: Results) -> bool:
+    """True if a network needs no more learning for a capture with these results."""
+    enough = DEFAULT_SCHEDULE.enough_retrieval
+    return all(isinstance(result, JointResult) and result.retrieval > enough for result in results)
+
+
+def _observation(
+    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], refined: Mapping[str, RefinedPair],
+    capture: Capture,
+) -> RigObservation:  # fmt: skip
+    in_file_px = {p.name: result[p.name].in_file_px(p.scales) for p in pairs}
+    residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
+    misaligned = frozenset(
+        name
+        for name, a in in_file_px.items()
+        if a.status != "aligned" and a.joint is not None and a.joint.retrieval >= MIN_RETRIEVAL
+    )
+    return RigObservation(observed(pairs, result, capture), residuals, refined, misaligned)
+
+
+def log_failure(message: str, error: Exception) -> None:
+    """Log why a capture cannot be used for learning; it is reported when it is aligned. Raises MemoryError again."""
+    if isinstance(error, MemoryError):
+        raise error
+    _LOG.debug("%s: %s", message, error, exc_info=not isinstance(error, AgalignError))
