@@ -228,7 +228,7 @@ def _call(function: Callable[[], Any]) -> Any:
 def own_processes(jobs: int) -> Iterator[CallPool]:
     """Start a pool of `jobs` worker processes, which import their libraries in the background."""
     threads = max(1, usable_cores() // jobs)
-    context = worker_context(__name__)
+    context = worker_context("agalign.batch.preload")
     with (
         threads_of_children(threads),
         ProcessPool(_call, jobs, context, start_worker, (threads,), max_tasks_per_worker=_CAPTURES_A_PROCESS) as pool,

@@ -31,8 +31,11 @@ def fingerprint(capture: Capture, *stages: Stage) -> str:
 
 
 def refinement_key(capture: Capture, settings: Settings) -> str:
-    """Return the hash of everything that the refined mappings of a capture depend on, apart from the network."""
-    return fingerprint(capture, settings.joint, settings.seed, settings.flight)
+    """Return the hash of everything that the refined mappings of a capture depend on, apart from the network.
+
+    It contains the label: files of two folders may have equal names, sizes and times.
+    """
+    return hashed(capture.label, fingerprint(capture, settings.joint, settings.seed, settings.flight))
 
 
 def hashed(*facts: Fact) -> str:

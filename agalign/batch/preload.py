@@ -1,0 +1,13 @@
+"""What the fork server imports; workers are forked from it.
+
+The garbage collector is paused during the imports and later ignores their million objects: the imports take 0.4 s less,
+and workers do not copy the memory pages of these objects.
+"""
+
+import gc
+from importlib import import_module
+
+gc.disable()
+import_module("agalign.batch.workers")
+gc.freeze()
+gc.enable()
