@@ -108,7 +108,11 @@ class _FlightLearner:
         rig = self._rig(list(observations.values()))
         if rig is None and self.start is not None:
             rig = self.start.rig
-        refined = {self._key(c): observations[c.label].refined for c in self.captures if c.label in observations}
+        refined = {
+            self._key(c): seen.refined
+            for c in self.captures
+            if (seen := observations.get(c.label)) is not None and seen.is_aligned
+        }
         return replace(model, rig=rig, mappings=medians if rig is None else {**medians, **rig.mean}, refined=refined)
 
     @property
@@ -141,7 +145,7 @@ class _FlightLearner:
         tests = list(self.apply(task, some))
         if sum(t.aligned for t in tests) < len(self._bands) or any(t.aligned != t.predicted for t in tests):
             return None
-        return {self._key(capture): t.refined for capture, t in zip(some, tests, strict=True)}
+        return {self._key(c): t.refined for c, t in zip(some, tests, strict=True) if len(t.refined) == t.aligned}
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if learning fails."""

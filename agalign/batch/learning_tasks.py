@@ -67,6 +67,11 @@ class RigObservation:
     misaligned: frozenset[str] = frozenset()
     """Bands with distinguishable patches that are not aligned."""
 
+    @property
+    def is_aligned(self) -> bool:
+        """True if all bands are aligned."""
+        return self.residuals.keys() == self.refined.keys()
+
     def updated(self, other: "RigObservation") -> "RigObservation":
         """Return the observation with the bands of another one of the same capture."""
         mine, others = self.observation, other.observation
