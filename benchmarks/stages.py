@@ -2,8 +2,9 @@
 
     python benchmarks/stages.py FLIGHT [--peers]
 
-One process, one thread. The imports, a run over the first capture and its neighbours, the same with the model that it
-learned, and the methods that others use are timed in turn, three times; the table has medians.
+One process, one thread. The imports, a run, the same with the model that it learned, and the methods that others use
+are timed in turn, three times; the table has medians. "A capture" is one that no model was learned from or tested with,
+as most of a long flight; the fixed part is the time of the run minus that of as many such captures.
 """
 
 import argparse
@@ -47,8 +48,25 @@ def seconds_of(act: Callable[[], object]) -> float:
     return time.perf_counter() - began
 
 
-def run(command: list[str]) -> None:
-    subprocess.run(command, check=False, env=os.environ | ONE_THREAD, stderr=subprocess.DEVNULL)
+def timed(command: list[str]) -> tuple[float, str]:
+    """Run a command; return its time in seconds and its standard output."""
+    began = time.perf_counter()
+    done = subprocess.run(
+        command, check=False, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    return time.perf_counter() - began, done.stdout
+
+
+def stages_of_refined(log: str) -> dict[str, float]:
+    """Return the mean seconds of each stage, from a log in JSON, of the captures that were refined in this run."""
+    by_capture: dict[str, dict[str, float]] = {}
+    for event in map(json.loads, log.splitlines()):
+        if event["event"] == "stage":
+            stages = by_capture.setdefault(event["capture"], {})
+            stages[event["stage"]] = stages.get(event["stage"], 0.0) + event["seconds"]
+    refined = [s for s in by_capture.values() if "refining" in s] or list(by_capture.values())
+    names = {name for stages in refined for name in stages}
+    return {name: sum(stages.get(name, 0.0) for stages in refined) / len(refined) for name in names}
 
 
 def main() -> None:
@@ -71,37 +89,20 @@ def main() -> None:
     for _ in range(ROUNDS):
         for name, align in methods.items():
             seconds.setdefault(f"{name}, a pair", []).append(seconds_of(lambda align=align: align(*pair)))
-        seconds.setdefault("imports of the libraries", []).append(
-            seconds_of(lambda: run([sys.executable, "-c", IMPORTS]))
-        )
+        seconds.setdefault("imports of the libraries", []).append(timed([sys.executable, "-c", IMPORTS])[0])
         with tempfile.TemporaryDirectory() as folder:
-            model: list[str] = []
-            for name in ("run", "run with the model of an earlier flight"):
-                out = Path(folder) / name.replace(" ", "_")
-                command = [
-                    sys.executable,
-                    "-m",
-                    "agalign",
-                    str(options.flight),
-                    "-o",
-                    str(out),
-                    "-q",
-                    "-j",
-                    "1",
-                    *model,
-                ]
-                whole = seconds_of(lambda command=command: run(command))
-                record = json.loads((out / "agalign-run.json").read_text())
-                stages = record["stage_seconds"]
-                learning = stages.pop("learning a flight", 0.0)
-                steady = sum(stages.values()) / len(captures)
-                seconds.setdefault(f"{name}: all of it", []).append(whole)
-                seconds.setdefault(f"{name}: fixed part", []).append(whole - steady * len(captures))
-                seconds.setdefault(f"{name}: of it learning", []).append(learning)
-                seconds.setdefault(f"{name}: a capture", []).append(steady)
-                for stage, value in sorted(stages.items(), key=lambda item: -item[1]):
-                    seconds.setdefault(f"{name}: {stage} a capture", []).append(value / len(captures))
-                model = ["--model", str(next((out / "models").glob("*")))]
+            out, again = Path(folder) / "out", Path(folder) / "again"
+            command = [sys.executable, "-m", "agalign", str(options.flight), "-j", "1", "--log-json", "-o"]
+            whole, _ = timed([*command, str(out)])
+            model = next((out / "models").iterdir())
+            with_model, log = timed([*command, str(again), "--model", str(model)])
+        stages = stages_of_refined(log)
+        capture = sum(stages.values())
+        values = {"a capture": capture, **{f"- {name}": s for name, s in sorted(stages.items(), key=lambda i: -i[1])}}
+        for name, run_s in (("a run", whole), ("a run with the model of an earlier flight", with_model)):
+            values |= {name: run_s, f"{name}: fixed part": run_s - capture * len(captures)}
+        for name, value in values.items():
+            seconds.setdefault(name, []).append(value)
     unit, imports = median(seconds["SIFT + RANSAC, a pair"]), median(seconds["imports of the libraries"])
     print(f"{options.flight.name}: {len(captures)} captures, {pairs} pairs")
     print("| | seconds | x SIFT | x imports |\n|---|---|---|---|")
