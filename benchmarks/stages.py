@@ -49,18 +49,16 @@ def seconds_of(act: Callable[[], object]) -> float:
 
 
 def timed(command: list[str]) -> tuple[float, str]:
-    """Run a command; return its time in seconds and its standard output."""
+    """Run a command; return its time in seconds and its standard error."""
     began = time.perf_counter()
-    done = subprocess.run(
-        command, check=False, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    return time.perf_counter() - began, done.stdout
+    done = subprocess.run(command, check=False, env=os.environ | ONE_THREAD, stderr=subprocess.PIPE, text=True)
+    return time.perf_counter() - began, done.stderr
 
 
 def stages_of_refined(log: str) -> dict[str, float]:
     """Return the mean seconds of each stage, from a log in JSON, of the captures that were refined in this run."""
     by_capture: dict[str, dict[str, float]] = {}
-    for event in map(json.loads, log.splitlines()):
+    for event in (json.loads(line) for line in log.splitlines() if line.startswith("{")):
         if event["event"] == "stage":
             stages = by_capture.setdefault(event["capture"], {})
             stages[event["stage"]] = stages.get(event["stage"], 0.0) + event["seconds"]
