@@ -108,10 +108,11 @@ class _FlightLearner:
         rig = self._rig(list(observations.values()))
         if rig is None and self.start is not None:
             rig = self.start.rig
+        # Without a rig, a second refinement from the medians reduces the errors.
         refined = {
             self._key(c): seen.refined
             for c in self.captures
-            if (seen := observations.get(c.label)) is not None and seen.is_aligned
+            if rig is not None and (seen := observations.get(c.label)) is not None and seen.is_aligned
         }
         return replace(model, rig=rig, mappings=medians if rig is None else {**medians, **rig.mean}, refined=refined)
 

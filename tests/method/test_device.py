@@ -1,7 +1,6 @@
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -138,7 +137,7 @@ def test_a_flight_on_a_gpu_has_the_result_of_the_cpu(gpu: GPU, flight: Path, tmp
         model, path = learn_flight(captures, settings, lambda *_: None), tmp_path / name
         assert model is not None
         save_model(model, path)
-        loaded = replace(load_model(path, lambda: choose_device(name)), refined={})
+        loaded = load_model(path, lambda: choose_device(name))
         assert {w.device.type for w in (*model.net.parameters(), *loaded.net.parameters())} == {name}
         joint = align_capture_bands(captures[0], settings, loaded, lambda *_: None)["NIR"].joint
         assert joint is not None
