@@ -7,6 +7,7 @@ import sys
 import tempfile
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -16,13 +17,22 @@ import pytest
 import agalign
 from agalign.batch import RunOptions, dask_executor, run_flight, workers
 from agalign.batch.report import CaptureReport
-from agalign.batch.workers import DaskExecutor, Task, do_capture, done_by, done_in, own_processes
+from agalign.batch.workers import (
+    DaskExecutor,
+    Task,
+    applied_by,
+    applied_in,
+    do_capture,
+    done_by,
+    done_in,
+    own_processes,
+)
 from agalign.cameras.discover import discover
 from agalign.config import SeedSettings, Settings
 from agalign.errors import ConfigurationError, WorkerError
 from agalign.products.sidecar import CaptureResult
 
-from ..values.pool_tasks import signal_self
+from ..values.pool_tasks import signal_self, sleep, without_memory
 
 pytestmark = pytest.mark.slow
 
@@ -97,6 +107,20 @@ def test_a_process_killed_twice_costs_its_capture(flight: Path, tmp_path: Path) 
         "its worker process was killed (signal 9; out of memory?); run again to process the remaining captures",
     )
     assert [r.state for r in reports.values()] == ["done"] * (len(tasks) - 1)
+
+
+def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(
+    tmp_path: Path,
+) -> None:
+    """The first argument takes longest; the loss of a worker twice, as by a lack of memory, is one line."""
+    with own_processes(2) as pool:
+        assert list(applied_in(pool, sleep, [0.6, 0.0, 0.1])) == [0.6, 0.0, 0.1]
+    with ThreadPoolExecutor(2) as threads:
+        assert list(applied_by(threads, sleep, [0.3, 0.0, 0.1], 2)) == [0.3, 0.0, 0.1]
+    with own_processes(1) as pool, pytest.raises(WorkerError, match="the flight cannot be learned: its worker process"):
+        list(applied_in(pool, partial(signal_self, number=signal.SIGKILL, times=2), [tmp_path / "mark"]))
+    with own_processes(1) as pool, pytest.raises(MemoryError):
+        list(applied_in(pool, without_memory, [0]))
 
 
 def test_a_stopped_process_is_told_as_late(flight: Path, tmp_path: Path) -> None:

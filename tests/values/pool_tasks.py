@@ -110,3 +110,7 @@ class NotUnpicklable:
 
 def result_that_cannot_be_read(_: int) -> NotUnpicklable:
     return NotUnpicklable()
+
+
+def without_memory(_: int) -> None:
+    raise MemoryError
