@@ -154,10 +154,10 @@ class _FlightLearner:
         stretches = [
             tuple(self.captures[part[k]] for k in dict.fromkeys((len(part) // 2, 0, len(part) - 1))) for part in parts
         ]
-        # All captures of a short flight determine the rig; those of a long one are easier to align with the model.
+        # The rig needs further captures; refined at the same time, they occupy all workers.
         first = {stretch[0].label for stretch in stretches}
-        is_short = len(self.captures) <= _MIN_RIG_CAPTURES
-        others = [(c,) for c in self.captures if c.label not in first] if is_short else []
+        spread = [c for c in _spread(self.captures, _MIN_RIG_CAPTURES) if c.label not in first]
+        others = [(c,) for c in spread[: _MIN_RIG_CAPTURES - len(stretches)]]
         patches = FLIGHT_PATCHES if len(stretches) >= MIN_CAPTURES else PATCHES
         start = None if self.start is None else portable(self.start)
         task = ChooseAndRefine(self._bands, self._settings_without_relief, patches, start)
