@@ -462,8 +462,10 @@ def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
     """Kill the only worker, and again when it tries the same capture once more, which it does last."""
     for finished in (1, MANY - 1):
         wait_until(lambda finished=finished: len(list(scene.out.glob("?.json"))) >= finished)
-        time.sleep(0.2)  # of the second or more that a capture takes
-        workers(process)[0].kill()
+        (worker,) = workers(process)
+        before_s = worker.cpu_times().user
+        wait_until(lambda worker=worker, before_s=before_s: worker.cpu_times().user > before_s + 0.05)
+        worker.kill()
 
 
 def kill_workers_as_they_appear(process: "subprocess.Popen[str]", scene: Scene) -> None:
