@@ -26,6 +26,8 @@ LOST_SERVER_EXIT_CODE = 255
 """Exit code of a worker after its fork server was killed; the worker itself may still run."""
 ENDS_WITHIN_S = 10.0
 """Timeout for the end of a killed process, which takes milliseconds unless it waits for a disk or file server."""
+_START_RETRIES, _RETRY_INTERVAL_S = 20, 0.1
+"""Of connections to the fork server."""
 _PROCESS_LOCK = threading.Lock()
 """Starting a process polls all others. Two threads that poll one process get a wrong exit code."""
 
@@ -65,12 +67,23 @@ class Worker:
         try:
             with _PROCESS_LOCK, without_interrupt_key():
                 if not self._abandoned:
-                    self.process.start()
+                    self._start()
                     self._launched = True
         except Exception as error:
             self.problem = f"{type(error).__name__}: {error}"
         finally:
             worker_end.close()  # the process has the only other copy: the pipe closes when it ends
+
+    def _start(self) -> None:
+        """Start the process. A fork server that was killed refuses connections shortly before its end is known."""
+        for _ in range(_START_RETRIES):
+            try:
+                self.process.start()
+            except ConnectionError:
+                time.sleep(_RETRY_INTERVAL_S)
+            else:
+                return
+        self.process.start()
 
     def waits_for(self) -> list[Any]:
         """Return the objects for `multiprocessing.connection.wait`: the pipe and the sentinel of the process."""

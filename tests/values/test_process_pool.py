@@ -267,6 +267,22 @@ def test_a_worker_that_stops_while_it_starts(monkeypatch: pytest.MonkeyPatch) ->
 # ---- storms
 
 
+def test_a_start_is_tried_again_if_the_fork_server_refuses_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server was killed, and its parent does not know it yet."""
+    start, starts = CONTEXT.Process.start, []
+
+    def refused_first(process: Any) -> None:
+        starts.append(process)
+        if len(starts) == 1:
+            raise ConnectionRefusedError
+        start(process)
+
+    monkeypatch.setattr(CONTEXT.Process, "start", refused_first)
+    with pool(tasks.size) as workers:
+        assert [outcome.value() for outcome in workers.run([b"abc"])] == [3]
+    assert len(starts) == 2
+
+
 def killing(workers: ProcessPool[Any, Any], stop: threading.Event, rest_s: Callable[[], float]) -> list[int]:
     """Kill one worker after another until the event is set: the ids of the killed ones."""
     killed: list[int] = []
