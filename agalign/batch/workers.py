@@ -43,6 +43,8 @@ _POLL_INTERVAL_S = 5.0
 """Interval at which the state of a cluster is checked while no task completes."""
 _TIMEOUT_EXIT_CODE = 75
 _OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
+_PRELOAD = "agalign.batch.preload"
+"""Module that worker processes import first."""
 _CAPTURES_A_PROCESS = 500
 """Number of captures after which a process is replaced: libraries leak some kilobytes per capture."""
 
@@ -228,7 +230,7 @@ def _call(function: Callable[[], Any]) -> Any:
 def own_processes(jobs: int) -> Iterator[CallPool]:
     """Start a pool of `jobs` worker processes, which import their libraries in the background."""
     threads = max(1, usable_cores() // jobs)
-    context = worker_context("agalign.batch.preload")
+    context = worker_context(_PRELOAD)
     with (
         threads_of_children(threads),
         ProcessPool(_call, jobs, context, start_worker, (threads,), max_tasks_per_worker=_CAPTURES_A_PROCESS) as pool,
@@ -272,7 +274,7 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
         _check_versions(stack.enter_context(client))
         # Workers import their libraries while this process learns the flight.
         for worker in client.ncores():
-            fire_and_forget(client.submit(import_module, __name__, workers=[worker], pure=False))
+            fire_and_forget(client.submit(import_module, _PRELOAD, workers=[worker], pure=False))
         yield DaskExecutor(client, timeout_s)
 
 
