@@ -34,7 +34,7 @@ from agalign.products.preview import preview_bytes
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
-from agalign.values.processes import follow_parent, threads_of_children, worker_context
+from agalign.values.processes import WORKER_MODULE, follow_parent, threads_of_children, worker_context
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 _LOG = logging.getLogger(__name__)
@@ -43,8 +43,6 @@ _POLL_INTERVAL_S = 5.0
 """Interval at which the state of a cluster is checked while no task completes."""
 _TIMEOUT_EXIT_CODE = 75
 _OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
-_PRELOAD = "agalign.batch.preload"
-"""Module that worker processes import first."""
 _CAPTURES_A_PROCESS = 500
 """Number of captures after which a process is replaced: libraries leak some kilobytes per capture."""
 
@@ -230,7 +228,7 @@ def _call(function: Callable[[], Any]) -> Any:
 def own_processes(jobs: int) -> Iterator[CallPool]:
     """Start a pool of `jobs` worker processes, which import their libraries in the background."""
     threads = max(1, usable_cores() // jobs)
-    context = worker_context(_PRELOAD)
+    context = worker_context(WORKER_MODULE)
     with (
         threads_of_children(threads),
         ProcessPool(_call, jobs, context, start_worker, (threads,), max_tasks_per_worker=_CAPTURES_A_PROCESS) as pool,
@@ -274,7 +272,7 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
         _check_versions(stack.enter_context(client))
         # Workers import their libraries while this process learns the flight.
         for worker in client.ncores():
-            fire_and_forget(client.submit(import_module, _PRELOAD, workers=[worker], pure=False))
+            fire_and_forget(client.submit(import_module, WORKER_MODULE, workers=[worker], pure=False))
         yield DaskExecutor(client, timeout_s)
 
 

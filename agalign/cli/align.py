@@ -347,7 +347,7 @@ def align(
         load_ahead()
         flight = find_captures(folder, options, terminal)
         if not dask and not dry_run:
-            start_server_ahead("agalign.batch.preload", len(flight.captures), jobs or usable_cores())
+            start_server_ahead(len(flight.captures), jobs or usable_cores())
         from agalign.batch import RunOptions
 
         run_options = RunOptions(

@@ -52,6 +52,10 @@ def without_interrupt_key() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+WORKER_MODULE = "agalign.batch.preload"
+"""Module that imports all that the workers of a run need."""
+
+
 def worker_context(preload: str) -> BaseContext:
     """Return the start method of worker processes: forked from a fork server that has imported the module `preload`, or
     spawned.
@@ -70,12 +74,12 @@ CAPTURES_WORTH_A_PROCESS = 2
 """Minimum number of captures per process: starting one takes the time of one capture, while a flight is learned."""
 
 
-def start_server_ahead(preload: str, captures: int, cores: int) -> None:
-    """Start the fork server early if a run of this many captures will use workers: it imports `preload` while this
+def start_server_ahead(captures: int, cores: int) -> None:
+    """Start the fork server early if a run of this many captures will use workers: it imports WORKER_MODULE while this
     process imports the same.
     """
     processes = min(cores, captures // CAPTURES_WORTH_A_PROCESS)
-    if processes < 2 or worker_context(preload).get_start_method() != "forkserver":
+    if processes < 2 or worker_context(WORKER_MODULE).get_start_method() != "forkserver":
         return
     from multiprocessing import forkserver
 
