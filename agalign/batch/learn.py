@@ -110,9 +110,9 @@ class _FlightLearner:
             rig = self.start.rig
         # Without a rig, a second refinement from the medians reduces the errors.
         refined = {
-            self._key(c): seen.refined
+            self._key(c): found.refined
             for c in self.captures
-            if rig is not None and (seen := observations.get(c.label)) is not None and seen.is_aligned
+            if rig is not None and (found := observations.get(c.label)) is not None and found.is_aligned
         }
         return replace(model, rig=rig, mappings=medians if rig is None else {**medians, **rig.mean}, refined=refined)
 
@@ -182,7 +182,7 @@ class _FlightLearner:
         pairs = [(one, images) for one, images in zip(chosen, loaded, strict=True) if images is not None]
         groups: list[ImageGroup] = []
         for one, images in pairs:
-            groups += images.groups_from({} if one.seen is None else one.seen.refined)
+            groups += images.groups_from({} if one.observation is None else one.observation.refined)
         try:
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
@@ -198,7 +198,7 @@ class _FlightLearner:
         `known` are the captures that the network has refined.
         """
         count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // _CAPTURES_PER_RIG_CAPTURE))
-        result = {one.capture.label: one.seen for one in known if one.seen is not None}
+        result = {one.capture.label: one.observation for one in known if one.observation is not None}
         if len(self.captures) < MIN_CAPTURES:
             return result
         again = [c for c in self.captures if c.label in result and result[c.label].misaligned]

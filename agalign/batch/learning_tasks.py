@@ -1,4 +1,4 @@
-"""Tasks of learning a flight: each processes one capture, in this process or on a worker."""
+"""Tasks of learning a flight, one for each capture, in this process or on a worker."""
 
 import copy
 import logging
@@ -84,14 +84,15 @@ class RigObservation:
 
 @dataclass(frozen=True)
 class LearningCapture:
-    """A capture to learn the network from, and its mappings refined by the initial network or the learned one."""
+    """A capture to learn the network from, with the results of the initial network or of the learned one."""
 
     capture: Capture
     is_good_enough: bool
     """The network needs no more learning for it."""
     mappings: Mapping[str, Matrix] = field(default_factory=dict)
     """Refined mappings of bands with distinguishable held-out patches, px of the files."""
-    seen: RigObservation | None = None
+    observation: RigObservation | None = None
+    """None if the initial network was not applied, because a seed is not trusted."""
 
 
 @dataclass(frozen=True)
