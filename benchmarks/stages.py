@@ -74,8 +74,8 @@ def main() -> None:
     options = parser.parse_args()
     cv2.setNumThreads(1)
     captures = discover(options.flight).captures
-    band = captures[0].moving[0]
-    pair = read(captures[0].reference.path), read(band.path)
+    middle = captures[len(captures) // 2]  # the first may show the sky or a panel
+    pair = read(middle.reference.path), read(middle.moving[0].path)
     methods: dict[str, Align] = {"SIFT + RANSAC": sift}
     for name in PEERS if options.peers else ():
         try:
