@@ -8,6 +8,8 @@ import gc
 from importlib import import_module
 
 gc.disable()
-import_module("agalign.batch.workers")
-gc.freeze()
-gc.enable()
+try:
+    import_module("agalign.batch.workers")
+    gc.freeze()
+finally:
+    gc.enable()

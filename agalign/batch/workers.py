@@ -156,9 +156,7 @@ def applied_in(pool: CallPool, function: Callable[[T], R], arguments: Sequence[T
     return _in_order((outcome.number, outcome.value) for outcome in outcomes)
 
 
-def applied_by(
-    executor: Executor, function: Callable[[T], R], arguments: Sequence[T], maximum: int
-) -> Iterator[R]:  # fmt: skip
+def applied_by(executor: Executor, function: Callable[[T], R], arguments: Sequence[T], maximum: int) -> Iterator[R]:
     """Apply a function to arguments on an executor, like `values.apply.Apply`; at most `maximum` at a time."""
     executor = executor.without_timeout() if isinstance(executor, DaskExecutor) else executor
     loss = executor.loss if isinstance(executor, DaskExecutor) else str

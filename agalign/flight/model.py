@@ -53,7 +53,7 @@ class FlightModel:
     rig: Rig | None = None
     """Geometry of the camera; None if too few captures determine it."""
     refined: Mapping[str, Mapping[str, RefinedPair]] = field(default_factory=dict)
-    """Mappings by band of captures from which it was learned, by `fingerprint.refinement_key`."""
+    """Mappings by band of captures with which it was learned or tested, by `fingerprint.refinement_key`."""
 
     def side(self, band: str) -> int | None:
         """Return the network's side of a moving band; None for an unknown band."""

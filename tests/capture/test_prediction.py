@@ -112,7 +112,7 @@ def test_mappings_that_learning_refined_are_verified_and_not_refined_again(
     refined: list[str] = []
 
     def statuses(number: int, model: FlightModel) -> set[str]:
-        """Return the statuses of the bands of a capture, whose name is added to `refined` if they are refined."""
+        """Return the statuses of the bands of a capture. If its pairs are refined, its name is added to `refined`."""
 
         def refine(*arguments: Any) -> Results:
             refined.append(captures[number].name)
