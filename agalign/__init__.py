@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         WorkerError,
     )
     from agalign.products.dataset import open_capture, open_flight
+    from agalign.products.read_alignment import read_alignment
     from agalign.values.alignment import Alignment, Prediction, Residual, Seed
     from agalign.values.pixel_units import FixedFilePx, FixedImagePx, MovingFilePx
 
@@ -81,6 +82,7 @@ __all__ = [
     "discover",
     "open_capture",
     "open_flight",
+    "read_alignment",
     "warp_onto",
 ]
 
@@ -89,6 +91,7 @@ _OTHER_MODULES = {
     "agalign.batch": ("CaptureReport", "FlightReports", "RunOptions"),
     "agalign.cameras.discover": ("DiscoverOptions", "FolderScan", "discover"),
     "agalign.products.dataset": ("open_capture", "open_flight"),
+    "agalign.products.read_alignment": ("read_alignment",),
     "agalign.values.alignment": ("Alignment", "Prediction", "Residual", "Seed"),
     "agalign.values.pixel_units": ("FixedFilePx", "FixedImagePx", "MovingFilePx"),
 }

@@ -18,12 +18,11 @@ from agalign.config import Settings
 from agalign.errors import InputError
 from agalign.pixels.masks import raster_of
 from agalign.pixels.radiometry import with_radiometry
-from agalign.pixels.resample import resample
 from agalign.values import geometry
-from agalign.values.alignment import Alignment
+from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Capture
 from agalign.values.choices import Interpolation, SeedKind
-from agalign.values.image import Mask, Tile
+from agalign.values.image import Mask
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.values.processes import end_if_reimported
@@ -56,11 +55,11 @@ def align(
     fixed_valid, moving_valid
         (H, W), False where pixels must not be used.
 
-    Returns an Alignment. Its `fixed_to_moving` (3x3) maps a pixel of `fixed` to a pixel of `moving`: x right, y down,
-    (0, 0) the centre of the top-left pixel. Check its `status`: only `aligned` has passed verification. With
-    `predicted`, the mapping is extrapolated over a part of the image without measurements, with the standard error
-    `prediction.std_px`; apply `field` before the homography. With `seed_only` and `failed`, the homography is that of
-    the seed. `reason` explains each of the three.
+    Returns an Alignment on the grid of `fixed`. `warp` resamples `moving` to it, `map` maps pixels of `fixed` to pixels
+    of `moving`, `inverse` maps back: x right, y down, (0, 0) the centre of the top-left pixel. Check its `status`: only
+    `aligned` has passed verification. With `predicted`, the mapping is extrapolated over a part of the image without
+    measurements, with the standard error `prediction.std_px`. With `seed_only` and `failed`, the mapping is that of the
+    seed. `reason` explains each of the three.
     Raises InputError for arrays that are not images, GeometryError for a seed that is not a homography.
     """
     settings = settings or Settings()
@@ -83,18 +82,18 @@ def warp_onto(
     valid: ArrayLike | None = None,
     interpolation: Interpolation = "lanczos",
 ) -> tuple[NDArray[np.generic], Mask]:
-    """Resample a single-band image (H, W) onto a fixed grid of (width, height) pixels; the type stays the same.
+    """Resample an image to a grid of (width, height) pixels by a homography (3x3) that maps its pixels to the image.
 
-    Returns the pixels and their mask, (height, width) each. Raises InputError and GeometryError.
+    An alignment may have lenses, a displacement field or a relief in addition: use `Alignment.warp` for it. Arguments
+    and results are those of `Alignment.warp`. Raises InputError, also for an Alignment, and GeometryError.
     """
-    pixels = np.asarray(moving)
-    if pixels.ndim != 2:
-        raise InputError(f"moving must be (H, W), not {pixels.shape}; warp several bands one by one")
-    mask = np.ones(pixels.shape, bool) if valid is None else np.asarray(valid, bool)
+    if isinstance(fixed_to_moving, Alignment):
+        raise InputError("an alignment is more than a homography; use its method warp(moving)")
     mapping = PixelMapping(geometry.normalised(fixed_to_moving))
-    positions = mapping.positions(Tile(0, 0, *fixed_size_px))
-    size_px = pixels.shape[1], pixels.shape[0]
-    return resample(pixels, mask, positions, size_px, (0, 0), interpolation)
+    by_homography = Alignment[FixedImagePx](
+        mapping, fixed_size_px, "aligned", (), Seed("user", mapping.fixed_to_moving, 0.0)
+    )
+    return by_homography.warp(moving, valid=valid, interpolation=interpolation)
 
 
 def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureOutcome:

@@ -271,7 +271,7 @@ def _observation(
     pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], refined: Mapping[str, RefinedPair],
     capture: Capture,
 ) -> RigObservation:  # fmt: skip
-    in_file_px = {p.name: result[p.name].in_file_px(p.scales) for p in pairs}
+    in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
     residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
     misaligned = frozenset(
         name

@@ -26,6 +26,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, RefinedPair, Seed
 from agalign.values.capture import Capture
 from agalign.values.issues import SEED_ASKED_FOR, Issue
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
 
 PairProgress = Callable[[str, str, float], None]
@@ -72,13 +73,16 @@ def align_capture_bands(
     result: dict[str, Alignment[FixedFilePx]] = {}
     for band in capture.bands_of_the_references_lens:
         identity = Seed("identity", geometry.identity(), 0.0)
-        result[band.name] = Alignment(identity.fixed_to_moving, "pixel", "aligned", (), identity, None, None, 0.0)
+        result[band.name] = Alignment(
+            PixelMapping(identity.fixed_to_moving), capture.reference.size_px, "aligned", (), identity
+        )
     for pair in pairs:
         result |= _between_files(capture, pair, aligned[pair.name])
     for band in capture.moving:
         if band.name in unusable:
             overlay = Seed("identity", geometry.overlay(capture.reference.size_px, band.size_px), 0.0)
-            result[band.name] = without_result(overlay, "pixel", unusable[band.name])
+            mapping = PixelMapping(overlay.fixed_to_moving)
+            result[band.name] = Alignment(mapping, capture.reference.size_px, "failed", (unusable[band.name],), overlay)
     return {band.name: result[band.name] for band in capture.moving}
 
 
@@ -86,7 +90,7 @@ def _between_files(
     capture: Capture, pair: BandPair, aligned: Alignment[FixedImagePx]
 ) -> dict[str, Alignment[FixedFilePx]]:
     """Convert the alignment of a pair to px of the files of its bands; refine it if the files have more pixels."""
-    alignment = aligned.in_file_px(pair.scales)
+    alignment = aligned.in_file_px(pair.scales, capture.reference.size_px)
     if pair.is_reduced and alignment.status == "aligned":
         alignment = at_full_resolution(capture.reference, pair.bands[0], alignment)
     shared = replace(alignment, seconds=alignment.seconds / len(pair.bands))
@@ -184,7 +188,7 @@ class PairAligner:
                 self.progress(pair.name, "seeding", 0.0)
                 seed = find_seed(pair, self.settings.seed, self.model)
                 if isinstance(seed, Issue):
-                    self.result[pair.name] = without_result(first_candidate(pair), pair.space, seed)
+                    self.result[pair.name] = without_result(pair, first_candidate(pair), seed)
                 else:
                     starts.append((pair, seed))
         return starts

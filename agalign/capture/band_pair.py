@@ -18,9 +18,10 @@ from agalign.pixels.raster import read_for_alignment
 from agalign.pixels.resample import warped
 from agalign.pixels.stripes import without_common_stripes
 from agalign.values import geometry
-from agalign.values.alignment import SAME_SCALES, DisplacementField, PairScales
+from agalign.values.alignment import SAME_SCALES, PairScales
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import SeedKind, Space
+from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue

@@ -36,14 +36,14 @@ def predicted_if_coarse(pair: BandPair, alignment: Alignment[FixedImagePx]) -> A
     """
     if not pair.is_coarse or alignment.status in ("aligned", "predicted") or not alignment.seed.trusted:
         return alignment
-    start = replace(alignment, fixed_to_moving=alignment.seed.fixed_to_moving, field=pair.field, local=None)
+    start = replace(alignment, mapping=pair.mapping(alignment.seed.fixed_to_moving))
     for _ in range(_ROUNDS):
-        mapping = replace(pair.mapping(start.fixed_to_moving), local=None)
+        mapping = replace(start.mapping, local=None)
         fit = _fit(pair, mapping)
         if fit is None:
             return alignment
         start = with_fit(pair, start, fit)
-    warped_pair = WarpedPair.of(pair, pair.mapping(start.fixed_to_moving, start.field))
+    warped_pair = WarpedPair.of(pair, start.mapping)
     return alignment if alias_peak(*warped_pair.reduced_spectra()).ratio > MAX_ALIAS_PEAK else start
 
 

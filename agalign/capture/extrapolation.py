@@ -34,8 +34,7 @@ def without_extrapolated(
         if alignment.status != "aligned" or "geo" in pair.candidates or _is_covered(pair, rig):
             continue
         assert alignment.residual is not None
-        mapping = pair.mapping(alignment.fixed_to_moving, alignment.field)
-        in_frame_px = points_in_frame(mapping, pair.fixed.size_px, pair.moving.size_px)
+        in_frame_px = points_in_frame(alignment.mapping.of_the_plane, pair.fixed.size_px, pair.moving.size_px)
         issues = issues_of_extrapolation(alignment.residual, pair.fixed.size_px, in_frame_px)
         if issues:
             checked[pair.name] = _extrapolated(pair, alignment, issues)
@@ -53,7 +52,7 @@ def _extrapolated(
     """Return the MAP estimate of homography and lens distortion from the windows as a prediction."""
     size_px = pair.fixed.size_px
     # A displacement field that was fitted to the windows is extrapolated too and therefore replaced.
-    start = replace(pair.mapping(alignment.fixed_to_moving), local=None)
+    start = replace(alignment.mapping.of_the_plane, local=None)
     fit = fit_with_lens(
         start, WarpedPair.of(pair, start).residual, size_px, calibrated=pair.space == "undistorted"
     )  # fmt: skip
@@ -77,6 +76,6 @@ def with_fit(pair: BandPair, alignment: Alignment[FixedImagePx], fit: LensFit) -
         covariance_px2=fit.covariance_px2 * np.outer(to_file_px, to_file_px),
     )  # fmt: skip
     return replace(
-        alignment, status="predicted", fixed_to_moving=corrected, field=mapping.local, local=None,
-        residual=WarpedPair.of(pair, mapping).residual, prediction=prediction,
+        alignment, mapping=mapping, status="predicted", residual=WarpedPair.of(pair, mapping).residual,
+        prediction=prediction,
     )  # fmt: skip

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agalign.capture.corner_fit import CornerFit, corner_correction, with_corners
-from agalign.capture.verification import without_result
 from agalign.errors import GeometryError, UnreadableFileError
 from agalign.flight.factors import distance_px
 from agalign.pixels.masks import learnable
@@ -23,7 +22,7 @@ from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Band
 from agalign.values.image import Raster, Tile
 from agalign.values.issues import UNREADABLE, Issue
-from agalign.values.mapping import PixelMapping, mapping_of
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.check import Evidence
 from agalign.verify.checks import issues_of
@@ -53,11 +52,12 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[Fixed
     with open_raster(reference.path) as source:
         tiles = [_FixedTile.read(source, reference, *of_cell) for of_cell in _tiles(reference, alignment).items()]
     try:
-        refined = _refined(alignment, moving, mapping_of(reference, moving, alignment), tiles, reference.size_px)
+        refined = _refined(alignment, moving, alignment.mapping, tiles, reference.size_px)
     except UnreadableFileError as error:
         issue = Issue(UNREADABLE, detail=str(error))
-        failed: Alignment[FixedFilePx] = without_result(alignment.seed, alignment.space, issue)
-        return replace(failed, seconds=alignment.seconds)
+        return replace(
+            alignment, mapping=alignment.of_the_seed, status="failed", issues=(issue,), joint=None, residual=None
+        )
     return alignment if refined is None else refined
 
 
@@ -138,9 +138,7 @@ def _refined(
         prediction = replace(prediction, off_px=off_px)
     if issues_of(Evidence(joint, after, size_px, prediction=prediction)):
         return None
-    return replace(
-        alignment, fixed_to_moving=mapping.fixed_to_moving, joint=joint, residual=after, prediction=prediction
-    )
+    return replace(alignment, mapping=mapping, joint=joint, residual=after, prediction=prediction)
 
 
 def _tiles(reference: Band, alignment: Alignment[FixedFilePx]) -> dict[tuple[int, int], Tile]:

@@ -28,8 +28,9 @@ from agalign.relief.plane_parallax import (
     parallax_of,
 )
 from agalign.values import geometry
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, DisplacementField, JointResult, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
 from agalign.values.choices import ReliefUse
+from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
@@ -280,8 +281,8 @@ class _Estimate:
         if WarpedPair(pair, complete, pair.warped_moving(complete), held_out).issues(joint):
             return rejected
         alignment = Alignment(
-            final.fixed_to_moving, pair.space, "aligned", (), candidate.seed, joint, held_out, 0.0,
-            field=final.field or pair.field, parallax=parallax,
+            complete, size_px, "aligned", (), candidate.seed, joint, held_out,
+            candidates={"homography": without_relief.p95_px, "relief": held_out.p95_px},
         )  # fmt: skip
         return _Checked(pair.name, held_out.p95_px, alignment)
 

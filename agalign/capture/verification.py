@@ -11,15 +11,16 @@ from agalign.pixels.grey import channel_mean
 from agalign.pixels.resample import shrink
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, DisplacementResult, JointResult, Prediction, Residual, Seed
-from agalign.values.choices import ReliefUse, SeedKind, Space
+from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed
+from agalign.values.choices import Geometry, ReliefUse, SeedKind
 from agalign.values.image import Raster
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
+from agalign.values.pixel_units import FixedImagePx, PixelScale
 from agalign.verify.acceptance import is_unchanged, seed_fits, status_of
 from agalign.verify.check import Evidence
 from agalign.verify.checks import issues_of
+from agalign.verify.displacement_field import DisplacementResult
 from agalign.verify.extrapolation_check import points_in_frame, unobserved_quarters
 from agalign.verify.residuals import residual_under
 from agalign.verify.window_check import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX
@@ -35,9 +36,9 @@ _PARALLAX_ISSUES = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
 """Issues caused by parallax, which a displacement field may remove."""
 
 
-def without_result(seed: Seed, space: Space, issue: Issue) -> Alignment[FixedPx]:
+def without_result(pair: BandPair, seed: Seed, issue: Issue) -> Alignment[FixedImagePx]:
     """Return a failed alignment without a result."""
-    return Alignment(seed.fixed_to_moving, space, "failed", (issue,), seed, None, None, 0.0)
+    return Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", (issue,), seed)
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def verified(
     `warped_pair` is the pair with a mapping close to the result's, if available; it avoids measuring again.
     """
     joint: JointResult[FixedImagePx] | None = None
-    local: DisplacementResult[FixedImagePx] | None = None
+    local: DisplacementResult | None = None
     issues: tuple[Issue, ...] = ()
     is_displaced = False
     if isinstance(result, JointResult):
@@ -126,9 +127,12 @@ def verified(
     status = status_of(issues, warped_pair.residual, seed=usable)
     if usable and issues and not is_displaced and not seed_fits(warped_pair.residual):
         issues = (*issues, Issue(SEED_DOES_NOT_FIT))
+    candidates: dict[Geometry, FixedImagePx] = {}
+    if local is not None:
+        candidates = {"homography": local.before_p95_px, "field": local.after_p95_px}
     alignment = Alignment(
-        warped_pair.mapping.fixed_to_moving, pair.space, status, issues, seed, joint, warped_pair.residual, 0.0,
-        local=local, field=warped_pair.mapping.local,
+        warped_pair.mapping, pair.fixed.size_px, status, issues, seed, joint, warped_pair.residual,
+        candidates=candidates,
     )  # fmt: skip
     return _predicted_by_windows(alignment, pair) if issues and is_displaced else alignment
 
@@ -148,7 +152,7 @@ def _predicted_by_windows(alignment: Alignment[FixedImagePx], pair: BandPair) ->
 
 def _verified(
     warped_pair: WarpedPair, joint: JointResult[FixedImagePx], use: ReliefUse
-) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult[FixedImagePx] | None]:
+) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult | None]:
     """Return the pair, with a displacement field if one is accepted, its issues, and the result of the field fit."""
     issues = warped_pair.issues(joint)
     if not _needs_field(use, issues, has_rig=warped_pair.pair.has_rig):
@@ -176,7 +180,7 @@ def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) ->
 class _FieldResult:
     """A pair with a displacement field, after verification."""
 
-    local: DisplacementResult[FixedImagePx]
+    local: DisplacementResult
     pair: WarpedPair | None = None
     """With the residual of held-out windows; None without a field or with issues that a field cannot remove."""
     issues: tuple[Issue, ...] = ()
@@ -194,7 +198,7 @@ class _FieldResult:
 
     def or_without_field(
         self, plane: WarpedPair, issues: tuple[Issue, ...]
-    ) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult[FixedImagePx]]:
+    ) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult]:
         """Return the pair with the field, or `plane` if there is no field or only `plane` passes verification."""
         if self.pair is None or (self.issues and not issues):
             return plane, issues, replace(self.local, field=None)
@@ -221,17 +225,15 @@ def as_predicted(alignment: Alignment[FixedImagePx], pair: BandPair, prediction:
     """Return the alignment, px of the images, with the mapping of a prediction, px of the files."""
     fixed_to_moving = pair.scales.between_images(prediction.fixed_to_moving)
     residual = WarpedPair.of(pair, pair.mapping(fixed_to_moving)).residual
-    return replace(
-        alignment, fixed_to_moving=fixed_to_moving, status="predicted", residual=residual, local=None,
-        field=pair.field, prediction=prediction,
-    )  # fmt: skip
+    mapping = pair.mapping(fixed_to_moving)
+    return replace(alignment, mapping=mapping, status="predicted", residual=residual, prediction=prediction)
 
 
 def with_metrics(alignment: Alignment[FixedImagePx], pair: BandPair) -> Alignment[FixedImagePx]:
     """Return the alignment with similarity metrics before (image borders overlaid) and after alignment."""
     similarity = pair.reference.similarity
     before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
-    after = pair.warped_moving(pair.mapping(alignment.fixed_to_moving, alignment.field, alignment.parallax))
+    after = pair.warped_moving(alignment.mapping)
     return replace(alignment, before=similarity.to(before), after=similarity.to(after))
 
 

@@ -49,8 +49,7 @@ def by_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[
     if issues_of(Evidence(joint, held_out, pair.fixed.size_px, images=warped_pair, file_px=pair.file_px)):
         return alignment
     return replace(
-        alignment, fixed_to_moving=joint.fixed_to_moving, status="aligned", issues=(), joint=joint, residual=held_out,
-        local=None, field=pair.field,
+        alignment, mapping=warped_pair.mapping, status="aligned", issues=(), joint=joint, residual=held_out,
     )  # fmt: skip
 
 

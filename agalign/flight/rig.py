@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from agalign.values.alignment import DisplacementField
+from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import MovingFilePx
 

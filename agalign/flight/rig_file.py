@@ -11,7 +11,7 @@ from safetensors import safe_open
 
 from agalign.errors import InputError
 from agalign.flight.rig import CaptureFactors, Rig
-from agalign.values.alignment import DisplacementField
+from agalign.values.displacement import DisplacementField
 from agalign.values.files import open_regular
 
 

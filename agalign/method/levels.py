@@ -16,7 +16,7 @@ from agalign.method.patches import FOOTPRINT_PX, Keypoints, bilinear, footprint_
 from agalign.pixels.resample import shrink
 from agalign.pixels.structure import gradient_magnitude
 from agalign.values import geometry, lens
-from agalign.values.alignment import DisplacementField
+from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.lens import Lens

@@ -6,11 +6,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
 from agalign.values.image import Mask, Raster
+from agalign.values.resample import planes_of
 
 _MIN_SIDE_PX = 48
 """Smaller images contain too few patches for learning."""
-_MAX_CHANNELS = 16
-"""Distinguishes (H, W, C) from (C, H, W): images have more rows than this."""
 _MAX_SENSOR_BYTES = 2
 """Sensors deliver 8 or 16 bits; the maximum of a wider type is not saturation."""
 _COMMON_FILL_VALUES = (-9999.0, -99999.0, -32767.0, -32768.0)
@@ -76,7 +75,9 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     Constant fill at the border is masked, and saturated areas of 8 and 16 bit integers. Raises InputError, with `name`,
     if the array is not an image or `valid` has another shape.
     """
-    planes = _planes(np.asarray(image), name)
+    planes, _ = planes_of(image, name)
+    if min(planes.shape[1:]) < _MIN_SIDE_PX:
+        raise InputError(f"{name} is {np.shape(image)}: images need {_MIN_SIDE_PX} px a side")
     is_sensor_type = planes.dtype.kind in "ui" and planes.dtype.itemsize <= _MAX_SENSOR_BYTES
     saturation = float(np.iinfo(str(planes.dtype)).max) if is_sensor_type else None
     mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
@@ -89,19 +90,3 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
         mask = learnable(mask, plane, saturation)
     pixels = np.where(mask, planes, 0).astype(np.float32)
     return Raster(pixels if len(planes) > 1 else pixels[0], mask)
-
-
-def _planes(array: NDArray[np.generic], name: str) -> NDArray[np.generic]:
-    """Convert (H, W), (H, W, C) or (C, H, W) to (C, H, W). Raises InputError, with `name`, for any other array."""
-    if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
-        raise InputError(
-            f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"
-        )
-    if array.ndim == 3 and array.shape[-1] <= _MAX_CHANNELS < array.shape[0]:
-        array = np.moveaxis(array, -1, 0)
-    planes = array if array.ndim == 3 else array[None]
-    if len(planes) > _MAX_CHANNELS or min(planes.shape[1:]) < _MIN_SIDE_PX:
-        raise InputError(
-            f"{name} is {array.shape}: images need {_MIN_SIDE_PX} px a side and at most {_MAX_CHANNELS} channels"
-        )
-    return planes

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
 
 from agalign._version import __version__
 from agalign.flight.fingerprint import fingerprint
@@ -16,12 +17,14 @@ from agalign.products.relief_map import ReliefMap
 from agalign.products.sidecar import (
     BandPart,
     CameraPart,
+    FieldPart,
     FilePart,
+    GeometryPart,
     GridPart,
     HomographyPart,
     IssuePart,
     JointPart,
-    LocalPart,
+    LensPart,
     Matrix3x3,
     MetricsPart,
     OutputPart,
@@ -39,21 +42,21 @@ from agalign.products.sidecar import (
 )
 from agalign.products.stack import Stack
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementResult, JointResult, Prediction, Residual
+from agalign.values.alignment import JointResult, Prediction, Residual
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import CaptureStatus
+from agalign.values.displacement import DisplacementField
 from agalign.values.files import file_checksum
-from agalign.values.geometry import Matrix
-from agalign.values.mapping import PixelMapping, mapping_of
+from agalign.values.geometry import Matrix, Points
+from agalign.values.lens import Lens
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.relief import Relief
 
-_GRID = 17, 13
-"""Columns and rows of the sampled mapping if that is nearly a homography."""
-_FINE_GRID = 65, 49
-"""Columns and rows with a displacement field, or if the lens models differ."""
-_MAX_INTERPOLATION_ERROR_PX = 0.2
-"""The coarse grid is used if bilinear interpolation between its points is at most this far off."""
+_GRIDS = ((17, 13), (33, 25), (65, 49), (129, 97))
+"""Columns and rows of the sampled mapping; the first with a small enough error is used."""
+_MAX_INTERPOLATION_ERROR_PX = 0.02
+"""Maximum error of cubic interpolation halfway between the points: less than that of an alignment."""
 
 
 def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:
@@ -114,6 +117,7 @@ def _output_part(context: ProductContext) -> OutputPart:
         radiometry=None if context.write_settings.radiometry == "off" else _radiometry(context.capture),
         crop=(grid.x0, grid.y0, grid.width, grid.height),
         scale=(grid.scale.x, grid.scale.y),
+        undistorted=grid.undistorted,
         nodata=values.pop() if len(values) == 1 else None,
     )
 
@@ -162,11 +166,10 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     )  # fmt: skip
 
 
-def _relief_part(context: ProductContext, mapping: PixelMapping) -> ReliefPart | None:
+def _relief_part(context: ProductContext, mapping: PixelMapping, nodes_px: Points) -> ReliefPart | None:
     parallax = mapping.parallax
     if parallax is None:
         return None
-    nodes_px = geometry.lattice(*context.capture.reference.size_px, *_GRID)
     # The mapping is linear in the parallax: its values for a parallax of 0 and of 1 px determine it.
     flat = np.zeros((1, 1), np.float32)
     at_zero, at_one = (
@@ -184,10 +187,8 @@ def _relief_part(context: ProductContext, mapping: PixelMapping) -> ReliefPart |
 def _moving_part(context: ProductContext, band: Band, place: PlacePart | None) -> BandPart:
     reference, alignment = context.capture.reference, context.alignments[band.name]
     joint, residual = alignment.joint, alignment.residual
-    local = alignment.local
-    mapping = mapping_of(reference, band, alignment)
-    needs_fine_grid = alignment.field is not None or _is_curved(mapping.of_the_plane, reference.size_px)
-    grid_px = geometry.lattice(*reference.size_px, *(_FINE_GRID if needs_fine_grid else _GRID))
+    mapping = alignment.mapping
+    grid_px = _grid_px(mapping.of_the_plane, reference.size_px)
     after = dict(alignment.after) | _residual_metrics(residual)
     return BandPart(
         band=band.name,
@@ -209,8 +210,12 @@ def _moving_part(context: ProductContext, band: Band, place: PlacePart | None) -
         metrics=MetricsPart(
             before=_similarity_part(alignment.before), after=_similarity_part(after), tiles=_tile_parts(residual)
         ),
-        local=None if local is None else _local_part(local),
-        relief=_relief_part(context, mapping),
+        geometry=GeometryPart(
+            kind=alignment.geometry, held_out_p95_px={k: _finite(round(v, 4)) for k, v in alignment.candidates.items()}
+        ),
+        lenses=_lens_parts(mapping),
+        field=None if mapping.local is None else _field_part(mapping.local, reference.size_px),
+        relief=_relief_part(context, mapping, grid_px),
         prediction=None if alignment.prediction is None else _prediction_part(alignment.prediction),
         place=place,
         seconds=round(alignment.seconds, 3),
@@ -226,12 +231,31 @@ def _residual_metrics(residual: Residual[FixedFilePx] | None) -> dict[str, float
     return {"residual_px": residual.median_px, "residual_p95_px": residual.p95_px} | coverage
 
 
-def _is_curved(mapping: PixelMapping, size_px: tuple[int, int]) -> bool:
-    """True if linear interpolation halfway between the points of the coarse grid is too far off the mapping."""
-    points = geometry.lattice(*size_px, *_GRID).reshape(_GRID[1], _GRID[0], 2)
-    mapped = mapping(points)
-    error_px = mapping(0.5 * (points[:, 1:] + points[:, :-1])) - 0.5 * (mapped[:, 1:] + mapped[:, :-1])
-    return bool(np.abs(error_px).max() > _MAX_INTERPOLATION_ERROR_PX)
+def _grid_px(mapping: PixelMapping, size_px: tuple[int, int]) -> Points:
+    """Return the points (n, 2) at which cubic interpolation reproduces a smooth mapping, or the densest grid."""
+    for columns, rows in _GRIDS:
+        x, y = np.linspace(0, size_px[0] - 1, columns), np.linspace(0, size_px[1] - 1, rows)
+        x_between, y_between = (x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2
+        sampled, exact = mapping.at_crossings(x, y), mapping.at_crossings(x_between, y_between)
+        splines = [RectBivariateSpline(y, x, sampled[..., k])(y_between, x_between) for k in (0, 1)]
+        if np.abs(np.stack(splines, axis=-1) - exact).max() <= _MAX_INTERPOLATION_ERROR_PX:
+            break
+    return geometry.lattice(*size_px, columns, rows)
+
+
+def _lens_parts(mapping: PixelMapping) -> tuple[LensPart, LensPart] | None:
+    if mapping.fixed_lens is None or mapping.moving_lens is None:
+        return None
+    return _lens_part(mapping.fixed_lens), _lens_part(mapping.moving_lens)
+
+
+def _lens_part(lens: Lens) -> LensPart:
+    return LensPart(**(asdict(lens) | {"distortion": list(lens.distortion)}))
+
+
+def _field_part(field: DisplacementField, size_px: tuple[int, int]) -> FieldPart:
+    on_file = field.on_lattice(field.step_px / field.scale.mean, size_px)
+    return FieldPart(step_px=on_file.step_px, displacements_px=[_points(row) for row in on_file.displacements_px])
 
 
 def _prediction_part(prediction: Prediction) -> PredictionPart:
@@ -241,11 +265,6 @@ def _prediction_part(prediction: Prediction) -> PredictionPart:
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
-
-
-def _local_part(local: DisplacementResult[FixedFilePx]) -> LocalPart:
-    before, after = _finite(local.before_p95_px), _finite(local.after_p95_px)
-    return LocalPart(applied=local.field is not None, before_p95_px=before, after_p95_px=after)
 
 
 def _joint_part(joint: JointResult[FixedFilePx], *, accepted: bool) -> JointPart:

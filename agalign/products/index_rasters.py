@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from agalign._version import __version__
 from agalign.errors import AgalignError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.pixels.resample import tiles
 from agalign.products.checked_raster import CheckedRaster, check_complete, checked_raster, tiled_profile
 from agalign.products.index_bands import RAW, BandReader, IndexBand
 from agalign.products.index_picture import picture_size, write_picture
@@ -29,6 +28,7 @@ from agalign.products.index_statistics import (
 )
 from agalign.products.indices import Index, bands_for, compute
 from agalign.values.image import FloatImage, Tile
+from agalign.values.resample import tiles
 
 _WORK_TILE_PX = 2048
 """Side of the tiles that are calculated one after another: it limits the memory."""

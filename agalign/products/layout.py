@@ -14,7 +14,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.image import Mask, OutputGrid, Tile
-from agalign.values.mapping import PixelMapping, mapping_of
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, PixelScale
 
 _FLIGHT_MARGIN_PX = 2
@@ -103,7 +103,7 @@ class _OutputPixels:
 def _mappings(capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]]) -> dict[str, PixelMapping]:
     """The mapping from raw pixels of the reference to raw pixels of each usable moving band."""
     usable = [b for b in capture.moving if b.name in alignments]
-    return {b.name: mapping_of(capture.reference, b, alignments[b.name]) for b in usable}
+    return {b.name: alignments[b.name].mapping for b in usable}
 
 
 def _layers(capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], pixels: _OutputPixels) -> list[Layer]:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from agalign.config import WriteSettings
 from agalign.pixels.raster import open_raster, read_window
-from agalign.pixels.resample import tiles
 from agalign.products.layout import Layer
 from agalign.values.capture import Band, Capture
 from agalign.values.image import Mask, OutputGrid, Tile
+from agalign.values.resample import tiles
 
 Pixels = NDArray[np.generic]
 _TILE_PX = 2048

@@ -25,7 +25,6 @@ from agalign.config import WriteSettings
 from agalign.errors import InputError
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.pixels.resample import tiles
 from agalign.products.checked_raster import checked_raster
 from agalign.products.layout import Layer, output_layers
 from agalign.products.nodata import with_nodata
@@ -35,6 +34,7 @@ from agalign.products.sidecar import is_delivered
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
+from agalign.values.resample import tiles
 
 _MIN_PAN_WIDTH_NM = 200.0
 """Bandwidth from which a band is panchromatic: multispectral bands have 10 to 60 nm."""

@@ -16,7 +16,7 @@ from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, read_tile, without_warnings
-from agalign.pixels.resample import resample_tile, tiles
+from agalign.pixels.resample import resample_tile
 from agalign.products.checked_raster import CheckedRaster, checked_raster, grid_profile
 from agalign.products.indices import Role, role_of
 from agalign.products.layout import Layer
@@ -25,6 +25,7 @@ from agalign.products.raster_tags import describe, georeference_tags
 from agalign.values.capture import Capture, Georeference
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
+from agalign.values.resample import tiles
 
 GEOTIFF = "image/tiff; application=geotiff"
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"

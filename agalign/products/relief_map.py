@@ -15,7 +15,6 @@ from agalign.values import lens
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
-from agalign.values.mapping import mapping_of
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.relief import Relief
 
@@ -52,7 +51,7 @@ class ReliefMap(Product):
 
 def relief_of(alignments: Mapping[str, Alignment[FixedFilePx]]) -> Relief | None:
     """Return the relief of a capture; None if no band is displaced by one."""
-    return next((a.parallax.relief for a in alignments.values() if a.parallax is not None), None)
+    return next((a.mapping.parallax.relief for a in alignments.values() if a.mapping.parallax is not None), None)
 
 
 def relief_layers(
@@ -86,7 +85,7 @@ def _range_m(
     reference, at_infinity, baselines_m, mappings = capture.reference, [], [], []
     for band in capture.moving:
         alignment = alignments.get(band.name)
-        if alignment is None or alignment.parallax is None or alignment.space != "undistorted":
+        if alignment is None or alignment.mapping.parallax is None or alignment.space != "undistorted":
             continue
         try:
             homography_at_infinity = rig_seed(reference, band)
@@ -96,7 +95,7 @@ def _range_m(
             continue
         at_infinity.append(homography_at_infinity)
         baselines_m.append(np.subtract(reference.lens_offset_m, band.lens_offset_m))
-        mappings.append(mapping_of(reference, band, alignment))
+        mappings.append(alignment.mapping)
     if not mappings or reference.lens is None:
         return np.full(parallax_px.shape, np.nan, np.float32)
     inverse_m = inverse_range(mappings, at_infinity, np.array(baselines_m), reference.lens, points, parallax_px)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from agalign.values.choices import CaptureStatus, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
+from agalign.values.choices import CaptureStatus, Geometry, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.files import is_inside
 from agalign.verify.checks import KINDS
 
@@ -111,9 +111,33 @@ class SeedPart(_Part):
     """The same for the second highest peak."""
 
 
+class LensPart(_Part):
+    """Lens model of a camera, Brown-Conrady in OpenCV's convention, raw pixels of the file."""
+
+    fx_px: float
+    """Focal length along x."""
+    fy_px: float
+    """Focal length along y."""
+    cx_px: float
+    """Optical centre, x."""
+    cy_px: float
+    """Optical centre, y."""
+    distortion: list[float]
+    """k1, k2, p1, p2, k3, k4, k5, k6; omitted ones are 0."""
+
+
+class FieldPart(_Part):
+    """Displacement field: raw pixels of the reference are displaced first, then undistorted and mapped."""
+
+    step_px: float
+    """Spacing of the nodes; the first one is the centre of the top-left pixel."""
+    displacements_px: list[list[PointPx]]
+    """Displacements (x, y) by row and column of the nodes; cubic splines between them."""
+
+
 class GridPart(_Part):
-    """The complete mapping, lenses included, at 17 x 13 points, or 65 x 49 with a displacement field or if lens models
-    differ. If there is a `relief`, use that instead.
+    """The complete mapping, lenses and displacement field included, sampled so that cubic interpolation reproduces it
+    to 0.02 px: 17 x 13 points, or up to 129 x 97 if it is more curved. If there is a `relief`, use that instead.
     """
 
     reference_px: list[PointPx]
@@ -224,15 +248,13 @@ class MetricsPart(MetricsResult):
     """Local shifts of the windows; with recipe `windows`, of those left out of the fit."""
 
 
-class LocalPart(_Part):
-    """Displacement field of this band alone, and the p95 shift of windows left out of its fit."""
+class GeometryPart(_Part):
+    """What the mapping has in addition to homography and lens models, and how the alternatives compare."""
 
-    applied: bool
-    """Whether the field was used."""
-    before_p95_px: float | None
-    """Without the field, px."""
-    after_p95_px: float | None
-    """With the field, px."""
+    kind: Geometry
+    """`homography`: nothing; `field`: a smooth displacement field; `relief`: the parallax of the capture."""
+    held_out_p95_px: dict[Geometry, float | None]
+    """p95 of the shifts of windows that were left out of the fits, px, for each geometry that was fitted."""
 
 
 class ReliefPart(_Part):
@@ -249,7 +271,7 @@ class ReliefPart(_Part):
     occluded: float
     """Share of the reference pixels that are occluded in this band."""
     reference_px: list[PointPx]
-    """17 x 13 nodes on the reference file, row by row."""
+    """Nodes on the reference file, row by row: those of `grid`."""
     plane_px: list[PointPx]
     """Where the reference plane maps the nodes, raw px of the moving file."""
     slope: list[PointPx]
@@ -303,8 +325,8 @@ class BandResult(_Result):
     """Result of the optimisation."""
     metrics: MetricsResult | None = None
     """Similarity before and after."""
-    local: LocalPart | None = None
-    """Displacement field of this band alone, if one was tried."""
+    geometry: GeometryPart | None = None
+    """Kind of the mapping, and the alternatives."""
     prediction: PredictionPart | None = None
     """Prediction by the rig of the flight, or by extrapolation."""
     place: PlacePart | None = None
@@ -320,6 +342,10 @@ class BandPart(BandResult):
 
     metrics: MetricsPart | None = None
     """Similarity before and after, and local shifts."""
+    lenses: tuple[LensPart, LensPart] | None = None
+    """Lens models of the reference and the band, if the homography is between undistorted pixels."""
+    field: FieldPart | None = None
+    """Displacement field of the mapping."""
     grid: GridPart | None = None
     """The complete mapping, sampled."""
     relief: ReliefPart | None = None
@@ -352,6 +378,8 @@ class OutputPart(_Part):
     """x0, y0, width, height on the reference grid, multiplied by `scale`."""
     scale: tuple[float, float] = (1.0, 1.0)
     """Output pixels per reference pixel along x and y."""
+    undistorted: bool = False
+    """True for the lens-corrected grid of the reference."""
     nodata: float | str | None
     """Nodata value of the stack, or of all single bands; null if they differ; `"nan"` for NaN. Integers without a
     nodata value in the input: 0, or another value that no valid pixel has.
@@ -467,8 +495,8 @@ class Sidecar(CaptureResult):
 
     def result(self) -> CaptureResult:
         """Return the sidecar without the long tables of its bands: those of a season would not fit into memory."""
-        tables: dict[str, Any] = {"bands": {"__all__": {"grid": True, "relief": True, "metrics": {"tiles"}}}}
-        return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude=tables))
+        tables: dict[str, Any] = {**dict.fromkeys(("grid", "field", "relief"), True), "metrics": {"tiles"}}
+        return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude={"bands": {"__all__": tables}}))
 
 
 def is_delivered(status: PairStatus, std_px: float | None, accept_predicted_px: float) -> bool:

@@ -11,8 +11,8 @@ from agalign.values.text import without_formula
 
 SUMMARY_COLUMNS = (
     "folder", "capture", "band", "wavelength_nm", "status", "reason", "seed", "retrieval", "corner_std_px",
-    "residual_px", "residual_p95_px", "residual_coverage", "local_applied", "local_p95_before_px",
-    "local_p95_after_px", "prediction_from", "prediction_std_px", "prediction_off_px",
+    "residual_px", "residual_p95_px", "residual_coverage", "geometry", "homography_p95_px",
+    "geometry_p95_px", "prediction_from", "prediction_std_px", "prediction_off_px",
     "mattes_mi_before", "mattes_mi_after", "nmi_before",
     "nmi_after", "ncc_before", "ncc_after", "gradient_correlation_before", "gradient_correlation_after",
     "structure_ssim_before", "structure_ssim_after", "seconds",
@@ -56,10 +56,10 @@ def _row(folder: str, sidecar: Sidecar, band: BandPart) -> dict[str, object]:
     }
     if band.joint is not None:
         row |= {"retrieval": rounded(band.joint.retrieval), "corner_std_px": rounded(band.joint.corner_std_px)}
-    if band.local is not None:
-        local = band.local
-        before_px, after_px = rounded(local.before_p95_px), rounded(local.after_p95_px)
-        row |= {"local_applied": local.applied, "local_p95_before_px": before_px, "local_p95_after_px": after_px}
+    if band.geometry is not None:
+        held_out = band.geometry.held_out_p95_px
+        homography_px, chosen_px = rounded(held_out.get("homography")), rounded(held_out.get(band.geometry.kind))
+        row |= {"geometry": band.geometry.kind, "homography_p95_px": homography_px, "geometry_p95_px": chosen_px}
     if band.prediction is not None:
         prediction = band.prediction
         std_px, off_px = rounded(prediction.std_px), rounded(prediction.off_px)

@@ -22,7 +22,6 @@ from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import PairStatus
 from agalign.values.files import write_text
 from agalign.values.geometry import Points
-from agalign.values.mapping import mapping_of
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.text import harmless
 
@@ -78,10 +77,10 @@ def _points(context: ProductContext) -> Iterator[TiePoint]:
     for band in context.capture.moving:
         alignment = context.usable.get(band.name)
         if alignment is not None and alignment.residual is not None:
-            yield from tie_points(context.capture.reference, band, alignment)
+            yield from tie_points(band, alignment)
 
 
-def tie_points(reference: Band, band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoint]:
+def tie_points(band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoint]:
     """Yield the tie points of a band with a measured residual.
 
     The point p of the reference corresponds to p + shift in the warped band, and so to mapping(p + shift) in the file
@@ -91,7 +90,7 @@ def tie_points(reference: Band, band: Band, alignment: Alignment[FixedFilePx]) -
     assert residual is not None
     measured = np.isfinite(residual.shifts_px[:, 0])
     at_px, shifts_px = residual.centres_px[measured], residual.shifts_px[measured]
-    moving_px = mapping_of(reference, band, alignment)(at_px + shifts_px)
+    moving_px = alignment.map(at_px + shifts_px)
     # The standard error of a shift is proportional to 1 / (height of its correlation peak)^2.
     sigma = residual.peaks_sigma[measured] if len(residual.peaks_sigma) else np.ones(len(at_px))
     weights = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma

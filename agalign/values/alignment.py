@@ -7,13 +7,23 @@ from dataclasses import dataclass, replace
 from typing import Generic, cast
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from numpy.typing import ArrayLike, NDArray
 
+from agalign.errors import InputError
 from agalign.values import geometry
-from agalign.values.choices import ModelFamily, PairStatus, PredictionSource, SeedKind, Space
-from agalign.values.geometry import Matrix
+from agalign.values.choices import (
+    Geometry,
+    Interpolation,
+    ModelFamily,
+    PairStatus,
+    PredictionSource,
+    SeedKind,
+    Space,
+)
+from agalign.values.geometry import Matrix, Points
+from agalign.values.image import Mask
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, explanation, sentence
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import (
     SAME_PIXELS,
     FixedFilePx,
@@ -21,8 +31,9 @@ from agalign.values.pixel_units import (
     FixedPx,
     MovingFilePx,
     PixelScale,
+    Size,
 )
-from agalign.values.relief import Parallax
+from agalign.values.resample import planes_of, resample_planes
 
 MIN_RETRIEVAL = 0.2
 """Minimum held-out retrieval: below it psi is not updated and no result is accepted. Chance is below 0.01; unrelated
@@ -143,61 +154,6 @@ class Residual(Generic[FixedPx]):
 
 
 @dataclass(frozen=True)
-class DisplacementField:
-    """A smooth field of displacements on an image, px, by its values on a lattice."""
-
-    step_px: float
-    """Distance of the lattice's nodes, px of the image that it was made for."""
-    displacements_px: NDArray[np.float64]
-    """(rows, columns, 2), px of that image; the first node is the centre of its top-left pixel."""
-    scale: PixelScale = SAME_PIXELS
-    """Size of that image relative to the one on which the field is evaluated."""
-
-    def __call__(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The displacement (..., 2) at points (..., 2), by cubic splines; outside the lattice that of its edge."""
-        points = np.asarray(points_px)
-        on_lattice = points if self.scale == SAME_PIXELS else self.scale.positions(points)
-        at = on_lattice.reshape(-1, 2)[:, ::-1].T / self.step_px
-        planes = np.moveaxis(self.displacements_px, -1, 0)
-        values = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
-        return self.scale.inverse.displacements(np.stack(values, axis=-1).reshape(points.shape))
-
-    def rescaled(self, scale: PixelScale) -> "DisplacementField":
-        """The same on an image that is resized by `scale`."""
-        return replace(self, scale=self.scale.over(scale))
-
-    def on_lattice(self, step_px: float, size_px: tuple[int, int]) -> "DisplacementField":
-        """The same by its values on another lattice, which covers an image (width, height)."""
-        columns, rows = (math.ceil(n / step_px) + 1 for n in size_px)
-        nodes = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64) * step_px
-        return DisplacementField(float(step_px), self(nodes))
-
-    def plus(self, other: "DisplacementField") -> "DisplacementField":
-        """The sum of two fields on one lattice: x -> d(x) + other(x)."""
-        return DisplacementField(self.step_px, self.displacements_px + other.displacements_px)
-
-
-@dataclass(frozen=True)
-class DisplacementResult(Generic[FixedPx]):
-    """A displacement field, and its effect on the residual of held-out windows; no field if it does not reduce it."""
-
-    field: DisplacementField | None
-    before_p95_px: FixedPx
-    after_p95_px: FixedPx
-    held_out: "Residual[FixedPx] | None" = None
-    """Residual of held-out windows: each field is fitted without the window and those that overlap it."""
-
-    def in_file_px(self: "DisplacementResult[FixedImagePx]", scales: "PairScales") -> "DisplacementResult[FixedFilePx]":
-        """The same on the grid of the reference band's file."""
-        up = scales.fixed.inverse
-        field = None if self.field is None else self.field.rescaled(up)
-        before, after = (FixedFilePx(p95 * up.mean) for p95 in (self.before_p95_px, self.after_p95_px))
-        return DisplacementResult(
-            field, before, after, None if self.held_out is None else self.held_out.in_file_px(scales)
-        )
-
-
-@dataclass(frozen=True)
 class PairScales:
     """The sizes of the two images of a band pair, each relative to its file."""
 
@@ -243,40 +199,105 @@ class Prediction:
 class Alignment(Generic[FixedPx]):
     """Mapping of one band pair, between the images or between the files, and how it was estimated and verified."""
 
-    fixed_to_moving: Matrix
-    """Between undistorted pixels if both lenses are known, else between raw pixels."""
-    space: Space
+    mapping: PixelMapping
+    """The complete mapping from raw pixels of the reference to raw pixels of the moving image."""
+    size_px: Size
+    """(width, height) of the reference, on whose grid `warp` resamples."""
     status: PairStatus
     issues: tuple[Issue, ...]
     """Reasons against accepting the alignment, the most important first; empty if it is `aligned`."""
     seed: Seed
-    joint: JointResult[FixedPx] | None
-    residual: Residual[FixedPx] | None
-    seconds: float
+    joint: JointResult[FixedPx] | None = None
+    residual: Residual[FixedPx] | None = None
+    """Of windows that took no part in the estimation."""
+    seconds: float = 0.0
     before: Mapping[str, float] = dataclasses.field(default_factory=dict)
     after: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    local: DisplacementResult[FixedPx] | None = None
-    """Displacement field of this band alone and its gain; None if none was tried."""
-    field: DisplacementField | None = None
-    """Displacements of rig and capture in raw px of the reference, applied before the homography."""
-    parallax: Parallax | None = None
-    """The capture's relief, which displaces undistorted px of the reference along the band's baseline."""
+    candidates: Mapping[Geometry, FixedPx] = dataclasses.field(default_factory=dict)
+    """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     prediction: Prediction | None = None
     """Prediction by the rig of the flight; None without a rig."""
 
-    def in_file_px(self: "Alignment[FixedImagePx]", scales: "PairScales") -> "Alignment[FixedFilePx]":
-        """The same between the files of the two bands."""
+    def map(self, reference_px: ArrayLike) -> Points:
+        """Map raw pixels (..., 2) of the reference to raw pixels of the moving image, (0, 0) a pixel's centre."""
+        return self.mapping(reference_px)
+
+    def inverse(self, moving_px: ArrayLike) -> Points:
+        """Map raw pixels (..., 2) of the moving image to raw pixels of the reference, to 0.001 px.
+
+        Where the parallax hides a part of the scene, one of several solutions. NaN where the iteration diverges.
+        """
+        return self.mapping.inverse(moving_px)
+
+    def warp(
+        self,
+        moving: ArrayLike,
+        *,
+        valid: ArrayLike | None = None,
+        nodata: float | None = None,
+        interpolation: Interpolation = "lanczos",
+    ) -> tuple[NDArray[np.generic], Mask]:
+        """Resample the moving image, (H, W), (H, W, C) or (C, H, W) of any numeric type, to the grid of the reference.
+
+        `valid` (H, W) is False for pixels that must not be used; NaN and `nodata` are never used. Returns the pixels in
+        the layout and type of `moving`, and their mask (height, width): True where all channels are known, inside the
+        moving image and not occluded. Other pixels are `nodata`, by default NaN or, for integers, 0. Raises InputError
+        for an array that is not an image.
+        """
+        planes, channels_last = planes_of(moving, "moving")
+        mask = np.ones(planes.shape[1:], bool) if valid is None else np.asarray(valid, bool)
+        if mask.shape != planes.shape[1:]:
+            raise InputError(f"valid is {mask.shape}, the image {planes.shape[1:]}")
+        for plane in planes:
+            mask = mask & (np.isfinite(plane) if plane.dtype.kind == "f" else True) & (plane != nodata)
+        fill = nodata if nodata is not None else math.nan if planes.dtype.kind == "f" else 0
+        pixels, known = resample_planes(planes, mask, self.mapping, self.size_px, interpolation, fill)
+        if np.ndim(moving) == 2:
+            return pixels[0], known
+        return (np.moveaxis(pixels, 0, -1) if channels_last else pixels), known
+
+    @property
+    def fixed_to_moving(self) -> Matrix:
+        """The homography of the mapping, between undistorted pixels if both lenses are known, else between raw ones.
+
+        It is the complete mapping only if there are no lenses, displacement field and relief: use `warp` and `map`.
+        """
+        return self.mapping.fixed_to_moving
+
+    @property
+    def of_the_seed(self) -> PixelMapping:
+        """The mapping of the seed, with the lenses and without displacements."""
+        return PixelMapping(self.seed.fixed_to_moving, self.mapping.fixed_lens, self.mapping.moving_lens)
+
+    @property
+    def geometry(self) -> Geometry:
+        """What the mapping has in addition to the homography and the lenses of the tags."""
+        if self.mapping.parallax is not None:
+            return "relief" if self.mapping.local is None else "relief and field"
+        return "homography" if self.mapping.local is None else "field"
+
+    @property
+    def space(self) -> Space:
+        """The pixels between which the homography is."""
+        return "pixel" if self.mapping.fixed_lens is None else "undistorted"
+
+    def in_file_px(self: "Alignment[FixedImagePx]", scales: "PairScales", size_px: Size) -> "Alignment[FixedFilePx]":
+        """The same between the files of the two bands; `size_px` is (width, height) of the reference's file."""
         up = scales.fixed.inverse
         return Alignment(
-            scales.between_files(self.fixed_to_moving), self.space, self.status, self.issues,
-            replace(self.seed, fixed_to_moving=scales.between_files(self.seed.fixed_to_moving)),
-            None if self.joint is None else self.joint.in_file_px(scales),
-            None if self.residual is None else self.residual.in_file_px(scales),
-            self.seconds, self.before, self.after,
-            None if self.local is None else self.local.in_file_px(scales),
-            None if self.field is None else self.field.rescaled(up),
-            None if self.parallax is None else self.parallax.rescaled(up), self.prediction,
-        )  # fmt: skip
+            mapping=self.mapping.rescaled(up, scales.moving.inverse),
+            size_px=size_px,
+            status=self.status,
+            issues=self.issues,
+            seed=replace(self.seed, fixed_to_moving=scales.between_files(self.seed.fixed_to_moving)),
+            joint=None if self.joint is None else self.joint.in_file_px(scales),
+            residual=None if self.residual is None else self.residual.in_file_px(scales),
+            seconds=self.seconds,
+            before=self.before,
+            after=self.after,
+            candidates={kind: FixedFilePx(p95_px * up.mean) for kind, p95_px in self.candidates.items()},
+            prediction=self.prediction,
+        )
 
     @property
     def reason(self) -> str | None:

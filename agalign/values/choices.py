@@ -14,6 +14,8 @@ Sharing = Literal["siamese", "pseudo-siamese", "unshared"]
 ModelFamily = Literal["homography", "affine", "translation"]
 FamilyChoice = Literal["auto", "homography", "affine", "translation"]
 Space = Literal["pixel", "undistorted"]
+Geometry = Literal["homography", "field", "relief", "relief and field"]
+"""What a mapping has in addition to the lens models of the tags: nothing, a displacement field, a relief, or both."""
 PairStatus = Literal["reference", "aligned", "predicted", "seed_only", "failed"]
 PredictionSource = Literal["bands", "neighbours", "flight", "windows"]
 CaptureStatus = Literal["ok", "degraded", "failed"]

@@ -10,18 +10,19 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from agalign.values import geometry, lens
-from agalign.values.alignment import Alignment, DisplacementField
-from agalign.values.capture import Band
+from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, Tile
 from agalign.values.lens import Lens
-from agalign.values.pixel_units import FixedFilePx, PixelScale
+from agalign.values.pixel_units import PixelScale
 from agalign.values.relief import Parallax, between_levels
 
 _KNOT_STEP_PX = 32
 """Distance of the knots of interpolated curved mappings: the error with real lenses is below 0.0001 px."""
 _FIELD_KNOT_STEP_PX = 12
 """Minimum distance of the knots with a displacement field, which has four knots per step of its lattice."""
+_MAX_INVERSE_ITERATIONS, _INVERSE_TOLERANCE_PX = 50, 1e-3
+"""Of the fixed-point iteration of an inverse; it converges where displacements change by less than 1 px per px."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,32 @@ class PixelMapping:
         undistorted = lens.undistort(self.fixed_lens, displaced)
         return undistorted if self.parallax is None else undistorted + self.parallax.displacements(raw)
 
+    def inverse(self, moving_px: ArrayLike) -> Points:
+        """(..., 2) raw moving pixels to raw reference pixels, NaN where the iteration does not converge.
+
+        The displacements of field and relief are subtracted in turn until the positions no longer change.
+        """
+        undistorted = geometry.apply(geometry.invert(self.fixed_to_moving), lens.undistort(self.moving_lens, moving_px))
+        result = raw = lens.distort(self.fixed_lens, undistorted)
+        for _ in range(_MAX_INVERSE_ITERATIONS):
+            of_plane = undistorted if self.parallax is None else undistorted - self.parallax.displacements(raw)
+            displaced = lens.distort(self.fixed_lens, of_plane)
+            result = displaced if self.local is None else displaced - self.local(raw)
+            change_px, raw = np.abs(result - raw).max(axis=-1, keepdims=True), result
+            if not (change_px > _INVERSE_TOLERANCE_PX).any():
+                break
+        else:
+            result = np.where(change_px > _INVERSE_TOLERANCE_PX, np.nan, result)
+        return lens.undistort(self.pre_distortion, result)
+
+    def with_parallax(self, parallax: Parallax | None) -> "PixelMapping":
+        """The mapping with another parallax."""
+        return replace(self, parallax=parallax)
+
     @property
     def of_the_plane(self) -> "PixelMapping":
         """The mapping without parallax."""
-        return self if self.parallax is None else replace(self, parallax=None)
+        return self if self.parallax is None else self.with_parallax(None)
 
     def from_undistorted(self, reference_lens: Lens) -> "PixelMapping":
         """The mapping for undistorted pixels of the reference instead of its raw ones."""
@@ -135,14 +158,6 @@ class PixelMapping:
 
 def _along(start: int, length: int) -> Points:
     return np.arange(start, start + length, dtype=np.float64)
-
-
-def mapping_of(reference: Band, moving: Band, alignment: Alignment[FixedFilePx]) -> PixelMapping:
-    """The complete mapping between the raw pixels of two aligned files."""
-    local, parallax = alignment.field, alignment.parallax
-    if alignment.space == "pixel":
-        return PixelMapping(alignment.fixed_to_moving, local=local, parallax=parallax)
-    return PixelMapping(alignment.fixed_to_moving, reference.lens, moving.lens, local=local, parallax=parallax)
 
 
 def splined(

@@ -16,7 +16,8 @@ from scipy.spatial import cKDTree
 
 from agalign.pixels.resample import warped
 from agalign.pixels.structure import Field
-from agalign.values.alignment import DisplacementField, DisplacementResult, Residual
+from agalign.values.alignment import Residual
+from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
@@ -83,6 +84,17 @@ _MIN_WEIGHT = 0.1
 peak."""
 
 
+@dataclass(frozen=True)
+class DisplacementResult:
+    """A displacement field, and its effect on the residual of held-out windows; no field if it does not reduce it."""
+
+    field: DisplacementField | None
+    before_p95_px: FixedImagePx
+    after_p95_px: FixedImagePx
+    held_out: Residual[FixedImagePx] | None = None
+    """Residual of held-out windows: each field is fitted without the window and those that overlap it."""
+
+
 class DisplacementEstimator:
     """Small, overlapping windows of the reference, for fields of any number of moving bands."""
 
@@ -102,9 +114,7 @@ class DisplacementEstimator:
         """The windows in which a field is verified; they do not overlap."""
         return FixedWindows(self._valid, self._structure, self._verification_px)
 
-    def refine(
-        self, moving: Raster, mapping: PixelMapping, *, verify: bool = False
-    ) -> DisplacementResult[FixedImagePx]:
+    def refine(self, moving: Raster, mapping: PixelMapping, *, verify: bool = False) -> DisplacementResult:
         """Fit the displacement field of a mapping, including the field that the mapping already has.
 
         Returns no field if it does not reduce the residuals of held-out windows significantly. The shifts are measured
@@ -128,7 +138,7 @@ class DisplacementEstimator:
                 break
         if field is None or field is initial:
             return DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
-        result = DisplacementResult[FixedImagePx](field, gain.before_p95_px, gain.after_p95_px)
+        result = DisplacementResult(field, gain.before_p95_px, gain.after_p95_px)
         if not verify:
             return result
         return replace(result, held_out=self._held_out(moving, replace(mapping, local=field), field, gain.smoothness))

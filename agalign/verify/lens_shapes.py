@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementField, Residual
+from agalign.values.alignment import Residual
+from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedPx

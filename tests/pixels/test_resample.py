@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from agalign.pixels.resample import resample, resample_tile, tiles, warped
+from agalign.pixels.resample import resample_tile, warped
+from agalign.values.resample import resample, tiles
 from agalign.products.layout import _largest_rectangle, common_area
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens

@@ -166,7 +166,7 @@ class Facts:
         }  # fmt: skip
 
     def _pair(self, band: BandPart, sidecar: Sidecar) -> dict[str, Any]:
-        local, prediction = band.local, band.prediction
+        prediction = band.prediction
         tiles = [] if band.metrics is None else band.metrics.tiles
         offset_px, distance_px = _band_offset(band.grid, sidecar)
         lattice = tuple(v for t in tiles for v in t.centre_px)
@@ -176,7 +176,7 @@ class Facts:
             "written": band.place is not None, "offset_px": offset_px, "apart_px": distance_px,
             **_residual(band.metrics), **_joint(band.joint),
             "prediction": None if prediction is None else prediction.model_dump(by_alias=True),
-            "local": None if local is None else local.model_dump(),
+            "geometry": None if band.geometry is None else band.geometry.model_dump(),
             "occluded": None if band.relief is None else band.relief.occluded,
             "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
             "shifts": [None if v is None else round(v / _SHIFT_STEP_PX) for t in tiles for v in t.shift_px],

@@ -8,12 +8,12 @@
 
 /**
  * @typedef {{from: string, std_px: number, off_px: number | null}} Prediction
- * @typedef {{applied: boolean, before_p95_px: number | null, after_p95_px: number | null}} Local
+ * @typedef {{kind: string, held_out_p95_px: Record<string, number | null>}} Geometry
  * @typedef {{band: string, wavelength_nm: number | null, status: string, reason: string | null, seed: string | null,
  *   seconds: number, written: boolean, offset_px: [number, number] | null, apart_px: number | null,
  *   residual_px: number | null, residual_p95_px: number | null, coverage: number | null, retrieval: number | null,
  *   corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
- *   prediction: Prediction | null, local: Local | null, occluded: number | null, lattice: number, shifts: (number | null)[]}} Pair
+ *   prediction: Prediction | null, geometry: Geometry | null, occluded: number | null, lattice: number, shifts: (number | null)[]}} Pair
  * @typedef {{name: string, median: number | null, p5: number | null, p95: number | null, valid: number,
  *   span: [number, number], unit: string, raw: boolean, file: string, picture: string}} Index
  * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
@@ -992,17 +992,18 @@ function sentence(pair, reference) {
 
 /** @param {Capture} capture */
 function numbers(capture) {
-  const heads = ["Band", "Status", "Seed", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Mattes MI", "NMI", "NCC", "Gradients", "SSIM", "Local field, 95 %", "Relief, occluded", "Seconds"];
+  const heads = ["Band", "Status", "Seed", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Mattes MI", "NMI", "NCC", "Gradients", "SSIM", "Geometry, 95 %", "Relief, occluded", "Seconds"];
   const body = moving(capture).map((pair) => {
     /** @param {string} name @param {number} [digits] */
     const change = (name, digits = 3) => {
       const [before, after] = pair.similarity?.[name] ?? [null, null];
       return before === null && after === null ? "–" : `${fixed(before, digits)} → ${fixed(after, digits)}`;
     };
-    const local = pair.local === null ? "–" : pair.local.applied ? `${fixed(pair.local.before_p95_px)} → ${fixed(pair.local.after_p95_px)}` : "not needed";
+    const held_out = pair.geometry === null ? {} : pair.geometry.held_out_p95_px;
+    const geometry = pair.geometry === null ? "–" : `${pair.geometry.kind}${Object.keys(held_out).length > 1 ? ` (${Object.entries(held_out).map(([kind, px]) => `${kind} ${fixed(px)}`).join(", ")})` : ""}`;
     const cells = [
       pair.seed ?? "–", fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3), pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`,
-      fixed(pair.corner_std_px, 3), fixed(pair.retrieval), change("mattes_mi"), change("nmi"), change("ncc", 2), change("gradient_correlation", 2), change("structure_ssim", 2), local, pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
+      fixed(pair.corner_std_px, 3), fixed(pair.retrieval), change("mattes_mi"), change("nmi"), change("ncc", 2), change("gradient_correlation", 2), change("structure_ssim", 2), geometry, pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
     ];
     return el("tr", {}, el("th", { scope: "row" }, pair.band), el("td", {}, badge(pair.status)), ...cells.map((text, i) => el("td", { class: i === 0 ? "" : "n" }, text)));
   });

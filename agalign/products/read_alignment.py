@@ -1,0 +1,85 @@
+"""The complete mapping of a band, rebuilt from the sidecar of its capture."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.errors import NoSuchBandError, SidecarError
+from agalign.pixels.raster import read_preview
+from agalign.products.sidecar import BandPart, LensPart, ReliefPart, Sidecar
+from agalign.products.sidecar_file import read_sidecar
+from agalign.relief.occlusion import occluded
+from agalign.values import lens
+from agalign.values.alignment import Alignment, Residual, Seed
+from agalign.values.displacement import DisplacementField
+from agalign.values.image import OutputGrid
+from agalign.values.issues import Issue
+from agalign.values.lens import Lens
+from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import FixedFilePx, PixelScale
+from agalign.values.relief import Parallax, Relief
+from agalign.verify.checks import KINDS
+
+
+def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
+    """Return the alignment of a moving band as a sidecar and its relief raster store it.
+
+    Its `map`, `inverse` and `warp` are those of the run, between the raw pixels of the files; the relief is known in
+    the area that was written. `joint` and `prediction` are None.
+    Raises SidecarError for a file that is not a sidecar or lacks the mapping, NoSuchBandError for a band that is not a
+    moving band of the capture, UnreadableFileError for a relief raster that cannot be read.
+    """
+    path = Path(sidecar)
+    content = read_sidecar(path)
+    part = next((b for b in content.bands if b.band == band and b.status != "reference"), None)
+    if part is None:
+        names = ", ".join(b.band for b in content.bands if b.status != "reference")
+        raise NoSuchBandError(f"{path}: no moving band {band!r}; choose from {names}")
+    if part.homography is None or part.seed is None:
+        raise SidecarError(f"{path}: has no mapping of the band {band!r}")
+    fixed, moving = (None, None) if part.lenses is None else map(_lens, part.lenses)
+    field = None if part.field is None else DisplacementField(part.field.step_px, np.array(part.field.displacements_px))
+    mapping = PixelMapping(np.array(part.homography.fixed_to_moving), fixed, moving, local=field)
+    if part.relief is not None:
+        mapping = mapping.with_parallax(_parallax(path, content, part.relief, fixed))
+    seed = Seed(part.seed.kind, np.array(part.seed.fixed_to_moving), part.seed.peak_sigma)
+    size_px = content.reference.width, content.reference.height
+    issues = tuple(Issue(KINDS[i.kind], i.value, i.limit) for i in part.issues)
+    return Alignment(mapping, size_px, part.status, issues, seed, residual=_residual(part), seconds=part.seconds)
+
+
+def _lens(part: LensPart) -> Lens:
+    return Lens(part.fx_px, part.fy_px, part.cx_px, part.cy_px, tuple(part.distortion))
+
+
+def _residual(part: BandPart) -> Residual[FixedFilePx] | None:
+    if part.metrics is None:
+        return None
+    centres = np.array([t.centre_px for t in part.metrics.tiles], float).reshape(-1, 2)
+    shifts = np.array([t.shift_px for t in part.metrics.tiles], float).reshape(-1, 2)
+    return Residual[FixedFilePx].of(centres, shifts, np.empty(0))
+
+
+def _parallax(path: Path, content: Sidecar, part: ReliefPart, fixed: Lens | None) -> Parallax:
+    """Return the parallax of a band, from the raster that was written on the output grid."""
+    if part.file is None or content.output is None:
+        raise SidecarError(f"{path}: its relief was not written")
+    output, (_, _, width, height) = content.output, content.output.crop
+    values = read_preview(path.parent / part.file, 1, (0, 0, width, height), (width, height))
+    grid = OutputGrid(*output.crop, PixelScale(*output.scale), output.undistorted)
+    parallax_px = _on_reference(values, grid, (content.reference.width, content.reference.height), fixed)
+    relief = Relief(parallax_px, np.ones_like(parallax_px))
+    return Parallax(relief, part.baseline, occluded(relief, part.baseline))
+
+
+def _on_reference(
+    values: NDArray[np.float32], grid: OutputGrid, size_px: tuple[int, int], fixed: Lens | None
+) -> NDArray[np.float32]:
+    """Return values (height, width) on a grid at the raw pixels of the reference; those at the edge are continued."""
+    points = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float64) for n in size_px)), axis=-1)
+    if grid.undistorted:
+        points = lens.undistort(fixed, points)
+    at = (grid.scale.positions(points) - (grid.x0, grid.y0)).astype(np.float32)
+    return np.asarray(cv2.remap(values, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))

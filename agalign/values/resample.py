@@ -1,0 +1,161 @@
+"""Interpolation of arrays at fractional positions, tile by tile."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agalign.errors import InputError
+from agalign.values.choices import Interpolation
+from agalign.values.geometry import Points
+from agalign.values.image import Mask, Tile
+from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import Size
+
+_FLAGS: dict[str, int] = {
+    "nearest": cv2.INTER_NEAREST,
+    "bilinear": cv2.INTER_LINEAR,
+    "cubic": cv2.INTER_CUBIC,
+    "lanczos": cv2.INTER_LANCZOS4,
+}
+_SUPPORT_PX = 4
+"""Half width of the widest interpolation kernel."""
+_SAMPLE_PX = 16
+"""Spacing of the positions from which the extent of a tile in the moving image is computed."""
+_MIN_VALID_WEIGHT = 0.999
+"""Minimum weight of valid pixels in a valid resampled pixel: float32 weights do not sum to exactly 1."""
+_TILE_PX = 1024
+"""Side of the tiles in which arrays are resampled: OpenCV limits the sides of one image to 32,767 px."""
+_MAX_CHANNELS = 16
+"""Distinguishes (H, W, C) from (C, H, W): images have more rows than this."""
+
+
+def tiles(area: Tile, side_px: int) -> Iterator[Tile]:
+    """Yield the tiles of an area row by row; those at the right and bottom may be smaller than `side_px`."""
+    for y in range(area.y0, area.y0 + area.height, side_px):
+        for x in range(area.x0, area.x0 + area.width, side_px):
+            width = min(side_px, area.x0 + area.width - x)
+            height = min(side_px, area.y0 + area.height - y)
+            yield Tile(x, y, width, height)
+
+
+def planes_of(image: ArrayLike, name: str) -> tuple[NDArray[np.generic], bool]:
+    """Return an image (H, W), (H, W, C) or (C, H, W) as (C, H, W), and True if its channels were last.
+
+    Raises InputError, with `name`, for any other array.
+    """
+    array = np.asarray(image)
+    if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
+        raise InputError(
+            f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"
+        )
+    channels_last = array.ndim == 3 and array.shape[-1] <= _MAX_CHANNELS < array.shape[0]
+    planes = np.moveaxis(array, -1, 0) if channels_last else array if array.ndim == 3 else array[None]
+    if len(planes) > _MAX_CHANNELS:
+        raise InputError(f"{name} is {array.shape}: images have at most {_MAX_CHANNELS} channels")
+    return planes, channels_last
+
+
+def resample_planes(
+    planes: NDArray[np.generic], valid: Mask, mapping: PixelMapping, size_px: Size, interpolation: Interpolation,
+    fill: float,
+) -> tuple[NDArray[np.generic], Mask]:  # fmt: skip
+    """Resample planes (C, h, w) with the mask `valid` (h, w) to a reference of `size_px` (width, height).
+
+    Returns (C, height, width) of the same type, with `fill` where a pixel is not valid, and the mask (height, width).
+    """
+    width, height = size_px
+    result = np.empty((len(planes), height, width), planes.dtype)
+    result_valid = np.empty((height, width), bool)
+    moving_size_px = valid.shape[1], valid.shape[0]
+    for tile in tiles(Tile(0, 0, width, height), _TILE_PX):
+        at = np.s_[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
+        positions = mapping.positions(tile)
+        source = source_window(positions, moving_size_px, has_relief=mapping.parallax is not None)
+        if source is None:
+            result[:, *at], result_valid[at] = fill, False
+            continue
+        cut = np.s_[source.y0 : source.y0 + source.height, source.x0 : source.x0 + source.width]
+        local = (positions - (source.x0, source.y0)).astype(np.float32)
+        sensor = (-source.x0, -source.y0), (moving_size_px[0] - source.x0, moving_size_px[1] - source.y0)
+        visible = ~mapping.hidden(tile)
+        for plane, resampled in zip(planes, result, strict=True):
+            pixels, inside = resample(plane[cut], valid[cut], local, sensor[1], sensor[0], interpolation)
+            result_valid[at] = inside & visible
+            resampled[at] = np.where(result_valid[at], pixels, np.asarray(fill).astype(planes.dtype))
+    return result, result_valid
+
+
+def source_window(positions: NDArray[np.floating], size_px: Size, *, has_relief: bool) -> Tile | None:
+    """Return the window of an image (width, height) that interpolation at positions (H, W, 2) reads; None for none.
+
+    Without a relief the mapping is smooth: coarse samples and the borders determine the extent within one pixel.
+    """
+    step = 1 if has_relief else _SAMPLE_PX
+    rows, columns = (np.append(np.arange(0, n, step), n - 1) for n in positions.shape[:2])
+    samples = positions[np.ix_(rows, columns)]
+    if not np.isfinite(samples).any():
+        return None
+    # Points near the horizon of a homography are far outside of every image.
+    low, high = (np.clip(f(samples, axis=(0, 1)), -(2**30), 2**30) for f in (np.nanmin, np.nanmax))
+    x0, y0 = np.maximum(np.floor(low).astype(int) - _SUPPORT_PX - 1, 0).tolist()
+    x1, y1 = np.minimum(np.ceil(high).astype(int) + _SUPPORT_PX + 2, size_px).tolist()
+    return Tile(x0, y0, x1 - x0, y1 - y0) if x1 - x0 >= 1 and y1 - y0 >= 1 else None
+
+
+def resample(
+    pixels: NDArray[np.generic],
+    valid: Mask,
+    positions: NDArray[np.floating],
+    sensor_end: tuple[int, int],
+    sensor_start: tuple[int, int],
+    interpolation: Interpolation,
+) -> tuple[NDArray[np.generic], Mask]:
+    """Resample pixels (h, w) of a window of an image at positions (H, W, 2) in px of the window.
+
+    `sensor_start` (x, y) is the position of the image's first pixel in the window, `sensor_end` one past its last
+    pixel. Returns (H, W) pixels of the same type, with integers rounded and clipped, and their mask.
+    """
+    map_xy = positions.astype(np.float32, copy=False)
+    all_valid = bool(valid.all())
+    source = _for_remap(pixels if all_valid else _filled(pixels, valid), interpolation)
+    sampled = cv2.remap(source, map_xy, None, _FLAGS[interpolation], borderMode=cv2.BORDER_REPLICATE)
+    half = 0.5 if interpolation == "nearest" else 0.0
+    inside = between(map_xy, np.subtract(sensor_start, half), np.subtract(sensor_end, 1 - half))
+    if not all_valid:
+        flag = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
+        weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)
+        inside &= weight > _MIN_VALID_WEIGHT
+    return _as_type(sampled, pixels.dtype), np.asarray(inside)
+
+
+def between(positions: NDArray[np.floating], minimum: Points, maximum: Points) -> Mask:
+    """Return (H, W) True where positions (H, W, 2) are inside or on the border of a rectangle."""
+    return np.asarray(cv2.inRange(positions, tuple(map(float, minimum)), tuple(map(float, maximum))) != 0)
+
+
+def _for_remap(pixels: NDArray[np.generic], interpolation: Interpolation) -> NDArray[np.generic]:
+    """Convert to a type that cv2.remap supports and in which it neither rounds nor clips."""
+    if interpolation == "nearest" and pixels.dtype in (np.uint8, np.uint16, np.int16, np.float32, np.float64):
+        return pixels
+    wide = pixels.dtype in (np.float64, np.int32, np.uint32, np.int64, np.uint64)
+    return pixels.astype(np.float64 if wide else np.float32)
+
+
+def _filled(pixels: NDArray[np.generic], valid: Mask) -> NDArray[np.generic]:
+    """Replace invalid pixels by the mean of their surroundings, which prevents ringing of wide kernels at nodata."""
+    known = valid.astype(np.float32)
+    values = np.where(valid, pixels, 0).astype(np.float32)
+    kernel = 2 * _SUPPORT_PX + 1, 2 * _SUPPORT_PX + 1
+    mean = cv2.blur(values, kernel) / np.maximum(cv2.blur(known, kernel), 1e-6)
+    return np.where(valid, pixels, mean.astype(pixels.dtype))
+
+
+def _as_type(values: NDArray[np.generic], dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+    if values.dtype == dtype or dtype.kind == "f":
+        return values.astype(dtype, copy=False)
+    if dtype.kind == "b":
+        return np.asarray(values >= np.float32(0.5))
+    limits = np.iinfo(str(dtype))
+    return np.asarray(np.clip(np.rint(values), limits.min, limits.max).astype(dtype))
