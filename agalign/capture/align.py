@@ -13,7 +13,7 @@ from agalign.capture.map_estimate import map_estimate
 from agalign.capture.prediction import bands_to_learn, with_predictions
 from agalign.capture.relief import ReliefCandidate, aligned_by_relief
 from agalign.capture.seeding import find_seed, first_candidate, image_groups
-from agalign.capture.verification import WarpedPair, verified, with_metrics, without_result
+from agalign.capture.verification import WarpedPair, predicted_by_windows, verified, with_metrics, without_result
 from agalign.capture.window_estimate import by_windows
 from agalign.config import Settings
 from agalign.flight.fingerprint import refinement_key
@@ -197,7 +197,7 @@ class PairAligner:
         """Use the seeds as results, as the user requested."""
         for pair, seed in starts:
             with self.timer.measure([pair.name]):
-                self.result[pair.name] = verified(pair, seed, Issue(SEED_ASKED_FOR), self.settings)
+                self.result[pair.name] = verified(pair, seed, Issue(SEED_ASKED_FOR), "never", seed_only=True)
 
     def refine(self, starts: Sequence[Start]) -> None:
         """Align the pairs of the bands that the flight's network contains with this network."""
@@ -266,13 +266,17 @@ def verify_together(
         ]
         estimates = _map_estimates(starts, results, warped_pairs, model, settings)
         progress(starts[0][0].name if starts else "", "relief", 0.0)
-        alignments = aligned_by_relief(_relief_candidates(starts, estimates, warped_pairs), settings.relief.use)
+        relief = aligned_by_relief(_relief_candidates(starts, estimates, warped_pairs), settings.relief.use)
+    alignments = relief.alignments
     for (pair, seed), result, warped_pair in zip(starts, estimates, warped_pairs, strict=True):
         if pair.name in alignments:
             continue
         progress(pair.name, "checking", 0.0)
         with timer.measure([pair.name]):
-            alignments[pair.name] = verified(pair, seed, result, settings, warped_pair)
+            use = "never" if pair.name in relief.along_a_line else settings.relief.use
+            alignment = verified(pair, seed, result, use, warped_pair, seed_only=settings.seed.only)
+            is_mixed = pair.name in relief.others and alignment.status == "aligned"
+            alignments[pair.name] = predicted_by_windows(alignment, pair) if is_mixed else alignment
     return alignments
 
 

@@ -9,14 +9,14 @@ from agalign.pixels.resample import shrink, textured
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.displacement_field import COARSE, FINE, LENS, DisplacementEstimator
+from agalign.verify.displacement_field import DisplacementEstimator
 from agalign.verify.metrics import FixedSimilarity
 from agalign.verify.residuals import FixedWindows
 
 _SEED_LONGEST_PX = 384
 """Longer side of the images on which seeds are scored; large shifts are found quickly at this resolution."""
 
-_FIT_PX = LENS.window_px
+_FIT_PX = 48
 """Side of the windows to which planes and baselines are fitted; small, so that most contain a single surface."""
 _HELD_OUT_PX = 64
 """Side of the windows that verify a relief; larger, because their shifts have less noise."""
@@ -94,24 +94,14 @@ class Reference:
         return FixedWindows(self.grey.valid, self.structure, _SMALL_WINDOW_PX)
 
     @cached_property
-    def coarse_field(self) -> DisplacementEstimator:
-        """Estimator of coarse displacement fields."""
-        return DisplacementEstimator(self.grey.valid, self.structure, COARSE)
-
-    @cached_property
-    def fine_field(self) -> DisplacementEstimator:
-        """Estimator of fine displacement fields."""
-        return DisplacementEstimator(self.grey.valid, self.structure, FINE)
+    def displacement_field(self) -> DisplacementEstimator:
+        """Estimator of displacement fields."""
+        return DisplacementEstimator(self.grey.valid, self.structure)
 
     @cached_property
     def fit_windows(self) -> FixedWindows:
         """Windows in the black fields of a chessboard, for the fit of planes and baselines."""
         return FixedWindows.on_chessboard(self.grey.valid, self.structure, _FIT_PX, white=False)
-
-    @cached_property
-    def lens_field(self) -> DisplacementEstimator:
-        """Estimator of residual lens distortion in the same windows."""
-        return DisplacementEstimator(self.grey.valid, self.structure, LENS, self.fit_windows)
 
     @cached_property
     def held_out_windows(self) -> FixedWindows:

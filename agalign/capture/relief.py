@@ -1,14 +1,13 @@
-"""One relief for all bands of a capture: test for parallax, estimation, verification of every band.
+"""Relief of a capture: a candidate for the geometry of all its bands, compared with displacement fields.
 
-The verification of a band uses no pixels of the band to which its mapping was fitted. The homography and the baseline
-are fitted to windows in the black fields of a chessboard. The band is verified in larger windows in the white fields,
-with the relief that was estimated from the OTHER bands. The output uses the relief of all bands, which is more
-accurate.
+The relief of half of the lenses verifies the other half, in windows that took no part in the fit of planes and
+baselines. A band that the relief of the others does not explain, as it was exposed at another time, gets a homography
+and a baseline of its own under that relief. Either all bands of the capture use the relief, or none.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +17,21 @@ from agalign.capture.corner_fit import corner_correction, with_corners
 from agalign.capture.verification import WarpedPair
 from agalign.errors import GeometryError
 from agalign.pixels.grey import channel_mean
+from agalign.relief.adjustment import (
+    Adjustment,
+    WindowShifts,
+    adjust,
+    are_of_lenses,
+    are_on_a_line,
+    parallax_of,
+    shifts_by_corners,
+)
 from agalign.relief.dense import DenseMatching, View
 from agalign.relief.occlusion import nearer_sign, occluded
-from agalign.relief.plane_parallax import (
-    PlaneParallax,
-    WindowShifts,
-    are_of_lenses,
-    fit_plane_parallax,
-    parallax_of,
-)
 from agalign.values import geometry
 from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
-from agalign.values.choices import ReliefUse
+from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.displacement import DisplacementField
-from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.values.relief import Parallax, Relief
@@ -49,12 +49,19 @@ chance."""
 _FAR_PX, _MAX_FAR_SHARE = 1.0, 0.05
 """A relief is also tried if more than this share of the windows has shifts above _FAR_PX: windows across depth edges
 may contain the parallax of neither side, so that the squared shifts do not decrease."""
-_MAX_ROUNDS = 2
-"""The relief is estimated again after the fit of lens fields, because the first one contains a part of these."""
-_MAX_EXCLUDED_BANDS = 2
-"""Each excluded band costs the time of one estimate."""
+_MAX_LINE_PX = 1.0
+"""Common displacements along one line with a larger p95 are those of shadows or leaves, not of lenses: a displacement
+field would follow them too."""
+_MAX_SCALE_RATIO, _MIN_FOREIGN_PX = 3.0, 0.4
+"""Minimum ratio of the residual of a band that the parallax of the others does not explain to theirs, and its minimum.
+"""
 _RANGE_PERCENTILES = (1.0, 99.0)
 """Percentiles of the windows' parallax that limit its range; values beyond are wrong peaks."""
+_ROUNDS = 3
+"""Rounds of the fit of a band under the relief of the others, as large shifts are measured in steps."""
+_CLEAR_GAIN = 2.0
+"""Ratio of the p95 of held-out windows by homography and by relief above which no displacement field is compared: a
+field cannot follow depth edges."""
 
 
 @dataclass(frozen=True)
@@ -66,40 +73,45 @@ class ReliefCandidate:
     joint: JointResult[FixedImagePx]
     warped: WarpedPair
 
+    def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
+        """Measure the windows of the fit with a mapping."""
+        return self.pair.reference.fit_windows.residuals(self.pair.warped_moving(mapping))
 
-def aligned_by_relief(candidates: Sequence[ReliefCandidate], use: ReliefUse) -> dict[str, Alignment[FixedImagePx]]:
-    """Align bands by one relief of the capture; return those that pass verification, by name.
+    def held_out_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
+        """Measure the windows that take no part in the fit."""
+        return self.pair.reference.held_out_windows.residuals(self.pair.warped_moving(mapping))
 
-    With `use` "auto" a relief is only estimated if `shows_relief`.
+
+@dataclass
+class ReliefResult:
+    """The bands of a capture after the estimation of its relief."""
+
+    alignments: dict[str, Alignment[FixedImagePx]] = field(default_factory=dict)
+    """Bands aligned by the relief, by name."""
+    others: set[str] = field(default_factory=set)
+    """Bands of a capture with a relief that does not align them: their homographies are another geometry."""
+    along_a_line: set[str] = field(default_factory=set)
+    """Bands with common displacements that neither a relief nor displacement fields must follow."""
+
+
+def aligned_by_relief(candidates: Sequence[ReliefCandidate], use: ReliefUse) -> ReliefResult:
+    """Align bands by one relief of the capture.
+
+    With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax.
     """
+    result = ReliefResult()
     if use == "never":
-        return {}
-    result: dict[str, Alignment[FixedImagePx]] = {}
+        return result
     for group in _comparable(candidates):
-        if len(group) >= _MIN_BANDS and (use == "always" or shows_relief(group)):
-            result |= _aligned_group(group)
-    return result
-
-
-def _aligned_group(group: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImagePx]]:
-    """Align the bands of one group by their relief.
-
-    If a band does not pass verification, the relief is estimated again without the worst band, which may bias it.
-    """
-    result: dict[str, Alignment[FixedImagePx]] = {}
-    for _ in range(_MAX_EXCLUDED_BANDS + 1):
-        estimate = _Estimate.of(group)
-        if estimate is None:
-            break
-        checked = [estimate.checked(band) for band in estimate.bands]
-        passed = {c.name: c.alignment for c in checked if c.alignment is not None}
-        if len(passed) < len(result):
-            break
-        result = passed
-        worst = max(checked, key=lambda c: (c.alignment is None, c.p95_px))
-        group = [c for c in group if c.pair.name != worst.name]
-        if worst.alignment is not None or len(group) < _MIN_BANDS:
-            break
+        if len(group) < _MIN_BANDS:
+            continue
+        parallax_px, on_a_line = _common_parallax_px(group)
+        if on_a_line and parallax_px > _MAX_LINE_PX:
+            result.along_a_line |= {c.pair.name for c in group}
+        elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
+            aligned = _aligned_group(group)
+            result.alignments |= aligned
+            result.others |= {c.pair.name for c in group} - aligned.keys() if aligned else set()
     return result
 
 
@@ -117,29 +129,39 @@ def _comparable(candidates: Sequence[ReliefCandidate]) -> list[list[ReliefCandid
     return list(groups.values())
 
 
-def shows_relief(group: Sequence[ReliefCandidate]) -> bool:
-    """Return True if the residuals of the homographies contain parallax that is common to the bands.
+def _common_parallax_px(group: Sequence[ReliefCandidate]) -> tuple[float, bool]:
+    """Return the p95 of the parallax that is common to the bands, 0 if it is not significant, and if the baselines are
+    on one line without tags that confirm them.
 
-    The p95 of the parallax is at least _MIN_PARALLAX_PX, and either many shifts of a band are large, or the parallax
-    from the other bands reduces the shifts of the median band significantly.
+    It is significant if either many shifts of a band are large, or the parallax from the other bands reduces the shifts
+    of the median band significantly.
     """
-    windows = WindowShifts.of(_common_residuals(group), [c.warped.mapping for c in group])
-    model = _model(group, windows)
-    if model is None or np.percentile(np.abs(model.parallax_px), 95) < _MIN_PARALLAX_PX:
-        return False
-    if max(_far_share(c.warped.residual) for c in group) > _MAX_FAR_SHARE:
-        return True
-    size_px = group[0].pair.fixed.size_px
-    shifts_px = windows.shifts_px - np.stack(
-        [model.shifts_px(windows.points_px, size_px, band) for band in range(len(group))], axis=1
-    )
-    gains = []
-    for band in range(len(group)):
-        others = np.delete(np.arange(len(group)), band)
+    residuals, size_px = _common_residuals(group), group[0].pair.fixed.size_px
+    windows = WindowShifts.of(residuals, [c.warped.mapping for c in group])
+    consistent = _consistent(windows, _layouts(group), size_px, with_fields=False)
+    if consistent is None:
+        return 0.0, False
+    bands, model = consistent
+    far_share = max(_far_share(residuals[band]) for band in bands)
+    if far_share <= _MAX_FAR_SHARE and _gain_by_others_sigma(windows.of_bands(bands), model, size_px) < _MIN_GAIN_SIGMA:
+        return 0.0, False
+    parallax_px = float(np.percentile(np.abs(model.parallax_px), 95))
+    return parallax_px, _layout(_layouts(group), bands) is None and are_on_a_line(model.baselines)
+
+
+def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tuple[int, int]) -> float:
+    """Return the decrease of the squared shifts of the median band by the parallax from the others, in sigma."""
+    shifts_px = windows.shifts_px - shifts_by_corners(model, windows.points_px, size_px)
+    bands, gains = np.arange(shifts_px.shape[1]), []
+    for band in bands:
+        others = np.delete(bands, band)
         parallax = parallax_of(shifts_px[:, others], model.baselines[others], windows.weights[:, others])
-        remaining_px = shifts_px[:, band] - parallax[:, None] * model.baselines[band]
-        gains.append(_gain_sigma(shifts_px[:, band], remaining_px))
-    return float(np.median(gains)) >= _MIN_GAIN_SIGMA
+        after_px = shifts_px[:, band] - parallax[:, None] * model.baselines[band]
+        before, after = (np.linalg.norm(s, axis=1) for s in (shifts_px[:, band], after_px))
+        measured = np.isfinite(before) & np.isfinite(after)
+        enough = measured.sum() >= _MIN_WINDOWS
+        gains.append(decrease_sigma(before[measured], after[measured]) if enough else 0.0)
+    return float(np.median(gains))
 
 
 def _common_residuals(group: Sequence[ReliefCandidate]) -> list[Residual[FixedImagePx]]:
@@ -157,184 +179,240 @@ def _far_share(residual: Residual[FixedImagePx]) -> float:
     return float((lengths[measured] > _FAR_PX).mean()) if measured.any() else 0.0
 
 
-def _gain_sigma(before_px: NDArray[np.float64], after_px: NDArray[np.float64]) -> float:
-    """Return `decrease_sigma` of the measured shifts (n, 2); 0 for too few windows."""
-    before, after = (np.linalg.norm(s, axis=1) for s in (before_px, after_px))
-    measured = np.isfinite(before) & np.isfinite(after)
-    return decrease_sigma(before[measured], after[measured]) if measured.sum() >= _MIN_WINDOWS else 0.0
+_Layouts = Sequence[tuple[float, float] | None]
 
 
-def _model(group: Sequence[ReliefCandidate], windows: WindowShifts) -> PlaneParallax | None:
-    """Fit plane + parallax to the windows; None if a band has too few of them or the baselines are not of lenses."""
-    if len(windows) == 0 or (windows.weights > 0).sum(axis=0).min() < _MIN_WINDOWS:
-        return None
-    layout = _layout(group)
-    model = fit_plane_parallax(windows, group[0].pair.fixed.size_px, layout)
-    return model if model is not None and are_of_lenses(model.baselines, layout) else None
+def _layouts(group: Sequence[ReliefCandidate]) -> _Layouts:
+    return [c.pair.layout for c in group]
 
 
-def _layout(group: Sequence[ReliefCandidate]) -> NDArray[np.float64] | None:
-    """Return the layouts (bands, 2) of the pairs; None if the tags lack one."""
-    layouts = [c.pair.layout for c in group]
-    return None if any(layout is None for layout in layouts) else np.array(layouts, float)
+def _layout(layouts: _Layouts, bands: Sequence[int]) -> NDArray[np.float64] | None:
+    """Return the layouts (bands, 2) of some bands; None if the tags lack one."""
+    some = [layouts[band] for band in bands]
+    return None if any(layout is None for layout in some) else np.array(some, float)
+
+
+def _consistent(
+    windows: WindowShifts, layouts: _Layouts, size_px: tuple[int, int], *, with_fields: bool
+) -> tuple[list[int], Adjustment] | None:
+    """Adjust the model to the bands with common parallax; return their indices and the model, or None.
+
+    A band that the parallax of the others does not explain is left out, one after another.
+    """
+
+    def adjusted(bands: Sequence[int], *, fields: bool) -> Adjustment | None:
+        layout, some = _layout(layouts, bands), windows.of_bands(bands)
+        model = adjust(some, size_px, layout, with_fields=fields) if some.are_enough(_MIN_WINDOWS) else None
+        return model if model is not None and are_of_lenses(model.baselines, layout) else None
+
+    def agreement_px(foreign: int) -> float:
+        model = adjusted([b for b in kept if b != foreign], fields=False)
+        return math.inf if model is None else float(np.median(model.scales_px))
+
+    kept = list(range(windows.shifts_px.shape[1]))
+    while len(kept) >= _MIN_BANDS:
+        model = adjusted(kept, fields=with_fields)
+        if model is not None:
+            scales_px = model.scales_px
+            worst = int(scales_px.argmax())
+            limit_px = max(_MIN_FOREIGN_PX, _MAX_SCALE_RATIO * float(np.median(np.delete(scales_px, worst))))
+            if len(kept) == _MIN_BANDS or scales_px[worst] <= limit_px:
+                return kept, model
+            kept.pop(worst)
+        else:
+            kept.remove(min(kept, key=agreement_px))
+    return None
 
 
 @dataclass(frozen=True)
 class _Band:
-    """One band with its current homography and baseline."""
+    """One band with the mapping of its reference plane and its baseline."""
 
     candidate: ReliefCandidate
-    fixed_to_moving: Matrix
+    plane: PixelMapping
     baseline: tuple[float, float]
-    field: DisplacementField | None = None
-    """Residual lens distortion; None for the rig's field."""
 
     @property
-    def plane(self) -> PixelMapping:
-        """The mapping without parallax."""
-        return self.candidate.pair.mapping(self.fixed_to_moving, self.field)
+    def name(self) -> str:
+        """Name of the pair."""
+        return self.candidate.pair.name
 
     def view(self) -> View:
         """Return the band as input of dense matching."""
         return View(channel_mean(self.candidate.pair.moving_image), self.plane, self.baseline)
 
-    def parallax(self, relief: Relief) -> Parallax:
-        """Return the parallax of the band with its occluded pixels."""
-        return Parallax(relief, self.baseline, occluded(relief, self.baseline))
-
     def mapping(self, relief: Relief, *, with_occlusions: bool = False) -> PixelMapping:
         """Return the mapping with a relief; verification excludes occluded pixels, robust fits do not need to."""
-        parallax = self.parallax(relief) if with_occlusions else Parallax(relief, self.baseline)
-        return replace(self.plane, parallax=parallax)
+        hidden = occluded(relief, self.baseline) if with_occlusions else None
+        return self.plane.with_parallax(Parallax(relief, self.baseline, hidden))
 
-    def corrected(self, corners_px: NDArray[np.float64], baseline_change: NDArray[np.float64]) -> "_Band":
-        """Apply corrections of the corners (8,) and of the baseline (2,). Raises GeometryError."""
-        size_px = self.candidate.pair.fixed.size_px
-        matrix = geometry.compose(self.fixed_to_moving, geometry.moving_corners(corners_px, *size_px))
-        x, y = np.add(self.baseline, baseline_change).tolist()
-        return replace(self, fixed_to_moving=matrix, baseline=(x, y))
+    def corrected(
+        self,
+        corners_px: NDArray[np.float64],
+        baseline: NDArray[np.float64],
+        lens_field: DisplacementField | None = None,
+    ) -> "_Band":
+        """Apply corrections of the corners (8,) and of the lens field; replace the baseline. Raises GeometryError."""
+        plane, size_px = self.plane, self.candidate.pair.fixed.size_px
+        matrix = geometry.compose(plane.fixed_to_moving, geometry.moving_corners(corners_px, *size_px))
+        local = plane.local
+        if lens_field is not None:
+            local = lens_field if local is None else lens_field.plus(local.on_lattice(lens_field.step_px, size_px))
+        x, y = baseline.tolist()
+        return replace(self, plane=replace(plane, fixed_to_moving=matrix, local=local), baseline=(x, y))
+
+    @property
+    def negated(self) -> "_Band":
+        """The band for a relief of the opposite sign."""
+        return replace(self, baseline=(-self.baseline[0], -self.baseline[1]))
+
+
+def _aligned_group(group: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImagePx]]:
+    """Align the bands of one group by their relief; empty if another geometry explains the capture better."""
+    try:
+        estimate = _Estimate.of(group)
+        if estimate is None:
+            return {}
+        checked = [estimate.checked(band) for band in estimate.bands]
+        if not _is_chosen(checked):
+            return {}
+        names = {band.name for band in estimate.bands}
+        for candidate in (c for c in group if c.pair.name not in names):
+            band = estimate.fitted(candidate)
+            checked += [] if band is None else [estimate.checked(band)]
+    except GeometryError:
+        return {}
+    return {c.name: c.alignment for c in checked if c.alignment is not None}
 
 
 @dataclass(frozen=True)
 class _Estimate:
-    """The relief of a capture, from all bands and from all but one."""
+    """The relief of a capture, from all bands and from two halves of them."""
 
     bands: Sequence[_Band]
     relief: Relief
-    without: Mapping[str, Relief]
-    """By band, the relief from the other bands."""
+    halves: Sequence[Relief]
+    """From the bands with odd and with even index: each verifies the other bands."""
 
     @classmethod
     def of(cls, group: Sequence[ReliefCandidate]) -> "_Estimate | None":
-        """Estimate the relief; None if the windows do not determine the baselines."""
-        reference = group[0].pair.reference
-        initial = [_Band(c, c.warped.mapping.fixed_to_moving, (0.0, 0.0)) for c in group]
-        windows = WindowShifts.of([_fit_residual(b, b.plane) for b in initial], [b.plane for b in initial])
-        model = _model(group, windows)
-        if model is None:
+        """Estimate the relief from bands with common parallax; None if the windows do not determine the baselines.
+
+        Raises GeometryError.
+        """
+        pair = group[0].pair
+        bands = [_Band(c, c.warped.mapping, (0.0, 0.0)) for c in group]
+        windows = WindowShifts.of(_fit_residuals(bands, [b.plane for b in bands]), [b.plane for b in bands])
+        consistent = _consistent(windows, _layouts(group), pair.fixed.size_px, with_fields=not pair.has_rig)
+        if consistent is None:
             return None
-        try:
-            changes = zip(initial, model.corners_px, model.baselines, strict=True)
-            bands = [b.corrected(corners_px, baseline) for b, corners_px, baseline in changes]
-            low, high = np.percentile(model.parallax_px, _RANGE_PERCENTILES)
-            all_bands = range(len(bands))
-            for _ in range(_MAX_ROUNDS):
-                matching = DenseMatching(reference.grey, [b.view() for b in bands], (float(low), float(high)))
-                matched = matching.matched(all_bands)
-                bands = [_with_lens_field(b, matched) for b in _refitted(bands, matched)]
-                if all(b.field is None for b in bands):
-                    break
-        except GeometryError:
+        kept, model = consistent
+        layout = _layout(_layouts(group), kept)
+        bands = _applied([bands[k] for k in kept], model)
+        low, high = np.percentile(model.parallax_px, _RANGE_PERCENTILES).tolist()
+        matching = DenseMatching(pair.reference.grey, [b.view() for b in bands], (low, high))
+        matched = matching.matched(range(len(bands)))
+        mappings = [b.mapping(matched) for b in bands]
+        windows = WindowShifts.of(_fit_residuals(bands, mappings), mappings)
+        baselines = np.array([b.baseline for b in bands])
+        # The parallax of the windows is a free parameter: noise of the relief would otherwise shorten the baselines.
+        total = windows.plus(matched(windows.centres_px), baselines)
+        refitted = adjust(total, pair.fixed.size_px, baselines, with_fields=not pair.has_rig)
+        bands = bands if refitted is None else _applied(bands, refitted)
+        baselines = np.array([b.baseline for b in bands])
+        if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
-        if not are_of_lenses(np.array([b.baseline for b in bands]), _layout(group)):
-            return None
-        others = [[k for k in all_bands if k != band] for band in all_bands]
-        relief, *without = matching.refined([b.view() for b in bands], [all_bands, *others])
-        is_reversed = _layout(group) is None and nearer_sign(matched, np.array([b.baseline for b in bands])) < 0
-        if is_reversed:
-            bands = [replace(b, baseline=(-b.baseline[0], -b.baseline[1])) for b in bands]
-            relief, without = relief.negated, [r.negated for r in without]
-        names = [b.candidate.pair.name for b in bands]
-        return cls(bands, relief, dict(zip(names, without, strict=True)))
+        odd, even = range(1, len(bands), 2), range(0, len(bands), 2)
+        relief, *halves = matching.refined([b.view() for b in bands], [range(len(bands)), odd, even])
+        if layout is None and nearer_sign(matched, baselines) < 0:
+            bands, relief, halves = [b.negated for b in bands], relief.negated, [r.negated for r in halves]
+        return cls(bands, relief, halves)
+
+    def verifying(self, band: _Band) -> Relief:
+        """Return the relief of other bands than this one."""
+        return self.halves[self.bands.index(band) % 2] if band in self.bands else self.relief
+
+    def fitted(self, candidate: ReliefCandidate) -> _Band | None:
+        """Fit homography and baseline of a band under the relief of the others; None if too few windows are measured.
+
+        Raises GeometryError.
+        """
+        band = _Band(candidate, candidate.warped.mapping, (0.0, 0.0))
+        for _ in range(_ROUNDS):
+            mapping = band.mapping(self.relief)
+            residual = candidate.fit_residual(mapping)
+            if len(residual.measured_px) < _MIN_WINDOWS:
+                return None
+            windows = WindowShifts.of([residual], [mapping])
+            corners_px, change = windows.fit_baseline(self.relief(windows.centres_px), candidate.pair.fixed.size_px)
+            band = band.corrected(corners_px, np.add(band.baseline, change))
+        return band
 
     def checked(self, band: _Band) -> "_Checked":
-        """Verify a band with the relief; it must pass all checks and be more accurate than its homography alone."""
-        candidate = band.candidate
-        pair, size_px = candidate.pair, candidate.pair.fixed.size_px
-        rejected = _Checked(pair.name, FixedImagePx(math.inf), None)
+        """Verify a band with the relief from other bands, with a displacement field if that is more accurate.
+
+        Raises GeometryError.
+        """
+        candidate, pair = band.candidate, band.candidate.pair
+        plane = candidate.held_out_residual(candidate.warped.mapping)
+        rejected = _Checked(pair.name, plane)
         mapping = band.mapping(self.relief)
-        fit = corner_correction(mapping, _fit_residual(band, mapping), size_px)
+        fit = corner_correction(mapping, candidate.fit_residual(mapping), pair.fixed.size_px)
         if fit is None:
             return rejected
-        try:
-            final = band.corrected(fit.mean_px, np.zeros(2))
-        except GeometryError:
-            return rejected
-        without_relief = _held_out_residual(pair, candidate.warped.mapping)
-        held_out = _held_out_residual(pair, final.mapping(self.without[pair.name], with_occlusions=True))
-        rejected = replace(rejected, p95_px=held_out.p95_px)
-        if _is_worse(held_out, without_relief):
-            return rejected
-        joint = with_corners(candidate.joint, final.fixed_to_moving, fit.covariance_px2)
-        parallax = final.parallax(self.relief)
-        complete = replace(final.plane, parallax=parallax)
-        if WarpedPair(pair, complete, pair.warped_moving(complete), held_out).issues(joint):
-            return rejected
+        final = band.corrected(fit.mean_px, np.array(band.baseline))
+        complete = final.mapping(self.relief, with_occlusions=True)
+        verifying = final.mapping(self.verifying(band), with_occlusions=True)
+        held_out = candidate.held_out_residual(verifying)
+        candidates: dict[Geometry, FixedImagePx] = {"homography": plane.p95_px, "relief": held_out.p95_px}
+        joint = with_corners(candidate.joint, complete.fixed_to_moving, fit.covariance_px2)
+        if not pair.has_rig:
+            result = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), complete, verifying)
+            if result.field is not None and result.held_out is not None:
+                complete, held_out = replace(complete, local=result.field), result.held_out
+                candidates["relief and field"] = held_out.p95_px
+        issues = WarpedPair(pair, complete, pair.warped_moving(complete), held_out).issues(joint)
+        if issues:
+            return replace(rejected, held_out=held_out)
         alignment = Alignment(
-            complete, size_px, "aligned", (), candidate.seed, joint, held_out,
-            candidates={"homography": without_relief.p95_px, "relief": held_out.p95_px},
-        )  # fmt: skip
-        return _Checked(pair.name, held_out.p95_px, alignment)
+            complete, pair.fixed.size_px, "aligned", (), candidate.seed, joint, held_out, candidates=candidates
+        )
+        return _Checked(pair.name, plane, held_out, alignment)
 
 
 @dataclass(frozen=True)
 class _Checked:
-    """A band after its verification with the relief from the other bands."""
+    """A band after its verification with the relief from other bands."""
 
     name: str
-    p95_px: FixedImagePx
-    """p95 of the shifts of held-out windows."""
-    alignment: Alignment[FixedImagePx] | None
+    plane: Residual[FixedImagePx]
+    """Residual of held-out windows by the homography alone."""
+    held_out: Residual[FixedImagePx] | None = None
+    """The same with the relief; None if it was not measured."""
+    alignment: Alignment[FixedImagePx] | None = None
     """None if it does not pass."""
 
 
-def _is_worse(residual: Residual[FixedImagePx], other: Residual[FixedImagePx]) -> bool:
-    """Return True if the p95 of a residual is larger, or its median is larger by more than its p95 is smaller.
+def _is_chosen(checked: Sequence[_Checked]) -> bool:
+    """Return True if the relief explains the held-out windows of the median band better than the homographies.
 
     If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.
     """
-    gain_px = float(other.p95_px) - float(residual.p95_px)
-    return not (gain_px >= 0 and float(residual.median_px) - float(other.median_px) <= gain_px)
+    gains_px = []
+    for each in checked:
+        if each.held_out is None or each.alignment is None:
+            gains_px.append(-math.inf)
+            continue
+        gain_px = float(each.plane.p95_px) - float(each.held_out.p95_px)
+        gains_px.append(gain_px - max(0.0, float(each.held_out.median_px) - float(each.plane.median_px)))
+    return float(np.median(gains_px)) >= 0
 
 
-def _refitted(bands: Sequence[_Band], relief: Relief) -> list[_Band]:
-    """Fit plane + parallax again, to shifts measured with a relief, which are more accurate. Raises GeometryError.
-
-    The parallax of the windows is a free parameter: noise of the relief would otherwise shorten the baselines.
-    """
-    mappings = [b.mapping(relief) for b in bands]
-    windows = WindowShifts.of([_fit_residual(*each) for each in zip(bands, mappings, strict=True)], mappings)
-    baselines = np.array([b.baseline for b in bands])
-    total = windows.plus(relief(windows.centres_px), baselines)
-    model = fit_plane_parallax(total, bands[0].candidate.pair.fixed.size_px, baselines)
-    if model is None:
-        return list(bands)
-    return [b.corrected(c, t) for b, c, t in zip(bands, model.corners_px, model.baselines - baselines, strict=True)]
+def _applied(bands: Sequence[_Band], model: Adjustment) -> list[_Band]:
+    """Return the bands with the corrections and baselines of a model. Raises GeometryError."""
+    by_band = zip(bands, model.corners_px, model.baselines, model.fields, strict=True)
+    return [band.corrected(corners_px, baseline, lens_field) for band, corners_px, baseline, lens_field in by_band]
 
 
-def _with_lens_field(band: _Band, relief: Relief) -> _Band:
-    """Fit the residual lens distortion of a band, unless it is calibrated by tags or the rig."""
-    pair = band.candidate.pair
-    if pair.has_rig or pair.space == "undistorted":
-        return band
-    result = pair.reference.lens_field.refine(channel_mean(pair.moving_image), band.mapping(relief))
-    return replace(band, field=result.field)
-
-
-def _fit_residual(band: _Band, mapping: PixelMapping) -> Residual[FixedImagePx]:
-    pair = band.candidate.pair
-    return pair.reference.fit_windows.residuals(pair.warped_moving(mapping))
-
-
-def _held_out_residual(pair: BandPair, mapping: PixelMapping) -> Residual[FixedImagePx]:
-    return pair.reference.held_out_windows.residuals(pair.warped_moving(mapping))
+def _fit_residuals(bands: Sequence[_Band], mappings: Sequence[PixelMapping]) -> list[Residual[FixedImagePx]]:
+    return [b.candidate.fit_residual(m) for b, m in zip(bands, mappings, strict=True)]

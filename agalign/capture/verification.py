@@ -1,12 +1,10 @@
 """Verification of a pair on the warped images: status and issues of its alignment."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.config import Settings
 from agalign.pixels.grey import channel_mean
 from agalign.pixels.resample import shrink
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
@@ -102,11 +100,14 @@ def verified(
     pair: BandPair,
     seed: Seed,
     result: JointResult[FixedImagePx] | Issue,
-    settings: Settings,
+    use: ReliefUse,
     warped_pair: WarpedPair | None = None,
+    *,
+    seed_only: bool = False,
 ) -> Alignment[FixedImagePx]:
     """Verify a result; return its alignment with status, px of the images. With issues it has the mapping of the seed.
 
+    `use` is "never" for no displacement field.
     `warped_pair` is the pair with a mapping close to the result's, if available; it avoids measuring again.
     """
     joint: JointResult[FixedImagePx] | None = None
@@ -117,13 +118,13 @@ def verified(
         joint = _unchanged_if_aligned(result, pair)
         mapping = pair.mapping(joint.fixed_to_moving)
         warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.with_mapping(mapping)
-        warped_pair, issues, local = _verified(warped_pair, joint, settings.relief.use)
+        warped_pair, issues, local = _verified(warped_pair, joint, use)
         is_displaced = local is not None and local.field is not None
     else:
         issues = (result,)
     if warped_pair is None or (issues and not is_displaced):
         warped_pair = WarpedPair.of(pair, pair.mapping(seed.fixed_to_moving))
-    usable = seed.trusted or settings.seed.only
+    usable = seed.trusted or seed_only
     status = status_of(issues, warped_pair.residual, seed=usable)
     if usable and issues and not is_displaced and not seed_fits(warped_pair.residual):
         issues = (*issues, Issue(SEED_DOES_NOT_FIT))
@@ -134,11 +135,11 @@ def verified(
         warped_pair.mapping, pair.fixed.size_px, status, issues, seed, joint, warped_pair.residual,
         candidates=candidates,
     )  # fmt: skip
-    return _predicted_by_windows(alignment, pair) if issues and is_displaced else alignment
+    return predicted_by_windows(alignment, pair) if issues and is_displaced else alignment
 
 
-def _predicted_by_windows(alignment: Alignment[FixedImagePx], pair: BandPair) -> Alignment[FixedImagePx]:
-    """Return as `predicted` an alignment with a displacement field that has issues in its held-out windows.
+def predicted_by_windows(alignment: Alignment[FixedImagePx], pair: BandPair) -> Alignment[FixedImagePx]:
+    """Return as `predicted` an alignment that its windows do not confirm, or another geometry than that of its capture.
 
     The standard error is the RMS of the shifts of these windows.
     """
@@ -157,13 +158,7 @@ def _verified(
     issues = warped_pair.issues(joint)
     if not _needs_field(use, issues, has_rig=warped_pair.pair.has_rig):
         return warped_pair, issues, None
-    coarse = _with_field(warped_pair, joint)
-    if coarse.passes or not issues:
-        return coarse.or_without_field(warped_pair, issues)
-    # Surfaces at different heights close to each other, such as leaves of large plants, need a finer field.
-    fine = _with_field(warped_pair, joint, fine=True)
-    better = fine if fine.passes or fine.p95_px < coarse.p95_px else coarse
-    return better.or_without_field(warped_pair, issues)
+    return _with_field(warped_pair, joint).or_without_field(warped_pair, issues)
 
 
 def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) -> bool:
@@ -186,16 +181,6 @@ class _FieldResult:
     issues: tuple[Issue, ...] = ()
     """Issues of the held-out windows."""
 
-    @property
-    def passes(self) -> bool:
-        """True if there is a field and no issue."""
-        return self.pair is not None and not self.issues
-
-    @property
-    def p95_px(self) -> FixedImagePx:
-        """p95 of the held-out windows; infinite without a field."""
-        return FixedImagePx(math.inf) if self.pair is None else self.pair.residual.p95_px
-
     def or_without_field(
         self, plane: WarpedPair, issues: tuple[Issue, ...]
     ) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult]:
@@ -205,11 +190,10 @@ class _FieldResult:
         return self.pair, self.issues, self.local
 
 
-def _with_field(warped_pair: WarpedPair, joint: JointResult[FixedImagePx], *, fine: bool = False) -> _FieldResult:
+def _with_field(warped_pair: WarpedPair, joint: JointResult[FixedImagePx]) -> _FieldResult:
     """Fit a displacement field in addition to the mapping of a pair and verify it."""
     pair, mapping = warped_pair.pair, warped_pair.mapping
-    estimator = pair.reference.fine_field if fine else pair.reference.coarse_field
-    local = estimator.refine(channel_mean(pair.moving_image), mapping, verify=True)
+    local = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), mapping)
     if local.field is None:
         return _FieldResult(local)
     displaced = WarpedPair.of(pair, replace(mapping, local=local.field))

@@ -25,32 +25,18 @@ from agalign.values.pixel_units import FixedImagePx
 from agalign.values.robust import cauchy_weights, shift_scale_px
 from agalign.verify.residuals import FixedWindows, decrease_sigma
 
-
-@dataclass(frozen=True)
-class FieldScale:
-    """Resolution of a displacement field."""
-
-    window_px: int
-    """Side of the windows in which shifts are measured; they overlap by half."""
-    lattice_px: int
-    """Spacing of the field's nodes."""
-    verification_px: int = 48
-    """Side of the windows in which the field is verified. Windows of the fit share no pixels with these, so small ones
-    are closer to the nearest windows of the fit."""
-
-
-LENS = FieldScale(window_px=48, lattice_px=96)
-"""For residual lens distortion, which varies over hundreds of pixels, in addition to a relief."""
-COARSE = FieldScale(window_px=64, lattice_px=48)
-"""For most scenes: larger windows have less noise."""
-FINE = FieldScale(window_px=32, lattice_px=24, verification_px=32)
-"""For plants and walls with parallax that varies too quickly for the coarse field."""
-
-_MAX_WINDOWS = 4000
-"""The spacing of the windows grows in larger images, which limits the time; the field is smooth."""
+_WINDOW_PX, _STEP_PX = 40, 20
+"""Side and spacing of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones
+are as accurate, and larger ones less."""
+_LATTICE_PX = 24
+"""Spacing of the field's nodes: leaves and branches near the camera have parallax at this scale."""
+_VERIFICATION_PX = 48
+"""Side of the windows in which a field is verified; larger ones are farther from the windows of the fit."""
+_MAX_WINDOWS = 5500
+"""The spacing of the windows grows in images above 2 megapixels, which limits the time."""
 _MIN_NODE_SPACING = 0.75
 """Minimum spacing of the nodes relative to that of the windows: the windows do not determine more nodes."""
-_SMOOTHNESS = (0.3, 1.0, 4.0, 16.0, 64.0)
+_SMOOTHNESS = (0.2, 1.0, 5.0, 25.0)
 """Weights of the field's second differences relative to one window; selected by cross-validation."""
 _DAMPING = 0.003
 """Weight of the field's length, relative to one window; it matters only far from all windows."""
@@ -70,15 +56,18 @@ _LOSS_SCALE_PX = 0.1
 """Scale of the robust loss by which fields are compared: several times the noise of a shift."""
 _MIN_CAPTURES, _COMMON_FOLDS = 3, 4
 """Minimum number of captures for a common field, and number of folds of its cross-validation."""
+_COMMON_LATTICE_PX = 48
+"""Spacing of the nodes of a common field: the distortion of lenses varies over hundreds of pixels."""
 _COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
 """As `_SMOOTHNESS`, relative to one window of each capture."""
 _MIN_COMMON_GAIN_SIGMA, _MAX_COMMON_P95_GROWTH = 2.5, 1.05
 """Less strict than within one capture: captures that are left out have only their lenses in common with the others."""
+_FOLDS = 4
+"""Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain."""
+_GAIN_FOLDS = (0, 2, 8, 10)
+"""Folds with which fields are compared, a quarter of the windows."""
 _SAME_WINDOW_PX = 1.0
 """Windows of one grid at a smaller distance are identical."""
-_ALL_FOLDS = range(16)
-_SOME_FOLDS = (0, 2, 8, 10)
-"""Folds with which the smoothness is selected; their windows are far from each other."""
 _MIN_WEIGHT = 0.1
 """Windows with a lower relative weight are excluded from the comparison of fields: parallax within a window lowers its
 peak."""
@@ -98,86 +87,79 @@ class DisplacementResult:
 class DisplacementEstimator:
     """Small, overlapping windows of the reference, for fields of any number of moving bands."""
 
-    def __init__(self, valid: Mask, structure: Field, scale: FieldScale, windows: FixedWindows | None = None) -> None:
-        """Cut windows from the structure field (height, width) of the reference with the mask `valid`.
-
-        Fields are fitted to `windows`, by default windows of the whole image.
-        """
-        self._valid, self._structure, self._verification_px = valid, structure, scale.verification_px
-        step_px = max(scale.window_px // 2, round((valid.size / _MAX_WINDOWS) ** 0.5))
+    def __init__(self, valid: Mask, structure: Field) -> None:
+        """Cut windows from the structure field (height, width) of the reference with the mask `valid`."""
+        self._valid, self._structure = valid, structure
+        step_px = max(_STEP_PX, round((valid.size / _MAX_WINDOWS) ** 0.5))
         self.size_px = valid.shape[1], valid.shape[0]
-        self.lattice_px = max(scale.lattice_px, round(_MIN_NODE_SPACING * step_px))
-        self.windows = windows or FixedWindows(valid, structure, scale.window_px, step_px)
+        self.lattice_px = max(_LATTICE_PX, round(_MIN_NODE_SPACING * step_px))
+        self.windows = FixedWindows(valid, structure, _WINDOW_PX, step_px)
 
     @cached_property
     def verification(self) -> FixedWindows:
         """The windows in which a field is verified; they do not overlap."""
-        return FixedWindows(self._valid, self._structure, self._verification_px)
+        return FixedWindows(self._valid, self._structure, _VERIFICATION_PX)
 
-    def refine(self, moving: Raster, mapping: PixelMapping, *, verify: bool = False) -> DisplacementResult:
+    def refine(self, moving: Raster, mapping: PixelMapping, verified: PixelMapping | None = None) -> DisplacementResult:
         """Fit the displacement field of a mapping, including the field that the mapping already has.
 
         Returns no field if it does not reduce the residuals of held-out windows significantly. The shifts are measured
-        again with the field of each round, as correlation is sharper and large shifts are measured in steps. With
-        `verify` the result contains the cross-validated residual of the final field.
+        again with the field of each round, as correlation is sharper and large shifts are measured in steps. The
+        residual of held-out windows is that of the mapping `verified`, by default `mapping`, with the field.
         """
-        first = self._measure(moving, mapping)
-        gain = self._best_gain(first)
+        shifts = self._measure(moving, mapping)
+        gain = self._best_gain(shifts)
+        without = DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
         if not gain.is_significant(_MIN_GAIN_SIGMA):
-            return DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
-        initial = None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px)
-        field = initial
+            return without
+        field, total = (
+            None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px),
+            shifts,
+        )
         for number in range(_MAX_ROUNDS):
-            residual = first if number == 0 else self._measure(moving, replace(mapping, local=field))
-            update = self._field(Shifts.of(residual), gain.smoothness)
-            total = update if field is None else field.plus(update)
-            if not _is_one_to_one(total, self.size_px):
+            if number > 0:
+                shifts = self._measure(moving, replace(mapping, local=field))
+            total = shifts if field is None else shifts.plus(field(shifts.centres_px))
+            next_field = self._field(total, gain.smoothness)
+            if not _is_one_to_one(next_field, self.size_px):
+                return without
+            field = next_field
+            if number + 1 >= _MIN_ROUNDS and shifts.median_px <= _CONVERGED_PX:
                 break
-            field = total
-            if number + 1 >= _MIN_ROUNDS and residual.median_px <= _CONVERGED_PX:
-                break
-        if field is None or field is initial:
-            return DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
-        result = DisplacementResult(field, gain.before_p95_px, gain.after_p95_px)
-        if not verify:
-            return result
-        return replace(result, held_out=self._held_out(moving, replace(mapping, local=field), field, gain.smoothness))
+        assert field is not None
+        held_out = self._held_out(moving, replace(verified or mapping, local=field), total, gain.smoothness)
+        return DisplacementResult(field, gain.before_p95_px, gain.after_p95_px, held_out)
 
     def _held_out(
-        self, moving: Raster, mapping: PixelMapping, field: DisplacementField, smoothness: float
+        self, moving: Raster, mapping: PixelMapping, total: "Shifts", smoothness: float
     ) -> Residual[FixedImagePx]:
         """Return the cross-validated residual of the verification windows.
 
         The shifts are measured with the complete mapping, for which correlation is sharp. The total shift of each
         window is compared with a field fitted to windows that share no pixels with it.
         """
-        shifts = Shifts.of(self._measure(moving, mapping))
-        total = replace(shifts, shifts_px=shifts.shifts_px + field(shifts.centres_px))
+        assert mapping.local is not None
         residual = self.verification.residuals(warped(moving, mapping, self.size_px))
         min_distance_px = (self.windows.side + self.verification.side) / 2
         predicted_px = self._cross_predicted(total, residual.centres_px, min_distance_px, smoothness)
-        remaining_px = residual.shifts_px + field(residual.centres_px) - predicted_px
+        remaining_px = residual.shifts_px + mapping.local(residual.centres_px) - predicted_px
         return Residual.of(residual.centres_px, remaining_px, residual.peaks_sigma)
 
-    def _best_gain(self, first: Residual[FixedImagePx]) -> "_Gain":
+    def _best_gain(self, shifts: "Shifts") -> "_Gain":
         """Return the gain of the least smooth field with a significant gain, else that of the smoothest field."""
-        gains = [self._held_out_gain(first, s, _SOME_FOLDS, min_distance_px=0) for s in _SMOOTHNESS]
-        best = min(gains, key=lambda g: g.loss).smoothness
+        if len(shifts) < _MIN_WINDOWS:
+            return _Gain(_SMOOTHNESS[-1])
+        best = min(_SMOOTHNESS, key=lambda s: self._held_out_gain(shifts, s, min_distance_px=_SAME_WINDOW_PX).loss)
         # Held-out windows at a larger distance from those of the fit may require a smoother field.
         for smoothness in (s for s in _SMOOTHNESS if s >= best):
-            gain = self._held_out_gain(first, smoothness, _ALL_FOLDS, min_distance_px=self.windows.side)
+            gain = self._held_out_gain(shifts, smoothness, min_distance_px=self.windows.side)
             if gain.is_significant(_MIN_GAIN_SIGMA):
                 break
         return gain
 
-    def _held_out_gain(
-        self, residual: Residual[FixedImagePx], smoothness: float, folds: Iterable[int], min_distance_px: float
-    ) -> "_Gain":
+    def _held_out_gain(self, shifts: "Shifts", smoothness: float, min_distance_px: float) -> "_Gain":
         """Return the cross-validated gain of a field, without windows nearer than `min_distance_px` in the fit."""
-        shifts = Shifts.of(residual)
-        if len(shifts) < _MIN_WINDOWS:
-            return _Gain(smoothness)
-        predicted = self._cross_predicted(shifts, shifts.centres_px, min_distance_px, smoothness, folds)
+        predicted = self._cross_predicted(shifts, shifts.centres_px, min_distance_px, smoothness, _GAIN_FOLDS)
         return _gain_of(shifts, np.linalg.norm(shifts.shifts_px - predicted, axis=1), smoothness)
 
     def _cross_predicted(
@@ -186,26 +168,29 @@ class DisplacementEstimator:
         centres_px: Points,
         min_distance_px: float,
         smoothness: float,
-        folds: Iterable[int] = _ALL_FOLDS,
+        folds: Iterable[int] = range(_FOLDS**2),
     ) -> Points:
         """Predict the shifts (n, 2) at centres (n, 2) by fields fitted to windows at a minimum distance.
 
-        The distance is the maximum norm. NaN in other folds and where too few windows are left.
+        The distance is the maximum norm. NaN in other folds and where too few windows are left. The robust weights are
+        those of a fit to all windows.
         """
         fold = _folds(centres_px)
+        weighted = shifts.reweighted(self._field(shifts, smoothness)(shifts.centres_px))
         result = np.full((len(centres_px), 2), np.nan)
         for k in folds:
             is_held_out = fold == k
-            is_fitted = ~_near(shifts.centres_px, centres_px[is_held_out], max(min_distance_px, _SAME_WINDOW_PX))
+            is_fitted = ~_near(shifts.centres_px, centres_px[is_held_out], min_distance_px)
             if is_fitted.sum() >= _MIN_WINDOWS // 2:
-                result[is_held_out] = self._field(shifts.subset(is_fitted), smoothness)(centres_px[is_held_out])
+                field = self._field(weighted.subset(is_fitted), smoothness, reweightings=1)
+                result[is_held_out] = field(centres_px[is_held_out])
         return result
 
-    def _field(self, shifts: "Shifts", smoothness: float) -> DisplacementField:
-        return fitted_field(shifts, smoothness, self.lattice_px, self.size_px)
+    def _field(self, shifts: "Shifts", smoothness: float, reweightings: int = _REWEIGHTINGS) -> DisplacementField:
+        return fitted_field(shifts, smoothness, self.lattice_px, self.size_px, reweightings)
 
-    def _measure(self, moving: Raster, mapping: PixelMapping) -> Residual[FixedImagePx]:
-        return self.windows.residuals(warped(moving, mapping, self.size_px), min_valid=1.0)
+    def _measure(self, moving: Raster, mapping: PixelMapping) -> "Shifts":
+        return Shifts.of(self.windows.residuals(warped(moving, mapping, self.size_px), min_valid=1.0))
 
 
 @dataclass(frozen=True)
@@ -241,6 +226,21 @@ class Shifts:
     def subset(self, mask: NDArray[np.bool_]) -> "Shifts":
         """Return the shifts where `mask` (n,) is True."""
         return Shifts(self.centres_px[mask], self.shifts_px[mask], self.weights[mask], self.peaks_sigma[mask])
+
+    def plus(self, shifts_px: Points) -> "Shifts":
+        """Return the windows with shifts (n, 2) added."""
+        return replace(self, shifts_px=self.shifts_px + shifts_px)
+
+    def reweighted(self, fitted_px: Points) -> "Shifts":
+        """Return the windows with weights that are robust to shifts far from the fitted ones (n, 2)."""
+        residuals_px = np.linalg.norm(self.shifts_px - fitted_px, axis=1)
+        robust = cauchy_weights(residuals_px, _CAUCHY_SCALES * shift_scale_px(residuals_px))
+        return replace(self, weights=self.weights * robust)
+
+    @property
+    def median_px(self) -> float:
+        """Median length of the shifts."""
+        return float(np.median(np.linalg.norm(self.shifts_px, axis=1))) if len(self) else math.inf
 
     def __len__(self) -> int:
         return len(self.centres_px)
@@ -281,10 +281,10 @@ def _gain_of(shifts: Shifts, remaining_px: NDArray[np.float64], smoothness: floa
 def _folds(centres_px: Points) -> NDArray[np.int64]:
     """Return the fold (n,) of each window.
 
-    A fold contains every fourth window along both axes: between two of them is a window that overlaps neither.
+    A fold contains every fourth window along both axes.
     """
     column, row = (np.unique(centres_px[:, axis], return_inverse=True)[1] for axis in (0, 1))
-    return np.asarray(column % 4 + 4 * (row % 4))
+    return np.asarray(column % _FOLDS + _FOLDS * (row % _FOLDS))
 
 
 def _near(centres_px: Points, others_px: Points, distance_px: float) -> NDArray[np.bool_]:
@@ -310,7 +310,7 @@ def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int
     folds = [captures[k::count] for k in range(count)]
 
     def fitted(some: Sequence[Shifts], smoothness: float) -> DisplacementField:
-        return fitted_field(Shifts.joined(some), smoothness * len(some), COARSE.lattice_px, size_px)
+        return fitted_field(Shifts.joined(some), smoothness * len(some), _COMMON_LATTICE_PX, size_px)
 
     def gain(smoothness: float) -> _Gain:
         remaining_px = []
@@ -326,7 +326,9 @@ def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int
     return field if _is_one_to_one(field, size_px) else None
 
 
-def fitted_field(shifts: Shifts, smoothness: float, lattice_px: int, size_px: tuple[int, int]) -> DisplacementField:
+def fitted_field(
+    shifts: Shifts, smoothness: float, lattice_px: int, size_px: tuple[int, int], reweightings: int = _REWEIGHTINGS
+) -> DisplacementField:
     """Fit a smooth field d to shifts s at centres x on a grid of nodes:
 
         min sum_i t_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + damping |d|^2
@@ -347,13 +349,12 @@ def fitted_field(shifts: Shifts, smoothness: float, lattice_px: int, size_px: tu
     elements = (nodes[second] - nodes[first]) * (rows * columns) + nodes[first]
     products = bilinear[first] * bilinear[second]
     weights = shifts.weights
-    for _ in range(_REWEIGHTINGS):
+    for number in range(reweightings):
         normal = penalty + _sums(elements, products * weights, penalty.size).reshape(penalty.shape)
         right_side = [_sums(nodes, bilinear * weights * s, rows * columns) for s in shifts.shifts_px.T]
         field = solveh_banded(normal, np.stack(right_side, axis=-1), overwrite_ab=True, lower=True, check_finite=False)
-        fitted = (bilinear[..., None] * field[nodes]).sum(axis=0)
-        residuals_px = np.linalg.norm(shifts.shifts_px - fitted, axis=1)
-        weights = shifts.weights * cauchy_weights(residuals_px, _CAUCHY_SCALES * shift_scale_px(residuals_px))
+        if number + 1 < reweightings:
+            weights = shifts.reweighted((bilinear[..., None] * field[nodes]).sum(axis=0)).weights
     lattice = field.reshape(rows, columns, 2)
     return DisplacementField(float(lattice_px), lattice if order[0] == 0 else lattice.transpose(1, 0, 2).copy())
 

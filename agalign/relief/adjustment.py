@@ -1,12 +1,14 @@
-"""Plane + parallax from the residual shifts of windows: homography and baseline per band, parallax per window.
+"""Adjustment of a capture: homography, lens field and baseline per band, parallax per window (plane + parallax).
 
 The shift of window i in band b, in undistorted px of the reference, is
 
-    s_ib = D(x_i) delta_b + t_b z_i + noise
+    s_ib = D(x_i) delta_b + N(x_i) f_b + t_b z_i + noise
 
-delta_b (8,) corrects the band's homography at the image corners, t_b (2,) is the band's baseline, and z_i is the
-parallax of the window, common to all bands: a rank-1 factorisation (Irani 2002). It is solved by alternating least
-squares. Cauchy weights reduce the influence of wrong correlation peaks and of windows across depth edges.
+delta_b (8,) corrects the band's homography at the image corners, f_b are the nodes of a smooth field (the difference of
+the lenses' distortion), t_b (2,) is the band's baseline, and z_i is the parallax of the window, common to all bands: a
+rank-1 factorisation (Irani 2002). It is solved by alternating least squares: z is determined before f, so that f only
+contains what no common parallax explains. Cauchy weights reduce the influence of wrong correlation peaks and of windows
+across depth edges.
 
 Two ambiguities are removed. A plane a + b x + c y added to z is equivalent to other homographies of all bands: z is 0
 on the plane that contains most windows. The scale of z is free: the longest baseline has length 1. If the lens layout
@@ -18,9 +20,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from agalign.values import geometry
 from agalign.values.alignment import Residual
+from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
@@ -50,22 +54,68 @@ _MIN_SPREAD = 0.3
 a blurred reference."""
 
 
+_NODE_SPACING_PX, _MIN_NODES = 200, 4
+"""Spacing of the nodes of a lens field along each axis; distortion varies over hundreds of pixels."""
+_SMOOTHNESS = 3.0
+"""Weight of the second differences of a lens field, relative to one window."""
+_FIELD_DAMPING = 0.01
+"""Weight of the length of a lens field, relative to one window."""
+_FIELD_STEP_PX = 48
+"""Spacing of the nodes of the resulting displacement field."""
+_MIN_WIDTH = 0.15
+"""Minimum ratio of the singular values of baselines that are not on one line: 0.22 to 0.5 for cameras."""
+
+
+class LensBasis:
+    """Natural cubic splines over an image: the shapes of a smooth lens field."""
+
+    def __init__(self, size_px: tuple[int, int]) -> None:
+        """Place nodes on an image (width, height)."""
+        self.size_px = size_px
+        self.counts = [max(_MIN_NODES, round(n / _NODE_SPACING_PX) + 1) for n in size_px]
+        columns, rows = (np.diff(np.eye(n), 2, axis=0) for n in self.counts)
+        twist = np.kron(*(np.diff(np.eye(n), axis=0) for n in self.counts[::-1]))
+        bending = np.kron(np.eye(self.counts[1]), columns.T @ columns) + np.kron(rows.T @ rows, np.eye(self.counts[0]))
+        self.penalty = _SMOOTHNESS * (bending + 2 * twist.T @ twist) + _FIELD_DAMPING * np.eye(len(bending))
+        """(k, k) quadratic form of the prior."""
+
+    def __call__(self, points_px: Points) -> Array:
+        """Return (n, k) the value of each shape at points (n, 2)."""
+        x, y = (self._along(points_px[:, axis], axis) for axis in (0, 1))
+        return np.asarray((y[:, :, None] * x[:, None, :]).reshape(len(points_px), -1))
+
+    def field(self, coefficients_px: Array) -> DisplacementField:
+        """Return the field with coefficients (k, 2)."""
+        columns, rows = (int(np.ceil(n / _FIELD_STEP_PX)) + 1 for n in self.size_px)
+        nodes = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(np.float64)
+        nodes *= _FIELD_STEP_PX
+        return DisplacementField(float(_FIELD_STEP_PX), (self(nodes) @ coefficients_px).reshape(rows, columns, 2))
+
+    def _along(self, positions_px: Array, axis: int) -> Array:
+        end, count = self.size_px[axis] - 1, self.counts[axis]
+        spline = CubicSpline(np.linspace(0, end, count), np.eye(count), bc_type="natural")
+        return np.asarray(spline(np.clip(positions_px, 0, end)))
+
+
 @dataclass(frozen=True)
-class PlaneParallax:
-    """The plane + parallax model of a capture."""
+class Adjustment:
+    """The adjusted model of a capture."""
 
     baselines: Array
     """(bands, 2) t_b, the longest of length 1."""
     corners_px: Array
     """(bands, 8) corrections of the homographies at the corners, px of the reference."""
+    fields: Sequence[DisplacementField | None]
+    """Corrections of the lens fields by band; None if they were not adjusted."""
     parallax_px: Array
     """(n,) parallax of the windows."""
     residuals_px: Array
     """(n, bands) lengths of the residuals; NaN where a window was not measured in a band."""
 
-    def shifts_px(self, points_px: Points, size_px: tuple[int, int], band: int) -> Array:
-        """Return the shifts (n, 2) by the correction of a band's homography at points (n, 2), without parallax."""
-        return np.asarray(geometry.over_corners(points_px, *size_px) @ self.corners_px[band])
+    @property
+    def scales_px(self) -> Array:
+        """(bands,) robust standard deviation of the residuals."""
+        return _scales_px(self.residuals_px)
 
 
 @dataclass(frozen=True)
@@ -104,6 +154,29 @@ class WindowShifts:
     def __len__(self) -> int:
         return len(self.points_px)
 
+    def are_enough(self, minimum: int) -> bool:
+        """Return True if at least `minimum` windows are measured in each band."""
+        return len(self) > 0 and int((self.weights > 0).sum(axis=0).min()) >= minimum
+
+    def of_bands(self, bands: Sequence[int]) -> "WindowShifts":
+        """Select bands by index."""
+        return replace(self, shifts_px=self.shifts_px[:, bands], weights=self.weights[:, bands])
+
+    def fit_baseline(self, parallax_px: Array, size_px: tuple[int, int]) -> tuple[Array, Array]:
+        """Fit homography and baseline of a single band to a known parallax (n,) of the windows.
+
+        `size_px` is (width, height) of the reference. Returns corrections of the corners (8,) and of the baseline (2,).
+        """
+        design, prior = _design(self.points_px, size_px, None)
+        shifts, weights = np.nan_to_num(self.shifts_px), self.weights
+        for _ in range(_ITERATIONS):
+            corners, baseline = _bands(shifts, parallax_px, design, prior, weights)
+            predicted = design @ corners[0] + parallax_px[:, None] * baseline[0]
+            residuals = np.linalg.norm(shifts[:, 0] - predicted, axis=1)
+            scale = shift_scale_px(residuals[self.weights[:, 0] > 0])
+            weights = self.weights * cauchy_weights(residuals, _CAUCHY_SCALES * scale)[:, None]
+        return corners[0], baseline[0]
+
     def plus(self, parallax: Array, baselines: Array) -> "WindowShifts":
         """Add the parallax (n,) of the relief with which the windows were measured, along the baselines (bands, 2).
 
@@ -112,39 +185,42 @@ class WindowShifts:
         return replace(self, shifts_px=self.shifts_px + parallax[:, None, None] * baselines)
 
 
-def fit_plane_parallax(
-    windows: WindowShifts, size_px: tuple[int, int], layout: Array | None = None
-) -> PlaneParallax | None:
+def adjust(
+    windows: WindowShifts, size_px: tuple[int, int], layout: Array | None = None, *, with_fields: bool = True
+) -> Adjustment | None:
     """Fit the model to the windows of a capture; None if too few windows are measured in all bands.
 
     `size_px` is (width, height) of the reference. `layout` (bands, 2) are the known directions, in any unit, in which
     points move in the bands when the scene comes nearer; they initialise the baselines and determine their sign.
+    Without `with_fields`, f is 0.
     """
     initial = _initial_baselines(windows) if layout is None else layout
     if initial is None or not np.linalg.norm(initial, axis=1).max() > 0:
         return None
     baselines = initial / np.linalg.norm(initial, axis=1).max()
-    design = geometry.over_corners(windows.points_px, *size_px)
+    basis = LensBasis(size_px) if with_fields else None
+    design, prior = _design(windows.points_px, size_px, basis)
     plane = _plane_coordinates(windows.points_px, size_px)
     shifts, weights = np.nan_to_num(windows.shifts_px), windows.weights
-    corners = np.zeros((len(baselines), 8))
+    smooth = np.zeros((len(baselines), len(prior)))
     for _ in range(_ITERATIONS):
-        parallax, information = _parallax(shifts - np.einsum("nki,bi->nbk", design, corners), baselines, weights)
+        parallax, information = _parallax(shifts - np.einsum("nki,bi->nbk", design, smooth), baselines, weights)
         parallax = parallax - plane @ _reference_plane(parallax, plane, information)
-        corners, baselines = _bands(shifts, parallax, design, weights)
+        smooth, baselines = _bands(shifts, parallax, design, prior, weights)
         longest = np.linalg.norm(baselines, axis=1).max()
         if not longest > 0:
             return None
         baselines, parallax = baselines / longest, parallax * longest
-        predicted = np.einsum("nki,bi->nbk", design, corners) + parallax[:, None, None] * baselines
+        predicted = np.einsum("nki,bi->nbk", design, smooth) + parallax[:, None, None] * baselines
         residuals = np.where(windows.weights > 0, np.linalg.norm(shifts - predicted, axis=2), np.nan)
-        scales = np.array([shift_scale_px(r[np.isfinite(r)]) for r in residuals.T])
+        scales = _scales_px(residuals)
         weights = windows.weights * np.nan_to_num(cauchy_weights(residuals, _CAUCHY_SCALES * scales))
         # Inverse variance of bands worse than the median, so that an inconsistent band does not determine the parallax.
         weights *= np.minimum(1, (np.median(scales) / scales) ** 2)
     if layout is not None and np.sum(baselines * layout) < 0:
         baselines, parallax = -baselines, -parallax
-    return PlaneParallax(baselines, corners, parallax, residuals)
+    fields = [None if basis is None else basis.field(s[8:].reshape(2, -1).T) for s in smooth]
+    return Adjustment(baselines, smooth[:, :8], fields, parallax, residuals)
 
 
 def are_of_lenses(baselines: Array, layout: Array | None) -> bool:
@@ -159,6 +235,21 @@ def are_of_lenses(baselines: Array, layout: Array | None) -> bool:
     lengths = np.linalg.norm(baselines, axis=1)
     from_mean = np.linalg.norm(baselines - baselines.mean(axis=0), axis=1)
     return bool(from_mean.max() >= _MIN_SPREAD * lengths.max() > 0)
+
+
+def are_on_a_line(baselines: Array) -> bool:
+    """Return True if baselines (bands, 2) have one direction.
+
+    Those of lenses in a row do too, but edges of shadows and leaves in blurred bands, or rows in the wind, also move
+    along one direction, by a different length in each band.
+    """
+    longest, shortest = np.linalg.svd(baselines, compute_uv=False)[[0, -1]]
+    return bool(shortest < _MIN_WIDTH * longest)
+
+
+def shifts_by_corners(model: Adjustment, points_px: Points, size_px: tuple[int, int]) -> Array:
+    """Return (n, bands, 2) the shifts by the corrections of the homographies at points (n, 2), without parallax."""
+    return np.asarray(np.einsum("nki,bi->nbk", geometry.over_corners(points_px, *size_px), model.corners_px))
 
 
 def parallax_of(residual_px: Array, baselines: Array, weights: Array) -> Array:
@@ -204,11 +295,34 @@ def _reference_plane(parallax: Array, plane: Array, information: Array) -> Array
     return np.asarray(result)
 
 
-def _bands(shifts: Array, parallax: Array, design: Array, weights: Array) -> tuple[Array, Array]:
-    """Return the corrections (bands, 8) and baselines (bands, 2) by weighted least squares for each band."""
-    full = np.concatenate([design, parallax[:, None, None] * np.eye(2)], axis=2)
-    normal = np.einsum("nb,nki,nkj->bij", weights, full, full, optimize=True)
-    normal += _DAMPING * np.diag([1.0] * 8 + [1e-3] * 2)
-    right = np.einsum("nb,nki,nbk->bi", weights, full, shifts, optimize=True)
-    solution = np.linalg.solve(normal, right[..., None])[..., 0]
-    return solution[:, :8], solution[:, 8:]
+def _design(points_px: Points, size_px: tuple[int, int], basis: LensBasis | None) -> tuple[Array, Array]:
+    """Return the Jacobian (n, 2, k) of shifts by (delta, f) and the quadratic form (k, k) of their prior."""
+    corners = geometry.over_corners(points_px, *size_px)
+    if basis is None:
+        return corners, _DAMPING * np.eye(8)
+    shapes = basis(points_px)
+    count = shapes.shape[1]
+    design, prior = np.zeros((len(points_px), 2, 8 + 2 * count)), np.zeros((8 + 2 * count,) * 2)
+    design[:, :, :8], prior[:8, :8] = corners, _DAMPING * np.eye(8)
+    for axis in (0, 1):
+        columns = slice(8 + axis * count, 8 + (axis + 1) * count)
+        design[:, axis, columns], prior[columns, columns] = shapes, basis.penalty
+    return design, prior
+
+
+def _bands(shifts: Array, parallax: Array, design: Array, prior: Array, weights: Array) -> tuple[Array, Array]:
+    """Return (delta, f) (bands, k) and baselines (bands, 2) by weighted least squares for each band."""
+    count = design.shape[2]
+    full = np.concatenate([design, parallax[:, None, None] * np.eye(2)], axis=2).reshape(-1, count + 2)
+    form = np.zeros((count + 2,) * 2)
+    form[:count, :count], form[count:, count:] = prior, 1e-3 * _DAMPING * np.eye(2)
+    solution = np.empty((shifts.shape[1], count + 2))
+    for band, of_band in enumerate(solution):
+        weighted = full * np.repeat(weights[:, band], 2)[:, None]
+        of_band[:] = np.linalg.solve(weighted.T @ full + form, weighted.T @ shifts[:, band].reshape(-1))
+    return solution[:, :count], solution[:, count:]
+
+
+def _scales_px(residuals_px: Array) -> Array:
+    """Return (bands,) the robust standard deviations of residuals (n, bands), NaN where not measured."""
+    return np.array([shift_scale_px(r[np.isfinite(r)]) for r in residuals_px.T])
