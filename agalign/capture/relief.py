@@ -52,9 +52,9 @@ may contain the parallax of neither side, so that the squared shifts do not decr
 _MAX_LINE_PX = 1.0
 """Common displacements along one line with a larger p95 are those of shadows or leaves, not of lenses: a displacement
 field would follow them too."""
-_MAX_SCALE_RATIO, _MIN_FOREIGN_PX = 3.0, 0.4
-"""Minimum ratio of the residual of a band that the parallax of the others does not explain to theirs, and its minimum.
-"""
+_MAX_SCALE_RATIO, _MIN_FOREIGN_PX = 2.0, 0.4
+"""Maximum ratio of the residual of a band to that of the others, for common parallax: up to 1.4 for bands of the same
+time, 2.4 for a photograph of another time. Residuals below the minimum are accepted anyway."""
 _RANGE_PERCENTILES = (1.0, 99.0)
 """Percentiles of the windows' parallax that limit its range; values beyond are wrong peaks."""
 _ROUNDS = 3
@@ -205,23 +205,23 @@ def _consistent(
         model = adjust(some, size_px, layout, with_fields=fields) if some.are_enough(_MIN_WINDOWS) else None
         return model if model is not None and are_of_lenses(model.baselines, layout) else None
 
-    def agreement_px(foreign: int) -> float:
-        model = adjusted([b for b in kept if b != foreign], fields=False)
+    def median_scale_px(bands: Sequence[int]) -> float:
+        model = adjusted(bands, fields=False)
         return math.inf if model is None else float(np.median(model.scales_px))
 
     kept = list(range(windows.shifts_px.shape[1]))
-    while len(kept) >= _MIN_BANDS:
-        model = adjusted(kept, fields=with_fields)
-        if model is not None:
-            scales_px = model.scales_px
-            worst = int(scales_px.argmax())
-            limit_px = max(_MIN_FOREIGN_PX, _MAX_SCALE_RATIO * float(np.median(np.delete(scales_px, worst))))
-            if len(kept) == _MIN_BANDS or scales_px[worst] <= limit_px:
-                return kept, model
-            kept.pop(worst)
+    model = adjusted(kept, fields=with_fields)
+    while len(kept) > _MIN_BANDS:
+        if model is None:
+            worst = int(np.argmin([median_scale_px([b for b in kept if b != foreign]) for foreign in kept]))
         else:
-            kept.remove(min(kept, key=agreement_px))
-    return None
+            worst = int(model.scales_px.argmax())
+            others_px = float(np.median(np.delete(model.scales_px, worst)))
+            if model.scales_px[worst] <= max(_MIN_FOREIGN_PX, _MAX_SCALE_RATIO * others_px):
+                break
+        kept.pop(worst)
+        model = adjusted(kept, fields=with_fields)
+    return None if model is None else (kept, model)
 
 
 @dataclass(frozen=True)
