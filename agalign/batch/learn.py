@@ -124,11 +124,6 @@ class _FlightLearner:
     def _size_px(self) -> tuple[int, int]:
         return self.captures[0].reference.size_px
 
-    @property
-    def _settings_without_relief(self) -> Settings:
-        """Neither the network nor the rig models the displacements of single captures."""
-        return self.settings.model_copy(update={"relief": self.settings.relief.model_copy(update={"use": "never"})})
-
     def _key(self, capture: Capture) -> str:
         return refinement_key(capture, self.settings)
 
@@ -142,7 +137,7 @@ class _FlightLearner:
         if model.rig is None or not set(self._bands) <= set(model.bands):
             return None
         some = [self.captures[len(self.captures) * k // 3] for k in (1, 2)]
-        task = TryModel(portable(model), self._settings_without_relief)
+        task = TryModel(portable(model), self.settings)
         tests = list(self.apply(task, some))
         if sum(t.aligned for t in tests) < len(self._bands) or any(t.aligned != t.predicted for t in tests):
             return None
@@ -160,7 +155,7 @@ class _FlightLearner:
         others = [(c,) for c in spread[: _MIN_RIG_CAPTURES - len(stretches)]]
         patches = FLIGHT_PATCHES if len(stretches) >= MIN_CAPTURES else PATCHES
         start = None if self.start is None else portable(self.start)
-        task = ChooseAndRefine(self._bands, self._settings_without_relief, patches, start)
+        task = ChooseAndRefine(self._bands, self.settings, patches, start)
         refined = []
         for one in self.apply(task, [*stretches, *others]):
             refined.append(one)
@@ -177,7 +172,7 @@ class _FlightLearner:
         self, net: Descriptor, chosen: Sequence[LearningCapture], patches: int
     ) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Train a network on captures, from the mappings that are already refined; None if that fails."""
-        settings = self._settings_without_relief
+        settings = self.settings
         loaded = [load_capture(one.capture, self._bands, settings, self.start) for one in chosen]
         pairs = [(one, images) for one, images in zip(chosen, loaded, strict=True) if images is not None]
         groups: list[ImageGroup] = []
@@ -203,7 +198,7 @@ class _FlightLearner:
             return result
         again = [c for c in self.captures if c.label in result and result[c.label].misaligned]
         waiting = [*again, *(c for c in _spread(self.captures, count) if c.label not in result)]
-        task = ObserveRig(portable(model), self._settings_without_relief)
+        task = ObserveRig(portable(model), self.settings)
         while waiting:
             counts = Counter(band for o in result.values() for band in o.residuals)
             missing = count - min(counts.values(), default=0)

@@ -132,7 +132,7 @@ class LoadedCapture:
         results = [of_pair[i] for i in range(len(self.pairs))]
         known = [(p, r) for p, r in zip(self.pairs, results, strict=True) if isinstance(r, JointResult)]
         starts = list(zip(self.pairs, self.seeds, strict=True))
-        aligned = verify_together(starts, results, None, settings)
+        aligned = verify_together(starts, results, None, settings, with_fields=False)
         return LearningCapture(
             self.capture, _are_good_enough(results),
             {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL},
@@ -221,7 +221,7 @@ class ObserveRig:
             model = _on_device(self.model, self.settings)
             pairs, _ = read_pairs(capture, self.settings.seed, model)
             pairs = [p for p in pairs if p.has_rig_pixels and (bands is None or p.name in bands)]
-            aligner = PairAligner(self.settings, model, quiet)
+            aligner = PairAligner(self.settings, model, quiet, with_fields=False)
             return _observation(pairs, aligner.align(pairs, None, scratch=False), aligner.refined, capture)
         except Exception as error:
             log_failure(f"{capture.label} does not determine the rig", error)
@@ -250,7 +250,7 @@ class TryModel:
         assert model.rig is not None
         try:
             pairs, _ = read_pairs(capture, self.settings.seed, model)
-            aligner = PairAligner(self.settings, model, quiet)
+            aligner = PairAligner(self.settings, model, quiet, with_fields=False)
             result = aligner.align(pairs, None, scratch=False)
             checked = with_predictions(pairs, result, model.rig, capture)
         except Exception as error:

@@ -134,6 +134,8 @@ class PairAligner:
     settings: Settings
     model: FlightModel | None
     progress: PairProgress
+    with_fields: bool = True
+    """False while a flight is learned: residual lens distortion is fitted to all its captures together."""
     refined: dict[str, RefinedPair] = field(default_factory=dict)
     """Results by band of the last optimisation, before they are combined with those of other bands and the rig."""
     result: dict[str, Alignment[FixedImagePx]] = field(default_factory=dict)
@@ -237,7 +239,9 @@ class PairAligner:
 
     def _verify(self, starts: Sequence[Start], results: Results) -> None:
         self.refined |= refined_pairs(starts, results)
-        self.result |= verify_together(starts, results, self.model, self.settings, self.progress, self.timer)
+        self.result |= verify_together(
+            starts, results, self.model, self.settings, self.progress, self.timer, with_fields=self.with_fields
+        )
 
 
 def refined_pairs(starts: Sequence[Start], results: Results) -> dict[str, RefinedPair]:
@@ -255,9 +259,12 @@ def _quiet(band: str, stage: str, share: float) -> None:
 
 def verify_together(
     starts: Sequence[Start], results: Results, model: FlightModel | None, settings: Settings,
-    progress: PairProgress = _quiet, timer: _Timer | None = None,
+    progress: PairProgress = _quiet, timer: _Timer | None = None, *, with_fields: bool = True,
 ) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
-    """Combine the results of a capture by MAP estimation and verify each one; return the alignments by name."""
+    """Combine the results of a capture by MAP estimation and verify each one; return the alignments by name.
+
+    Without `with_fields`, no displacement fields are fitted.
+    """
     timer = timer or _Timer()
     with timer.measure([pair.name for pair, _ in starts]):
         warped_pairs = [
@@ -266,14 +273,15 @@ def verify_together(
         ]
         estimates = _map_estimates(starts, results, warped_pairs, model, settings)
         progress(starts[0][0].name if starts else "", "relief", 0.0)
-        relief = aligned_by_relief(_relief_candidates(starts, estimates, warped_pairs), settings.relief.use)
+        candidates = _relief_candidates(starts, estimates, warped_pairs)
+        relief = aligned_by_relief(candidates, settings.relief.use, with_fields=with_fields)
     alignments = relief.alignments
     for (pair, seed), result, warped_pair in zip(starts, estimates, warped_pairs, strict=True):
         if pair.name in alignments:
             continue
         progress(pair.name, "checking", 0.0)
         with timer.measure([pair.name]):
-            use = "never" if pair.name in relief.along_a_line else settings.relief.use
+            use = settings.relief.use if with_fields and pair.name not in relief.along_a_line else "never"
             alignment = verified(pair, seed, result, use, warped_pair, seed_only=settings.seed.only)
             is_mixed = pair.name in relief.others and alignment.status == "aligned"
             alignments[pair.name] = predicted_by_windows(alignment, pair) if is_mixed else alignment

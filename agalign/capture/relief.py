@@ -94,8 +94,10 @@ class ReliefResult:
     """Bands with common displacements that neither a relief nor displacement fields must follow."""
 
 
-def aligned_by_relief(candidates: Sequence[ReliefCandidate], use: ReliefUse) -> ReliefResult:
-    """Align bands by one relief of the capture.
+def aligned_by_relief(
+    candidates: Sequence[ReliefCandidate], use: ReliefUse, *, with_fields: bool = True
+) -> ReliefResult:
+    """Align bands by one relief of the capture, by default with displacement fields where no rig contains them.
 
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax.
     """
@@ -109,7 +111,7 @@ def aligned_by_relief(candidates: Sequence[ReliefCandidate], use: ReliefUse) -> 
         if on_a_line and parallax_px > _MAX_LINE_PX:
             result.along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
-            aligned = _aligned_group(group)
+            aligned = _aligned_group(group, with_fields=with_fields and not group[0].pair.has_rig)
             result.alignments |= aligned
             result.others |= {c.pair.name for c in group} - aligned.keys() if aligned else set()
     return result
@@ -267,10 +269,10 @@ class _Band:
         return replace(self, baseline=(-self.baseline[0], -self.baseline[1]))
 
 
-def _aligned_group(group: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImagePx]]:
+def _aligned_group(group: Sequence[ReliefCandidate], *, with_fields: bool) -> dict[str, Alignment[FixedImagePx]]:
     """Align the bands of one group by their relief; empty if another geometry explains the capture better."""
     try:
-        estimate = _Estimate.of(group)
+        estimate = _Estimate.of(group, with_fields=with_fields)
         if estimate is None:
             return {}
         checked = [estimate.checked(band) for band in estimate.bands]
@@ -293,9 +295,10 @@ class _Estimate:
     relief: Relief
     halves: Sequence[Relief]
     """From the bands with odd and with even index: each verifies the other bands."""
+    with_fields: bool
 
     @classmethod
-    def of(cls, group: Sequence[ReliefCandidate]) -> "_Estimate | None":
+    def of(cls, group: Sequence[ReliefCandidate], *, with_fields: bool) -> "_Estimate | None":
         """Estimate the relief from bands with common parallax; None if the windows do not determine the baselines.
 
         Raises GeometryError.
@@ -303,7 +306,7 @@ class _Estimate:
         pair = group[0].pair
         bands = [_Band(c, c.warped.mapping, (0.0, 0.0)) for c in group]
         windows = WindowShifts.of(_fit_residuals(bands, [b.plane for b in bands]), [b.plane for b in bands])
-        consistent = _consistent(windows, _layouts(group), pair.fixed.size_px, with_fields=not pair.has_rig)
+        consistent = _consistent(windows, _layouts(group), pair.fixed.size_px, with_fields=with_fields)
         if consistent is None:
             return None
         kept, model = consistent
@@ -317,7 +320,7 @@ class _Estimate:
         baselines = np.array([b.baseline for b in bands])
         # The parallax of the windows is a free parameter: noise of the relief would otherwise shorten the baselines.
         total = windows.plus(matched(windows.centres_px), baselines)
-        refitted = adjust(total, pair.fixed.size_px, baselines, with_fields=not pair.has_rig)
+        refitted = adjust(total, pair.fixed.size_px, baselines, with_fields=with_fields)
         bands = bands if refitted is None else _applied(bands, refitted)
         baselines = np.array([b.baseline for b in bands])
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
@@ -326,7 +329,7 @@ class _Estimate:
         relief, *halves = matching.refined([b.view() for b in bands], [range(len(bands)), odd, even])
         if layout is None and nearer_sign(matched, baselines) < 0:
             bands, relief, halves = [b.negated for b in bands], relief.negated, [r.negated for r in halves]
-        return cls(bands, relief, halves)
+        return cls(bands, relief, halves, with_fields)
 
     def verifying(self, band: _Band) -> Relief:
         """Return the relief of other bands than this one."""
@@ -366,7 +369,7 @@ class _Estimate:
         held_out = candidate.held_out_residual(verifying)
         candidates: dict[Geometry, FixedImagePx] = {"homography": plane.p95_px, "relief": held_out.p95_px}
         joint = with_corners(candidate.joint, complete.fixed_to_moving, fit.covariance_px2)
-        if not pair.has_rig:
+        if self.with_fields:
             result = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), complete, verifying)
             if result.field is not None and result.held_out is not None:
                 complete, held_out = replace(complete, local=result.field), result.held_out

@@ -36,7 +36,7 @@ _MAX_WINDOWS = 5500
 """The spacing of the windows grows in images above 2 megapixels, which limits the time."""
 _MIN_NODE_SPACING = 0.75
 """Minimum spacing of the nodes relative to that of the windows: the windows do not determine more nodes."""
-_SMOOTHNESS = (0.2, 1.0, 5.0, 25.0)
+_SMOOTHNESS = (0.2, 1.0, 5.0, 25.0, 200.0)
 """Weights of the field's second differences relative to one window; selected by cross-validation."""
 _DAMPING = 0.003
 """Weight of the field's length, relative to one window; it matters only far from all windows."""
