@@ -131,6 +131,4 @@ def _prior(pair: BandPair, result: JointResult[FixedImagePx], rig: Rig | None) -
     """Return the prior of delta by the rig; None if it does not contain the band."""
     if rig is None or pair.name not in rig.mean or not pair.has_rig_pixels:
         return None
-    return expected_corners(rig, pair.name, pair.scales.between_files(result.fixed_to_moving)).rescaled(
-        pair.scales.fixed
-    )
+    return expected_corners(rig, pair.name, pair.scales.between_files(result.fixed_to_moving), pair.scales.fixed)

@@ -7,7 +7,7 @@ coordinates of the model in `rig`, in px. The norm of the coefficients is the RM
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from agalign.flight.rig import FACTORS, Factor
 from agalign.values import geometry
@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
 """Standard deviations of the prior of a capture's factors (5,); wide, to allow heights outside the learned range."""
+_FACTOR_PRIOR = np.zeros((1, FACTORS)), np.array(FACTOR_STD_PX)
 MIN_STD_PX = 0.05
 """Added in quadrature to the standard error of a mapping, which does not contain all errors."""
 _COLUMNS: dict[Factor, tuple[int, ...]] = {"distance": (0,), "tilt": (1, 2), "motion": (3, 4), "reference": (3, 4)}
@@ -31,52 +32,43 @@ _REWEIGHTINGS = 6
 """Iterations after which the robust weights have converged."""
 
 
-def factor_mask(factors: Sequence[Factor]) -> Array:
-    """Return (5,) 1 for the columns of the given factors, else 0."""
-    result = np.zeros(FACTORS)
-    for factor in factors:
-        result[list(_COLUMNS[factor])] = 1.0
-    return result
+def design_tensor(factors: Sequence[Factor]) -> Array:
+    """Return (3, 2, 3, 5) the coefficients (2, 3) of the bilinear model: of (t_x, t_y, d) times the factors (5,).
 
-
-def factor_design(baseline: Array, delay: float) -> Array:
-    """Return (2, 3, 5) the derivative of a band's coefficients with respect to the factors.
-
-    `baseline` (2,) and `delay` are t_b and d_b of the model in `rig`.
+    Columns of factors that are not used are 0.
     """
-    result = np.zeros((2, 3, FACTORS))
-    result[:, range(3), range(3)] = baseline[:, None]
-    result[(0, 1), 0, (3, 4)] = delay
-    return result
+    result = np.zeros((3, 2, 3, FACTORS))
+    result[0, 0, range(3), range(3)] = result[1, 1, range(3), range(3)] = 1.0
+    result[2, (0, 1), 0, (3, 4)] = 1.0
+    used = [column for factor in factors for column in _COLUMNS[factor]]
+    return result * np.isin(range(FACTORS), used)
 
 
-def solve_factors(differences: Array, designs: Array, weights: Array, mask: Array) -> tuple[Array, Array]:
-    """Estimate factors (captures, 5) and covariances (captures, 5, 5) by least squares with Cauchy weights.
+def least_squares(
+    design: Array, target: Array, weights: Array, prior: tuple[Array, Array] = _FACTOR_PRIOR, *, robust: bool = True
+) -> tuple[Array, Array]:
+    """Solve n linear problems with Gaussian priors; return the parameters (n, p) and their covariances (n, p, p).
 
-    `differences` (captures, bands, 2, 3) are coefficients of the mappings minus the means of the bands, px; `designs`
-    (bands, 2, 3, 5) are from `factor_design`, `weights` (captures, bands) from `mapping_weight`, 0 for bands without a
-    mapping, and `mask` (5,) from `factor_mask`.
+    The parameters are the factors of n captures, or the parameters of n bands. `target` (n, k, 2, 3) has the
+    coefficients of k mappings, px, and `design` (k, 2, 3, p) their derivative with respect to the parameters. `weights`
+    (n, k) are from `mapping_weight`, 0 without a mapping. `prior` is the mean (n or 1, p) and the standard deviation
+    (p,), by default of factors. `robust` reduces the weights of mappings with large residuals.
     """
-    x = (designs * mask).reshape(len(designs), 6, FACTORS)
-    y = differences.reshape(*differences.shape[:2], 6)
-    prior = np.diag(1 / np.square(FACTOR_STD_PX))
-    captures, bands = weights.shape
-    squares = (x.transpose(0, 2, 1) @ x).reshape(bands, FACTORS * FACTORS)
-    products = (y[:, :, None] @ x)[:, :, 0]
-    rows = x.reshape(bands * 6, FACTORS)
-    robust = np.ones_like(weights)
-    for _ in range(_REWEIGHTINGS):
-        w = weights * robust
-        covariance = np.linalg.inv((w @ squares).reshape(captures, FACTORS, FACTORS) + prior)
-        result = (covariance @ (w[:, None] @ products)[:, 0, :, None])[..., 0]
-        squared_px2 = ((y - (result @ rows.T).reshape(y.shape)) ** 2).sum(axis=2)
-        robust = cauchy_weights(np.sqrt(squared_px2), _OUTLIER_PX)
-    return result, covariance * np.outer(mask, mask)
+    x, y = design.reshape(len(design), 6, design.shape[-1]), target.reshape(*weights.shape, 6)
+    mean, information = prior[0], 1 / prior[1] ** 2
+    squares, products = x.swapaxes(1, 2) @ x, np.einsum("nkr,krp->nkp", y, x)
+    inlier = np.ones_like(weights)
+    for _ in range(_REWEIGHTINGS if robust else 1):
+        covariance = np.linalg.inv(np.tensordot(weights * inlier, squares, 1) + np.diag(information))
+        right_side = ((weights * inlier)[:, None] @ products)[:, 0] + mean * information
+        result = (covariance @ right_side[..., None])[..., 0]
+        inlier = cauchy_weights(np.linalg.norm(y - np.moveaxis(x @ result.T, 2, 0), axis=2), _OUTLIER_PX)
+    return np.asarray(result), np.asarray(covariance)
 
 
-def mapping_weight(std_px: float, model_error_px: float = 0.0) -> float:
+def mapping_weight(std_px: ArrayLike, model_error_px: ArrayLike = 0.0) -> Array:
     """Return the weight, 1 / px^2, of a mapping from its standard error and the error of the model."""
-    return 1 / (std_px**2 + model_error_px**2 + MIN_STD_PX**2)
+    return np.asarray(1 / (np.square(std_px) + np.square(model_error_px) + MIN_STD_PX**2))
 
 
 def lattice_points(size_px: tuple[int, int]) -> Points:
@@ -84,14 +76,10 @@ def lattice_points(size_px: tuple[int, int]) -> Points:
     return geometry.lattice(*size_px, *_LATTICE)
 
 
-def coordinates(size_px: tuple[int, int], points_px: Points | None = None) -> Array:
-    """Return g = (1, u, v), (N, 3), of points (N, 2), by default of `lattice_points`.
-
-    u and v have mean 0 and variance 1 over the lattice.
-    """
-    lattice = lattice_points(size_px)
-    points = lattice if points_px is None else points_px
-    return np.column_stack([np.ones(len(points)), (points - lattice.mean(axis=0)) / lattice.std(axis=0)])
+def coordinates(size_px: tuple[int, int]) -> Array:
+    """Return g = (1, u, v), (35, 3), of `lattice_points`; u and v have mean 0 and variance 1."""
+    points = lattice_points(size_px)
+    return np.column_stack([np.ones(len(points)), (points - points.mean(axis=0)) / points.std(axis=0)])
 
 
 def affine_difference(mean: Matrix, mapping: Matrix, size_px: tuple[int, int]) -> Array:

@@ -28,7 +28,6 @@ Factor = Literal["distance", "tilt", "motion", "reference"]
 
 FACTORS = 5
 """Number of elements of nu and w together."""
-NO_FACTORS: tuple[float, ...] = (0.0,) * FACTORS
 MIN_CAPTURES = 3
 """Fewer captures agree by chance too often."""
 
@@ -74,8 +73,6 @@ class Rig:
     """d_b by band."""
     baseline_std: Mapping[str, float]
     """Standard error of each coordinate of t_b, by band."""
-    centres: Mapping[str, tuple[float, ...]]
-    """Mean factors (5,) of the captures with a mapping of the band; at these its mean is most accurate."""
     factors: tuple[Factor, ...]
     """The factors that cross-validation selected."""
     captures: tuple[CaptureFactors, ...]

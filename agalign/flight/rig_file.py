@@ -34,7 +34,7 @@ def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
     return Rig(
         size_px=(int(width), int(height)), mean={b: np.array(m) for b, m in facts.pop("mean").items()},
         baselines={b: (x, y) for b, (x, y) in facts.pop("baselines").items()},
-        centres={b: tuple(c) for b, c in facts.pop("centres").items()}, factors=tuple(facts.pop("factors")),
+        factors=tuple(facts.pop("factors")),
         captures=tuple(_capture_factors(c) for c in facts.pop("seen")),
         fields={b: DisplacementField(steps[b], values) for b, values in fields.items()}, **facts,
     )  # fmt: skip

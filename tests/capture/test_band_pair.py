@@ -112,7 +112,7 @@ def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
 
 def test_the_error_of_a_rig_is_converted_to_px_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     band, size = "LWIR", (800, 600)
-    rig = Rig(size, {band: np.diag([0.1, 0.1, 1.0])}, {band: (1.0, 0.0)}, {}, {}, {}, (), (), {band: 0.5})
+    rig = Rig(size, {band: np.diag([0.1, 0.1, 1.0])}, {band: (1.0, 0.0)}, {}, {}, (), (), {band: 0.5})
     monkeypatch.setattr(band_pair, "unobserved_error_px", lambda *_, **__: 0.5)
     model = FlightModel(None, "", (band,), {}, "", rig)  # type: ignore[arg-type]
     assert _candidate_std_px(band, model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)

@@ -97,8 +97,8 @@ def test_a_fully_covered_image_is_unchanged() -> None:
 def test_a_rig_of_the_whole_image_prevents_extrapolation(extrapolation_px: dict[str, float], status: str) -> None:
     pair = replace(pair_in(LEFT), candidate_std_px={"model": 1.0})
     rig = Rig(
-        SIZE, {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}, {"moving": 0.1}, {"moving": (0.0,) * 5},
-        (), (), {"moving": 0.1}, extrapolation_px=extrapolation_px,
+        SIZE, {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}, {"moving": 0.1}, (), (), {"moving": 0.1},
+        extrapolation_px=extrapolation_px,
     )  # fmt: skip
     before = aligned(pair)
     assert without_extrapolated([pair], {"moving": before}, rig)["moving"].status == status

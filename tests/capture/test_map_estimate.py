@@ -8,7 +8,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.verification import WarpedPair
 from agalign.flight.learn_rig import learn_rig
-from agalign.flight.rig import NO_FACTORS, Observation, Rig
+from agalign.flight.rig import Observation, Rig
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.image import Raster
@@ -24,7 +24,7 @@ def rig(std_px: float = 0.1) -> Rig:
     bands = "red", "nir"
     return Rig(
         SIZE, dict.fromkeys(bands, MEAN), {"red": (0.6, 0.0), "nir": (0.0, 0.8)}, dict.fromkeys(bands, 0.0),
-        dict.fromkeys(bands, 0.01), dict.fromkeys(bands, NO_FACTORS), ("distance",), (),
+        dict.fromkeys(bands, 0.01), ("distance",), (),
         dict.fromkeys(bands, std_px),
     )  # fmt: skip
 

@@ -46,7 +46,7 @@ def model() -> FlightModel:
     captures = tuple(CaptureFactors(float(k), None, (0.1, 0.2), (float(k), 0.0, 0.0, 0.0, 0.0)) for k in range(3))
     rig = Rig(
         (640, 480), {"Red": geometry.translation(3, 4)}, {"Red": (1.0, 0.0)}, {"Red": 0.5}, {"Red": 0.01},
-        {"Red": (0.0,) * 5}, ("distance",), captures, {"Red": MovingFilePx(0.1)}, fields={"Red": FIELD},
+        ("distance",), captures, {"Red": MovingFilePx(0.1)}, fields={"Red": FIELD},
     )  # fmt: skip
     mappings = {"Red": geometry.translation(3, 4), "NIR": geometry.translation(-1, 2)}
     return FlightModel(net, "Maker Model 1 [Green 640x480]", ("Red", "NIR"), mappings, "abc", rig, REFINED)
@@ -66,7 +66,7 @@ def test_a_model_is_read_back_as_it_was_written(model: FlightModel, tmp_path: Pa
         np.testing.assert_array_equal(again.mappings[band], mapping)
     assert model.rig is not None
     assert again.rig is not None
-    same = ("size_px", "baselines", "delays", "baseline_std", "centres", "factors", "captures", "from_bands_px")
+    same = ("size_px", "baselines", "delays", "baseline_std", "factors", "captures", "from_bands_px")
     assert [getattr(again.rig, n) for n in same] == [getattr(model.rig, n) for n in same]
     np.testing.assert_array_equal(again.rig.fields["Red"].displacements_px, FIELD.displacements_px)
     assert again.rig.fields["Red"].step_px == 48.0

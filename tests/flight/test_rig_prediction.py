@@ -10,12 +10,10 @@ from agalign.flight.rig import CaptureFactors, Observation, Rig
 from agalign.flight.rig_prediction import (
     band_design,
     band_summaries,
+    estimated_factors,
     expected_corners,
     extreme_mappings,
-    interpolated_in_height,
-    interpolated_in_time,
     predict_band,
-    regressed_on_motion,
     unobserved_error_px,
 )
 from agalign.values import geometry
@@ -38,7 +36,7 @@ def rig(*captures: CaptureFactors, baseline_std: float = 0.0) -> Rig:
     return Rig(
         SIZE, {"Red": geometry.translation(30, -5), "NIR": geometry.translation(-12, 8)},
         {"Red": (0.6, 0.0), "NIR": (0.0, 0.8)}, {"Red": 1.0, "NIR": 0.5}, dict.fromkeys(bands, baseline_std),
-        dict.fromkeys(bands, (0.0,) * 5), ("distance",), captures, dict.fromkeys(bands, FROM_BANDS_PX),
+        ("distance",), captures, dict.fromkeys(bands, FROM_BANDS_PX),
     )  # fmt: skip
 
 
@@ -111,7 +109,7 @@ def test_without_factors_every_capture_is_the_mean() -> None:
     known = showing(rig(), "Red", 0.0)
     predicted = predict_band(still, "NIR", known)
     assert predicted.source == "flight"
-    np.testing.assert_array_equal(predicted.fixed_to_moving, still.mean["NIR"])
+    np.testing.assert_allclose(predicted.fixed_to_moving, still.mean["NIR"], atol=1e-9)
     assert predicted.std_px == pytest.approx(FROM_BANDS_PX, rel=0.05)
 
 
@@ -125,42 +123,40 @@ def test_errors_of_unobserved_captures() -> None:
     assert unobserved_error_px(line, "Red", by_neighbours=True) == pytest.approx(expected)
 
 
+def distance_at(query: CaptureFactors, known: list[CaptureFactors]) -> tuple[float, float, float]:
+    """The estimated distance, its standard error, and the gap."""
+    factors, std, gap = estimated_factors(query, known, "seconds") or pytest.fail("no estimate")
+    return factors[0], std[0], gap
+
+
 def test_factors_are_interpolated_in_time_with_the_error_of_a_brownian_bridge() -> None:
     known = [capture(4.0, seconds=30.0), capture(0.0, seconds=10.0)]
-    guess = interpolated_in_time(capture(0.0, seconds=15.0), known)
-    assert guess is not None
-    assert guess.factors[0] == pytest.approx(1.0)
-    assert guess.gap == pytest.approx(5.0)
-    assert guess.std[0] == pytest.approx(4.0 * np.sqrt(0.25 * 0.75))
-    before = interpolated_in_time(capture(0.0, seconds=0.0), known)
-    assert before is not None
-    assert (before.factors[0], before.gap, before.std[0]) == (0.0, 10.0, 0.0)
-    assert interpolated_in_time(capture(0.0), known) is None
+    assert distance_at(capture(0.0, seconds=15.0), known) == pytest.approx((1.0, 4.0 * np.sqrt(0.25 * 0.75), 5.0))
+    assert distance_at(capture(0.0, seconds=0.0), known) == (0.0, 0.0, 10.0)
+    assert estimated_factors(capture(0.0), known, "seconds") is None
 
 
 def test_the_distance_is_interpolated_in_height_and_the_rest_in_time() -> None:
     known = [
         capture(2.0 * k, seconds=float(k), altitude_m=50.0 + k, steps_px=(float(k), 0.0)) for k in range(3)
     ]  # fmt: skip
-    guess = interpolated_in_height(capture(0.0, seconds=2.0, altitude_m=50.5), known)
-    assert guess is not None
-    assert guess.factors[0] == pytest.approx(1.0)
-    assert guess.factors[3] == pytest.approx(2.0)
-    assert guess.gap == pytest.approx(0.5)
-    assert guess.std[0] == pytest.approx(2.0 * 0.5)
-    assert interpolated_in_height(capture(0.0, altitude_m=50.5), known[:2]) is None
-    assert interpolated_in_height(capture(0.0, seconds=1.0), known) is None
+    estimate = estimated_factors(capture(0.0, seconds=2.0, altitude_m=50.5), known, "altitude_m")
+    assert estimate is not None
+    factors, std, gap = estimate
+    assert (factors[0], factors[3], std[0], std[3], gap) == pytest.approx((1.0, 2.0, 2.0 * 0.5, 0.0, 0.5))
+    assert estimated_factors(capture(0.0, seconds=1.0), known, "altitude_m") is None
 
 
 def test_shifts_are_a_linear_function_of_the_motion() -> None:
     known = [capture(7.0, 0.0, motion=(x, y), steps_px=(1 + 2 * x, 3 * y)) for x, y in ((0, 0), (1, 0), (0, 1), (2, 2))]
-    guess = regressed_on_motion(capture(0.0, 0.0, motion=(3.0, 1.0)), known)
-    assert guess is not None
-    np.testing.assert_allclose(guess.factors, [7.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
-    assert guess.gap == pytest.approx(np.sqrt(2))
-    np.testing.assert_array_equal(guess.std[3:], 0.0)
-    assert regressed_on_motion(capture(0.0, motion=(1.0, 1.0)), known[:2]) is None
-    assert regressed_on_motion(capture(0.0), known) is None
+    in_time, flight = (estimated_factors(capture(0.0, 0.0, motion=(3.0, 1.0)), known, e) for e in ("seconds", "flight"))
+    assert in_time is not None
+    assert flight is not None
+    np.testing.assert_allclose(in_time[0], [7.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
+    np.testing.assert_allclose(flight[0], [0.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
+    unknown = estimated_factors(capture(0.0), known, "flight")
+    assert unknown is not None
+    assert not unknown[0].any()
 
 
 def test_an_unseen_altitude_adds_an_error() -> None:
@@ -193,7 +189,7 @@ def test_expected_corners_equal_those_of_the_rig_for_any_mapping() -> None:
     over = geometry.over_corners(points, *SIZE)
     squares = np.einsum("nki,ij,nkj->n", over, expectation.covariance, over)
     assert squares.mean() == pytest.approx(FROM_BANDS_PX**2)
-    double = expectation.rescaled((2.0, 3.0))
+    double = expected_corners(some, "Red", geometry.translation(28, -5), (2.0, 3.0))
     np.testing.assert_allclose(double.corners, [4.0, 0.0] * 4, atol=1e-9)
     np.testing.assert_allclose(double.by_factor[0::2, 0], 1.2)
     up = np.diag([2.0, 3.0] * 4)

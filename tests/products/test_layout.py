@@ -6,7 +6,7 @@ import pytest
 import rasterio
 
 from agalign.config import WriteSettings
-from agalign.flight.rig import NO_FACTORS, CaptureFactors, Rig
+from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.layout import output_layers
 from agalign.products.raster_file import write_raster
 from agalign.values import geometry
@@ -59,12 +59,12 @@ def test_where_all_bands_show_everything_no_nodata_is_declared(tmp_path: Path) -
 def rig_between(low_px: float, high_px: float) -> Rig:
     """One band that moves to the right as the ground comes nearer."""
     middle = (low_px + high_px) / 2
-    factors = [(v - middle, *NO_FACTORS[1:]) for v in (low_px, middle, high_px)]
+    factors = [(v - middle, 0.0, 0.0, 0.0, 0.0) for v in (low_px, middle, high_px)]
     seen = tuple(CaptureFactors(float(k), None, None, f) for k, f in enumerate(factors))
     bars = {"nir": 0.1}
     return Rig(
         (120, 90), {"nir": geometry.translation(middle, 0)}, {"nir": (1.0, 0.0)}, {"nir": 0.0}, bars,
-        {"nir": NO_FACTORS}, ("distance",), seen, bars,
+        ("distance",), seen, bars,
     )  # fmt: skip
 
 
