@@ -36,8 +36,6 @@ _MAX_MEDIAN_RATIO, _MIN_MEDIAN_PX = 6.0, 3.0
 """A capture is an outlier if a factor exceeds the ratio times the flight's median, or times the minimum median."""
 _CORNERS = [0, 6, 34, 28]
 """Indices of the image's corners in `lattice_points`, clockwise from the top left."""
-_STEP = 1e-3
-"""Change of the factors for derivatives, px."""
 _MAX_GAP_RATIO = 2.0
 """An estimate is validated on captures with a gap of at most this ratio to the gap of the predicted capture."""
 _OF_MOTION = np.array([0, 0, 0, 1, 1])
@@ -69,9 +67,8 @@ def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
     """
     has_others = any(b != band and b in rig.mean for b in known.mappings)
     prediction = (_from_bands if has_others else _from_captures)(rig, band, known)
-    if rig.covers(band):
-        return prediction
-    return replace(prediction, std_px=MovingFilePx(np.hypot(prediction.std_px, rig.extrapolation_px[band])))
+    std_px = MovingFilePx(np.hypot(prediction.std_px, rig.extrapolation_px.get(band, 0.0)))
+    return replace(prediction, std_px=std_px)
 
 
 def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> MovingFilePx:
@@ -93,14 +90,14 @@ def expected_corners(rig: Rig, band: str, fixed_to_moving: Matrix, scale: Sequen
     """
     points, up = lattice_points(rig.size_px), np.tile(scale, 4)
     corners, to_fixed = points[_CORNERS], geometry.invert(fixed_to_moving)
-    # (6, 4, 2) the corners in the moving image for factors of 0, and after a small change of each factor.
-    changes_px = np.einsum("nk,akf->fna", coordinates(rig.size_px)[_CORNERS], band_design(rig, band)) * _STEP
+    # (5, 4, 2) changes of the corners in the moving image by 1 px of each factor.
+    changes_px = np.einsum("nk,akf->fna", coordinates(rig.size_px)[_CORNERS], band_design(rig, band))
     moving = geometry.apply(rig.mean[band], corners) + np.concatenate([np.zeros((1, 4, 2)), changes_px])
     moved = up[:, None] * (geometry.apply(to_fixed, moving) - corners).reshape(-1, 8).T
     over = geometry.over_corners(points, *rig.size_px)
     std_px = max(rig.from_bands_px[band], MIN_STD_PX) / geometry.local_scale(fixed_to_moving, *rig.size_px)[-1]
     covariance = std_px**2 / 8 * np.linalg.inv(np.einsum("nki,nkj->ij", over, over) / len(over))
-    return Expectation(moved[:, 0], (moved[:, 1:] - moved[:, :1]) / _STEP, np.outer(up, up) * covariance)
+    return Expectation(moved[:, 0], moved[:, 1:] - moved[:, :1], np.outer(up, up) * covariance)
 
 
 def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
@@ -181,8 +178,8 @@ def estimated_factors(
 ) -> tuple[Array, Array, float] | None:
     """Return factors (5,), their standard error (5,), and the gap to the nearest capture used; None if unknown.
 
-    They are the flight's mean, or linearly interpolated in time, with the error of a Brownian bridge between the two
-    captures. With `altitude_m` the distance is interpolated over the altitude, and the other factors in time.
+    They are the flight's mean, or linearly interpolated in time, with the standard deviation of the two captures,
+    weighted by their shares. With `altitude_m` the distance is interpolated over the altitude, the others in time.
     """
     others, mean = _at_motion(others, capture.motion)
     if estimator == "flight":
@@ -192,11 +189,8 @@ def estimated_factors(
     if position is None or not known:
         return None
     x, factors = np.array([getattr(c, estimator) for c in known]), np.array([c.factors for c in known])
-    after = int(np.searchsorted(x, position))
-    one, other = max(after - 1, 0), min(after, len(x) - 1)
-    share = float(np.clip((position - x[one]) / max(x[other] - x[one], 1e-9), 0, 1))
-    result = (1 - share) * factors[one] + share * factors[other]
-    std = np.abs(factors[other] - factors[one]) * np.sqrt(share * (1 - share))
+    result, squares = np.array([np.interp(position, x, y) for y in (*factors.T, *factors.T**2)]).reshape(2, FACTORS)
+    std = np.sqrt(np.maximum(squares - result**2, 0.0))
     if estimator == "altitude_m" and (in_time := estimated_factors(capture, others, "seconds")):
         result[1:], std[1:] = in_time[0][1:], in_time[1][1:]
     return result, std, float(np.abs(x - position).min())
@@ -257,10 +251,9 @@ def _leave_one_out(rig: Rig, band: str, estimator: Estimator) -> list[tuple[floa
 
 
 def _altitude_error_px(rig: Rig, altitude_m: float | None) -> float:
-    """Return the error of the distance factor at an altitude that differs from those of the learned captures.
+    """Return the error of the distance factor by the difference from the nearest altitude of a learned captures.
 
-    It is proportional to the difference from the nearest altitude: the slope of the factor over the altitude and the
-    standard error of the slope, by linear regression over the learned captures with a prior.
+    It is proportional to the slope of the factor, by linear regression with a prior, and the slope's standard error.
     """
     known = np.array([(c.altitude_m, c.factors[0]) for c in rig.captures if c.altitude_m is not None])
     if altitude_m is None or len(known) < MIN_CAPTURES:
