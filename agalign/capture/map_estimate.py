@@ -21,21 +21,40 @@ from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.corner_fit import corner_correction, with_corners
-from agalign.flight.factors import FACTOR_STD_PX
+from agalign.flight.factors import FACTOR_STD_PX, MIN_STD_PX, coordinates, lattice_points
 from agalign.flight.rig import Rig
-from agalign.flight.rig_prediction import Expectation, expected_corners
+from agalign.flight.rig_prediction import band_design
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
+from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedImagePx
 
 Array = NDArray[np.float64]
 
+_CORNERS = [0, 6, 34, 28]
+"""Indices of the image's corners in `lattice_points`, clockwise from the top left."""
 _MAX_CORRECTION_PX = 1.0
 """Maximum displacement of a corner by windows; larger ones contradict the mapping and are ignored."""
 _REWEIGHTINGS = 6
 """Iterations after which the weights have converged."""
 _DEGREES_OF_FREEDOM = 4.0
 """Of the t distribution of a band's distance from the rig; heavy tails, as a lens may have moved."""
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """Prior distribution of the displacements of the reference's corners between a mapping of a band and the rig's.
+
+    The mean is corners + by_factor @ f for the factors f (5,) of a capture. Displacements are (x, y) of the corners in
+    turn, clockwise from the top left, px of the reference.
+    """
+
+    corners: Array
+    """(8,) displacements for factors of 0."""
+    by_factor: Array
+    """(8, 5) derivative with respect to the factors."""
+    covariance: Array
+    """(8, 8) for known factors, px squared."""
 
 
 @dataclass(frozen=True)
@@ -132,3 +151,21 @@ def _prior(pair: BandPair, result: JointResult[FixedImagePx], rig: Rig | None) -
     if rig is None or pair.name not in rig.mean or not pair.has_rig_pixels:
         return None
     return expected_corners(rig, pair.name, pair.scales.between_files(result.fixed_to_moving), pair.scales.fixed)
+
+
+def expected_corners(rig: Rig, band: str, fixed_to_moving: Matrix, scale: Sequence[float] = (1, 1)) -> Expectation:
+    """Return the prior of the corner displacements of a band relative to `fixed_to_moving`, for unknown factors.
+
+    They are in px of an image that is larger than the reference's file by `scale` (x, y). The covariance distributes
+    the cross-validated error over all homographies: those with equal mean square are equally likely.
+    """
+    points, up = lattice_points(rig.size_px), np.tile(scale, 4)
+    corners, to_fixed = points[_CORNERS], geometry.invert(fixed_to_moving)
+    # (5, 4, 2) changes of the corners in the moving image by 1 px of each factor.
+    changes_px = np.einsum("nk,akf->fna", coordinates(rig.size_px)[_CORNERS], band_design(rig, band))
+    moving = geometry.apply(rig.mean[band], corners) + np.concatenate([np.zeros((1, 4, 2)), changes_px])
+    moved = up[:, None] * (geometry.apply(to_fixed, moving) - corners).reshape(-1, 8).T
+    over = geometry.over_corners(points, *rig.size_px)
+    std_px = max(rig.from_bands_px[band], MIN_STD_PX) / geometry.local_scale(fixed_to_moving, *rig.size_px)[-1]
+    covariance = std_px**2 / 8 * np.linalg.inv(np.einsum("nki,nkj->ij", over, over) / len(over))
+    return Expectation(moved[:, 0], moved[:, 1:] - moved[:, :1], np.outer(up, up) * covariance)

@@ -1,4 +1,4 @@
-"""Mappings as linear functions of a capture's factors, and the estimation of the factors by robust least squares.
+"""Mappings as bilinear functions of a band's lens and a capture's factors, and their robust least squares.
 
 The difference between two mappings of a band is expressed as (2, 3) coefficients of g = (1, u, v), the normalised
 coordinates of the model in `rig`, in px. The norm of the coefficients is the RMS distance over the image.
@@ -33,15 +33,11 @@ _REWEIGHTINGS = 6
 
 
 def design_tensor(factors: Sequence[Factor]) -> Array:
-    """Return (3, 2, 3, 5) the coefficients (2, 3) of the bilinear model: of (t_x, t_y, d) times the factors (5,).
-
-    Columns of factors that are not used are 0.
-    """
+    """Return (3, 2, 3, 5) the bilinear model: coefficients (2, 3) of (t_x, t_y, d) times factors (5,), if used else 0."""
     result = np.zeros((3, 2, 3, FACTORS))
     result[0, 0, range(3), range(3)] = result[1, 1, range(3), range(3)] = 1.0
     result[2, (0, 1), 0, (3, 4)] = 1.0
-    used = [column for factor in factors for column in _COLUMNS[factor]]
-    return result * np.isin(range(FACTORS), used)
+    return result * np.isin(range(FACTORS), [column for factor in factors for column in _COLUMNS[factor]])
 
 
 def least_squares(

@@ -28,8 +28,6 @@ _FACTOR_SETS: tuple[tuple[Factor, ...], ...] = (
     ("motion",), ("distance", "motion"), ("distance", "tilt", "motion"),
 )  # fmt: skip
 """Candidates in the order of preference: on parallel flight lines, motion alone resembles distance with motion."""
-_DELAYS: set[Factor] = {"motion", "reference"}
-"""Factors that shift each band in proportion to its delay."""
 _LAYOUT_STD = 0.015
 """Standard error of the lens positions of a camera model, relative to the norm of all baselines."""
 _UNKNOWN_STD = 1000.0
@@ -64,17 +62,14 @@ def learn_rig(
     for candidate, candidate_px in others:
         if np.linalg.norm(candidate_px) < _MAX_ERROR_RATIO * np.linalg.norm(errors_px):
             factors, errors_px = candidate, candidate_px
-    fitted, t_std, by_capture = table.fit(np.ones(len(captures)), factors or ("distance",))
-    means = zip(bands, table.median, fitted[:, :6].reshape(-1, 2, 3), strict=True)
-    by_band = dict(zip(bands, fitted[:, 6:].tolist(), strict=True))
+    fitted, t_std, nu_w = table.fit(np.ones(len(captures)), factors or ("distance",))
+    offsets, lenses = fitted[:, :6].reshape(-1, 2, 3), dict(zip(bands, fitted[:, 6:].tolist(), strict=True))
+    by_capture = zip(captures, nu_w.tolist(), strict=True)
     return Rig(
-        size_px, {b: displaced(median, offset, size_px) for b, median, offset in means},
-        {b: (x, y) for b, (x, y, _) in by_band.items()}, {b: delay for b, (_, _, delay) in by_band.items()},
+        size_px, {b: displaced(m, o, size_px) for b, m, o in zip(bands, table.median, offsets, strict=True)},
+        {b: (x, y) for b, (x, y, _) in lenses.items()}, {b: delay for b, (_, _, delay) in lenses.items()},
         dict(zip(bands, t_std.tolist(), strict=True)), factors,
-        tuple(
-            CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f))
-            for c, f in zip(captures, by_capture.tolist(), strict=True)
-        ),
+        tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in by_capture),
         dict(zip(bands, errors_px.tolist(), strict=True)),
     )  # fmt: skip
 
@@ -135,7 +130,6 @@ class _Table:
             previous, bands = bands, np.hstack([estimate[:, :6], _normalised(estimate[:, 6:], factors)])
             if np.abs(bands - previous).max() < _CONVERGED:
                 break
-        # Captures far from the median factors determine the baselines.
         information = weights.T @ (result[:, :3] ** 2).sum(axis=1) + 1 / t_std**2
         return bands, np.minimum(1 / np.sqrt(information), 1.0), result
 
@@ -187,7 +181,8 @@ def _normalised(lens: Array, factors: Sequence[Factor]) -> Array:
     their delays could be distance or motion.
     """
     t, delay = lens[:, :2], _unit(np.ones(len(lens)) if "reference" in factors else lens[:, 2])
-    return np.column_stack([_unit(t if _DELAYS.isdisjoint(factors) else t - np.outer(delay, delay @ t)), delay])
+    has_delays = "motion" in factors or "reference" in factors
+    return np.column_stack([_unit(t - np.outer(delay, delay @ t) if has_delays else t), delay])
 
 
 def _unit(vectors: Array) -> Array:

@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter, itemgetter
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from agalign.flight.factors import (
     MIN_STD_PX,
     affine_difference,
-    coordinates,
     design_tensor,
     displaced,
-    lattice_points,
     least_squares,
     mapping_weight,
 )
@@ -26,6 +24,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import MovingFilePx
 
 Array = NDArray[np.float64]
+Captures = Sequence[CaptureFactors]
 Estimator = Literal["flight", "seconds", "altitude_m"]
 
 _ALTITUDE_SLOPE_STD_PX_PER_M = 1.5
@@ -34,70 +33,28 @@ _MIN_ALTITUDE_SCATTER_PX = 0.5
 """Minimum scatter of the distance factor around its linear regression on the altitude."""
 _MAX_MEDIAN_RATIO, _MIN_MEDIAN_PX = 6.0, 3.0
 """A capture is an outlier if a factor exceeds the ratio times the flight's median, or times the minimum median."""
-_CORNERS = [0, 6, 34, 28]
-"""Indices of the image's corners in `lattice_points`, clockwise from the top left."""
 _MAX_GAP_RATIO = 2.0
 """An estimate is validated on captures with a gap of at most this ratio to the gap of the predicted capture."""
 _OF_MOTION = np.array([0, 0, 0, 1, 1])
 """1 for the factors that depend on the image motion."""
-_MIN_CAPTURES_TO_SELECT = 6
+_MIN_CAPTURES_FOR_ALTITUDE = 6
 """With fewer captures, the estimator with the smallest error would be selected by chance."""
 
 
-@dataclass(frozen=True)
-class Expectation:
-    """Prior distribution of the displacements of the reference's corners between a mapping of a band and the rig's.
-
-    The mean is corners + by_factor @ f for the factors f (5,) of a capture. Displacements are (x, y) of the corners in
-    turn, clockwise from the top left, px of the reference.
-    """
-
-    corners: Array
-    """(8,) displacements for factors of 0."""
-    by_factor: Array
-    """(8, 5) derivative with respect to the factors."""
-    covariance: Array
-    """(8, 8) for known factors, px squared."""
-
-
 def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
-    """Predict the mapping of a band from the known mappings of the other bands, or without any from other captures.
-
-    Raises KeyError for a band that the rig does not contain.
-    """
+    """Predict the mapping of a band of the rig from the other bands of the capture, or if none is known from others."""
     has_others = any(b != band and b in rig.mean for b in known.mappings)
     prediction = (_from_bands if has_others else _from_captures)(rig, band, known)
-    std_px = MovingFilePx(np.hypot(prediction.std_px, rig.extrapolation_px.get(band, 0.0)))
-    return replace(prediction, std_px=std_px)
+    return replace(prediction, std_px=MovingFilePx(np.hypot(prediction.std_px, rig.extrapolation_px.get(band, 0.0))))
 
 
 def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> MovingFilePx:
     """Return the RMS error of a band in captures without any known band.
 
-    They are predicted from the captures before and after (`by_neighbours`) or from the flight's mean. Raises KeyError
-    for a band that the rig does not contain.
+    They are predicted from the captures before and after (`by_neighbours`) or from the flight's mean.
     """
     squares = [square for _, square in _leave_one_out(rig, band, "seconds" if by_neighbours else "flight")]
     return MovingFilePx(np.sqrt(np.mean(squares or [0.0]) + rig.from_bands_px[band] ** 2))
-
-
-def expected_corners(rig: Rig, band: str, fixed_to_moving: Matrix, scale: Sequence[float] = (1, 1)) -> Expectation:
-    """Return the prior of the corner displacements of a band relative to `fixed_to_moving`, for unknown factors.
-
-    They are in px of an image that is larger than the reference's file by `scale` (x, y). The covariance distributes
-    the cross-validated error over all homographies: those with equal mean square are equally likely. Raises KeyError
-    for a band that the rig does not contain.
-    """
-    points, up = lattice_points(rig.size_px), np.tile(scale, 4)
-    corners, to_fixed = points[_CORNERS], geometry.invert(fixed_to_moving)
-    # (5, 4, 2) changes of the corners in the moving image by 1 px of each factor.
-    changes_px = np.einsum("nk,akf->fna", coordinates(rig.size_px)[_CORNERS], band_design(rig, band))
-    moving = geometry.apply(rig.mean[band], corners) + np.concatenate([np.zeros((1, 4, 2)), changes_px])
-    moved = up[:, None] * (geometry.apply(to_fixed, moving) - corners).reshape(-1, 8).T
-    over = geometry.over_corners(points, *rig.size_px)
-    std_px = max(rig.from_bands_px[band], MIN_STD_PX) / geometry.local_scale(fixed_to_moving, *rig.size_px)[-1]
-    covariance = std_px**2 / 8 * np.linalg.inv(np.einsum("nki,nkj->ij", over, over) / len(over))
-    return Expectation(moved[:, 0], moved[:, 1:] - moved[:, :1], np.outer(up, up) * covariance)
 
 
 def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
@@ -137,9 +94,6 @@ def band_summaries(rig: Rig) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-# ---- from the other bands of the capture
-
-
 def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     """Predict a band from the mappings of the other bands of the capture.
 
@@ -149,13 +103,11 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     variance, which is large for a capture that the rig does not describe.
     """
     others = [b for b in rig.mean if b != band]
-    mappings = [known.mappings.get(b, rig.mean[b]) for b in others]
+    mean_and_mapping = [(rig.mean[b], known.mappings.get(b, rig.mean[b])) for b in others]
     std_px = [known.std_px[b] if b in known.mappings else math.inf for b in others]
     design, designs = band_design(rig, band), np.stack([band_design(rig, b) for b in others])
     expected_px = np.array([rig.from_bands_px[b] for b in others])
-    differences = np.stack(
-        [affine_difference(rig.mean[b], m, rig.size_px) for b, m in zip(others, mappings, strict=True)]
-    )
+    differences = np.stack([affine_difference(*pair, rig.size_px) for pair in mean_and_mapping])
     weights = mapping_weight(np.stack([std_px, np.full(len(others), MIN_STD_PX)]), expected_px)
     solutions, (covariance, complete) = least_squares(designs, np.stack([differences, 0 * differences]), weights)
     excess_px2 = ((differences - designs @ solutions[0]) ** 2).sum(axis=(1, 2)) - expected_px**2
@@ -170,21 +122,18 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     return Prediction(mapping, "bands" if rig.factors else "flight", MovingFilePx(error_px))
 
 
-# ---- from other captures
-
-
 def estimated_factors(
-    capture: CaptureFactors | Observation, others: Sequence[CaptureFactors], estimator: Estimator
+    capture: CaptureFactors | Observation, others: Captures, estimator: Estimator
 ) -> tuple[Array, Array, float] | None:
     """Return factors (5,), their standard error (5,), and the gap to the nearest capture used; None if unknown.
 
     They are the flight's mean, or linearly interpolated in time, with the standard deviation of the two captures,
     weighted by their shares. With `altitude_m` the distance is interpolated over the altitude, the others in time.
     """
-    others, mean = _at_motion(others, capture.motion)
+    moved, mean = _at_motion(others, capture.motion)
     if estimator == "flight":
         return mean, np.zeros(FACTORS), 0.0
-    known = sorted((c for c in others if getattr(c, estimator) is not None), key=attrgetter(estimator))
+    known = sorted((c for c in moved if getattr(c, estimator) is not None), key=attrgetter(estimator))
     position = getattr(capture, estimator)
     if position is None or not known:
         return None
@@ -196,9 +145,7 @@ def estimated_factors(
     return result, std, float(np.abs(x - position).min())
 
 
-def _at_motion(
-    captures: Sequence[CaptureFactors], motion: tuple[float, float] | None
-) -> tuple[Sequence[CaptureFactors], Array]:
+def _at_motion(captures: Captures, motion: tuple[float, float] | None) -> tuple[Captures, Array]:
     """Return captures with the factors that they would have at an image motion, and the flight's mean (5,).
 
     w is a linear function of the motion. If motions are unknown, the captures are unchanged.
@@ -222,8 +169,7 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
     the captures used if that is larger.
     """
     design, results = band_design(rig, band), []
-    estimators: tuple[Estimator, ...] = ("flight", "seconds", "altitude_m")
-    for estimator in estimators if len(rig.captures) >= _MIN_CAPTURES_TO_SELECT else estimators[:2]:
+    for estimator in get_args(Estimator)[: 3 if len(rig.captures) >= _MIN_CAPTURES_FOR_ALTITUDE else 2]:
         estimate, tests = estimated_factors(known, rig.captures, estimator), _leave_one_out(rig, band, estimator)
         if estimate is not None and tests:
             factors, std, gap = estimate
@@ -235,9 +181,8 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
     variance_px2, factors = min(results, key=itemgetter(0), default=(0.0, np.zeros(FACTORS)))
     altitude_px = _altitude_error_px(rig, known.altitude_m) * float(np.linalg.norm(rig.baselines[band]))
     error_px = MovingFilePx(np.sqrt(variance_px2 + rig.from_bands_px[band] ** 2 + altitude_px**2))
-    coefficients = design @ factors
-    mapping = displaced(rig.mean[band], coefficients, rig.size_px)
-    return Prediction(mapping, "neighbours" if coefficients.any() else "flight", error_px)
+    mapping = displaced(rig.mean[band], design @ factors, rig.size_px)
+    return Prediction(mapping, "neighbours" if (design @ factors).any() else "flight", error_px)
 
 
 def _leave_one_out(rig: Rig, band: str, estimator: Estimator) -> list[tuple[float, float]]:
@@ -251,7 +196,7 @@ def _leave_one_out(rig: Rig, band: str, estimator: Estimator) -> list[tuple[floa
 
 
 def _altitude_error_px(rig: Rig, altitude_m: float | None) -> float:
-    """Return the error of the distance factor by the difference from the nearest altitude of a learned captures.
+    """Return the error of the distance factor by the difference from the nearest altitude of the learned captures.
 
     It is proportional to the slope of the factor, by linear regression with a prior, and the slope's standard error.
     """

@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.map_estimate import map_estimate
+from agalign.capture.map_estimate import expected_corners, map_estimate
 from agalign.capture.verification import WarpedPair
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig
@@ -24,8 +25,7 @@ def rig(std_px: float = 0.1) -> Rig:
     bands = "red", "nir"
     return Rig(
         SIZE, dict.fromkeys(bands, MEAN), {"red": (0.6, 0.0), "nir": (0.0, 0.8)}, dict.fromkeys(bands, 0.0),
-        dict.fromkeys(bands, 0.01), ("distance",), (),
-        dict.fromkeys(bands, std_px),
+        dict.fromkeys(bands, 0.01), ("distance",), (), dict.fromkeys(bands, std_px),
     )  # fmt: skip
 
 
@@ -138,3 +138,26 @@ def test_a_band_in_few_captures_does_not_affect_the_others() -> None:
         assert np.isfinite(band.fixed_to_moving).all()
         assert np.isfinite(band.corner_std_xy_px).all()
         assert band.corner_std_px < 0.05
+
+
+def test_expected_corners_equal_those_of_the_rig_for_any_mapping() -> None:
+    near = geometry.translation(28.0, -12.0)
+    expectation = expected_corners(rig(), "red", near)
+    np.testing.assert_allclose(expectation.corners, [2.0, 0.0] * 4, atol=1e-9)
+    np.testing.assert_allclose(expectation.by_factor[:, 0], [0.6, 0.0] * 4, atol=1e-9)
+    assert not expectation.by_factor[:, 3:].any()
+    over = geometry.over_corners(geometry.lattice(*SIZE, 7, 5), *SIZE)
+    squares = np.einsum("nki,ij,nkj->n", over, expectation.covariance, over)
+    assert squares.mean() == pytest.approx(0.1**2)
+    double = expected_corners(rig(), "red", near, (2.0, 3.0))
+    np.testing.assert_allclose(double.corners, [4.0, 0.0] * 4, atol=1e-9)
+    np.testing.assert_allclose(double.by_factor[0::2, 0], 1.2)
+    up = np.diag([2.0, 3.0] * 4)
+    np.testing.assert_allclose(double.covariance, up @ expectation.covariance @ up)
+
+
+def test_expectations_of_a_coarse_band_are_in_px_of_the_reference() -> None:
+    coarse = replace(rig(), mean={"nir": geometry.compose(np.diag([0.1, 0.1, 1.0]), MEAN)})
+    one, other = (expected_corners(r, "nir", r.mean["nir"]) for r in (rig(), coarse))
+    np.testing.assert_allclose(other.covariance, 100 * one.covariance, rtol=1e-6)
+    np.testing.assert_allclose(other.by_factor, 10 * one.by_factor, rtol=1e-3, atol=1e-9)

@@ -9,7 +9,7 @@ from agalign.flight.factors import distance_px, median_mapping
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig
 from agalign.flight.rig_file import rig_from_json, rig_to_json
-from agalign.flight.rig_prediction import expected_corners, extreme_mappings, predict_band, unobserved_error_px
+from agalign.flight.rig_prediction import extreme_mappings, predict_band, unobserved_error_px
 from agalign.products.sidecar import PredictionPart
 from agalign.values import geometry
 from agalign.values.alignment import DisplacementField
@@ -258,15 +258,6 @@ def test_interpolation_between_different_captures_has_an_error() -> None:
     error, std = error_px(rig, "NIR", replace(unobserved, altitude_m=None), mappings(0.1)["NIR"])
     assert std > 10
     assert error < 3 * std
-
-
-def test_expectations_of_a_coarse_band_are_in_px_of_the_reference() -> None:
-    rig = usual_rig()
-    mean = rig.mean["NIR"]
-    coarse = replace(rig, mean={**rig.mean, "NIR": geometry.compose(np.diag([0.1, 0.1, 1.0]), mean)})
-    one, other = (expected_corners(r, "NIR", r.mean["NIR"]) for r in (rig, coarse))
-    np.testing.assert_allclose(other.covariance, 100 * one.covariance, rtol=1e-6)
-    np.testing.assert_allclose(other.by_factor, 10 * one.by_factor, rtol=1e-3, atol=1e-9)
 
 
 def test_a_capture_without_a_time_is_not_between_captures_in_time() -> None:

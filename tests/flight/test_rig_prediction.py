@@ -11,7 +11,6 @@ from agalign.flight.rig_prediction import (
     band_design,
     band_summaries,
     estimated_factors,
-    expected_corners,
     extreme_mappings,
     predict_band,
     unobserved_error_px,
@@ -177,23 +176,6 @@ def test_with_few_captures_only_two_estimators_are_used() -> None:
     six = predict_band(rig(*captures), "NIR", known).std_px
     five = predict_band(rig(*captures[:5]), "NIR", known).std_px
     assert six < 0.5 * five
-
-
-def test_expected_corners_equal_those_of_the_rig_for_any_mapping() -> None:
-    some = rig(capture(1.0), capture(-1.0), capture(0.0))
-    expectation = expected_corners(some, "Red", geometry.translation(28, -5))
-    np.testing.assert_allclose(expectation.corners, [2.0, 0.0] * 4, atol=1e-9)
-    np.testing.assert_allclose(expectation.by_factor[:, 0], [0.6, 0.0] * 4, atol=1e-9)
-    assert not expectation.by_factor[:, 3:].any()
-    points = geometry.lattice(*SIZE, 7, 5)
-    over = geometry.over_corners(points, *SIZE)
-    squares = np.einsum("nki,ij,nkj->n", over, expectation.covariance, over)
-    assert squares.mean() == pytest.approx(FROM_BANDS_PX**2)
-    double = expected_corners(some, "Red", geometry.translation(28, -5), (2.0, 3.0))
-    np.testing.assert_allclose(double.corners, [4.0, 0.0] * 4, atol=1e-9)
-    np.testing.assert_allclose(double.by_factor[0::2, 0], 1.2)
-    up = np.diag([2.0, 3.0] * 4)
-    np.testing.assert_allclose(double.covariance, up @ expectation.covariance @ up)
 
 
 def test_the_extremes_exclude_outliers() -> None:
