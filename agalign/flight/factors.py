@@ -33,7 +33,7 @@ _REWEIGHTINGS = 6
 
 
 def design_tensor(factors: Sequence[Factor]) -> Array:
-    """Return (3, 2, 3, 5) the bilinear model: coefficients (2, 3) of (t_x, t_y, d) times factors (5,), if used else 0."""
+    """Return (3, 2, 3, 5) the bilinear model: coefficients of (t_x, t_y, d) times the factors (5,), 0 if not used."""
     result = np.zeros((3, 2, 3, FACTORS))
     result[0, 0, range(3), range(3)] = result[1, 1, range(3), range(3)] = 1.0
     result[2, (0, 1), 0, (3, 4)] = 1.0
