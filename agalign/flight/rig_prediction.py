@@ -138,8 +138,9 @@ def estimated_factors(
     if position is None or not known:
         return None
     x, factors = np.array([getattr(c, estimator) for c in known]), np.array([c.factors for c in known])
-    result, squares = np.array([np.interp(position, x, y) for y in (*factors.T, *factors.T**2)]).reshape(2, FACTORS)
-    std = np.sqrt(np.maximum(squares - result**2, 0.0))
+    place = float(np.interp(position, x, np.arange(len(x))))
+    start, end, share = factors[int(place)], factors[min(int(place) + 1, len(x) - 1)], place % 1
+    result, std = start + share * (end - start), np.abs(end - start) * np.sqrt(share * (1 - share))
     if estimator == "altitude_m" and (in_time := estimated_factors(capture, others, "seconds")):
         result[1:], std[1:] = in_time[0][1:], in_time[1][1:]
     return result, std, float(np.abs(x - position).min())
