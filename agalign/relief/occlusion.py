@@ -44,19 +44,18 @@ def occluded(relief: Relief, baseline: tuple[float, float]) -> Mask:
     """
     longest = math.hypot(baseline[0] * relief.scale.x, baseline[1] * relief.scale.y)
     min_step_px = _MIN_WIDTH_PX / max(longest, 1e-9)
-    parallax_px = relief.parallax_px
+    parallax_px = relief.parallax_px - relief.parallax_px.min()
     height, width = parallax_px.shape
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    moved_x = np.rint(x + np.float32(baseline[0] * relief.scale.x) * parallax_px).astype(np.int32)
-    moved_y = np.rint(y + np.float32(baseline[1] * relief.scale.y) * parallax_px).astype(np.int32)
+    x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    moved_x = np.rint(x + np.float32(baseline[0] * relief.scale.x) * relief.parallax_px).astype(np.int32)
+    moved_y = np.rint(y + np.float32(baseline[1] * relief.scale.y) * relief.parallax_px).astype(np.int32)
     inside = (moved_x >= 0) & (moved_x < width) & (moved_y >= 0) & (moved_y < height)
-    cell = np.where(inside, moved_y * width + moved_x, height * width).ravel()
-    # In ascending order the nearest pixel is written last. Pixels outside share the last cell, which is ignored.
-    order = np.argsort(parallax_px, axis=None, kind="stable")
-    nearest = np.full(height * width + 1, -np.inf, np.float32)
-    nearest[cell[order]] = parallax_px.ravel()[order]
-    nearest[-1] = -np.inf
-    hidden = nearest[cell].reshape(height, width) > parallax_px + np.float32(min_step_px)
+    cell = np.where(inside, moved_y * np.int32(width) + moved_x, np.int32(height * width))
+    nearest = np.zeros(height * width + 1, np.float32)
+    # The bits of floats that are not negative have their order, and `maximum.at` is much faster for integers.
+    np.maximum.at(nearest.view(np.int32), cell.ravel(), parallax_px.ravel().view(np.int32))
+    nearest[-1] = 0  # Pixels outside share the last cell, which is ignored.
+    hidden = nearest.take(cell) > parallax_px + np.float32(min_step_px)
     # Closing fills the gaps between the pixels of a magnified nearer surface.
     closed = cv2.morphologyEx(hidden.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)

@@ -1,5 +1,6 @@
 """Occlusions, compared with the exact geometry."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -90,6 +91,36 @@ def test_a_reduced_relief() -> None:
     full = Relief(half.parallax_px * 2, half.confidence, PixelScale(0.5, 0.5))
     np.testing.assert_array_equal(occluded(full, (1.0, 0.0)), shadow(BOX, NEAR_PX, 0))
     assert half.scale == SAME_PIXELS
+
+
+def by_definition(relief: Relief, baseline: tuple[float, float], min_step_px: float) -> Mask:
+    """The z-buffer, pixel by pixel, before the closing and the removal of small areas."""
+    z = relief.parallax_px.astype(float)
+    at = {}
+    for (y, x), value in np.ndenumerate(z):
+        at[y, x] = round(y + baseline[1] * value), round(x + baseline[0] * value)
+    nearest: dict[tuple[int, int], float] = {}
+    for pixel, cell in at.items():
+        nearest[cell] = max(nearest.get(cell, -np.inf), z[pixel])
+    hidden = [
+        0 <= cell[0] < HEIGHT and 0 <= cell[1] < WIDTH and nearest[cell] > z[pixel] + min_step_px
+        for pixel, cell in at.items()
+    ]
+    return np.array(hidden).reshape(z.shape)
+
+
+@pytest.mark.parametrize("baseline", [(0.83, -0.57), (-0.41, 0.29), (0.0, 1.0)])
+def test_the_z_buffer_of_a_rough_relief(baseline: tuple[float, float]) -> None:
+    rng = np.random.default_rng(1)
+    z = cv2.resize(rng.uniform(-12, 9, (6, 9)).astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
+    z += rng.normal(0, 0.3, z.shape).astype(np.float32)
+    relief = Relief(z, np.ones_like(z))
+    hidden = by_definition(relief, baseline, 1.5 / np.hypot(*baseline))
+    closed = cv2.morphologyEx(hidden.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    expected = (labels > 0) & (statistics[labels, cv2.CC_STAT_AREA] >= 16)
+    assert expected.mean() > 0.05
+    np.testing.assert_array_equal(occluded(relief, baseline), expected)
 
 
 def matched(sign: int, baselines: np.ndarray, shown: float = 0.9, behind: float = 0.2) -> Relief:
