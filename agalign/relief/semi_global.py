@@ -8,54 +8,64 @@ with q the previous pixel on the path. Each pixel gets the label with the minimu
 StereoSGBM cannot be used: it computes the costs from two rectified images and accepts no cost volume.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.values.image import FloatImage
 
-Volume = NDArray[np.int16]
-"""(labels, height, width). Sums over four paths are below 2^15 if a cost plus the large penalty is below 2^13."""
+Volume = NDArray[np.uint8]
+"""(labels, height, width) costs; a cost plus both penalties is at most 255."""
+MAX_LARGE = 63
+"""Maximum large penalty. A path adds at most this much to the cost, so the sum over four paths is at most 252."""
 
 
-def aggregated(costs: Volume, small: int, large: int) -> Volume:
+def aggregated(costs: Volume, small: int, large: int) -> NDArray[np.uint16]:
     """Return the sum of the path costs from the left, right, top and bottom, (labels, height, width).
 
     `small` is the penalty of a step by one label, `large` that of a longer step.
     """
-    total = np.zeros_like(costs)
-    for axes, inverse_axes in (((2, 0, 1), (1, 2, 0)), ((1, 0, 2), (1, 0, 2))):
-        ordered = np.ascontiguousarray(costs.transpose(axes))
-        sums = np.zeros_like(ordered)
-        _add_path(ordered, sums, np.int16(small), np.int16(large))
-        _add_path(ordered[::-1], sums[::-1], np.int16(small), np.int16(large))
-        total += sums.transpose(inverse_axes)
-    return total
+    vertical = _path_penalties(costs, np.uint8(small), np.uint8(large))
+    horizontal = _path_penalties(np.stack([cv2.transpose(plane) for plane in costs]), np.uint8(small), np.uint8(large))
+    result = np.multiply(costs, 4, dtype=np.uint16)
+    for plane, down, across in zip(result, vertical, horizontal, strict=True):
+        plane += cv2.add(down, cv2.transpose(across))
+    return result
 
 
-def _add_path(costs: Volume, sums: Volume, small: np.int16, large: np.int16) -> None:
-    """Add the path costs along the first axis of `costs` (length, labels, lines) to `sums`."""
-    previous = costs[0].copy()
-    sums[0] += previous
-    for i in range(1, len(costs)):
-        minimum = previous.min(axis=0)
-        current = np.minimum(previous, minimum + large)
-        previous += small
-        np.minimum(current[1:], previous[:-1], out=current[1:])
-        np.minimum(current[:-1], previous[1:], out=current[:-1])
-        current -= minimum
-        current += costs[i]
-        sums[i] += current
-        previous = current
+def _path_penalties(costs: Volume, small: np.uint8, large: np.uint8) -> Volume:
+    """Return L - C (labels, length, lines) of the two paths along the second axis of the costs, added."""
+    result = np.zeros_like(costs)
+    length = costs.shape[1]
+    for path in (range(length), range(length - 1, -1, -1)):
+        previous = costs[:, path[0]].copy()
+        current = np.empty_like(previous)
+        for i in path[1:]:
+            minimum = previous.min(axis=0)
+            np.minimum(previous, minimum + large, out=current)
+            previous += small
+            np.minimum(current[1:], previous[:-1], out=current[1:])
+            np.minimum(current[:-1], previous[1:], out=current[:-1])
+            current -= minimum
+            result[:, i] += current
+            current += costs[:, i]
+            previous, current = current, previous
+    return result
 
 
-def sub_label_minimum(costs: NDArray[np.int16] | NDArray[np.float32]) -> FloatImage:
-    """Return the label of minimum cost, (height, width), refined by the parabola through its neighbours."""
+def sub_label_minimum(costs: NDArray[np.uint16] | NDArray[np.float32]) -> FloatImage:
+    """Return the label of minimum cost, (height, width), refined by the parabola through its neighbours.
+
+    There are at least three labels.
+    """
     last = len(costs) - 1
-    label = costs.argmin(axis=0)
+    minimum = costs.min(axis=0)
+    label = np.zeros(minimum.shape, np.uint16)
+    for k in range(last, -1, -1):  # `argmin` along the first axis is several times slower.
+        np.copyto(label, k, where=costs[k] == minimum)
     inner = np.clip(label, 1, last - 1)
-    lower, centre, upper = (
-        np.take_along_axis(costs, inner[None] + k, axis=0)[0].astype(np.float32) for k in (-1, 0, 1)
-    )
+    at = inner * np.intp(minimum.size) + np.arange(minimum.size).reshape(minimum.shape)
+    lower, centre, upper = (costs.reshape(-1).take(at + k * minimum.size).astype(np.float32) for k in (-1, 0, 1))
     curvature = lower - 2 * centre + upper
     offset = np.where(curvature > 0, (lower - upper) / (2 * np.maximum(curvature, 1e-9)), 0.0)
     return np.asarray(np.where(inner == label, inner + np.clip(offset, -0.5, 0.5), label), np.float32)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from agalign.relief.semi_global import aggregated, sub_label_minimum
+from agalign.relief.semi_global import MAX_LARGE, aggregated, sub_label_minimum
 
 
 def by_definition(costs: np.ndarray, small: int, large: int) -> np.ndarray:
@@ -25,16 +25,22 @@ def by_definition(costs: np.ndarray, small: int, large: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("labels", "small", "large"), [(5, 6, 40), (7, 3, 15), (3, 10, 10), (1, 2, 5), (2, 2, 5)])
 def test_four_paths(labels: int, small: int, large: int) -> None:
-    costs = np.random.default_rng(labels).integers(0, 100, (labels, 6, 8)).astype(np.int16)
+    costs = np.random.default_rng(labels).integers(0, 100, (labels, 6, 8)).astype(np.uint8)
     given = costs.copy()
     np.testing.assert_array_equal(aggregated(costs, small, large), by_definition(costs, small, large))
     np.testing.assert_array_equal(costs, given)
 
 
+def test_the_highest_costs_and_penalties_do_not_overflow() -> None:
+    small, highest = 9, 255 - 9 - MAX_LARGE
+    costs = np.random.default_rng(0).choice(np.array([0, highest], np.uint8), (6, 9, 7))
+    np.testing.assert_array_equal(aggregated(costs, small, MAX_LARGE), by_definition(costs, small, MAX_LARGE))
+
+
 def test_edges_are_preserved_and_noise_is_removed() -> None:
     rng = np.random.default_rng(0)
     truth = np.where(np.arange(30)[None, :] < 13, 2, 6).repeat(20, axis=0).reshape(20, 30)
-    costs = rng.integers(60, 100, (9, 20, 30)).astype(np.int16)
+    costs = rng.integers(60, 100, (9, 20, 30)).astype(np.uint8)
     np.put_along_axis(costs, truth[None], 40, axis=0)
     wrong = rng.random(truth.shape) < 0.15
     costs[0][wrong] = 10
@@ -43,7 +49,7 @@ def test_edges_are_preserved_and_noise_is_removed() -> None:
     assert (smooth != truth).mean() < 0.02
 
 
-@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
 @pytest.mark.parametrize("at", [1.0, 1.4, 3.0, 3.45, 4.62, 5.0])
 def test_the_minimum_of_a_parabola(at: float, dtype: type) -> None:
     labels = np.arange(7)
