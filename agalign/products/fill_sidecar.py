@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import CloughTocher2DInterpolator
 
 from agalign._version import __version__
 from agalign.flight.fingerprint import fingerprint
@@ -54,9 +54,11 @@ from agalign.values.pixel_units import FixedFilePx
 from agalign.values.relief import Relief
 
 _GRIDS = ((17, 13), (33, 25), (65, 49), (129, 97))
-"""Columns and rows of the sampled mapping; the first with a small enough error is used."""
-_MAX_INTERPOLATION_ERROR_PX = 0.02
-"""Maximum error of cubic interpolation halfway between the points: less than that of an alignment."""
+"""Columns and rows of the sampled mapping, each with the points halfway between those of the one before; the first with
+a small enough error is used."""
+_MAX_INTERPOLATION_ERROR_PX, _INTERPOLATION_PERCENTILE = 0.02, 99
+"""Maximum of this percentile of the error of cubic interpolation: less than the error of an alignment. The largest
+errors are at the border, where the derivatives are estimated from one side."""
 
 
 def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:
@@ -232,15 +234,20 @@ def _residual_metrics(residual: Residual[FixedFilePx] | None) -> dict[str, float
 
 
 def _grid_px(mapping: PixelMapping, size_px: tuple[int, int]) -> Points:
-    """Return the points (n, 2) at which cubic interpolation reproduces a smooth mapping, or the densest grid."""
-    for columns, rows in _GRIDS:
-        x, y = np.linspace(0, size_px[0] - 1, columns), np.linspace(0, size_px[1] - 1, rows)
-        x_between, y_between = (x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2
-        sampled, exact = mapping.at_crossings(x, y), mapping.at_crossings(x_between, y_between)
-        splines = [RectBivariateSpline(y, x, sampled[..., k])(y_between, x_between) for k in (0, 1)]
-        if np.abs(np.stack(splines, axis=-1) - exact).max() <= _MAX_INTERPOLATION_ERROR_PX:
+    """Return the points (n, 2) from which cubic interpolation reproduces a smooth mapping, or the densest grid.
+
+    Clough-Tocher, which works on any points, is less accurate than splines on the lattice.
+    """
+    points_px = geometry.lattice(*size_px, *_GRIDS[0])
+    for finer in _GRIDS[1:]:
+        interpolated = CloughTocher2DInterpolator(points_px, mapping(points_px))
+        finer_px = geometry.lattice(*size_px, *finer)
+        error_px = np.abs(interpolated(finer_px) - mapping(finer_px))
+        # Rounding moves some points at the border outside of the triangles: NaN.
+        if np.nanpercentile(error_px, _INTERPOLATION_PERCENTILE) <= _MAX_INTERPOLATION_ERROR_PX:
             break
-    return geometry.lattice(*size_px, columns, rows)
+        points_px = finer_px
+    return points_px
 
 
 def _lens_parts(mapping: PixelMapping) -> tuple[LensPart, LensPart] | None:

@@ -136,8 +136,9 @@ class FieldPart(_Part):
 
 
 class GridPart(_Part):
-    """The complete mapping, lenses and displacement field included, sampled so that cubic interpolation reproduces it
-    to 0.02 px: 17 x 13 points, or up to 129 x 97 if it is more curved. If there is a `relief`, use that instead.
+    """The complete mapping, lenses and displacement field included, sampled so that cubic interpolation (scipy's
+    CloughTocher2DInterpolator or RectBivariateSpline) reproduces it to 0.02 px: 17 x 13 points, or up to 129 x 97 if it
+    is more curved. If there is a `relief`, use that instead.
     """
 
     reference_px: list[PointPx]
@@ -252,7 +253,9 @@ class GeometryPart(_Part):
     """What the mapping has in addition to homography and lens models, and how the alternatives compare."""
 
     kind: Geometry
-    """`homography`: nothing; `field`: a smooth displacement field; `relief`: the parallax of the capture."""
+    """`homography`: nothing; `field`: a smooth displacement field; `relief`: the parallax of the capture;
+    `relief and field`: both.
+    """
     held_out_p95_px: dict[Geometry, float | None]
     """p95 of the shifts of windows that were left out of the fits, px, for each geometry that was fitted."""
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
 
 import agalign
 from agalign.config import Settings
@@ -22,9 +22,11 @@ from agalign.products.sidecar import (
     Sidecar,
 )
 from agalign.products.sidecar_file import find_sidecars, read_result, read_sidecar, write_sidecar
+from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.capture import Band, Capture
+from agalign.values.displacement import DisplacementField
 from agalign.values.image import OutputGrid
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.lens import Lens
@@ -111,7 +113,7 @@ def test_a_rejected_solution_says_so() -> None:
     capture = Capture("c", Path(), bands, 0)
     issues = (Issue(RETRIEVAL, 0.1, 0.2), Issue(COVERAGE, math.nan, 0.6))
     for status, issue in (("seed_only", issues), ("aligned", ())):
-        alignment = Alignment(seed.fixed_to_moving, "pixel", status, issue, seed, joint, residual, 0.0)
+        alignment = Alignment(PixelMapping(seed.fixed_to_moving), (64, 48), status, issue, seed, joint, residual)
         part = sidecar_of(context_of(capture, {"nir": alignment})).bands[1]
         assert part.joint is not None
         assert part.joint.accepted == (status == "aligned")
@@ -122,6 +124,31 @@ def test_a_rejected_solution_says_so() -> None:
 def test_a_doubt_that_could_not_be_measured_is_null_in_json() -> None:
     part = IssuePart(kind="retrieval", value=None, limit=0.2)
     assert json.loads(part.model_dump_json()) == {"kind": "retrieval", "value": None, "limit": 0.2}
+
+
+def interpolated(grid: GridPart, at_px: np.ndarray) -> dict[str, np.ndarray]:
+    """The grid at points (n, 2), by each interpolation that its documentation names."""
+    reference_px, moving_px = np.array(grid.reference_px), np.array(grid.moving_px)
+    x, y = np.unique(reference_px[:, 0]), np.unique(reference_px[:, 1])
+    splines = (RectBivariateSpline(y, x, v.reshape(len(y), len(x))) for v in moving_px.T)
+    return {
+        "Clough-Tocher": CloughTocher2DInterpolator(reference_px, moving_px)(at_px),
+        "lattice": np.stack([s.ev(at_px[:, 1], at_px[:, 0]) for s in splines], axis=-1),
+    }
+
+
+def test_the_grid_reproduces_a_displacement_field() -> None:
+    """Of 1 px (standard deviation) between nodes 48 px apart, on lens models."""
+    lenses = [cameras.BANDS[k].lens(1280, 960) for k in (1, 3)]
+    field = DisplacementField(48.0, np.random.default_rng(0).normal(0, 1, (21, 28, 2)))
+    mapping = PixelMapping(geometry.translation(5.0, 2.0), *lenses, local=field)
+    bands = tuple(Band(name, Path(f"{name}.tif"), 1, 1280, 960, "uint16") for name in ("green", "nir"))
+    alignment = Alignment(mapping, (1280, 960), "aligned", (), Seed("rig", np.eye(3), 30.0))
+    part = sidecar_of(context_of(Capture("c", Path(), bands, 0), {"nir": alignment})).bands[1]
+    assert part.grid is not None
+    at = np.random.default_rng(1).uniform((0, 0), (1279, 959), (2000, 2))
+    for there in interpolated(part.grid, at).values():
+        assert np.nanpercentile(np.abs(there - mapping(at)), 99) < 0.02
 
 
 def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
@@ -137,15 +164,17 @@ def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
         "rgb": geometry.compose(wide.matrix, geometry.invert(plain.matrix)), "red": geometry.translation(5.0, 2.0),
     }  # fmt: skip
     seed = Seed("rig", np.eye(3), 30.0)
-    alignments = {b: Alignment(m, "undistorted", "aligned", (), seed, None, None, 0.0) for b, m in result.items()}
+    mappings = {b: PixelMapping(m, plain, wide if b == "rgb" else plain) for b, m in result.items()}
+    alignments = {b: Alignment(m, (1037, 777), "aligned", (), seed) for b, m in mappings.items()}
     _, colour, red = sidecar_of(context_of(Capture("c", Path(), bands, 0), alignments)).bands
     assert colour.grid is not None
     assert red.grid is not None
     assert (len(colour.grid.reference_px), len(red.grid.reference_px)) == (65 * 49, 17 * 13)
     at = np.random.default_rng(0).uniform((0, 0), (1036, 776), (500, 2))
-    there = CloughTocher2DInterpolator(colour.grid.reference_px, colour.grid.moving_px)(at)
-    exact = PixelMapping(result["rgb"], plain, wide)(at)
-    assert np.abs(there - exact).max() < 0.02
+    for name, part in (("rgb", colour), ("red", red)):
+        assert part.grid is not None
+        for there in interpolated(part.grid, at).values():
+            assert np.abs(there - mappings[name](at)).max() < 0.02
 
 
 @pytest.mark.parametrize("name", ["../a.tif", "/vsicurl/http://example.org/a.tif", "C:/a.tif"])
