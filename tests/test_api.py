@@ -6,6 +6,7 @@ import agalign
 from agalign.errors import GeometryError, InputError
 from agalign.method import joint
 from agalign.values import geometry
+from agalign.values.mapping import PixelMapping
 
 from .conftest import mean_error_px, textured_image, textured_pair
 
@@ -96,8 +97,17 @@ def test_warp_onto() -> None:
     pixels, valid = agalign.warp_onto(moving, TRUTH, (400, 320))
     assert pixels.shape == valid.shape == (320, 400)
     assert np.corrcoef(pixels[valid], fixed[valid])[0, 1] < -0.9
-    with pytest.raises(InputError):
-        agalign.warp_onto(np.zeros((3, 50, 50)), np.eye(3), (50, 50))
+    channels, _ = agalign.warp_onto(np.stack([moving, 2 * moving]), TRUTH, (400, 320))
+    np.testing.assert_allclose(channels, np.stack([pixels, 2 * pixels]), atol=1e-5)
+
+
+def test_warp_onto_refuses_an_alignment() -> None:
+    """Its homography alone would be a part of the mapping."""
+    seed = agalign.Seed("user", np.eye(3), 0.0)
+    with pytest.raises(InputError, match=r"its method warp\(moving\)"):
+        agalign.warp_onto(
+            np.zeros((50, 50)), agalign.Alignment(PixelMapping(np.eye(3)), (50, 50), "aligned", (), seed), (50, 50)
+        )
 
 
 def test_undeclared_fill_costs_a_good_pair_nothing() -> None:

@@ -45,7 +45,7 @@ def resample_tile_of(
 ) -> tuple[NDArray[np.generic], Mask]:  # fmt: skip
     """Call `resample_tile` on an open file, so that GDAL's block cache serves neighbouring tiles."""
     positions = mapping.positions(tile, np.float32)
-    source = source_window(positions, band.size_px, has_relief=mapping.parallax is not None)
+    source = source_window(positions, band.size_px, is_smooth=mapping.is_smooth(tile))
     if source is None:
         shape = tile.height, tile.width
         return np.zeros(shape, band.dtype if radiometry is None else np.float32), np.zeros(shape, dtype=bool)

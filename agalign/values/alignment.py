@@ -242,7 +242,7 @@ class Alignment(Generic[FixedPx]):
         `valid` (H, W) is False for pixels that must not be used; NaN and `nodata` are never used. Returns the pixels in
         the layout and type of `moving`, and their mask (height, width): True where all channels are known, inside the
         moving image and not occluded. Other pixels are `nodata`, by default NaN or, for integers, 0. Raises InputError
-        for an array that is not an image.
+        for an array that is not an image, or a `nodata` that its type cannot hold.
         """
         planes, channels_last = planes_of(moving, "moving")
         mask = np.ones(planes.shape[1:], bool) if valid is None else np.asarray(valid, bool)
@@ -251,6 +251,8 @@ class Alignment(Generic[FixedPx]):
         for plane in planes:
             mask = mask & (np.isfinite(plane) if plane.dtype.kind == "f" else True) & (plane != nodata)
         fill = nodata if nodata is not None else math.nan if planes.dtype.kind == "f" else 0
+        if planes.dtype.kind in "ui" and not _is_value_of(str(planes.dtype), fill):
+            raise InputError(f"nodata is {nodata:g}, which {planes.dtype} cannot hold")
         pixels, known = resample_planes(planes, mask, self.mapping, self.size_px, interpolation, fill)
         if np.ndim(moving) == 2:
             return pixels[0], known
@@ -320,3 +322,9 @@ class Alignment(Generic[FixedPx]):
         std_px = None if self.joint is None else round(self.joint.corner_std_px, 3)
         reason = "" if self.reason is None else f", reason={self.reason!r}"
         return f"Alignment(status={self.status!r}, residual_median_px={median_px}, corner_std_px={std_px}{reason})"
+
+
+def _is_value_of(dtype: str, value: float) -> bool:
+    """True for an integer within the limits of an integer type."""
+    limits = np.iinfo(dtype)
+    return float(value).is_integer() and limits.min <= value <= limits.max

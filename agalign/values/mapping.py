@@ -103,6 +103,12 @@ class PixelMapping:
             or any(map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion)))
         )
 
+    def is_smooth(self, tile: Tile) -> bool:
+        """True without parallax, and if the horizon of the homography does not cross the tile."""
+        corners = np.array([(tile.x0 + x, tile.y0 + y) for x in (0, tile.width) for y in (0, tile.height)], np.float64)
+        depths = self.of_the_plane.undistorted(corners) @ self.fixed_to_moving[2, :2] + self.fixed_to_moving[2, 2]
+        return self.parallax is None and bool((depths > 0).all() or (depths < 0).all())
+
     def positions(self, tile: Tile, dtype: DTypeLike = np.float64) -> Points:
         """Position of each pixel of a tile in the moving image, (height, width, 2) raw px."""
         return self.at_crossings(_along(tile.x0, tile.width), _along(tile.y0, tile.height), dtype)

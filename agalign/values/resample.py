@@ -27,6 +27,8 @@ _MIN_VALID_WEIGHT = 0.999
 """Minimum weight of valid pixels in a valid resampled pixel: float32 weights do not sum to exactly 1."""
 _TILE_PX = 1024
 """Side of the tiles in which arrays are resampled: OpenCV limits the sides of one image to 32,767 px."""
+_MAX_SOURCE_PX = 32_000
+"""Maximum side of the part of an image that is resampled at once."""
 _MAX_CHANNELS = 16
 """Distinguishes (H, W, C) from (C, H, W): images have more rows than this."""
 
@@ -69,12 +71,17 @@ def resample_planes(
     result = np.empty((len(planes), height, width), planes.dtype)
     result_valid = np.empty((height, width), bool)
     moving_size_px = valid.shape[1], valid.shape[0]
-    for tile in tiles(Tile(0, 0, width, height), _TILE_PX):
+    pending = list(tiles(Tile(0, 0, width, height), _TILE_PX))
+    while pending:
+        tile = pending.pop()
         at = np.s_[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
         positions = mapping.positions(tile)
-        source = source_window(positions, moving_size_px, has_relief=mapping.parallax is not None)
+        source = source_window(positions, moving_size_px, is_smooth=mapping.is_smooth(tile))
         if source is None:
             result[:, *at], result_valid[at] = fill, False
+            continue
+        if max(source.width, source.height) > _MAX_SOURCE_PX:
+            pending += tiles(tile, (max(tile.width, tile.height) + 1) // 2)
             continue
         cut = np.s_[source.y0 : source.y0 + source.height, source.x0 : source.x0 + source.width]
         local = (positions - (source.x0, source.y0)).astype(np.float32)
@@ -87,12 +94,12 @@ def resample_planes(
     return result, result_valid
 
 
-def source_window(positions: NDArray[np.floating], size_px: Size, *, has_relief: bool) -> Tile | None:
+def source_window(positions: NDArray[np.floating], size_px: Size, *, is_smooth: bool) -> Tile | None:
     """Return the window of an image (width, height) that interpolation at positions (H, W, 2) reads; None for none.
 
-    Without a relief the mapping is smooth: coarse samples and the borders determine the extent within one pixel.
+    If the mapping is smooth, coarse samples and the borders determine the extent within one pixel.
     """
-    step = 1 if has_relief else _SAMPLE_PX
+    step = _SAMPLE_PX if is_smooth else 1
     rows, columns = (np.append(np.arange(0, n, step), n - 1) for n in positions.shape[:2])
     samples = positions[np.ix_(rows, columns)]
     if not np.isfinite(samples).any():
