@@ -1,5 +1,6 @@
 """The complete mapping of a band, rebuilt from the sidecar of its capture."""
 
+import math
 from pathlib import Path
 
 import cv2
@@ -27,7 +28,7 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
     """Return the alignment of a moving band as a sidecar and its relief raster store it.
 
     Its `map`, `inverse` and `warp` are those of the run, between the raw pixels of the files; the relief is known in
-    the area that was written. `joint` and `prediction` are None.
+    the area that was written. `joint` and `prediction` are None, `before` and `after` empty.
     Raises SidecarError for a file that is not a sidecar or lacks the mapping, NoSuchBandError for a band that is not a
     moving band of the capture, UnreadableFileError for a relief raster that cannot be read.
     """
@@ -44,10 +45,16 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
     mapping = PixelMapping(np.array(part.homography.fixed_to_moving), fixed, moving, local=field)
     if part.relief is not None:
         mapping = mapping.with_parallax(_parallax(path, content, part.relief, fixed))
-    seed = Seed(part.seed.kind, np.array(part.seed.fixed_to_moving), part.seed.peak_sigma)
+    peaks = part.seed.peak_sigma, part.seed.runner_up_sigma
+    seed = Seed(part.seed.kind, np.array(part.seed.fixed_to_moving), part.seed.peak_sigma, *peaks)
+    held_out = {} if part.geometry is None else part.geometry.held_out_p95_px
+    candidates = {kind: FixedFilePx(math.inf if px is None else px) for kind, px in held_out.items()}
     size_px = content.reference.width, content.reference.height
     issues = tuple(Issue(KINDS[i.kind], i.value, i.limit) for i in part.issues)
-    return Alignment(mapping, size_px, part.status, issues, seed, residual=_residual(part), seconds=part.seconds)
+    return Alignment(
+        mapping, size_px, part.status, issues, seed, residual=_residual(part), seconds=part.seconds,
+        candidates=candidates,
+    )  # fmt: skip
 
 
 def _lens(part: LensPart) -> Lens:
