@@ -16,9 +16,9 @@ with tempfile.TemporaryDirectory() as folder:
     green = tifffile.imread(Path(folder) / "0000SET/000/IMG_0001_2.tif")
     nir = tifffile.imread(Path(folder) / "0000SET/000/IMG_0001_4.tif")
 
-found = agalign.align(green, nir)
-print(f"{found.status}: seed {found.seed.kind}, residual {found.residual.median_px:.3f} px")
-print(found.fixed_to_moving.round(5))
+result = agalign.align(green, nir)
+print(f"{result.status}: seed {result.seed.kind}, residual {result.residual.median_px:.3f} px")
+print(f"pixel (320, 240) of green is pixel {result.map([320, 240]).round(2)} of near infra-red")
 
-aligned, valid = agalign.warp_onto(nir, found.fixed_to_moving, (green.shape[1], green.shape[0]))
+nir_on_green, valid = result.warp(nir)
 print(f"{valid.mean():.0%} of the green image has near infra-red")

@@ -8,12 +8,17 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 import agalign
+from agalign.values import geometry
 
-from ..conftest import REAL_DATA
+from ..conftest import REAL_DATA, textured_image
+from ..test_api import TRUTH
 from .blocks import PAGES, ROOT, Block, blocks_of, commands_of, program
 
 RUN_BY = {
@@ -62,6 +67,55 @@ def test_a_page_does_what_it_says(page: Path, desk: Path, tmp_path: Path) -> Non
         if not any(program(command) in RUN_BY for command in commands):
             for command in commands:
                 run(block, ["bash", "-c", command], folder)
+
+
+def test_the_python_of_the_readme_aligns_pixels() -> None:
+    """NIR has reversed contrast, a hole of NaN, and a displacement of 1.5 px that no homography represents."""
+    displaced = SmoothPair()
+    (block,) = (b for b in blocks_of(ROOT / "README.md") if b.kind == "python")
+    names: dict[str, Any] = {"green": displaced.green, "nir": displaced.nir}
+    exec(block.text.partition("reports =")[0], names)
+    result, nir_on_green, valid = (names[name] for name in ("result", "nir_on_green", "valid"))
+    errors_px = np.linalg.norm(result.map(displaced.pixels) - displaced.truth(displaced.pixels), axis=-1)
+    assert np.median(errors_px) <= 0.1
+    assert np.percentile(errors_px, 95) <= 0.3
+    assert valid.mean() > 0.9
+    assert np.isfinite(nir_on_green[valid]).all()
+    assert np.isnan(nir_on_green[~valid]).all()
+    difference = np.abs(nir_on_green - displaced.nir_on_green)[valid]
+    assert np.median(difference) < 0.05 * displaced.nir_on_green.std()
+    assert np.percentile(difference, 95) < 0.15 * displaced.nir_on_green.std()
+    _, masked = result.warp(displaced.nir, valid=np.isfinite(displaced.nir) & (displaced.nir < 0))
+    assert (displaced.nir_on_green[masked] < 0.2).all()
+
+
+class SmoothPair:
+    """Two views of one texture, in each of which the position of every pixel is known."""
+
+    size_px = 640, 480
+    pixels = np.stack(np.meshgrid(*(np.arange(n) for n in size_px)), axis=-1).astype(float)
+
+    def __init__(self) -> None:
+        self.canvas = cv2.GaussianBlur(textured_image(2280, 1800), (0, 0), 1.5)
+        moving = self.pixels
+        for _ in range(30):  # to the pixel of green for each of NIR
+            moving = moving - (self.truth(moving) - self.pixels)
+        green = self._view(self.pixels)
+        self.green, self.nir, self.nir_on_green = green, self._toned(self._view(moving)), self._toned(green)
+        self.nir[200:230, 300:340] = np.nan
+
+    @staticmethod
+    def truth(points: np.ndarray) -> np.ndarray:
+        waves = np.stack([np.sin(points[..., 1] / 127), np.cos(points[..., 0] / 127)], axis=-1)
+        return geometry.apply(TRUTH, points + 1.5 * waves)
+
+    def _view(self, points: np.ndarray) -> np.ndarray:
+        at = (3 * points + 181).astype(np.float32)
+        return cv2.remap(self.canvas, at[..., 0], at[..., 1], cv2.INTER_CUBIC)
+
+    @staticmethod
+    def _toned(image: np.ndarray) -> np.ndarray:
+        return np.asarray(-image + 0.15 * image**2)
 
 
 def test_every_block_says_what_it_is() -> None:
