@@ -11,9 +11,11 @@ import pytest
 import agalign
 from agalign import api, config, errors
 from agalign.values.issues import BLANK_MOVING, Issue
+from agalign.values.mapping import PixelMapping
 
 FUNCTIONS = {
-    "align", "align_capture", "align_folder", "discover", "open_capture", "open_flight", "warp_onto",
+    "align", "align_capture", "align_folder", "discover", "open_capture", "open_flight",
+    "read_alignment", "warp_onto",
 }  # fmt: skip
 SETTINGS = {
     "CheckSettings", "FlightSettings", "JointSettings", "ReliefSettings", "SeedSettings", "Settings", "WriteSettings",
@@ -71,9 +73,10 @@ def test_settings_print_what_differs_from_the_defaults() -> None:
 
 def test_an_alignment_prints_one_short_line() -> None:
     seed = agalign.Seed("identity", np.eye(3), 0.0)
+    mapping = PixelMapping(np.eye(3))
     residual = agalign.Residual(np.zeros((44, 2)), np.zeros((44, 2)), 0.0512, 0.1, 0.9)
-    result = agalign.Alignment(np.eye(3), "pixel", "aligned", (), seed, None, residual, 1.0)
+    result = agalign.Alignment(mapping, (640, 480), "aligned", (), seed, residual=residual)
     assert repr(result) == "Alignment(status='aligned', residual_median_px=0.051, corner_std_px=None)"
-    failed = agalign.Alignment(np.eye(3), "pixel", "failed", (Issue(BLANK_MOVING),), seed, None, None, 1.0)
+    failed = agalign.Alignment(mapping, (640, 480), "failed", (Issue(BLANK_MOVING),), seed)
     assert repr(failed).startswith("Alignment(status='failed', residual_median_px=None, corner_std_px=None, reason='")
     assert "array" not in repr(failed)

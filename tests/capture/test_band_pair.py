@@ -102,10 +102,10 @@ def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
         np.eye(3), 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, ((0.2 / 2**0.5, 0.2 / 2**0.5),) * 4
     )
     seed = Seed("rig", np.eye(3), 30.0)
-    alignment = Alignment(np.eye(3), "undistorted", "aligned", (), seed, joint, None, 0.0)
+    alignment = Alignment(pair.mapping(np.eye(3)), pair.fixed.size_px, "aligned", (), seed, joint)
     known = observed([pair], {pair.name: alignment}, discover(flight).captures[0])
     assert known.std_px[pair.name] == pytest.approx(0.2)
-    coarse = replace(alignment, fixed_to_moving=np.diag([0.1, 0.1, 1.0]))
+    coarse = replace(alignment, mapping=pair.mapping(np.diag([0.1, 0.1, 1.0])))
     known = observed([pair], {pair.name: coarse}, discover(flight).captures[0])
     assert known.std_px[pair.name] == pytest.approx(0.02)
 

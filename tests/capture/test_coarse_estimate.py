@@ -44,7 +44,7 @@ def tried(fixed: np.ndarray, moving: np.ndarray) -> tuple[BandPair, Alignment]:
     seed = find_seed(pair, SeedSettings())
     assert isinstance(seed, Seed)
     issue = Issue(RETRIEVAL, 0.0, 0.2)
-    failed = Alignment(seed.fixed_to_moving, pair.space, "failed", (issue,), seed, None, None, 0.0)
+    failed = Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", (issue,), seed)
     return pair, predicted_if_coarse(pair, failed)
 
 
@@ -56,13 +56,11 @@ def scene() -> np.ndarray:
 
 @pytest.mark.parametrize("other_share", [0.2, 0.5])
 def test_a_band_with_another_field_of_view_is_predicted_with_its_error(scene: np.ndarray, other_share: float) -> None:
-    pair, result = tried(scene[100:340, 100:420], thermal(scene, other_share))
+    _, result = tried(scene[100:340, 100:420], thermal(scene, other_share))
     assert result.status == "predicted"
     assert result.prediction is not None
     points = geometry.lattice(*FIXED_PX, 9, 7)
-    error_px = np.linalg.norm(
-        pair.mapping(result.fixed_to_moving, result.field)(points) - geometry.apply(TRUTH, points), axis=1
-    )
+    error_px = np.linalg.norm(result.map(points) - geometry.apply(TRUTH, points), axis=1)
     assert np.sqrt((error_px**2).mean()) < result.prediction.std_px < 0.6
     assert result.reason is not None
     assert "predicted from windows in the image" in result.reason

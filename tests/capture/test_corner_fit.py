@@ -4,7 +4,8 @@ import numpy as np
 
 from agalign.capture.corner_fit import corner_correction, fit_corners
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementField, Residual
+from agalign.values.alignment import Residual
+from agalign.values.displacement import DisplacementField
 from agalign.values.mapping import PixelMapping
 
 SIZE = 640, 480

@@ -15,7 +15,6 @@ from agalign.flight.rig import Rig
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
-from agalign.values.mapping import PixelMapping
 from agalign.verify.expected_error import expected_error_px
 from agalign.verify.lens_shapes import lens_shapes
 from tests.conftest import textured_pair
@@ -61,9 +60,8 @@ def aligned(pair: BandPair) -> Alignment:
 
 
 def errors_px(alignment: Alignment, points: np.ndarray) -> np.ndarray:
-    mapping = PixelMapping(alignment.fixed_to_moving, local=alignment.field)
     truth = geometry.apply(MATRIX, points + lens_shapes(points, SIZE) @ LENS_PX)
-    return np.linalg.norm(mapping(points) - truth, axis=1)
+    return np.linalg.norm(alignment.map(points) - truth, axis=1)
 
 
 def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error() -> None:

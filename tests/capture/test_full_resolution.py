@@ -19,6 +19,7 @@ from agalign.flight.factors import distance_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed
 from agalign.values.capture import Capture
+from agalign.values.mapping import PixelMapping
 
 from ..conftest import textured_pair
 
@@ -45,7 +46,7 @@ def aligned_on_reduced_images(off_px: float = 1.2) -> Alignment:
     joint = JointResult(
         off, 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, ((1.0, 1.0),) * 4, np.eye(8)
     )  # fmt: skip
-    return Alignment(off, "pixel", "aligned", (), Seed("identity", np.eye(3), 30.0), joint, residual, 2.5)
+    return Alignment(PixelMapping(off), SIZE, "aligned", (), Seed("identity", np.eye(3), 30.0), joint, residual, 2.5)
 
 
 def refined(capture: Capture, alignment: Alignment) -> Alignment:

@@ -202,9 +202,8 @@ def test_a_more_accurate_prediction_by_windows_is_kept(
     result = align_pairs(pairs, settings, lambda *_: None, model)
     nir = result["NIR"]
     matrix = geometry.compose(geometry.translation(away_px, 0), nir.fixed_to_moving)
-    of_windows = replace(
-        nir, status="predicted", fixed_to_moving=matrix, prediction=Prediction(matrix, "windows", std_px)
-    )
+    mapping = replace(nir.mapping, fixed_to_moving=matrix)
+    of_windows = replace(nir, status="predicted", mapping=mapping, prediction=Prediction(matrix, "windows", std_px))
     assert model.rig is not None
     checked = with_predictions(pairs, {**result, "NIR": of_windows}, model.rig, capture)["NIR"]
     assert checked.prediction is not None

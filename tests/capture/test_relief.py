@@ -77,10 +77,6 @@ class Rendered:
             result.append(ReliefCandidate(pair, seed, joint, WarpedPair.of(pair, pair.mapping(matrix))))
         return result
 
-    def mapping(self, band: BandSpec, alignment: Alignment) -> PixelMapping:
-        lenses = (b.lens(*self.size_px) for b in (REFERENCE, band))
-        return PixelMapping(alignment.fixed_to_moving, *lenses, local=alignment.field, parallax=alignment.parallax)
-
     def error_px(self, band: BandSpec, mapping: PixelMapping) -> np.ndarray:
         """Return (n,) errors of all pixels that are visible in the band."""
         known = self.truth.bands[band.name]
@@ -111,13 +107,13 @@ def aligned(candidates: Sequence[ReliefCandidate]) -> dict[str, Alignment]:
 
 def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
     assert set(aligned) == {b.name for b in MOVING}
-    reliefs = [a.parallax.relief for a in aligned.values() if a.parallax is not None]
+    reliefs = [a.mapping.parallax.relief for a in aligned.values() if a.mapping.parallax is not None]
     assert len(reliefs) == 3
     assert all(r is reliefs[0] for r in reliefs)
     for band in MOVING:
         alignment = aligned[band.name]
         assert (alignment.status, alignment.issues) == ("aligned", ())
-        complete = boxes.mapping(band, alignment)
+        complete = alignment.mapping
         errors, plane = (boxes.error_px(band, m) for m in (complete, complete.of_the_plane))
         assert np.median(errors) < 0.2
         assert np.percentile(errors, 90) < 0.6
@@ -136,7 +132,7 @@ def test_occluded_pixels_are_detected(boxes: Rendered, aligned: Mapping[str, Ali
     in_all = np.logical_and.reduce([t.inside for t in boxes.truth.bands.values()])
     found, true, found_right, true_found = 0, 0, 0, 0
     for band in MOVING:
-        parallax = aligned[band.name].parallax
+        parallax = aligned[band.name].mapping.parallax
         assert parallax is not None
         assert parallax.hidden is not None
         hidden, known = parallax.hidden & in_all, boxes.truth.bands[band.name].hidden & in_all
@@ -148,12 +144,12 @@ def test_occluded_pixels_are_detected(boxes: Rendered, aligned: Mapping[str, Ali
 
 
 def test_range_is_right_to_two_percent(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
-    parallax = aligned["NIR"].parallax
+    parallax = aligned["NIR"].mapping.parallax
     assert parallax is not None
     infinite = [geometry.invert(to_plane(REFERENCE, b, boxes.size_px)) for b in MOVING]
     towards_m = np.subtract(REFERENCE.baseline_m, [b.baseline_m for b in MOVING])
     inverse_m = inverse_range(
-        [boxes.mapping(b, aligned[b.name]) for b in MOVING], infinite, towards_m, REFERENCE.lens(*boxes.size_px),
+        [aligned[b.name].mapping for b in MOVING], infinite, towards_m, REFERENCE.lens(*boxes.size_px),
         boxes.pixels, parallax.relief(boxes.pixels),
     )  # fmt: skip
     ratio = 1 / inverse_m / boxes.truth.range_m
@@ -167,7 +163,7 @@ def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequenc
     unknown = [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
     result = aligned_by_relief(unknown, "auto")
     assert len(result) == len(MOVING)
-    parallax = result["NIR"].parallax
+    parallax = result["NIR"].mapping.parallax
     assert parallax is not None
     assert np.corrcoef(parallax.relief(boxes.pixels).ravel(), boxes.truth.range_m.ravel())[0, 1] < -0.5
 
@@ -278,7 +274,7 @@ def test_an_unrelated_band_is_not_aligned(boxes: Rendered, kind: str) -> None:
     assert "NIR" not in result
     for band in MOVING:
         if band.name in result:
-            assert np.percentile(boxes.error_px(band, boxes.mapping(band, result[band.name])), 90) < 0.7
+            assert np.percentile(boxes.error_px(band, result[band.name].mapping), 90) < 0.7
 
 
 @pytest.mark.parametrize("kind", ["noise", "unrelated", "scrambled"])

@@ -9,11 +9,12 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.verification import WarpedPair, verified, with_metrics
 from agalign.config import ReliefSettings, Settings
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementField, DisplacementResult, JointResult, PairScales, Residual, Seed
+from agalign.values.alignment import JointResult, PairScales, Residual, Seed
+from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster
 from agalign.values.issues import FEW_KEYPOINTS, Issue
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.displacement_field import FINE
+from agalign.verify.displacement_field import FINE, DisplacementResult
 
 from ..conftest import textured_image, textured_pair
 
@@ -89,10 +90,11 @@ def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monk
     )
     results = verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
     assert results.status == "aligned"
-    assert results.local == DisplacementResult(None, 1.0, 0.5)
+    assert results.candidates == {"homography": 1.0, "field": 0.5}
+    assert results.geometry == "homography"
     assert results.residual.median_px < 0.1
     monkeypatch.setattr(verification, "issues_of", lambda *_: ())
-    assert verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS).local.field is not None
+    assert verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS).geometry == "field"
 
 
 def test_residuals_of_a_reduced_image_are_in_px_of_the_file() -> None:
@@ -126,7 +128,7 @@ def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: str, sta
     settings = Settings(relief=ReliefSettings(use=use))
     results = verified(displaced_pair(4.0), seed, result(np.eye(3)), settings)
     assert results.status == status
-    assert (results.field is not None) == (status == "aligned")
+    assert results.geometry == ("field" if status == "aligned" else "homography")
 
 
 @pytest.mark.slow
@@ -135,8 +137,8 @@ def test_quickly_varying_parallax_needs_a_fine_field() -> None:
     pair, seed = displaced_pair(2.5, apart_px=200.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     results = verified(pair, seed, result(np.eye(3)), Settings())
     assert results.status == "aligned"
-    assert results.field is not None
-    assert results.field.step_px == FINE.lattice_px
+    assert results.mapping.local is not None
+    assert results.mapping.local.step_px == FINE.lattice_px
     # The residual is that of held-out windows.
     assert results.residual.median_px < 0.4
     assert pair.reference.coarse_field.refine(pair.moving_image, pair.mapping(np.eye(3))).field is None
@@ -148,7 +150,7 @@ def test_a_field_is_tried_without_a_rig_and_rejected_without_need(rig_known: boo
     pair = replace(pair, candidate_std_px={"model": 1.0} if rig_known else {})
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
     plain = verified(pair, seed, result(np.eye(3)), Settings())
-    assert (plain.status, plain.local is not None, plain.field) == ("aligned", tried, None)
+    assert (plain.status, "field" in plain.candidates, plain.geometry) == ("aligned", tried, "homography")
 
 
 def test_issues_that_a_field_cannot_remove_are_reported(pair: BandPair) -> None:
@@ -210,4 +212,4 @@ def test_no_field_aligns_an_unrelated_image(kind: str) -> None:
     pair = pair_of(fixed, other)
     results = verified(pair, SEED, result(SEED.fixed_to_moving), SETTINGS)
     assert results.status not in ("aligned", "predicted")
-    assert results.field is None
+    assert results.geometry == "homography"

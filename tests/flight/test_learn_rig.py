@@ -12,7 +12,7 @@ from agalign.flight.rig_file import rig_from_json, rig_to_json
 from agalign.flight.rig_prediction import extreme_mappings, predict_band, unobserved_error_px
 from agalign.products.sidecar import PredictionPart
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementField
+from agalign.values.displacement import DisplacementField
 
 SIZE = 1280, 960
 BASELINES = {"Blue": (0.9, 0.0), "Red": (0.0, 0.65), "NIR": (0.9, 0.7), "Red edge": (0.4, 0.35)}

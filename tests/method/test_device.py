@@ -20,8 +20,9 @@ from agalign.method.joint import align_from_scratch
 from agalign.method.paper import Training
 from agalign.method.state import ImageGroup
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementField, JointResult
+from agalign.values.alignment import JointResult
 from agalign.values.choices import Recipe
+from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster
 from agalign.values.lens import Lens
 

@@ -4,7 +4,7 @@ import torch
 from agalign.method.levels import Level, Sampler, footprints_inside, make_level, make_level_image
 from agalign.method.patches import Keypoints, patch_positions, transform
 from agalign.values import lens
-from agalign.values.alignment import DisplacementField
+from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster
 from agalign.values.lens import Lens
 

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from agalign.pixels.resample import resample_tile, warped
-from agalign.values.resample import resample, tiles
 from agalign.products.layout import _largest_rectangle, common_area
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
@@ -20,6 +19,7 @@ from agalign.values.choices import Interpolation
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
+from agalign.values.resample import resample, tiles
 
 from ..conftest import textured_image, textured_pair
 

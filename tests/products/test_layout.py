@@ -13,6 +13,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, Capture
 from agalign.values.lens import Lens
+from agalign.values.mapping import PixelMapping
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 LENS = Lens(150.0, 150.0, 59.5, 44.5, (-0.1, 0.05))
@@ -30,7 +31,7 @@ def capture_of(folder: Path) -> Capture:
 
 def aligned_by(shift_px: float) -> Alignment:
     seed = Seed("identity", geometry.translation(shift_px, 0), 0.0)
-    return Alignment(seed.fixed_to_moving, "undistorted", "aligned", (), seed, None, None, 0.0)
+    return Alignment(PixelMapping(seed.fixed_to_moving, LENS, LENS), (120, 90), "aligned", (), seed)
 
 
 @pytest.mark.parametrize("undistort", [False, True])

@@ -26,7 +26,7 @@ from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, Capture, Georeference
-from agalign.values.mapping import mapping_of
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
 
 from ..conftest import textured_image
@@ -100,13 +100,13 @@ def test_a_finer_grid_has_the_same_outline_on_the_map() -> None:
     one = Band("a", Path("a"), 1, 100, 80, "uint8", georeference=place)
     pan = Band("pan", Path("b"), 1, 200, 160, "uint8")
     seed = Seed("identity", PixelScale(2.0, 2.0).matrix, 0.0)
-    alignment = Alignment(seed.fixed_to_moving, "pixel", "aligned", (), seed, None, None, 0.0)
+    alignment = Alignment(PixelMapping(seed.fixed_to_moving), (100, 80), "aligned", (), seed)
     capture = Capture("c", Path(), (one, pan), 0)
     layers, grid = output_layers(capture, {"pan": alignment}, WriteSettings(resolution="finest", crop="none"))
     assert (grid.width, grid.height, grid.scale) == (200, 160, (2.0, 2.0))
     assert layers[1].mapping is not None
     np.testing.assert_allclose(layers[1].mapping(np.array([[10.0, 7.0]])), [[10.0, 7.0]], atol=1e-9)
-    np.testing.assert_allclose(mapping_of(one, pan, alignment)(np.array([[0.0, 0.0]])), [[0.5, 0.5]])
+    np.testing.assert_allclose(alignment.map(np.array([[0.0, 0.0]])), [[0.5, 0.5]])
 
 
 def test_layout_bands_of_a_multiband_file(tmp_path: Path) -> None:
@@ -408,7 +408,7 @@ def test_options_go_together(relief_flight: Path, tmp_path: Path, options: dict[
     assert report.error is None
     assert report.sidecar is not None
     assert report.sidecar.status == "ok"
-    assert any(b.local is not None and b.local.applied for b in report.sidecar.bands)
+    assert any(b.geometry is not None and b.geometry.kind == "field" for b in report.sidecar.bands)
     folder = tmp_path / "0000SET" / "000"
     planes = {}
     for band in report.sidecar.bands:

@@ -26,7 +26,7 @@ from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
-from agalign.values.mapping import mapping_of
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
 from agalign.values.relief import Parallax, Relief
 
@@ -55,7 +55,8 @@ def alignments_of(capture: Capture, truth: Truth) -> dict[str, Alignment]:
         parallax = Parallax(relief, (x, y), truth.bands[band.name].hidden)
         residual = Residual.of(np.array([[50.0, 50.0]]), np.array([[0.1, 0.0]]), np.array([20.0]))
         seed = Seed("rig", plane, 30.0, 30.0, 5.0)
-        result[band.name] = Alignment(plane, "undistorted", "aligned", (), seed, None, residual, 0.0, parallax=parallax)
+        mapping = PixelMapping(plane, reference.lens, band.lens, parallax=parallax)
+        result[band.name] = Alignment(mapping, reference.size_px, "aligned", (), seed, residual=residual)
     return result
 
 
@@ -99,8 +100,8 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
 def test_these_alignments_are_the_truth(run: Run) -> None:
     for band in run.capture.moving:
-        mapping, known = mapping_of(run.capture.reference, band, run.alignments[band.name]), run.truth.bands[band.name]
-        assert np.abs(mapping(PIXELS) - known.moving_px)[known.visible].max() < 0.1
+        alignment, known = run.alignments[band.name], run.truth.bands[band.name]
+        assert np.abs(alignment.map(PIXELS) - known.moving_px)[known.visible].max() < 0.1
 
 
 def test_the_raster_of_the_relief(run: Run, written: tuple[Path, Sidecar]) -> None:
@@ -110,7 +111,7 @@ def test_the_raster_of_the_relief(run: Run, written: tuple[Path, Sidecar]) -> No
         assert source.descriptions == ("parallax", "confidence", "range")
         assert source.units == ("px", "1", "m")
     layers = read(path)
-    relief = run.alignments["NIR"].parallax.relief  # type: ignore[union-attr]
+    relief = run.alignments["NIR"].mapping.parallax.relief  # type: ignore[union-attr]
     np.testing.assert_allclose(layers["parallax"], relief.parallax_px, atol=0.0051)
     np.testing.assert_allclose(layers["confidence"], 0.8, atol=1e-6)
     assert np.median(np.abs(layers["range"] / run.truth.range_m - 1)) < 0.003
@@ -139,13 +140,13 @@ def test_the_grid_of_the_stack_is_that_of_the_relief(run: Run, tmp_path: Path, m
     assert sidecar.output.nodata is not None
     x, y = np.meshgrid(np.arange(x0, x0 + width), np.arange(y0, y0 + height))
     raw = lens.distort(run.capture.reference.lens, np.stack([x, y], axis=-1).astype(float))
-    relief = run.alignments["NIR"].parallax.relief  # type: ignore[union-attr]
+    relief = run.alignments["NIR"].mapping.parallax.relief  # type: ignore[union-attr]
     np.testing.assert_allclose(layers["parallax"], relief(raw), atol=0.0051)
 
 
 def test_layers_on_a_finer_grid_that_starts_elsewhere(run: Run) -> None:
     grid = OutputGrid(20, 14, 60, 50, PixelScale(2.0, 2.0))
-    relief = run.alignments["NIR"].parallax.relief  # type: ignore[union-attr]
+    relief = run.alignments["NIR"].mapping.parallax.relief  # type: ignore[union-attr]
     layers = relief_layers(run.capture, run.alignments, relief, grid)
     x, y = np.meshgrid(np.arange(20, 80), np.arange(14, 64))
     at = (np.stack([x, y], axis=-1) + 0.5) / 2 - 0.5
@@ -166,7 +167,7 @@ def test_where_places_of_lenses_are_unknown_there_is_no_range(
 
 
 def test_without_a_relief_nothing_is_written(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flat: Mapping[str, Alignment] = {n: replace(a, parallax=None) for n, a in run.alignments.items()}
+    flat: Mapping[str, Alignment] = {n: replace(a, mapping=a.mapping.of_the_plane) for n, a in run.alignments.items()}
     monkeypatch.setattr(run, "alignments", flat)
     sidecar = run.write(tmp_path, monkeypatch, relief_map=True)
     assert not list(tmp_path.rglob("*.relief.tif"))
@@ -195,12 +196,12 @@ def test_a_reader_can_rebuild_the_mapping(run: Run, written: tuple[Path, Sidecar
         nodes = np.array(part.reference_px)
         plane, slope = (spline(nodes, np.array(v))(PIXELS) for v in (part.plane_px, part.slope))
         alignment = run.alignments[band.name]
-        expected = mapping_of(run.capture.reference, band, alignment)(PIXELS)
+        expected = alignment.map(PIXELS)
         assert np.abs(plane + z * slope - expected).max() < 0.1
-        assert alignment.parallax is not None
-        assert alignment.parallax.hidden is not None
-        assert part.baseline == pytest.approx(alignment.parallax.baseline)
-        assert part.occluded == pytest.approx(alignment.parallax.hidden.mean(), abs=1e-4)
+        assert alignment.mapping.parallax is not None
+        assert alignment.mapping.parallax.hidden is not None
+        assert part.baseline == pytest.approx(alignment.mapping.parallax.baseline)
+        assert part.occluded == pytest.approx(alignment.mapping.parallax.hidden.mean(), abs=1e-4)
     assert next(b for b in sidecar.bands if b.status == "reference").relief is None
 
 

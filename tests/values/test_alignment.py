@@ -5,15 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from agalign.values import geometry
-from agalign.values.alignment import (
-    Alignment,
-    DisplacementField,
-    DisplacementResult,
-    JointResult,
-    PairScales,
-    Residual,
-    Seed,
-)
+from agalign.values.alignment import Alignment, JointResult, PairScales, Residual, Seed
+from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx, PixelScale
@@ -97,10 +90,9 @@ def test_windows_of_an_image_are_windows_of_its_file() -> None:
 def test_an_alignment_between_images_is_the_same_between_files() -> None:
     seed = Seed("rig", geometry.translation(5, -3), 30.0)
     residual = Residual[FixedImagePx].of(POINTS, np.full((3, 2), 0.1), np.full(3, 9.0))
-    local = DisplacementResult(field(), FixedImagePx(0.5), FixedImagePx(0.25))
     between_images: Alignment[FixedImagePx] = Alignment(
-        homography(),
-        "pixel",
+        PixelMapping(homography(), local=field()),
+        (150, 100),
         "aligned",
         (),
         seed,
@@ -109,17 +101,16 @@ def test_an_alignment_between_images_is_the_same_between_files() -> None:
         1.5,
         {"ncc": 0.1},
         {"ncc": 0.9},
-        local,
-        field(),
+        {"homography": FixedImagePx(0.5), "field": FixedImagePx(0.25)},
     )
-    between_files: Alignment[FixedFilePx] = between_images.in_file_px(SCALES)
+    between_files: Alignment[FixedFilePx] = between_images.in_file_px(SCALES, (300, 400))
+    mapped = between_images.map(SCALES.fixed.positions(POINTS))
+    assert_allclose(SCALES.moving.positions(between_files.map(POINTS)), mapped, atol=1e-9)
     assert_allclose(between_files.fixed_to_moving, SCALES.between_files(homography()))
     assert_allclose(between_files.seed.fixed_to_moving, SCALES.between_files(seed.fixed_to_moving))
-    assert between_files.field is not None
-    assert_allclose(SCALES.fixed.displacements(between_files.field(POINTS)), field()(SCALES.fixed.positions(POINTS)))
-    assert between_files.local is not None
-    assert between_files.local.after_p95_px == pytest.approx(0.25 * np.sqrt(8))
-    kept = ("space", "status", "issues", "seconds", "before", "after", "prediction")
+    assert between_files.candidates == pytest.approx({"homography": 0.5 * np.sqrt(8), "field": 0.25 * np.sqrt(8)})
+    assert between_files.size_px == (300, 400)
+    kept = ("space", "geometry", "status", "issues", "seconds", "before", "after", "prediction")
     assert [getattr(between_files, k) for k in kept] == [getattr(between_images, k) for k in kept]
     assert PairScales() == PairScales(PixelScale(1.0, 1.0), PixelScale(1.0, 1.0))
 

@@ -7,7 +7,8 @@ import pytest
 
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
-from agalign.values.alignment import Alignment, DisplacementField, PairScales, Seed
+from agalign.values.alignment import Alignment, PairScales, Seed
+from agalign.values.displacement import DisplacementField
 from agalign.values.image import Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
@@ -149,11 +150,8 @@ def test_a_file_that_was_reduced_has_the_same_ground() -> None:
     """An alignment found on reduced images, in px of the files."""
     scales = PairScales(PixelScale(0.5, 0.5), PixelScale(0.25, 0.25))
     seed = Seed("rig", H, 30.0, 30.0, 5.0)
-    found = Alignment(
-        H, "pixel", "aligned", (), seed, None, None, 0.0, parallax=Parallax(stepped(), BASELINE, box_hidden())
-    )
-    in_file = found.in_file_px(scales)
-    on_images, on_files = (PixelMapping(a.fixed_to_moving, parallax=a.parallax) for a in (found, in_file))
+    on_images = PixelMapping(H, parallax=Parallax(stepped(), BASELINE, box_hidden()))
+    on_files = Alignment(on_images, SIZE, "aligned", (), seed).in_file_px(scales, (1280, 960)).mapping
     points = pixels(WHOLE)[5::21, 6::23]
     of_files = (points + 0.5) * 2 - 0.5
     np.testing.assert_allclose(on_files(of_files), (on_images(points) + 0.5) * 4 - 0.5, atol=2e-4)

@@ -6,6 +6,7 @@ import pytest
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.issues import RETRIEVAL, SEED_DOES_NOT_FIT, Issue, sentence
+from agalign.values.mapping import PixelMapping
 from agalign.verify.acceptance import is_unchanged, status_of
 from agalign.verify.check import Evidence
 from agalign.verify.checks import issues_of
@@ -69,7 +70,7 @@ def test_a_seed_that_does_not_fit_is_not_used() -> None:
     issues = (Issue(RETRIEVAL, 0.1, 0.2),)
     off = replace(GOOD_RESIDUAL, median_px=9.0)
     assert status_of(issues, off, seed=True) == "failed"
-    failed = Alignment(np.eye(3), "pixel", "failed", (*issues, Issue(SEED_DOES_NOT_FIT)), SEED, None, off, 0.0)
+    failed = Alignment(PixelMapping(np.eye(3)), SIZE, "failed", (*issues, Issue(SEED_DOES_NOT_FIT)), SEED, residual=off)
     assert failed.reason is not None
     assert "rig seed is used unchanged, but the seed does not fit either" in failed.reason
 

@@ -6,7 +6,8 @@ import pytest
 from agalign.capture.reference import Reference
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry
-from agalign.values.alignment import DisplacementField, Residual
+from agalign.values.alignment import Residual
+from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed
+from agalign.values.mapping import PixelMapping
 from agalign.verify.expected_error import expected_error_px
 
 SIZE = 640, 480
@@ -16,7 +17,7 @@ def alignment(corner_std_px: list[float], residual: Residual | None) -> Alignmen
     joint = JointResult(
         np.eye(3), 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, ((0.1, 0.1),) * 4, np.diag(std**2)
     )
-    return Alignment(np.eye(3), "pixel", "aligned", (), Seed("identity", np.eye(3), 1.0), joint, residual, 0.0)
+    return Alignment(PixelMapping(np.eye(3)), SIZE, "aligned", (), Seed("identity", np.eye(3), 1.0), joint, residual)
 
 
 def windows(columns: int, shift_px: float) -> Residual:
@@ -44,6 +45,6 @@ def test_predictions_have_their_standard_error_and_seeds_none() -> None:
     predicted = replace(known, status="predicted", prediction=Prediction(np.eye(3), "bands", 0.4))
     np.testing.assert_allclose(expected_error_px(predicted, SIZE, LEFT), 0.4)
     # The standard error of a thermal band is in its own pixels, which are ten times as large.
-    thermal = replace(predicted, fixed_to_moving=np.diag([0.1, 0.1, 1.0]))
+    thermal = replace(predicted, mapping=PixelMapping(np.diag([0.1, 0.1, 1.0])))
     np.testing.assert_allclose(expected_error_px(thermal, SIZE, LEFT), 4.0)
     assert np.isinf(expected_error_px(replace(known, status="seed_only"), SIZE, LEFT)).all()
