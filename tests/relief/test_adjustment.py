@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from agalign.relief.plane_parallax import PlaneParallax, WindowShifts, are_of_lenses, fit_plane_parallax, parallax_of
+
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Residual
