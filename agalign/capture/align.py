@@ -69,7 +69,7 @@ def align_capture_bands(
         aligned = with_predictions(pairs, aligned, model.rig, capture)
     if not settings.seed.only:
         aligned = without_extrapolated(pairs, aligned, None if model is None else model.rig)
-    aligned = _with_metrics(pairs, aligned, progress)
+    aligned = _with_metrics(pairs, aligned, progress, with_ties=settings.write.tie_points)
     result: dict[str, Alignment[FixedFilePx]] = {}
     for band in capture.bands_of_the_references_lens:
         identity = Seed("identity", geometry.identity(), 0.0)
@@ -98,14 +98,14 @@ def _between_files(
 
 
 def _with_metrics(
-    pairs: Sequence[BandPair], result: dict[str, Alignment[FixedImagePx]], progress: PairProgress
+    pairs: Sequence[BandPair], result: dict[str, Alignment[FixedImagePx]], progress: PairProgress, *, with_ties: bool
 ) -> dict[str, Alignment[FixedImagePx]]:
     """Return the alignments with similarity metrics."""
     timer, measured = _Timer(), {}
     for pair in pairs:
         progress(pair.name, "measuring", 0.0)
         with timer.measure([pair.name]):
-            measured[pair.name] = with_metrics(result[pair.name], pair)
+            measured[pair.name] = with_metrics(result[pair.name], pair, with_ties=with_ties)
     return timer.added_to(measured)
 
 

@@ -94,6 +94,11 @@ class Reference:
         return FixedWindows(self.grey.valid, self.structure, _SMALL_WINDOW_PX)
 
     @cached_property
+    def tie_windows(self) -> FixedWindows:
+        """Windows of the size of those that verify a relief, over the whole image."""
+        return FixedWindows(self.grey.valid, self.structure, _HELD_OUT_PX)
+
+    @cached_property
     def displacement_field(self) -> DisplacementEstimator:
         """Estimator of displacement fields."""
         return DisplacementEstimator(self.grey.valid, self.structure)

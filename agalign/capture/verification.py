@@ -213,12 +213,19 @@ def as_predicted(alignment: Alignment[FixedImagePx], pair: BandPair, prediction:
     return replace(alignment, mapping=mapping, status="predicted", residual=residual, prediction=prediction)
 
 
-def with_metrics(alignment: Alignment[FixedImagePx], pair: BandPair) -> Alignment[FixedImagePx]:
-    """Return the alignment with similarity metrics before (image borders overlaid) and after alignment."""
+def with_metrics(
+    alignment: Alignment[FixedImagePx], pair: BandPair, *, with_ties: bool = False
+) -> Alignment[FixedImagePx]:
+    """Return the alignment with similarity metrics before (image borders overlaid) and after alignment.
+
+    `with_ties` also measures windows under the final mapping: small ones if parallax varies within large ones.
+    """
     similarity = pair.reference.similarity
     before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
     after = pair.warped_moving(alignment.mapping)
-    return replace(alignment, before=similarity.to(before), after=similarity.to(after))
+    windows = pair.reference.windows if alignment.mapping.parallax is None else pair.reference.tie_windows
+    ties = windows.residuals(after) if with_ties else None
+    return replace(alignment, before=similarity.to(before), after=similarity.to(after), ties=ties)
 
 
 def _unchanged_if_aligned(joint: JointResult[FixedImagePx], pair: BandPair) -> JointResult[FixedImagePx]:

@@ -76,17 +76,17 @@ class TiePoints(Product):
 def _points(context: ProductContext) -> Iterator[TiePoint]:
     for band in context.capture.moving:
         alignment = context.usable.get(band.name)
-        if alignment is not None and alignment.residual is not None:
+        if alignment is not None and alignment.ties is not None:
             yield from tie_points(band, alignment)
 
 
 def tie_points(band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoint]:
-    """Yield the tie points of a band with a measured residual.
+    """Yield the tie points of a band whose windows were measured under its final mapping.
 
     The point p of the reference corresponds to p + shift in the warped band, and so to mapping(p + shift) in the file
     of the band.
     """
-    residual = alignment.residual
+    residual = alignment.ties
     assert residual is not None
     measured = np.isfinite(residual.shifts_px[:, 0])
     at_px, shifts_px = residual.centres_px[measured], residual.shifts_px[measured]

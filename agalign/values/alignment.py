@@ -210,6 +210,8 @@ class Alignment(Generic[FixedPx]):
     joint: JointResult[FixedPx] | None = None
     residual: Residual[FixedPx] | None = None
     """Of windows that took no part in the estimation."""
+    ties: Residual[FixedPx] | None = None
+    """Of all windows under this mapping, including those that it was fitted to; None unless they were requested."""
     seconds: float = 0.0
     before: Mapping[str, float] = dataclasses.field(default_factory=dict)
     after: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -294,6 +296,7 @@ class Alignment(Generic[FixedPx]):
             seed=replace(self.seed, fixed_to_moving=scales.between_files(self.seed.fixed_to_moving)),
             joint=None if self.joint is None else self.joint.in_file_px(scales),
             residual=None if self.residual is None else self.residual.in_file_px(scales),
+            ties=None if self.ties is None else self.ties.in_file_px(scales),
             seconds=self.seconds,
             before=self.before,
             after=self.after,
