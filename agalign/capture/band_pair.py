@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from agalign.pixels.grey import channel_mean
 from agalign.pixels.raster import read_for_alignment
 from agalign.pixels.resample import warped
 from agalign.pixels.stripes import without_common_stripes
+from agalign.pixels.structure import blur_px
 from agalign.values import geometry
 from agalign.values.alignment import SAME_SCALES, PairScales
 from agalign.values.capture import Band, Capture
@@ -35,6 +37,7 @@ from agalign.values.pixel_units import (
     PixelScale,
 )
 from agalign.values.relief import Parallax
+from agalign.verify.residuals import FixedWindows
 
 Candidates = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of preference."""
@@ -49,6 +52,8 @@ _MAX_REDUCED_SCALE = 0.7
 _LONGEST_SIDE_PX = 2700
 """Larger images are reduced to this for estimation, which limits memory and time; `full_resolution` refines the result.
 The bands of most cameras have fewer pixels (2592 on the Mavic 3M)."""
+_MAX_SHARP_PX = 2.5
+"""Maximum length at which a sharp image varies (`structure.blur_px`)."""
 _COARSE_RATIO = 0.4
 """A moving band is coarse if its magnification relative to the reference is smaller than this; the reference is reduced
 for it."""
@@ -124,6 +129,16 @@ class BandPair:
         These are undistorted if the lens of the reference is known.
         """
         return self.space == ("pixel" if self.reference.image.lens is None else "undistorted")
+
+    @cached_property
+    def is_blurred(self) -> bool:
+        """True if one of the images is blurred: shifts of small windows are then noisy."""
+        return max(self.reference.blur_px, blur_px(channel_mean(self.moving_image))) > _MAX_SHARP_PX
+
+    @property
+    def windows(self) -> FixedWindows:
+        """The windows that verify an alignment."""
+        return self.reference.large_windows if self.is_blurred else self.reference.windows
 
     @property
     def sizes_px(self) -> tuple[tuple[int, int], tuple[int, int]]:

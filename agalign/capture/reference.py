@@ -6,7 +6,7 @@ from functools import cached_property
 from agalign.pixels.grey import channel_mean
 from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
 from agalign.pixels.resample import shrink, textured
-from agalign.pixels.structure import Field, structure_field, windowed_spectra
+from agalign.pixels.structure import Field, blur_px, structure_field, windowed_spectra
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
 from agalign.verify.displacement_field import DisplacementEstimator
@@ -82,6 +82,16 @@ class Reference:
     def windows(self) -> FixedWindows:
         """Windows for the verification of an alignment."""
         return FixedWindows(self.grey.valid, self.structure)
+
+    @cached_property
+    def large_windows(self) -> FixedWindows:
+        """Windows of twice the size with an overlap of one half, for blurred images."""
+        return FixedWindows(self.grey.valid, self.structure, 2 * self.windows.side, self.windows.side)
+
+    @cached_property
+    def blur_px(self) -> float:
+        """Length at which the image varies."""
+        return blur_px(self.grey)
 
     @cached_property
     def overlapping_windows(self) -> FixedWindows:

@@ -167,11 +167,16 @@ def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tup
 
 
 def _common_residuals(group: Sequence[ReliefCandidate]) -> list[Residual[FixedImagePx]]:
-    """Return the residuals of all bands in the same windows, in small ones if the residual of any band uses these."""
-    centres_px = {tuple(c) for c in group[0].pair.reference.windows.centres_px.tolist()}
+    """Return the residuals of all bands in the same windows: large ones if any band is blurred, or small ones if the
+    residual of any band uses these.
+    """
+    reference = group[0].pair.reference
+    if any(c.pair.is_blurred for c in group):
+        return [reference.large_windows.residuals(c.warped.warped) for c in group]
+    centres_px = {tuple(c) for c in reference.windows.centres_px.tolist()}
     if all(tuple(c) in centres_px for each in group for c in each.warped.residual.centres_px.tolist()):
         return [c.warped.residual for c in group]
-    return [c.pair.reference.small_windows.residuals(c.warped.warped) for c in group]
+    return [reference.small_windows.residuals(c.warped.warped) for c in group]
 
 
 def _far_share(residual: Residual[FixedImagePx]) -> float:

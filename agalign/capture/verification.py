@@ -87,7 +87,7 @@ class WarpedPair:
 def _residual_of(pair: BandPair, mapping: PixelMapping, warped: Raster) -> Residual[FixedImagePx]:
     """Measure the residual in windows; in small windows if these cover more quarters of the overlap."""
     size_px = pair.fixed.size_px
-    residual = pair.reference.windows.residuals(warped)
+    residual = pair.windows.residuals(warped)
     in_frame_px = points_in_frame(mapping, size_px, pair.moving_image.size_px)
     if not unobserved_quarters(residual.centres_px, size_px, in_frame_px):
         return residual
@@ -223,7 +223,7 @@ def with_metrics(
     similarity = pair.reference.similarity
     before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
     after = pair.warped_moving(alignment.mapping)
-    windows = pair.reference.windows if alignment.mapping.parallax is None else pair.reference.tie_windows
+    windows = pair.windows if alignment.mapping.parallax is None else pair.reference.tie_windows
     ties = windows.residuals(after) if with_ties else None
     return replace(alignment, before=similarity.to(before), after=similarity.to(after), ties=ties)
 

@@ -4,6 +4,7 @@ The double-angle gradient field z = a ((gx + i gy) / |g|)^2 is equal for edges o
 the gradient magnitude, clipped so that a few strong edges do not dominate.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -191,3 +192,23 @@ def _vertex(left: float, centre: float, right: float) -> float:
     """Return the offset of the maximum of the parabola through three samples 1 px apart, in [-0.5, 0.5]."""
     curvature = left - 2 * centre + right
     return 0.0 if curvature >= 0 else float(np.clip(0.5 * (left - right) / curvature, -0.5, 0.5))
+
+
+def blur_px(raster: Raster) -> float:
+    """Return the length at which a single-channel image varies: the RMS of first over that of second derivatives, px.
+
+    It is measured in the central half of both sides. Sharp images have 1.3 to 2.2 px, noisy ones up to 1.4, and those
+    with a Gaussian blur of 3 px at least 2.8.
+    """
+    height, width = raster.valid.shape
+    central = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    smooth = cv2.GaussianBlur(raster.pixels[central], (0, 0), 1.0)
+    first = [cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1))]
+    second = [
+        cv2.Scharr(gradient, cv2.CV_32F, *order, scale=1 / 32) for gradient in first for order in ((1, 0), (0, 1))
+    ]
+    inside = cv2.erode(raster.valid[central].astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    if not inside.any():
+        return 0.0
+    squares = [sum(float((d[inside] ** 2).mean()) for d in derivatives) for derivatives in (first, second)]
+    return math.sqrt(squares[0] / squares[1]) if squares[1] > 0 else 0.0
