@@ -23,7 +23,7 @@ from agalign.method.joint import Results, align_from_scratch, refine_with
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, RefinedPair, Seed
+from agalign.values.alignment import Alignment, JointResult, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
@@ -271,18 +271,27 @@ def verify_together(
             WarpedPair.of(pair, pair.mapping(result.fixed_to_moving)) if isinstance(result, JointResult) else None
             for (pair, _), result in zip(starts, results, strict=True)
         ]
-        estimates = _map_estimates(starts, results, warped_pairs, model, settings)
+        residuals = {p.name: w.residual for (p, _), w in zip(starts, warped_pairs, strict=True) if w is not None}
+        estimates = _map_estimates(starts, results, residuals, model, settings)
+        halves = [
+            _map_estimates(
+                starts, results, {n: r.where(r.is_black == black) for n, r in residuals.items()}, model, settings
+            )
+            for black in (True, False)
+        ]
         progress(starts[0][0].name if starts else "", "relief", 0.0)
         candidates = _relief_candidates(starts, estimates, warped_pairs)
         relief = aligned_by_relief(candidates, settings.relief.use, with_fields=with_fields)
     alignments = relief.alignments
-    for (pair, seed), result, warped_pair in zip(starts, estimates, warped_pairs, strict=True):
+    for (pair, seed), result, warped_pair, *by_half in zip(starts, estimates, warped_pairs, *halves, strict=True):
         if pair.name in alignments:
             continue
+        first, second = (r.fixed_to_moving if isinstance(r, JointResult) else None for r in by_half)
+        by_halves = None if first is None or second is None else (first, second)
         progress(pair.name, "checking", 0.0)
         with timer.measure([pair.name]):
             use = settings.relief.use if with_fields and pair.name not in relief.along_a_line else "never"
-            alignment = verified(pair, seed, result, use, warped_pair, seed_only=settings.seed.only)
+            alignment = verified(pair, seed, result, use, warped_pair, by_halves, seed_only=settings.seed.only)
             is_mixed = pair.name in relief.others and alignment.status == "aligned"
             alignments[pair.name] = predicted_by_windows(alignment, pair) if is_mixed else alignment
     return alignments
@@ -316,7 +325,7 @@ def _results(
 
 
 def _map_estimates(
-    starts: Sequence[Start], results: Results, warped_pairs: Sequence[WarpedPair | None],
+    starts: Sequence[Start], results: Results, residuals: Mapping[str, Residual[FixedImagePx]],
     model: FlightModel | None, settings: Settings,
 ) -> list[JointResult[FixedImagePx] | Issue]:  # fmt: skip
     """Return the results after the MAP estimation of all bands of the capture."""
@@ -324,7 +333,6 @@ def _map_estimates(
         return list(results)  # the estimate is a homography, not of the family that the user chose
     names = [pair.name for pair, _ in starts]
     joint = {name: r for name, r in zip(names, results, strict=True) if isinstance(r, JointResult)}
-    residuals = {name: w.residual for name, w in zip(names, warped_pairs, strict=True) if w is not None}
     rig = None if model is None else model.rig
     estimates = map_estimate([pair for pair, _ in starts], joint, residuals, rig)
     return [estimates[name] if isinstance(r, JointResult) else r for name, r in zip(names, results, strict=True)]

@@ -20,6 +20,8 @@ _FIT_PX = 48
 """Side of the windows to which planes and baselines are fitted; small, so that most contain a single surface."""
 _HELD_OUT_PX = 64
 """Side of the windows that verify a relief; larger, because their shifts have less noise."""
+_LARGE_WINDOW_PX = 168
+"""Side of windows in blurred images: 15 x 10 blurs of 3 px."""
 _SMALL_WINDOW_PX = 32
 """Side of windows between saturated areas: the smallest with a clear correlation peak."""
 
@@ -85,8 +87,8 @@ class Reference:
 
     @cached_property
     def large_windows(self) -> FixedWindows:
-        """Windows of twice the size with an overlap of one half, for blurred images."""
-        return FixedWindows(self.grey.valid, self.structure, 2 * self.windows.side, self.windows.side)
+        """Larger windows, for blurred images."""
+        return FixedWindows(self.grey.valid, self.structure, _LARGE_WINDOW_PX)
 
     @cached_property
     def blur_px(self) -> float:

@@ -11,6 +11,7 @@ from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse, SeedKind
+from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue
 from agalign.values.mapping import PixelMapping
@@ -64,6 +65,19 @@ class WarpedPair:
                 return replace(self, mapping=mapping, residual=residual_under(self.residual, self.mapping, mapping))
         return WarpedPair.of(self.pair, mapping)
 
+    def cross_validated(self, by_halves: tuple[Matrix, Matrix]) -> "WarpedPair":
+        """Return the pair with the residual of each window under a mapping that was estimated without it.
+
+        `by_halves` are homographies estimated without the white and without the black windows of a chessboard.
+        """
+        black, residual = self.residual.is_black, self.residual
+        shifts_px = residual.shifts_px.copy()
+        for of_half, matrix in zip((black, ~black), reversed(by_halves), strict=True):
+            mapping = replace(self.mapping, fixed_to_moving=matrix)
+            shifts_px[of_half] = residual_under(residual.where(of_half), self.mapping, mapping).shifts_px
+        crossed = Residual[FixedImagePx].of(residual.centres_px, shifts_px, residual.peaks_sigma)
+        return replace(self, residual=crossed)
+
     @property
     def reduced_scale(self) -> PixelScale:
         """(x, y) of the reduced images relative to the fixed image."""
@@ -102,13 +116,14 @@ def verified(
     result: JointResult[FixedImagePx] | Issue,
     use: ReliefUse,
     warped_pair: WarpedPair | None = None,
+    by_halves: tuple[Matrix, Matrix] | None = None,
     *,
     seed_only: bool = False,
 ) -> Alignment[FixedImagePx]:
     """Verify a result; return its alignment with status, px of the images. With issues it has the mapping of the seed.
 
-    `use` is "never" for no displacement field.
-    `warped_pair` is the pair with a mapping close to the result's, if available; it avoids measuring again.
+    `use` is "never" for no displacement field. `warped_pair` is the pair with a mapping close to the result's, if
+    available; it avoids measuring again. `by_halves` are homographies from half of the windows (`cross_validated`).
     """
     joint: JointResult[FixedImagePx] | None = None
     local: DisplacementResult | None = None
@@ -118,6 +133,8 @@ def verified(
         joint = _unchanged_if_aligned(result, pair)
         mapping = pair.mapping(joint.fixed_to_moving)
         warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.with_mapping(mapping)
+        if by_halves is not None and joint is result:
+            warped_pair = warped_pair.cross_validated(by_halves)
         warped_pair, issues, local = _verified(warped_pair, joint, use)
         is_displaced = local is not None and local.field is not None
     else:

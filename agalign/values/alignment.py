@@ -137,6 +137,16 @@ class Residual(Generic[FixedPx]):
         )
 
     @property
+    def is_black(self) -> NDArray[np.bool_]:
+        """(n,) True for alternate windows along both axes of their grid: the windows of the two halves share no pixels."""
+        column, row = (np.unique(self.centres_px[:, axis], return_inverse=True)[1] for axis in (0, 1))
+        return np.asarray((column + row) % 2 == 0)
+
+    def where(self, selected: NDArray[np.bool_]) -> "Residual[FixedPx]":
+        """The windows where a mask (n,) is True."""
+        return Residual[FixedPx].of(self.centres_px[selected], self.shifts_px[selected], self.peaks_sigma[selected])
+
+    @property
     def measured_px(self) -> NDArray[np.float64]:
         """(m, 2) centres of the windows in which a shift was measured."""
         return self.centres_px[np.isfinite(self.shifts_px[:, 0])]
