@@ -275,9 +275,9 @@ def verify_together(
         estimates = _map_estimates(starts, results, residuals, model, settings)
         halves = [
             _map_estimates(
-                starts, results, {n: r.where(r.is_black == black) for n, r in residuals.items()}, model, settings
+                starts, results, {name: r.where(of_half(r)) for name, r in residuals.items()}, model, settings
             )
-            for black in (True, False)
+            for of_half in (lambda r: r.is_black, lambda r: ~r.is_black)
         ]
         progress(starts[0][0].name if starts else "", "relief", 0.0)
         candidates = _relief_candidates(starts, estimates, warped_pairs)

@@ -138,7 +138,7 @@ class Residual(Generic[FixedPx]):
 
     @property
     def is_black(self) -> NDArray[np.bool_]:
-        """(n,) True for alternate windows along both axes of their grid: the windows of the two halves share no pixels."""
+        """(n,) True for alternate windows along both axes of their grid, as on a chessboard."""
         column, row = (np.unique(self.centres_px[:, axis], return_inverse=True)[1] for axis in (0, 1))
         return np.asarray((column + row) % 2 == 0)
 
