@@ -273,12 +273,10 @@ def verify_together(
         ]
         residuals = {p.name: w.residual for (p, _), w in zip(starts, warped_pairs, strict=True) if w is not None}
         estimates = _map_estimates(starts, results, residuals, model, settings)
-        halves = [
-            _map_estimates(
-                starts, results, {name: r.where(of_half(r)) for name, r in residuals.items()}, model, settings
-            )
-            for of_half in (lambda r: r.is_black, lambda r: ~r.is_black)
-        ]
+        black, white = (
+            {name: r.where(r.is_black == is_black) for name, r in residuals.items()} for is_black in (True, False)
+        )
+        halves = [_map_estimates(starts, results, half, model, settings) for half in (black, white)]
         progress(starts[0][0].name if starts else "", "relief", 0.0)
         candidates = _relief_candidates(starts, estimates, warped_pairs)
         relief = aligned_by_relief(candidates, settings.relief.use, with_fields=with_fields)
