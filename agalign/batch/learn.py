@@ -177,11 +177,11 @@ class _FlightLearner:
         pairs = [(one, images) for one, images in zip(chosen, loaded, strict=True) if images is not None]
         groups: list[ImageGroup] = []
         for one, images in pairs:
-            groups += images.groups_from({} if one.observation is None else one.observation.refined)
+            groups += images.groups_from(one.refined)
         try:
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
-                return net, list(pool.map(lambda p: p[1].refined_by(net, settings, patches), pairs))
+                return net, list(pool.map(lambda p: p[1].refined_by(net, settings, patches, is_final=True), pairs))
         except Exception as error:
             # One capture may make learning from all of them fail; a network is then learned for each capture alone.
             log_failure("the flight cannot be learned from", error)

@@ -91,8 +91,10 @@ class LearningCapture:
     """The network needs no more learning for it."""
     mappings: Mapping[str, Matrix] = field(default_factory=dict)
     """Refined mappings of bands with distinguishable held-out patches, px of the files."""
+    refined: Mapping[str, RefinedPair] = field(default_factory=dict)
+    """Refined mappings of all bands; empty if the initial network was not applied, because a seed is not trusted."""
     observation: RigObservation | None = None
-    """None if the initial network was not applied, because a seed is not trusted."""
+    """None if the mappings were not verified, because the network needs more learning."""
 
 
 @dataclass(frozen=True)
@@ -124,20 +126,23 @@ class LoadedCapture:
                     group.mappings[k] = pair.result.fixed_to_moving
         return [group for _, group in self.groups]
 
-    def refined_by(self, net: Descriptor, settings: Settings, patches: int) -> LearningCapture:
-        """Refine and verify the pairs by a network; return the capture without its images."""
+    def refined_by(self, net: Descriptor, settings: Settings, patches: int, *, is_final: bool) -> LearningCapture:
+        """Refine the pairs by a network and verify them if it is final or good enough; return the capture without its
+        images.
+        """
         of_pair: dict[int, JointResult[FixedImagePx] | Issue] = {}
         for places, group in self.groups:
             of_pair |= zip(places, refine_with(net, group, settings.joint, quiet, patches), strict=True)
         results = [of_pair[i] for i in range(len(self.pairs))]
         known = [(p, r) for p, r in zip(self.pairs, results, strict=True) if isinstance(r, JointResult)]
         starts = list(zip(self.pairs, self.seeds, strict=True))
-        aligned = verify_together(starts, results, None, settings, with_fields=False)
-        return LearningCapture(
-            self.capture, _are_good_enough(results),
-            {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL},
-            _observation(self.pairs, aligned, refined_pairs(starts, results), self.capture),
-        )  # fmt: skip
+        is_good_enough, refined = _are_good_enough(results), refined_pairs(starts, results)
+        observation = None
+        if is_final or is_good_enough:
+            aligned = verify_together(starts, results, None, settings, with_fields=False)
+            observation = _observation(self.pairs, aligned, refined, self.capture)
+        mappings = {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL}
+        return LearningCapture(self.capture, is_good_enough, mappings, refined, observation)
 
 
 def load_capture(
@@ -199,7 +204,7 @@ class ChooseAndRefine:
         if not (net.is_trained and best.is_trusted):
             return LearningCapture(best.capture, is_good_enough=False)
         try:
-            return best.refined_by(net, self.settings, self.patches)
+            return best.refined_by(net, self.settings, self.patches, is_final=False)
         except Exception as error:
             log_failure(f"{best.capture.label} cannot be learned from", error)
             return None

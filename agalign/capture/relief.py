@@ -32,6 +32,7 @@ from agalign.values import geometry
 from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.displacement import DisplacementField
+from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.values.relief import Parallax, Relief
@@ -75,11 +76,14 @@ class ReliefCandidate:
 
     def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
         """Measure the windows of the fit with a mapping."""
-        return self.pair.reference.fit_windows.residuals(self.pair.warped_moving(mapping))
+        return self.pair.reference.fit_windows.residuals(self._warped(mapping))
 
     def held_out_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
         """Measure the windows that take no part in the fit."""
-        return self.pair.reference.held_out_windows.residuals(self.pair.warped_moving(mapping))
+        return self.pair.reference.held_out_windows.residuals(self._warped(mapping))
+
+    def _warped(self, mapping: PixelMapping) -> Raster:
+        return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
 
 
 @dataclass
