@@ -124,6 +124,11 @@ class _FlightLearner:
     def _size_px(self) -> tuple[int, int]:
         return self.captures[0].reference.size_px
 
+    @property
+    def _has_rig(self) -> bool:
+        """True if the flight has enough captures for a rig."""
+        return len(self.captures) >= MIN_CAPTURES
+
     def _key(self, capture: Capture) -> str:
         return refinement_key(capture, self.settings)
 
@@ -155,7 +160,7 @@ class _FlightLearner:
         others = [(c,) for c in spread[: _MIN_RIG_CAPTURES - len(stretches)]]
         patches = FLIGHT_PATCHES if len(stretches) >= MIN_CAPTURES else PATCHES
         start = None if self.start is None else portable(self.start)
-        task = ChooseAndRefine(self._bands, self.settings, patches, start)
+        task = ChooseAndRefine(self._bands, self.settings, patches, start, self._has_rig)
         refined = []
         for one in self.apply(task, [*stretches, *others]):
             refined.append(one)
@@ -181,7 +186,9 @@ class _FlightLearner:
         try:
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
-                return net, list(pool.map(lambda p: p[1].refined_by(net, settings, patches, is_final=True), pairs))
+                return net, list(
+                    pool.map(lambda p: p[1].refined_by(net, settings, patches, observe=self._has_rig), pairs)
+                )
         except Exception as error:
             # One capture may make learning from all of them fail; a network is then learned for each capture alone.
             log_failure("the flight cannot be learned from", error)
@@ -194,7 +201,7 @@ class _FlightLearner:
         """
         count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // _CAPTURES_PER_RIG_CAPTURE))
         result = {one.capture.label: one.observation for one in known if one.observation is not None}
-        if len(self.captures) < MIN_CAPTURES:
+        if not self._has_rig:
             return result
         again = [c for c in self.captures if c.label in result and result[c.label].misaligned]
         waiting = [*again, *(c for c in _spread(self.captures, count) if c.label not in result)]
@@ -216,7 +223,7 @@ class _FlightLearner:
 
     def _rig(self, observations: Sequence[RigObservation]) -> Rig | None:
         """Return the rig, with the displacement fields of the lenses; None if the captures do not determine it."""
-        if len(self.captures) < MIN_CAPTURES:
+        if not self._has_rig:
             return None
         rig = learn_rig([o.observation for o in observations], self._size_px, _layout(self.captures), self.apply)
         if rig is None:

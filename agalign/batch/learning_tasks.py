@@ -126,9 +126,12 @@ class LoadedCapture:
                     group.mappings[k] = pair.result.fixed_to_moving
         return [group for _, group in self.groups]
 
-    def refined_by(self, net: Descriptor, settings: Settings, patches: int, *, is_final: bool) -> LearningCapture:
-        """Refine the pairs by a network and verify them if it is final or good enough; return the capture without its
-        images.
+    def refined_by(
+        self, net: Descriptor, settings: Settings, patches: int, *, observe: bool, is_final: bool = True
+    ) -> LearningCapture:
+        """Refine the pairs by a network; return the capture without its images.
+
+        With `observe` they are also verified, as observations of the rig, if the network is final or good enough.
         """
         of_pair: dict[int, JointResult[FixedImagePx] | Issue] = {}
         for places, group in self.groups:
@@ -138,7 +141,7 @@ class LoadedCapture:
         starts = list(zip(self.pairs, self.seeds, strict=True))
         is_good_enough, refined = _are_good_enough(results), refined_pairs(starts, results)
         observation = None
-        if is_final or is_good_enough:
+        if observe and (is_final or is_good_enough):
             aligned = verify_together(starts, results, None, settings, with_fields=False)
             observation = _observation(self.pairs, aligned, refined, self.capture)
         mappings = {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL}
@@ -188,6 +191,8 @@ class ChooseAndRefine:
     settings: Settings
     patches: int
     start: FlightModel | None
+    observe: bool
+    """The flight has enough captures for a rig."""
 
     def __call__(self, captures: Sequence[Capture]) -> LearningCapture | None:
         start = None if self.start is None else _on_device(self.start, self.settings)
@@ -204,7 +209,7 @@ class ChooseAndRefine:
         if not (net.is_trained and best.is_trusted):
             return LearningCapture(best.capture, is_good_enough=False)
         try:
-            return best.refined_by(net, self.settings, self.patches, is_final=False)
+            return best.refined_by(net, self.settings, self.patches, observe=self.observe, is_final=False)
         except Exception as error:
             log_failure(f"{best.capture.label} cannot be learned from", error)
             return None
