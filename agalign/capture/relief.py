@@ -36,6 +36,7 @@ from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.values.relief import Parallax, Relief
+from agalign.verify.displacement_field import robust_loss
 from agalign.verify.residuals import decrease_sigma
 
 _MIN_BANDS = 2
@@ -285,7 +286,7 @@ def _aligned_group(group: Sequence[ReliefCandidate], *, with_fields: bool) -> di
         if estimate is None:
             return {}
         checked = [estimate.checked(band) for band in estimate.bands]
-        if not _is_chosen(checked):
+        if not _is_chosen(checked) or (with_fields and not estimate.beats_fields(checked)):
             return {}
         names = {band.name for band in estimate.bands}
         for candidate in (c for c in group if c.pair.name not in names):
@@ -305,6 +306,7 @@ class _Estimate:
     halves: Sequence[Relief]
     """From the bands with odd and with even index: each verifies the other bands."""
     with_fields: bool
+    """Displacement fields are fitted, as no rig contains the distortion of the lenses."""
 
     @classmethod
     def of(cls, group: Sequence[ReliefCandidate], *, with_fields: bool) -> "_Estimate | None":
@@ -359,6 +361,26 @@ class _Estimate:
             corners_px, change = windows.fit_baseline(self.relief(windows.centres_px), candidate.pair.fixed.size_px)
             band = band.corrected(corners_px, np.add(band.baseline, change))
         return band
+
+    def beats_fields(self, checked: Sequence["_Checked"]) -> bool:
+        """Return True if the relief explains windows of the median band better than displacement fields without it."""
+        gains = []
+        for band, each in zip(self.bands, checked, strict=True):
+            if (
+                each.held_out is None
+                or each.alignment is None
+                or each.plane.p95_px >= _CLEAR_GAIN * each.held_out.p95_px
+            ):
+                gains.append(math.inf)
+                continue
+            pair, candidate = band.candidate.pair, band.candidate
+            estimator = pair.reference.displacement_field
+            field = estimator.refine(channel_mean(pair.moving_image), candidate.warped.mapping)
+            parallax = Parallax(self.verifying(band), band.baseline)
+            by_relief = pair.warped_moving(each.alignment.mapping.with_parallax(parallax))
+            by_field = field.held_out or estimator.verification.residuals(candidate.warped.warped)
+            gains.append(robust_loss(by_field) - robust_loss(estimator.verification.residuals(by_relief)))
+        return float(np.median(gains)) >= 0
 
     def checked(self, band: _Band) -> "_Checked":
         """Verify a band with the relief from other bands, with a displacement field if that is more accurate.

@@ -270,13 +270,25 @@ class _Gain:
         return self.sigma >= min_sigma and self.after_p95_px <= _MAX_P95_GROWTH * self.before_p95_px
 
 
+def robust_loss(residual: Residual[FixedImagePx]) -> float:
+    """Return the mean of log(1 + (shift / 0.1 px)^2) of the measured windows, infinite without any."""
+    lengths = np.linalg.norm(residual.shifts_px, axis=1)
+    measured = np.isfinite(lengths)
+    return float(_losses(lengths[measured]).mean()) if measured.any() else math.inf
+
+
+def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return log(1 + (length / 0.1 px)^2), which is robust to wrong peaks and depth edges."""
+    return np.asarray(np.log1p((lengths_px / _LOSS_SCALE_PX) ** 2))
+
+
 def _gain_of(shifts: Shifts, remaining_px: NDArray[np.float64], smoothness: float) -> _Gain:
     """Return the gain from the lengths (n,) of the remaining shifts, NaN for windows that were not held out."""
     is_compared = np.isfinite(remaining_px) & (shifts.weights >= _MIN_WEIGHT)
     if not is_compared.any():
         return _Gain(smoothness)
     before, after = np.linalg.norm(shifts.shifts_px[is_compared], axis=1), remaining_px[is_compared]
-    losses_before, losses = (np.log1p((lengths / _LOSS_SCALE_PX) ** 2) for lengths in (before, after))
+    losses_before, losses = _losses(before), _losses(after)
     decrease = losses_before - losses
     sigma = float(decrease.mean() / max(decrease.std() / math.sqrt(len(decrease)), 1e-12))
     before_p95, after_p95 = (FixedImagePx(np.percentile(lengths, 95)) for lengths in (before, after))
