@@ -366,11 +366,9 @@ class _Estimate:
         """Return True if the relief explains windows of the median band better than displacement fields without it."""
         gains = []
         for band, each in zip(self.bands, checked, strict=True):
-            if (
-                each.held_out is None
-                or each.alignment is None
-                or each.plane.p95_px >= _CLEAR_GAIN * each.held_out.p95_px
-            ):
+            if each.held_out is None or each.alignment is None:
+                continue
+            if each.plane.p95_px >= _CLEAR_GAIN * each.held_out.p95_px:
                 gains.append(math.inf)
                 continue
             pair, candidate = band.candidate.pair, band.candidate
@@ -380,7 +378,7 @@ class _Estimate:
             by_relief = pair.warped_moving(each.alignment.mapping.with_parallax(parallax))
             by_field = field.held_out or estimator.verification.residuals(candidate.warped.warped)
             gains.append(robust_loss(by_field) - robust_loss(estimator.verification.residuals(by_relief)))
-        return float(np.median(gains)) >= 0
+        return bool(gains) and float(np.median(gains)) >= 0
 
     def checked(self, band: _Band) -> "_Checked":
         """Verify a band with the relief from other bands, with a displacement field if that is more accurate.
@@ -398,16 +396,16 @@ class _Estimate:
         complete = final.mapping(self.relief, with_occlusions=True)
         verifying = final.mapping(self.verifying(band), with_occlusions=True)
         held_out = candidate.held_out_residual(verifying)
-        candidates: dict[Geometry, FixedImagePx] = {"homography": plane.p95_px, "relief": held_out.p95_px}
         joint = with_corners(candidate.joint, complete.fixed_to_moving, fit.covariance_px2)
         if self.with_fields:
             result = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), complete, verifying)
             if result.field is not None and result.held_out is not None:
                 complete, held_out = replace(complete, local=result.field), result.held_out
-                candidates["relief and field"] = held_out.p95_px
         issues = WarpedPair(pair, complete, pair.warped_moving(complete), held_out).issues(joint)
         if issues:
             return replace(rejected, held_out=held_out)
+        kind: Geometry = "relief" if complete.local is None else "relief and field"
+        candidates = {"homography": plane.p95_px, kind: held_out.p95_px}
         alignment = Alignment(
             complete, pair.fixed.size_px, "aligned", (), candidate.seed, joint, held_out, candidates=candidates
         )
