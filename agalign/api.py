@@ -12,7 +12,7 @@ from agalign.batch.capture import CaptureOutcome, process_capture, quiet
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.align import align_pairs
 from agalign.capture.band_pair import BandPair, Candidates
-from agalign.capture.extrapolation import without_extrapolated
+from agalign.capture.from_windows import without_extrapolated
 from agalign.capture.verification import with_metrics
 from agalign.config import Settings
 from agalign.errors import InputError

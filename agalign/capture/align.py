@@ -6,15 +6,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.coarse_estimate import predicted_if_coarse
-from agalign.capture.extrapolation import without_extrapolated
+from agalign.capture.from_windows import from_windows, without_extrapolated
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.prediction import bands_to_learn, with_predictions
 from agalign.capture.relief import ReliefCandidate, aligned_by_relief
 from agalign.capture.seeding import find_seed, first_candidate, image_groups
 from agalign.capture.verification import WarpedPair, predicted_by_windows, verified, with_metrics, without_result
-from agalign.capture.window_estimate import by_windows
 from agalign.config import Settings
 from agalign.flight.fingerprint import refinement_key
 from agalign.flight.model import FlightModel
@@ -230,7 +228,7 @@ class PairAligner:
         for pair, _ in starts:
             if pair.name in self.result:
                 with self.timer.measure([pair.name]):
-                    self.result[pair.name] = predicted_if_coarse(pair, by_windows(pair, self.result[pair.name]))
+                    self.result[pair.name] = from_windows(pair, self.result[pair.name])
 
     def _align(self, starts: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
         with self.timer.measure([pair.name for pair, _ in starts]):

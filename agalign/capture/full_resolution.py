@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agalign.capture.corner_fit import CornerFit, corner_correction, with_corners
-from agalign.errors import GeometryError, UnreadableFileError
+from agalign.errors import UnreadableFileError
 from agalign.flight.factors import distance_px
 from agalign.pixels.masks import learnable
 from agalign.pixels.raster import OpenRaster, open_raster, read_window
@@ -27,6 +26,7 @@ from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.check import Evidence
 from agalign.verify.checks import issues_of
 from agalign.verify.residuals import FixedWindows
+from agalign.verify.window_fit import fit_in_rounds
 
 _TILE_PX = 640
 """Side of a tile with 36 windows; an error of a few pixels of the reduced images does not move their content out of
@@ -34,10 +34,6 @@ it."""
 _MIN_CELLS, _MAX_CELLS = (4, 3), (8, 6)
 """Minimum and maximum (columns, rows) of cells, which contain one tile each: half of them determine eight parameters,
 and all of them fit into memory."""
-_ROUNDS = 3
-"""A correction is accurate to first order, so it is repeated."""
-_CONVERGED_PX = 0.02
-"""The refinement has converged if no corner moves by more than this, the noise of the windows."""
 _MAX_STEP_PX = 40.0
 """Maximum displacement of a corner; larger ones contradict the alignment of the reduced images."""
 
@@ -52,7 +48,7 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[Fixed
     with open_raster(reference.path) as source:
         tiles = [_FixedTile.read(source, reference, *of_cell) for of_cell in _tiles(reference, alignment).items()]
     try:
-        refined = _refined(alignment, moving, alignment.mapping, tiles, reference.size_px)
+        refined = _refined(alignment, moving, tiles, reference.size_px)
     except UnreadableFileError as error:
         issue = Issue(UNREADABLE, detail=str(error))
         return replace(
@@ -89,49 +85,25 @@ class _FixedTile:
         return Residual[FixedFilePx].of(centres_px, in_tile.shifts_px, in_tile.peaks_sigma)
 
 
-def _fitted(
-    moving: Band, start: PixelMapping, tiles: Sequence[_FixedTile], size_px: tuple[int, int]
-) -> tuple[PixelMapping, CornerFit] | None:
-    """Correct the mapping repeatedly while the median shift decreases; return it and the last correction, or None."""
-    result: tuple[PixelMapping, CornerFit] | None = None
-    mapping, residual = start, _residual(moving, start, tiles)
-    for _ in range(_ROUNDS):
-        fit = corner_correction(mapping, residual, size_px)
-        if fit is None or not fit.max_px <= _MAX_STEP_PX:
-            break
-        try:
-            step = replace(mapping, fixed_to_moving=fit.applied_to(mapping.fixed_to_moving, size_px))
-        except GeometryError:
-            break
-        next_residual = _residual(moving, step, tiles)
-        if not next_residual.median_px < residual.median_px:
-            break
-        result, mapping, residual = (step, fit), step, next_residual
-        if fit.max_px <= _CONVERGED_PX:
-            break
-    return result
-
-
 def _refined(
-    alignment: Alignment[FixedFilePx],
-    moving: Band,
-    start: PixelMapping,
-    tiles: Sequence[_FixedTile],
-    size_px: tuple[int, int],
+    alignment: Alignment[FixedFilePx], moving: Band, tiles: Sequence[_FixedTile], size_px: tuple[int, int]
 ) -> Alignment[FixedFilePx] | None:
     """Return the alignment fitted to half of the tiles, with its covariance and the residual of the other half.
 
     None if the median shift of that half does not decrease or a check finds an issue. Raises UnreadableFileError.
     """
-    fitted = _fitted(moving, start, [t for t in tiles if t.is_for_fit], size_px)
+    for_fit, held_out = ([t for t in tiles if t.is_for_fit is chosen] for chosen in (True, False))
+    fitted = fit_in_rounds(
+        alignment.mapping, lambda mapping: _residual(moving, mapping, for_fit), size_px,
+        lambda fit: fit.max_px <= _MAX_STEP_PX,
+    )  # fmt: skip
     if fitted is None or alignment.joint is None:
         return None
     mapping, fit = fitted
-    held_out = [t for t in tiles if not t.is_for_fit]
-    before, after = _residual(moving, start, held_out), _residual(moving, mapping, held_out)
+    before, after = (_residual(moving, m, held_out) for m in (alignment.mapping, mapping))
     if not after.median_px < before.median_px:
         return None
-    joint = with_corners(alignment.joint, mapping.fixed_to_moving, fit.covariance_px2)
+    joint = alignment.joint.with_homography(mapping.fixed_to_moving, fit.covariance_px2)
     prediction = alignment.prediction
     if prediction is not None:
         off_px = distance_px(mapping.fixed_to_moving, prediction.fixed_to_moving, size_px)

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.corner_fit import corner_correction, with_corners
 from agalign.flight.factors import FACTOR_STD_PX, MIN_STD_PX, coordinates, lattice_points
 from agalign.flight.rig import Rig
 from agalign.flight.rig_prediction import band_design
@@ -28,6 +27,7 @@ from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedImagePx
+from agalign.verify.window_fit import fit_windows
 
 Array = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def map_estimate(
     for pair, (delta, covariance) in zip(known, _solve(likelihoods, priors), strict=True):
         result, size = results[pair.name], pair.fixed.size_px
         mapping = geometry.compose(result.fixed_to_moving, geometry.moving_corners(delta, *size))
-        estimates[pair.name] = with_corners(result, mapping, covariance)
+        estimates[pair.name] = result.with_homography(mapping, covariance)
     return estimates
 
 
@@ -140,7 +140,7 @@ def _from_windows(
     pair: BandPair, result: JointResult[FixedImagePx], residual: Residual[FixedImagePx]
 ) -> InformationForm | None:
     """Return the distribution of delta by the windows; None if they are too few or the correction is too large."""
-    fit = corner_correction(pair.mapping(result.fixed_to_moving), residual, pair.fixed.size_px)
+    fit = fit_windows(pair.mapping(result.fixed_to_moving), residual, pair.fixed.size_px)
     if fit is None or not fit.max_px <= _MAX_CORRECTION_PX:
         return None
     return InformationForm.of(fit.mean_px, fit.covariance_px2)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.corner_fit import corner_correction, with_corners
 from agalign.capture.verification import WarpedPair
 from agalign.errors import GeometryError
 from agalign.pixels.grey import channel_mean
@@ -38,6 +37,7 @@ from agalign.values.pixel_units import FixedImagePx
 from agalign.values.relief import Parallax, Relief
 from agalign.verify.displacement_field import robust_loss
 from agalign.verify.residuals import decrease_sigma
+from agalign.verify.window_fit import fit_windows
 
 _MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
@@ -389,14 +389,14 @@ class _Estimate:
         plane = candidate.held_out_residual(candidate.warped.mapping)
         rejected = _Checked(pair.name, plane)
         mapping = band.mapping(self.relief)
-        fit = corner_correction(mapping, candidate.fit_residual(mapping), pair.fixed.size_px)
+        fit = fit_windows(mapping, candidate.fit_residual(mapping), pair.fixed.size_px)
         if fit is None:
             return rejected
         final = band.corrected(fit.mean_px, np.array(band.baseline))
         complete = final.mapping(self.relief, with_occlusions=True)
         verifying = final.mapping(self.verifying(band), with_occlusions=True)
         held_out = candidate.held_out_residual(verifying)
-        joint = with_corners(candidate.joint, complete.fixed_to_moving, fit.covariance_px2)
+        joint = candidate.joint.with_homography(complete.fixed_to_moving, fit.covariance_px2)
         if self.with_fields:
             result = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), complete, verifying)
             if result.field is not None and result.held_out is not None:

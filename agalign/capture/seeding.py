@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair, Candidates
-from agalign.capture.corner_fit import corner_correction
 from agalign.capture.verification import WarpedPair
 from agalign.config import SeedSettings
-from agalign.errors import GeometryError
 from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import match_seed, starter_for_matching
@@ -25,6 +23,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
 from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.acceptance import seed_fits
+from agalign.verify.window_fit import fit_in_rounds
 
 _CERTAIN_SIGMA = 120.0
 """Correlation peak of images that are aligned everywhere; a rotation of 1 degree reduces it to 60 to 120, of 3 degrees
@@ -42,8 +41,6 @@ _SAME_PEAK_PX = 2.0
 """Maximum distance, px of the reduced images, of a candidate from a peak that it belongs to."""
 _CLOSE_PX = 3.0
 """p95 of the residual of a match at which the search ends."""
-_MIN_WINDOWS = 12
-"""Minimum number of windows that correct a match; few suffice, because the corrected match is tested."""
 _MAX_ROTATION_DEGREES, _MAX_SCALE_CHANGE = 1.0, 0.02
 """Maximum deviation of a band from its rig by temperature and mounting."""
 _WITH_SCALE: Set[SeedKind] = frozenset({"rig", "centre", "geo", "model", "user"})
@@ -86,17 +83,21 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
 def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual: Residual[FixedImagePx]) -> Seed:
     """Return a match with a smaller residual than the best seed, or that seed."""
     for mapping in _matches(pair, model, by_learned_descriptors=not best.trusted):
-        match, match_residual = _unshifted(pair, mapping), _residual_of(pair, mapping)
-        corrected = _corrected(pair, mapping, match_residual)
-        if corrected is not None:
-            corrected_residual = _residual_of(pair, corrected)
-            if corrected_residual.is_better_than(match_residual):
-                match, match_residual = _unshifted(pair, corrected), corrected_residual
-        if seed_fits(match_residual) and match_residual.is_better_than(residual):
-            best, residual = replace(match, trusted=True), match_residual
+        for match, match_residual in _with_corrected(pair, mapping):
+            if seed_fits(match_residual) and match_residual.is_better_than(residual):
+                best, residual = replace(_unshifted(pair, match), trusted=True), match_residual
         if best.kind == "match" and residual.p95_px <= _CLOSE_PX:
             break
     return best
+
+
+def _with_corrected(pair: BandPair, fixed_to_moving: Matrix) -> Iterator[tuple[Matrix, Residual[FixedImagePx]]]:
+    """Yield a mapping, then its correction by its windows if these are enough, with their residuals."""
+    residual = _residual_of(pair, fixed_to_moving)
+    yield fixed_to_moving, residual
+    fitted = fit_in_rounds(pair.mapping(fixed_to_moving), lambda _: residual, pair.fixed.size_px, rounds=1)
+    if fitted is not None:
+        yield fitted[0].fixed_to_moving, _residual_of(pair, fitted[0].fixed_to_moving)
 
 
 def find_rotated(pair: BandPair, fixed_to_moving: Matrix, given: Residual[FixedImagePx]) -> Matrix | None:
@@ -122,15 +123,6 @@ def _is_rotated_or_scaled(matrix: Matrix, size_px: tuple[int, int]) -> bool:
     angle = np.degrees(np.arctan2(*(right - origin)[::-1]))
     scale = np.sqrt(abs(np.linalg.det([right - origin, down - origin])))
     return bool(abs(angle) > _MAX_ROTATION_DEGREES or abs(scale - 1) > _MAX_SCALE_CHANGE)
-
-
-def _corrected(pair: BandPair, fixed_to_moving: Matrix, residual: Residual[FixedImagePx]) -> Matrix | None:
-    """Return a mapping corrected by its residual; None if too few windows are measured."""
-    fit = corner_correction(pair.mapping(fixed_to_moving), residual, pair.fixed.size_px, _MIN_WINDOWS)
-    try:
-        return None if fit is None else fit.applied_to(fixed_to_moving, pair.fixed.size_px)
-    except GeometryError:
-        return None
 
 
 def _matches(pair: BandPair, model: FlightModel | None, *, by_learned_descriptors: bool) -> Iterator[Matrix]:

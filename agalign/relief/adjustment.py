@@ -86,10 +86,7 @@ class LensBasis:
 
     def field(self, coefficients_px: Array) -> DisplacementField:
         """Return the field with coefficients (k, 2)."""
-        columns, rows = (int(np.ceil(n / _FIELD_STEP_PX)) + 1 for n in self.size_px)
-        nodes = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(np.float64)
-        nodes *= _FIELD_STEP_PX
-        return DisplacementField(float(_FIELD_STEP_PX), (self(nodes) @ coefficients_px).reshape(rows, columns, 2))
+        return DisplacementField.sampled(lambda nodes: self(nodes) @ coefficients_px, _FIELD_STEP_PX, self.size_px)
 
     def _along(self, positions_px: Array, axis: int) -> Array:
         end, count = self.size_px[axis] - 1, self.counts[axis]

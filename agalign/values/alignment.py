@@ -85,6 +85,13 @@ class JointResult(Generic[FixedPx]):
         """Standard error of the mapping at the least certain corner: root mean square over both axes together."""
         return cast(FixedPx, max(math.hypot(*std) for std in self.corner_std_xy_px))
 
+    def with_homography(self, fixed_to_moving: Matrix, covariance_px2: NDArray[np.float64]) -> "JointResult[FixedPx]":
+        """Return the result with another homography and covariance (8, 8) of the corners."""
+        std = tuple((float(x), float(y)) for x, y in np.sqrt(np.diag(covariance_px2)).reshape(4, 2))
+        return replace(
+            self, fixed_to_moving=fixed_to_moving, corner_covariance_px2=covariance_px2, corner_std_xy_px=std
+        )
+
     def in_file_px(self: "JointResult[FixedImagePx]", scales: "PairScales") -> "JointResult[FixedFilePx]":
         """The same between the files."""
         up = scales.fixed.inverse

@@ -1,6 +1,7 @@
 """Smooth displacement fields over an image."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,18 @@ class DisplacementField:
     scale: PixelScale = SAME_PIXELS
     """Size of that image relative to the one on which the field is evaluated."""
 
+    @classmethod
+    def sampled(
+        cls, function: Callable[[NDArray[np.float64]], NDArray[np.float64]], step_px: float, size_px: tuple[int, int]
+    ) -> "DisplacementField":
+        """Sample a function from points (n, 2) to displacements (n, 2) on a lattice over an image (width, height)."""
+        columns, rows = (math.ceil(n / step_px) + 1 for n in size_px)
+        nodes = (
+            np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(np.float64)
+            * step_px
+        )
+        return cls(float(step_px), function(nodes).reshape(rows, columns, 2))
+
     def __call__(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """The displacement (..., 2) at points (..., 2), by cubic splines; outside the lattice that of its edge."""
         points = np.asarray(points_px)
@@ -36,9 +49,7 @@ class DisplacementField:
 
     def on_lattice(self, step_px: float, size_px: tuple[int, int]) -> "DisplacementField":
         """The same by its values on another lattice, which covers an image (width, height)."""
-        columns, rows = (math.ceil(n / step_px) + 1 for n in size_px)
-        nodes = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64) * step_px
-        return DisplacementField(float(step_px), self(nodes))
+        return DisplacementField.sampled(self, step_px, size_px)
 
     def plus(self, other: "DisplacementField") -> "DisplacementField":
         """The sum of two fields on one lattice: x -> d(x) + other(x)."""

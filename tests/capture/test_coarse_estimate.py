@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.coarse_estimate import predicted_if_coarse
+from agalign.capture.from_windows import from_windows
 from agalign.capture.seeding import find_seed
 from agalign.config import SeedSettings
 from agalign.values import geometry
@@ -45,7 +45,7 @@ def tried(fixed: np.ndarray, moving: np.ndarray) -> tuple[BandPair, Alignment]:
     assert isinstance(seed, Seed)
     issue = Issue(RETRIEVAL, 0.0, 0.2)
     failed = Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", (issue,), seed)
-    return pair, predicted_if_coarse(pair, failed)
+    return pair, from_windows(pair, failed)
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +80,6 @@ def test_a_repetitive_scene_is_not_predicted() -> None:
 def test_a_band_of_full_resolution_is_unchanged(scene: np.ndarray) -> None:
     pair, result = tried(scene[100:340, 100:420], thermal(scene, 0.2))
     failed = replace(result, status="failed", prediction=None)
-    assert predicted_if_coarse(replace(pair, is_coarse=False), failed) is failed
+    assert from_windows(replace(pair, is_coarse=False), failed) is failed
     untrusted = replace(failed, seed=replace(failed.seed, trusted=False))
-    assert predicted_if_coarse(pair, untrusted) is untrusted
+    assert from_windows(pair, untrusted) is untrusted

@@ -8,7 +8,7 @@ import pytest
 
 import agalign
 from agalign.capture.band_pair import BandPair
-from agalign.capture.extrapolation import without_extrapolated
+from agalign.capture.from_windows import without_extrapolated
 from agalign.capture.verification import verified
 from agalign.config import Settings
 from agalign.flight.rig import Rig

@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from agalign.cameras.discover import discover
-from agalign.capture import corner_fit, full_resolution
+from agalign.capture import full_resolution
 from agalign.capture.align import align_capture_bands
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.config import JointSettings, Settings
@@ -20,6 +20,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.mapping import PixelMapping
+from agalign.verify import window_fit
 
 from ..conftest import textured_pair
 
@@ -106,13 +107,13 @@ def test_the_windows_that_verify_share_no_pixel_with_those_of_the_fit(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fitted: list[np.ndarray] = []
-    fit_corners = corner_fit.fit_corners
+    fit_windows = window_fit.fit_windows
 
-    def recorded(points_px: np.ndarray, *rest: Any) -> Any:
-        fitted.append(points_px)
-        return fit_corners(points_px, *rest)
+    def recorded(mapping: PixelMapping, residual: Residual, *rest: Any) -> Any:
+        fitted.append(residual.centres_px)
+        return fit_windows(mapping, residual, *rest)
 
-    monkeypatch.setattr(corner_fit, "fit_corners", recorded)
+    monkeypatch.setattr(window_fit, "fit_windows", recorded)
     residual = refined(capture, aligned_on_reduced_images()).residual
     assert residual is not None
     assert len(residual.centres_px) > 50

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.capture import window_estimate
+from agalign.capture import from_windows as module
 from agalign.capture.band_pair import BandPair
+from agalign.capture.from_windows import from_windows
 from agalign.capture.verification import verified
-from agalign.capture.window_estimate import by_windows
 from agalign.config import Settings
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
@@ -45,7 +45,7 @@ def unaligned(pair: BandPair, issue: Issue = SILENT) -> Alignment:
 
 def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
     before = unaligned(pair)
-    after = by_windows(pair, before)
+    after = from_windows(pair, before)
     assert after.status == "aligned"
     assert after.issues == ()
     assert geometry.corner_error_px(before.fixed_to_moving, TRUTH, *SIZE) > 1
@@ -61,9 +61,9 @@ def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
 def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair) -> None:
     for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0)):
         before = unaligned(pair, issue)
-        assert by_windows(pair, before) is before
+        assert from_windows(pair, before) is before
     aligned = replace(unaligned(pair), status="aligned", issues=())
-    assert by_windows(pair, aligned) is aligned
+    assert from_windows(pair, aligned) is aligned
 
 
 def test_held_out_windows_must_confirm_the_fit() -> None:
@@ -72,13 +72,13 @@ def test_held_out_windows_must_confirm_the_fit() -> None:
     moving[:, 480:] = other[:, 480:]  # the part beyond has unrelated content
     pair = pair_of(fixed, moving)
     before = unaligned(pair)
-    assert by_windows(pair, before) is before
+    assert from_windows(pair, before) is before
 
 
 def test_a_seed_with_a_large_error_is_not_refined(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
     before = unaligned(pair)
-    monkeypatch.setattr(window_estimate, "_MAX_STEP_PX", 0.5)
-    assert by_windows(pair, before) is before
+    monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)
+    assert from_windows(pair, before) is before
 
 
 def windows(count: int, measured: float = 1.0) -> Residual:

@@ -1,0 +1,135 @@
+"""Alignments from windows where descriptors do not suffice.
+
+* Blurred, noisy or saturated images: the homography is fitted to half of the windows and verified with the others.
+* Bands with few pixels, such as thermal ones: often only a third of the windows have structure in common with another
+  band. If nearly all of these agree with a trusted seed, they predict the mapping with its standard error.
+* Images without common structure in one part: differences of lens distortion cause errors of the homography there that
+  no residual contains. The lens shapes are estimated too, and the alignment becomes a prediction.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from agalign.capture.band_pair import BandPair
+from agalign.capture.verification import WarpedPair
+from agalign.flight.rig import Rig
+from agalign.values.alignment import Alignment, JointResult, Prediction, Residual
+from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
+from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import FixedImagePx
+from agalign.verify.acceptance import seed_fits
+from agalign.verify.descriptor_check import BY_WINDOWS
+from agalign.verify.extrapolation_check import issues_of_extrapolation, points_in_frame
+from agalign.verify.lens_shapes import lens_std_px
+from agalign.verify.repetition import MAX_ALIAS_PEAK, alias_peak
+from agalign.verify.window_fit import WindowFit, chessboard, fit_in_rounds
+
+_DESCRIPTORS_FAILED = frozenset({RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN})
+"""Issues for which windows are tried; with other issues the descriptors have a result that may contradict them."""
+_MAX_STEP_PX = 16.0
+"""Maximum displacement of a corner; larger ones contradict the seed."""
+_MIN_COARSE_WINDOWS = 16
+"""Minimum number of measured windows of a coarse band, which overlap by half: twice the parameters of a homography."""
+_CLOSE_PX = 3.0
+"""Maximum residual of a consistent window, px of the reduced reference: 1.5 px of the band. By chance, one in a hundred
+windows of at least 56 px has a smaller one."""
+_MIN_CLOSE_SHARE = 0.85
+"""Minimum share of consistent windows among the measured ones."""
+
+
+def from_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx]:
+    """Return an alignment by windows if the descriptors failed and held-out windows confirm it.
+
+    Else return the prediction of a coarse band by windows that agree with its trusted seed, or else `alignment`.
+    """
+    if alignment.status in ("aligned", "predicted"):
+        return alignment
+    result = _aligned(pair, alignment)
+    if result is None and pair.is_coarse and alignment.seed.trusted:
+        result = _predicted(pair, alignment, pair.mapping(alignment.seed.fixed_to_moving), _is_consistent)
+        if result is not None:
+            alias = alias_peak(*WarpedPair.of(pair, result.mapping).reduced_spectra())
+            result = None if alias.ratio > MAX_ALIAS_PEAK else result
+    return result or alignment
+
+
+def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx] | None:
+    descriptors_failed = any(issue.kind in _DESCRIPTORS_FAILED for issue in alignment.issues)
+    if not descriptors_failed or alignment.residual is None or not seed_fits(alignment.residual):
+        return None
+    max_step_px = min(_MAX_STEP_PX, pair.max_shift_px)
+    fitted = fit_in_rounds(
+        pair.mapping(alignment.fixed_to_moving), lambda mapping: chessboard(WarpedPair.of(pair, mapping).residual)[0],
+        pair.fixed.size_px, lambda fit: fit.max_px <= max_step_px,
+    )  # fmt: skip
+    if fitted is None:
+        return None
+    mapping, fit = fitted
+    warped_pair = WarpedPair.of(pair, mapping)
+    held_out = chessboard(warped_pair.residual)[1]
+    retrieval, chance = (0.0, 0.0) if alignment.joint is None else (alignment.joint.retrieval, alignment.joint.chance)
+    joint = JointResult[FixedImagePx](
+        mapping.fixed_to_moving, math.nan, retrieval, chance, 0, (1.0,), BY_WINDOWS, "homography", fit.max_px, ()
+    ).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
+    if replace(warped_pair, residual=held_out).issues(joint):
+        return None
+    return replace(alignment, mapping=mapping, status="aligned", issues=(), joint=joint, residual=held_out)
+
+
+def _is_consistent(fit: WindowFit) -> bool:
+    count = len(fit.residuals_px)
+    return count >= _MIN_COARSE_WINDOWS and bool((fit.residuals_px <= _CLOSE_PX).sum() >= _MIN_CLOSE_SHARE * count)
+
+
+def without_extrapolated(
+    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig | None = None
+) -> dict[str, Alignment[FixedImagePx]]:
+    """Return the alignments; those `aligned` but extrapolated over a quarter of the image become `predicted`.
+
+    Bands that the rig covers and georeferenced files, which have no lens distortion, are not changed.
+    """
+    checked = dict(result)
+    for pair in pairs:
+        alignment, size_px = result[pair.name], pair.fixed.size_px
+        is_covered = rig is not None and pair.has_rig_pixels and pair.has_rig and rig.covers(pair.name)
+        if alignment.status != "aligned" or alignment.residual is None or "geo" in pair.candidates or is_covered:
+            continue
+        plane = alignment.mapping.of_the_plane
+        in_frame_px = points_in_frame(plane, size_px, pair.moving.size_px)
+        issues = issues_of_extrapolation(alignment.residual, size_px, in_frame_px)
+        if issues:
+            extrapolated = replace(alignment, status="failed", issues=issues)
+            checked[pair.name] = _predicted(pair, extrapolated, plane) or extrapolated
+    return checked
+
+
+def _predicted(
+    pair: BandPair, alignment: Alignment[FixedImagePx], start: PixelMapping,
+    is_accepted: Callable[[WindowFit], bool] = lambda _: True,
+) -> Alignment[FixedImagePx] | None:  # fmt: skip
+    """Return the alignment as `predicted` by a homography and lens shapes, which replace the field of `start`."""
+    size_px, to_file = pair.fixed.size_px, pair.scales.fixed.inverse
+    fitted = fit_in_rounds(
+        replace(start, local=None), lambda mapping: _measured(pair, mapping), size_px, is_accepted,
+        lens_std_px(size_px, calibrated=pair.space == "undistorted"),
+    )  # fmt: skip
+    if fitted is None:
+        return None
+    mapping, fit = fitted
+    matrix, to_file_px = mapping.fixed_to_moving, np.r_[np.tile(to_file, 4), np.full(4, to_file.mean)]
+    std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, size_px, pair.moving.size_px)))
+    prediction = Prediction(
+        pair.scales.between_files(matrix), "windows", pair.in_moving_file_px(std_px, matrix),
+        covariance_px2=fit.covariance_px2 * np.outer(to_file_px, to_file_px),
+    )  # fmt: skip
+    residual = WarpedPair.of(pair, mapping).residual
+    return replace(alignment, mapping=mapping, status="predicted", residual=residual, prediction=prediction)
+
+
+def _measured(pair: BandPair, mapping: PixelMapping) -> Residual[FixedImagePx]:
+    if pair.is_coarse:
+        return pair.reference.overlapping_windows.residuals(pair.warped_moving(mapping))
+    return WarpedPair.of(pair, mapping).residual
