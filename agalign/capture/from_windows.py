@@ -25,7 +25,7 @@ from agalign.verify.descriptor_check import BY_WINDOWS
 from agalign.verify.extrapolation_check import issues_of_extrapolation, points_in_frame
 from agalign.verify.lens_shapes import lens_std_px
 from agalign.verify.repetition import MAX_ALIAS_PEAK, alias_peak
-from agalign.verify.window_fit import WindowFit, chessboard, fit_in_rounds
+from agalign.verify.window_fit import WindowFit, fit_in_rounds
 
 _DESCRIPTORS_FAILED = frozenset({RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN})
 """Issues for which windows are tried; with other issues the descriptors have a result that may contradict them."""
@@ -62,14 +62,14 @@ def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[Fi
         return None
     max_step_px = min(_MAX_STEP_PX, pair.max_shift_px)
     fitted = fit_in_rounds(
-        pair.mapping(alignment.fixed_to_moving), lambda mapping: chessboard(WarpedPair.of(pair, mapping).residual)[0],
+        pair.mapping(alignment.fixed_to_moving), lambda mapping: _half(WarpedPair.of(pair, mapping), is_black=True),
         pair.fixed.size_px, lambda fit: fit.max_px <= max_step_px,
     )  # fmt: skip
     if fitted is None:
         return None
     mapping, fit = fitted
     warped_pair = WarpedPair.of(pair, mapping)
-    held_out = chessboard(warped_pair.residual)[1]
+    held_out = _half(warped_pair, is_black=False)
     retrieval, chance = (0.0, 0.0) if alignment.joint is None else (alignment.joint.retrieval, alignment.joint.chance)
     joint = JointResult[FixedImagePx](
         mapping.fixed_to_moving, math.nan, retrieval, chance, 0, (1.0,), BY_WINDOWS, "homography", fit.max_px, ()
@@ -77,6 +77,10 @@ def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[Fi
     if replace(warped_pair, residual=held_out).issues(joint):
         return None
     return replace(alignment, mapping=mapping, status="aligned", issues=(), joint=joint, residual=held_out)
+
+
+def _half(warped_pair: WarpedPair, *, is_black: bool) -> Residual[FixedImagePx]:
+    return warped_pair.residual.where(warped_pair.residual.is_black == is_black)
 
 
 def _is_consistent(fit: WindowFit) -> bool:

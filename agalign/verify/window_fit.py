@@ -4,7 +4,6 @@
 
 s_i is the shift of the window at x_i, m are the displacements of the image's corners and the coefficients of the lens
 shapes, D is their Jacobian. The maximum a posteriori estimate is computed by iteratively reweighted least squares.
-Windows are split like the fields of a chessboard into those of a fit and those that verify it.
 """
 
 from collections.abc import Callable
@@ -139,14 +138,3 @@ def fit_in_rounds(
             break
         mapping = replace(result[0], local=mapping.local)
     return result
-
-
-def chessboard(residual: Residual[FixedPx]) -> tuple[Residual[FixedPx], Residual[FixedPx]]:
-    """Split windows like the fields of a chessboard: return those of a fit and those that verify it."""
-    column, row = (np.unique(residual.centres_px[:, axis], return_inverse=True)[1] for axis in (0, 1))
-    is_black = (column + row) % 2 == 0
-    black, white = (
-        Residual[FixedPx].of(residual.centres_px[mask], residual.shifts_px[mask], residual.peaks_sigma[mask])
-        for mask in (is_black, ~is_black)
-    )
-    return black, white
