@@ -7,7 +7,7 @@ number of tiles, independent of the size of the files.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,6 +37,9 @@ and all of them fit into memory."""
 _MAX_STEP_PX = 40.0
 """Maximum displacement of a corner; larger ones contradict the alignment of the reduced images."""
 
+_Tiles = Sequence[tuple[Tile, FixedWindows]]
+"""Tiles with the windows of the reference."""
+
 
 def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[FixedFilePx]) -> Alignment[FixedFilePx]:
     """Refine an alignment between the files of two bands that was estimated on reduced images.
@@ -46,9 +49,12 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[Fixed
     UnreadableFileError for the reference.
     """
     with open_raster(reference.path) as source:
-        tiles = [_FixedTile.read(source, reference, *of_cell) for of_cell in _tiles(reference, alignment).items()]
+        for_fit, held_out = (
+            [(tile, _windows(source, reference, tile)) for tile in of_colour]
+            for of_colour in _tiles(reference, alignment)
+        )
     try:
-        refined = _refined(alignment, moving, tiles, reference.size_px)
+        refined = _refined(alignment, moving, for_fit, held_out, reference.size_px)
     except UnreadableFileError as error:
         issue = Issue(UNREADABLE, detail=str(error))
         return replace(
@@ -57,42 +63,18 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[Fixed
     return alignment if refined is None else refined
 
 
-@dataclass(frozen=True)
-class _FixedTile:
-    """The windows of a tile of the reference."""
-
-    cell: tuple[int, int]
-    tile: Tile
-    windows: FixedWindows
-
-    @classmethod
-    def read(cls, source: OpenRaster, reference: Band, cell: tuple[int, int], tile: Tile) -> "_FixedTile":
-        """Read a tile from the open file of the reference."""
-        pixels, valid = read_window(source, reference, tile.x0, tile.y0, tile.width, tile.height)
-        fixed = _raster(pixels, valid, reference)
-        return cls(cell, tile, FixedWindows(fixed.valid, structure_field(fixed)))
-
-    @property
-    def is_for_fit(self) -> bool:
-        """True for one colour of the chessboard; tiles of the other colour are for verification."""
-        return sum(self.cell) % 2 == 0
-
-    def residual(self, source: OpenRaster, moving: Band, mapping: PixelMapping) -> Residual[FixedFilePx]:
-        """Measure the residual of the windows, px of the reference's file; `source` is the open moving file."""
-        warped = _raster(*resample_tile_of(source, moving, mapping, self.tile, "lanczos"), moving)
-        in_tile = self.windows.residuals(warped)
-        centres_px = in_tile.centres_px + np.array([self.tile.x0, self.tile.y0])
-        return Residual[FixedFilePx].of(centres_px, in_tile.shifts_px, in_tile.peaks_sigma)
+def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:
+    fixed = _raster(*read_window(source, reference, tile.x0, tile.y0, tile.width, tile.height), reference)
+    return FixedWindows(fixed.valid, structure_field(fixed))
 
 
 def _refined(
-    alignment: Alignment[FixedFilePx], moving: Band, tiles: Sequence[_FixedTile], size_px: tuple[int, int]
+    alignment: Alignment[FixedFilePx], moving: Band, for_fit: _Tiles, held_out: _Tiles, size_px: tuple[int, int]
 ) -> Alignment[FixedFilePx] | None:
     """Return the alignment fitted to half of the tiles, with its covariance and the residual of the other half.
 
     None if the median shift of that half does not decrease or a check finds an issue. Raises UnreadableFileError.
     """
-    for_fit, held_out = ([t for t in tiles if t.is_for_fit is chosen] for chosen in (True, False))
     fitted = fit_in_rounds(
         alignment.mapping, lambda mapping: _residual(moving, mapping, for_fit), size_px,
         lambda fit: fit.max_px <= _MAX_STEP_PX,
@@ -113,22 +95,19 @@ def _refined(
     return replace(alignment, mapping=mapping, joint=joint, residual=after, prediction=prediction)
 
 
-def _tiles(reference: Band, alignment: Alignment[FixedFilePx]) -> dict[tuple[int, int], Tile]:
-    """Return, by cell (column, row), a tile around the window with the highest peak in the reduced images."""
+def _tiles(reference: Band, alignment: Alignment[FixedFilePx]) -> tuple[list[Tile], list[Tile]]:
+    """Return, for each cell, a tile around the window with the highest peak in the reduced images, by colour."""
     residual, size_px = alignment.residual, reference.size_px
     if residual is None:
-        return {}
+        return [], []
     counts = [min(max(n // _TILE_PX, low), high) for n, low, high in zip(size_px, _MIN_CELLS, _MAX_CELLS, strict=True)]
-    best: dict[tuple[int, int], tuple[float, Tile]] = {}
-    for centre, shift, sigma in zip(residual.centres_px, residual.shifts_px, residual.peaks_sigma, strict=True):
-        if not math.isfinite(shift[0]):
-            continue
-        (column, x0, width), (row, y0, height) = (
-            _side(v, n, count) for v, n, count in zip(centre, size_px, counts, strict=True)
-        )
-        if (column, row) not in best or sigma > best[column, row][0]:
-            best[column, row] = float(sigma), Tile(x0, y0, width, height)
-    return {cell: tile for cell, (_, tile) in best.items()}
+    best: dict[tuple[int, int], Tile] = {}
+    for index in np.argsort(residual.peaks_sigma, kind="stable"):
+        if math.isfinite(residual.shifts_px[index, 0]):
+            (column, x0, width), (row, y0, height) = map(_side, residual.centres_px[index], size_px, counts)
+            best[column, row] = Tile(x0, y0, width, height)
+    black, white = ([tile for cell, tile in best.items() if sum(cell) % 2 == colour] for colour in (0, 1))
+    return black, white
 
 
 def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
@@ -139,16 +118,14 @@ def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
     return cell, int(np.clip(centre_px - side / 2, first, end - side)), side
 
 
-def _residual(moving: Band, mapping: PixelMapping, tiles: Sequence[_FixedTile]) -> Residual[FixedFilePx]:
+def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual[FixedFilePx]:
     """Measure the residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError."""
+    parts = [(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))]
     with open_raster(moving.path) as source:
-        parts = [tile.residual(source, moving, mapping) for tile in tiles]
-    if not parts:
-        return Residual[FixedFilePx].of(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
-    return Residual[FixedFilePx].of(
-        np.concatenate([p.centres_px for p in parts]), np.concatenate([p.shifts_px for p in parts]),
-        np.concatenate([p.peaks_sigma for p in parts]),
-    )  # fmt: skip
+        for tile, windows in tiles:
+            part = windows.residuals(_raster(*resample_tile_of(source, moving, mapping, tile, "lanczos"), moving))
+            parts.append((part.centres_px + np.array([tile.x0, tile.y0]), part.shifts_px, part.peaks_sigma))
+    return Residual[FixedFilePx].of(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _raster(pixels: np.ndarray, valid: np.ndarray, band: Band) -> Raster:
