@@ -57,25 +57,6 @@ class Expectation:
     """(8, 8) for known factors, px squared."""
 
 
-@dataclass(frozen=True)
-class InformationForm:
-    """Gaussian distribution of delta (8,), px of the reference's image, in information (canonical) form."""
-
-    information: Array
-    """(8, 8) inverse covariance."""
-    vector: Array
-    """(8,) information times mean."""
-
-    def __add__(self, other: "InformationForm") -> "InformationForm":
-        return InformationForm(self.information + other.information, self.vector + other.vector)
-
-    @classmethod
-    def of(cls, mean: Array, covariance: Array) -> "InformationForm":
-        """Convert mean (8,) and covariance (8, 8)."""
-        information = np.asarray(np.linalg.inv(covariance))
-        return cls(information, information @ mean)
-
-
 def map_estimate(
     pairs: Sequence[BandPair],
     results: Mapping[str, JointResult[FixedImagePx]],
@@ -87,11 +68,7 @@ def map_estimate(
     `residuals` are those of the results. Results without a covariance are returned unchanged.
     """
     known = [p for p in pairs if p.name in results and results[p.name].corner_covariance_px2 is not None]
-    likelihoods = []
-    for pair in known:
-        windows = _from_windows(pair, results[pair.name], residuals[pair.name])
-        descriptors = _from_descriptors(results[pair.name])
-        likelihoods.append(descriptors if windows is None else descriptors + windows)
+    likelihoods = [_likelihood(pair, results[pair.name], residuals[pair.name]) for pair in known]
     priors = [_prior(pair, results[pair.name], rig) for pair in known]
     estimates = dict(results)
     for pair, (delta, covariance) in zip(known, _solve(likelihoods, priors), strict=True):
@@ -101,7 +78,9 @@ def map_estimate(
     return estimates
 
 
-def _solve(likelihoods: Sequence[InformationForm], priors: Sequence[Expectation | None]) -> list[tuple[Array, Array]]:
+def _solve(
+    likelihoods: Sequence[tuple[Array, Array]], priors: Sequence[Expectation | None]
+) -> list[tuple[Array, Array]]:
     """Return delta (8,) and its covariance (8, 8) of each band."""
     factors = 8 * len(likelihoods) + np.arange(len(FACTOR_STD_PX))
     weights = np.ones(len(likelihoods))
@@ -109,10 +88,10 @@ def _solve(likelihoods: Sequence[InformationForm], priors: Sequence[Expectation 
         normal = np.zeros((factors[-1] + 1, factors[-1] + 1))
         right_side = np.zeros(len(normal))
         normal[factors, factors] = 1 / np.square(FACTOR_STD_PX)
-        for b, (likelihood, prior) in enumerate(zip(likelihoods, priors, strict=True)):
+        for b, ((information, vector), prior) in enumerate(zip(likelihoods, priors, strict=True)):
             band = 8 * b + np.arange(8)
-            normal[np.ix_(band, band)] += likelihood.information
-            right_side[band] += likelihood.vector
+            normal[np.ix_(band, band)] += information
+            right_side[band] += vector
             if prior is not None:
                 rows = np.concatenate([band, factors])
                 design = np.hstack([np.eye(8), -prior.by_factor])
@@ -131,19 +110,20 @@ def _solve(likelihoods: Sequence[InformationForm], priors: Sequence[Expectation 
     return [(np.round(solution[s], 6), np.round(covariance[s, s], 12)) for s in blocks]
 
 
-def _from_descriptors(result: JointResult[FixedImagePx]) -> InformationForm:
-    assert result.corner_covariance_px2 is not None
-    return InformationForm.of(np.zeros(8), result.corner_covariance_px2)
-
-
-def _from_windows(
+def _likelihood(
     pair: BandPair, result: JointResult[FixedImagePx], residual: Residual[FixedImagePx]
-) -> InformationForm | None:
-    """Return the distribution of delta by the windows; None if they are too few or the correction is too large."""
+) -> tuple[Array, Array]:
+    """Return the information (8, 8) on delta by descriptors and windows, and its product (8,) with their mean.
+
+    The windows are ignored if they are too few or their correction is too large.
+    """
+    assert result.corner_covariance_px2 is not None
+    information = np.asarray(np.linalg.inv(result.corner_covariance_px2))
     fit = fit_windows(pair.mapping(result.fixed_to_moving), residual, pair.fixed.size_px)
     if fit is None or not fit.max_px <= _MAX_CORRECTION_PX:
-        return None
-    return InformationForm.of(fit.mean_px, fit.covariance_px2)
+        return information, np.zeros(8)
+    of_windows = np.linalg.inv(fit.covariance_px2)
+    return information + of_windows, np.asarray(of_windows @ fit.mean_px)
 
 
 def _prior(pair: BandPair, result: JointResult[FixedImagePx], rig: Rig | None) -> Expectation | None:
