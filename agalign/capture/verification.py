@@ -169,13 +169,26 @@ def predicted_by_windows(alignment: Alignment[FixedImagePx], pair: BandPair) -> 
 
 
 def _verified(
-    warped_pair: WarpedPair, joint: JointResult[FixedImagePx], use: ReliefUse
+    plane: WarpedPair, joint: JointResult[FixedImagePx], use: ReliefUse
 ) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult | None]:
-    """Return the pair, with a displacement field if one is accepted, its issues, and the result of the field fit."""
-    issues = warped_pair.issues(joint)
-    if not _needs_field(use, issues, has_rig=warped_pair.pair.has_rig):
-        return warped_pair, issues, None
-    return _with_field(warped_pair, joint).or_without_field(warped_pair, issues)
+    """Return the pair, with a displacement field if one is accepted, its issues, and the result of the field fit.
+
+    With a field, the residual is that of held-out windows. The field is not accepted with issues that it cannot remove,
+    nor with any if the pair has none without it.
+    """
+    pair, issues = plane.pair, plane.issues(joint)
+    if not _needs_field(use, issues, has_rig=pair.has_rig):
+        return plane, issues, None
+    local = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
+    if local.field is not None:
+        displaced = WarpedPair.of(pair, replace(plane.mapping, local=local.field))
+        held_out = displaced if local.held_out is None else replace(displaced, residual=local.held_out)
+        # All checks run again, those of windows on all windows and on the held-out ones.
+        remaining = held_out.issues(joint)
+        by_parallax = all(issue.kind in _PARALLAX_ISSUES for issue in remaining)
+        if not displaced.issues(joint) and by_parallax and (issues or not remaining):
+            return held_out, remaining, local
+    return plane, issues, replace(local, field=None)
 
 
 def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) -> bool:
@@ -188,45 +201,11 @@ def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) ->
     return only_parallax and (use == "always" or (use == "auto" and (bool(issues) or not has_rig)))
 
 
-@dataclass(frozen=True)
-class _FieldResult:
-    """A pair with a displacement field, after verification."""
-
-    local: DisplacementResult
-    pair: WarpedPair | None = None
-    """With the residual of held-out windows; None without a field or with issues that a field cannot remove."""
-    issues: tuple[Issue, ...] = ()
-    """Issues of the held-out windows."""
-
-    def or_without_field(
-        self, plane: WarpedPair, issues: tuple[Issue, ...]
-    ) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult]:
-        """Return the pair with the field, or `plane` if there is no field or only `plane` passes verification."""
-        if self.pair is None or (self.issues and not issues):
-            return plane, issues, replace(self.local, field=None)
-        return self.pair, self.issues, self.local
-
-
-def _with_field(warped_pair: WarpedPair, joint: JointResult[FixedImagePx]) -> _FieldResult:
-    """Fit a displacement field in addition to the mapping of a pair and verify it."""
-    pair, mapping = warped_pair.pair, warped_pair.mapping
-    local = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), mapping)
-    if local.field is None:
-        return _FieldResult(local)
-    displaced = WarpedPair.of(pair, replace(mapping, local=local.field))
-    held_out = displaced if local.held_out is None else replace(displaced, residual=local.held_out)
-    # All checks run again, those of windows on all windows and on the held-out ones.
-    issues = held_out.issues(joint)
-    if displaced.issues(joint) or any(issue.kind not in _PARALLAX_ISSUES for issue in issues):
-        return _FieldResult(local)
-    return _FieldResult(local, held_out, issues)
-
-
 def as_predicted(alignment: Alignment[FixedImagePx], pair: BandPair, prediction: Prediction) -> Alignment[FixedImagePx]:
     """Return the alignment, px of the images, with the mapping of a prediction, px of the files."""
     fixed_to_moving = pair.scales.between_images(prediction.fixed_to_moving)
-    residual = WarpedPair.of(pair, pair.mapping(fixed_to_moving)).residual
     mapping = pair.mapping(fixed_to_moving)
+    residual = WarpedPair.of(pair, mapping).residual
     return replace(alignment, mapping=mapping, status="predicted", residual=residual, prediction=prediction)
 
 
