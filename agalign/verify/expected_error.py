@@ -8,7 +8,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, Residual
 from agalign.values.geometry import Points
 from agalign.values.pixel_units import FixedFilePx
-from agalign.verify.lens_shapes import over_corners_and_lens
+from agalign.verify.lens_shapes import variance_px2
 
 _NEAREST_WINDOWS = 8
 """Number of windows from which the error at a point is estimated, weighted by their distance."""
@@ -37,18 +37,16 @@ def expected_error_px(
 
 def _mapping_px2(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], points_px: Points) -> NDArray[np.float64]:
     """Return the variance of the mapping at points, (n,)."""
-    if alignment.status == "predicted" and alignment.prediction is not None:
-        if alignment.prediction.covariance_px2 is not None:
-            jacobian = over_corners_and_lens(points_px, size_px)
-            return np.asarray(np.einsum("nki,ij,nkj->n", jacobian, alignment.prediction.covariance_px2, jacobian))
+    prediction, joint = alignment.prediction, alignment.joint
+    if alignment.status == "predicted" and prediction is not None:
+        if prediction.covariance_px2 is not None:
+            return variance_px2(points_px, prediction.covariance_px2, size_px)
         # The standard error is in px of the moving file.
         ratio = abs(float(geometry.local_scale(alignment.fixed_to_moving, *size_px)[-1]))
-        return np.full(len(points_px), (alignment.prediction.std_px / ratio) ** 2)
-    joint = alignment.joint
+        return np.full(len(points_px), (prediction.std_px / ratio) ** 2)
     if alignment.status != "aligned" or joint is None or joint.corner_covariance_px2 is None:
         return np.full(len(points_px), 0.0 if joint is None and alignment.status == "aligned" else np.inf)
-    jacobian = geometry.over_corners(points_px, *size_px)
-    return np.asarray(np.einsum("nki,ij,nkj->n", jacobian, joint.corner_covariance_px2, jacobian))
+    return variance_px2(points_px, joint.corner_covariance_px2, size_px)
 
 
 def _windows_px2(residual: Residual[FixedFilePx], points_px: Points) -> NDArray[np.float64]:

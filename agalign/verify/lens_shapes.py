@@ -42,6 +42,12 @@ def over_corners_and_lens(points_px: Points, size_px: tuple[int, int]) -> Array:
     return np.concatenate([geometry.over_corners(points_px, *size_px), lens_shapes(points_px, size_px)], axis=2)
 
 
+def variance_px2(points_px: Points, covariance_px2: Array, size_px: tuple[int, int]) -> Array:
+    """Return (n,) the variance at points (n, 2) by the covariance of the corners (8, 8), or with shapes (12, 12)."""
+    jacobian = over_corners_and_lens(points_px, size_px)[:, :, : len(covariance_px2)]
+    return np.asarray(np.einsum("nki,ij,nkj->n", jacobian, covariance_px2, jacobian))
+
+
 def lens_std_px(size_px: tuple[int, int], *, calibrated: bool) -> Array:
     """Return (4,) the standard deviation of each shape on an image (width, height), px."""
     return np.array(LENS_STD) * float(np.hypot(*size_px)) / 2 * (CALIBRATED if calibrated else 1.0)

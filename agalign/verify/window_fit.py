@@ -20,7 +20,7 @@ from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedPx
 from agalign.values.robust import MIN_SHIFT_SCALE_PX, cauchy_weights, shift_scale_px
-from agalign.verify.lens_shapes import lens_shapes, over_corners_and_lens
+from agalign.verify.lens_shapes import lens_shapes, over_corners_and_lens, variance_px2
 
 Array = NDArray[np.float64]
 
@@ -65,9 +65,8 @@ class WindowFit:
 
     def std_px(self, points_px: Points) -> float:
         """Return the RMS error over points (n, 2), including the residual of single windows."""
-        jacobian = over_corners_and_lens(points_px, self.size_px)[:, :, : len(self.mean_px)]
-        square = np.einsum("nki,ij,nkj->n", jacobian, self.covariance_px2, jacobian).mean()
-        return float(np.sqrt(square + shift_scale_px(self.residuals_px) ** 2))
+        of_mapping_px2 = variance_px2(points_px, self.covariance_px2, self.size_px).mean()
+        return float(np.sqrt(of_mapping_px2 + shift_scale_px(self.residuals_px) ** 2))
 
     def applied_to(self, mapping: PixelMapping) -> PixelMapping:
         """Correct a homography; lens shapes become the mapping's displacement field. Raises GeometryError."""
