@@ -11,7 +11,7 @@ from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.prediction import bands_to_learn, with_predictions
 from agalign.capture.relief import ReliefCandidate, aligned_by_relief
-from agalign.capture.seeding import find_seed, first_candidate, image_groups
+from agalign.capture.seeding import find_seed, image_groups
 from agalign.capture.verification import WarpedPair, predicted_by_windows, verified, with_metrics, without_result
 from agalign.config import Settings
 from agalign.flight.fingerprint import refinement_key
@@ -188,7 +188,7 @@ class PairAligner:
                 self.progress(pair.name, "seeding", 0.0)
                 seed = find_seed(pair, self.settings.seed, self.model)
                 if isinstance(seed, Issue):
-                    self.result[pair.name] = without_result(pair, first_candidate(pair), seed)
+                    self.result[pair.name] = without_result(pair, Seed(*next(iter(pair.candidates.items())), 0.0), seed)
                 else:
                     starts.append((pair, seed))
         return starts

@@ -45,11 +45,8 @@ def with_predictions(
     image does not fit the rig; its alignment gets an issue and is not replaced.
     """
     known = observed([p for p in pairs if p.has_rig_pixels], result, capture)
-    checked = dict(result)
-    for pair in pairs:
-        if pair.name in rig.mean and pair.has_rig_pixels:
-            checked[pair.name] = _with_prediction(pair, result[pair.name], rig, known)
-    return checked
+    covered = [p for p in pairs if p.name in rig.mean and p.has_rig_pixels]
+    return {**result, **{p.name: _with_prediction(p, result[p.name], rig, known) for p in covered}}
 
 
 def _with_prediction(
@@ -98,13 +95,9 @@ def bands_to_learn(
         alignment = result.get(pair.name)
         if alignment is None or pair.name not in rig.mean or not pair.has_rig_pixels:
             return False
-        is_predicted = predict_band(rig, pair.name, known).std_px <= accept_predicted_px
-        return is_predicted or not _has_common_structure(alignment)
+        joint = alignment.joint
+        is_retrieved = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
+        has_common_structure = alignment.seed.trusted or is_retrieved
+        return not has_common_structure or predict_band(rig, pair.name, known).std_px <= accept_predicted_px
 
     return {pair.name for pair in pairs if not is_skipped(pair)}
-
-
-def _has_common_structure(alignment: Alignment[FixedImagePx]) -> bool:
-    """Return True for a trusted seed or a retrieval above chance."""
-    joint = alignment.joint
-    return alignment.seed.trusted or (joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance)

@@ -85,7 +85,8 @@ def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual:
     for mapping in _matches(pair, model, by_learned_descriptors=not best.trusted):
         for match, match_residual in _with_corrected(pair, mapping):
             if seed_fits(match_residual) and match_residual.is_better_than(residual):
-                best, residual = replace(_unshifted(pair, match), trusted=True), match_residual
+                # The match has its own score: it is not shifted to the correlation peak.
+                best, residual = replace(_scored(pair, "match", match)[0], trusted=True), match_residual
         if best.kind == "match" and residual.p95_px <= _CLOSE_PX:
             break
     return best
@@ -194,12 +195,6 @@ def best_seed(pair: BandPair, candidates: Candidates, force: SeedKind | None = N
     return max(forced or scored, key=lambda seed: seed.score)
 
 
-def first_candidate(pair: BandPair) -> Seed:
-    """Return the first candidate of a pair as a seed without a score."""
-    kind, matrix = next(iter(pair.candidates.items()))
-    return Seed(kind, matrix, 0.0)
-
-
 def _at_other_scales(pair: BandPair) -> Iterator[Seed]:
     """Yield the trusted seeds that overlay the images at other scales.
 
@@ -211,11 +206,6 @@ def _at_other_scales(pair: BandPair) -> Iterator[Seed]:
             geometry.translation(*centre), np.diag([scale, scale, 1.0]), geometry.translation(*-centre)
         )
         yield from (s for s in _scored(pair, "structure", geometry.compose(overlay, about_centre)) if s.trusted)
-
-
-def _unshifted(pair: BandPair, fixed_to_moving: Matrix) -> Seed:
-    """Return a match with its score, without shifting it to the correlation peak."""
-    return _scored(pair, "match", fixed_to_moving)[0]
 
 
 def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[Seed]:

@@ -37,7 +37,7 @@ _MIN_VALID_SHARE = 0.9
 
 
 class FixedWindows:
-    """Windows of the reference, whose shifts can be measured in any number of moving bands."""
+    """Windows of the reference with structure, at `centres_px` (n, 2); shifts are measured in any number of bands."""
 
     def __init__(
         self, valid: Mask, structure: Field, side_px: int = _WINDOW_PX, step_px: int | None = None,
@@ -55,6 +55,7 @@ class FixedWindows:
             origins = [(x, y) for y in _starts(height, self.side, step_px) for x in _starts(width, self.side, step_px)]
         inside = [(x, y) for x, y in origins if x + self.side <= width and y + self.side <= height]
         self.origins, windows = self._strong(structure, inside)
+        self.centres_px = self._centres_px(self.origins)
         self.spectra = windowed_spectra(windows)
 
     @classmethod
@@ -90,11 +91,6 @@ class FixedWindows:
         fixed = self.spectra if len(origins) == len(rows) else self.spectra[[rows[o] for o in origins]]
         shifts_px, sigma = _peaks(whitened_cross_spectra(fixed, windowed_spectra(windows)))
         return Residual.of(self._centres_px(origins), shifts_px, sigma)
-
-    @property
-    def centres_px(self) -> NDArray[np.float64]:
-        """(n, 2) centres of the windows with structure."""
-        return self._centres_px(self.origins)
 
     def _centres_px(self, origins: Sequence[_Origin]) -> NDArray[np.float64]:
         return np.asarray(np.array(origins, dtype=np.float64).reshape(-1, 2) + (self.side - 1) / 2)
