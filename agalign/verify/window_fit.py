@@ -26,17 +26,19 @@ Array = NDArray[np.float64]
 
 _MIN_WINDOWS = 12
 """Minimum number of windows for parameters without a prior: 1.5 times the eight of a homography."""
-_CORNER_STD_PX, _ANY_CORNER_STD_PX = 5.0, 1e3
-"""Standard deviation of the prior of a corner with lens shapes (the error of an extrapolated affine mapping), and
-without: windows on a line do not determine all corners."""
+_CORNER_STD_PX = 5.0
+"""Standard deviation of the prior of a corner, with lens shapes only: the error of an extrapolated affine mapping."""
+_MIN_INFORMATION_SHARE = 1e-12
+"""Share of the total information that is added to directions that no window determines, as with windows on a line."""
 _CAUCHY_SCALES = 2.0
 """Residual at which the robust weight is one half, in residual scales."""
 _REWEIGHTINGS = 6
 """Iterations after which the robust weights have converged."""
 _AXIS_SHARE = 1 / 3
 """Variance along one axis over the square of the scale of lengths: normally distributed vectors have 1 / 3.05."""
-_CORRELATED_WINDOWS = 12.0
-"""Effective number of windows with a common error by relief, which a fit with lens shapes extrapolates."""
+_EXTRAPOLATION_FACTOR = 12.0
+"""Factor on the variance of windows in a fit with lens shapes: it extrapolates errors by relief, which neighbouring
+windows have in common."""
 _COMMON_STD_PX = 0.01
 """Standard error along x and y common to all windows, which their residuals do not contain."""
 _ROUNDS, _CONVERGED_PX = 4, 0.02
@@ -95,15 +97,16 @@ def fit_windows(
     points_px, shifted_px = (mapping.undistorted(p) for p in (centres_px, centres_px + residual.shifts_px[measured]))
     shifts_px = shifted_px - points_px
     if lens_std_px is None:
-        design, std_px, factor = geometry.over_corners(points_px, *size_px), np.full(8, _ANY_CORNER_STD_PX), 1.0
+        design, std_px, factor = geometry.over_corners(points_px, *size_px), np.full(8, np.inf), 1.0
     else:
-        design, factor = over_corners_and_lens(points_px, size_px), _CORRELATED_WINDOWS
+        design, factor = over_corners_and_lens(points_px, size_px), _EXTRAPOLATION_FACTOR
         std_px = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px]
     by_peak = (peaks_sigma / np.median(peaks_sigma)) ** 4 if len(peaks_sigma) else peaks_sigma
     weights, residuals_px, scale_px = by_peak, np.zeros(len(shifts_px)), MIN_SHIFT_SCALE_PX
     for _ in range(_REWEIGHTINGS):
         information = weights / (factor * _AXIS_SHARE * scale_px**2 + MIN_SHIFT_SCALE_PX**2)
-        covariance = np.linalg.inv(np.einsum("n,nki,nkj->ij", information, design, design) + np.diag(std_px**-2.0))
+        normal = np.einsum("n,nki,nkj->ij", information, design, design) + np.diag(std_px**-2.0)
+        covariance = np.linalg.inv(normal + _MIN_INFORMATION_SHARE * np.trace(normal) * np.eye(len(normal)))
         mean = covariance @ np.einsum("n,nki,nk->i", information, design, shifts_px)
         residuals_px = np.linalg.norm(shifts_px - design @ mean, axis=1)
         scale_px = shift_scale_px(residuals_px)
