@@ -7,18 +7,17 @@ import pytest
 from agalign.capture import verification
 from agalign.capture.band_pair import BandPair
 from agalign.capture.verification import WarpedPair, verified, with_metrics
-from agalign.config import ReliefSettings, Settings
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, PairScales, Residual, Seed
+from agalign.values.choices import ReliefUse
 from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster
 from agalign.values.issues import FEW_KEYPOINTS, Issue
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.displacement_field import FINE, DisplacementResult
+from agalign.verify.displacement_field import DisplacementResult
 
 from ..conftest import textured_image, textured_pair
 
-SETTINGS = Settings(relief=ReliefSettings(use=True))
 SEED = Seed("rig", geometry.translation(5, -3), 30.0, 30.0, 5.0, trusted=True)
 
 
@@ -37,7 +36,7 @@ def pair() -> BandPair:
 
 
 def test_a_result_that_passes_is_aligned_and_measured(pair: BandPair) -> None:
-    results = verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
+    results = verified(pair, SEED, result(geometry.translation(6, -4)), "always")
     assert (results.status, results.issues, results.reason) == ("aligned", (), None)
     assert results.residual.median_px < 0.1
     measured = with_metrics(results, pair)
@@ -57,7 +56,7 @@ def test_a_converted_residual_equals_a_new_measurement(pair: BandPair) -> None:
 
 
 def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
-    results = verified(pair, SEED, result(geometry.translation(6, -4), retrieval=0.01), SETTINGS)
+    results = verified(pair, SEED, result(geometry.translation(6, -4), retrieval=0.01), "always")
     assert results.status == "seed_only"
     assert results.issues[0].code == "retrieval"
     np.testing.assert_array_equal(results.fixed_to_moving, SEED.fixed_to_moving)
@@ -65,14 +64,14 @@ def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
 
 
 def test_a_missing_result_has_its_own_reason(pair: BandPair) -> None:
-    result = verified(pair, SEED, Issue(FEW_KEYPOINTS, 3, 16), SETTINGS)
+    result = verified(pair, SEED, Issue(FEW_KEYPOINTS, 3, 16), "always")
     assert result.status == "seed_only"
     assert result.reason == "only 3 keypoints are in the area that both bands show; the rig seed is used unchanged"
 
 
 def test_an_unrelated_image_is_failed_with_or_without_a_seed() -> None:
     results = verified(
-        pair_of(textured_image(400, 320), textured_image(400, 320, 9)), SEED, result(np.eye(3), 0.01), SETTINGS
+        pair_of(textured_image(400, 320), textured_image(400, 320, 9)), SEED, result(np.eye(3), 0.01), "always"
     )
     assert results.status == "failed"
     assert results.reason is not None
@@ -84,17 +83,17 @@ def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monk
     wild = np.zeros((11, 14, 2))
     wild[..., 0] = 3.0
     monkeypatch.setattr(
-        pair.reference.coarse_field,
+        pair.reference.displacement_field,
         "refine",
         lambda *_, **__: DisplacementResult(DisplacementField(32.0, wild), 1.0, 0.5),
     )
-    results = verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS)
+    results = verified(pair, SEED, result(geometry.translation(6, -4)), "always")
     assert results.status == "aligned"
     assert results.candidates == {"homography": 1.0, "field": 0.5}
     assert results.geometry == "homography"
     assert results.residual.median_px < 0.1
     monkeypatch.setattr(verification, "issues_of", lambda *_: ())
-    assert verified(pair, SEED, result(geometry.translation(6, -4)), SETTINGS).geometry == "field"
+    assert verified(pair, SEED, result(geometry.translation(6, -4)), "always").geometry == "field"
 
 
 def test_residuals_of_a_reduced_image_are_in_px_of_the_file() -> None:
@@ -123,25 +122,22 @@ def displaced_pair(height_px: float, apart_px: float | None = None) -> BandPair:
 
 
 @pytest.mark.parametrize(("use", "status"), [("auto", "aligned"), ("always", "aligned"), ("never", "seed_only")])
-def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: str, status: str) -> None:
+def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: ReliefUse, status: str) -> None:
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
-    settings = Settings(relief=ReliefSettings(use=use))
-    results = verified(displaced_pair(4.0), seed, result(np.eye(3)), settings)
+    results = verified(displaced_pair(4.0), seed, result(np.eye(3)), use)
     assert results.status == status
     assert results.geometry == ("field" if status == "aligned" else "homography")
 
 
 @pytest.mark.slow
-def test_quickly_varying_parallax_needs_a_fine_field() -> None:
-    """Waves of 200 px: a window of the coarse field contains a large part of a wave."""
-    pair, seed = displaced_pair(2.5, apart_px=200.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
-    results = verified(pair, seed, result(np.eye(3)), Settings())
+def test_a_field_follows_quickly_varying_parallax() -> None:
+    """Waves of 300 px. Shorter ones are not predicted without the windows that overlap one of verification."""
+    pair, seed = displaced_pair(2.5, apart_px=300.0), Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
+    results = verified(pair, seed, result(np.eye(3)), "auto")
     assert results.status == "aligned"
-    assert results.mapping.local is not None
-    assert results.mapping.local.step_px == FINE.lattice_px
     # The residual is that of held-out windows.
     assert results.residual.median_px < 0.4
-    assert pair.reference.coarse_field.refine(pair.moving_image, pair.mapping(np.eye(3))).field is None
+    assert results.geometry == "field"
 
 
 @pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])
@@ -149,7 +145,7 @@ def test_a_field_is_tried_without_a_rig_and_rejected_without_need(rig_known: boo
     pair = displaced_pair(0.0)
     pair = replace(pair, candidate_std_px={"model": 1.0} if rig_known else {})
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
-    plain = verified(pair, seed, result(np.eye(3)), Settings())
+    plain = verified(pair, seed, result(np.eye(3)), "auto")
     assert (plain.status, "field" in plain.candidates, plain.geometry) == ("aligned", tried, "homography")
 
 
@@ -158,7 +154,7 @@ def test_issues_that_a_field_cannot_remove_are_reported(pair: BandPair) -> None:
     fixed, moving = textured_pair(geometry.translation(6, -4))
     partly_shifted = moving.copy()
     partly_shifted[:, 270:] = np.roll(moving, 15, axis=0)[:, 270:]
-    results = verified(pair_of(fixed, partly_shifted), SEED, result(geometry.translation(6, -4)), Settings())
+    results = verified(pair_of(fixed, partly_shifted), SEED, result(geometry.translation(6, -4)), "auto")
     assert results.status != "aligned"
     assert {"close_windows", "cluster"} & {d.code for d in results.issues}
     assert "of the windows" in (results.reason or "")
@@ -183,19 +179,18 @@ def test_a_field_is_verified_in_held_out_windows(monkeypatch: pytest.MonkeyPatch
     """A field may fit any shifts of its own windows."""
     pair = displaced_pair(2.5)
     seed = Seed("rig", np.eye(3), 30.0, 30.0, 5.0, trusted=True)
-    good = pair.reference.coarse_field.refine(pair.moving_image, pair.mapping(np.eye(3)), verify=True)
+    good = pair.reference.displacement_field.refine(pair.moving_image, pair.mapping(np.eye(3)))
     assert good.field is not None
     assert good.held_out is not None
-    accepted = verified(pair, seed, result(np.eye(3)), SETTINGS)
+    accepted = verified(pair, seed, result(np.eye(3)), "always")
     assert accepted.status == "aligned"
     assert accepted.residual is not None
     np.testing.assert_array_equal(accepted.residual.shifts_px, good.held_out.shifts_px)
     off = replace(
         good, held_out=Residual.of(good.held_out.centres_px, good.held_out.shifts_px + 1.5, good.held_out.peaks_sigma)
     )
-    for estimator in (pair.reference.coarse_field, pair.reference.fine_field):
-        monkeypatch.setattr(estimator, "refine", lambda *_, **__: off)
-    refused = verified(pair, seed, result(np.eye(3)), SETTINGS)
+    monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_: off)
+    refused = verified(pair, seed, result(np.eye(3)), "always")
     assert refused.status == "predicted"
     assert refused.prediction is not None
     assert refused.prediction.std_px > 1.5
@@ -210,6 +205,6 @@ def test_no_field_aligns_an_unrelated_image(kind: str) -> None:
         else textured_image(480, 360, 9)
     )
     pair = pair_of(fixed, other)
-    results = verified(pair, SEED, result(SEED.fixed_to_moving), SETTINGS)
+    results = verified(pair, SEED, result(SEED.fixed_to_moving), "always")
     assert results.status not in ("aligned", "predicted")
     assert results.geometry == "homography"

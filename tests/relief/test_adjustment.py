@@ -1,11 +1,19 @@
-"""Planes, baselines and parallax, recovered from synthetic shifts of windows."""
+"""Homographies, lens fields, baselines and parallax, recovered from synthetic shifts of windows."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from agalign.relief.plane_parallax import PlaneParallax, WindowShifts, are_of_lenses, fit_plane_parallax, parallax_of
 
+from agalign.relief.adjustment import (
+    Adjustment,
+    WindowShifts,
+    adjust,
+    are_of_lenses,
+    are_on_a_line,
+    parallax_of,
+    shifts_by_corners,
+)
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Residual
@@ -45,20 +53,19 @@ def shifts(noise_px: float = 0.06, wrong: float = 0.2, missing: float = 0.0) -> 
     return WindowShifts(POINTS, POINTS, result, np.where(gone, 0.0, 1.0))
 
 
-def assert_recovered(model: PlaneParallax | None, sign: int = 1, tolerance_px: float = 0.15) -> None:
+def assert_recovered(model: Adjustment | None, sign: int = 1, tolerance_px: float = 0.15) -> None:
     assert model is not None
     np.testing.assert_allclose(model.baselines, sign * BASELINES, atol=0.02)
     error = np.abs(model.parallax_px - sign * heights())
     assert np.percentile(error, 75) < tolerance_px
-    for band in range(len(BASELINES)):
-        plane = geometry.over_corners(POINTS, *SIZE) @ corners()[band]
-        assert np.abs(model.shifts_px(POINTS, SIZE, band) - plane).max() < tolerance_px
+    planes = np.einsum("nki,bi->nbk", geometry.over_corners(POINTS, *SIZE), corners())
+    assert np.abs(shifts_by_corners(model, POINTS, SIZE) - planes).max() < tolerance_px
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.001, 40.0])
 def test_the_model_is_recovered_despite_noise_and_wrong_peaks(unit: float) -> None:
     """Whatever the unit of the layout."""
-    model = fit_plane_parallax(shifts(), SIZE, BASELINES * unit)
+    model = adjust(shifts(), SIZE, BASELINES * unit, with_fields=False)
     assert_recovered(model)
     assert np.nanmedian(model.residuals_px) < 0.15
     assert 0.1 < (model.residuals_px > 2).mean() < 0.25
@@ -66,7 +73,7 @@ def test_the_model_is_recovered_despite_noise_and_wrong_peaks(unit: float) -> No
 
 def test_windows_may_be_missing_in_some_bands() -> None:
     some = shifts(missing=0.3)
-    model = fit_plane_parallax(some, SIZE, BASELINES)
+    model = adjust(some, SIZE, BASELINES, with_fields=False)
     assert_recovered(model)
     np.testing.assert_array_equal(np.isfinite(model.residuals_px), some.weights > 0)
 
@@ -75,7 +82,7 @@ def test_windows_may_be_missing_in_some_bands() -> None:
 def test_an_unrelated_band_does_not_bias_the_others(layout: np.ndarray | None) -> None:
     windows = shifts(wrong=0.0)
     windows.shifts_px[:, 0] = np.random.default_rng(2).uniform(-20, 20, (len(POINTS), 2))
-    model = fit_plane_parallax(windows, SIZE, layout)
+    model = adjust(windows, SIZE, layout, with_fields=False)
     assert model is not None
     others = model.baselines[1:] / np.linalg.norm(model.baselines[1:], axis=1).max()
     wanted = BASELINES[1:] * np.sign(np.sum(others * BASELINES[1:]))
@@ -84,16 +91,16 @@ def test_an_unrelated_band_does_not_bias_the_others(layout: np.ndarray | None) -
 
 def test_only_the_sign_of_the_layout_must_be_right() -> None:
     rough = BASELINES + np.random.default_rng(5).normal(0, 0.15, BASELINES.shape)
-    assert_recovered(fit_plane_parallax(shifts(), SIZE, rough))
+    assert_recovered(adjust(shifts(), SIZE, rough, with_fields=False))
 
 
 def test_the_layout_determines_the_sign() -> None:
-    assert_recovered(fit_plane_parallax(shifts(), SIZE, BASELINES))
-    assert_recovered(fit_plane_parallax(shifts(), SIZE, -BASELINES), sign=-1)
+    assert_recovered(adjust(shifts(), SIZE, BASELINES, with_fields=False))
+    assert_recovered(adjust(shifts(), SIZE, -BASELINES, with_fields=False), sign=-1)
 
 
 def test_without_a_layout_only_the_sign_is_unknown() -> None:
-    model = fit_plane_parallax(shifts(), SIZE)
+    model = adjust(shifts(), SIZE, with_fields=False)
     assert model is not None
     assert_recovered(model, sign=1 if (model.baselines * BASELINES).sum() > 0 else -1)
 
@@ -103,19 +110,59 @@ def test_the_reference_plane_contains_most_windows() -> None:
     tilted = shifts()
     tilt = 0.01 * (POINTS[:, 0] - 320) - 0.02 * (POINTS[:, 1] - 240) + 5
     tilted = replace(tilted, shifts_px=tilted.shifts_px + tilt[:, None, None] * BASELINES)
-    model = fit_plane_parallax(tilted, SIZE, BASELINES)
+    model = adjust(tilted, SIZE, BASELINES, with_fields=False)
     assert model is not None
     assert np.percentile(np.abs(model.parallax_px - heights()), 75) < 0.15
+
+
+def lens_fields() -> np.ndarray:
+    """(n, bands, 2) differences of radial distortion, up to 1 px at the corners of the image."""
+    u = 2 * POINTS / np.array(SIZE) - 1
+    radial = u * (u**2).sum(axis=1, keepdims=True)
+    radial /= np.linalg.norm(radial, axis=1).max()
+    return radial[:, None, :] * np.array([1.0, -1.0, 0.5, -0.5])[:, None]
+
+
+def test_lens_fields_are_recovered_next_to_parallax() -> None:
+    """Homography and field are compared as a sum, because a field contains homographies too."""
+    windows = shifts(wrong=0.05)
+    windows = replace(windows, shifts_px=windows.shifts_px + lens_fields())
+    model = adjust(windows, SIZE, BASELINES)
+    assert model is not None
+    np.testing.assert_allclose(model.baselines, BASELINES, atol=0.02)
+    assert np.percentile(np.abs(model.parallax_px - heights()), 90) < 0.15
+    planes = np.einsum("nki,bi->nbk", geometry.over_corners(POINTS, *SIZE), corners())
+    fitted = shifts_by_corners(model, POINTS, SIZE)
+    for band, field in enumerate(model.fields):
+        assert field is not None
+        error = fitted[:, band] + field(POINTS) - planes[:, band] - lens_fields()[:, band]
+        # The smoothness reduces the field in the corners.
+        assert np.percentile(np.linalg.norm(error, axis=1), 95) < 0.25
+        assert np.median(np.linalg.norm(error, axis=1)) < 0.08
+    without = adjust(windows, SIZE, BASELINES, with_fields=False)
+    assert without is not None
+    assert without.fields == [None] * 4
+    assert np.all(without.scales_px > 1.05 * model.scales_px)
+
+
+@pytest.mark.parametrize(("baselines", "on_a_line"), [
+    (BASELINES, False),
+    (BASELINES[[0, 1]], False),
+    (np.array([[-1.0, 0.5], [0.4, -0.2], [-0.2, 0.1]]), True),
+    (np.array([[-1.0, 0.5], [0.4, -0.15]]), True),
+])  # fmt: skip
+def test_baselines_on_a_line(baselines: np.ndarray, on_a_line: bool) -> None:
+    assert are_on_a_line(baselines) == on_a_line
 
 
 def test_too_few_windows_give_no_model() -> None:
     windows = shifts()
     few = WindowShifts(POINTS[:7], POINTS[:7], windows.shifts_px[:7], windows.weights[:7])
-    assert fit_plane_parallax(few, SIZE) is None
+    assert adjust(few, SIZE, with_fields=False) is None
     # Eight windows suffice if they are measured in all bands.
     nothing = replace(windows, weights=np.where(np.arange(4) == 2, 0.0, windows.weights))
-    assert fit_plane_parallax(nothing, SIZE) is None
-    assert fit_plane_parallax(windows, SIZE, np.zeros((4, 2))) is None
+    assert adjust(nothing, SIZE, with_fields=False) is None
+    assert adjust(windows, SIZE, np.zeros((4, 2)), with_fields=False) is None
 
 
 def test_parallax_is_the_projection_onto_the_baselines() -> None:
@@ -174,6 +221,6 @@ def test_noise_of_the_reference_is_not_parallax(layout: np.ndarray | None, bands
     for shifts_px, is_depth in ((noise, False), (shifts().shifts_px, True)):
         windows = WindowShifts(POINTS, POINTS, shifts_px[:, bands], np.ones((len(POINTS), len(bands))))
         known = None if layout is None else layout[bands]
-        model = fit_plane_parallax(windows, SIZE, known)
+        model = adjust(windows, SIZE, known, with_fields=False)
         assert model is not None
         assert are_of_lenses(model.baselines, known) == is_depth
