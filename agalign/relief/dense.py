@@ -68,6 +68,8 @@ _NODE_STEP_PX = 8
 """Spacing of the grid on which lenses and homographies are evaluated."""
 _MIN_ENERGY = 1e-3
 """Energy added to that of a window, so that windows without structure have no correlation."""
+_OUTSIDE_ENERGY = 1e3
+"""Energy of windows with centres outside the moving image, so that the part inside has no correlation."""
 
 
 @dataclass(frozen=True)
@@ -243,7 +245,8 @@ class _MovingBand:
 
     def _correlation(self, positions: FloatImage, rows: slice, extended: slice) -> FloatImage:
         """Return the correlation in some rows from the positions in these and the rows around."""
-        warped = np.asarray(cv2.remap(self.structure, positions[0], positions[1], cv2.INTER_LINEAR))
+        border = (0.0, 0.0, _OUTSIDE_ENERGY, 0.0)
+        warped = np.asarray(cv2.remap(self.structure, *positions, cv2.INTER_LINEAR, borderValue=border))
         return self.fixed.correlation(warped, extended)[rows.start - extended.start :][: rows.stop - rows.start]
 
     def _size_px(self, view: View) -> tuple[int, int]:

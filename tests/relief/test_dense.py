@@ -72,6 +72,17 @@ def test_a_thin_object_that_the_wide_search_smooths_away() -> None:
     check(relief, BAR, 20)
 
 
+def test_windows_outside_a_moving_image_do_not_match() -> None:
+    """At the right border, two of three bands do not show the ground: only the other one determines it."""
+    plane = PixelMapping(np.array([[1.0, 0, 40], [0, 1, 0], [0, 0, 1]]))
+    ground = np.asarray(textured_image(WIDTH + 40, HEIGHT, 3), np.float32)
+    seen = [View(raster(ground[:, 40:]), PixelMapping(np.eye(3)), (0.0, 1.0))]
+    seen += [View(raster(ground[:, :-40]), plane, b) for b in ((1.0, 0.0), (-1.0, 0.0))]
+    matching = DenseMatching(raster(ground[:, 40:]), seen, (-8.0, 8.0))
+    (relief,) = matching.refined(seen, [range(3)])
+    assert np.abs(relief.parallax_px).max() < 1.0
+
+
 def test_thirty_bands_do_not_overflow() -> None:
     seen = views(BOX, 12, [BASELINES[k % 4] for k in range(30)])
     matching = of_views(seen, BOX, 12)
