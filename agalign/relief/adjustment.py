@@ -199,9 +199,10 @@ def adjust(
     design, prior = _design(windows.points_px, size_px, basis)
     plane = _plane_coordinates(windows.points_px, size_px)
     shifts, weights = np.nan_to_num(windows.shifts_px), windows.weights
-    smooth = np.zeros((len(baselines), len(prior)))
+    smooth, precisions = np.zeros((len(baselines), len(prior))), np.ones(len(baselines))
     for _ in range(_ITERATIONS):
-        parallax, information = _parallax(shifts - np.einsum("nki,bi->nbk", design, smooth), baselines, weights)
+        relative = shifts - np.einsum("nki,bi->nbk", design, smooth)
+        parallax, information = _parallax(relative, baselines, weights * precisions)
         parallax = parallax - plane @ _reference_plane(parallax, plane, information)
         smooth, baselines = _bands(shifts, parallax, design, prior, weights)
         longest = np.linalg.norm(baselines, axis=1).max()
@@ -213,7 +214,8 @@ def adjust(
         scales = _scales_px(residuals)
         weights = windows.weights * np.nan_to_num(cauchy_weights(residuals, _CAUCHY_SCALES * scales))
         # Inverse variance of bands worse than the median, so that an inconsistent band does not determine the parallax.
-        weights *= np.minimum(1, (np.median(scales) / scales) ** 2)
+        # The fit of a band does not use it: its priors are relative to windows of weight 1.
+        precisions = np.minimum(1, (np.median(scales) / scales) ** 2)
     if layout is not None and np.sum(baselines * layout) < 0:
         baselines, parallax = -baselines, -parallax
     fields = [None if basis is None else basis.field(s[8:].reshape(2, -1).T) for s in smooth]
@@ -224,14 +226,21 @@ def are_of_lenses(baselines: Array, layout: Array | None) -> bool:
     """Return True if baselines (bands, 2) are plausible for lenses with a layout (bands, 2), None if unknown.
 
     Noise of the reference shifts the windows of all bands equally. It resembles parallax that is common to the bands,
-    but all baselines are nearly equal, which those of different lenses are not.
+    but all baselines are nearly equal, which those of different lenses are not. Equal baselines resemble the layout of
+    lenses on one side of the reference, but it must be more similar to them than their mean is.
     """
     if layout is not None:
-        norms = np.linalg.norm(baselines) * np.linalg.norm(layout)
-        return bool(np.sum(baselines * layout) >= _MIN_LAYOUT_COSINE * norms > 0)
+        of_mean = _cosine(baselines, np.broadcast_to(baselines.mean(axis=0), baselines.shape))
+        return _cosine(baselines, layout) >= max(_MIN_LAYOUT_COSINE, of_mean)
     lengths = np.linalg.norm(baselines, axis=1)
     from_mean = np.linalg.norm(baselines - baselines.mean(axis=0), axis=1)
     return bool(from_mean.max() >= _MIN_SPREAD * lengths.max() > 0)
+
+
+def _cosine(baselines: Array, others: Array) -> float:
+    """Return the cosine similarity of baselines (bands, 2) and others; 0 if either are all zero."""
+    norms = np.linalg.norm(baselines) * np.linalg.norm(others)
+    return float(np.sum(baselines * others) / norms) if norms > 0 else 0.0
 
 
 def are_on_a_line(baselines: Array) -> bool:
