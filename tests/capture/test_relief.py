@@ -11,7 +11,15 @@ from synthetic_flights.relief import make_scene
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.reference import Reference
-from agalign.capture.relief import ReliefCandidate, _is_worse, aligned_by_relief, shows_relief
+from agalign.capture.relief import (
+    _MIN_PARALLAX_PX,
+    ReliefCandidate,
+    ReliefResult,
+    _Checked,
+    _common_parallax_px,
+    _is_chosen,
+    aligned_by_relief,
+)
 from agalign.capture.verification import WarpedPair
 from agalign.relief.range import inverse_range
 from agalign.synthetic.flight import recorded
@@ -83,6 +91,11 @@ class Rendered:
         return np.asarray(np.linalg.norm(mapping(self.pixels) - known.moving_px, axis=-1)[known.visible])
 
 
+def shows_relief(candidates: Sequence[ReliefCandidate]) -> bool:
+    parallax_px, on_a_line = _common_parallax_px(candidates)
+    return parallax_px >= _MIN_PARALLAX_PX and not on_a_line
+
+
 @pytest.fixture(scope="module")
 def boxes() -> Rendered:
     size_px = 640, 480
@@ -102,7 +115,7 @@ def candidates(boxes: Rendered) -> list[ReliefCandidate]:
 
 @pytest.fixture(scope="module")
 def aligned(candidates: Sequence[ReliefCandidate]) -> dict[str, Alignment]:
-    return aligned_by_relief(candidates, "auto")
+    return aligned_by_relief(candidates, "auto").alignments
 
 
 def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
@@ -161,7 +174,7 @@ def test_range_is_right_to_two_percent(boxes: Rendered, aligned: Mapping[str, Al
 def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[ReliefCandidate]) -> None:
     """The sign follows from occlusions. The reference plane may differ from the one with a layout."""
     unknown = [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
-    result = aligned_by_relief(unknown, "auto")
+    result = aligned_by_relief(unknown, "auto").alignments
     assert len(result) == len(MOVING)
     parallax = result["NIR"].mapping.parallax
     assert parallax is not None
@@ -180,19 +193,19 @@ def test_bands_measured_in_windows_of_different_sizes_have_common_residuals(
 
 
 def test_use(candidates: Sequence[ReliefCandidate]) -> None:
-    assert aligned_by_relief(candidates, "never") == {}
+    assert aligned_by_relief(candidates, "never") == ReliefResult()
     # One moving band cannot be verified with others; a coarse one has another reference.
-    assert aligned_by_relief(candidates[:1], "always") == {}
+    assert aligned_by_relief(candidates[:1], "always") == ReliefResult()
     coarse = [replace(c, pair=replace(c.pair, is_coarse=True)) for c in candidates[1:]]
-    assert aligned_by_relief([candidates[0], *coarse], "always") == {}
+    assert aligned_by_relief([candidates[0], *coarse], "always") == ReliefResult()
 
 
 def test_a_flat_scene_gets_no_relief(flat: Rendered) -> None:
     candidates = flat.candidates()
     assert not shows_relief(candidates)
-    assert aligned_by_relief(candidates, "auto") == {}
+    assert aligned_by_relief(candidates, "auto") == ReliefResult()
     # A forced relief is not better than the homographies and therefore rejected.
-    assert aligned_by_relief(candidates, "always") == {}
+    assert aligned_by_relief(candidates, "always") == ReliefResult()
 
 
 @pytest.mark.parametrize("has_layout", [True, False])
@@ -209,7 +222,7 @@ def test_noise_of_the_reference_is_not_relief(flat: Rendered, has_layout: bool) 
     if not has_layout:
         candidates = [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
     assert not shows_relief(candidates)
-    assert aligned_by_relief(candidates, "always") == {}
+    assert aligned_by_relief(candidates, "always") == ReliefResult()
 
 
 @pytest.mark.parametrize(("height_px", "shown"), [(0.25, False), (1.0, True)])
@@ -242,7 +255,13 @@ def of_lengths(median_px: float, p95_px: float) -> Residual:
 def test_a_relief_may_not_be_worse_than_its_plane(
     relief: tuple[float, float], plane: tuple[float, float], worse: bool
 ) -> None:
-    assert _is_worse(of_lengths(*relief), of_lengths(*plane)) == worse
+    alignment = Alignment(PixelMapping(np.eye(3)), (640, 480), "aligned", (), Seed("rig", np.eye(3), 30.0))
+    checked = _Checked("NIR", of_lengths(*plane), of_lengths(*relief), alignment)
+    assert _is_chosen([checked]) != worse
+    # The median of the bands decides; a band that does not pass counts as one without a gain.
+    failed = replace(checked, alignment=None)
+    assert not _is_chosen([checked, failed, failed])
+    assert _is_chosen([checked, checked, failed]) != worse
 
 
 # ---- what fits noise cannot pass
@@ -270,7 +289,7 @@ def unrelated(size_px: tuple[int, int], seed: int) -> np.ndarray:
 def test_an_unrelated_band_is_not_aligned(boxes: Rendered, kind: str) -> None:
     makers = {"noise": noise(boxes.size_px, 7), "unrelated": unrelated(boxes.size_px, 7)}
     nir = makers[kind] if kind in makers else scrambled(boxes.images["NIR"], 3)
-    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "always")
+    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "always").alignments
     assert "NIR" not in result
     for band in MOVING:
         if band.name in result:
@@ -285,4 +304,4 @@ def test_unrelated_bands_are_not_aligned(boxes: Rendered, kind: str) -> None:
         return (noise if kind == "noise" else unrelated)(boxes.size_px, number)
 
     images = {b.name: instead(b.name, n) for n, b in enumerate(MOVING)}
-    assert aligned_by_relief(boxes.candidates(images), "always") == {}
+    assert aligned_by_relief(boxes.candidates(images), "always").alignments == {}
