@@ -223,7 +223,7 @@ class PairAligner:
 
     def fit_windows(self, starts: Sequence[Start]) -> None:
         """Align by windows the pairs without retrieval of held-out patches."""
-        if self.settings.joint.model_family not in ("auto", "homography"):
+        if not _may_be_homography(self.settings):
             return
         for pair, _ in starts:
             if pair.name in self.result:
@@ -251,6 +251,11 @@ def refined_pairs(starts: Sequence[Start], results: Results) -> dict[str, Refine
     }
 
 
+def _may_be_homography(settings: Settings) -> bool:
+    """Return False if the user chose a model family with fewer parameters."""
+    return settings.joint.model_family in ("auto", "homography")
+
+
 def _quiet(band: str, stage: str, share: float) -> None:
     """Ignore progress."""
 
@@ -261,9 +266,11 @@ def verify_together(
 ) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
     """Combine the results of a capture by MAP estimation and verify each one; return the alignments by name.
 
-    Without `with_fields`, no displacement fields are fitted.
+    Without `with_fields`, no displacement fields are fitted. A model family that the user chose is not replaced by a
+    relief or a displacement field.
     """
     timer = timer or _Timer()
+    relief_use = settings.relief.use if _may_be_homography(settings) else "never"
     with timer.measure([pair.name for pair, _ in starts]):
         warped_pairs = [
             WarpedPair.of(pair, pair.mapping(result.fixed_to_moving)) if isinstance(result, JointResult) else None
@@ -277,7 +284,7 @@ def verify_together(
         halves = [_map_estimates(starts, results, half, model, settings) for half in (black, white)]
         progress(starts[0][0].name if starts else "", "relief", 0.0)
         candidates = _relief_candidates(starts, estimates, warped_pairs)
-        relief = aligned_by_relief(candidates, settings.relief.use, with_fields=with_fields)
+        relief = aligned_by_relief(candidates, relief_use, with_fields=with_fields)
     alignments = relief.alignments
     for (pair, seed), result, warped_pair, *by_half in zip(starts, estimates, warped_pairs, *halves, strict=True):
         if pair.name in alignments:
@@ -286,7 +293,7 @@ def verify_together(
         by_halves = None if first is None or second is None else (first, second)
         progress(pair.name, "checking", 0.0)
         with timer.measure([pair.name]):
-            use = settings.relief.use if with_fields and pair.name not in relief.along_a_line else "never"
+            use = relief_use if with_fields and pair.name not in relief.along_a_line else "never"
             alignment = verified(pair, seed, result, use, warped_pair, by_halves, seed_only=settings.seed.only)
             is_mixed = pair.name in relief.others and alignment.status == "aligned"
             alignments[pair.name] = predicted_by_windows(alignment, pair) if is_mixed else alignment
@@ -325,7 +332,7 @@ def _map_estimates(
     model: FlightModel | None, settings: Settings,
 ) -> list[JointResult[FixedImagePx] | Issue]:  # fmt: skip
     """Return the results after the MAP estimation of all bands of the capture."""
-    if settings.joint.model_family not in ("auto", "homography"):
+    if not _may_be_homography(settings):
         return list(results)  # the estimate is a homography, not of the family that the user chose
     names = [pair.name for pair, _ in starts]
     joint = {name: r for name, r in zip(names, results, strict=True) if isinstance(r, JointResult)}

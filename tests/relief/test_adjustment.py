@@ -94,7 +94,7 @@ def test_priors_do_not_depend_on_the_noise_of_a_band() -> None:
     few = POINTS[::6]
     rng = np.random.default_rng(0)
     shift = heights()[::6, None, None] * BASELINES + rng.normal(0, 0.02, (len(few), 4, 2))
-    shift[:, 1] += rng.normal(0, 1.5, (len(few), 2)) + [20, -20]
+    shift[:, 1] += rng.normal((20, -20), 1.5, (len(few), 2))
     model = adjust(WindowShifts(few, few, shift, np.ones((len(few), 4))), SIZE, BASELINES, with_fields=False)
     assert model is not None
     error_px = shifts_by_corners(model, few, SIZE)[:, 1] - [20, -20]
