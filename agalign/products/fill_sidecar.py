@@ -239,6 +239,8 @@ def _grid_px(mapping: PixelMapping, size_px: tuple[int, int]) -> Points:
     Clough-Tocher, which works on any points, is less accurate than splines on the lattice.
     """
     points_px = geometry.lattice(*size_px, *_GRIDS[0])
+    if min(size_px) == 1:
+        return points_px  # points on one line have no triangles
     for finer in _GRIDS[1:]:
         interpolated = CloughTocher2DInterpolator(points_px, mapping(points_px))
         finer_px = geometry.lattice(*size_px, *finer)
