@@ -246,7 +246,7 @@ class _MovingBand:
     def _correlation(self, positions: FloatImage, rows: slice, extended: slice) -> FloatImage:
         """Return the correlation in some rows from the positions in these and the rows around."""
         border = (0.0, 0.0, _OUTSIDE_ENERGY, 0.0)
-        warped = np.asarray(cv2.remap(self.structure, *positions, cv2.INTER_LINEAR, borderValue=border))
+        warped = np.asarray(cv2.remap(self.structure, positions[0], positions[1], cv2.INTER_LINEAR, borderValue=border))
         return self.fixed.correlation(warped, extended)[rows.start - extended.start :][: rows.stop - rows.start]
 
     def _size_px(self, view: View) -> tuple[int, int]:

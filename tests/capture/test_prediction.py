@@ -92,10 +92,10 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
     """Where a capture is lower than the others, its bands start too far off; the model's mappings are nearer."""
     verify_together = learning_tasks.verify_together
 
-    def not_nir(*arguments: Any) -> dict[str, Alignment]:
+    def not_nir(*arguments: Any, **options: Any) -> dict[str, Alignment]:
         return {
             name: replace(a, status="seed_only") if name == "NIR" else a
-            for name, a in verify_together(*arguments).items()
+            for name, a in verify_together(*arguments, **options).items()
         }
 
     monkeypatch.setattr(learning_tasks, "verify_together", not_nir)
