@@ -23,7 +23,7 @@ from agalign.method.state import ImageGroup
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
-from agalign.values.issues import SEED_ASKED_FOR, Issue
+from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
 
@@ -296,7 +296,7 @@ def verify_together(
             use = relief_use if with_fields and pair.name not in relief.along_a_line else "never"
             alignment = verified(pair, seed, result, use, warped_pair, by_halves, seed_only=settings.seed.only)
             is_mixed = pair.name in relief.others and alignment.status == "aligned"
-            alignments[pair.name] = predicted_by_windows(alignment, pair) if is_mixed else alignment
+            alignments[pair.name] = predicted_by_windows(alignment, pair, OTHER_GEOMETRY) if is_mixed else alignment
     return alignments
 
 

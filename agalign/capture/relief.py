@@ -8,6 +8,7 @@ and a baseline of its own under that relief. Either all bands of the capture use
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from statistics import median_high
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,8 @@ _MAX_SCALE_RATIO, _MIN_FOREIGN_PX = 2.0, 0.4
 time, 2.4 for a photograph of another time. Residuals below the minimum are accepted anyway."""
 _RANGE_PERCENTILES = (1.0, 99.0)
 """Percentiles of the windows' parallax that limit its range; values beyond are wrong peaks."""
+_MAX_LEFT_OUT_BANDS = 4
+"""Up to this number, each band is verified by all others: the relief of one or two bands is too noisy."""
 _ROUNDS = 3
 """Rounds of the fit of a band under the relief of the others, as large shifts are measured in steps."""
 _CLEAR_GAIN = 2.0
@@ -299,12 +302,12 @@ def _aligned_group(group: Sequence[ReliefCandidate], *, with_fields: bool) -> di
 
 @dataclass(frozen=True)
 class _Estimate:
-    """The relief of a capture, from all bands and from two halves of them."""
+    """The relief of a capture, from all bands and from some of them."""
 
     bands: Sequence[_Band]
     relief: Relief
-    halves: Sequence[Relief]
-    """From the bands with odd and with even index: each verifies the other bands."""
+    others: Sequence[Relief]
+    """From the bands of `_verifying`, which do not contain the bands that they verify."""
     with_fields: bool
     """Displacement fields are fitted, as no rig contains the distortion of the lenses."""
 
@@ -336,15 +339,15 @@ class _Estimate:
         baselines = np.array([b.baseline for b in bands])
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
-        odd, even = range(1, len(bands), 2), range(0, len(bands), 2)
-        relief, *halves = matching.refined([b.view() for b in bands], [range(len(bands)), odd, even])
+        every = range(len(bands))
+        relief, *others = matching.refined([b.view() for b in bands], [every, *_verifying(every)])
         if layout is None and nearer_sign(matched, baselines) < 0:
-            bands, relief, halves = [b.negated for b in bands], relief.negated, [r.negated for r in halves]
-        return cls(bands, relief, halves, with_fields)
+            bands, relief, others = [b.negated for b in bands], relief.negated, [r.negated for r in others]
+        return cls(bands, relief, others, with_fields)
 
     def verifying(self, band: _Band) -> Relief:
         """Return the relief of other bands than this one."""
-        return self.halves[self.bands.index(band) % 2] if band in self.bands else self.relief
+        return self.others[self.bands.index(band) % len(self.others)] if band in self.bands else self.relief
 
     def fitted(self, candidate: ReliefCandidate) -> _Band | None:
         """Fit homography and baseline of a band under the relief of the others; None if too few windows are measured.
@@ -425,8 +428,19 @@ class _Checked:
     """None if it does not pass."""
 
 
+def _verifying(bands: Sequence[int]) -> list[list[int]]:
+    """Return the bands whose relief verifies band 0, 1, and so on, from the first again after the last.
+
+    With few bands all others, else the bands with odd and those with even index: two reliefs instead of one for
+    each band.
+    """
+    if len(bands) <= _MAX_LEFT_OUT_BANDS:
+        return [[b for b in bands if b != band] for band in bands]
+    return [[b for b in bands if b % 2 != parity] for parity in (0, 1)]
+
+
 def _is_chosen(checked: Sequence[_Checked]) -> bool:
-    """Return True if the relief explains the held-out windows of the median band better than the homographies.
+    """Return True if the relief explains the held-out windows of half of the bands better than the homographies.
 
     If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.
     """
@@ -437,7 +451,7 @@ def _is_chosen(checked: Sequence[_Checked]) -> bool:
             continue
         gain_px = float(each.plane.p95_px) - float(each.held_out.p95_px)
         gains_px.append(gain_px - max(0.0, float(each.held_out.median_px) - float(each.plane.median_px)))
-    return float(np.median(gains_px)) >= 0
+    return median_high(gains_px) >= 0
 
 
 def _applied(bands: Sequence[_Band], model: Adjustment) -> list[_Band]:

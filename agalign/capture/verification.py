@@ -13,7 +13,7 @@ from agalign.values.alignment import Alignment, JointResult, Prediction, Residua
 from agalign.values.choices import Geometry, ReliefUse, SeedKind
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
-from agalign.values.issues import SEED_DOES_NOT_FIT, Issue
+from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, IssueKind
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, PixelScale
 from agalign.verify.acceptance import is_unchanged, seed_fits, status_of
@@ -155,7 +155,9 @@ def verified(
     return predicted_by_windows(alignment, pair) if issues and is_displaced else alignment
 
 
-def predicted_by_windows(alignment: Alignment[FixedImagePx], pair: BandPair) -> Alignment[FixedImagePx]:
+def predicted_by_windows(
+    alignment: Alignment[FixedImagePx], pair: BandPair, reason: IssueKind | None = None
+) -> Alignment[FixedImagePx]:
     """Return as `predicted` an alignment that its windows do not confirm, or another geometry than that of its capture.
 
     The standard error is the RMS of the shifts of these windows.
@@ -165,7 +167,8 @@ def predicted_by_windows(alignment: Alignment[FixedImagePx], pair: BandPair) -> 
     std_px = FixedImagePx(np.sqrt(np.nanmean(lengths**2)))
     matrix = alignment.fixed_to_moving
     prediction = Prediction(pair.scales.between_files(matrix), "windows", pair.in_moving_file_px(std_px, matrix))
-    return replace(alignment, status="predicted", prediction=prediction)
+    issues = alignment.issues if reason is None else (Issue(reason), *alignment.issues)
+    return replace(alignment, status="predicted", issues=issues, prediction=prediction)
 
 
 def _verified(

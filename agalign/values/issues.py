@@ -100,7 +100,16 @@ RETRIEVAL = IssueKind(
 SEED_DOES_NOT_FIT = IssueKind("seed_does_not_fit", "but the seed does not fit either", UNLIKE)
 """Added to the issues of a result if its seed cannot be used instead."""
 
+OTHER_GEOMETRY = IssueKind(
+    "other_geometry", "the relief that aligns the other bands does not align this one",
+    Remedy(
+        "a band was exposed at another time, or parts of the scene moved",
+        "look at the picture; --bands omits the band, --relief never aligns all bands without a relief",
+    ),
+)  # fmt: skip
+"""Reported for a band that only a homography or displacement field aligns, in a capture with a relief."""
+
 KINDS = (
     UNREADABLE, BLANK_REFERENCE, BLANK_MOVING, NO_SUCH_SEED, SEED_ASKED_FOR, NO_CONTRAST, FEW_KEYPOINTS, NOT_INVERTIBLE,
-    CORNERS_UNKNOWN, RETRIEVAL,
+    CORNERS_UNKNOWN, RETRIEVAL, OTHER_GEOMETRY,
 )  # fmt: skip
