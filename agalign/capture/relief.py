@@ -119,7 +119,8 @@ def aligned_by_relief(
         if on_a_line and parallax_px > _MAX_LINE_PX:
             result.along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
-            aligned = _aligned_group(group, with_fields=with_fields and not group[0].pair.has_rig)
+            may_be_field = with_fields and not group[0].pair.has_rig
+            aligned = _aligned_group(group, with_fields=may_be_field, is_requested=use == "always")
             result.alignments |= aligned
             result.others |= {c.pair.name for c in group} - aligned.keys() if aligned else set()
     return result
@@ -282,14 +283,16 @@ class _Band:
         return replace(self, baseline=(-self.baseline[0], -self.baseline[1]))
 
 
-def _aligned_group(group: Sequence[ReliefCandidate], *, with_fields: bool) -> dict[str, Alignment[FixedImagePx]]:
+def _aligned_group(
+    group: Sequence[ReliefCandidate], *, with_fields: bool, is_requested: bool
+) -> dict[str, Alignment[FixedImagePx]]:
     """Align the bands of one group by their relief; empty if another geometry explains the capture better."""
     try:
         estimate = _Estimate.of(group, with_fields=with_fields)
         if estimate is None:
             return {}
         checked = [estimate.checked(band) for band in estimate.bands]
-        if not _is_chosen(checked) or (with_fields and not estimate.beats_fields(checked)):
+        if not _is_chosen(checked) or (with_fields and not is_requested and not estimate.beats_fields(checked)):
             return {}
         names = {band.name for band in estimate.bands}
         for candidate in (c for c in group if c.pair.name not in names):

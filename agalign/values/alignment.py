@@ -227,8 +227,6 @@ class Alignment(Generic[FixedPx]):
     joint: JointResult[FixedPx] | None = None
     residual: Residual[FixedPx] | None = None
     """Of windows that took no part in the estimation."""
-    ties: Residual[FixedPx] | None = None
-    """Of all windows under this mapping, including those that it was fitted to; None unless they were requested."""
     seconds: float = 0.0
     before: Mapping[str, float] = dataclasses.field(default_factory=dict)
     after: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -236,6 +234,8 @@ class Alignment(Generic[FixedPx]):
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     prediction: Prediction | None = None
     """Prediction by the rig of the flight; None without a rig."""
+    ties: Residual[FixedPx] | None = None
+    """Of all windows under this mapping, including those that it was fitted to; None unless they were requested."""
 
     def map(self, reference_px: ArrayLike) -> Points:
         """Map raw pixels (..., 2) of the reference to raw pixels of the moving image, (0, 0) a pixel's centre."""
