@@ -178,7 +178,7 @@ class _FlightLearner:
     ) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Train a network on captures, from the mappings that are already refined; None if that fails."""
         settings = self.settings
-        loaded = [load_capture(one.capture, self._bands, settings, self.start) for one in chosen]
+        loaded = [load_capture(one.capture, self._bands, settings, self.start, one.refined) for one in chosen]
         pairs = [(one, images) for one, images in zip(chosen, loaded, strict=True) if images is not None]
         groups: list[ImageGroup] = []
         for one, images in pairs:

@@ -149,15 +149,19 @@ class LoadedCapture:
 
 
 def load_capture(
-    capture: Capture, bands: Sequence[str], settings: Settings, start: FlightModel | None
-) -> LoadedCapture | None:
-    """Read a capture and find its seeds; None if no band can be used.
+    capture: Capture, bands: Sequence[str], settings: Settings, start: FlightModel | None,
+    known: Mapping[str, RefinedPair] | None = None,
+) -> LoadedCapture | None:  # fmt: skip
+    """Read a capture and find its seeds, or use those of the `known` pairs by band; None if no band can be used.
 
     Bands have their index in `bands` as index in the network. Seeds of kind `match` use the network of `start`.
     """
+    seeds_known = {} if known is None else {name: pair.seed for name, pair in known.items()}
     try:
         pairs, _ = read_pairs(capture, settings.seed)
-        seeds_of = [(p, find_seed(p, settings.seed, start)) for p in pairs if p.has_rig_pixels]
+        seeds_of = [
+            (p, seeds_known.get(p.name) or find_seed(p, settings.seed, start)) for p in pairs if p.has_rig_pixels
+        ]
         result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
         if not result:
             return None
