@@ -28,7 +28,8 @@ from agalign.verify.repetition import MAX_ALIAS_PEAK, alias_peak
 from agalign.verify.window_fit import WindowFit, fit_in_rounds
 
 _DESCRIPTORS_FAILED = frozenset({RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN})
-"""Issues for which windows are tried; with other issues the descriptors have a result that may contradict them."""
+"""Issues for which windows are tried. With other issues, the descriptors of sharp images have a result that may
+contradict them."""
 _MAX_STEP_PX = 16.0
 """Maximum displacement of a corner; larger ones contradict the seed."""
 _MIN_COARSE_WINDOWS = 16
@@ -57,7 +58,7 @@ def from_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignmen
 
 
 def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx] | None:
-    descriptors_failed = any(issue.kind in _DESCRIPTORS_FAILED for issue in alignment.issues)
+    descriptors_failed = pair.is_blurred or any(issue.kind in _DESCRIPTORS_FAILED for issue in alignment.issues)
     if not descriptors_failed or alignment.residual is None or not seed_fits(alignment.residual):
         return None
     max_step_px = min(_MAX_STEP_PX, pair.max_shift_px)
