@@ -225,10 +225,14 @@ class PairAligner:
         """Align by windows the pairs without retrieval of held-out patches."""
         if not _may_be_homography(self.settings):
             return
+        has_relief = any(a.mapping.parallax is not None for a in self.result.values())
         for pair, _ in starts:
-            if pair.name in self.result:
-                with self.timer.measure([pair.name]):
-                    self.result[pair.name] = from_windows(pair, self.result[pair.name])
+            if pair.name not in self.result:
+                continue
+            with self.timer.measure([pair.name]):
+                before, after = self.result[pair.name], from_windows(pair, self.result[pair.name])
+                is_mixed = has_relief and not pair.is_coarse and after is not before and after.status == "aligned"
+                self.result[pair.name] = predicted_by_windows(after, pair, OTHER_GEOMETRY) if is_mixed else after
 
     def _align(self, starts: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
         with self.timer.measure([pair.name for pair, _ in starts]):
