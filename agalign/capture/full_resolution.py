@@ -92,7 +92,8 @@ def _refined(
         prediction = replace(prediction, off_px=off_px)
     if issues_of(Evidence(joint, after, size_px, prediction=prediction)):
         return None
-    return replace(alignment, mapping=mapping, joint=joint, residual=after, prediction=prediction)
+    ties = None if alignment.ties is None else after
+    return replace(alignment, mapping=mapping, joint=joint, residual=after, ties=ties, prediction=prediction)
 
 
 def _tiles(reference: Band, alignment: Alignment[FixedFilePx]) -> tuple[list[Tile], list[Tile]]:
