@@ -999,8 +999,8 @@ function numbers(capture) {
       const [before, after] = pair.similarity?.[name] ?? [null, null];
       return before === null && after === null ? "–" : `${fixed(before, digits)} → ${fixed(after, digits)}`;
     };
-    const held_out = pair.geometry === null ? {} : pair.geometry.held_out_p95_px;
-    const geometry = pair.geometry === null ? "–" : `${pair.geometry.kind}${Object.keys(held_out).length > 1 ? ` (${Object.entries(held_out).map(([kind, px]) => `${kind} ${fixed(px)}`).join(", ")})` : ""}`;
+    const heldOut = pair.geometry === null ? {} : pair.geometry.held_out_p95_px;
+    const geometry = pair.geometry === null ? "–" : `${pair.geometry.kind}${Object.keys(heldOut).length > 1 ? ` (${Object.entries(heldOut).map(([kind, px]) => `${kind} ${fixed(px)}`).join(", ")})` : ""}`;
     const cells = [
       pair.seed ?? "–", fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3), pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`,
       fixed(pair.corner_std_px, 3), fixed(pair.retrieval), change("mattes_mi"), change("nmi"), change("ncc", 2), change("gradient_correlation", 2), change("structure_ssim", 2), geometry, pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
