@@ -45,7 +45,7 @@ def test_a_band_without_a_reason_is_told_too() -> None:
 
 
 def test_every_doubt_has_a_remedy() -> None:
-    assert len(KINDS) == 21
+    assert len(KINDS) == 22
     for kind in KINDS.values():
         assert kind.remedy.cause
         assert kind.remedy.advice
