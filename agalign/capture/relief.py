@@ -432,7 +432,7 @@ class _Checked:
 
 
 def _verifying(bands: Sequence[int]) -> list[list[int]]:
-    """Return the bands whose relief verifies band 0, 1, and so on, from the first again after the last.
+    """Return lists of bands: the relief of list i verifies the bands i, i + n and so on, for n lists.
 
     With few bands all others, else the bands with odd and those with even index: two reliefs instead of one for
     each band.

@@ -74,7 +74,9 @@ def _parallax(path: Path, content: Sidecar, part: ReliefPart, fixed: Lens | None
     if part.file is None or content.output is None:
         raise SidecarError(f"{path}: its relief was not written")
     if content.output.undistorted and fixed is None:
-        raise SidecarError(f"{path}: lacks the lens of the reference, on whose grid the relief is; omit --undistort")
+        raise SidecarError(
+            f"{path}: has a relief on a lens-corrected grid, but not the lens; run again without --undistort"
+        )
     output, (_, _, width, height) = content.output, content.output.crop
     values = read_preview(path.parent / part.file, 1, (0, 0, width, height), (width, height))
     grid = OutputGrid(*output.crop, PixelScale(*output.scale), output.undistorted)

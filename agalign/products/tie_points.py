@@ -81,7 +81,7 @@ def _points(context: ProductContext) -> Iterator[TiePoint]:
 
 
 def tie_points(band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoint]:
-    """Yield the tie points of a band whose windows were measured under its final mapping.
+    """Yield the tie points of a band with windows that were measured under its final mapping.
 
     The point p of the reference corresponds to p + shift in the warped band, and so to mapping(p + shift) in the file
     of the band.

@@ -219,7 +219,7 @@ class Alignment(Generic[FixedPx]):
     mapping: PixelMapping
     """The complete mapping from raw pixels of the reference to raw pixels of the moving image."""
     size_px: Size
-    """(width, height) of the reference, on whose grid `warp` resamples."""
+    """(width, height) of the reference; `warp` resamples to its grid."""
     status: PairStatus
     issues: tuple[Issue, ...]
     """Reasons against accepting the alignment, the most important first; empty if it is `aligned`."""

@@ -55,6 +55,17 @@ def test_a_converted_residual_equals_a_new_measurement(pair: BandPair) -> None:
     assert warped_pair.with_mapping(far).warped is not warped_pair.warped
 
 
+def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) -> None:
+    warped_pair = WarpedPair.of(pair, pair.mapping(geometry.translation(6, -4)))
+    by_black, by_white = geometry.translation(6.1, -4), geometry.translation(6, -4.2)
+    crossed, before = warped_pair.cross_validated((by_black, by_white)).residual, warped_pair.residual
+    black, change_px = before.is_black, crossed.shifts_px - before.shifts_px
+    np.testing.assert_allclose(change_px[~black], np.broadcast_to((-0.1, 0), change_px[~black].shape), atol=1e-6)
+    np.testing.assert_allclose(change_px[black], np.broadcast_to((0, 0.2), change_px[black].shape), atol=1e-6)
+    joint = result(geometry.translation(6, -4))
+    assert verified(pair, SEED, joint, "never", None, (by_black, by_white)).residual.median_px > 0.08
+
+
 def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
     results = verified(pair, SEED, result(geometry.translation(6, -4), retrieval=0.01), "always")
     assert results.status == "seed_only"

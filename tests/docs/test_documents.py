@@ -90,7 +90,7 @@ def test_the_python_of_the_readme_aligns_pixels() -> None:
 
 
 class SmoothPair:
-    """Two views of one texture, in each of which the position of every pixel is known."""
+    """Two views of one texture with known positions of every pixel."""
 
     size_px = 640, 480
     pixels = np.stack(np.meshgrid(*(np.arange(n) for n in size_px)), axis=-1).astype(float)
