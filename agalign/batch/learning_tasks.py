@@ -142,7 +142,7 @@ class LoadedCapture:
         is_good_enough, refined = _are_good_enough(results), refined_pairs(starts, results)
         observation = None
         if observe and (is_final or is_good_enough):
-            aligned = verify_together(starts, results, None, settings, with_fields=False)
+            aligned = verify_together(starts, results, None, settings, is_observation=True)
             observation = _observation(self.pairs, aligned, refined, self.capture)
         mappings = {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL}
         return LearningCapture(self.capture, is_good_enough, mappings, refined, observation)
@@ -235,7 +235,7 @@ class ObserveRig:
             model = _on_device(self.model, self.settings)
             pairs, _ = read_pairs(capture, self.settings.seed, model)
             pairs = [p for p in pairs if p.has_rig_pixels and (bands is None or p.name in bands)]
-            aligner = PairAligner(self.settings, model, quiet, with_fields=False)
+            aligner = PairAligner(self.settings, model, quiet, is_observation=True)
             return _observation(pairs, aligner.align(pairs, None, scratch=False), aligner.refined, capture)
         except Exception as error:
             log_failure(f"{capture.label} does not determine the rig", error)
@@ -264,7 +264,7 @@ class TryModel:
         assert model.rig is not None
         try:
             pairs, _ = read_pairs(capture, self.settings.seed, model)
-            aligner = PairAligner(self.settings, model, quiet, with_fields=False)
+            aligner = PairAligner(self.settings, model, quiet, is_observation=True)
             result = aligner.align(pairs, None, scratch=False)
             checked = with_predictions(pairs, result, model.rig, capture)
         except Exception as error:

@@ -132,8 +132,8 @@ class PairAligner:
     settings: Settings
     model: FlightModel | None
     progress: PairProgress
-    with_fields: bool = True
-    """False while a flight is learned: residual lens distortion is fitted to all its captures together."""
+    is_observation: bool = False
+    """True while a flight is learned: residual lens distortion is fitted to all its captures together."""
     refined: dict[str, RefinedPair] = field(default_factory=dict)
     """Results by band of the last optimisation, before they are combined with those of other bands and the rig."""
     result: dict[str, Alignment[FixedImagePx]] = field(default_factory=dict)
@@ -242,7 +242,13 @@ class PairAligner:
     def _verify(self, starts: Sequence[Start], results: Results) -> None:
         self.refined |= refined_pairs(starts, results)
         self.result |= verify_together(
-            starts, results, self.model, self.settings, self.progress, self.timer, with_fields=self.with_fields
+            starts,
+            results,
+            self.model,
+            self.settings,
+            self.progress,
+            self.timer,
+            is_observation=self.is_observation,
         )
 
 
@@ -266,12 +272,12 @@ def _quiet(band: str, stage: str, share: float) -> None:
 
 def verify_together(
     starts: Sequence[Start], results: Results, model: FlightModel | None, settings: Settings,
-    progress: PairProgress = _quiet, timer: _Timer | None = None, *, with_fields: bool = True,
+    progress: PairProgress = _quiet, timer: _Timer | None = None, *, is_observation: bool = False,
 ) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
     """Combine the results of a capture by MAP estimation and verify each one; return the alignments by name.
 
-    Without `with_fields`, no displacement fields are fitted. A model family that the user chose is not replaced by a
-    relief or a displacement field.
+    For an observation of the rig, no displacement fields are fitted. A model family that the user chose is not replaced
+    by a relief or a displacement field.
     """
     timer = timer or _Timer()
     relief_use = settings.relief.use if _may_be_homography(settings) else "never"
@@ -288,7 +294,7 @@ def verify_together(
         halves = [_map_estimates(starts, results, half, model, settings) for half in (black, white)]
         progress(starts[0][0].name if starts else "", "relief", 0.0)
         candidates = _relief_candidates(starts, estimates, warped_pairs)
-        relief = aligned_by_relief(candidates, relief_use, with_fields=with_fields)
+        relief = aligned_by_relief(candidates, relief_use, is_observation=is_observation)
     alignments = relief.alignments
     for (pair, seed), result, warped_pair, *by_half in zip(starts, estimates, warped_pairs, *halves, strict=True):
         if pair.name in alignments:
@@ -297,7 +303,7 @@ def verify_together(
         by_halves = None if first is None or second is None else (first, second)
         progress(pair.name, "checking", 0.0)
         with timer.measure([pair.name]):
-            use = relief_use if with_fields and pair.name not in relief.along_a_line else "never"
+            use = relief_use if not is_observation and pair.name not in relief.along_a_line else "never"
             alignment = verified(pair, seed, result, use, warped_pair, by_halves, seed_only=settings.seed.only)
             is_mixed = pair.name in relief.others and alignment.status == "aligned"
             alignments[pair.name] = predicted_by_windows(alignment, pair, OTHER_GEOMETRY) if is_mixed else alignment

@@ -64,6 +64,8 @@ _MAX_LEFT_OUT_BANDS = 4
 """Up to this number, each band is verified by all others: the relief of one or two bands is too noisy."""
 _ROUNDS = 3
 """Rounds of the fit of a band under the relief of the others, as large shifts are measured in steps."""
+_COMPARED_BANDS = 2
+"""Bands with which a relief is compared with displacement fields: a field takes longer than the relief of a band."""
 _CLEAR_GAIN = 2.0
 """Ratio of the p95 of held-out windows by homography and by relief above which no displacement field is compared: a
 field cannot follow depth edges."""
@@ -103,11 +105,12 @@ class ReliefResult:
 
 
 def aligned_by_relief(
-    candidates: Sequence[ReliefCandidate], use: ReliefUse, *, with_fields: bool = True
+    candidates: Sequence[ReliefCandidate], use: ReliefUse, *, is_observation: bool = False
 ) -> ReliefResult:
-    """Align bands by one relief of the capture, by default with displacement fields where no rig contains them.
+    """Align bands by one relief of the capture, with displacement fields where no rig contains them.
 
-    With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax.
+    With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
+    observation of the rig, only the homographies matter: there are no fields, and the relief has half the resolution.
     """
     result = ReliefResult()
     if use == "never":
@@ -119,8 +122,7 @@ def aligned_by_relief(
         if on_a_line and parallax_px > _MAX_LINE_PX:
             result.along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
-            may_be_field = with_fields and not group[0].pair.has_rig
-            aligned = _aligned_group(group, with_fields=may_be_field, is_requested=use == "always")
+            aligned = _aligned_group(group, is_requested=use == "always", is_observation=is_observation)
             result.alignments |= aligned
             result.others |= {c.pair.name for c in group} - aligned.keys() if aligned else set()
     return result
@@ -148,6 +150,8 @@ def _common_parallax_px(group: Sequence[ReliefCandidate]) -> tuple[float, bool]:
     of the median band significantly.
     """
     residuals, size_px = _common_residuals(group), group[0].pair.fixed.size_px
+    if max(_p95_px(residual) for residual in residuals) < _MIN_PARALLAX_PX:
+        return 0.0, False
     windows = WindowShifts.of(residuals, [c.warped.mapping for c in group])
     consistent = _consistent(windows, _layouts(group), size_px, with_fields=False)
     if consistent is None:
@@ -186,6 +190,12 @@ def _common_residuals(group: Sequence[ReliefCandidate]) -> list[Residual[FixedIm
     if all(tuple(c) in centres_px for each in group for c in each.warped.residual.centres_px.tolist()):
         return [c.warped.residual for c in group]
     return [reference.small_windows.residuals(c.warped.warped) for c in group]
+
+
+def _p95_px(residual: Residual[FixedImagePx]) -> float:
+    """Return the p95 of the lengths of the measured shifts, 0 without any: robust, as a wrong peak is no parallax."""
+    measured_px = np.linalg.norm(residual.shifts_px[np.isfinite(residual.shifts_px[:, 0])], axis=1)
+    return float(np.percentile(measured_px, 95)) if measured_px.size else 0.0
 
 
 def _far_share(residual: Residual[FixedImagePx]) -> float:
@@ -284,11 +294,12 @@ class _Band:
 
 
 def _aligned_group(
-    group: Sequence[ReliefCandidate], *, with_fields: bool, is_requested: bool
+    group: Sequence[ReliefCandidate], *, is_requested: bool, is_observation: bool
 ) -> dict[str, Alignment[FixedImagePx]]:
     """Align the bands of one group by their relief; empty if another geometry explains the capture better."""
+    with_fields = not is_observation and not group[0].pair.has_rig
     try:
-        estimate = _Estimate.of(group, with_fields=with_fields)
+        estimate = _Estimate.of(group, with_fields=with_fields, is_refined=not is_observation)
         if estimate is None:
             return {}
         checked = [estimate.checked(band) for band in estimate.bands]
@@ -315,10 +326,10 @@ class _Estimate:
     """Displacement fields are fitted, as no rig contains the distortion of the lenses."""
 
     @classmethod
-    def of(cls, group: Sequence[ReliefCandidate], *, with_fields: bool) -> "_Estimate | None":
+    def of(cls, group: Sequence[ReliefCandidate], *, with_fields: bool, is_refined: bool) -> "_Estimate | None":
         """Estimate the relief from bands with common parallax; None if the windows do not determine the baselines.
 
-        Raises GeometryError.
+        It has the full resolution if it `is_refined`, else half. Raises GeometryError.
         """
         pair = group[0].pair
         bands = [_Band(c, c.warped.mapping, (0.0, 0.0)) for c in group]
@@ -342,8 +353,12 @@ class _Estimate:
         baselines = np.array([b.baseline for b in bands])
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
-        every = range(len(bands))
-        relief, *others = matching.refined([b.view() for b in bands], [every, *_verifying(every)])
+        selections = [range(len(bands)), *_verifying(range(len(bands)))]
+        relief, *others = (
+            matching.refined([b.view() for b in bands], selections)
+            if is_refined
+            else [matching.matched(selection) for selection in selections]
+        )
         if layout is None and nearer_sign(matched, baselines) < 0:
             bands, relief, others = [b.negated for b in bands], relief.negated, [r.negated for r in others]
         return cls(bands, relief, others, with_fields)
@@ -369,11 +384,16 @@ class _Estimate:
         return band
 
     def beats_fields(self, checked: Sequence["_Checked"]) -> bool:
-        """Return True if the relief explains windows of the median band better than displacement fields without it."""
-        gains = []
-        for band, each in zip(self.bands, checked, strict=True):
-            if each.held_out is None or each.alignment is None:
-                continue
+        """Return True if the relief explains windows better than displacement fields without it.
+
+        The bands with the longest baselines decide, which have the largest parallax.
+        """
+        gains: list[float] = []
+        confirmed = [(b, c) for b, c in zip(self.bands, checked, strict=True) if c.held_out and c.alignment]
+        confirmed.sort(key=lambda pair: -math.hypot(*pair[0].baseline))
+        for band, each in confirmed[:_COMPARED_BANDS]:
+            assert each.held_out is not None
+            assert each.alignment is not None
             if each.plane.p95_px >= _CLEAR_GAIN * each.held_out.p95_px:
                 gains.append(math.inf)
                 continue
@@ -384,7 +404,7 @@ class _Estimate:
             by_relief = pair.warped_moving(each.alignment.mapping.with_parallax(parallax))
             by_field = field.held_out or estimator.verification.residuals(candidate.warped.warped)
             gains.append(robust_loss(by_field) - robust_loss(estimator.verification.residuals(by_relief)))
-        return bool(gains) and float(np.median(gains)) >= 0
+        return bool(gains) and float(np.mean(gains)) >= 0
 
     def checked(self, band: _Band) -> "_Checked":
         """Verify a band with the relief from other bands, with a displacement field if that is more accurate.
