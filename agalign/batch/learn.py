@@ -92,9 +92,9 @@ class _FlightLearner:
             refined = self._refined_by(self.start)
             if refined is not None:
                 return replace(self.start, refined=refined)
-        if not self._has_rig:
+        elif not self._has_rig:
             # Learning takes as long as aligning one or two captures, and those that need it are learned from alone.
-            net = initial_network(self._bands, self.settings, self.start)
+            net = initial_network(self._bands, self.settings, None)
             return FlightModel(net, flight_camera(self.captures), self._bands, {}, "") if net.is_trained else None
         network = self._network()
         if network is None:
