@@ -6,21 +6,16 @@ Cameras are painted with half of their pixels along each side but for the Altum,
 """
 
 import sys
-import tempfile
 import time
-from collections import defaultdict
-from pathlib import Path
 
 import numpy as np
+from common import band_errors, flight_and_out, print_head, print_row, read_ties
 from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.troubles import make_two_headings
 
 import agalign
-from agalign.cameras.discover import DiscoverOptions
-from agalign.synthetic.rig import CameraSpec
-from agalign.synthetic.score import Score, score_against_truth
 
-CAMERAS: dict[str, tuple[CameraSpec, tuple[int, int]]] = {
+CAMERAS = {
     "mavic": (MAVIC, (1280, 960)),
     "mavic-3m": (MAVIC_3M, (1296, 972)),
     "altum": (ALTUM, (2064, 1544)),
@@ -30,32 +25,28 @@ CAMERAS: dict[str, tuple[CameraSpec, tuple[int, int]]] = {
 
 
 def main(captures: int, names: list[str]) -> None:
-    print("| camera | band | aligned | predicted | other | median, px | worst capture, px | in its own px |")
-    print("|---|---|---|---|---|---|---|---|")
+    print_head("camera", "band", "aligned", "predicted", "other", "median, px", "worst capture, px", "in its own px")
     for name in names:
         camera, size_px = CAMERAS[name]
-        with tempfile.TemporaryDirectory() as temporary:
-            folder, out = Path(temporary) / "flight", Path(temporary) / "aligned"
-            truth = make_two_headings(folder, captures, size_px, camera=camera, line=captures // 2, lakes=False)
+        with flight_and_out() as (flight, out):
+            truth = make_two_headings(flight, captures, size_px, camera=camera, line=captures // 2, lakes=False)
             began = time.perf_counter()
-            reports = agalign.align_folder(folder, out, options=DiscoverOptions(with_rgb=True))
+            agalign.align_folder(flight, out, options=agalign.DiscoverOptions(with_rgb=True))
             seconds = time.perf_counter() - began
-            by_band = defaultdict[str, list[Score]](list)
-            for score in score_against_truth(reports, truth):
-                by_band[score.band].append(score)
-            coarse = {b.name: b.size_ratio[0] / b.view * camera.bands[camera.reference].view for b in camera.bands}
-            for band, scores in by_band.items():
-                counts = [sum(s.status == status for s in scores) for status in ("aligned", "predicted")]
-                own = np.array([s.median_px for s in scores])
-                # The grid of the sidecar contains positions in the moving file.
-                there, here = own, own / coarse[band]
-                print(
-                    f"| {name} | {band} | {counts[0]} | {counts[1]} | {len(scores) - sum(counts)} | "
-                    f"{np.median(here):.3f} | {here.max():.3f} | {np.median(there):.3f} / {there.max():.3f} |"
-                )
-            print(f"| {name} | all | | | | | | {seconds / captures:.1f} s a capture |", flush=True)
+            bands = band_errors(out, read_ties(truth))
+        view = camera.bands[camera.reference].view
+        for spec in camera.bands:
+            own = [b for b in bands if b.band == spec.name]
+            if not own:
+                continue
+            counts = [sum(b.status == status for b in own) for status in ("aligned", "predicted")]
+            # The grid of the sidecar contains positions in the moving file.
+            there = np.array([b.median_px for b in own])
+            here = there / (spec.size_ratio[0] / spec.view * view)
+            errors = f"{np.median(here):.3f}", f"{here.max():.3f}", f"{np.median(there):.3f} / {there.max():.3f}"
+            print_row(name, spec.name, *counts, len(own) - sum(counts), *errors)
+        print_row(name, "all", *[""] * 5, f"{seconds / captures:.1f} s a capture")
 
 
 if __name__ == "__main__":
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 8
-    main(count, sys.argv[2:] or list(CAMERAS))
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 8, sys.argv[2:] or list(CAMERAS))

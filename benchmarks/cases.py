@@ -1,4 +1,6 @@
-"""Band pairs with ground truth, from folders with `ties.json` or the `truth.json` of a synthetic flight."""
+"""Band pairs with ground truth, from folders with `ties.json` or the `truth.json` of a synthetic flight, and image
+pairs with a homography in a text file.
+"""
 
 import json
 from collections.abc import Iterator
@@ -9,22 +11,22 @@ import numpy as np
 
 from agalign.cameras import rig_seed
 from agalign.cameras.discover import discover
+from agalign.evaluation.image_pairs import PairFiles
 from agalign.pixels.raster import probe, read_for_alignment
 from agalign.pixels.resample import warped
 from agalign.values import lens
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Band
+from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 
-Matrix = np.ndarray
+_PAIR_NAMES = ("VIS_{}.png", "NIR_TF_{}.png", "GT_{}.txt"), ("VI_{}_a.png", "VI_{}_b.png", "VI_{}_fixed_to_moving.txt")
 
 
 @dataclass(frozen=True)
 class Case:
     """One band pair with its ground truth."""
 
-    set_name: str
-    capture: Capture | None
     reference: Band
     band: Band
     fixed: Raster
@@ -51,30 +53,34 @@ def straightened(raster: Raster) -> Raster:
     return warped(raster, PixelMapping(np.eye(3), None, raster.lens), raster.size_px)
 
 
-def cases(folders: list[Path]) -> Iterator[Case]:
-    """Return every band pair of folders with ties.json or truth.json."""
-    for path in [p for folder in folders for p in (folder / "ties.json", folder / "truth.json") if p.is_file()]:
-        captures = {}
-        for capture in discover(path.parent).captures:
-            captures.update({b.path.name: capture for b in capture.bands})
+def cases(folder: Path) -> Iterator[Case]:
+    """Return every band pair of a folder with ties.json or truth.json."""
+    for path in [p for p in (folder / "ties.json", folder / "truth.json") if p.is_file()]:
+        bands = {b.path.name: b for capture in discover(folder).captures for b in capture.bands}
         for entry in json.loads(path.read_text()).values():
-            capture = captures.get(entry["reference"])
-            reference = _band(path.parent, entry["reference"], capture)
+            reference = bands.get(entry["reference"]) or _plain_band(folder, entry["reference"])
             fixed = read_for_alignment(reference, 4096)
             for name, truth in entry["bands"].items():
-                band = _band(path.parent, name, capture)
+                band = bands.get(name) or _plain_band(folder, name)
                 both = reference.lens is not None and band.lens is not None
                 here, there = (b if both else replace(b, lens=None) for b in (reference, band))
                 raw = np.array(truth["ties"])
                 ties = np.hstack([lens.undistort(here.lens, raw[:, :2]), lens.undistort(there.lens, raw[:, 2:])])
                 images = fixed if both else replace(fixed, lens=None), read_for_alignment(there, 4096)
-                yield Case(path.parent.name, capture, here, there, *images, ties)
+                yield Case(here, there, *images, ties)
 
 
-def _band(folder: Path, name: str, capture: Capture | None) -> Band:
-    for band in capture.bands if capture else ():
-        if band.path.name == name:
-            return band
+def _plain_band(folder: Path, name: str) -> Band:
     path = next(folder.rglob(name))
     info = probe(path)
     return Band(path.stem, path, 1, info.width_px, info.height_px, info.dtypes[0])
+
+
+def image_pairs(folder: Path) -> list[PairFiles]:
+    """Return the aerial (VIS_1.png, NIR_TF_1.png, GT_1.txt) and visible-thermal pairs of a folder by number."""
+    files = [(n, [folder / name.format(n) for name in names]) for n in range(1, 100) for names in _PAIR_NAMES]
+    return [
+        PairFiles(str(number), folder.name, fixed, moving, np.loadtxt(truth))
+        for number, (fixed, moving, truth) in files
+        if truth.is_file()
+    ]

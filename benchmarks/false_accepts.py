@@ -10,10 +10,10 @@ seed, as in lattices.py: aligned is wrong where it is a period away. Truth comes
 
 import sys
 import time
-from collections import defaultdict
 
 import cv2
 import numpy as np
+from common import WRONG_PX, print_head, print_row
 from lattices import pair as lattice
 
 import agalign
@@ -34,8 +34,7 @@ def scene(rng: np.random.Generator, east_m: float = 0.0) -> tuple[Ground, Pose, 
 
 
 def view(ground: Ground, band: int, pose: Pose, rng: np.random.Generator) -> np.ndarray:
-    painted = reflectance(ground, BANDS[band])
-    return render(painted, ground, BANDS[band], pose, SIZE, rng)
+    return render(reflectance(ground, BANDS[band]), ground, BANDS[band], pose, SIZE, rng)
 
 
 def water(rng: np.random.Generator) -> np.ndarray:
@@ -67,8 +66,7 @@ def pair(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
     truth = true_homography(reference, moving, here, SIZE)
     seed = None
     if kind == "all but saturated":
-        level = np.quantile(other_view, 0.01)
-        return fixed, np.where(other_view > level, 65535, other_view).astype(np.uint16), None, None
+        return fixed, saturated(other_view, 0.01), None, None
     if kind == "a third lies apart":
         third = SIZE[0] // 3
         other_view = other_view.copy()
@@ -80,8 +78,7 @@ def pair(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
         noisy = other_view + rng.normal(0, 1500, other_view.shape)
         other_view = np.clip(noisy, 0, 65535).astype(np.uint16)
     elif kind == "partly saturated":
-        level = np.quantile(other_view, 0.7)
-        other_view = np.where(other_view > level, 65535, other_view).astype(np.uint16)
+        other_view = saturated(other_view, 0.7)
     elif kind == "5 % off":
         angle = rng.uniform(0, 2 * np.pi)
         shift = 0.05 * SIZE[0] * np.array([np.cos(angle), np.sin(angle)])
@@ -89,45 +86,40 @@ def pair(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
     return fixed, other_view, seed, truth
 
 
-BAD = (
-    "another field", "another place of the field", "water", "8 % overlap", "all but saturated", "a third lies apart",
-)  # fmt: skip
+def saturated(image: np.ndarray, share: float) -> np.ndarray:
+    """Return an image whose pixels above a quantile are saturated."""
+    return np.where(image > np.quantile(image, share), 65535, image).astype(np.uint16)
+
+
+BAD = ("another field", "another place of the field", "water", "8 % overlap", "all but saturated", "a third lies apart")
 GRID = "planted grid"
 GOOD = ("as it comes", "blurred", "noisy", "partly saturated", "5 % off")
 
 
-def main() -> None:
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 200
-    first = int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    tally: dict[str, list[tuple[str, float, float]]] = defaultdict(list)
-    kinds = (*BAD, *GOOD, GRID)
+def main(count: int = 200, first: int = 0) -> None:
+    tally: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in (*BAD, *GOOD, GRID)}
     for number in range(first, first + count):
-        kind = kinds[number % len(kinds)]
+        kind = tuple(tally)[number % len(tally)]
         fixed, moving, seed, truth = pair(kind, np.random.default_rng(number))
         began = time.perf_counter()
         result = agalign.align(fixed, moving, seed=seed)
-        error = np.nan
-        if truth is not None:
-            # Lens distortion changes the truth by a few pixels, which a homography only partly models.
-            error = lens_free_error(result.fixed_to_moving, truth, fixed.shape[::-1])
-        tally[kind].append((result.status, error, time.perf_counter() - began))
-        print(f"{number:4d} {kind:28s} {result.status:9s} {error:7.2f} {tally[kind][-1][2]:5.1f} s", flush=True)
-    print("| kind | pairs | aligned | seed_only | failed | wrongly aligned | rejected | worst error, px | seconds |")
-    print("|---|---|---|---|---|---|---|---|---|")
+        seconds = time.perf_counter() - began
+        # Lens distortion changes the truth by a few pixels, which a homography only partly models.
+        error = np.nan if truth is None else lens_free_error(result.fixed_to_moving, truth, fixed.shape[::-1])
+        tally[kind].append((result.status, error, seconds))
+        print(f"{number:4d} {kind:28s} {result.status:9s} {error:7.2f} {seconds:5.1f} s", flush=True)
+    statuses = "aligned", "seed_only", "failed"
+    print_head("kind", "pairs", *statuses, "wrongly aligned", "rejected", "worst error, px", "seconds")
     for kind in (*GOOD, GRID, *BAD):
         rows = tally[kind]
         if not rows:
             continue
-        n = {s: sum(r[0] == s for r in rows) for s in ("aligned", "seed_only", "failed")}
+        counts = [sum(r[0] == s for r in rows) for s in statuses]
         errors = [r[1] for r in rows if r[0] == "aligned"]
-        wrong = n["aligned"] if kind in BAD else sum(e > 1 for e in errors)
-        rejected = len(rows) - n["aligned"] if kind in GOOD else "-"
+        wrong = counts[0] if kind in BAD else sum(e > WRONG_PX for e in errors)
+        rejected = len(rows) - counts[0] if kind in GOOD else "-"
         worst = "-" if kind in BAD or not errors else f"{max(errors):.2f}"
-        seconds = np.median([r[2] for r in rows])
-        print(
-            f"| {kind} | {len(rows)} | {n['aligned']} | {n['seed_only']} | {n['failed']} | {wrong} | {rejected} "
-            f"| {worst} | {seconds:.1f} |"
-        )
+        print_row(kind, len(rows), *counts, wrong, rejected, worst, f"{np.median([r[2] for r in rows]):.1f}")
 
 
 def lens_free_error(result: np.ndarray, truth: np.ndarray, size: tuple[int, int]) -> float:
@@ -138,4 +130,4 @@ def lens_free_error(result: np.ndarray, truth: np.ndarray, size: tuple[int, int]
 
 
 if __name__ == "__main__":
-    main()
+    main(*map(int, sys.argv[1:]))

@@ -8,65 +8,44 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
-import psutil
+from common import print_head, print_row, watched
 from synthetic_flights.aligned import make_aligned
 
-NAMES = "ndvi,ndre,gndvi"
+
+def command(out: Path, target: Path) -> list[str]:
+    options = ["--index", "ndvi,ndre,gndvi", "--jobs", "2", "--json", "--quiet"]
+    return [sys.executable, "-m", "agalign", "indices", str(out), "-o", str(target), *options]
 
 
-def main(captures: int, size_px: tuple[int, int]) -> None:
+def show(name: str, out: Path, target: Path) -> None:
+    with tempfile.TemporaryFile() as file:
+        run = watched(command(out, target), stdout=file)
+        file.seek(0)
+        reports = json.load(file)["indices"]
+    written = sum(not r["kept"] for r in reports)
+    memory_mb = run.samples[:, 2]
+    quarter, end = memory_mb[len(memory_mb) // 4], memory_mb[-5:].max()
+    time_s = f"{run.seconds:.0f}", f"{run.seconds / max(written, 1):.3f}"
+    print_row(name, f"{written} of {len(reports)}", *time_s, f"{quarter:.0f}", f"{end:.0f}")
+
+
+def main(captures: int = 1000, width_px: int = 320, height_px: int = 240) -> None:
     with tempfile.TemporaryDirectory() as temporary:
-        out = Path(temporary) / "aligned"
-        make_aligned(out, captures, size_px)
-        print("| run | rasters written | s | s a raster | memory at a quarter, MB | at the end, MB |")
-        print("|---|---|---|---|---|---|")
-        show("whole", out, Path(temporary) / "whole")
-        killed = Path(temporary) / "killed"
-        with subprocess.Popen(command(out, killed)) as process:
+        out, whole, killed = (Path(temporary) / name for name in ("aligned", "whole", "killed"))
+        make_aligned(out, captures, (width_px, height_px))
+        print_head("run", "rasters written", "s", "s a raster", "memory at a quarter, MB", "at the end, MB")
+        show("whole", out, whole)
+        with subprocess.Popen(command(out, killed), stdout=subprocess.DEVNULL) as process:
             while len(list(killed.rglob("*_ndvi.tif"))) < captures // 3:
                 time.sleep(0.1)
             process.send_signal(signal.SIGKILL)
         show("after kill -9", out, killed)
-        whole, again = ((Path(temporary) / name / "indices.csv").read_bytes() for name in ("whole", "killed"))
-        print(f"\ntables are {'equal' if whole == again else 'DIFFERENT'}")
-
-
-def command(out: Path, target: Path) -> list[str]:
-    return [sys.executable, "-m", "agalign", "indices", str(out), "-o", str(target), "--index", NAMES, "--jobs", "2",
-            "--json", "--quiet"]  # fmt: skip
-
-
-def show(name: str, out: Path, target: Path) -> None:
-    began, memory_mb = time.monotonic(), []
-    with subprocess.Popen(command(out, target), stdout=subprocess.PIPE) as process:
-        watch = threading.Thread(target=watch_memory, args=(process.pid, memory_mb))
-        watch.start()
-        text, _ = process.communicate()
-        watch.join()
-    seconds = time.monotonic() - began
-    reports = json.loads(text)["indices"]
-    written = sum(not r["kept"] for r in reports)
-    quarter, end = memory_mb[len(memory_mb) // 4], max(memory_mb[-5:])
-    each = seconds / max(written, 1)
-    print(f"| {name} | {written} of {len(reports)} | {seconds:.0f} | {each:.3f} | {quarter:.0f} | {end:.0f} |")
-
-
-def watch_memory(pid: int, memory_mb: list[float]) -> None:
-    """Append the memory of a process and its descendants, MB, every half second."""
-    try:
-        process = psutil.Process(pid)
-        while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
-            everyone = [process, *process.children(recursive=True)]
-            memory_mb.append(sum(p.memory_full_info().uss for p in everyone) / 1e6)
-            time.sleep(0.5)
-    except psutil.Error:
-        return
+        equal = (whole / "indices.csv").read_bytes() == (killed / "indices.csv").read_bytes()
+        print(f"\ntables are {'equal' if equal else 'DIFFERENT'}")
 
 
 if __name__ == "__main__":
-    given = [int(a) for a in sys.argv[1:]]
-    main(given[0] if given else 1000, (given[1], given[2]) if len(given) > 2 else (320, 240))
+    main(*map(int, sys.argv[1:]))

@@ -12,6 +12,7 @@ import time
 
 import cv2
 import numpy as np
+from common import WRONG_PX, print_head, print_row
 
 import agalign
 from agalign.values import geometry
@@ -48,33 +49,30 @@ def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     return images[0], images[1], geometry.translation(*shift), period
 
 
-def main() -> None:
-    count, first = (*map(int, sys.argv[1:]), *(60, 0)[len(sys.argv) - 1 :])
+def main(count: int = 60, first: int = 0) -> None:
     table: dict[str, list[tuple[str, float, float]]] = {"none": [], "good": [], "bad": []}
     for number in range(first, first + count):
         rng = np.random.default_rng(number)
         fixed, moving, truth, period = pair(rng)
-        kind = ("none", "good", "bad")[number % 3]
+        kind = tuple(table)[number % len(table)]
         angle = rng.uniform(0, 2 * np.pi)
         off = {"none": 0.0, "good": 0.25 * rng.uniform() * period, "bad": period * rng.integers(1, 4)}[kind]
-        seed = geometry.compose(truth, geometry.translation(off * np.cos(angle), off * np.sin(angle)))
+        start = geometry.compose(truth, geometry.translation(off * np.cos(angle), off * np.sin(angle)))
+        seed, std_px = None if kind == "none" else start, period / 6 if kind == "good" else None
         began = time.perf_counter()
-        result = agalign.align(
-            fixed, moving, seed=None if kind == "none" else seed, seed_std_px=period / 6 if kind == "good" else None
-        )
+        result = agalign.align(fixed, moving, seed=seed, seed_std_px=std_px)
         error = geometry.corner_error_px(result.fixed_to_moving, truth, *SIZE)
         table[kind].append((result.status, error, time.perf_counter() - began))
-        print(
-            f"{number} {kind:5} period {period:5.1f}  {result.status:9} {error:7.2f} px  {result.reason or ''}",
-            flush=True,
-        )
-    print("\n| seed | pairs | aligned | rightly, to 1 px | wrongly | seconds |\n|---|---|---|---|---|---|")
+        print(f"{number} {kind:5} period {period:5.1f}", end="  ")
+        print(f"{result.status:9} {error:7.2f} px  {result.reason or ''}", flush=True)
+    print()
+    print_head("seed", "pairs", "aligned", "rightly, to 1 px", "wrongly", "seconds")
     for kind, rows in table.items():
         aligned = [e for s, e, _ in rows if s == "aligned"]
-        right = sum(e < 1 for e in aligned)
+        right = sum(e < WRONG_PX for e in aligned)
         seconds = np.median([t for _, _, t in rows]) if rows else 0.0
-        print(f"| {kind} | {len(rows)} | {len(aligned)} | {right} | {len(aligned) - right} | {seconds:.1f} |")
+        print_row(kind, len(rows), len(aligned), right, len(aligned) - right, f"{seconds:.1f}")
 
 
 if __name__ == "__main__":
-    main()
+    main(*map(int, sys.argv[1:]))

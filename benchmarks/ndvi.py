@@ -4,11 +4,11 @@ python benchmarks/ndvi.py [CAPTURES]
 """
 
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import rasterio
+from common import flight_and_out, print_head, print_row
 
 import agalign
 from agalign.batch.index_run import index_tasks, run_indices
@@ -27,35 +27,33 @@ SIZE_PX = (1280, 960)
 NDVI = INDICES["ndvi"]
 
 
-def main(captures: int) -> None:
+def main(captures: int = 3) -> None:
     errors: dict[str, list[np.ndarray]] = {"before": [], "after": []}
-    with tempfile.TemporaryDirectory() as temporary:
-        folder, out = Path(temporary) / "flight", Path(temporary) / "aligned"
-        synthetic.make_flight(folder, captures, SIZE_PX)
+    bands = {b.name: b for b in cameras.BANDS}
+    infrared_and_red, reference = (bands["NIR"], bands["Red"]), cameras.BANDS[cameras.REFERENCE]
+    with flight_and_out() as (flight, out):
+        synthetic.make_flight(flight, captures, SIZE_PX)
         poses, ground, _ = synthetic.plan_flight(captures, SIZE_PX)
-        settings = Settings(write=WriteSettings(radiometry="auto"))
-        agalign.align_folder(folder, out, settings=settings)
-        bands = {b.name: b for b in cameras.BANDS}
-        reference = cameras.BANDS[cameras.REFERENCE]
+        agalign.align_folder(flight, out, settings=Settings(write=WriteSettings(radiometry="auto")))
         reports = [r for done in run_indices(index_tasks(out, [NDVI], out)) for r in done.reports]
+        painted = [reflectance(ground, band) for band in infrared_and_red]
         for number, (pose, report) in enumerate(zip(poses, reports, strict=True), start=1):
-            painted = [reflectance(ground, bands[name]) for name in ("NIR", "Red")]
             truth = compute(NDVI, [synthetic.view(p, ground, reference, pose, SIZE_PX) for p in painted])
-            before = compute(NDVI, [as_it_lies(folder, number, bands[name]) for name in ("NIR", "Red")])
+            before = compute(NDVI, [raw_reflectance(flight, number, band) for band in infrared_and_red])
             with rasterio.open(report.path) as dataset:
                 after = dataset.read(1)
             x0, y0, width, height = read_sidecar(report.path.with_name(f"IMG_{number:04d}.json")).output.crop
             window = np.s_[y0 : y0 + height, x0 : x0 + width]
             errors["before"].append(np.abs(before[window] - truth[window]))
             errors["after"].append(np.abs(after - truth[window]))
-    print("| NDVI | median error | mean | 95 % | pixels off by more than 0.1 |\n|---|---|---|---|---|")
+    print_head("NDVI", "median error", "mean", "95 %", "pixels off by more than 0.1")
     for name, result in errors.items():
-        all_of = np.concatenate([e[np.isfinite(e)] for e in result])
-        middle, p95 = np.percentile(all_of, (50, 95))
-        print(f"| {name} | {middle:.3f} | {all_of.mean():.3f} | {p95:.3f} | {(all_of > 0.1).mean():.1%} |")
+        every = np.concatenate([e[np.isfinite(e)] for e in result])
+        figures = [f"{value:.3f}" for value in (np.median(every), every.mean(), np.percentile(every, 95))]
+        print_row(name, *figures, f"{(every > 0.1).mean():.1%}")
 
 
-def as_it_lies(folder: Path, number: int, spec: rig.BandSpec) -> np.ndarray:
+def raw_reflectance(folder: Path, number: int, spec: rig.BandSpec) -> np.ndarray:
     """Reflectance of a band in its own pixels."""
     path = folder / "0000SET" / "000" / f"IMG_{number:04d}_{spec.rig_index + 1}.tif"
     (band,) = MicaSense().bands(path, read_tags(path), probe(path))
@@ -64,4 +62,4 @@ def as_it_lies(folder: Path, number: int, spec: rig.BandSpec) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)
+    main(*map(int, sys.argv[1:]))

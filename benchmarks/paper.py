@@ -5,7 +5,7 @@
 precision: descriptors and homographies from starts 5 % off, no seeding. robustness: starts 0 to 20 % off in four
 directions (recipe paper, which takes a minute a pair: in one, on 5 pairs), without seeding and for `method+seeds` with
 it; a table, robustness.csv and the plot robustness.png. automatic: 20 pairs teach a descriptor without labels, 5 test
-it. The same is to be had from `agalign evaluate` and `agalign learn` on any pairs.
+it. `agalign evaluate` and `agalign learn` do the same on any pairs.
 """
 
 import random
@@ -13,8 +13,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
+from cases import image_pairs
+from common import print_head, print_row, pyplot
 
 from agalign.capture.band_pair import BandPair
 from agalign.config import JointSettings, Settings
@@ -28,15 +29,6 @@ SHIFTS = (0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2)
 SPLIT_SEED = 2018
 
 
-def pairs_of(folder: Path) -> list[PairFiles]:
-    result = []
-    for truth in sorted(folder.glob("GT_*.txt"), key=lambda p: int(p.stem[3:])):
-        number = truth.stem[3:]
-        images = folder / f"VIS_{number}.png", folder / f"NIR_TF_{number}.png"
-        result.append(PairFiles(number, "aerial", *images, np.loadtxt(truth)))
-    return result
-
-
 def split(pairs: list[PairFiles]) -> tuple[list[PairFiles], list[PairFiles]]:
     """20 to learn from, 5 to test."""
     mixed = random.Random(SPLIT_SEED).sample(pairs, len(pairs))
@@ -45,10 +37,9 @@ def split(pairs: list[PairFiles]) -> tuple[list[PairFiles], list[PairFiles]]:
 
 def precision(pairs: list[PairFiles], names: list[str]) -> None:
     names = names or ["fast:pseudo-siamese", "fast:siamese", "fast:unshared", "sift", "daisy", "paper:pseudo-siamese"]
-    methods = {name: method_named(name) for name in names}
-    results = list(evaluate(pairs, methods, Starts((0.05,))))
-    markdown(precision_table(results))
-    markdown(error_table(results))
+    results = list(evaluate(pairs, {name: method_named(name) for name in names}, Starts((0.05,))))
+    print_table(precision_table(results))
+    print_table(error_table(results))
 
 
 def robustness(pairs: list[PairFiles], names: list[str]) -> None:
@@ -59,23 +50,20 @@ def robustness(pairs: list[PairFiles], names: list[str]) -> None:
         starts = Starts(SHIFTS, directions=1 if slow else 4, seeding=bool(seeds))
         results += evaluate(split(pairs)[1] if slow else pairs, {name: method_named(method)}, starts)
         Path("robustness.csv").write_text(as_csv(results))
-    markdown(error_table(results))
+    print_table(error_table(results))
     plot(results, Path("robustness.png"))
 
 
 def plot(results: list[Result], path: Path) -> None:
     """Mean homography error and mAP over the start's error, a line a method."""
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6))
-    for number, name in enumerate(dict.fromkeys(r.method for r in results)):
-        shifts = [s for s in SHIFTS if any(r.method == name and r.shift == s for r in results)]
+    figure, axes = pyplot().subplots(1, 2, figsize=(9, 3.6))
+    for name in dict.fromkeys(r.method for r in results):
+        own = [r for r in results if r.method == name]
+        shifts = sorted({r.shift for r in own})
         for axis, field, scale in zip(axes, ("error_share", "average_precision"), (100, 1), strict=True):
-            means = [scale * np.mean([getattr(r, field) for r in results if (r.method, r.shift) == (name, s)])
-                     for s in shifts]  # fmt: skip
+            means = [scale * np.mean([getattr(r, field) for r in own if r.shift == s]) for s in shifts]
             if np.isfinite(means).all():
-                axis.plot([100 * s for s in shifts], means, marker="o", color=f"C{number}", label=name)
+                axis.plot([100 * s for s in shifts], means, marker="o", label=name)
     axes[0].set(xlabel="start off by, % of the side", ylabel="mean homography error, % of the side")
     axes[1].set(xlabel="start off by, % of the side", ylabel="mAP", ylim=(0, 1))
     for axis in axes:
@@ -91,7 +79,6 @@ def automatic(pairs: list[PairFiles], _names: list[str]) -> None:
     coarse = []
     for pair in train:
         fixed, moving = read_image(pair.fixed), read_image(pair.moving)
-        assert pair.fixed_to_moving is not None
         ((_, start),) = Starts((0.05,)).of(pair.fixed_to_moving, max(fixed.size_px), rng)
         coarse.append((pair.name, fixed, moving, {"user": start}))
     methods = {name: method_named(name) for name in ("sift", "daisy")}
@@ -106,17 +93,16 @@ def automatic(pairs: list[PairFiles], _names: list[str]) -> None:
             save_model(model, path)
             methods[path.stem] = method_named(str(path))
         results = list(evaluate(test, methods, Starts((0.05,))))
-    markdown(precision_table(results))
+    print_table(precision_table(results))
 
 
-def markdown(rows: list[list[str]]) -> None:
-    for number, row in enumerate(rows):
-        print("| " + " | ".join(row) + " |")
-        if number == 0:
-            print("|" + "---|" * len(row))
+def print_table(rows: list[list[str]]) -> None:
+    print_head(*rows[0])
+    for row in rows[1:]:
+        print_row(*row)
     print(flush=True)
 
 
 if __name__ == "__main__":
     steps = {"precision": precision, "robustness": robustness, "automatic": automatic}
-    steps[sys.argv[2]](pairs_of(Path(sys.argv[1])), sys.argv[3:])
+    steps[sys.argv[2]](image_pairs(Path(sys.argv[1])), sys.argv[3:])

@@ -8,11 +8,13 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+from common import WRONG_PX
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from synthetic_flights.depth import BandTruth, Truth
 
 from agalign.pixels.raster import without_warnings
+from agalign.products.sidecar_file import find_sidecars
 
 Map = NDArray[np.float64]
 """(height, width, 2): raw px of the moving image for each raw px of the reference."""
@@ -20,8 +22,6 @@ Window = tuple[slice, slice]
 """Rows and columns of the reference."""
 WHOLE: Window = (slice(None), slice(None))
 
-WRONG_PX = 1.0
-"""A band that is called `aligned` while more than a tenth of its pixels is farther off is wrong."""
 _TOLERANCE_PX = 1
 """An occluded pixel counts as found, and a masked one as right, where the other is this near: truth is decided at
 pixel centres."""
@@ -35,14 +35,13 @@ class Score:
     kind: str
     close: bool
     scene: int
-    band: str
-    status: str
+    band: str = ""
+    status: str = "-"
     """`-` for a method that does not verify."""
-    median_px: float
-    p90_px: float
-    beyond_1_px: float
+    median_px: float = np.nan
+    p90_px: float = np.nan
+    beyond_1_px: float = np.nan
     """Share of the pixels."""
-    wrong: bool
     range_error: float = np.nan
     """Median relative error of the relief's range."""
     density: float = np.nan
@@ -52,6 +51,16 @@ class Score:
     """Of the pixels without data in the stack, against the occluded ones."""
     seconds: float = np.nan
     """Processing time of the whole capture."""
+
+    @property
+    def wrong(self) -> bool:
+        """True for a wrong acceptance: the band is misaligned, or does not show the scene."""
+        return self.status == "aligned" and not self.p90_px <= WRONG_PX
+
+    @property
+    def place(self) -> str:
+        """Kind and distance of the scene."""
+        return f"{self.kind}, {'close' if self.close else 'far'}, scene {self.scene}"
 
 
 @dataclass(frozen=True)
@@ -69,12 +78,9 @@ class Sidecar:
 
 
 def read_sidecar(out: Path) -> Sidecar:
-    """The one sidecar below a run's output."""
-    for path in sorted(out.rglob("*.json")):
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if str(content.get("schema", "")).startswith("agalign/1"):
-            return Sidecar(path, content)
-    raise FileNotFoundError(f"no sidecar below {out}")
+    """Return the one sidecar below the output of a run."""
+    (path,) = find_sidecars(out)
+    return Sidecar(path, json.loads(path.read_text(encoding="utf-8")))
 
 
 def mapping_of(sidecar: Sidecar, band: dict[str, Any]) -> Map | None:
@@ -107,23 +113,18 @@ def _layer(path: Path, name: str) -> NDArray[np.float64] | None:
         return np.asarray(dataset.read(dataset.descriptions.index(name) + 1, masked=True).filled(np.nan), np.float64)
 
 
-def residuals(mapping: Map | None, truth: BandTruth, window: Window = WHOLE) -> tuple[float, float, float]:
-    """(median, 90th percentile, share beyond 1 px) of the distance to the truth, over pixels of a window that the band
-    shows and that did not move.
+def residuals(mapping: Map | None, truth: BandTruth, window: Window = WHOLE) -> dict[str, float]:
+    """Return median, 90th percentile and share beyond 1 px of the distance to the truth, as fields of a score, over
+    pixels of a window that the band shows and that did not move.
     """
     some = truth.scored[window]
     if mapping is None or not some.any():
-        return np.nan, np.nan, np.nan
+        return {}
     error_px = np.linalg.norm(mapping[window][some] - truth.moving_px[window][some], axis=-1)
     # A pixel without a mapping is infinitely far off, which no interpolating quantile can express.
     error_px = np.sort(np.where(np.isfinite(error_px), error_px, np.inf))
     median, p90 = (float(error_px[int(share * (len(error_px) - 1))]) for share in (0.5, 0.9))
-    return median, p90, float((error_px > 1).mean())
-
-
-def is_wrong(status: str, p90_px: float) -> bool:
-    """True for a wrong acceptance: the band is misaligned, or does not show the scene."""
-    return status == "aligned" and not p90_px <= WRONG_PX
+    return {"median_px": median, "p90_px": p90, "beyond_1_px": float((error_px > 1).mean())}
 
 
 def range_errors(sidecar: Sidecar, truth: Truth) -> tuple[float, float]:
@@ -139,17 +140,18 @@ def range_errors(sidecar: Sidecar, truth: Truth) -> tuple[float, float]:
     return float(np.median(np.abs(range_m[some] / expected[some] - 1))), float(some.mean())
 
 
-def occlusion_scores(sidecar: Sidecar, band: dict[str, Any], truth: BandTruth) -> tuple[float, float]:
-    """(precision, recall) of the pixels without data in the stack, where the truth is inside the moving image."""
+def occlusion_scores(sidecar: Sidecar, band: dict[str, Any], truth: BandTruth) -> dict[str, float]:
+    """Return precision and recall, as fields of a score, of the pixels without data in the stack, where the truth is
+    inside the moving image.
+    """
     place = band.get("place")
     if place is None:
-        return np.nan, np.nan
+        return {}
     with without_warnings(), rasterio.open(sidecar.path.parent / place["file"]) as dataset:
         masked = dataset.read_masks(place["band_index"]) == 0
-    inside, hidden = truth.inside[sidecar.window], truth.hidden[sidecar.window]
-    masked &= inside
-    hidden = hidden & inside
-    return _share(masked, _grown(hidden)), _share(hidden, _grown(masked))
+    inside = truth.inside[sidecar.window]
+    masked, hidden = masked & inside, truth.hidden[sidecar.window] & inside
+    return {"precision": _share(masked, _grown(hidden)), "recall": _share(hidden, _grown(masked))}
 
 
 def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -8,30 +8,27 @@ and scaled about its centre on a canvas that holds all of it. A pair is found wh
 of the moving file. Prints a table, and draws a heat map.
 """
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 from pathlib import Path
 
 import cv2
 import numpy as np
-from bands.methods import sift
 from cases import Case, cases
+from common import WRONG_PX, parser, print_head, print_row, pyplot
+from peers import elastix, sift
 
 import agalign
-from agalign.evaluation.methods import elastix_affinity
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
+from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
-FOUND_PX, WRONG_PX = 0.3, 1.0
+FOUND_PX = 0.3
 SHIFTS, TURNS, SCALES = (0.0, 0.1, 0.2, 0.25), (0.0, 3.0, 10.0, 45.0, 90.0, 180.0), (0.5, 0.8, 1.25, 2.0)
-STARTS = (
-    [(shift, turn, 1.0) for turn in TURNS for shift in SHIFTS] + [(0.0, turn, s) for s in SCALES for turn in TURNS]
-)  # fmt: skip
-
-Matrix = np.ndarray
+STARTS = [(shift, turn, 1.0) for turn in TURNS for shift in SHIFTS] + [(0.0, turn, s) for s in SCALES for turn in TURNS]
 Aligner = Callable[[Raster, Raster], tuple[Matrix | None, bool]]
 """Maps a pair to (fixed_to_moving, whether the method accepts its result)."""
 
@@ -66,7 +63,7 @@ def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
     """Register the moving image, resampled to the size of the fixed one, by elastix."""
     overlay = geometry.overlay(fixed.size_px, moving.size_px)
     resized = cv2.warpPerspective(moving.pixels, overlay, fixed.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    result = elastix_affinity(fixed, Raster(resized, fixed.valid))
+    result = elastix(fixed.pixels, resized)
     return None if result is None else geometry.compose(overlay, result), True
 
 
@@ -85,58 +82,49 @@ def error_px(case: Case, to_moved: Matrix, result: Matrix | None) -> float:
 def chosen(folders: Sequence[Path], pairs: int) -> Iterator[Case]:
     """Return this number of pairs of each set, evenly spread."""
     for folder in folders:
-        some = list(cases([folder]))
+        some = list(cases(folder))
         yield from (some[i] for i in np.unique(np.linspace(0, len(some) - 1, pairs).round().astype(int)))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, nargs="+")
-    parser.add_argument("--pairs", type=int, default=3)
-    parser.add_argument("--methods", default=";".join(METHODS))
-    parser.add_argument("--plot", type=Path)
-    options = parser.parse_args()
-    shares: dict[str, dict[tuple[float, float, float], float]] = {name: {} for name in options.methods.split(";")}
-    print("| method | shift | turn | scale | found | median, px | worst sure, px | wrong though sure | s |")
-    print("|---|---|---|---|---|---|---|---|---|", flush=True)
+    options = parser(__doc__)
+    options.add_argument("data", type=Path, nargs="+")
+    options.add_argument("--pairs", type=int, default=3)
+    options.add_argument("--methods", default=";".join(METHODS))
+    options.add_argument("--plot", type=Path)
+    asked = options.parse_args()
+    shares: dict[str, dict[tuple[float, float, float], float]] = {name: {} for name in asked.methods.split(";")}
+    head = "method", "shift", "turn", "scale", "found", "median, px", "worst sure, px", "wrong though sure", "s"
+    print_head(*head)
     with tempfile.TemporaryDirectory() as folder:
-        made = Path(folder) / "synthetic"
-        synthetic.make_flight(made, captures=2, rng_seed=11)
-        tried = list(chosen([*options.data, made], options.pairs))
-        for start in STARTS:
-            for name in shares:
-                errors, sure, seconds = [], [], []
-                for case in tried:
-                    fixed, moving = case.straight()
-                    image, to_moved = moved(moving, *start)
-                    began = time.perf_counter()
-                    result, is_sure = METHODS[name](fixed, image)
-                    seconds.append(time.perf_counter() - began)
-                    errors.append(error_px(case, to_moved, result))
-                    sure.append(is_sure)
-                off, says = np.array(errors), np.array(sure)
-                hit = off <= FOUND_PX
-                shares[name][start] = float(hit.mean())
-                worst = f"{off[says].max():.2f}" if says.any() else "-"
-                print(
-                    f"| {name} | {start[0]:.0%} | {start[1]:g}° | {start[2]:g} | {hit.sum()} of {len(hit)} | "
-                    f"{np.median(off):.3f} | {worst} | {(says & (off > WRONG_PX)).sum()} | {np.median(seconds):.1f} |",
-                    flush=True,
-                )
-    if options.plot is not None:
-        draw(shares, options.plot)
+        synthetic.make_flight(Path(folder), captures=2, rng_seed=11)
+        tried = list(chosen([*asked.data, Path(folder)], asked.pairs))
+    for start, (name, of_method) in product(STARTS, shares.items()):
+        rows = []
+        for case in tried:
+            fixed, moving = case.straight()
+            image, to_moved = moved(moving, *start)
+            began = time.perf_counter()
+            result, is_sure = METHODS[name](fixed, image)
+            rows.append((error_px(case, to_moved, result), is_sure, time.perf_counter() - began))
+        off, seconds = (np.array([row[k] for row in rows]) for k in (0, 2))
+        sure = np.array([row[1] for row in rows])
+        hit = off <= FOUND_PX
+        of_method[start] = float(hit.mean())
+        worst = f"{off[sure].max():.2f}" if sure.any() else "-"
+        errors = f"{np.median(off):.3f}", worst, (sure & (off > WRONG_PX)).sum(), f"{np.median(seconds):.1f}"
+        moved_by = f"{start[0]:.0%}", f"{start[1]:g}°", f"{start[2]:g}"
+        print_row(name, *moved_by, f"{hit.sum()} of {len(hit)}", *errors)
+    if asked.plot is not None:
+        draw(shares, asked.plot)
 
 
 def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path) -> None:
     """Draw a heat map per method: share of successes by rotation, shift and scale."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
     across = [(s, 1.0) for s in SHIFTS] + [(0.0, s) for s in SCALES]
     labels = [f"{shift:.0%}" for shift in SHIFTS] + [f"x{scale:g}" for scale in SCALES]
-    figure, axes = plt.subplots(1, len(shares), figsize=(5.4 * len(shares), 3.6), sharey=True, squeeze=False)
+    size = 5.4 * len(shares), 3.6
+    figure, axes = pyplot().subplots(1, len(shares), figsize=size, sharey=True, squeeze=False)
     for axis, (name, result) in zip(axes[0], shares.items(), strict=True):
         table = np.array([[result[shift, turn, scale] for shift, scale in across] for turn in TURNS])
         image = axis.imshow(table, cmap="RdYlGn", vmin=0, vmax=1, aspect="auto")

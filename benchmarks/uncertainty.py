@@ -6,52 +6,37 @@ At each corner of the reference and along each axis, the error should lie within
 68 % and within 1.96 of them in 95 % of the cases.
 """
 
-import json
 import sys
-import tempfile
-from pathlib import Path
 
 import numpy as np
+from common import flight_and_out, print_head, print_row, read_ties
 
 import agalign
-from agalign.synthetic import flight as synthetic
+from agalign.synthetic import make_flight
 from agalign.values import geometry
 
 
-def main() -> None:
-    captures = int(sys.argv[1]) if len(sys.argv) > 1 else 12
-    rng_seed = int(sys.argv[2]) if len(sys.argv) > 2 else 1
-    ratios: dict[str, list[float]] = {}
-    errors: dict[str, list[float]] = {}
-    claims: dict[str, list[float]] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        source, out = Path(folder) / "flight", Path(folder) / "aligned"
-        truth = json.loads(synthetic.make_flight(source, captures, rng_seed=rng_seed).read_text())
-        for report in agalign.align_folder(source, out):
-            for band in report.sidecar.bands if report.sidecar else ():
-                if band.status != "aligned":
-                    continue
-                true = np.array(truth[report.sidecar.capture]["bands"][band.file]["fixed_to_moving"])
-                size = report.sidecar.reference.width, report.sidecar.reference.height
-                corners = geometry.corners(*size)
-                back = geometry.compose(geometry.invert(true), np.array(band.homography.fixed_to_moving))
-                error = geometry.apply(back, corners) - corners
-                std = np.array(band.joint.corner_std_xy_px)
-                ratios.setdefault(band.band, []).extend(np.abs(error / std).ravel())
-                errors.setdefault(band.band, []).extend(np.abs(error).ravel())
-                claims.setdefault(band.band, []).extend(std.ravel())
-    print("| band | corners x axes | within 1 std (68 %) | within 1.96 std (95 %) | rms error, px | rms std, px |")
-    print("|---|---|---|---|---|---|")
-    for name in [*ratios, "all"]:
-        r, e, s = (
-            np.concatenate(list(table.values())) if name == "all" else np.array(table[name])
-            for table in (ratios, errors, claims)
-        )
-        print(
-            f"| {name} | {len(r)} | {(r <= 1).mean():.0%} | {(r <= 1.96).mean():.0%} "
-            f"| {np.sqrt((e**2).mean()):.3f} | {np.sqrt((s**2).mean()):.3f} |"
-        )
+def main(captures: int = 12, rng_seed: int = 1) -> None:
+    bands: dict[str, list[np.ndarray]] = {}
+    with flight_and_out() as (flight, out):
+        truth = read_ties(make_flight(flight, captures, rng_seed=rng_seed))
+        sidecars = [r.sidecar for r in agalign.align_folder(flight, out) if r.sidecar]
+    for sidecar in sidecars:
+        corners = geometry.corners(sidecar.reference.width, sidecar.reference.height)
+        for band in (b for b in sidecar.bands if b.status == "aligned"):
+            true = geometry.invert(np.array(truth[band.file]["fixed_to_moving"]))
+            back = geometry.compose(true, np.array(band.homography.fixed_to_moving))
+            error = np.abs(geometry.apply(back, corners) - corners)
+            bands.setdefault(band.band, []).append(np.stack([error, np.array(band.joint.corner_std_xy_px)]))
+    print_head(
+        "band", "corners x axes", "within 1 std (68 %)", "within 1.96 std (95 %)", "rms error, px", "rms std, px"
+    )
+    for name in (*bands, "all"):
+        some = [one for band, values in bands.items() if name in (band, "all") for one in values]
+        error, std = np.concatenate(some, axis=1).reshape(2, -1)
+        shares = [f"{(error <= times * std).mean():.0%}" for times in (1, 1.96)]
+        print_row(name, error.size, *shares, *(f"{np.sqrt((values**2).mean()):.3f}" for values in (error, std)))
 
 
 if __name__ == "__main__":
-    main()
+    main(*map(int, sys.argv[1:]))

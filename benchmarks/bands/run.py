@@ -3,133 +3,207 @@
     pip install -e '.[bench]' && python benchmarks/bands/run.py DATA [-o results.csv] [--plot FILE]
         [--methods 'SIFT + RANSAC;mine.py:align'] [--sets p4m_forest,...] [--variants 'as it is,turn 10,...']
 
-DATA is any folder: images are known by their checksums, and sets that are not there are named, with where they are
-published. Each method runs in a process of its own with as many threads as it takes; one that raises has refused the
-pair. Scores are written to -o, and as tables beside it (.md); what was said of each pair to --said, as score.py reads
-it.
+DATA is any folder: images are recognised by their checksums, and missing sets are listed with their publisher. Each
+method runs in a process of its own with as many threads as it takes; one that raises has refused the pair. Scores are
+written to -o, and as tables next to it (.md); the mapping of each pair to --said, in the format that score.py reads.
 """
 
 import argparse
 import csv
 import json
-import os
-import subprocess
+import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
+import rasterio
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not to be found
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
-from bands import capture
-from bands.images import LENS_CORRECTED, VARIANTS, Located, locate, read, spoilt
-from bands.methods import PAIR_METHODS, Align, UnavailableError, method_named
+from cases import straightened
+from common import align, parser, watched
+from peers import METHODS, Align, UnavailableError, grey_raster, method_named
+
+from agalign.cameras.discover import discover
+from agalign.pixels.raster import TIFF_SUFFIXES, without_warnings
+from agalign.products.sidecar_file import find_sidecars
+from agalign.values import geometry, lens
+from agalign.values.capture import Band
+from agalign.values.mapping import PixelMapping
+from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, locate, read, spoilt
 from bands.report import draw, tables
-from bands.score import Pair, pairs_of, read_sets, score_pairs, summary, write_csv
+from bands.score import AS_IT_IS, Pair, pairs_of, read_sets, score_pairs, summary, write_csv
 
+WHOLE = {"agalign, capture": (), "agalign, capture, no tags": ("--ignore-metadata",)}
+"""Runs of the command line on a whole flight, with its files and tags: options by name."""
+ALL_METHODS = (*METHODS, *WHOLE)
 Row = dict[str, Any]
-METHODS = (*PAIR_METHODS, *capture.WHOLE)
-SLOW = ("kornia ImageRegistrator",)
-"""Run where they are named."""
 _FIELDS = ("method", "set", "capture", "file", "variant", "claimed", "seconds", "homography", "grid")
 
 
-def asked(align: Align, pair: Pair, variant: str, paths: dict[str, Path], bands: dict[str, Any]) -> Row:
-    """What a pair method says of a pair; an exception is a refusal."""
+def _grid(reference_px: Any, moving_px: Any) -> Row:
+    return {"reference_px": np.round(reference_px, 4).tolist(), "moving_px": np.round(moving_px, 4).tolist()}
+
+
+# ---- the program on a whole flight
+
+
+def by_command_line(method: str, paths: Paths, pairs: Sequence[Pair], variant: str) -> list[Row]:
+    """`agalign FOLDER` on the files of a set, with degraded moving bands of the pairs; the rest of the flight is
+    unchanged. A band is claimed if it is aligned; a predicted one is given and not claimed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        flight, out = Path(folder, "flight"), Path(folder, "out")
+        flight.mkdir()
+        for name, path in paths.items():
+            shutil.copyfile(path, flight / name)
+        for pair in pairs if variant != AS_IT_IS else ():
+            pixels = spoilt(read(paths[pair.file]), pair, variant)
+            with without_warnings(), rasterio.open(flight / pair.file, "r+") as dataset:
+                dataset.write(pixels, 1)
+        seconds = align(flight, out, *WHOLE[method]) / (len(paths) - len({p.reference for p in pairs}))
+        sidecars = [json.loads(path.read_text(encoding="utf-8")) for path in find_sidecars(out)]
+    bands = {band["file"]: band for sidecar in sidecars for band in sidecar["bands"]}
+    return [{**claim(bands.get(pair.file)), "seconds": seconds} for pair in pairs]
+
+
+def claim(band: Mapping[str, Any] | None) -> Row:
+    """Return the mapping of a band in a sidecar, if it has one, and whether it is claimed."""
+    if band is None or band["status"] not in ("aligned", "predicted") or not band["grid"]:
+        return {}
+    return {
+        "grid": _grid(band["grid"]["reference_px"], band["grid"]["moving_px"]),
+        "claimed": "yes" if band["status"] == "aligned" else "no",
+    }
+
+
+# ---- pair methods
+
+
+def bands_of(paths: Paths) -> dict[str, Band]:
+    """Return the bands with the lenses of a set's files by name; none for files without tags."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, path in paths.items() if has_tags(paths) else ():
+            Path(folder, name).symlink_to(path.resolve())
+        return {band.path.name: band for capture in discover(Path(folder)).captures for band in capture.bands}
+
+
+def has_tags(paths: Paths) -> bool:
+    """Return True for files of a camera, which are a flight."""
+    return all(path.suffix.lower() in TIFF_SUFFIXES for path in paths.values())
+
+
+def lens_corrected(method: Align, fixed: tuple[Image, Band], moving: tuple[Image, Band]) -> Row:
+    """Return the mapping by a pair method of images without distortion, as a grid between the raw pixels of the files.
+    The correction is not included in its seconds.
+    """
+    images = [straightened(replace(grey_raster(image), lens=band.lens)) for image, band in (fixed, moving)]
+    began = time.perf_counter()
+    matrix = method(images[0].pixels, images[1].pixels)
+    seconds = time.perf_counter() - began
+    if matrix is None:
+        return {"seconds": seconds}
+    here = geometry.lattice(*images[0].size_px, 33, 25)
+    there = PixelMapping(geometry.normalised(matrix), fixed[1].lens, moving[1].lens)(here)
+    return {"grid": _grid(here, there), "seconds": seconds}
+
+
+def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[str, Band]) -> Row:
+    """Return the mapping of a pair by a pair method; an exception is a refusal."""
     fixed, moving = read(paths[pair.reference]), read(paths[pair.file])
     if variant != LENS_CORRECTED:
         moving = spoilt(moving, pair, variant)
     began = time.perf_counter()
     try:
         if variant == LENS_CORRECTED:
-            return capture.lens_corrected(align, (fixed, bands[pair.reference]), (moving, bands[pair.file]))
-        matrix = align(fixed, moving)
-    except Exception as error:  # whatever a method dies of is its own affair
+            return lens_corrected(method, (fixed, bands[pair.reference]), (moving, bands[pair.file]))
+        matrix = method(fixed, moving)
+    except Exception as error:  # any exception of a method
         print(f"{pair.key}, {variant}: refused ({type(error).__name__}: {error})", file=sys.stderr)
-        return {"seconds": time.perf_counter() - began}
-    said = {} if matrix is None else {"homography": [[float(v) for v in row] for row in matrix]}
-    return {**said, "seconds": time.perf_counter() - began}
+        matrix = None
+    result = {} if matrix is None else {"homography": np.asarray(matrix, float).tolist()}
+    return {**result, "seconds": time.perf_counter() - began}
 
 
-def run_method(name: str, located: Located, sets: dict[str, Any], variants: Sequence[str]) -> list[Row]:
-    """What one method says of everything. Raises UnavailableError."""
-    align = None if name in capture.WHOLE else method_named(name)
+# ---- methods on all sets
+
+
+def applies(name: str, variant: str, pairs: Sequence[Pair], bands: Mapping[str, Band], paths: Paths) -> bool:
+    """Return False for images without a lens to correct, and for the program on corrected images or without tags."""
+    if variant == LENS_CORRECTED:
+        used = [bands.get(file) for p in pairs for file in (p.reference, p.file)]
+        return name not in WHOLE and all(b is not None and lens.is_distorting(b.lens) for b in used)
+    return name not in WHOLE or has_tags(paths)
+
+
+def run_method(name: str, located: Mapping[str, Paths], sets: dict[str, Any], variants: Sequence[str]) -> list[Row]:
+    """Return the rows of one method for all pairs. Raises UnavailableError."""
+    method = None if name in WHOLE else method_named(name)
     rows: list[Row] = []
-    for set_name, paths in located.paths.items():
-        tags = capture.has_tags(paths)
-        with tempfile.TemporaryDirectory() as links:
-            bands = capture.bands_of(paths, Path(links))
+    for set_name, paths in located.items():
+        bands = bands_of(paths)
         for variant in variants:
             pairs = pairs_of(sets[set_name], variant)
-            if not capture.applies(name, variant, pairs, bands, tags=tags):
+            if not applies(name, variant, pairs, bands, paths):
                 continue
-            if align is None:
-                with tempfile.TemporaryDirectory() as folder:
-                    said = capture.by_command_line(name, paths, pairs, variant, Path(folder))
+            if method is None:
+                said = by_command_line(name, paths, pairs, variant)
             else:
-                said = [asked(align, pair, variant, paths, bands) for pair in pairs]
-            of = {"method": name, "variant": variant}
-            rows += [
-                {**of, "set": p.set, "capture": p.capture, "file": p.file, **s}
-                for p, s in zip(pairs, said, strict=True)
-            ]
+                said = [asked(method, pair, variant, paths, bands) for pair in pairs]
+            for pair, row in zip(pairs, said, strict=True):
+                key = dict(zip(("set", "capture", "file"), pair.key, strict=True))
+                rows.append({"method": name, "variant": variant, **key, **row})
     return rows
 
 
 def child(name: str, arguments: Sequence[str]) -> tuple[list[Row], float]:
-    """(rows, largest memory in GB) of this script running one method, none where it could not.
-
-    A method that takes its process with it takes no other's.
+    """Return (rows, largest memory in GB) of this script running one method in a process of its own, which may crash;
+    no rows without a result.
     """
     with tempfile.NamedTemporaryFile("r", suffix=".json") as file:
-        process = subprocess.Popen([sys.executable, __file__, *arguments, "--only", name, "-o", file.name])
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
+        run = watched([sys.executable, __file__, *arguments, "--only", name, "-o", file.name])
+        if run.code:
             print(f"{name}: left out", file=sys.stderr)
             return [], 0.0
-        return json.load(file), usage.ru_maxrss / 1e6
+        return json.load(file), run.largest_gb
 
 
-def tell_missing(located: Located, sets: dict[str, Any]) -> None:
-    for name, files in located.missing.items():
+def print_missing(missing: Mapping[str, Sequence[str]], sets: dict[str, Any]) -> None:
+    for name, files in missing.items():
         published = sets[name]["published"]
         where = f"{published['repository']}, {published['path']}" if "repository" in published else published["by"]
-        print(
-            f"{name}: left out, {len(files)} of {len(sets[name]['files'])} files are not there ({where})",
-            file=sys.stderr,
-        )
+        count = f"{len(files)} of {len(sets[name]['files'])}"
+        print(f"{name}: left out, {count} files are missing ({where})", file=sys.stderr)
 
 
 def write_said(rows: Iterable[Row], path: Path) -> None:
-    """The rows as score.py reads them."""
+    """Write the rows in the format that score.py reads."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, _FIELDS, lineterminator="\n")
         writer.writeheader()
         for row in rows:
-            cells = {k: json.dumps(v) if k in ("homography", "grid") else v for k, v in row.items()}
-            writer.writerow(cells)
+            writer.writerow({k: json.dumps(v) if k in ("homography", "grid") else v for k, v in row.items()})
 
 
 def parsed() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("-o", "--output", type=Path, default=Path("results.csv"))
-    parser.add_argument("--methods", help=f"separated by ;: FILE.py:FUNCTION, {'; '.join(METHODS)}")
-    parser.add_argument("--sets", help="separated by commas")
-    parser.add_argument("--variants", help=f"separated by commas: {', '.join(VARIANTS)}")
-    parser.add_argument(
-        "--jobs", type=int, default=1, help="methods at a time; with more than one, seconds mean little"
-    )
-    parser.add_argument("--said", type=Path)
-    parser.add_argument("--plot", type=Path)
-    parser.add_argument("--only", help=argparse.SUPPRESS)
-    return parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("data", type=Path)
+    options.add_argument("-o", "--output", type=Path, default=Path("results.csv"))
+    options.add_argument("--methods", help=f"separated by ;: FILE.py:FUNCTION, {'; '.join(ALL_METHODS)}")
+    options.add_argument("--sets", help="separated by commas")
+    options.add_argument("--variants", help=f"separated by commas: {', '.join(VARIANTS)}")
+    options.add_argument("--jobs", type=int, default=1, help="methods at a time; above one, seconds mean little")
+    options.add_argument("--said", type=Path)
+    options.add_argument("--plot", type=Path)
+    options.add_argument("--only", help=argparse.SUPPRESS)
+    return options.parse_args()
 
 
 def main() -> None:
@@ -139,20 +213,20 @@ def main() -> None:
         sets = {name: sets[name] for name in options.sets.split(",")}
     variants = options.variants.split(",") if options.variants else VARIANTS
     if unknown := set(variants) - set(VARIANTS):
-        sys.exit(f"there is no variant {unknown.pop()}")
-    located = locate(options.data, sets)
+        sys.exit(f"unknown variant '{unknown.pop()}'; choose from {', '.join(VARIANTS)}")
+    located, missing = locate(options.data, sets)
     if options.only:
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every tag it does not know
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every unknown tag
         try:
             options.output.write_text(json.dumps(run_method(options.only, located, sets, variants)))
         except UnavailableError as error:
             sys.exit(f"{options.only}: {error}")
         return
-    tell_missing(located, sets)
-    if not located.paths:
-        sys.exit(f"{options.data}: no set is there")
-    names = options.methods.split(";") if options.methods else [m for m in METHODS if m not in SLOW]
-    arguments = [str(options.data), "--sets", ",".join(located.paths), "--variants", ",".join(variants)]
+    print_missing(missing, sets)
+    if not located:
+        sys.exit(f"{options.data}: contains no complete set")
+    names = options.methods.split(";") if options.methods else ALL_METHODS
+    arguments = [str(options.data), "--sets", ",".join(located), "--variants", ",".join(variants)]
     with ThreadPoolExecutor(options.jobs) as pool:
         result = dict(zip(names, pool.map(lambda name: child(name, arguments), names), strict=True))
     rows = [row for some, _ in result.values() for row in some]

@@ -15,7 +15,7 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -153,9 +153,7 @@ def _chosen(pairs: list[Pair], variant: str) -> list[Pair]:
 def _moved(pair: Pair, variant: str) -> Pair:
     there = apply(movement(variant, pair.size_px), pair.moving_px)
     inside = _inside(there, pair.size_px)
-    return Pair(
-        pair.set, pair.capture, pair.reference, pair.file, pair.reference_px[inside], there[inside], pair.size_px
-    )  # fmt: skip
+    return replace(pair, reference_px=pair.reference_px[inside], moving_px=there[inside])
 
 
 def movement(variant: str, size_px: tuple[int, int]) -> Matrix:
@@ -268,12 +266,12 @@ def _score(set_name: str, variant: str, method: str, group: Sequence[Scored]) ->
     medians, p95 = np.array([s.median_px for s in claims]), np.array([s.p95_px for s in claims])
     unclaimed = np.array([s.median_px for s in group if s.given and not s.claimed])
     seconds = np.array([s.seconds for s in group])
-    return Score(
-        set_name, variant, method, len(group), len(claims), int((medians > WRONG_PX).sum()),
-        sum(not s.given for s in group), len(unclaimed), float((medians <= GOOD_PX).sum() / len(group)),
-        float((medians <= WRONG_PX).sum() / len(group)), _median(medians), _median(p95),
-        float(medians.max()) if len(claims) else np.nan, _median(unclaimed), _median(seconds[np.isfinite(seconds)]),
-    )  # fmt: skip
+    under = [float((medians <= limit_px).sum() / len(group)) for limit_px in (GOOD_PX, WRONG_PX)]
+    worst = float(medians.max()) if claims else np.nan
+    wrong, refused = int((medians > WRONG_PX).sum()), sum(not s.given for s in group)
+    counts = len(group), len(claims), wrong, refused, len(unclaimed)
+    errors = _median(medians), _median(p95), worst, _median(unclaimed), _median(seconds[np.isfinite(seconds)])
+    return Score(set_name, variant, method, *counts, *under, *errors)
 
 
 def _median(values: NDArray[np.float64]) -> float:
@@ -284,25 +282,29 @@ def _median(values: NDArray[np.float64]) -> float:
 
 
 def write_csv(scores: Sequence[Score], path: Path) -> None:
-    """Return every score as CSV; unknown values are empty."""
+    """Write every score as CSV; unknown values are empty."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([f.name for f in fields(Score)])
-        writer.writerows([_cell(v, 4) for v in asdict(s).values()] for s in scores)
+        writer.writerows([_cell(v, 4) for v in astuple(s)] for s in scores)
+
+
+def table(rows: Sequence[Sequence[object]]) -> str:
+    """Return a Markdown table; the first row is the head."""
+    head, *body = ["| " + " | ".join(map(str, row)) + " |" for row in rows]
+    return "\n".join([head, "|---" * len(rows[0]) + "|", *body])
 
 
 def markdown(scores: Sequence[Score]) -> str:
-    """A table of the scores of one set and variant."""
-    head = ("method", "pairs", "claimed", "**wrong claims**", "refused", "unclaimed", "under 0.5 px", "under 1 px",
-            "median, px", "95 %, px", "worst pair, px", "s a pair")  # fmt: skip
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    """Return a table of the scores of one set and variant."""
+    counts = "method", "pairs", "claimed", "**wrong claims**", "refused", "unclaimed", "under 0.5 px", "under 1 px"
+    rows = [(*counts, "median, px", "95 %, px", "worst pair, px", "s a pair")]
     for s in scores:
         unclaimed = f"{s.unclaimed} ({s.unclaimed_median_px:.2f} px)" if s.unclaimed else "0"
-        cells = (s.method, s.pairs, s.claimed, f"**{s.wrong_claims}**", s.refused, unclaimed,
-                 f"{s.under_half_px:.0%}", f"{s.under_1_px:.0%}", _cell(s.median_px, 3), _cell(s.p95_px, 2),
-                 _cell(s.worst_px, 2), _cell(s.seconds, 2))  # fmt: skip
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+        shares = f"{s.under_half_px:.0%}", f"{s.under_1_px:.0%}"
+        errors = [_cell(v, n) for v, n in ((s.median_px, 3), (s.p95_px, 2), (s.worst_px, 2), (s.seconds, 2))]
+        rows.append((s.method, s.pairs, s.claimed, f"**{s.wrong_claims}**", s.refused, unclaimed, *shares, *errors))
+    return table(rows)
 
 
 def _cell(value: object, digits: int) -> str:

@@ -10,10 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from bands import capture, score
+from bands import score
 from bands.images import VARIANTS, locate, read, spoilt
-from bands.methods import UnavailableError, identity, method_named
-from bands.run import asked, write_said
+from bands.run import asked, claim, lens_corrected, write_said
+from peers import UnavailableError, identity, method_named
 
 from agalign.cameras.discover import discover
 
@@ -160,18 +160,18 @@ def test_a_set_is_sound(name: str) -> None:
 @pytest.mark.real
 def test_the_images_are_those_of_the_checksums(real_data: Path) -> None:
     sets = score.read_sets()
-    located = locate(real_data, sets)
-    assert not located.missing
-    assert {name: len(paths) for name, paths in located.paths.items()} == {n: len(s["files"]) for n, s in sets.items()}
+    located, missing = locate(real_data, sets)
+    assert not missing
+    assert {name: len(paths) for name, paths in located.items()} == {n: len(s["files"]) for n, s in sets.items()}
 
 
 def test_images_that_are_not_there_are_named(tmp_path: Path) -> None:
     sets = score.read_sets()
     file = next(iter(sets["p4m_forest"]["files"].values()))
     (tmp_path / "as large.TIF").write_bytes(bytes(file["bytes"]))
-    located = locate(tmp_path, sets)
-    assert not located.paths
-    assert len(located.missing["p4m_forest"]) == 5
+    located, missing = locate(tmp_path, sets)
+    assert not located
+    assert len(missing["p4m_forest"]) == 5
 
 
 def test_a_method_that_raises_has_refused(
@@ -202,9 +202,9 @@ def test_anyones_method_is_taken_from_a_file(tmp_path: Path) -> None:
 
 def test_only_what_is_called_aligned_is_claimed() -> None:
     grid = {"reference_px": [[0, 0], [1, 0], [0, 1]], "moving_px": [[0, 0], [1, 0], [0, 1]]}
-    said = {s: capture._row({"status": s, "grid": grid}, 1.0) for s in ("aligned", "predicted", "seed_only", "failed")}
+    said = {s: claim({"status": s, "grid": grid}) for s in ("aligned", "predicted", "seed_only", "failed")}
     assert (said["aligned"]["claimed"], said["predicted"]["claimed"]) == ("yes", "no")
-    assert said["seed_only"] == said["failed"] == capture._row(None, 1.0) == {"seconds": 1.0}
+    assert said["seed_only"] == said["failed"] == claim(None) == {}
 
 
 def test_lens_corrected_images_are_scored_between_raw_pixels(flight: Path) -> None:
@@ -213,7 +213,7 @@ def test_lens_corrected_images_are_scored_between_raw_pixels(flight: Path) -> No
     file = "IMG_0001_4.tif"
     both = [(read(bands[name].path), bands[name]) for name in (truth["reference"], file)]
     known = truth["bands"][file]
-    said = capture.lens_corrected(lambda _f, _m: np.array(known["fixed_to_moving"]), *both)
+    said = lens_corrected(lambda _f, _m: np.array(known["fixed_to_moving"]), *both)
     here, there = np.hsplit(np.array(known["ties"]), 2)
     pair = score.Pair("synthetic", "1", truth["reference"], file, here, there, bands[file].size_px)
     assert np.median(score.errors_px(said, pair)) < 0.02

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
-from relief_peers import by_peer, dis, farneback
-from relief_score import Sidecar, is_wrong, mapping_of, occlusion_scores, range_errors, residuals
+from peers import by_dense, dis, farneback
+from relief_score import Score, Sidecar, mapping_of, occlusion_scores, range_errors, residuals
 from synthetic_flights.depth import BandTruth, Truth
 
 from agalign.pixels.raster import without_warnings
@@ -29,6 +29,10 @@ def sidecar(folder: Path, crop: tuple[int, int, int, int] = (0, 0, WIDTH, HEIGHT
     return Sidecar(folder / "IMG_0001.json", content)
 
 
+def figures(mapping: np.ndarray, *args: object) -> tuple[float, ...]:
+    return tuple(residuals(mapping, *args).values())  # type: ignore[arg-type]
+
+
 def test_a_grid_is_interpolated(tmp_path: Path) -> None:
     here = geometry.lattice(WIDTH, HEIGHT, 17, 13)
     bent = here + np.stack([here[:, 1] ** 2, here[:, 0] * here[:, 1]], axis=1) / 500
@@ -44,9 +48,11 @@ def test_a_relief_displaces_the_written_pixels(tmp_path: Path) -> None:
     nodes = geometry.lattice(WIDTH, HEIGHT, 17, 13)
     plane = HERE + HERE**2 / 500
     relief = {
-        "file": "IMG_0001.relief.tif", "reference_px": nodes.tolist(), "plane_px": (nodes + nodes**2 / 500).tolist(),
+        "file": "IMG_0001.relief.tif",
+        "reference_px": nodes.tolist(),
+        "plane_px": (nodes + nodes**2 / 500).tolist(),
         "slope": (np.array((0.8, -0.5)) + nodes / 1000).tolist(),
-    }  # fmt: skip
+    }
     # A step that no grid of the sidecar could show.
     parallax = np.where(HERE[4:, 8:, 0] < 40, -2.0, 5.0).astype(np.float32)
     write(tmp_path / "IMG_0001.relief.tif", parallax[None], ["parallax"])
@@ -66,22 +72,25 @@ def test_residuals_are_of_what_is_visible_and_still() -> None:
     left, top = HERE[..., 0] < 48, HERE[..., 1] < 8
     truth = known(hidden=left, moved=top)
     mapping = truth.moving_px + np.where(left | top, 100.0, 0.25)[..., None] * (0.6, 0.8)
-    assert residuals(mapping, truth) == pytest.approx((0.25, 0.25, 0.0), abs=1e-4)
+    assert figures(mapping, truth) == pytest.approx((0.25, 0.25, 0.0), abs=1e-4)
     partly = truth.moving_px + np.where(HERE[..., 0] < 60, 2.0, 0.25)[..., None] * (0.6, 0.8)
-    assert residuals(partly, truth) == pytest.approx((0.25, 2.0, 0.25), abs=1e-4)
+    assert figures(partly, truth) == pytest.approx((0.25, 2.0, 0.25), abs=1e-4)
     written = slice(4, 60), slice(50, 90)
     cropped = np.full_like(partly, np.nan)
     cropped[written] = partly[written]
-    assert residuals(cropped, truth, written) == pytest.approx((0.25, 2.0, 0.25), abs=1e-4)
-    assert np.isnan(residuals(None, truth)).all()
-    assert np.isnan(residuals(mapping, known(hidden=np.ones((HEIGHT, WIDTH), bool)))).all()
-    assert residuals(np.full_like(mapping, np.nan), truth)[1] == np.inf
+    assert figures(cropped, truth, written) == pytest.approx((0.25, 2.0, 0.25), abs=1e-4)
+    assert not residuals(None, truth)
+    assert not residuals(mapping, known(hidden=np.ones((HEIGHT, WIDTH), bool)))
+    assert residuals(np.full_like(mapping, np.nan), truth)["p90_px"] == np.inf
 
 
 def test_wrong_is_aligned_and_off_or_of_another_scene() -> None:
-    assert [is_wrong("aligned", p90) for p90 in (0.2, 1.0, 1.1, np.inf, np.nan)] == [False, False, True, True, True]
-    assert not is_wrong("predicted", 5.0)
-    assert not is_wrong("failed", np.nan)
+    def wrong(status: str, p90_px: float) -> bool:
+        return Score("agalign", "flat", True, 0, status=status, p90_px=p90_px).wrong
+
+    assert [wrong("aligned", p90) for p90 in (0.2, 1.0, 1.1, np.inf, np.nan)] == [False, False, True, True, True]
+    assert not wrong("predicted", 5.0)
+    assert not wrong("failed", np.nan)
 
 
 def write(path: Path, bands: np.ndarray, names: Sequence[str] = ()) -> None:
@@ -116,20 +125,19 @@ def test_occlusions_are_pixels_without_data_to_one_px(tmp_path: Path) -> None:
     stack[1, :, 80:] = 0  # outside the band's image
     write(tmp_path / "IMG_0001.tif", stack)
     band = {"place": {"file": "IMG_0001.tif", "band_index": 2}}
-    precision, recall = occlusion_scores(sidecar(tmp_path), band, known(hidden=hidden, inside=inside))
-    assert precision == pytest.approx(0.5)
-    assert recall == pytest.approx(0.8)
-    assert np.isnan(occlusion_scores(sidecar(tmp_path), {"place": None}, known())).all()
+    result = occlusion_scores(sidecar(tmp_path), band, known(hidden=hidden, inside=inside))
+    assert result == pytest.approx({"precision": 0.5, "recall": 0.8})
+    assert not occlusion_scores(sidecar(tmp_path), {"place": None}, known())
 
 
-@pytest.mark.parametrize("peer", [dis, farneback])
-def test_peers_find_a_shift_on_top_of_their_start(peer: object) -> None:
+@pytest.mark.parametrize("method", [dis, farneback])
+def test_dense_methods_find_a_shift_on_top_of_their_start(method: object) -> None:
     rng = np.random.default_rng(0)
     ground = cv2.GaussianBlur(rng.normal(size=(240, 320)).astype(np.float32), (0, 0), 2.5)
     reference, moving = ground[20:220, 20:300], ground[18:218, 23:303]
     here = np.stack(np.meshgrid(np.arange(280), np.arange(200)), axis=-1).astype(np.float64)
     start = np.array((-2.0, 0.9))
     # The content at (x, y) of the reference is at (x - 3, y + 2) of the moving image; the start is 1.5 px off.
-    mapping = by_peer(peer, reference, moving, here + start)  # type: ignore[arg-type]
+    mapping = by_dense(method, reference, moving, here + start)  # type: ignore[arg-type]
     error = np.linalg.norm(mapping - here - (-3, 2), axis=-1)[40:-40, 40:-40]
     assert np.median(error) < 0.15

@@ -1,0 +1,198 @@
+"""Shared by the benchmarks: options, tables, runs of the command line, and errors at ground truth."""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CloughTocher2DInterpolator
+
+from agalign.products.sidecar_file import find_sidecars
+
+WRONG_PX = 1.0
+"""A band that is called aligned with a larger error is wrong."""
+Ties = dict[str, dict[str, Any]]
+"""Entries of ties.json or truth.json by the name of the moving file, each with `ties` (n, 4), raw px."""
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the docstring of a script as its help."""
+    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+# ---- tables
+
+
+def print_row(*cells: object) -> None:
+    """Print a row of a Markdown table."""
+    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+
+
+def print_head(*cells: str) -> None:
+    """Print the head of a Markdown table."""
+    print_row(*cells)
+    print("|---" * len(cells) + "|", flush=True)
+
+
+class Section:
+    """A section of a document between two comments, printed at once; without a document it is only printed."""
+
+    def __init__(self, name: str, document: Path | None) -> None:
+        self._marks = f"<!-- {name} -->", f"<!-- end of {name} -->"
+        self._document, self._parts = document, list[str]()
+
+    def table(self, rows: Sequence[Sequence[str]]) -> None:
+        """Add rows of text, the first of them the head."""
+        head, *body = [[cell.replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows]
+        self.say("\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body)))
+
+    def say(self, text: str) -> None:
+        """Add a paragraph."""
+        print(text, end="\n\n", flush=True)
+        self._parts.append(text)
+        if self._document is not None:
+            begin, end = self._marks
+            before, found, rest = self._document.read_text(encoding="utf-8").partition(begin)
+            if not found or end not in rest:
+                raise SystemExit(f"{self._document} has no section {begin}")
+            new = "\n\n".join([before + begin, *self._parts, end + rest.partition(end)[2]])
+            self._document.write_text(new, encoding="utf-8")
+
+
+def pyplot() -> Any:
+    """Return matplotlib.pyplot for figures in files."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    return plt
+
+
+# ---- runs of the command line
+
+
+def command(flight: Path, out: Path, *options: str) -> list[str]:
+    """Return the command that aligns a folder, quietly unless it logs."""
+    quiet = () if "--log-json" in options else ("-q",)
+    return [sys.executable, "-m", "agalign", str(flight), "-o", str(out), *quiet, *options]
+
+
+def align(flight: Path, out: Path, *options: str) -> float:
+    """Align a folder, and return the seconds. Bands that are not aligned end the program with exit code 3."""
+    began = time.perf_counter()
+    subprocess.run(command(flight, out, *options), check=False)
+    return time.perf_counter() - began
+
+
+@contextmanager
+def flight_and_out() -> Iterator[tuple[Path, Path]]:
+    """Return two names in a temporary folder: of a flight, and of the output of a run."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder) / "flight", Path(folder) / "out"
+
+
+@dataclass(frozen=True)
+class Watched:
+    """Resources of a process and its descendants."""
+
+    code: int
+    seconds: float
+    largest_gb: float
+    """Peak memory of the largest process."""
+    samples: NDArray[np.float64]
+    """(n, 5) every half second: seconds, resident and own memory in MB, open files, processes."""
+    left: list[Any]
+    """Processes that outlived it."""
+
+
+def watched(argv: Sequence[str], **options: Any) -> Watched:
+    """Run a command and sample its resources. `options` are those of subprocess.Popen."""
+    import psutil
+
+    began, samples, seen = time.monotonic(), [], set[psutil.Process]()
+    process = subprocess.Popen(argv, **options)
+    while True:
+        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+        if pid:
+            process.returncode = os.waitstatus_to_exitcode(status)
+            break
+        values = []
+        with_children = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+        for one in with_children:
+            try:
+                memory = one.memory_full_info()
+                values.append((memory.rss / 1e6, memory.uss / 1e6, one.num_fds(), 1))
+            except (psutil.Error, OSError):
+                continue
+        seen.update(with_children[1:])
+        samples.append((time.monotonic() - began, *np.sum(values or [(0, 0, 0, 0)], axis=0)))
+        time.sleep(0.5)
+    seconds = time.monotonic() - began
+    _, left = psutil.wait_procs(seen, timeout=10)
+    return Watched(process.returncode, seconds, usage.ru_maxrss / 1e6, np.array(samples), left)
+
+
+# ---- errors at ground truth
+
+
+@dataclass(frozen=True)
+class BandError:
+    """Error of a moving band at its tie points."""
+
+    capture: str
+    band: str
+    file: str
+    status: str
+    source: str
+    """Origin of a prediction, or empty."""
+    median_px: float
+    p95_px: float
+    std_px: float
+    """Reported standard error; nan without one."""
+    seconds: float
+
+
+def read_ties(path: Path) -> Ties:
+    """Return the truth of a ties.json or truth.json by file."""
+    captures = json.loads(path.read_text(encoding="utf-8")).values()
+    return {file: entry | {"trouble": c.get("trouble", "")} for c in captures for file, entry in c["bands"].items()}
+
+
+def band_errors(out: Path, truth: Ties) -> list[BandError]:
+    """Return the error of each band with tie points, from the grids in the sidecars of a run."""
+    result = []
+    for path in find_sidecars(out):
+        sidecar = json.loads(path.read_text(encoding="utf-8"))
+        for band in sidecar["bands"]:
+            grid, prediction, joint = band["grid"], band["prediction"] or {}, band["joint"] or {}
+            if band["file"] not in truth or band["status"] == "reference" or grid is None:
+                continue
+            ties = np.array(truth[band["file"]]["ties"])
+            mapping = CloughTocher2DInterpolator(grid["reference_px"], grid["moving_px"])
+            error_px = np.linalg.norm(mapping(ties[:, :2]) - ties[:, 2:], axis=1)
+            std_px = prediction.get("std_px") if prediction else joint.get("corner_std_px")
+            aligned_or_predicted = band["status"] in ("aligned", "predicted") and std_px is not None
+            result.append(
+                BandError(
+                    sidecar["capture"],
+                    band["band"],
+                    band["file"],
+                    band["status"],
+                    prediction.get("from", ""),
+                    *map(float, np.nanpercentile(error_px, (50, 95))),
+                    std_px if aligned_or_predicted else np.nan,
+                    band["seconds"],
+                )
+            )
+    return result
