@@ -23,6 +23,8 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
 SHARES = {"xmp": 0.5, "tags": 0.35, "names": 0.15}
 MAX_SECONDS, MAX_MEGABYTES = 1, 500
 LONGEST_BYTES = {"xmp": 20_000, "tags": 30_000, "names": 300}
@@ -35,7 +37,6 @@ def seeds(folder: Path) -> None:
     from agalign.synthetic.cameras import REDEDGE
     from agalign.synthetic.flight import make_flight
 
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
     from synthetic_flights.cameras import ALTUM, MAVIC, MAVIC_3M, SENTERA_6X
 
     for target in SHARES:
@@ -149,8 +150,7 @@ def main() -> None:
     asked, more = options.parse_known_args()
     if asked.target and asked.corpus:
         fuzz(asked.target, asked.corpus, [f"-runs={asked.inputs}", *more])
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks" / "reliability"))
-    from report import Section
+    from common import Section
 
     with tempfile.TemporaryDirectory() as folder:
         seeds(Path(folder))

@@ -1,13 +1,10 @@
-"""A Dask cluster of two worker processes on this machine, one of them killed half-way: is everything done, and is it
-equal to a run without a cluster?
+"""A Dask cluster of two worker processes on this machine, one of which is killed half-way: is every capture done, and
+are the files equal to those of a run without a cluster?
 
     python benchmarks/reliability/cluster.py [--captures 40] [--markdown FILE]
 """
 
-import argparse
 import json
-import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -15,8 +12,11 @@ import time
 from pathlib import Path
 
 import psutil
-from kills import contents, differences, files
-from report import Section
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import Section, align, command, parser
+from kills import differences, snapshot
 
 from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic import flight as synthetic
@@ -24,19 +24,21 @@ from agalign.synthetic import flight as synthetic
 SIZE_PX = 480, 360
 
 
-def dask(*arguments: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "distributed.cli." + arguments[0], *arguments[1:]]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def dask(program: str, address_file: Path, *arguments: str) -> "subprocess.Popen[bytes]":
+    module = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", str(address_file)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen([*module, "--no-dashboard", *arguments], **quiet)
 
 
-def worker_process(nanny: subprocess.Popen[bytes]) -> psutil.Process:
-    """Return the worker process below its nanny."""
-    children = psutil.Process(nanny.pid).children(recursive=True)
-    return max(children, key=lambda p: p.memory_info().rss)
+def kill_worker(nanny_pid: int) -> None:
+    """Kill a nanny and its worker, which is the largest of its children."""
+    nanny = psutil.Process(nanny_pid)
+    max(nanny.children(recursive=True), key=lambda p: p.memory_info().rss).kill()
+    nanny.kill()
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = parser(__doc__)
     options.add_argument("--captures", type=int, default=40)
     options.add_argument("--markdown", type=Path)
     asked = options.parse_args()
@@ -45,42 +47,27 @@ def main() -> None:
         flight, alone, out = Path(folder, "flight"), Path(folder, "alone"), Path(folder, "out")
         address_file = Path(folder, "scheduler.json")
         synthetic.make_flight(flight, asked.captures, SIZE_PX, rng_seed=5)
-        program = [sys.executable, "-m", "agalign", str(flight), "-q"]
-        began = time.monotonic()
-        subprocess.run([*program, "-o", str(alone), "-j", "2"], check=True)
-        alone_s = time.monotonic() - began
-        scheduler = dask("dask_scheduler", "--scheduler-file", str(address_file), "--no-dashboard", "--port", "0")
-        there = [
-            "--scheduler-file",
-            str(address_file),
-            "--nthreads",
-            "1",
-            "--no-dashboard",
-            "--local-directory",
-            folder,
-        ]
-        nannies = [dask("dask_worker", *there) for _ in range(2)]
+        alone_s = align(flight, alone, "-j", "2")
+        worker = "--nthreads", "1", "--local-directory", folder
+        processes = [dask("dask_worker", address_file, *worker) for _ in range(2)]
+        processes.append(dask("dask_scheduler", address_file, "--port", "0"))
         try:
             while not address_file.is_file():
                 time.sleep(0.2)
             address = json.loads(address_file.read_text())["address"]
-            began = time.monotonic()
-            run = subprocess.Popen(
-                [*program[:-1], "-o", str(out), "--dask", address], stderr=subprocess.PIPE, text=True
-            )
-            killed_at = 0
+            began, killed_at = time.monotonic(), 0
+            run = subprocess.Popen(command(flight, out, "--dask", address))
             while run.poll() is None:
                 done = len(find_sidecars(out)) if out.is_dir() else 0
                 if not killed_at and done >= asked.captures // 2:
-                    os.kill(worker_process(nannies[0]).pid, signal.SIGKILL)
-                    os.kill(nannies[0].pid, signal.SIGKILL)
+                    kill_worker(processes[0].pid)
                     killed_at = done
                 time.sleep(0.1)
             seconds = time.monotonic() - began
         finally:
-            for process in (*nannies, scheduler):
+            for process in processes:
                 process.terminate()
-        result = differences(out, {name: contents(path) for name, path in files(alone).items()})
+        result = differences(out, snapshot(alone))
         section.say(
             f"{asked.captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} on a scheduler and two worker processes; one, "
             f"with its nanny, killed by SIGKILL when {killed_at} captures were done: exit code {run.returncode}, "

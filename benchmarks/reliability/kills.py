@@ -7,72 +7,71 @@ are drawn evenly over the time that an undisturbed run takes; SIGKILL goes to th
 workers with it. Compared are all files that a run writes, rasters pixel by pixel, sidecars without the seconds.
 """
 
-import argparse
 import json
-import os
 import random
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Collection
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import psutil
 import rasterio
-from report import Section
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import Section, align, command, parser
 
 from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic import flight as synthetic
 from agalign.values.files import RUN_FILE
 
 CAPTURES, SIZE_PX = 12, (480, 360)
-OPTIONS = ("--layout", "both", "--error-map", "--stac", "-j", "2", "-q")
+OPTIONS = ("--layout", "both", "--error-map", "--stac", "-j", "2")
 CHANGING = {RUN_FILE, "summary.csv", "index.html"}
 """These hold seconds."""
 
 
-def command(flight: Path, out: Path) -> list[str]:
-    return [sys.executable, "-m", "agalign", str(flight), "-o", str(out), *OPTIONS]
-
-
-def without_seconds(value: object) -> object:
+def without(value: object, names: Collection[str]) -> object:
+    """Return a JSON value without the entries of these names."""
     if isinstance(value, dict):
-        return {k: without_seconds(v) for k, v in value.items() if k != "seconds"}
-    return [without_seconds(v) for v in value] if isinstance(value, list) else value
+        return {k: without(v, names) for k, v in value.items() if k not in names}
+    return [without(v, names) for v in value] if isinstance(value, list) else value
 
 
 def contents(path: Path) -> object:
-    """What must be equal: pixels and what is said of them, JSON without times, else the bytes."""
-    if path.suffix in (".tif", ".tiff"):
+    """Return what must be equal: pixels and names of bands, JSON without times, else the bytes."""
+    if path.suffix == ".tif":
         with rasterio.open(path) as source:
             return source.profile["dtype"], source.descriptions, source.read().tobytes()
-    if path.suffix == ".json":
-        return without_seconds(json.loads(path.read_text()))
-    return path.read_bytes()
+    return without(json.loads(path.read_text()), {"seconds"}) if path.suffix == ".json" else path.read_bytes()
 
 
-def files(out: Path) -> dict[str, Path]:
-    return {p.relative_to(out).as_posix(): p for p in out.rglob("*") if p.is_file() and p.name not in CHANGING}
-
-
-def differences(out: Path, expected: dict[str, object]) -> Counter[str]:
-    """Return the numbers of missing, left-over, unreadable and different files."""
-    result: Counter[str] = Counter()
-    here = files(out)
-    result["missing"] = len(expected.keys() - here.keys())
-    result["left over"] = len(here.keys() - expected.keys())
-    for name in expected.keys() & here.keys():
+def snapshot(out: Path, content: Callable[[Path], object] = contents) -> dict[str, object]:
+    """Return the contents of the files of a run by name; the error of an unreadable one."""
+    result: dict[str, object] = {}
+    for path in (p for p in out.rglob("*") if p.is_file() and p.name not in CHANGING):
         try:
-            if contents(here[name]) != expected[name]:
-                result["different"] += 1
-                print("different:", name)
+            result[path.relative_to(out).as_posix()] = content(path)
         except Exception as error:
-            print(name, error)
-            result["corrupt"] += 1
+            result[path.relative_to(out).as_posix()] = error
+    return result
+
+
+def differences(out: Path, expected: dict[str, object], content: Callable[[Path], object] = contents) -> Counter[str]:
+    """Return the numbers of missing, left-over, unreadable and different files."""
+    here = snapshot(out, content)
+    result = Counter({"missing": len(expected.keys() - here), "left over": len(here.keys() - expected)})
+    for name in expected.keys() & here:
+        corrupt = isinstance(here[name], Exception)
+        if corrupt or here[name] != expected[name]:
+            print("corrupt:" if corrupt else "different:", name)
+            result["corrupt" if corrupt else "different"] += 1
     return result
 
 
@@ -99,11 +98,10 @@ def kill_after(seconds: float, argv: list[str], *, workers_too: bool) -> bool:
     time.sleep(seconds)
     running = process.poll() is None
     children = psutil.Process(process.pid).children(recursive=True) if running else []
-    for one in [process.pid, *(c.pid for c in children if workers_too)]:
-        try:
-            os.kill(one, signal.SIGKILL)
-        except ProcessLookupError:
-            continue
+    process.kill()
+    for child in children if workers_too else ():
+        with suppress(psutil.NoSuchProcess):
+            child.kill()
     process.wait()
     psutil.wait_procs(children, timeout=10)
     left = [c for c in children if c.is_running() and c.status() != psutil.STATUS_ZOMBIE]
@@ -113,7 +111,7 @@ def kill_after(seconds: float, argv: list[str], *, workers_too: bool) -> bool:
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = parser(__doc__)
     options.add_argument("--kills", type=int, default=50)
     options.add_argument("--rng-seed", type=int, default=0)
     options.add_argument("--markdown", type=Path)
@@ -123,22 +121,19 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         flight, whole, out = Path(folder, "flight"), Path(folder, "whole"), Path(folder, "out")
         synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
-        began = time.monotonic()
-        subprocess.run(command(flight, whole), check=True)
-        seconds = time.monotonic() - began
-        expected = {name: contents(path) for name, path in files(whole).items()}
+        seconds = align(flight, whole, *OPTIONS)
+        expected = snapshot(whole)
         result: Counter[str] = Counter()
         hit, kept = 0, []
         for number in range(asked.kills):
             shutil.rmtree(out, ignore_errors=True)
             at = rng.uniform(0.02, 1.0) * seconds
-            hit += kill_after(at, command(flight, out), workers_too=bool(number % 2))
+            hit += kill_after(at, command(flight, out, *OPTIONS), workers_too=bool(number % 2))
             torn = whole_sidecars(out)
-            done = subprocess.run([*command(flight, out)[:-1], "--log-json"], capture_output=True, text=True)
+            again = command(flight, out, *OPTIONS, "--log-json")
+            done = subprocess.run(again, capture_output=True, text=True, check=False)
             kept.append(done.stderr.count('"state": "kept"'))
-            here = differences(out, expected) + torn
-            here["bad exit codes"] = int(done.returncode != 0)
-            here = Counter({k: v for k, v in here.items() if v})
+            here = +(differences(out, expected) + torn + Counter({"bad exit codes": int(done.returncode != 0)}))
             print(
                 f"{number + 1}: killed after {at:.1f} s, {kept[-1]} captures kept, {dict(here) or 'equal'}", flush=True
             )

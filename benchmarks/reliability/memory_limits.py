@@ -5,7 +5,6 @@
 A run must finish, or end within a minute with a line that gives the reason. Linux only.
 """
 
-import argparse
 import re
 import resource
 import signal
@@ -14,10 +13,11 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Sequence
 from pathlib import Path
 
-from report import Section
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import Section, command, parser
 
 from agalign.synthetic import flight as synthetic
 
@@ -29,15 +29,18 @@ def run_within(limit_gb: float, flight: Path, out: Path, *options: str) -> tuple
     """(how it ended, its first line, seconds) of a run with so much address space."""
     limit = int(limit_gb * 1e9)
     began = time.monotonic()
-    command = [sys.executable, "-m", "agalign", str(flight), "-o", str(out), "--bands", "green,red", "-q", *options]
     process = subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace",
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)), start_new_session=True,
-    )  # fmt: skip
+        command(flight, out, "--bands", "green,red", *options),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+    )
     try:
         _, errors = process.communicate(timeout=MAX_S)
     except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGKILL)
+        process.kill()
         process.communicate()
         return f"not ended after {MAX_S} s", "", time.monotonic() - began
     lines = errors.replace(f"{out}/", "").replace(f"{flight}/", "").splitlines()
@@ -46,13 +49,13 @@ def run_within(limit_gb: float, flight: Path, out: Path, *options: str) -> tuple
     how = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
     if "Traceback" in errors or "please report" in errors:
         how += ", with a traceback or a request for a report"
-    elif code not in (0,) and not line.startswith("agalign: "):
+    elif code and not line.startswith("agalign: "):
         how += ", without a reason"
     return how, line.removeprefix("agalign: "), time.monotonic() - began
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = parser(__doc__)
     options.add_argument("--from", dest="first_gb", type=float, default=1.0)
     options.add_argument("--to", dest="last_gb", type=float, default=2.0)
     options.add_argument("--step", dest="step_gb", type=float, default=0.05)
@@ -74,17 +77,12 @@ def main() -> None:
                 line = re.sub(r"limited to [0-9.]+ GB", "limited to … GB", line)
                 print(f"-j {jobs} {limit_gb:.2f} GB: {how}, {seconds:.1f} s: {line}", flush=True)
                 rows[jobs, how, line].append((limit_gb, seconds))
-    head = ("jobs", "limit, GB", "runs", "slowest, s", "how it ended", "first line")
-    table = [head]
+    table = [("jobs", "limit, GB", "runs", "slowest, s", "how it ended", "first line")]
     for (jobs, how, line), seen in rows.items():
         limits_gb, seconds_of = zip(*seen, strict=True)
-        table.append((str(jobs), _range(limits_gb), str(len(seen)), f"{max(seconds_of):.0f}", how, line))
+        ends = dict.fromkeys(f"{gb:.2f}" for gb in (min(limits_gb), max(limits_gb)))
+        table.append((str(jobs), " to ".join(ends), str(len(seen)), f"{max(seconds_of):.0f}", how, line))
     section.table(table)
-
-
-def _range(limits_gb: Sequence[float]) -> str:
-    low, high = min(limits_gb), max(limits_gb)
-    return f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}"
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ fork of this process, which has already loaded the program and gives temporary f
 only. Without strace, or where the system does not allow tracing, nothing is measured.
 """
 
-import argparse
 import os
 import random
 import re
@@ -22,6 +21,7 @@ import time
 import traceback
 import warnings
 from collections import Counter, defaultdict
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -31,8 +31,11 @@ from typing import NoReturn
 
 import numpy as np
 import tifffile
-from kills import contents, differences, files, whole_sidecars
-from report import Section
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import Section, parser
+from kills import contents, differences, snapshot, whole_sidecars, without
 
 from agalign.cli import main as cli
 from agalign.products.report import SUMMARY_FILE
@@ -40,18 +43,14 @@ from agalign.synthetic import flight as synthetic
 
 CAPTURES, SIZE_PX = 2, (240, 180)
 OPTIONS = ("--layout", "both", "--error-map", "--stac", "--bands", "green,red", "--relief", "never", "-j", "1", "-q")
-ERRORS = {
-    "write": ("EIO", "ENOSPC", "EINTR"),
-    "pwrite64": ("EIO", "ENOSPC", "EINTR"),
-    "fsync": ("EIO", "ENOSPC", "EINTR"),
-    "rename": ("EIO", "ENOSPC", "EACCES"),
-    "openat": ("EIO", "ENOSPC", "EINTR"),
-    "close": ("EIO", "ENOSPC", "EINTR"),
-}
+_USUAL = "EIO", "ENOSPC", "EINTR"
+ERRORS = dict.fromkeys(("write", "pwrite64", "fsync", "rename", "openat", "close"), _USUAL)
+ERRORS["rename"] = "EIO", "ENOSPC", "EACCES"
 MAX_S = 60
 _PLACES = {273, 279, 324, 325}
 """TIFF tags that may differ between equal images."""
-_CALL = re.compile(r'^(\d+)\s+(\w+)\((?:\d+<([^>]*)>|(?:AT_FDCWD[^,]*, )?"([^"]*)")')
+_SIZES = {"seconds", "bytes", "sha256", "file:size", "file:checksum"}
+_CALL = re.compile(r'^\d+\s+(\w+)\((?:\d+<([^>]*)>|(?:AT_FDCWD[^,]*, )?"([^"]*)")')
 
 
 @dataclass(frozen=True)
@@ -74,48 +73,37 @@ def skip(reason: str) -> NoReturn:
     raise SystemExit
 
 
-def arguments(flight: Path, out: Path) -> list[str]:
-    return ["agalign", str(flight), "-o", str(out), *OPTIONS]
-
-
 def run(argv: list[str], folder: Path, *tracing: str) -> Ending:
     """Run the program in a fork of this process; with arguments of strace, traced by it."""
     errors, trace, modules = folder / "errors.txt", folder / "trace.txt", folder / "modules.txt"
     trace.write_text("")
-    gate, opener = os.pipe()
     pid = os.fork()
     if pid == 0:
-        _run_in_child(argv, errors, modules, gate, opener)
-    os.close(gate)
-    tracer = None
+        _run_in_child(argv, errors, modules)
+    os.waitpid(pid, os.WUNTRACED)
     if tracing:
-        tracer = subprocess.Popen(
-            ["strace", "-f", "-y", *tracing, "-o", str(trace), "-p", str(pid)], stderr=subprocess.PIPE, text=True
-        )
-        if tracer.stderr is None or "attached" not in tracer.stderr.readline():
+        strace = ["strace", "-f", "-y", *tracing, "-o", str(trace), "-p", str(pid)]
+        tracer = subprocess.Popen(strace, stderr=subprocess.PIPE, text=True)
+        if "attached" not in tracer.stderr.readline():
             os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
             skip("strace cannot trace a process here (ptrace is not allowed)")
-    os.write(opener, b"!")
-    os.close(opener)
+    os.kill(pid, signal.SIGCONT)
     code = _exit_code_of(pid)
-    if tracer is not None:
+    if tracing:
         tracer.communicate()
     return Ending(code, errors.read_text(errors="replace"), trace.read_text(errors="replace"))
 
 
-def _run_in_child(argv: list[str], errors: Path, modules: Path, gate: int, opener: int) -> None:
-    """What a process of its own would do from the first line of `main` on."""
+def _run_in_child(argv: list[str], errors: Path, modules: Path) -> None:
+    """Stop until SIGCONT, and do what a process of its own would do from the first line of `main` on."""
     code = 1
     try:
         os.setsid()
-        os.close(opener)
-        target = os.open(errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        os.dup2(target, 2)
+        os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
         numbers = count()
         secrets.token_hex = lambda _bytes=None: f"{next(numbers):016x}"
-        os.read(gate, 1)
+        os.kill(os.getpid(), signal.SIGSTOP)
         sys.argv = argv
         cli.main()
         code = 0
@@ -149,25 +137,13 @@ def _exit_code_of(pid: int) -> int | None:
     return None
 
 
-def calls_below(out: Path, trace: str) -> dict[str, Counter[str]]:
-    """How often each system call has each file or folder below `out` as its argument."""
-    result: dict[str, Counter[str]] = defaultdict(Counter)
+def calls_in(out: Path, trace: str) -> Iterator[tuple[str, str, bool]]:
+    """Yield (name, path, whether strace made it fail) of each system call with a file or folder below `out`."""
     for line in trace.splitlines():
         match = _CALL.match(line)
-        if match is not None:
-            _, name, of_descriptor, path = match.groups()
-            if f"{of_descriptor or path}/".startswith(f"{out}/"):
-                result[name][of_descriptor or path] += 1
-    return result
-
-
-def what_failed(out: Path, trace: str) -> str:
-    """The kind of file that the failed call was for; empty where no call failed."""
-    for line in trace.splitlines():
-        match = _CALL.match(line)
-        if "(INJECTED)" in line and match is not None:
-            return re.sub(r"part-\w+", "part-*", os.path.relpath(match[3] or match[4], out))
-    return ""
+        path = (match[2] or match[3]) if match else ""
+        if match and f"{path}/".startswith(f"{out}/"):
+            yield match[1], path, "(INJECTED)" in line
 
 
 def plan(calls: dict[str, Counter[str]], faults: int, rng: random.Random) -> list[tuple[str, str, str, int]]:
@@ -193,51 +169,29 @@ def _shuffled(calls: Counter[str], rng: random.Random) -> list[tuple[str, int]]:
     return result
 
 
-def tags_of(out: Path) -> dict[str, object]:
-    """All tags of the TIFF files by name, without the positions and sizes of tiles and strips."""
-    result: dict[str, object] = {}
-    for name, path in files(out).items():
-        if path.suffix == ".tif":
-            with tifffile.TiffFile(path) as tiff:
-                result[name] = [(t.code, t.value) for page in tiff.pages for t in page.tags if t.code not in _PLACES]
-    return result
-
-
-def compared(out: Path, expected: dict[str, object], tags: dict[str, object]) -> Counter[str]:
-    """How many files are missing, left over, different; sizes and checksums of rasters with equal pixels may differ.
-
-    The report and the summary hold seconds, and are counted as different where the summary lacks a line.
+def strict_contents(path: Path) -> object:
+    """Return contents with all tags of a TIFF file, but without the positions and sizes of tiles, strips and files: a
+    repeated write may leave a gap.
     """
-    result = differences(out, {name: value for name, value in expected.items() if Path(name).suffix != ".json"})
-    here, wanted = records(out), {name for name in expected if Path(name).suffix == ".json"}
-    result["left over"] -= len(here)
-    summary = out / SUMMARY_FILE
+    if path.suffix == ".json":
+        return without(contents(path), _SIZES)
+    if path.suffix != ".tif":
+        return contents(path)
+    with tifffile.TiffFile(path) as tiff:
+        tags = [(t.code, t.value) for page in tiff.pages for t in page.tags if t.code not in _PLACES]
+    return contents(path), tags
+
+
+def compared(out: Path, expected: dict[str, object]) -> Counter[str]:
+    """Return the numbers of missing, left-over, unreadable and different files; the summary, which holds seconds, is
+    different if it lacks a line.
+    """
+    result, summary = differences(out, expected, strict_contents), out / SUMMARY_FILE
     result["different"] += not summary.exists() or len(summary.read_text().splitlines()) != 1 + CAPTURES
-    result["missing"] += len(wanted - here.keys())
-    result["left over"] += len(here.keys() - wanted)
-    different = [name for name in wanted & here.keys() if here[name] != without_sizes(expected[name])]
-    here_tags = tags_of(out)
-    different += [name for name in tags.keys() & here_tags.keys() if here_tags[name] != tags[name]]
-    result["different"] += len(different)
-    if different:
-        print("different:", *different)
     return result
 
 
-def records(out: Path) -> dict[str, object]:
-    """The contents of the JSON files by name."""
-    return {name: without_sizes(contents(path)) for name, path in files(out).items() if path.suffix == ".json"}
-
-
-def without_sizes(value: object) -> object:
-    """A write that is done again may leave a gap in a TIFF."""
-    if isinstance(value, dict):
-        left_out = ("bytes", "sha256", "file:size", "file:checksum")
-        return {k: without_sizes(v) for k, v in value.items() if k not in left_out}
-    return [without_sizes(v) for v in value] if isinstance(value, list) else value
-
-
-def faults_of(ending: Ending, out: Path, expected: dict[str, object], tags: dict[str, object]) -> Counter[str]:
+def faults_of(ending: Ending, out: Path, expected: dict[str, object]) -> Counter[str]:
     """What is wrong right after a run with a fault."""
     result: Counter[str] = Counter()
     if ending.code is None:
@@ -246,7 +200,7 @@ def faults_of(ending: Ending, out: Path, expected: dict[str, object], tags: dict
     result["torn"] = sum(whole_sidecars(out).values())
     result["traceback"] = int("Traceback" in ending.errors or "please report" in ending.errors)
     if ending.code == 0 and not ending.complaints:
-        result["unnoticed"] = sum(compared(out, expected, tags).values())
+        result["unnoticed"] = sum(compared(out, expected).values())
     elif ending.code not in (1, 3) or not ending.complaints:
         result["bad exit"] = 1
     if any(p.name.startswith(".agalign") for p in out.rglob("*")):
@@ -255,7 +209,7 @@ def faults_of(ending: Ending, out: Path, expected: dict[str, object], tags: dict
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = parser(__doc__)
     options.add_argument("--calls", nargs="+", choices=ERRORS, default=list(ERRORS))
     options.add_argument("--faults", type=int, default=200)
     options.add_argument("--rng-seed", type=int, default=0)
@@ -270,16 +224,18 @@ def main() -> None:
         folder = Path(name).resolve()
         flight, out = folder / "flight", folder / "out"
         synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
-        argv = arguments(flight, out)
+        argv = ["agalign", str(flight), "-o", str(out), *OPTIONS]
         run(argv, folder)
         load_modules_of_run(folder)
         shutil.rmtree(out)
         whole = run(argv, folder, "-e", "trace=" + ",".join(ERRORS))
         if whole.code != 0 or whole.complaints:
             raise SystemExit(f"the run without faults ended with {whole.code}: {whole.errors}")
-        expected = {name: contents(path) for name, path in files(out).items()}
-        tags = tags_of(out)
-        calls = {call: paths for call, paths in calls_below(out, whole.trace).items() if call in asked.calls}
+        expected = snapshot(out, strict_contents)
+        calls: dict[str, Counter[str]] = defaultdict(Counter)
+        for call, path, _ in calls_in(out, whole.trace):
+            if call in asked.calls:
+                calls[call][path] += 1
         print({name: paths.total() for name, paths in calls.items()}, f"{len(expected)} files", flush=True)
         rows: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
         for number, (call, error, path, at) in enumerate(plan(calls, asked.faults, rng), start=1):
@@ -287,11 +243,12 @@ def main() -> None:
             began = time.monotonic()
             inject = f"inject={call}:error={error}:when={at}"
             ending = run(argv, folder, "-P", path, "-e", f"trace={call}", "-e", inject)
-            here = faults_of(ending, out, expected, tags)
+            here = faults_of(ending, out, expected)
             again = run(argv, folder)
-            after = compared(out, expected, tags)
+            after = compared(out, expected)
             after["bad exit"] = int(again.code != 0 or bool(again.complaints))
-            hit = what_failed(out, ending.trace)
+            failed = (os.path.relpath(p, out) for _, p, injected in calls_in(out, ending.trace) if injected)
+            hit = re.sub(r"part-\w+", "part-*", next(failed, ""))
             row = rows[call, error]
             row["runs"] += bool(hit)
             row["refused"] += ending.code in (1, 3) and bool(ending.complaints)

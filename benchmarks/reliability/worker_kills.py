@@ -8,7 +8,6 @@ to 400 kB, so that kills also come while a task or a result is on its way. Then,
 those of a run without kills.
 """
 
-import argparse
 import os
 import random
 import re
@@ -23,11 +22,13 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
 
 import psutil
-from report import Section
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from agalign.errors import WorkerError
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
@@ -51,10 +52,8 @@ def do_tiny(task: Tiny) -> tuple[int, int, bytes]:
 
 
 def make_tiny(rng: random.Random) -> list[Tiny]:
-    def data_size() -> int:
-        return rng.choice([10, 1000, MAX_BYTES])
-
-    return [(n, rng.uniform(0, 0.02), rng.randbytes(data_size()), data_size()) for n in range(TASKS)]
+    sizes = 10, 1000, MAX_BYTES
+    return [(n, rng.uniform(0, 0.02), rng.randbytes(rng.choice(sizes)), rng.choice(sizes)) for n in range(TASKS)]
 
 
 def workers_below(process: psutil.Process) -> list[psutil.Process]:
@@ -78,12 +77,10 @@ class Killer(threading.Thread):
     def run(self) -> None:
         while self.killed < self._maximum and not self._stopped.wait(self._rng.uniform(*self._rest_s)):
             alive = workers_below(self._target)
-            if alive:
-                try:
+            with suppress(psutil.NoSuchProcess):
+                if alive:
                     self._rng.choice(alive).kill()
                     self.killed += 1
-                except psutil.NoSuchProcess:
-                    continue
 
     def stop(self) -> int:
         """How many it has killed."""
@@ -123,75 +120,62 @@ def run_tiny(kills: int, rng: random.Random) -> Counter[str]:
     return result
 
 
+def run_flight(argv: list[str], result: Counter[str], killer_rng: random.Random | None = None) -> tuple[int, str]:
+    """Return (exit code, standard error) of a run, with kills if there is a generator; one that hangs prints what its
+    threads do.
+    """
+    environment = {**os.environ, "PYTHONFAULTHANDLER": "1"}
+    process = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
+    maximum = 0 if killer_rng is None else sys.maxsize
+    killer = Killer(psutil.Process(process.pid), killer_rng or random.Random(), (0.2, 4.0), maximum)
+    killer.start()
+    try:
+        _, errors = process.communicate(timeout=HUNG_S)
+    except subprocess.TimeoutExpired:
+        result["hung"] += 1
+        process.send_signal(signal.SIGABRT)
+        _, errors = process.communicate()
+        print(errors)
+    result["kills"] += killer.stop()
+    return process.returncode, errors
+
+
 def flights(minutes: float, rng: random.Random, folder: Path) -> Iterator[Counter[str]]:
-    """What came of each disturbed run over the same flight."""
+    """Yield the result of each run with kills over the same flight, followed by the same command without."""
     # Each worker of the tiny tasks imports this module: what loads slowly is imported here.
-    from kills import contents, files
+    from common import align, command
+    from kills import differences, snapshot
 
     from agalign.synthetic import flight as synthetic
 
     flight, whole, out = folder / "flight", folder / "whole", folder / "out"
     synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=6)
-    command = [sys.executable, "-m", "agalign", str(flight), "-j", "2", "-q", "-o"]
-    subprocess.run([*command, str(whole)], check=True)
-    expected = {name: contents(path) for name, path in files(whole).items()}
+    align(flight, whole, "-j", "2")
+    expected = snapshot(whole)
     end_s = time.monotonic() + 60 * minutes
     while time.monotonic() < end_s:
         shutil.rmtree(out, ignore_errors=True)
         shutil.copytree(whole / "models", out / "models")  # a run learns for longer than it aligns
-        yield disturbed([*command, str(out)], out, expected, rng)
-
-
-def disturbed(command: list[str], out: Path, expected: dict[str, object], rng: random.Random) -> Counter[str]:
-    """One run with kills, and the same command again."""
-    from kills import differences
-
-    result = Counter(runs=1)
-    with started(command) as process:
-        killer = Killer(psutil.Process(process.pid), rng, (0.2, 4.0), sys.maxsize)
-        killer.start()
-        said = what_it_said(process, result)
-        result["kills"] += killer.stop()
-    told = set(re.findall(r"agalign: (\S+): its worker process was killed \(signal 9", said))
-    finished = {p.relative_to(out).with_suffix("").as_posix() for p in out.rglob("IMG_*.json")}
-    result["reported as killed"] = len(told)
-    if "worker processes one after another ended" in said:
-        result["runs ended with a reason"] += 1
-    else:
-        result["lost"] = max(CAPTURES - len(told | finished), 0)
-    with started(command) as process:
-        what_it_said(process, result)
-    after = differences(out, expected)
-    result["wrong"] = after["missing"] + after["corrupt"] + after["different"] + (process.returncode != 0)
-    result["left over"] = after["left over"]
-    result["tasks"] = CAPTURES
-    return result
-
-
-def started(command: list[str]) -> "subprocess.Popen[str]":
-    environment = {**os.environ, "PYTHONFAULTHANDLER": "1"}
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
-
-
-def what_it_said(process: "subprocess.Popen[str]", result: Counter[str]) -> str:
-    """Standard error of a run; one that hangs prints what its threads do."""
-    try:
-        return process.communicate(timeout=HUNG_S)[1]
-    except subprocess.TimeoutExpired:
-        result["hung"] += 1
-        process.send_signal(signal.SIGABRT)
-        said = process.communicate()[1]
-        print(said)
-        return said
-
-
-def row(name: str, result: Counter[str]) -> tuple[str, ...]:
-    also = ("runs", "tasks", "kills", "reported as killed", "runs ended with a reason", *KINDS)
-    return (name, *(str(result[kind]) for kind in also))
+        result = Counter(runs=1, tasks=CAPTURES)
+        _, errors = run_flight(command(flight, out, "-j", "2"), result, rng)
+        killed = set(re.findall(r"agalign: (\S+): its worker process was killed \(signal 9", errors))
+        finished = {p.relative_to(out).with_suffix("").as_posix() for p in out.rglob("IMG_*.json")}
+        result["reported as killed"] = len(killed)
+        if "worker processes one after another ended" in errors:
+            result["runs ended with a reason"] += 1
+        else:
+            result["lost"] = max(CAPTURES - len(killed | finished), 0)
+        code, _ = run_flight(command(flight, out, "-j", "2"), result)
+        after = differences(out, expected)
+        result["wrong"] = after["missing"] + after["corrupt"] + after["different"] + (code != 0)
+        result["left over"] = after["left over"]
+        yield result
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    from common import Section, parser
+
+    options = parser(__doc__)
     options.add_argument("--kills", type=int, default=1000)
     options.add_argument("--minutes", type=float, default=10.0)
     options.add_argument("--rng-seed", type=int, default=0)
@@ -207,10 +191,12 @@ def main() -> None:
         for one in flights(asked.minutes, rng, Path(folder)):
             real += one
             print({k: v for k, v in one.items() if v}, flush=True)
-    section = Section("worker kills", asked.markdown)
-    heads = ("", "runs", "tasks", "kills", "reported as killed", "ended with a reason", *KINDS)
-    section.table([heads, row("tiny tasks, 8 workers", tiny), row(f"flights of {CAPTURES} captures, 2 workers", real)])
-    if any(counts[kind] for counts in (tiny, real) for kind in KINDS):
+    counted = ("runs", "tasks", "kills", "reported as killed", "runs ended with a reason", *KINDS)
+    results = {"tiny tasks, 8 workers": tiny, f"flights of {CAPTURES} captures, 2 workers": real}
+    rows = [("", *(name.replace("runs ended", "ended") for name in counted))]
+    rows += [(name, *(str(result[kind]) for kind in counted)) for name, result in results.items()]
+    Section("worker kills", asked.markdown).table(rows)
+    if any(counts[kind] for counts in results.values() for kind in KINDS):
         raise SystemExit("something was lost, hung, wrong or left over")
 
 

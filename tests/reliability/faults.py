@@ -806,8 +806,8 @@ FAULTS = (
 
 def main() -> None:
     """The table of docs/reliability.md: the faults after which a run ends with another exit code than 0."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "reliability"))
-    from report import Section
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+    from common import Section
 
     document = Path(sys.argv[2]) if sys.argv[1:2] == ["--markdown"] else None
     rows = [("fault", "exit code", "first message")]
