@@ -1,20 +1,12 @@
 """The output folder of a run, with stacks and sidecars of aligned captures, made without aligning any."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import rasterio
 
-from agalign.products.sidecar import (
-    BandPart,
-    CameraPart,
-    OutputPart,
-    PlacePart,
-    PositionPart,
-    ProductPart,
-    ReferencePart,
-    Sidecar,
-)
+from agalign.products.sidecar import Sidecar
 from agalign.products.sidecar_file import write_sidecar
 
 BANDS = {"Green": 560.0, "Red": 668.0, "NIR": 842.0, "Red edge": 717.0}
@@ -48,23 +40,15 @@ def make_aligned(
 
 
 def _sidecar(name: str, number: int, size_px: tuple[int, int], *, raw: bool) -> Sidecar:
+    """The sidecar of aligned.json with another name, time, place and size."""
     width, height = size_px
-    bands = [
-        BandPart(
-            band=band, wavelength_nm=nm, file=f"{name}_{index}.tif", band_index=1,
-            status="reference" if index == 1 else "aligned", reason=None, seconds=0.1,
-            place=PlacePart(file=f"{name}.tif", band_index=index),
-        )
-        for index, (band, nm) in enumerate(BANDS.items(), start=1)
-    ]  # fmt: skip
-    return Sidecar(
-        schema="agalign/1", agalign="0", capture=name, capture_id="", flight_id="", status="ok", missing_bands=[],
-        captured_at=f"2026-06-21T10:{number // 60 % 60:02d}:{number % 60:02d}",
-        position=PositionPart(latitude=52.0, longitude=5.0 + 1e-4 * number, altitude_m=60.0),
-        camera=CameraPart(make="MicaSense", model="RedEdge-M", serial="1"),
-        reference=ReferencePart(band="Green", file=f"{name}_1.tif", band_index=1, width=width, height=height),
-        bands=bands, settings="",
-        output=OutputPart(file=f"{name}.tif", bytes=None, radiometry=None if raw else "reflectance by light sensor",
-                          crop=(0, 0, width, height), nodata=None if raw else "nan"),
-        products=[ProductPart(kind="stack", file=f"{name}.tif", bytes=1, sha256=f"{number:064x}")],
-    )  # fmt: skip
+    text = (Path(__file__).parent / "aligned.json").read_text(encoding="utf-8").replace("IMG_0001", name)
+    content = json.loads(text)
+    content["captured_at"] = f"2026-06-21T10:{number // 60 % 60:02d}:{number % 60:02d}"
+    content["position"]["longitude"] += 1e-4 * number
+    content["reference"] |= {"width": width, "height": height}
+    content["output"]["crop"] = 0, 0, width, height
+    if raw:
+        content["output"] |= {"radiometry": None, "nodata": None}
+    content["products"][0]["sha256"] = f"{number:064x}"
+    return Sidecar.model_validate(content)

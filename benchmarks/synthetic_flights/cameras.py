@@ -1,93 +1,150 @@
-"""Cameras other than the demo's, with the layouts and tags of real units."""
+"""Cameras other than the demo's, with the layouts, tags and files of real units; cameras.json describes their bands."""
 
-from dataclasses import replace
+import json
+from dataclasses import dataclass
+from pathlib import Path
 
-from agalign.synthetic.cameras import BANDS, REFERENCE
-from agalign.synthetic.rig import BandSpec
-from agalign.synthetic.tags import MicaSenseCamera
-from synthetic_flights.dji import DjiCamera
-from synthetic_flights.sentera import SenteraCamera
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
-MAVIC = DjiCamera("M3M", (
-    BandSpec("Green", 560, 32, 0.125, 0.105, 0.070, 1, (0.0, 0.0, 0.0), (-0.012, -0.009),
-             (-0.081, 0.095, 0.0002, -0.0003, -0.02), (-5.1, 3.4), 0.0),
-    BandSpec("Red", 650, 32, 0.175, 0.060, 0.045, 2, (-0.21, 0.17, -0.11), (0.012, -0.009),
-             (-0.084, 0.098, -0.0001, 0.0002, -0.02), (4.6, 8.2), 0.025),
-    BandSpec("RedEdge", 730, 32, 0.230, 0.310, 0.240, 3, (-0.12, -0.24, 0.08), (-0.012, 0.009),
-             (-0.079, 0.091, 0.0003, -0.0001, -0.03), (-7.7, -2.9), 0.050),
-    BandSpec("NIR", 860, 52, 0.270, 0.510, 0.420, 4, (0.26, -0.09, 0.14), (0.012, 0.009),
-             (-0.086, 0.101, -0.0002, 0.0003, -0.03), (9.3, 5.5), 0.075),
-), 0)  # fmt: skip
-"""Its bands are exposed one after another: at 8 m/s and 28 m up near infra-red moves by 62 px against green between
-opposite headings.
-"""
+from agalign.cameras.tiff_directory import rational
+from agalign.synthetic.rig import BandSpec, CameraSpec, Exposure, to_plane
+from agalign.synthetic.tags import BLACK_LEVEL, EXPOSURE_S, WHITE_LEVEL, MicaSenseCamera, write_tiff
+from agalign.values import geometry
+
+_HERE = Path(__file__).parent
+_DJI, _SENTERA = ((_HERE / name).read_text(encoding="utf-8") for name in ("dji.xmp", "sentera.xmp"))
+_BAND_NAMES = {"Green": "G", "Red": "R", "RedEdge": "RE", "NIR": "NIR"}
+_SERIAL = "SYNTHETIC0000001"
+_TO_COLOUR = 1.7162, (1296.0, 972.0), (2639.9, 1978.0), (2592, 5280)
+"""Of one real Mavic 3M, band frame to colour photograph: scale, a point in each, and their widths in px."""
 
 
-_MS_VIEW = 1.356
-"""2170 px of focal length on 2592."""
-_MS = replace(MAVIC.bands[0], distortion=(0.0, 0.0, 0.0, 0.0, 0.0), view=_MS_VIEW)
-_TO_1280 = 1280 / 2592
+@dataclass(frozen=True)
+class DjiCamera(CameraSpec):
+    """A Mavic 3 Multispectral: a TIFF per band, and a photograph of the colour camera."""
+
+    maker = "DJI"
+    calibrated: bool = True
+    """The mappings of the bands to a common plane are in the tags, not only their optical centres."""
+
+    def capture_name(self, number: int) -> str:
+        return f"DJI_{20260621100000 + number}_{number:04d}"
+
+    def file_name(self, band: BandSpec, number: int) -> str:
+        name = self.capture_name(number)
+        return f"{name}_D.JPG" if band.sees == "colour" else f"{name}_MS_{_BAND_NAMES[band.name]}.TIF"
+
+    def write_band(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
+        """Write (height, width) pixels and their tags; a colour photograph is written band after band."""
+        if band.sees == "colour":
+            self._write_colour(path, pixels, band, exposure)
+            return
+        own = (
+            f'   drone-dji:SensorIndex="{band.rig_index}" {self._plane(band, exposure.size_px)}>\n'
+            f"   <Camera:BandName>{band.name}</Camera:BandName>\n"
+            f"   <Camera:CentralWavelength>{band.wavelength_nm:g}</Camera:CentralWavelength>\n"
+            f"   <Camera:WavelengthFWHM>{band.bandwidth_nm:g}</Camera:WavelengthFWHM>\n"
+        )
+        write_tiff(path, pixels, self, band, exposure, _dji_xmp(band, exposure, exposure.size_px, own), _SERIAL, {}, {})
+
+    def _plane(self, band: BandSpec, size_px: tuple[int, int]) -> str:
+        """The tags that map a band's pixels to the common plane, or to the photograph."""
+        if self.calibrated:
+            return f'drone-dji:CalibratedHMatrix="{_numbers(to_plane(self.bands[self.reference], band, size_px))}"'
+        x, y = (v * size_px[0] / 1280 for v in band.centre_offset_px)
+        scale, here, there, (own_px, colour_px) = _TO_COLOUR
+        reduced = size_px[0] / own_px
+        own, colour = (np.diag([s, s, 1.0]) for s in (reduced, size_px[0] * colour_px / own_px / colour_px))
+        designed = (
+            geometry.translation(*there) @ np.diag([scale, scale, 1.0]) @ geometry.translation(-here[0], -here[1])
+        )
+        return (
+            f'drone-dji:RelativeOpticalCenterX="{x:.5f}" drone-dji:RelativeOpticalCenterY="{y:.5f}" '
+            f'drone-dji:DewarpHMatrix="{_numbers(colour @ designed @ np.linalg.inv(own))}"'
+        )
+
+    def _write_colour(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
+        """Write one plane of a photograph and keep the others; without a file they are dark."""
+        planes = [b.name for b in self.bands if b.sees == "colour"]
+        kept = path.with_suffix(".npy")
+        before = np.load(kept) if kept.is_file() else np.zeros((*pixels.shape, len(planes)), np.uint8)
+        share = np.clip((pixels.astype(np.float32) - BLACK_LEVEL) / (WHITE_LEVEL - BLACK_LEVEL), 0, 1)
+        before[..., planes.index(band.name)] = np.rint(255 * share ** (1 / 2.2))
+        if planes.index(band.name) < len(planes) - 1:
+            np.save(kept, before)
+            return
+        kept.unlink(missing_ok=True)
+        size_px = round(pixels.shape[1] / band.size_ratio[0]), round(pixels.shape[0] / band.size_ratio[1])
+        exif = Image.Exif()
+        exif.update({271: self.maker, 272: self.model, 306: exposure.moment})
+        exif.get_ifd(0x8769).update({0x9003: exposure.moment, 0x920A: band.focal_length_mm, 0xA431: _SERIAL})
+        xmp = _dji_xmp(band, exposure, size_px, ">").encode()
+        Image.fromarray(before).save(path, quality=95, subsampling=0, exif=exif, xmp=xmp)
 
 
-def _centre(x: float, y: float) -> tuple[float, float]:
-    """A RelativeOpticalCenter on 2592 x 1944 as an offset of the principal point."""
-    return x * _TO_1280, y * _TO_1280
-
-
-def _colours(template: BandSpec) -> tuple[BandSpec, ...]:
-    """The three bands of a colour photograph."""
-    shades = ("RGB Red", 620.0, 0.180, 0.070, 0.050), ("RGB Green", 545.0, 0.125, 0.100, 0.070), (
-        "RGB Blue", 460.0, 0.085, 0.045, 0.032,
-    )  # fmt: skip
-    return tuple(
-        replace(template, name=n, wavelength_nm=nm, soil=s, crop=c, tree=t, sees="colour") for n, nm, s, c, t in shades
+def _dji_xmp(band: BandSpec, exposure: Exposure, size_px: tuple[int, int], own: str) -> str:
+    """Return the packet of a band or photograph with what both have in common."""
+    model, pose, (k1, k2, p1, p2, k3) = band.lens(*size_px), exposure.pose, band.distortion
+    x, y = ((n - 1) / 2 for n in band.size_px(size_px))
+    dewarp = model.fx_px, model.fy_px, model.cx_px - x, model.cy_px - y, k1, k2, p1, p2, k3
+    return _DJI.format(
+        pose=pose,
+        pitch_deg=pose.pitch_deg - 90,
+        north_m_s=-pose.velocity_m_s[1],
+        lens=model,
+        x=x,
+        y=y,
+        dewarp=",".join(map(str, dewarp)),
+        uuid=f"synthetic{exposure.number:023d}",
+        own=own,
     )
 
 
-MAVIC_3M = DjiCamera("M3M", (
-    replace(_MS, centre_offset_px=_centre(7.26, 16.83)),
-    replace(_MS, name="Red", wavelength_nm=650, soil=0.175, crop=0.060, tree=0.045, rig_index=2,
-            rig_degrees=(0.0, 0.0, 0.05), baseline_m=(0.012, -0.009), centre_offset_px=_centre(11.32, 3.06),
-            delay_s=0.0128),
-    replace(_MS, name="RedEdge", wavelength_nm=730, soil=0.230, crop=0.310, tree=0.240, rig_index=3,
-            rig_degrees=(0.0, 0.0, -0.08), baseline_m=(-0.012, 0.009), centre_offset_px=_centre(1.15, 24.70),
-            delay_s=0.0256),
-    replace(_MS, name="NIR", wavelength_nm=860, bandwidth_nm=52, soil=0.270, crop=0.510, tree=0.420, rig_index=4,
-            rig_degrees=(0.0, 0.0, 0.0), baseline_m=(0.012, 0.009), centre_offset_px=(0.0, 0.0), delay_s=0.0384),
-    *_colours(replace(_MS, rig_index=0, rig_degrees=(0.0, 0.0, 0.03), baseline_m=(0.0, -0.03), delay_s=-0.01,
-                      distortion=(-0.11, 0.012, 0.0002, -0.0001, -0.02), centre_offset_px=(0.1, 0.0),
-                      size_ratio=(5280 / 2592, 3956 / 1944), view=_MS_VIEW * 5280 / 2592 / 1.7162)),
-), 0, (2592, 1944), calibrated=False)  # fmt: skip
+def _numbers(matrix: NDArray[np.float64]) -> str:
+    return ",".join(f"{v:.9g}" for v in geometry.normalised(matrix).ravel())
+
+
+class SenteraCamera(CameraSpec):
+    """A 6X: a folder per band, registered on board."""
+
+    maker = "Sentera"
+
+    def capture_name(self, number: int) -> str:
+        return f"IMG_{number:05d}"
+
+    def file_name(self, band: BandSpec, number: int) -> str:
+        """With the folder of the band."""
+        spectrum = f"{band.wavelength_nm:.0f}", f"{band.bandwidth_nm:.0f}"
+        folder = "-".join((str(band.rig_index), band.name, *spectrum))
+        return f"{folder}/{'_'.join((self.capture_name(number), *spectrum))}.tif"
+
+    def write_band(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
+        plane = geometry.normalised(to_plane(self.bands[self.reference], band, exposure.size_px))
+        matrix = "".join(f"<rdf:li>{v:.9g}</rdf:li>" for v in plane.ravel())
+        xmp = _SENTERA.format(band=band, capture=f"synthetic{exposure.number:011d}", matrix=matrix)
+        write_tiff(path, pixels, self, band, exposure, xmp, "SY6X0001", {}, {0x829A: rational(EXPOSURE_S)})
+
+
+def _camera(name: str, kind: type[CameraSpec]) -> CameraSpec:
+    """Return a camera of cameras.json."""
+    entry = json.loads((_HERE / "cameras.json").read_text(encoding="utf-8"), object_hook=_tuples)[name]
+    return kind(**{**entry, "bands": tuple(BandSpec(**band) for band in entry["bands"])})
+
+
+def _tuples(entry: dict[str, object]) -> dict[str, object]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
+
+
+MAVIC = _camera("mavic", DjiCamera)
+"""Its bands are exposed one after another: at 8 m/s and 28 m up near infra-red moves by 62 px against green between
+opposite headings.
+"""
+MAVIC_3M = _camera("mavic-3m", DjiCamera)
 """As one real unit is: no CalibratedHMatrix, bands without distortion, and a colour camera that sees 1.19 times as far
 to each side; at 8 m/s and 28 m up near infra-red moves by 32 px against red between opposite headings.
 """
-
-_ALTUM_VIEW = 1.0105
-_ALTUM_BANDS = tuple(replace(b, view=_ALTUM_VIEW) for b in BANDS)
-_LWIR = replace(
-    BANDS[0], name="LWIR", wavelength_nm=11000, bandwidth_nm=6000, soil=0.46, crop=0.20, tree=0.14, rig_index=5,
-    rig_degrees=(0.330743, -0.522099, 0.197540), baseline_m=(0.0, 0.03),
-    distortion=(-0.38696, 0.47842, 0.00367, 0.00041, -0.48929), centre_offset_px=(-9.7, -20.5), sees="heat", view=1.117,
-    tags_off_deg=(0.2, -0.15, 0.1),
-)  # fmt: skip
-ALTUM = MicaSenseCamera(
-    "Altum", (*_ALTUM_BANDS, replace(_LWIR, size_ratio=(160 / 2064, 120 / 1544))), REFERENCE, (2064, 1544)
-)
-ALTUM_PT = MicaSenseCamera("Altum-PT", (
-    *_ALTUM_BANDS,
-    replace(BANDS[1], name="Panchro", wavelength_nm=634.5, bandwidth_nm=463, soil=0.170, crop=0.150, tree=0.110,
-            rig_index=5, rig_degrees=(0.12, 0.21, -0.07), baseline_m=(0.0, 0.02), centre_offset_px=(4.2, -6.1),
-            size_ratio=(4112 / 2064, 3008 / 1544), view=0.988),
-    replace(_LWIR, rig_index=6, size_ratio=(320 / 2064, 256 / 1544)),
-), REFERENCE, (2064, 1544))  # fmt: skip
-
-_NO_LENS = (0.0, 0.0, 0.0, 0.0, 0.0)
-SENTERA_6X = SenteraCamera("6X", tuple(
-    replace(band, name=name, wavelength_nm=nm, bandwidth_nm=width, rig_index=k, distortion=_NO_LENS,
-            rig_degrees=(0.1 * band.rig_degrees[0], 0.1 * band.rig_degrees[1], band.rig_degrees[2]))
-    for k, (band, name, nm, width) in enumerate((
-        (BANDS[0], "Blue", 475.0, 30.0), (BANDS[1], "Green", 550.0, 20.0), (BANDS[2], "Red", 670.0, 30.0),
-        (BANDS[4], "RedEdge", 715.0, 10.0), (BANDS[3], "NIR", 840.0, 20.0),
-    ))
-), 1, (2048, 1536))  # fmt: skip
+ALTUM, ALTUM_PT = (_camera(name, MicaSenseCamera) for name in ("altum", "altum-pt"))
+SENTERA_6X = _camera("6x", SenteraCamera)
 """One folder per band; registered on board except for the parallax and small angles."""

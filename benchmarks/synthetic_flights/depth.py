@@ -37,11 +37,9 @@ _SEEN_THROUGH = 0.02
 """A pixel that a hand covers by more than this share does not show the scene."""
 
 # Lens positions of a RedEdge-M, from the movement of its bands against Green.
-_PLACES_M = {
-    "Blue": (-0.030, 0.0), "Green": (0.0, 0.0), "Red": (0.0, -0.021), "NIR": (-0.030, -0.021),
-    "Red edge": (-0.015, -0.0105),
-}  # fmt: skip
-CLOSE_RANGE = MicaSenseCamera("RedEdge-M", tuple(replace(b, baseline_m=_PLACES_M[b.name]) for b in BANDS), REFERENCE)
+_PLACES_M = (-0.030, 0.0), (0.0, 0.0), (0.0, -0.021), (-0.030, -0.021), (-0.015, -0.0105)
+_BANDS = tuple(replace(band, baseline_m=place_m) for band, place_m in zip(BANDS, _PLACES_M, strict=True))
+CLOSE_RANGE = MicaSenseCamera("RedEdge-M", _BANDS, REFERENCE)
 
 
 @dataclass(frozen=True)
@@ -124,26 +122,6 @@ class Truth:
     """(height, width): depth along the reference's optical axis."""
     bands: Mapping[str, BandTruth]
 
-    def write(self, path: Path) -> None:
-        """Write an .npz file that `read_truth` reads."""
-        arrays = {
-            f"{name}/{part}": getattr(truth, part)
-            for name, truth in self.bands.items()
-            for part in ("moving_px", "hidden", "inside", "moved")
-        }
-        np.savez(path, kind=np.array(self.kind), range_m=self.range_m, **arrays)
-
-
-def read_truth(path: Path) -> Truth:
-    """The truth that `Truth.write` has written."""
-    with np.load(path) as stored:
-        names = dict.fromkeys(key.split("/")[0] for key in stored if "/" in key)
-        bands = {
-            name: BandTruth(*(stored[f"{name}/{part}"] for part in ("moving_px", "hidden", "inside", "moved")))
-            for name in names
-        }
-        return Truth(str(stored["kind"]), stored["range_m"], bands)
-
 
 def view(scene: Scene, band: BandSpec, size_px: tuple[int, int]) -> Field:
     """Reflectances (height, width) as a band sees them, without vignetting and noise."""
@@ -151,14 +129,14 @@ def view(scene: Scene, band: BandSpec, size_px: tuple[int, int]) -> Field:
     eye, patches = seen.eye(band, size_px), seen.at_exposure_of(band)
     x, y = eye.rays(_SAMPLES)
     depth, light = np.full(x.shape, np.inf, np.float32), np.zeros(x.shape, np.float32)
-    tiles = {name: (tile, tile.mean()) for name, tile in reflectances(seen.textures, band).items()}
+    tiles = reflectances(seen.textures, band)
     for patch, box in zip(patches, boxes_of(patches, eye, _SAMPLES), strict=True):
         for hits in hits_of(patch, eye, x, y, box):
             left, top, right, bottom = hits.box
             window = slice(top, bottom), slice(left, right)
             closer = hits.depth_m < depth[window]
             if closer.any():
-                shaded = _shaded(patch, hits, seen.textures, tiles, eye, (x[window], y[window]))
+                shaded = _shaded(patch, hits, seen.textures, tiles[patch.material], eye, (x[window], y[window]))
                 depth[window][closer] = hits.depth_m[closer]
                 light[window][closer] = shaded[closer]
     mean = cv2.resize(cv2.GaussianBlur(light, (0, 0), _BLUR_PX * _SAMPLES), size_px, interpolation=cv2.INTER_AREA)
@@ -169,15 +147,12 @@ def view(scene: Scene, band: BandSpec, size_px: tuple[int, int]) -> Field:
     return np.asarray(mean, np.float32)
 
 
-def _shaded(
-    patch: Patch, hits: Hits, textures: Textures, tiles: Mapping[str, tuple[Field, np.float32]], eye: Eye,
-    rays: tuple[Field, Field],
-) -> Field:  # fmt: skip
-    """Reflectance times light at hits (height, width); misses have any value. `tiles` have their means."""
+def _shaded(patch: Patch, hits: Hits, textures: Textures, tile: Field, eye: Eye, rays: tuple[Field, Field]) -> Field:
+    """Reflectance times light at hits (height, width) of a tile; misses have any value."""
     length_u, length_v = (float(np.linalg.norm(axis)) for axis in (patch.u_m, patch.v_m))
     # Rays that miss a small patch would sample far away, or at infinity.
     u, v = (np.clip(np.nan_to_num(at), -1, 1) for at in (hits.u, hits.v))
-    tile, mean = tiles[patch.material]
+    mean = tile.mean()
     offset_u, offset_v = (t % (len(tile) * textures.texel_m) for t in patch.texture_m)
     u_m, v_m = u * length_u + offset_u, v * length_v + offset_v
     result = mean + (sample(tile, u_m, v_m, textures.texel_m) - mean) * np.float32(patch.contrast)
@@ -264,9 +239,13 @@ def truth_of(scene: Scene, size_px: tuple[int, int], camera: CameraSpec = CLOSE_
 
 
 def write_capture(
-    folder: Path, scene: Scene, number: int = 1, size_px: tuple[int, int] = (640, 480), rng_seed: int = 0,
+    folder: Path,
+    scene: Scene,
+    number: int = 1,
+    size_px: tuple[int, int] = (640, 480),
+    rng_seed: int = 0,
     camera: CameraSpec = CLOSE_RANGE,
-) -> Truth:  # fmt: skip
+) -> Truth:
     """Write a file per band below `folder`, as a RedEdge does, and return the truth."""
     rng = np.random.default_rng(rng_seed)
     images = folder / "0000SET" / "000"

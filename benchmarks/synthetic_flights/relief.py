@@ -73,7 +73,8 @@ class Site:
 
 
 def _down(up: Sequence[float], length_m: float) -> tuple[float, float, float]:
-    return up[0] * length_m, up[1] * length_m, -up[2] * length_m
+    x, y, z = (float(v) * length_m for v in up)
+    return x, y, -z
 
 
 def _turned(xy: Sequence[float], angle: float) -> Vector:
@@ -102,9 +103,14 @@ def box(
 
 
 def plant(
-    site: Site, centre: Sequence[float], size: float, height: float, group: int, gloss: float = 0.0,
+    site: Site,
+    centre: Sequence[float],
+    size: float,
+    height: float,
+    group: int,
+    gloss: float = 0.0,
     leaves_between: tuple[int, int] = (9, 16),
-) -> list[Patch]:  # fmt: skip
+) -> list[Patch]:
     """Leaves around a stem, at several heights and tilts, the higher ones shorter."""
     leaves = []
     count = int(site.rng.integers(*leaves_between))
@@ -120,10 +126,8 @@ def plant(
         lift = np.array([*(-np.sin(tilt) * out), np.cos(tilt)])
         v = 0.38 * length * (np.cos(roll) * np.array([*side, 0.0]) + np.sin(roll) * lift)
         middle = np.array(centre) + (0, 0, height * at) + u * 0.95
-        leaves.append(site.patch(
-            middle.tolist(), u.tolist(), v.tolist(), "leaf", shape="leaf", group=group, gloss=gloss,
-            shade=0.7 + 0.3 * at + site.uniform(-0.1, 0.1),
-        ))  # fmt: skip
+        shade = 0.7 + 0.3 * at + site.uniform(-0.1, 0.1)
+        leaves.append(site.patch(middle, u, v, "leaf", shape="leaf", group=group, gloss=gloss, shade=shade))
     return leaves
 
 
@@ -156,10 +160,10 @@ def _terraces(site: Site) -> list[Patch]:
         here, there = (step * levels[(number + k + offset) % len(levels)] for k in (0, 1))
         middle = _turned((number * width, 0), angle)
         tread = (width - bank) / 2 * _turned((1, 0), angle)
-        result.append(site.patch((*middle, here), (*tread, 0), half.tolist(), str(site.rng.choice(["field", "soil"]))))
+        result.append(site.patch((*middle, here), (*tread, 0), half, str(site.rng.choice(["field", "soil"]))))
         across = _turned(((number + 0.5) * width, 0), angle)
         slope = np.append(bank / 2 * _turned((1, 0), angle), (there - here) / 2)
-        result.append(site.patch((*across, (here + there) / 2), slope.tolist(), half.tolist(), "soil", shade=0.8))
+        result.append(site.patch((*across, (here + there) / 2), slope, half, "soil", shade=0.8))
     return result
 
 
@@ -208,9 +212,9 @@ def _pots(site: Site) -> list[Patch]:
     return result
 
 
-_KINDS: dict[str, Callable[[Site], list[Patch]]] = {
-    "flat": _flat, "terraces": _terraces, "plants": _plants, "boxes": _boxes, "pots": _pots,
-}  # fmt: skip
+_KINDS: dict[str, Callable[[Site], list[Patch]]] = dict(
+    zip((*GEOMETRIES, "pots"), (_flat, _terraces, _plants, _boxes, _pots), strict=True)
+)
 
 
 def make_scene(kind: str, rng_seed: int, *, close: bool = True, width_px: int = 640) -> Scene:

@@ -1,15 +1,16 @@
 """A flight with the faults of a whole season, with its ground truth."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.special import expit
 
 from agalign.synthetic.cameras import REDEDGE
-from agalign.synthetic.flight import Shot, Spoil, write_shots
+from agalign.synthetic.flight import Shot, write_shots
 from agalign.synthetic.ground import Field, Ground, paint_ground
 from agalign.synthetic.rig import CameraSpec, Pose
 from synthetic_flights.cameras import MAVIC
@@ -34,115 +35,84 @@ def make_troubled_flight(
 
 
 def make_two_headings(
-    folder: Path, captures: int = 24, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0,
-    camera: CameraSpec = MAVIC, line: int = _LINE, *, lakes: bool = True,
-) -> Path:  # fmt: skip
+    folder: Path,
+    captures: int = 24,
+    size_px: tuple[int, int] = (1280, 960),
+    rng_seed: int = 0,
+    camera: CameraSpec = MAVIC,
+    line: int = _LINE,
+    *,
+    lakes: bool = True,
+) -> Path:
     """Write a flight of lines to and fro with the camera facing one way, by default one that exposes its bands one
     after another; with `lakes` the captures before and after each turn are over water.
     """
     rng = np.random.default_rng(rng_seed)
+    plain, lake = _capture(camera=camera), _capture("a lake", camera=camera, spoil=water)
     shots = []
     for number in range(captures):
         speed = float(rng.normal(_SPEED_M_S, 0.5)) * (-1) ** (number // line)
         drift = float(rng.normal(0.0, 0.3))
         pose = replace(_pose(rng, number), yaw_deg=float(rng.normal(12.0, 1.5)), velocity_m_s=(drift, -speed))
         turns = lakes and number % line in (0, line - 1) and 0 < number < captures - 1
-        ground = paint_ground(rng, [_above_the_origin(pose)], size_px, camera=camera)
-        shots.append(_shot(pose, ground, *(("a lake",) if turns else ()), spoil=water if turns else None))
+        shots.append((lake if turns else plain)(rng, pose, size_px))
     return write_shots(folder, shots, size_px, camera, rng)
 
 
 def _plan(captures: int) -> list[Make]:
     """What to make of each capture: troubles first and last where they belong, the others spread over the flight."""
-    start: list[Make] = [_panel, _panel, *(_at(h, "take-off") for h in (4.0, 8.0, 13.0, 19.0))]
-    end: list[Make] = [*(_at(h, "landing") for h in (15.0, 6.0)), _panel]
-    between: list[Make] = [
-        _spoilt("a lake", water), _spoilt("a lake", water), _spoilt("fog", fog), _spoilt("fog", fog),
-        _spoilt("blur, 3 px", blur), _spoilt("blur, 3 px", blur), _spoilt("motion, 25 px", motion),
-        _spoilt("noise, 30 %", noise), _spoilt("noise, 30 %", noise), _spoilt("half saturated", half_saturated),
-        _planted, _planted, _planted, _terraces, _terraces, _without("NIR"), _spoilt("NIR lost", nothing, ("NIR",)),
-        _spoilt("Blue lost", nothing, ("Blue",)),
-    ]  # fmt: skip
-    middle: list[Make] = [_plain] * max(0, captures - len(start) - len(end) - len(between))
-    # Of each few captures one is troubled, the first few being good.
-    mixed = list(_interleaved(middle, between))
-    return [*start, *mixed, *end][:captures]
-
-
-def _interleaved(many: list[Make], few: list[Make]) -> Iterator[Make]:
-    spread = np.linspace(0, len(few), len(many) + 1)[1:].astype(int).tolist()
-    given = 0
-    for make, until in zip(many, spread, strict=True):
-        yield make
-        yield from few[given:until]
-        given = until
-    yield from few[given:]
+    panel = _capture("panel", 1.0, change=_with_panel)
+    start = [panel, panel, *(_capture("take-off", height_m) for height_m in (4.0, 8.0, 13.0, 19.0))]
+    end = [*(_capture("landing", height_m) for height_m in (15.0, 6.0)), panel]
+    twice = {"a lake": water, "fog": fog, "blur, 3 px": blur, "motion, 25 px": motion, "noise, 30 %": noise}
+    between = [_capture(name, spoil=spoil) for name, spoil in twice.items() for _ in range(1 + (spoil is not motion))]
+    between += [_capture("half saturated", spoil=half_saturated)]
+    between += [_capture("planted grid", change=_orchard)] * 3 + [_capture("terraces", relief_m=1.5)] * 2
+    between += [_capture("no NIR", without=("NIR",))]
+    between += [_capture(f"{band} lost", spoil=nothing, spoilt=(band,)) for band in ("NIR", "Blue")]
+    plain = [_capture()] * max(0, captures - len(start) - len(end) - len(between))
+    # One of every few captures is degraded, the first few being good.
+    until = np.linspace(0, len(between), len(plain) + 1).astype(int).tolist()
+    mixed = [make for k, one in enumerate(plain) for make in (one, *between[until[k] : until[k + 1]])]
+    return [*start, *mixed, *between[until[-1] :], *end][:captures]
 
 
 def _pose(rng: np.random.Generator, number: int) -> Pose:
-    return Pose(
-        altitude_m=float(rng.normal(_HEIGHT_M, 0.7)), yaw_deg=float(rng.normal(0, 3)), roll_deg=float(rng.normal(0, 2)),
-        pitch_deg=float(rng.normal(0, 2)), east_m=4.0 * (number % 10), north_m=4.0 * (number // 10),
-    )  # fmt: skip
+    altitude_m = float(rng.normal(_HEIGHT_M, 0.7))
+    yaw_deg, roll_deg, pitch_deg = (float(rng.normal(0, std_deg)) for std_deg in (3, 2, 2))
+    return Pose(altitude_m, yaw_deg, roll_deg, pitch_deg, 4.0 * (number % 10), 4.0 * (number // 10))
 
 
-def _ground(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int], relief_m: float = 0.0) -> Ground:
-    """Return the ground below one capture."""
-    return paint_ground(rng, [_above_the_origin(pose)], size_px, relief_m)
+def _capture(
+    trouble: str = "",
+    altitude_m: float | None = None,
+    relief_m: float = 0.0,
+    camera: CameraSpec = REDEDGE,
+    change: Callable[[np.random.Generator, Ground], Ground] | None = None,
+    **more: Any,
+) -> Make:
+    """Return a function that makes a capture over its own ground, which is centred on it. `more` are fields of Shot."""
 
-
-def _above_the_origin(pose: Pose) -> Pose:
-    """Return a separate ground for each capture, centred on it."""
-    return replace(pose, east_m=0.0, north_m=0.0)
-
-
-def _shot(pose: Pose, ground: Ground, trouble: str = "", **more: object) -> Shot:
-    return replace(Shot(_above_the_origin(pose), ground, trouble=trouble), **more)  # type: ignore[arg-type]
-
-
-def _plain(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
-    return _shot(pose, _ground(rng, pose, size_px))
-
-
-def _at(altitude_m: float, trouble: str) -> Make:
     def make(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
-        low = replace(pose, altitude_m=altitude_m)
-        return _shot(low, _ground(rng, low, size_px), trouble)
+        pose = replace(pose, altitude_m=altitude_m or pose.altitude_m, east_m=0.0, north_m=0.0)
+        ground = paint_ground(rng, [pose], size_px, relief_m, camera)
+        return Shot(pose, change(rng, ground) if change else ground, trouble=trouble, **more)
 
     return make
 
 
-def _spoilt(trouble: str, spoil: Spoil, bands: tuple[str, ...] | None = None) -> Make:
-    def make(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
-        return _shot(pose, _ground(rng, pose, size_px), trouble, spoil=spoil, spoilt=bands)
-
-    return make
-
-
-def _without(band: str) -> Make:
-    def make(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
-        return _shot(pose, _ground(rng, pose, size_px), f"no {band}", without=(band,))
-
-    return make
-
-
-def _panel(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
-    """The calibration panel on the ground, held under the camera a metre up."""
-    low = replace(pose, altitude_m=1.0)
-    ground = _ground(rng, low, size_px)
+def _with_panel(_rng: np.random.Generator, ground: Ground) -> Ground:
+    """The calibration panel on the ground."""
     axis = (np.arange(len(ground.crop)) - len(ground.crop) / 2) * ground.metres_per_px
-    x, y = np.meshgrid(axis, axis)
-    square = (np.abs(x) < 0.075) & (np.abs(y) < 0.075)
-    frame = (np.abs(x) < 0.1) & (np.abs(y) < 0.1) & ~square
-    brightness = np.where(square, 2.0, np.where(frame, 0.3, ground.brightness)).astype(np.float32)
-    bare = square | frame
+    distance = np.maximum(*np.abs(np.meshgrid(axis, axis)))
+    bare, square = distance < 0.1, distance < 0.075
+    brightness = np.where(square, 2.0, np.where(bare, 0.3, ground.brightness)).astype(np.float32)
     crop, tree = (np.where(bare, np.float32(0), cover) for cover in (ground.crop, ground.tree))
-    return _shot(low, replace(ground, brightness=brightness, crop=crop, tree=tree), "panel")
+    return replace(ground, brightness=brightness, crop=crop, tree=tree)
 
 
-def _planted(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
-    """An orchard: round trees on a lattice, 2.2 m apart, on mown grass."""
-    ground = _ground(rng, pose, size_px)
+def _orchard(rng: np.random.Generator, ground: Ground) -> Ground:
+    """Round trees on a lattice, 2.2 m apart, on mown grass."""
     side, metre = len(ground.crop), 1 / ground.metres_per_px
     period, angle = 2.2 * metre, float(rng.uniform(0, np.pi))
     axis = np.arange(side, dtype=np.float32)
@@ -150,22 +120,14 @@ def _planted(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> 
     across = (np.cos(angle) * axis[:, None] - np.sin(angle) * axis[None, :]) / period
     row, column = np.floor(along).astype(int), np.floor(across).astype(int)
     # Each tree is a little off the lattice.
-    jitter = 0.03 * rng.normal(size=(2, 512, 512)).astype(np.float32)
-    off = np.hypot(along - row - 0.5 + jitter[0][row % 512, column % 512],
-                   across - column - 0.5 + jitter[1][row % 512, column % 512])  # fmt: skip
+    jitter = 0.03 * rng.normal(size=(2, 512, 512)).astype(np.float32)[:, row % 512, column % 512]
+    off = np.hypot(along - row - 0.5 + jitter[0], across - column - 0.5 + jitter[1])
     tree = expit(30 * (0.32 - off)).astype(np.float32)
-    planted = replace(
-        ground, tree=tree, crop=np.asarray(0.15 * (1 - tree), np.float32), brightness=0.9 + 0.1 * ground.brightness,
-        vigour=0.2 * ground.vigour,
-    )  # fmt: skip
-    return _shot(pose, planted, "planted grid")
+    covers = {"tree": tree, "crop": np.asarray(0.15 * (1 - tree), np.float32)}
+    return replace(ground, **covers, brightness=0.9 + 0.1 * ground.brightness, vigour=0.2 * ground.vigour)
 
 
-def _terraces(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
-    return _shot(pose, _ground(rng, pose, size_px, relief_m=1.5), "terraces")
-
-
-# ---- what becomes of the light
+# ---- changes of the light
 
 
 def water(light: Field, rng: np.random.Generator) -> Field:

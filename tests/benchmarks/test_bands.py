@@ -67,9 +67,11 @@ def test_what_a_grid_leaves_out_it_has_wrong(sets: dict[str, Any]) -> None:
 
 def test_wrong_claims_refusals_and_estimates_without_a_claim_are_counted_apart(sets: dict[str, Any]) -> None:
     rows = [
-        row("1_r.png", homography=shifted(0.1, 0).tolist()), row("1_n.png", homography=shifted(7, 0).tolist()),
-        row("2_r.png"), row("2_n.png", homography=shifted(9, 0).tolist(), claimed="no"),
-    ]  # fmt: skip
+        row("1_r.png", homography=shifted(0.1, 0).tolist()),
+        row("1_n.png", homography=shifted(7, 0).tolist()),
+        row("2_r.png"),
+        row("2_n.png", homography=shifted(9, 0).tolist(), claimed="no"),
+    ]
     (result,) = score.summary(score.score_pairs(rows, sets))
     assert (result.pairs, result.claimed, result.wrong_claims, result.refused, result.unclaimed) == (4, 2, 1, 1, 1)
     assert (result.under_half_px, result.under_1_px) == (0.25, 0.25)
@@ -82,9 +84,11 @@ def test_what_is_left_out_is_refused_and_what_is_not_asked_raises(sets: dict[str
     (result,) = score.summary(score.score_pairs([one], sets))
     assert (result.claimed, result.refused) == (1, 3)
     for rows, problem in (
-        ([one, one], "two rows"), ([row("1_x.png")], "no such pair"), ([{**one, "set": "moon"}], "no set"),
+        ([one, one], "two rows"),
+        ([row("1_x.png")], "no such pair"),
+        ([{**one, "set": "moon"}], "no set"),
         ([row("1_r.png", homography="1 2 3")], "no mapping"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(ValueError, match=problem):
             score.score_pairs(rows, sets)
 

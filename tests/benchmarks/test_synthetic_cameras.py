@@ -19,9 +19,13 @@ from agalign.values import geometry
 pytestmark = pytest.mark.slow
 
 CAMERAS = {
-    "RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "Altum": ALTUM, "Altum-PT": ALTUM_PT,
+    "RedEdge": REDEDGE,
+    "M3M calibrated": MAVIC,
+    "M3M": MAVIC_3M,
+    "Altum": ALTUM,
+    "Altum-PT": ALTUM_PT,
     "6X": SENTERA_6X,
-}  # fmt: skip
+}
 SIZE = 324, 243
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, read_truth, truth_of, view, write_capture
+from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view, write_capture
 from synthetic_flights.materials import make_textures
 from synthetic_flights.patches import Eye, Patch, boxes_of, nearest
 from synthetic_flights.relief import FOOLING, GEOMETRIES, fooling, make_scene
@@ -147,18 +147,6 @@ def test_files_are_a_capture_of_a_rededge(tmp_path: Path, plants: Scene) -> None
         spec = next(b for b in CLOSE_RANGE.bands if b.name == band.name)
         expected = geometry.invert(to_plane(reference, spec, size))
         assert geometry.corner_error_px(rig_seed(capture.reference, band), expected, *size) < 0.01
-
-
-def test_truth_is_written_and_read(tmp_path: Path, plants: Scene) -> None:
-    truth = truth_of(plants, SIZE)
-    truth.write(tmp_path / "truth.npz")
-    stored = read_truth(tmp_path / "truth.npz")
-    assert stored.kind == "plants"
-    np.testing.assert_array_equal(stored.range_m, truth.range_m)
-    assert list(stored.bands) == list(truth.bands)
-    for name, known in truth.bands.items():
-        for part in ("moving_px", "hidden", "inside", "moved", "visible", "scored"):
-            np.testing.assert_array_equal(getattr(stored.bands[name], part), getattr(known, part))
 
 
 @pytest.mark.parametrize("kind", GEOMETRIES)
