@@ -5,7 +5,6 @@
 Writes matches.jpg, aligned.jpg and loss-surface.png to FOLDER, by default docs/figures.
 """
 
-import json
 import sys
 import tempfile
 from dataclasses import replace
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from common import read_ties
 from numpy.typing import NDArray
 
 import agalign
@@ -26,7 +26,7 @@ from agalign.products.drawing import with_text
 from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
-from agalign.values.geometry import Matrix
+from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster
 
 SIZE_PX = (800, 600)
@@ -37,12 +37,9 @@ GREEN, RED = (80, 200, 60), (60, 60, 230)
 def straight_pair(folder: Path) -> tuple[Raster, Raster, Matrix]:
     """Return green and near infrared of one synthetic capture without lens distortion, and the true homography."""
     straight = replace(cameras.REDEDGE, bands=tuple(replace(b, distortion=(0.0,) * 5) for b in cameras.BANDS))
-    capture = json.loads(synthetic.make_flight(folder, 1, SIZE_PX, rng_seed=11, camera=straight).read_text())[
-        "IMG_0001"
-    ]
-    fixed, moving = capture["reference"], "IMG_0001_4.tif"
-    images = [read_image(folder / "0000SET" / "000" / name) for name in (fixed, moving)]
-    return *images, np.array(capture["bands"][moving]["fixed_to_moving"])
+    truth = read_ties(synthetic.make_flight(folder, 1, SIZE_PX, rng_seed=11, camera=straight))
+    fixed, moving = (read_image(folder / "0000SET" / "000" / f"IMG_0001_{index}.tif") for index in (2, 4))
+    return fixed, moving, np.array(truth["IMG_0001_4.tif"]["fixed_to_moving"])
 
 
 def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
@@ -67,9 +64,7 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
     return np.vstack(rows)
 
 
-def draw_matches(
-    fixed: Raster, moving: Raster, here: NDArray[np.float64], there: NDArray[np.float64], right: NDArray[np.bool_]
-) -> NDArray[np.uint8]:  # fmt: skip
+def draw_matches(fixed: Raster, moving: Raster, here: Points, there: Points, right: NDArray) -> NDArray[np.uint8]:
     """Return both images next to each other, with lines between corresponding rows of `here` and `there`, (N, 2)."""
     sheet = np.hstack([cv2.cvtColor(to_8_bit(r), cv2.COLOR_GRAY2BGR) for r in (fixed, moving)])
     beside = np.array([fixed.size_px[0], 0.0])

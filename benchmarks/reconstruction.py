@@ -7,10 +7,8 @@ together: in the common reconstruction the bands of a capture have one pose wher
 which a rig of several cameras took, are the control. `pip install "pycolmap>=4"`; it is no dependency of agalign.
 """
 
-import argparse
 import math
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -18,6 +16,7 @@ from statistics import median
 import cv2
 import numpy as np
 import pycolmap
+from common import parser, print_head, print_row
 from numpy.typing import NDArray
 
 from agalign.cameras import known_cameras
@@ -29,6 +28,8 @@ from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.capture import Band
 
 _SHOWN_PERCENTILES = 0.5, 99.5
+Photos = dict[tuple[str, str], NDArray[np.uint8]]
+"""By capture and band: 8 bits, undistorted to the pinhole camera that all photos share."""
 
 
 @dataclass(frozen=True)
@@ -45,102 +46,69 @@ class Pinhole:
         return f"{k[0, 0]},{k[1, 1]},{k[0, 2] + 0.5},{k[1, 2] + 0.5}"
 
 
-@dataclass(frozen=True)
-class Photo:
-    """One band of one capture in 8 bits, undistorted to the pinhole camera that all photos share."""
-
-    capture: str
-    band: str
-    pixels: NDArray[np.uint8]
-
-    @property
-    def name(self) -> str:
-        """Of its file."""
-        return f"{self.capture}--{self.band}.png"
-
-
-@dataclass(frozen=True)
-class BandPose:
-    """The pose of a band of one capture relative to the reference's."""
-
-    band: str
-    rotation_px: float
-    """The angle between the two, px at the centre of the image."""
-    offset_px: float
-    """The distance of the two centres of projection, px of the ground below."""
-    shift_px: float
-    """Median distance of the scene's points in the two images: over flat ground a rotation and an offset cancel."""
-
-
-def photo_of(capture: str, name: str, band: Band, camera: Pinhole) -> Photo:
+def photo_of(band: Band, camera: Pinhole) -> NDArray[np.uint8]:
     """A band of a file, undistorted by the lens in the file's tags."""
     with open_raster(band.path) as source:
         raw = source.read(band.band_index).astype(np.float32)
     low, high = np.percentile(raw[raw > 0], _SHOWN_PERCENTILES)
     grey = (np.clip((raw - low) / (high - low), 0, 1) * 255).astype(np.uint8)
-    assert band.lens is not None
     distortion = np.array((*band.lens.distortion, *(0.0,) * 8)[:8])
-    maps = cv2.initUndistortRectifyMap(
-        band.lens.matrix, distortion, np.eye(3), camera.matrix, camera.size_px, cv2.CV_32FC1
-    )  # fmt: skip
-    return Photo(capture, name, np.asarray(cv2.remap(grey, *maps, cv2.INTER_CUBIC), np.uint8))
+    new = camera.matrix, camera.size_px, cv2.CV_32FC1
+    maps = cv2.initUndistortRectifyMap(band.lens.matrix, distortion, np.eye(3), *new)
+    return np.asarray(cv2.remap(grey, *maps, cv2.INTER_CUBIC), np.uint8)
 
 
-def aligned_photos(out: Path) -> tuple[list[Photo], Pinhole, str]:
+def aligned_photos(out: Path) -> tuple[Photos, Pinhole, str]:
     """(the band files of a run, their camera, the name of the reference)."""
-    photos: list[Photo] = []
-    camera, reference = None, ""
+    bands: dict[tuple[str, str], Band] = {}
     for path in find_sidecars(out):
         sidecar = read_sidecar(path)
-        reference = sidecar.reference.band
-        for part in sidecar.bands:
-            if part.place is not None:
-                (band,) = read_file(path.parent / part.place.file, known_cameras(), DiscoverOptions()).bands
-                assert band.lens is not None
-                camera = camera or Pinhole(band.lens.matrix, band.size_px)
-                photos.append(photo_of(sidecar.capture, part.band, band, camera))
-    if camera is None:
+        for part in (p for p in sidecar.bands if p.place is not None):
+            (band,) = read_file(path.parent / part.place.file, known_cameras(), DiscoverOptions()).bands
+            bands[sidecar.capture, part.band] = band
+    if not bands:
         raise SystemExit(f"{out}: no band files; run agalign with --layout bands")
-    return photos, camera, reference
+    first = next(iter(bands.values()))
+    camera = Pinhole(first.lens.matrix, first.size_px)
+    return {key: photo_of(band, camera) for key, band in bands.items()}, camera, sidecar.reference.band
 
 
-def original_photos(flight: Path, names: set[str]) -> tuple[list[Photo], Pinhole]:
+def original_photos(flight: Path, names: set[str]) -> tuple[Photos, Pinhole]:
     """(the original bands of these captures, the camera of the first one's reference)."""
     captures = [c for c in discover(flight).captures if c.name in names]
-    lens = captures[0].reference.lens
-    assert lens is not None
-    camera = Pinhole(lens.matrix, captures[0].reference.size_px)
-    return [photo_of(c.name, b.name, b, camera) for c in captures for b in c.bands], camera
+    camera = Pinhole(captures[0].reference.lens.matrix, captures[0].reference.size_px)
+    return {(c.name, b.name): photo_of(b, camera) for c in captures for b in c.bands}, camera
 
 
-def reconstruct(photos: Sequence[Photo], camera: Pinhole) -> pycolmap.Reconstruction | None:
+def reconstruct(photos: Photos, camera: Pinhole) -> pycolmap.Reconstruction | None:
     """The largest model of some photos with a known camera; None where there is none."""
-    options = pycolmap.IncrementalPipelineOptions(
-        ba_refine_focal_length=False, ba_refine_principal_point=False, ba_refine_extra_params=False,
-        min_model_size=2, random_seed=0,
-    )  # fmt: skip
+    fixed = dict.fromkeys(("ba_refine_focal_length", "ba_refine_principal_point", "ba_refine_extra_params"), False)
+    options = pycolmap.IncrementalPipelineOptions(**fixed, min_model_size=2, random_seed=0)
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=camera.params)
+    on_cpu = {"device": pycolmap.Device.cpu}
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         images, database = root / "images", root / "database.db"
         images.mkdir()
-        for one in photos:
-            cv2.imwrite(str(images / one.name), one.pixels)
-        pycolmap.extract_features(
-            database, images, camera_mode=pycolmap.CameraMode.SINGLE, device=pycolmap.Device.cpu,
-            reader_options=pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=camera.params),
-        )  # fmt: skip
-        pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+        for key, pixels in photos.items():
+            cv2.imwrite(str(images / f"{'--'.join(key)}.png"), pixels)
+        mode = pycolmap.CameraMode.SINGLE
+        pycolmap.extract_features(database, images, camera_mode=mode, reader_options=reader, **on_cpu)
+        pycolmap.match_exhaustive(database, **on_cpu)
         models = pycolmap.incremental_mapping(database, images, root / "models", options)
     return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
 
 
-def poses(model: pycolmap.Reconstruction, camera: Pinhole, reference: str) -> list[BandPose]:
-    """The poses of the bands relative to the reference of their capture, where both are in the model."""
-    found = {tuple(i.name.removesuffix(".png").split("--")): i for i in model.images.values() if i.has_pose}
+def poses(model: pycolmap.Reconstruction, camera: Pinhole, reference: str) -> dict[str, list[tuple[float, ...]]]:
+    """The poses of each band relative to the reference of its capture, where both are in the model: median distance of
+    the scene's points in the two images, which over flat ground may be 0 though rotation and offset are not; the angle
+    between the two, px at the centre of the image; and the distance of the two centres of projection, px of the ground.
+    """
+    images = {tuple(i.name.removesuffix(".png").split("--")): i for i in model.images.values() if i.has_pose}
     focal_px = float(camera.matrix[0, 0])
-    result = []
-    for (capture, band), image in found.items():
-        other = found.get((capture, reference))
+    result: dict[str, list[tuple[float, ...]]] = {}
+    for (capture, band), image in sorted(images.items()):
+        other = images.get((capture, reference))
         if band == reference or other is None:
             continue
         one, two = image.cam_from_world(), other.cam_from_world()
@@ -152,56 +120,46 @@ def poses(model: pycolmap.Reconstruction, camera: Pinhole, reference: str) -> li
         distance = float(np.linalg.norm(image.projection_center() - other.projection_center()))
         offset_px = distance / float(np.median(seen_by_other[:, 2])) * focal_px
         shift_px = float(np.median(np.linalg.norm(shifts, axis=1)))
-        result.append(BandPose(band, math.tan(angle) * focal_px, offset_px, shift_px))
+        result.setdefault(band, []).append((shift_px, math.tan(angle) * focal_px, offset_px))
     return result
 
 
-def summary(model: pycolmap.Reconstruction | None, photos: Sequence[Photo]) -> str:
-    """Photos with a pose, points, and the mean reprojection error, as cells of a table."""
+def summary(model: pycolmap.Reconstruction | None, photos: Photos) -> tuple[str, ...]:
+    """Photos with a pose, points, and the mean reprojection error."""
     if model is None:
-        return f"0 of {len(photos)} | - | -"
-    error_px = model.compute_mean_reprojection_error()
-    return f"{model.num_reg_images()} of {len(photos)} | {model.num_points3D()} | {error_px:.2f}"
+        return f"0 of {len(photos)}", "-", "-"
+    error_px = f"{model.compute_mean_reprojection_error():.2f}"
+    return f"{model.num_reg_images()} of {len(photos)}", str(model.num_points3D()), error_px
 
 
-def print_by_band(photos: Sequence[Photo], camera: Pinhole) -> None:
-    """A reconstruction for each band."""
-    print("\n| aligned band by itself | photos with a pose | points | reprojection error, px |\n|---|---|---|---|")
-    for band in dict.fromkeys(p.band for p in photos):
-        own = [p for p in photos if p.band == band]
-        print(f"| {band} | {summary(reconstruct(own, camera), own)} |")
-
-
-def print_together(title: str, photos: Sequence[Photo], camera: Pinhole, reference: str) -> None:
-    """One reconstruction of all bands."""
+def print_together(title: str, photos: Photos, camera: Pinhole, reference: str) -> None:
+    """One reconstruction of all bands; medians and maxima over the captures."""
     model = reconstruct(photos, camera)
     if model is None:
         print(f"\n{title}: no model; do at least three captures overlap?")
         return
-    print(f"\n{title}: {summary(model, photos)}")
-    print(
-        f"\n| band | captures | shift of the scene against {reference}, px | rotation, px | offset, px of the ground |"
-    )
-    print("|---|---|---|---|---|")
-    result = poses(model, camera, reference)
-    for band in sorted({p.band for p in result}):
-        own = [p for p in result if p.band == band]
-        columns = [p.shift_px for p in own], [p.rotation_px for p in own], [p.offset_px for p in own]
-        cells = " | ".join(f"{median(values):.2f}, {max(values):.2f}" for values in columns)
-        print(f"| {band} | {len(own)} | {cells} |")
+    print(f"\n{title}: {' | '.join(summary(model, photos))}\n")
+    shift = f"shift of the scene against {reference}, px"
+    print_head("band", "captures", shift, "rotation, px", "offset, px of the ground")
+    for band, own in sorted(poses(model, camera, reference).items()):
+        print_row(band, len(own), *(f"{median(v):.2f}, {max(v):.2f}" for v in zip(*own, strict=True)))
 
 
 def main() -> None:
-    """Print all tables; shifts, rotations and offsets are median and maximum over the captures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("flight", type=Path)
-    parser.add_argument("out", type=Path)
-    arguments = parser.parse_args()
+    """Print all tables."""
+    options = parser(__doc__)
+    options.add_argument("flight", type=Path)
+    options.add_argument("out", type=Path)
+    asked = options.parse_args()
     pycolmap.logging.minloglevel = 2
     with without_warnings():
-        photos, camera, reference = aligned_photos(arguments.out)
-        originals, their_camera = original_photos(arguments.flight, {p.capture for p in photos})
-    print_by_band(photos, camera)
+        photos, camera, reference = aligned_photos(asked.out)
+        originals, their_camera = original_photos(asked.flight, {capture for capture, _ in photos})
+    print()
+    print_head("aligned band by itself", "photos with a pose", "points", "reprojection error, px")
+    for band in dict.fromkeys(band for _, band in photos):
+        own = {key: pixels for key, pixels in photos.items() if key[1] == band}
+        print_row(band, *summary(reconstruct(own, camera), own))
     print_together("All aligned bands", photos, camera, reference)
     print_together("All original bands", originals, their_camera, reference)
 

@@ -5,19 +5,16 @@
 The scene is rendered, and aligned by the command line twice; FOLDER keeps what was made for the next call.
 """
 
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import cv2
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 import rasterio
+from common import align, pyplot
 from numpy.typing import NDArray
+from PIL import Image
 from relief_score import Sidecar, read_sidecar
 from synthetic_flights.depth import write_capture
 from synthetic_flights.relief import make_scene
@@ -46,8 +43,7 @@ def main() -> None:
 def run(folder: Path, name: str, use: str) -> Sidecar:
     """The sidecar of an alignment."""
     if not (folder / name).is_dir():
-        command = [sys.executable, "-m", "agalign", folder / "flight", "-o", folder / name, "--relief", use, "-q"]
-        subprocess.run(command, check=False)
+        align(folder / "flight", folder / name, "--relief", use)
     return read_sidecar(folder / name)
 
 
@@ -55,10 +51,9 @@ def draw(aligned: Sidecar, flat: Sidecar, path: Path) -> None:
     x0, y0, width, height = aligned.content["output"]["crop"]
     extent = (x0, x0 + width, y0 + height, y0)
     relief = aligned.path.with_suffix(".relief.tif")
-    figure, axes = plt.subplot_mosaic(
-        [["reference", "relief", "before"], ["reference", "relief", "after"]],
-        figsize=(10.4, 3.0), width_ratios=(3.6, 3.95, 1.95), layout="constrained",
-    )  # fmt: skip
+    plt, panels = pyplot(), [["reference", "relief", "before"], ["reference", "relief", "after"]]
+    style = {"figsize": (10.4, 3.0), "width_ratios": (3.6, 3.95, 1.95), "layout": "constrained"}
+    figure, axes = plt.subplot_mosaic(panels, **style)
     axes["reference"].imshow(stretched(band(aligned, "Green")), cmap="gray", extent=extent)
     axes["reference"].set_title("reference band")
     with without_warnings(), rasterio.open(relief) as dataset:
@@ -75,7 +70,8 @@ def draw(aligned: Sidecar, flat: Sidecar, path: Path) -> None:
     for axis in axes.values():
         axis.set(xticks=[], yticks=[])
     figure.savefig(path, dpi=100)
-    compressed(path)
+    # A palette is a third of the size.
+    Image.open(path).convert("RGB").quantize(160, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def detail(sidecar: Sidecar) -> NDArray[np.uint8]:
@@ -101,13 +97,6 @@ def band(sidecar: Sidecar, name: str) -> NDArray[np.float32]:
 def stretched(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
     low, high = np.nanpercentile(pixels, (1, 99))
     return np.asarray(np.nan_to_num((pixels - low) / (high - low)).clip(0, 1) * 255, np.uint8)
-
-
-def compressed(path: Path) -> None:
-    """A palette is a third of the size."""
-    from PIL import Image
-
-    Image.open(path).convert("RGB").quantize(160, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 if __name__ == "__main__":

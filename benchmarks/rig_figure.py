@@ -6,11 +6,8 @@ python benchmarks/rig_figure.py MODEL.safetensors FIGURE.png
 import sys
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from common import pyplot
 
 from agalign.flight.model import load_model
 from agalign.method.device import choose_device
@@ -24,9 +21,9 @@ _TIMES = 800
 def main() -> None:
     model = load_model(Path(sys.argv[1]), lambda: choose_device("cpu"))
     if model.rig is None:
-        sys.exit(f"{sys.argv[1]}: knows no rig")
+        sys.exit(f"{sys.argv[1]}: contains no rig")
     rig, bands = model.rig, list(model.rig.mean)
-    figure, axes = plt.subplots(1, 1 + len(bands), figsize=(3.1 * (1 + len(bands)), 3.2), layout="constrained")
+    figure, axes = pyplot().subplots(1, 1 + len(bands), figsize=(3.1 * (1 + len(bands)), 3.2), layout="constrained")
     plan = axes[0]
     plan.plot(0, 0, "o", color="0.4", markersize=9)
     plan.annotate("reference", (0, 0), textcoords="offset points", xytext=(8, 6), color="0.3")
@@ -48,8 +45,8 @@ def main() -> None:
         points = geometry.lattice(width, height, 13, 10)
         apart = rig.fields[band](points)
         length = np.linalg.norm(apart, axis=1)
-        axis.quiver(*points.T, *(_TIMES * apart.T), length, angles="xy", scale_units="xy", scale=1, cmap="viridis",
-                    clim=(0, 0.25), width=0.006)  # fmt: skip
+        style = {"angles": "xy", "scale_units": "xy", "scale": 1, "cmap": "viridis", "clim": (0, 0.25), "width": 0.006}
+        axis.quiver(*points.T, *(_TIMES * apart.T), length, **style)
         axis.set_title(f"{band}: up to {length.max():.2f} px")
     figure.suptitle(f"{len(rig.captures)} captures; arrows of the lens fields {_TIMES} times as long", fontsize=9)
     figure.savefig(sys.argv[2], dpi=70)

@@ -33,11 +33,11 @@ SIZE_PX = 32, 24
 
 def seeds(folder: Path) -> None:
     """Write the initial corpus of each target."""
+    from synthetic_flights.cameras import ALTUM, MAVIC, MAVIC_3M, SENTERA_6X
+
     from agalign.cameras.tiff_directory import XMP, read_directories
     from agalign.synthetic.cameras import REDEDGE
     from agalign.synthetic.flight import make_flight
-
-    from synthetic_flights.cameras import ALTUM, MAVIC, MAVIC_3M, SENTERA_6X
 
     for target in SHARES:
         (folder / target).mkdir(parents=True)

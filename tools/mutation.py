@@ -20,6 +20,7 @@ import importlib
 import importlib.util
 import json
 import math
+import multiprocessing
 import os
 import shutil
 import signal
@@ -29,9 +30,11 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from queue import Queue
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch reads it when it is imported
 
@@ -51,15 +54,14 @@ ELSEWHERE = {
     "agalign/values/text.py": ("tests/products/test_failures.py",),
 }
 """Modules whose behaviour is also tested outside tests/<package>; those tests run after the package's own."""
-PRELOADED = (
-    "cv2", "defusedxml", "filelock", "jinja2", "numpy", "PIL.Image", "pydantic", "pytest",
-    "rasterio", "rich", "safetensors.torch", "scipy.ndimage", "scipy.optimize", "scipy.spatial", "skimage", "tifffile",
-    "torch", "typer", "xarray",
-)  # fmt: skip
+PRELOADED = ("cv2", "numpy", "pydantic", "pytest", "rasterio", "scipy.optimize", "skimage", "torch", "typer", "xarray")
+"""Libraries that take long to import."""
 NOT_COPIED = (".git", ".*_cache", "__pycache__", ".hypothesis", ".venv", "build", "dist", "site", "*.egg-info")
 TIMEOUT_FACTOR, TIMEOUT_S = 3.0, 30.0
 """A mutant times out after this many times the duration of its tests on unchanged code, plus this many seconds."""
 BASELINE_LIMIT_S = 1800.0
+LOG = Path("../tests.log")
+"""Output of the tests, next to a copy."""
 
 
 @dataclass(frozen=True)
@@ -84,142 +86,108 @@ def files_with_tests(path: str, seconds: dict[str, float], max_seconds: float = 
     return tuple(sorted(files, key=lambda f: (Path(f).name != own, seconds.get(f, 0.0), f)))
 
 
-def run_tests(copy: Path, tests: tuple[str, ...]) -> int:
-    """Run pytest in this (forked) process group on a copy; returns its exit code, 99 where another agalign is found."""
-    os.setsid()
-    log = os.open(copy.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-    os.dup2(log, 1)
-    os.dup2(log, 2)
-    os.chdir(copy)
-    sys.path[:] = [str(copy), *(p for p in sys.path if Path(p).resolve() not in (ROOT, ROOT / "tools"))]
-    os.environ |= {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
-    spec = importlib.util.find_spec("agalign")
-    if spec is None or not Path(spec.origin or "").is_relative_to(copy):
-        return 99
-    import pytest
-
-    options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "-m", "not real", "--hypothesis-seed=0"]
-    return int(pytest.main([*options, *tests]))
-
-
-class Slot:
-    """One copy of the work tree, and the process that runs tests in it."""
-
-    def __init__(self, copy: Path) -> None:
-        self.copy = copy
-        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*NOT_COPIED))
-        subprocess.run([sys.executable, "-m", "compileall", "-q", str(copy / "agalign")], check=True)
-
-    @contextlib.contextmanager
-    def changed(self, path: str, source: str) -> Iterator[None]:
-        """The copy with one module replaced; its time is put back too, so that its compiled file is valid again."""
-        target = self.copy / path
-        before, stat = target.read_bytes(), target.stat()
-        target.write_text(source, encoding="utf-8")
-        try:
-            yield
-        finally:
-            target.write_bytes(before)
-            os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-
-    def start(self, tests: tuple[str, ...]) -> int:
-        """Fork a process that runs the tests; returns its id."""
-        sys.stdout.flush()
-        pid = os.fork()
-        if pid:
-            return pid
-        code = 98
-        try:
-            code = run_tests(self.copy, tests)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
-
-    def status_by_mypy(self, mutant: Mutant) -> str:
-        with self.changed(mutant.path, mutant.source):
-            command = ["mypy", "--cache-dir", str(self.copy.with_name("mypy"))]
-            done = subprocess.run(command, cwd=self.copy, capture_output=True, check=False)
-        return "type error" if done.returncode == 1 else "survived"
-
-
-@dataclass
-class Run:
+@dataclass(frozen=True)
+class Job:
     """Tests of a mutant, or of the unchanged code."""
 
     mutant: Mutant | None
     tests: tuple[str, ...]
     limit_s: float
-    pid: int = 0
-    began: float = 0.0
-    changed: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
-
-    @property
-    def seconds(self) -> float:
-        return time.monotonic() - self.began
-
-    def start(self, slot: Slot) -> None:
-        if self.mutant is not None:
-            self.changed.enter_context(slot.changed(self.mutant.path, self.mutant.source))
-        self.began, self.pid = time.monotonic(), slot.start(self.tests)
+    mypy: bool = False
+    """Also run mypy if the tests pass."""
 
 
-def run_all(slots: list[Slot], runs: list[Run]) -> Iterator[tuple[Run, str]]:
-    """Do the runs, one in each slot at a time; yields each with its status."""
-    busy: dict[int, Run] = {}
-    queue = list(reversed(runs))
+def work_in(copies: "Queue[Path]") -> None:
+    """Take one of the copies of the work tree for this process."""
+    os.chdir(copies.get())
+
+
+def do(job: Job) -> tuple[Job, str, float]:
+    """Run a job in the copy of this process; returns it with its status and seconds."""
+    began = time.monotonic()
+    with changed(job.mutant):
+        status = run_tests(job)
+        if job.mypy and status == "survived":
+            done = subprocess.run(["mypy"], capture_output=True, check=False)
+            status = "type error" if done.returncode == 1 else status
+    return job, status, time.monotonic() - began
+
+
+@contextlib.contextmanager
+def changed(mutant: Mutant | None) -> Iterator[None]:
+    """The copy with one module replaced; its time is put back too, so that its compiled file is valid again."""
+    if mutant is None:
+        yield
+        return
+    target = Path(mutant.path)
+    before, stat = target.read_bytes(), target.stat()
+    target.write_text(mutant.source, encoding="utf-8")
     try:
-        while queue or busy:
-            for k, slot in enumerate(slots):
-                if k not in busy and queue:
-                    busy[k] = queue.pop()
-                    busy[k].start(slot)
-                elif k in busy and (status := _status(busy[k])):
-                    done = busy.pop(k)
-                    done.changed.close()
-                    if status == "broken":
-                        sys.exit(f"{done.tests} could not run:\n{slot.copy.with_suffix('.log').read_text()[-2000:]}")
-                    yield done, status
-            time.sleep(0.05)
+        yield
     finally:
-        for run in busy.values():
-            _kill(run.pid)
+        target.write_bytes(before)
+        os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
-def _status(run: Run) -> str:
-    """Empty while it runs."""
-    pid, raw = os.waitpid(run.pid, os.WNOHANG)
+def run_tests(job: Job) -> str:
+    """Run pytest in a fork of this process; returns the status of the mutant."""
+    deadline_s = time.monotonic() + job.limit_s
+    pid = os.fork()
     if pid == 0:
-        if run.seconds < run.limit_s:
-            return ""
-        _kill(run.pid)
-        return "timeout"
-    code = os.waitstatus_to_exitcode(raw)
-    if code == 0:
-        return "survived"
-    # 5 is pytest's for no tests. Any other code or signal is the change's doing, as the unchanged code passed.
-    return "broken" if code in (5, 98, 99) else "killed"
+        _run_pytest(job.tests)
+    while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
+        if time.monotonic() > deadline_s:
+            os.killpg(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            return "timeout"
+        time.sleep(0.05)
+    code = os.waitstatus_to_exitcode(ended[1])
+    if code in (5, 98, 99):  # 5 is pytest's for no tests
+        raise RuntimeError(f"{job.tests} could not run:\n{LOG.read_text()[-2000:]}")
+    # Any other code or signal is caused by the change, as the unchanged code passed.
+    return "killed" if code else "survived"
 
 
-def _kill(pid: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(pid, signal.SIGKILL)
-    with contextlib.suppress(ChildProcessError):
-        os.waitpid(pid, 0)
+def _run_pytest(tests: tuple[str, ...]) -> None:
+    """End this process with the exit code of pytest, 99 where another agalign is found, 98 without any."""
+    code = 98
+    try:
+        os.setsid()
+        log, here = os.open(LOG, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), Path.cwd()
+        os.dup2(log, 1)
+        os.dup2(log, 2)
+        sys.path[:] = [str(here), *(p for p in sys.path if Path(p).resolve() not in (ROOT, ROOT / "tools"))]
+        os.environ |= {"PYTHONPATH": str(here), "PYTHONDONTWRITEBYTECODE": "1"}
+        spec = importlib.util.find_spec("agalign")
+        if spec is None or not Path(spec.origin or "").is_relative_to(here):
+            os._exit(99)
+        import pytest
+
+        options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "-m", "not real", "--hypothesis-seed=0"]
+        code = int(pytest.main([*options, *tests]))
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
 
 
-def _durations(slots: list[Slot], mutants: list[Mutant], cache: Path) -> dict[str, float]:
+def done_by(pool: Executor, jobs: list[Job]) -> Iterator[tuple[Job, str, float]]:
+    """Jobs with status and seconds, in the order in which they end."""
+    return (future.result() for future in as_completed([pool.submit(do, job) for job in jobs]))
+
+
+def measured(pool: Executor, files: Iterable[str], cache: Path) -> dict[str, float]:
     """Seconds that each file of tests takes on the unchanged code, which must pass; those in `cache` are not run."""
     seconds: dict[str, float] = json.loads(cache.read_text(encoding="utf-8")) if cache.is_file() else {}
-    files = sorted({file for m in mutants for file in files_with_tests(m.path, {})} - set(seconds))
-    for run, status in run_all(slots, [Run(None, (file,), BASELINE_LIMIT_S) for file in files]):
+    jobs = [Job(None, (file,), BASELINE_LIMIT_S) for file in sorted(set(files) - set(seconds))]
+    for job, status, took in done_by(pool, jobs):
         if status != "survived":
-            sys.exit(f"{run.tests[0]} does not pass on the unchanged code")
-        seconds[run.tests[0]] = run.seconds
+            sys.exit(f"{job.tests[0]} does not pass on the unchanged code")
+        seconds[job.tests[0]] = took
         cache.write_text(json.dumps(seconds), encoding="utf-8")
-        print(f"unchanged  {run.seconds:5.1f} s {run.tests[0]}", flush=True)
+        print(f"unchanged  {took:5.1f} s {job.tests[0]}", flush=True)
     return seconds
 
 
@@ -280,23 +248,28 @@ def main() -> None:
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
     sys.dont_write_bytecode = True
+    fork = multiprocessing.get_context("fork")
+    copies: Queue[Path] = fork.Queue()
     with tempfile.TemporaryDirectory(prefix="agalign-mutation-") as folder:
-        copies = [Slot(Path(folder).resolve() / name / "agalign") for name in ("0", "1", "mypy")]
-        slots, for_mypy = copies[:2], copies[2]
-        durations = _durations(slots, todo, asked.results.with_suffix(".durations.json"))
-        runs = []
-        for m in todo:
-            tests = files_with_tests(m.path, durations, asked.max_test_seconds)
-            runs.append(Run(m, tests, TIMEOUT_FACTOR * sum(durations[f] for f in tests) + TIMEOUT_S))
-        for number, (run, status) in enumerate(run_all(slots, runs), start=1):
-            seconds, m = round(run.seconds, 1), run.mutant
-            assert m is not None
-            if status == "survived" and asked.mypy:
-                status = for_mypy.status_by_mypy(m)
-            results[m.key] = Result(m.key, m.path, m.line, m.operator, m.diff, status, seconds)
-            with asked.results.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(results[m.key])) + "\n")
-            print(f"{number}/{len(runs)} {status:9} {seconds:5.1f} s {m.path}:{m.line}", flush=True)
+        for name in ("0", "1"):
+            copy = Path(folder).resolve() / name / "agalign"
+            shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*NOT_COPIED))
+            subprocess.run([sys.executable, "-m", "compileall", "-q", str(copy / "agalign")], check=True)
+            copies.put(copy)
+        with ProcessPoolExecutor(2, fork, work_in, (copies,)) as pool:
+            files = {file for m in todo for file in files_with_tests(m.path, {})}
+            durations = measured(pool, files, asked.results.with_suffix(".durations.json"))
+            jobs = []
+            for m in todo:
+                tests = files_with_tests(m.path, durations, asked.max_test_seconds)
+                limit_s = TIMEOUT_FACTOR * sum(durations[f] for f in tests) + TIMEOUT_S
+                jobs.append(Job(m, tests, limit_s, asked.mypy))
+            for number, (job, status, seconds) in enumerate(done_by(pool, jobs), start=1):
+                m = job.mutant
+                results[m.key] = Result(m.key, m.path, m.line, m.operator, m.diff, status, round(seconds, 1))
+                with asked.results.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(asdict(results[m.key])) + "\n")
+                print(f"{number}/{len(jobs)} {status:9} {seconds:5.1f} s {m.path}:{m.line}", flush=True)
     _print_table([results[m.key] for m in mutants])
 
 

@@ -12,6 +12,7 @@ import sys
 import typing
 from collections.abc import Callable, Iterable
 from enum import Enum
+from functools import cache, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -28,48 +29,54 @@ from agalign.verify.checks import KINDS
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"
 
-SETTINGS = {
-    "--recipe": "joint.recipe", "--sharing": "joint.sharing", "--model-family": "joint.model_family",
-    "--device": "joint.device", "--rng-seed": "joint.rng_seed", "--seed": "seed.force", "--only-seed": "seed.only",
-    "--each-alone": "flight.together", "--accept-predicted": "check.accept_predicted_px", "--relief": "relief.use",
-    "--interpolation": "write.interpolation", "--crop": "write.crop", "--undistort": "write.undistort",
-    "--resolution": "write.resolution", "--layout": "write.layout", "--radiometry": "write.radiometry",
-    "--panel-albedo": "write.panel_albedo", "--index": "write.indices", "--pan-sharpen": "write.pan_sharpen",
-    "--error-map": "write.error_map", "--relief-map": "write.relief_map", "--fill-occluded": "write.fill_occluded",
-    "--tie-points": "write.tie_points", "--qa": "write.qa", "--georeference": "write.georeference",
-    "--ground-elevation": "write.ground_elevation_m", "--stac": "write.stac", "--format": "write.format",
-    "--compression": "write.compression", "--statistics": "write.statistics",
-}  # fmt: skip
-DISCOVER = {
-    "--reference": "reference", "--bands": "bands", "--order": "order", "--with-rgb": "with_rgb",
-    "--pattern": "pattern", "--ignore-metadata": "ignore_metadata", "--include": "include", "--exclude": "exclude",
-    "--max-pixels": "max_pixels",
-}  # fmt: skip
-RUN = {
-    "--jobs": "jobs", "--dask": "executor", "--timeout": "timeout_s", "--overwrite": "overwrite",
-    "--retry-failed": "retry_failed", "--align-panels": "align_panels",
-}  # fmt: skip
+OTHER_NAMES = {
+    "seed.force": "--seed",
+    "seed.only": "--only-seed",
+    "flight.together": "--each-alone",
+    "relief.use": "--relief",
+    "write.indices": "--index",
+    "executor": "--dask",
+}
+"""Options of settings with another name; all others have the name of the setting without its unit."""
+UNIT = re.compile("_(px|m|s)$")
+OWNERS = {
+    "Settings": Settings(),
+    "DiscoverOptions": agalign.DiscoverOptions(),
+    "RunOptions": agalign.RunOptions(),
+}
 COMMAND_LINE_ONLY = ("--model", "--dry-run", "--config", "--quiet", "--verbose", "--log-json")
 
 
-def options(names: dict[str, str], owner: object) -> str:
+def names_of(owner: object) -> dict[str, str]:
+    """{option: setting} of a settings object, in its order."""
+    parts = owner if isinstance(owner, Settings) else [("", owner)]
+    paths = [f"{part}.{name}".lstrip(".") for part, of_part in parts for name in type(of_part).__annotations__]
+    options = {
+        OTHER_NAMES.get(path, "--" + UNIT.sub("", path.split(".")[-1]).replace("_", "-")): path for path in paths
+    }
+    elsewhere = {"--jobs"} if isinstance(owner, agalign.DiscoverOptions) else set()  # it is also one of a run
+    return {option: path for option, path in options.items() if option in command_line_options().keys() - elsewhere}
+
+
+def options(owner: object) -> str:
     """One row per option: its name, the Python name, type, default in Python, and help text."""
     rows = [("option", "Python", "type", "default", "effect")]
     of_command = command_line_options()
-    for option, name in names.items():
-        kind, text = of_command[option]
+    for option, name in names_of(owner).items():
         opposite = " (opposite)" if option == "--each-alone" else ""
-        rows.append((f"`{option}`", f"`{name}`{opposite}", kind, f"`{attrgetter(name)(owner)}`", text))
+        default = f"`{attrgetter(name)(owner)}`"
+        rows.append((f"`{option}`", f"`{name}`{opposite}", of_command[option][0], default, of_command[option][1]))
     if isinstance(owner, agalign.RunOptions):
-        unlisted = of_command.keys() - {*SETTINGS, *DISCOVER, *RUN, *COMMAND_LINE_ONLY, "--out"}
-        if unlisted:
-            raise SystemExit(f"tools/pages.py: say which setting these options are of: {', '.join(sorted(unlisted))}")
+        listed = {option for one in OWNERS.values() for option in names_of(one)}
+        if unlisted := of_command.keys() - {*listed, *COMMAND_LINE_ONLY, "--out"}:
+            raise SystemExit(f"tools/pages.py: no setting has the name of {', '.join(sorted(unlisted))}")
         for option in COMMAND_LINE_ONLY:
             kind, text = of_command[option]
             rows.append((f"`{option}`", "argument `model`" if option == "--model" else "", kind, "", text))
     return table(rows)
 
 
+@cache
 def command_line_options() -> dict[str, tuple[str, str]]:
     """{option: (type, help text)} of `agalign align`."""
     hints = typing.get_type_hints(align)
@@ -145,11 +152,7 @@ def table(rows: Iterable[tuple[str, ...]]) -> str:
 
 
 TABLES: dict[str, dict[str, Callable[[], str]]] = {
-    "options.md": {
-        "Settings": lambda: options(SETTINGS, Settings()),
-        "DiscoverOptions": lambda: options(DISCOVER, agalign.DiscoverOptions()),
-        "RunOptions": lambda: options(RUN, agalign.RunOptions()),
-    },
+    "options.md": {name: partial(options, owner) for name, owner in OWNERS.items()},
     "sidecar.md": {"fields": fields},
     "troubleshooting.md": {"reasons": reasons},
 }
