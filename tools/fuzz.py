@@ -9,7 +9,6 @@ comes to hold more than 500 MB. Inputs begin from the files of a synthetic fligh
 the working folder, as `crash-…`, `timeout-…` or `oom-…`, to be given to `--target` as an argument of its own.
 """
 
-import argparse
 import contextlib
 import logging
 import os
@@ -119,30 +118,28 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
             path.unlink()
         folder.rmdir()
 
-    options = [
-        f"-timeout={MAX_SECONDS}", f"-rss_limit_mb={MAX_MEGABYTES}", f"-max_len={LONGEST_BYTES[target]}",
-        "-print_final_stats=1", "-verbosity=1",
-    ]  # fmt: skip
+    limits = f"-timeout={MAX_SECONDS} -rss_limit_mb={MAX_MEGABYTES} -max_len={LONGEST_BYTES[target]}"
+    options = [*limits.split(), "-print_final_stats=1", "-verbosity=1"]
     test_one = {"xmp": on_xmp, "tags": on_tags, "names": on_names}[target]
     atheris.Setup([sys.argv[0], *options, *arguments, str(corpus)], test_one)
     atheris.Fuzz()
 
 
-def run(target: str, inputs: int, corpus: Path) -> tuple[int, int, int, str]:
-    """(inputs, slowest in seconds, peak MB, how it ended) of a target in a process of its own."""
+def run(target: str, inputs: int, corpus: Path) -> tuple[list[int], str]:
+    """([inputs, slowest in seconds, peak MB], error, if any) of a target in a process of its own."""
     command = [sys.executable, __file__, "--target", target, "--inputs", str(inputs), "--corpus", str(corpus)]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
     stats = {name: int(value) for name, value in re.findall(r"stat::(\w+):\s+(\d+)", done.stdout)}
-    said = done.stdout[done.stdout.find("=== Uncaught") :] if "=== Uncaught" in done.stdout else done.stdout
-    ended = "no failure" if done.returncode == 0 else said[-3000:]
-    return (
-        stats.get("number_of_executed_units", 0), stats.get("slowest_unit_time_sec", 0),
-        stats.get("peak_rss_mb", 0), ended,
-    )  # fmt: skip
+    names = "number_of_executed_units", "slowest_unit_time_sec", "peak_rss_mb"
+    _, found, uncaught = done.stdout.partition("=== Uncaught")
+    error = (found + uncaught if found else done.stdout)[-3000:] if done.returncode else ""
+    return [stats.get(name, 0) for name in names], error
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    from common import Section, parser
+
+    options = parser(__doc__)
     options.add_argument("--inputs", type=int, default=200_000)
     options.add_argument("--target", choices=SHARES)
     options.add_argument("--corpus", type=Path)
@@ -150,22 +147,19 @@ def main() -> None:
     asked, more = options.parse_known_args()
     if asked.target and asked.corpus:
         fuzz(asked.target, asked.corpus, [f"-runs={asked.inputs}", *more])
-    from common import Section
-
     with tempfile.TemporaryDirectory() as folder:
         seeds(Path(folder))
         rows = [("what is fuzzed", "inputs", "failures", "slowest, whole seconds", "most memory, MB", "seconds")]
-        failed = []
+        errors = []
         for target, share in SHARES.items() if asked.target is None else {asked.target: 1.0}.items():
             began = time.monotonic()
-            count, slowest, memory, ended = run(target, round(asked.inputs * share), Path(folder, target))
-            bad = ended != "no failure"
-            failed += [ended] if bad else []
-            took = time.monotonic() - began
-            rows.append((target, str(count), str(int(bad)), str(slowest), str(memory), f"{took:.0f}"))
+            (count, slowest, memory), error = run(target, round(asked.inputs * share), Path(folder, target))
+            errors += [error] if error else []
+            numbers = count, int(bool(error)), slowest, memory, round(time.monotonic() - began)
+            rows.append((target, *map(str, numbers)))
         Section("fuzz", asked.markdown).table(rows)
-        if failed:
-            raise SystemExit("\n".join(failed))
+        if errors:
+            raise SystemExit("\n".join(errors))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
-from itertools import count
+from itertools import count, cycle, islice
 from pathlib import Path
 from typing import NoReturn
 
@@ -147,26 +147,15 @@ def calls_in(out: Path, trace: str) -> Iterator[tuple[str, str, bool]]:
 
 
 def plan(calls: dict[str, Counter[str]], faults: int, rng: random.Random) -> list[tuple[str, str, str, int]]:
-    """(call, error, path, number of the call) of each fault: pairs of call and error in turn, each with its files in
-    turn, as far as there are calls.
+    """(call, error, path, number of the call from 1) of each fault: pairs of call and error in turn, each with a random
+    file, and a random call of those on the file; none twice.
     """
     pairs = [(call, error) for call, errors in ERRORS.items() for error in errors if calls.get(call)]
-    waiting = {pair: _shuffled(calls[pair[0]], rng) for pair in pairs}
-    result: list[tuple[str, str, str, int]] = []
-    while len(result) < faults and any(waiting.values()):
-        result += [(*pair, *waiting[pair].pop()) for pair in pairs if waiting[pair]]
-    return result[:faults]
-
-
-def _shuffled(calls: Counter[str], rng: random.Random) -> list[tuple[str, int]]:
-    """(path, number from 1) of all calls in random order; the last ones are of different paths."""
-    result: list[tuple[str, int]] = []
-    numbers = {path: rng.sample(range(1, of_path + 1), of_path) for path, of_path in calls.items()}
-    while numbers:
-        paths = rng.sample(sorted(numbers), len(numbers))
-        result = [*((path, numbers[path].pop()) for path in paths), *result]
-        numbers = {path: left for path, left in numbers.items() if left}
-    return result
+    result: dict[tuple[str, str, str, int], None] = {}
+    for call, error in islice(cycle(pairs), 10 * faults):
+        path = rng.choice(sorted(calls[call]))
+        result[call, error, path, rng.randint(1, calls[call][path])] = None
+    return list(result)[:faults]
 
 
 def strict_contents(path: Path) -> object:
