@@ -19,7 +19,7 @@ from agalign.synthetic.ground import Field
 from agalign.synthetic.rig import BandSpec, CameraSpec, Exposure, Pose
 from agalign.synthetic.tags import MicaSenseCamera
 from synthetic_flights.materials import Textures, reflectances, sample
-from synthetic_flights.patches import Eye, Hits, Patch, boxes_of, hits_of, nearest
+from synthetic_flights.patches import Eye, Hits, Patch, boxes_of, nearer, nearest
 
 Mask = NDArray[np.bool_]
 
@@ -130,15 +130,9 @@ def view(scene: Scene, band: BandSpec, size_px: tuple[int, int]) -> Field:
     x, y = eye.rays(_SAMPLES)
     depth, light = np.full(x.shape, np.inf, np.float32), np.zeros(x.shape, np.float32)
     tiles = reflectances(seen.textures, band)
-    for patch, box in zip(patches, boxes_of(patches, eye, _SAMPLES), strict=True):
-        for hits in hits_of(patch, eye, x, y, box):
-            left, top, right, bottom = hits.box
-            window = slice(top, bottom), slice(left, right)
-            closer = hits.depth_m < depth[window]
-            if closer.any():
-                shaded = _shaded(patch, hits, seen.textures, tiles[patch.material], eye, (x[window], y[window]))
-                depth[window][closer] = hits.depth_m[closer]
-                light[window][closer] = shaded[closer]
+    for index, hits, window, closer in nearer(patches, eye, x, y, boxes_of(patches, eye, _SAMPLES), depth):
+        tile, rays = tiles[patches[index].material], (x[window], y[window])
+        light[window][closer] = _shaded(patches[index], hits, seen.textures, tile, eye, rays)[closer]
     mean = cv2.resize(cv2.GaussianBlur(light, (0, 0), _BLUR_PX * _SAMPLES), size_px, interpolation=cv2.INTER_AREA)
     hand = scene.hands.get(band.name)
     if hand is not None:

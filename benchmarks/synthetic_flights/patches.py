@@ -163,17 +163,28 @@ def boxes_of(patches: Sequence[Patch], eye: Eye, samples: int = 1, farther_px: f
     return [tuple(row) for row in np.rint(ends * samples).astype(int).tolist()]  # type: ignore[misc]
 
 
+def nearer(
+    patches: Sequence[Patch], eye: Eye, x: Floats, y: Floats, boxes: Sequence[Box], depth_m: Floats
+) -> Iterator[tuple[int, Hits, tuple[slice, slice], NDArray[np.bool_]]]:
+    """Yield (index of the patch, hits, their rows and columns, where they are nearer than those before) and update
+    `depth_m`, which is inf for rays that meet nothing.
+    """
+    for index, (patch, box) in enumerate(zip(patches, boxes, strict=True)):
+        for hits in hits_of(patch, eye, x, y, box):
+            left, top, right, bottom = hits.box
+            window = slice(top, bottom), slice(left, right)
+            closer = hits.depth_m < depth_m[window]
+            if closer.any():
+                depth_m[window][closer] = hits.depth_m[closer]
+                yield index, hits, window, closer
+
+
 def nearest(
     patches: Sequence[Patch], eye: Eye, x: Floats, y: Floats, boxes: Sequence[Box]
 ) -> tuple[Floats, NDArray[np.int32]]:
     """(depth along the optical axis in m, index of the patch) of what each ray meets first; inf and -1 for nothing."""
     depth = np.full(x.shape, np.inf)
     index = np.full(x.shape, -1, np.int32)
-    for number, (patch, box) in enumerate(zip(patches, boxes, strict=True)):
-        for hits in hits_of(patch, eye, x, y, box):
-            left, top, right, bottom = hits.box
-            window = slice(top, bottom), slice(left, right)
-            closer = hits.depth_m < depth[window]
-            depth[window][closer] = hits.depth_m[closer]
-            index[window][closer] = number
+    for number, _, window, closer in nearer(patches, eye, x, y, boxes, depth):
+        index[window][closer] = number
     return depth, index
