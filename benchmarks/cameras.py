@@ -2,7 +2,7 @@
 
 python benchmarks/cameras.py [CAPTURES] [CAMERA ...]
 
-Cameras are painted with half of their pixels along each side but for the Altum, whose thermal band is small as it is.
+Cameras are rendered with half of their pixels along each side, but the Altum, with its small thermal band, with all.
 """
 
 import sys

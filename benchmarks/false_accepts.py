@@ -3,9 +3,9 @@
     python benchmarks/false_accepts.py [pairs, by default 200] [first]
 
 The bad: two different fields, two captures of one field at different places, water (a moving texture of its own in
-each image), 8 % of overlap, a band that is almost all saturated, and one of which a third lies 15 px apart. The good: a
-rig's usual offset, blurred, noisy, partly saturated, shifted by 5 % of the image. Between them planted grids without a
-seed, as in lattices.py: aligned is wrong where it is a period away. Truth comes from the generator.
+each image), 8 % of overlap, a band that is almost all saturated, and one with a third of it displaced by 15 px. The
+good: a rig's usual offset, blurred, noisy, partly saturated, shifted by 5 % of the image. Between them planted grids
+without a seed, as in lattices.py: aligned is wrong where it is a period away. Truth comes from the generator.
 """
 
 import sys
@@ -67,7 +67,7 @@ def pair(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
     seed = None
     if kind == "all but saturated":
         return fixed, saturated(other_view, 0.01), None, None
-    if kind == "a third lies apart":
+    if kind == "a third displaced":
         third = SIZE[0] // 3
         other_view = other_view.copy()
         other_view[:, -third:] = np.roll(other_view, 15, axis=0)[:, -third:]
@@ -87,11 +87,11 @@ def pair(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
 
 
 def saturated(image: np.ndarray, share: float) -> np.ndarray:
-    """Return an image whose pixels above a quantile are saturated."""
+    """Return an image with saturated pixels above a quantile."""
     return np.where(image > np.quantile(image, share), 65535, image).astype(np.uint16)
 
 
-BAD = ("another field", "another place of the field", "water", "8 % overlap", "all but saturated", "a third lies apart")
+BAD = ("another field", "another place of the field", "water", "8 % overlap", "all but saturated", "a third displaced")
 GRID = "planted grid"
 GOOD = ("as it comes", "blurred", "noisy", "partly saturated", "5 % off")
 

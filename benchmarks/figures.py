@@ -67,8 +67,8 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
 def draw_matches(fixed: Raster, moving: Raster, here: Points, there: Points, right: NDArray) -> NDArray[np.uint8]:
     """Return both images next to each other, with lines between corresponding rows of `here` and `there`, (N, 2)."""
     sheet = np.hstack([cv2.cvtColor(to_8_bit(r), cv2.COLOR_GRAY2BGR) for r in (fixed, moving)])
-    beside = np.array([fixed.size_px[0], 0.0])
-    for one, other, is_right in zip(here, there + beside, right, strict=True):
+    right_of = np.array([fixed.size_px[0], 0.0])
+    for one, other, is_right in zip(here, there + right_of, right, strict=True):
         colour = GREEN if is_right else RED
         ends = [(round(float(x)), round(float(y))) for x, y in (one, other)]
         cv2.line(sheet, *ends, colour, 1, cv2.LINE_AA)

@@ -2,9 +2,9 @@
 
     python benchmarks/lost_bands.py FLIGHT...
 
-FLIGHT holds a flight whose captures have reference ties in ties.json. In one run each capture loses another band, to
-noise; in another one whole capture is water. Errors are medians over the ties of the written bands, next to the
-standard error in the sidecar.
+FLIGHT holds a flight with reference tie points of its captures in ties.json. In one run each capture loses another
+band, to noise; in another one whole capture is water. Errors are medians over the ties of the written bands, next to
+the standard error in the sidecar.
 """
 
 import json

@@ -3,7 +3,7 @@
     python tools/licences.py           # writes; everything of pyproject.toml must be installed
     python tools/licences.py --check   # exit code 1 where the page lacks a library, or one that is not permissive
 
-The check bears libraries that are not installed, and licences that are only spelt otherwise than in the table.
+The check allows libraries that are not installed, and other spellings of a licence than in the table.
 """
 
 import re
@@ -83,7 +83,7 @@ def check(wanted: dict[str, tuple[str, str]], table: str) -> list[str]:
         except PackageNotFoundError:
             continue
         if NOT_PERMISSIVE.search(said) and result not in page:
-            problems.append(f"{result} is under {said}: say so in docs/licences.md")
+            problems.append(f"{result} is under {said}: add it to docs/licences.md")
     return problems
 
 

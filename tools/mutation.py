@@ -53,7 +53,7 @@ ELSEWHERE = {
     "agalign/values/mapping.py": ("tests/pixels/test_resample.py",),
     "agalign/values/text.py": ("tests/products/test_failures.py",),
 }
-"""Modules whose behaviour is also tested outside tests/<package>; those tests run after the package's own."""
+"""Modules that are also tested outside tests/<package>; those tests run after the package's own."""
 PRELOADED = ("cv2", "numpy", "pydantic", "pytest", "rasterio", "scipy.optimize", "skimage", "torch", "typer", "xarray")
 """Libraries that take long to import."""
 NOT_COPIED = (".git", ".*_cache", "__pycache__", ".hypothesis", ".venv", "build", "dist", "site", "*.egg-info")

@@ -1,4 +1,4 @@
-"""Scores what a method says of band pairs against their truth. Needs numpy and scipy, and nothing of agalign.
+"""Scores the mappings of band pairs by a method against their truth. Needs numpy and scipy, and not agalign.
 
     python benchmarks/bands/score.py RESULTS [-o TABLE.csv] [--sets FOLDER]
 
@@ -6,7 +6,7 @@ RESULTS is CSV with a header, or JSON with a list of objects. A row is a band pa
 one), and `homography` (nine numbers, row by row) or `grid` (JSON {"reference_px": [[x, y], ...], "moving_px": ...}:
 where the mapping sends some pixels of the reference). Both map a raw pixel of the reference file to a raw pixel of the
 moving file: x right, y down, (0, 0) the centre of the top-left pixel. A row with neither is a refusal. Optional are
-`method`, `variant`, `seconds`, and `claimed`: "no" for an estimate that the method itself does not vouch for.
+`method`, `variant`, `seconds`, and `claimed`: "no" for an estimate that the method itself does not accept.
 """
 
 import argparse
@@ -87,7 +87,7 @@ class Score:
     """Claimed, and more than 1 px off in the median."""
     refused: int
     unclaimed: int
-    """Estimates that the method does not vouch for; neither claims nor refusals."""
+    """Estimates that the method does not accept; neither claims nor refusals."""
     under_half_px: float
     under_1_px: float
     median_px: float
@@ -182,7 +182,7 @@ def _inside(points_px: Points, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     return np.asarray(((points_px >= 0) & (points_px <= np.subtract(size_px, 1))).all(axis=1))
 
 
-# ---- what a method says
+# ---- results of a method
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:
@@ -194,7 +194,7 @@ def read_results(path: Path) -> list[dict[str, Any]]:
 
 
 def _decoded(value: Any) -> Any:
-    """A cell of a CSV file as the JSON value that it stands for."""
+    """Return the JSON value in a cell of a CSV file."""
     if not isinstance(value, str):
         return value
     return json.loads(value) if value.lstrip().startswith(("[", "{")) else [float(v) for v in value.split()]

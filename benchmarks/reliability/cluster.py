@@ -1,5 +1,5 @@
-"""A Dask cluster of two worker processes on this machine, one of which is killed half-way: is every capture done, and
-are the files equal to those of a run without a cluster?
+"""A Dask cluster on this machine that loses one of its two worker processes half-way: is every capture done, and are
+the files equal to those of a run without a cluster?
 
     python benchmarks/reliability/cluster.py [--captures 40] [--markdown FILE]
 """

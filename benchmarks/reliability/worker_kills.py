@@ -4,7 +4,7 @@
 
 First the pool alone: eight workers on however many cores, tasks of some milliseconds with arguments and results of up
 to 400 kB, so that kills also come while a task or a result is on its way. Then, for so many minutes, runs of
-`agalign -j 2` over a small flight. After each run the same command goes on undisturbed, and every file is compared with
+`agalign -j 2` over a small flight. After each run the same command runs undisturbed, and every file is compared with
 those of a run without kills.
 """
 

@@ -88,7 +88,7 @@ def _turned(xy: Sequence[float], angle: float) -> Vector:
 def box(
     site: Site, centre: Sequence[float], half: Sequence[float], angle: float, material: str, **more: object
 ) -> list[Patch]:
-    """The top and the four walls of a box that stands on `centre`; `half` is half its length, half its width, and its
+    """The top and the four walls of a box with its base at `centre`; `half` is half its length, half its width, and its
     height.
     """
     x, y, base = centre
