@@ -30,6 +30,17 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
+def parsed(description: str | None, *paths: str, **options: int | float | bool | None) -> argparse.Namespace:
+    """Parse the command line: `paths` are positional, `options` have defaults of their type; None is a path."""
+    result = parser(description)
+    for name in paths:
+        result.add_argument(name, type=Path)
+    for name, default in options.items():
+        kind = {"action": "store_true"} if default is False else {"type": Path if default is None else type(default)}
+        result.add_argument("--" + name.replace("_", "-"), default=default, **kind)
+    return result.parse_args()
+
+
 # ---- tables
 
 

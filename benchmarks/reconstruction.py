@@ -16,7 +16,7 @@ from statistics import median
 import cv2
 import numpy as np
 import pycolmap
-from common import parser, print_head, print_row
+from common import parsed, print_head, print_row
 from numpy.typing import NDArray
 
 from agalign.cameras import known_cameras
@@ -147,10 +147,7 @@ def print_together(title: str, photos: Photos, camera: Pinhole, reference: str) 
 
 def main() -> None:
     """Print all tables."""
-    options = parser(__doc__)
-    options.add_argument("flight", type=Path)
-    options.add_argument("out", type=Path)
-    asked = options.parse_args()
+    asked = parsed(__doc__, "flight", "out")
     pycolmap.logging.minloglevel = 2
     with without_warnings():
         photos, camera, reference = aligned_photos(asked.out)

@@ -20,7 +20,7 @@ from statistics import mean, median
 
 import cv2
 from bands.images import read
-from common import command, parser, print_head, print_row
+from common import command, parsed, print_head, print_row
 from peers import UnavailableError, method_named, sift
 
 from agalign.cameras.discover import discover
@@ -64,10 +64,7 @@ def runs(flight: Path) -> list[tuple[float, str]]:
 
 
 def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("flight", type=Path)
-    options.add_argument("--peers", action="store_true")
-    asked = options.parse_args()
+    asked = parsed(__doc__, "flight", peers=False)
     cv2.setNumThreads(1)
     captures = discover(asked.flight).captures
     middle = captures[len(captures) // 2]  # the first may show the sky or a panel

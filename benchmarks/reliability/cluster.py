@@ -15,7 +15,7 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, align, command, parser
+from common import Section, align, command, parsed
 from kills import differences, snapshot
 
 from agalign.products.sidecar_file import find_sidecars
@@ -38,10 +38,7 @@ def kill_worker(nanny_pid: int) -> None:
 
 
 def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("--captures", type=int, default=40)
-    options.add_argument("--markdown", type=Path)
-    asked = options.parse_args()
+    asked = parsed(__doc__, captures=40, markdown=None)
     section = Section("cluster", asked.markdown)
     with tempfile.TemporaryDirectory() as folder:
         flight, alone, out = Path(folder, "flight"), Path(folder, "alone"), Path(folder, "out")

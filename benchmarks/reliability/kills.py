@@ -25,7 +25,7 @@ import rasterio
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, align, command, parser
+from common import Section, align, command, parsed
 
 from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic import flight as synthetic
@@ -111,11 +111,7 @@ def kill_after(seconds: float, argv: list[str], *, workers_too: bool) -> bool:
 
 
 def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("--kills", type=int, default=50)
-    options.add_argument("--rng-seed", type=int, default=0)
-    options.add_argument("--markdown", type=Path)
-    asked = options.parse_args()
+    asked = parsed(__doc__, kills=50, rng_seed=0, markdown=None)
     section, rng = Section("kills", asked.markdown), random.Random(asked.rng_seed)
     np.seterr(all="ignore")
     with tempfile.TemporaryDirectory() as folder:

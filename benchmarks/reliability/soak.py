@@ -14,7 +14,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, flight_and_out, parser, watched
+from common import Section, command, flight_and_out, parsed, watched
 
 from agalign.synthetic import flight as synthetic
 
@@ -24,11 +24,7 @@ QUANTITIES = {"memory of all processes, MB": 2, "open files of all processes": 3
 
 
 def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("--captures", type=int, default=1000)
-    options.add_argument("--jobs", type=int, default=2)
-    options.add_argument("--markdown", type=Path)
-    asked = options.parse_args()
+    asked = parsed(__doc__, captures=1000, jobs=2, markdown=None)
     section = Section("soak", asked.markdown)
     with flight_and_out() as (flight, out):
         synthetic.make_flight(flight, asked.captures, SIZE_PX, rng_seed=1)

@@ -173,14 +173,9 @@ def flights(minutes: float, rng: random.Random, folder: Path) -> Iterator[Counte
 
 
 def main() -> None:
-    from common import Section, parser
+    from common import Section, parsed
 
-    options = parser(__doc__)
-    options.add_argument("--kills", type=int, default=1000)
-    options.add_argument("--minutes", type=float, default=10.0)
-    options.add_argument("--rng-seed", type=int, default=0)
-    options.add_argument("--markdown", type=Path)
-    asked = options.parse_args()
+    asked = parsed(__doc__, kills=1000, minutes=10.0, rng_seed=0, markdown=None)
     rng = random.Random(asked.rng_seed)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     warnings.simplefilter("ignore")  # of rasters without georeference
