@@ -29,7 +29,6 @@ def test_micasense_lens_is_the_generators(flight: Path) -> None:
     bands = micasense_bands(flight)
     for spec in cameras.BANDS:
         expected, result = spec.lens(480, 360), bands[spec.name].lens
-        assert result is not None
         np.testing.assert_allclose(
             [result.fx_px, result.cx_px, result.cy_px], [expected.fx_px, expected.cx_px, expected.cy_px], atol=1e-4
         )
@@ -68,7 +67,6 @@ def test_focal_length_of_old_firmware_is_in_pixels() -> None:
     new = tags(PerspectiveFocalLength="5.45", PrincipalPoint="2.4,1.8", PerspectiveFocalLengthUnits="mm")
     for result, expected in ((old, 1451.8), (new, 5.45 * 266.666667)):
         (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), result, INFO)
-        assert band.lens is not None
         assert band.lens.fx_px == pytest.approx(expected)
 
 

@@ -114,7 +114,7 @@ def test_the_error_of_a_rig_is_converted_to_px_of_the_reference(monkeypatch: pyt
     band, size = "LWIR", (800, 600)
     rig = Rig(size, {band: np.diag([0.1, 0.1, 1.0])}, {band: (1.0, 0.0)}, {}, {}, (), (), {band: 0.5})
     monkeypatch.setattr(band_pair, "unobserved_error_px", lambda *_, **__: 0.5)
-    model = FlightModel(None, "", (band,), {}, "", rig)  # type: ignore[arg-type]
+    model = FlightModel(None, "", (band,), {}, "", rig)
     assert _candidate_std_px(band, model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
 
 

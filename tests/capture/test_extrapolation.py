@@ -77,7 +77,6 @@ def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error() -> None
     error_px = np.sqrt((errors_px(after, points) ** 2).mean())
     assert error_px < 0.5 < np.sqrt((errors_px(before, points[right]) ** 2).mean())
     prediction = after.prediction
-    assert prediction is not None
     assert prediction.source == "windows"
     assert 0.5 * error_px < prediction.std_px < 1.0
     expected = expected_error_px(after, SIZE, points)
@@ -116,6 +115,5 @@ def test_half_masked_arrays_are_predicted() -> None:
     fixed, moving = distorted_images()
     result = agalign.align(fixed, moving, fixed_valid=valid_in(RIGHT), moving_valid=valid_in(RIGHT))
     assert result.status == "predicted"
-    assert result.prediction is not None
     assert (errors_px(result, geometry.lattice(*SIZE, 17, 13)) ** 2).mean() < (2 * result.prediction.std_px) ** 2
     assert agalign.align(fixed, moving).status == "aligned"

@@ -62,7 +62,6 @@ def align_reduced(capture: Capture, monkeypatch: pytest.MonkeyPatch, longest_sid
 def error_px(result: dict[str, Alignment]) -> float:
     nir = result["nir"]
     assert nir.status == "aligned"
-    assert nir.residual is not None
     assert nir.residual.centres_px.max() > 1000  # px of the file
     return geometry.corner_error_px(nir.fixed_to_moving, TRUTH, *SIZE)
 
@@ -96,7 +95,6 @@ def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture:
     good = aligned_on_reduced_images()
     better = refined(capture, good)
     assert geometry.corner_error_px(better.fixed_to_moving, TRUTH, *SIZE) < 0.05
-    assert better.joint is not None
     assert better.joint.corner_std_px < 0.1
     assert good.joint is not None
     unsure = replace(good, joint=replace(good.joint, retrieval=0.05))
@@ -115,7 +113,6 @@ def test_the_windows_that_verify_share_no_pixel_with_those_of_the_fit(
 
     monkeypatch.setattr(window_fit, "fit_windows", recorded)
     residual = refined(capture, aligned_on_reduced_images()).residual
-    assert residual is not None
     assert len(residual.centres_px) > 50
     apart = np.abs(residual.centres_px[:, None] - np.concatenate(fitted)[None]).max(axis=-1)
     assert apart.min() >= 80  # the side of the windows
@@ -125,7 +122,6 @@ def test_the_distance_from_the_prediction_is_that_of_the_refined_result(capture:
     expected = geometry.compose(TRUTH, geometry.translation(0.5, 0.0))
     prediction = Prediction(expected, "bands", 0.4, off_px=99.0)
     result = refined(capture, replace(aligned_on_reduced_images(), prediction=prediction))
-    assert result.prediction is not None
     assert result.prediction.off_px == pytest.approx(distance_px(result.fixed_to_moving, expected, SIZE))
     assert result.prediction.off_px == pytest.approx(0.5, abs=0.05)
 

@@ -66,7 +66,6 @@ def error_px(five: Path, capture: str, file: str, matrix: np.ndarray) -> float:
 
 
 def test_the_rig_of_the_flight_is_learned(model: FlightModel) -> None:
-    assert model.rig is not None
     assert "distance" in model.rig.factors
     assert set(model.rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
 
@@ -74,15 +73,12 @@ def test_the_rig_of_the_flight_is_learned(model: FlightModel) -> None:
 def test_a_valid_model_is_kept_and_an_outdated_one_is_learned_again(five: Path, model: FlightModel) -> None:
     captures = discover(five).captures
     again = learn_flight(captures, Settings(), lambda *_: None, start=model)
-    assert again is not None
     assert again.net is model.net
     assert again.rig is model.rig
-    assert model.rig is not None
     apart_px = dict(zip(model.bands, (12.0, -12.0, 9.0, -9.0), strict=True))
     elsewhere = {b: geometry.translation(apart_px[b], apart_px[b] / 3) @ m for b, m in model.rig.mean.items()}
     moved = replace(model, rig=replace(model.rig, mean=elsewhere), mappings=elsewhere)
     relearned = learn_flight(captures, Settings(), lambda *_: None, start=moved)
-    assert relearned is not None
     assert relearned.rig is not moved.rig
 
 
@@ -100,8 +96,6 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
 
     monkeypatch.setattr(learning_tasks, "verify_together", not_nir)
     model = learn_flight(discover(five).captures, Settings(), lambda *_: None)
-    assert model is not None
-    assert model.rig is not None
     assert "NIR" in model.rig.mean
 
 
@@ -146,7 +140,6 @@ def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, model: Fli
         "Blue": "aligned", "Red": "aligned", "NIR": "predicted", "Red edge": "aligned",
     }  # fmt: skip
     nir = result["NIR"]
-    assert nir.prediction is not None
     assert nir.prediction.source == "bands"
     assert error_px(five, "IMG_0003", "IMG_0003_4.tif", nir.fixed_to_moving) < 3 * nir.prediction.std_px
     assert "from the capture's other bands" in (nir.reason or "")
@@ -157,7 +150,6 @@ def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, model: Fli
 def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
     out, reports = run
     water = reports["IMG_0005"].sidecar
-    assert water is not None
     assert {b.status for b in water.bands} == {"reference", "predicted"}
     assert {b.prediction.source for b in water.bands if b.prediction} <= {"neighbours", "flight"}
     assert (out / "0000SET" / "000" / "IMG_0005.tif").is_file()
@@ -177,7 +169,6 @@ def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
 
 def test_an_alignment_that_contradicts_the_rig_is_rejected(five: Path, model: FlightModel) -> None:
     """The images match with a shift of one period, which contradicts the other bands."""
-    assert model.rig is not None
     moved = {
         b: geometry.compose(geometry.translation(25, 0), m) if b == "NIR" else m for b, m in model.rig.mean.items()
     }
@@ -206,7 +197,6 @@ def test_a_more_accurate_prediction_by_windows_is_kept(
     of_windows = replace(nir, status="predicted", mapping=mapping, prediction=Prediction(matrix, "windows", std_px))
     assert model.rig is not None
     checked = with_predictions(pairs, {**result, "NIR": of_windows}, model.rig, capture)["NIR"]
-    assert checked.prediction is not None
     assert (checked.status, checked.prediction.source) == ("predicted", source)
 
 

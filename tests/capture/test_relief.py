@@ -138,7 +138,6 @@ def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[s
         assert np.percentile(errors, 90) < 0.6
         assert np.percentile(plane, 90) > 3
         # The reported residual is measured with the relief from the other bands.
-        assert alignment.residual is not None
         assert alignment.residual.median_px < 0.25
 
 
@@ -152,7 +151,6 @@ def test_occluded_pixels_are_detected(boxes: Rendered, aligned: Mapping[str, Ali
     found, true, found_right, true_found = 0, 0, 0, 0
     for band in MOVING:
         parallax = aligned[band.name].mapping.parallax
-        assert parallax is not None
         assert parallax.hidden is not None
         hidden, known = parallax.hidden & in_all, boxes.truth.bands[band.name].hidden & in_all
         found, found_right = found + int(hidden.sum()), found_right + int((hidden & near(known)).sum())
@@ -164,7 +162,6 @@ def test_occluded_pixels_are_detected(boxes: Rendered, aligned: Mapping[str, Ali
 
 def test_range_is_right_to_two_percent(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
     parallax = aligned["NIR"].mapping.parallax
-    assert parallax is not None
     infinite = [geometry.invert(to_plane(REFERENCE, b, boxes.size_px)) for b in MOVING]
     towards_m = np.subtract(REFERENCE.baseline_m, [b.baseline_m for b in MOVING])
     inverse_m = inverse_range(
@@ -230,7 +227,6 @@ def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequenc
     result = aligned_by_relief(unknown, "auto").alignments
     assert len(result) == len(MOVING)
     parallax = result["NIR"].mapping.parallax
-    assert parallax is not None
     assert np.corrcoef(parallax.relief(boxes.pixels).ravel(), boxes.truth.range_m.ravel())[0, 1] < -0.5
 
 

@@ -30,7 +30,6 @@ def test_a_capture_with_common_stripes_is_aligned(tmp_path: Path) -> None:
     assert [score.status for score in scores] == ["aligned"] * 4
     assert max(score.median_px for score in scores) < 0.3
     (sidecar,) = (report.sidecar for report in reports)
-    assert sidecar is not None
     x0, y0, width, height = sidecar.output.crop
     (source,), (stack,) = tmp_path.rglob(sidecar.reference.file), (tmp_path / "out").rglob(sidecar.output.file)
     with rasterio.open(source) as read, rasterio.open(stack) as written:

@@ -50,10 +50,7 @@ def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
     assert after.issues == ()
     assert geometry.corner_error_px(before.fixed_to_moving, TRUTH, *SIZE) > 1
     assert geometry.corner_error_px(after.fixed_to_moving, TRUTH, *SIZE) < 0.3
-    assert after.joint is not None
     assert after.joint.recipe == "windows"
-    assert after.residual is not None
-    assert before.residual is not None
     # Only held-out windows verify the fit.
     assert 0.4 < len(after.residual.centres_px) / len(before.residual.centres_px) < 0.6
 

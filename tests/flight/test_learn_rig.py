@@ -90,7 +90,6 @@ def test_tilt_is_selected_where_the_ground_tilts() -> None:
     rng = np.random.default_rng(3)
     tilted = [observation(float(k), rng.normal(), tuple(2 * rng.normal(size=2))) for k in range(10)]
     rig = learn_rig(tilted, SIZE, {})
-    assert rig is not None
     assert rig.factors == ("distance", "tilt")
     known = observation(20.0, 0.5, (3.0, -2.0), without=("Red",))
     assert error_px(rig, "Red", known, mappings(0.5, (3.0, -2.0))["Red"])[0] < 0.3
@@ -99,7 +98,6 @@ def test_tilt_is_selected_where_the_ground_tilts() -> None:
 def test_without_common_variation_no_factor_is_selected() -> None:
     still = [observation(float(k), 0.0, noise=0.05, seed=k) for k in range(8)]
     rig = learn_rig(still, SIZE, {})
-    assert rig is not None
     assert rig.factors == ()
     assert predict_band(rig, "Red", observation(3.5, 0.0, without=("Red",))).source == "flight"
 
@@ -274,7 +272,6 @@ def test_a_capture_without_a_time_is_not_between_captures_in_time() -> None:
 def test_too_few_known_times_have_the_typical_error(known_times: int) -> None:
     sinking = [observation(10.0 * k if k < known_times else None, 0.5 * k, altitude_m=90.0 - k) for k in range(9)]
     rig = learn_rig(sinking, SIZE, {})
-    assert rig is not None
     again = rig_from_json(rig_to_json(rig), {})
     assert [s.seconds for s in again.captures] == [s.seconds for s in rig.captures] == [c.seconds for c in sinking]
     for band in BASELINES:
@@ -298,7 +295,6 @@ def with_rare_band() -> list[Observation]:
 
 def test_a_band_in_few_captures_has_a_finite_error() -> None:
     rig = learn_rig(with_rare_band(), SIZE, {})
-    assert rig is not None
     assert set(rig.mean) == set(BASELINES)
     assert all(0 < rig.from_bands_px[band] < 0.3 for band in BASELINES)
     error, std = error_px(rig, "NIR", observation(30.0, 0.5, without=("NIR",)), mappings(0.5)["NIR"])
@@ -313,7 +309,6 @@ def test_a_band_in_few_captures_has_a_finite_error() -> None:
 
 def test_extremes_of_outliers_are_the_least_outlying_capture() -> None:
     rig = learn_rig(flight(3), SIZE, {})
-    assert rig is not None
     outliers = [(90.0, 0.0, 0.0, 0.0, 0.0), (0.0, 50.0, 0.0, 0.0, 0.0), (0.0, 0.0, 70.0, 0.0, 0.0)]
     captures = tuple(replace(c, factors=f) for c, f in zip(rig.captures, outliers, strict=True))
     rig = replace(rig, factors=("distance", "tilt"), captures=captures)

@@ -149,12 +149,9 @@ def test_the_distance_is_interpolated_in_height_and_the_rest_in_time() -> None:
 def test_shifts_are_a_linear_function_of_the_motion() -> None:
     known = [capture(7.0, 0.0, motion=(x, y), steps_px=(1 + 2 * x, 3 * y)) for x, y in ((0, 0), (1, 0), (0, 1), (2, 2))]
     in_time, flight = (estimated_factors(capture(0.0, 0.0, motion=(3.0, 1.0)), known, e) for e in ("seconds", "flight"))
-    assert in_time is not None
-    assert flight is not None
     np.testing.assert_allclose(in_time[0], [7.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
     np.testing.assert_allclose(flight[0], [0.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
     unknown = estimated_factors(capture(0.0), known, "flight")
-    assert unknown is not None
     assert not unknown[0].any()
 
 

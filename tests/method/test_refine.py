@@ -18,7 +18,7 @@ from ..conftest import textured_pair
 class Halving(Solver):
     """Each step covers half of the remaining distance to a shift of 1 px."""
 
-    def step(self, _band: object, homography: torch.Tensor, _anchors: ReferencePatches) -> Step:  # type: ignore[override]
+    def step(self, _band: object, homography: torch.Tensor, _anchors: ReferencePatches) -> Step:
         left = 1.0 - float(homography[0, 2])
         change = torch.eye(3, dtype=torch.float64)
         change[0, 2] = left / 2
@@ -28,7 +28,7 @@ class Halving(Solver):
 def test_steps_with_a_constant_ratio_are_extrapolated() -> None:
     points = Keypoints(torch.zeros(4, 2), torch.zeros(4), torch.ones(4))
     reference_patches = ReferencePatches(points, torch.zeros(4, 256), torch.zeros(4, 256, 2))
-    result, last = Halving("homography").converge(None, torch.eye(3), reference_patches)  # type: ignore[arg-type]
+    result, last = Halving("homography").converge(None, torch.eye(3), reference_patches)
     assert last.length_px < 0.03
     assert abs(float(result[0, 2]) - 1.0) < 1e-3
 
@@ -38,7 +38,7 @@ class Unbounded(Solver):
 
     regular_steps = 0
 
-    def step(self, _band: object, homography: torch.Tensor, _anchors: ReferencePatches) -> Step:  # type: ignore[override]
+    def step(self, _band: object, homography: torch.Tensor, _anchors: ReferencePatches) -> Step:
         change = torch.eye(3, dtype=torch.float64)
         length_px = 0.4 if float(homography[0, 2]) < 0.4 * self.regular_steps - 1e-3 else math.inf
         if math.isfinite(length_px):
@@ -53,7 +53,7 @@ def test_a_step_of_infinite_length_ends_with_a_finite_homography(
     monkeypatch.setattr(Unbounded, "regular_steps", regular_steps)
     points = Keypoints(torch.zeros(4, 2), torch.zeros(4), torch.ones(4))
     reference_patches = ReferencePatches(points, torch.zeros(4, 256), torch.zeros(4, 256, 2))
-    result, last = Unbounded("homography").converge(None, torch.eye(3), reference_patches)  # type: ignore[arg-type]
+    result, last = Unbounded("homography").converge(None, torch.eye(3), reference_patches)
     assert torch.isfinite(result).all()
     assert last.length_px == math.inf
 

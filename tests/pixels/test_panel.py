@@ -30,7 +30,6 @@ def raster(pixels: np.ndarray) -> Raster:
 
 def test_a_panel_is_detected_by_its_code(panel: np.ndarray) -> None:
     result = find_panel(raster(panel))
-    assert result is not None
     assert result.code == PANEL_CODE
     within = panel[inside(result.area_px, panel.shape)]
     assert len(within) > 1000
@@ -42,7 +41,6 @@ def test_a_square_without_a_code_is_detected_only_on_request(panel: np.ndarray) 
     bare = np.where(panel > 0.6, 0.05, panel)  # no label
     assert find_panel(raster(bare)) is None
     result = find_panel(raster(bare), without_code=True)
-    assert result is not None
     assert result.code == ""
     assert panel[inside(result.area_px, panel.shape)].mean() == pytest.approx(0.51, abs=0.005)
 
@@ -52,13 +50,11 @@ def test_a_small_panel_far_from_the_centre_is_part_of_a_scene(
     panel: np.ndarray, at: tuple[int, int], in_scene: bool
 ) -> None:
     held = find_panel(raster(panel))
-    assert held is not None
     assert not held.in_scene
     scene = np.full((1125, 1500), 0.08)
     x, y = at
     scene[y : y + SIZE[1], x : x + SIZE[0]] = panel
     result = find_panel(raster(scene))
-    assert result is not None
     assert result.code == PANEL_CODE
     assert result.in_scene is in_scene
 

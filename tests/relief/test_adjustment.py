@@ -54,7 +54,6 @@ def shifts(noise_px: float = 0.06, wrong: float = 0.2, missing: float = 0.0) -> 
 
 
 def assert_recovered(model: Adjustment | None, sign: int = 1, tolerance_px: float = 0.15) -> None:
-    assert model is not None
     np.testing.assert_allclose(model.baselines, sign * BASELINES, atol=0.02)
     error = np.abs(model.parallax_px - sign * heights())
     assert np.percentile(error, 75) < tolerance_px
@@ -83,7 +82,6 @@ def test_an_unrelated_band_does_not_bias_the_others(layout: np.ndarray | None) -
     windows = shifts(wrong=0.0)
     windows.shifts_px[:, 0] = np.random.default_rng(2).uniform(-20, 20, (len(POINTS), 2))
     model = adjust(windows, SIZE, layout, with_fields=False)
-    assert model is not None
     others = model.baselines[1:] / np.linalg.norm(model.baselines[1:], axis=1).max()
     wanted = BASELINES[1:] * np.sign(np.sum(others * BASELINES[1:]))
     np.testing.assert_allclose(others, wanted / np.linalg.norm(wanted, axis=1).max(), atol=0.03)
@@ -113,7 +111,6 @@ def test_the_layout_determines_the_sign() -> None:
 
 def test_without_a_layout_only_the_sign_is_unknown() -> None:
     model = adjust(shifts(), SIZE, with_fields=False)
-    assert model is not None
     assert_recovered(model, sign=1 if (model.baselines * BASELINES).sum() > 0 else -1)
 
 
@@ -123,7 +120,6 @@ def test_the_reference_plane_contains_most_windows() -> None:
     tilt = 0.01 * (POINTS[:, 0] - 320) - 0.02 * (POINTS[:, 1] - 240) + 5
     tilted = replace(tilted, shifts_px=tilted.shifts_px + tilt[:, None, None] * BASELINES)
     model = adjust(tilted, SIZE, BASELINES, with_fields=False)
-    assert model is not None
     assert np.percentile(np.abs(model.parallax_px - heights()), 75) < 0.15
 
 
@@ -140,7 +136,6 @@ def test_lens_fields_are_recovered_next_to_parallax() -> None:
     windows = shifts(wrong=0.05)
     windows = replace(windows, shifts_px=windows.shifts_px + lens_fields())
     model = adjust(windows, SIZE, BASELINES)
-    assert model is not None
     np.testing.assert_allclose(model.baselines, BASELINES, atol=0.02)
     assert np.percentile(np.abs(model.parallax_px - heights()), 90) < 0.15
     planes = np.einsum("nki,bi->nbk", geometry.over_corners(POINTS, *SIZE), corners())
@@ -152,7 +147,6 @@ def test_lens_fields_are_recovered_next_to_parallax() -> None:
         assert np.percentile(np.linalg.norm(error, axis=1), 95) < 0.25
         assert np.median(np.linalg.norm(error, axis=1)) < 0.08
     without = adjust(windows, SIZE, BASELINES, with_fields=False)
-    assert without is not None
     assert without.fields == [None] * 4
     assert np.all(without.scales_px > 1.05 * model.scales_px)
 
@@ -237,5 +231,4 @@ def test_noise_of_the_reference_is_not_parallax(
         windows = WindowShifts(POINTS, POINTS, shifts_px[:, bands], np.ones((len(POINTS), len(bands))))
         known = None if layout is None else layout[bands]
         model = adjust(windows, SIZE, known, with_fields=False)
-        assert model is not None
         assert are_of_lenses(model.baselines, known) == is_depth

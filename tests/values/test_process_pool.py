@@ -388,7 +388,7 @@ def test_no_process_outlives_its_parent(method: str, number: int, whom: str, tmp
     root = Path(__file__).resolve().parents[2]
     environment = {**os.environ, "PYTHONPATH": str(root)}
     given = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "start_new_session": True, "env": environment}
-    with subprocess.Popen(command, **given) as process:  # type: ignore[call-overload]
+    with subprocess.Popen(command, **given) as process:
         try:
             assert process.stdout.readline() == b"begun\n"
             children = psutil.Process(process.pid).children(recursive=True)

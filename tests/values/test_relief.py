@@ -155,8 +155,7 @@ def test_a_file_that_was_reduced_has_the_same_ground() -> None:
     points = pixels(WHOLE)[5::21, 6::23]
     of_files = (points + 0.5) * 2 - 0.5
     np.testing.assert_allclose(on_files(of_files), (on_images(points) + 0.5) * 4 - 0.5, atol=2e-4)
-    assert on_files.parallax is not None
-    np.testing.assert_array_equal(on_files.parallax.hides(of_files), on_images.parallax.hides(points))  # type: ignore[union-attr]
+    np.testing.assert_array_equal(on_files.parallax.hides(of_files), on_images.parallax.hides(points))
 
 
 def test_the_displacement_field_of_lenses_and_the_parallax_add_up() -> None:

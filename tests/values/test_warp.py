@@ -121,7 +121,7 @@ def test_unusable_pixels_are_never_used(unusable: str, interpolation: str) -> No
     image[1, hole] = np.nan if unusable == "nan" else 1000.0
     options: dict[str, object] = {"nodata": {"nodata": 1000.0}, "valid": {"valid": ~hole}}.get(unusable, {})
     result = alignment(MAPPINGS["field"])
-    warped, valid = result.warp(image, interpolation=interpolation, **options)  # type: ignore[arg-type]
+    warped, valid = result.warp(image, interpolation=interpolation, **options)
     x, y = np.rint(result.map(pixels())).astype(int).transpose(2, 0, 1)
     inside = (x >= 0) & (x < SIZE[0]) & (y >= 0) & (y < SIZE[1])
     in_hole = np.zeros_like(inside)

@@ -151,8 +151,8 @@ def test_windows_pass_at_their_limits(
 def test_results_pass_at_their_limits(
     within: dict[str, object], beyond: dict[str, object], code: str, value: float | None, limit: float
 ) -> None:
-    assert issues_of(Evidence(replace(GOOD_JOINT, **within), GOOD_RESIDUAL, SIZE)) == ()  # type: ignore[arg-type]
-    joint = replace(GOOD_JOINT, **beyond)  # type: ignore[arg-type]
+    assert issues_of(Evidence(replace(GOOD_JOINT, **within), GOOD_RESIDUAL, SIZE)) == ()
+    joint = replace(GOOD_JOINT, **beyond)
     (issue,) = issues_of(Evidence(joint, GOOD_RESIDUAL, SIZE))
     assert (issue.code, issue.limit) == (code, limit)
     scale = geometry.local_scale(joint.fixed_to_moving, *SIZE)

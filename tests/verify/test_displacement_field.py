@@ -161,7 +161,7 @@ def test_smoothness_is_relative_to_the_number_of_captures(monkeypatch: pytest.Mo
 
     def recorded(shifts: Shifts, smoothness: float, *rest: object) -> DisplacementField:
         fits.append((len(shifts) // len(centres()), smoothness))
-        return fitted_field(shifts, smoothness, *rest)  # type: ignore[arg-type]
+        return fitted_field(shifts, smoothness, *rest)
 
     monkeypatch.setattr(displacement_field, "fitted_field", recorded)
     assert common_field(captures, SIZE) is not None
