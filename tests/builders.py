@@ -1,0 +1,59 @@
+"""Rasters, pairs and results that the tests of several packages build."""
+
+from collections.abc import Mapping
+from functools import cache
+
+import numpy as np
+
+from agalign.capture.band_pair import BandPair
+from agalign.values.alignment import JointResult, Residual
+from agalign.values.image import Raster
+from agalign.values.lens import Lens
+
+from .conftest import textured_image, textured_pair
+
+
+def whole(image: np.ndarray, lens: Lens | None = None) -> Raster:
+    """A raster of valid pixels only."""
+    return Raster(image, np.ones(image.shape[-2:], bool), lens)
+
+
+def texture(width: int = 400, height: int = 320, seed: int = 0) -> Raster:
+    return whole(textured_image(width, height, seed))
+
+
+def two_views(matrix: np.ndarray, width: int = 400, height: int = 320, seed: int = 0) -> list[Raster]:
+    """The fixed and the moving view of `textured_pair`, painted once in a process."""
+    return [whole(image.copy()) for image in _painted(tuple(map(float, np.ravel(matrix))), width, height, seed)]
+
+
+@cache
+def _painted(matrix: tuple[float, ...], width: int, height: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    return textured_pair(np.reshape(matrix, (3, 3)), width, height, seed)
+
+
+def pair_of(
+    fixed: Raster, moving: Raster, candidates: Mapping[str, np.ndarray] | None = None, **std_px: float
+) -> BandPair:
+    """A pair with candidates for its mapping, by default the identity, and their standard errors."""
+    return BandPair.of_images("moving", fixed, moving, candidates or {"identity": np.eye(3)}, std_px)
+
+
+def joint_result(
+    matrix: np.ndarray | None = None, *, std_px: float = 0.05, covariance: np.ndarray | None = None, **changes: object
+) -> JointResult:
+    """A result of the joint optimisation that passes verification."""
+    facts = {"loss": 0.1, "retrieval": 0.9, "chance": 0.004, "iterations": 0, "levels": (1.0,), "recipe": "fast"}
+    facts |= {"model_family": "homography", "last_step_px": 0.01, "corner_std_xy_px": ((std_px, std_px),) * 4}
+    return JointResult(np.eye(3) if matrix is None else matrix, **facts | changes, corner_covariance_px2=covariance)
+
+
+def residual_of(centres_px: np.ndarray, shifts_px: np.ndarray, sigma: float = 20.0) -> Residual:
+    """Windows with shifts (n, 2) or one shift (2,), and peaks of equal height."""
+    shifts_px = np.broadcast_to(np.asarray(shifts_px, float), np.shape(centres_px)).copy()
+    return Residual.of(centres_px, shifts_px, np.full(len(centres_px), sigma))
+
+
+def rms(vectors: np.ndarray) -> float:
+    """Root mean square length of vectors (n, 2)."""
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))

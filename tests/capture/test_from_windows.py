@@ -1,0 +1,255 @@
+"""Results by windows: where descriptors fail, where half of the image is extrapolated, and of coarse bands."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+import agalign
+from agalign.capture import from_windows as module
+from agalign.capture.band_pair import BandPair
+from agalign.capture.from_windows import from_windows, without_extrapolated
+from agalign.capture.seeding import find_seed
+from agalign.capture.verification import verified
+from agalign.config import SeedSettings, Settings
+from agalign.flight.rig import Rig
+from agalign.pixels.masks import raster_of
+from agalign.values import geometry
+from agalign.values.alignment import Alignment, Residual, Seed
+from agalign.values.issues import RETRIEVAL, UNREADABLE, Issue
+from agalign.verify.check import Evidence
+from agalign.verify.checks import issues_of
+from agalign.verify.expected_error import expected_error_px
+from agalign.verify.lens_shapes import lens_shapes
+from agalign.verify.mapping_check import FOLDS
+
+from ..builders import joint_result, pair_of, residual_of, rms, two_views, whole
+from ..conftest import textured_image
+
+SIZE = 640, 480
+SILENT = Issue(RETRIEVAL, 0.05, 0.2)
+
+# ---- where descriptors fail: confirmed by held-out windows
+
+LARGE = 800, 640
+TRUTH = geometry.compose(
+    geometry.translation(5.0, -3.0), np.array([[1.004, 0.002, 0], [-0.003, 0.998, 0], [0, 0, 1.0]])
+)
+
+
+@pytest.fixture(scope="module")
+def pair() -> BandPair:
+    return pair_of(*two_views(TRUTH, *LARGE))
+
+
+def unaligned(pair: BandPair, issue: Issue = SILENT) -> Alignment:
+    seed = Seed("structure", geometry.translation(5.0, -3.0), 20.0, trusted=True)
+    result = verified(pair, seed, issue, Settings())
+    assert result.status == "seed_only"
+    return result
+
+
+def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
+    before = unaligned(pair)
+    after = from_windows(pair, before)
+    assert (after.status, after.issues, after.joint.recipe) == ("aligned", (), "windows")
+    assert geometry.corner_error_px(before.fixed_to_moving, TRUTH, *LARGE) > 1
+    assert geometry.corner_error_px(after.fixed_to_moving, TRUTH, *LARGE) < 0.3
+    # Only held-out windows verify the fit.
+    assert 0.4 < len(after.residual.centres_px) / len(before.residual.centres_px) < 0.6
+
+
+def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
+    others = [unaligned(pair, issue) for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0))]
+    for before in (*others, replace(unaligned(pair), status="aligned", issues=())):
+        assert from_windows(pair, before) is before
+    monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)  # less than the error of the seed
+    before = unaligned(pair)
+    assert from_windows(pair, before) is before
+
+
+def test_held_out_windows_must_confirm_the_fit() -> None:
+    fixed, moving = two_views(TRUTH, *LARGE)
+    moving.pixels[:, 480:] = two_views(TRUTH, *LARGE, seed=5)[0].pixels[:, 480:]  # unrelated content
+    pair = pair_of(fixed, moving)
+    before = unaligned(pair)
+    assert from_windows(pair, before) is before
+
+
+def windows(count: int, measured: float = 1.0) -> Residual:
+    shifts = np.full((count, 2), 0.1)
+    shifts[round(measured * count) :] = np.nan
+    return residual_of(np.stack([100.0 * np.arange(count), np.zeros(count)], axis=1), shifts)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "residual", "is_accepted"),
+    [
+        ("windows", windows(20), True),
+        ("fast", windows(20), False),
+        ("windows", windows(11), False),
+        ("windows", windows(12), True),
+        ("windows", windows(30, 0.7), False),
+        ("windows", windows(30, 0.8), True),
+    ],
+)
+def test_without_descriptors_more_windows_are_required(recipe: str, residual: Residual, is_accepted: bool) -> None:
+    joint = joint_result(retrieval=0.05, recipe=recipe, std_px=0.1)
+    codes = [issue.code for issue in issues_of(Evidence(joint, residual, (3000, 100)))]
+    assert codes == ([] if is_accepted else ["retrieval"])
+
+
+# ---- no structure in one half: a prediction with the error of that half
+
+MATRIX = geometry.translation(6.0, -4.0)
+LENS_PX = np.array([0.8, 0.0, 0.4, 0.0])
+WHOLE, LEFT, RIGHT = slice(None), slice(None, 320), slice(320, None)
+
+
+def distorted_images() -> tuple[np.ndarray, np.ndarray]:
+    """A pair of lenses with a difference of up to 1.2 px."""
+    fixed, moving = two_views(MATRIX, *SIZE)
+    pixels = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1).reshape(-1, 2).astype(np.float64)
+    away = (pixels + lens_shapes(pixels, SIZE) @ LENS_PX).reshape(SIZE[1], SIZE[0], 2).astype(np.float32)
+    return cv2.remap(fixed.pixels, away, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), moving.pixels
+
+
+def valid_in(columns: slice) -> np.ndarray:
+    valid = np.zeros(SIZE[::-1], bool)
+    valid[:, columns] = True
+    return valid
+
+
+def pair_in(columns: slice) -> BandPair:
+    return pair_of(*(raster_of(image, valid_in(columns), "image") for image in distorted_images()))
+
+
+def true_positions(points: np.ndarray) -> np.ndarray:
+    return geometry.apply(MATRIX, points + lens_shapes(points, SIZE) @ LENS_PX)
+
+
+def aligned(pair: BandPair) -> Alignment:
+    """An alignment with a homography fitted to the common part."""
+    points = geometry.lattice(*SIZE, 40, 30)
+    seen = points[pair.fixed.valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
+    matrix = geometry.fit_homography(seen, true_positions(seen))
+    result = verified(
+        pair, Seed("structure", matrix, 20.0), joint_result(matrix, covariance=0.0025 * np.eye(8)), Settings()
+    )
+    assert result.status == "aligned"
+    return result
+
+
+@pytest.fixture(scope="module")
+def left() -> tuple[BandPair, Alignment]:
+    """The pair with pixels in its left half, and its alignment."""
+    pair = pair_in(LEFT)
+    return pair, aligned(pair)
+
+
+def extrapolated(pair: BandPair, before: Alignment, rig: Rig | None = None) -> Alignment:
+    return without_extrapolated([pair], {"moving": before}, rig)["moving"]
+
+
+def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error(left: tuple[BandPair, Alignment]) -> None:
+    pair, before = left
+    after = extrapolated(pair, before)
+    assert (after.status, after.prediction.source) == ("predicted", "windows")
+    assert [issue.code for issue in after.issues] == ["extrapolated"]
+    assert "top right and bottom right" in after.reason
+    assert "windows in the image" in after.reason
+    points = geometry.lattice(*SIZE, 17, 13)
+    errors, homography_errors = (a.map(points) - true_positions(points) for a in (after, before))
+    right = points[:, 0] > 330
+    assert rms(errors) < 0.5 < rms(homography_errors[right])
+    assert 0.5 * rms(errors) < after.prediction.std_px < 1.0
+    expected = expected_error_px(after, SIZE, points)
+    assert np.median(expected[right]) > 2 * np.median(expected[points[:, 0] < 300])
+    assert (np.linalg.norm(errors, axis=1) < 3 * expected).mean() > 0.95
+
+
+def test_covered_images_georeferenced_files_and_failed_pairs_are_unchanged(left: tuple[BandPair, Alignment]) -> None:
+    pair, before = left
+    failed, everywhere = replace(before, status="failed"), pair_in(WHOLE)
+    mosaic = replace(pair, candidates={"geo": np.eye(3)})
+    for one, alignment in ((everywhere, aligned(everywhere)), (mosaic, before), (pair, failed)):
+        assert extrapolated(one, alignment) is alignment
+
+
+@pytest.mark.parametrize(("extrapolation_px", "status"), [({}, "aligned"), ({"moving": 0.7}, "predicted")])
+def test_a_rig_of_the_whole_image_prevents_extrapolation(
+    left: tuple[BandPair, Alignment], extrapolation_px: dict[str, float], status: str
+) -> None:
+    std_px = {"moving": 0.1}
+    mean, baselines, delays = {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}
+    rig = Rig(SIZE, mean, baselines, delays, std_px, (), (), std_px, extrapolation_px=extrapolation_px)
+    pair, before = left
+    assert extrapolated(replace(pair, candidate_std_px={"model": 1.0}), before, rig).status == status
+
+
+@pytest.mark.slow
+def test_half_masked_arrays_are_predicted() -> None:
+    fixed, moving = distorted_images()
+    result = agalign.align(fixed, moving, fixed_valid=valid_in(RIGHT), moving_valid=valid_in(RIGHT))
+    assert result.status == "predicted"
+    points = geometry.lattice(*SIZE, 17, 13)
+    assert rms(result.map(points) - true_positions(points)) < 2 * result.prediction.std_px
+    assert agalign.align(fixed, moving).status == "aligned"
+
+
+# ---- bands with few pixels and little common structure: predicted with a correct standard error, or failed
+
+FIXED_PX, MOVING_PX = (320, 240), (160, 120)
+COARSE_TRUTH = geometry.compose(
+    geometry.translation(83.0, 57.0), np.diag([0.43, 0.43, 1.0]), geometry.translation(-159.5, -119.5)
+)
+"""A field of view a sixth wider than in an overlay of the images."""
+
+
+def thermal(scene: np.ndarray, other_share: float) -> np.ndarray:
+    """The scene in a thermal camera: inverted, with unrelated content in a share of the image."""
+    large = cv2.GaussianBlur(scene, (0, 0), 1.2)
+    to_moving = geometry.compose(COARSE_TRUTH, geometry.translation(-100.0, -100.0))
+    seen = cv2.warpPerspective(large, to_moving, MOVING_PX, flags=cv2.INTER_LINEAR)
+    mask = cv2.GaussianBlur(np.random.default_rng(5).normal(size=MOVING_PX[::-1]), (0, 0), 12)
+    other = cv2.GaussianBlur(textured_image(*MOVING_PX, seed=9), (0, 0), 1.0)
+    return np.asarray(np.where(mask > np.quantile(mask, other_share), -seen / seen.std(), other / other.std()))
+
+
+def tried(fixed: np.ndarray, moving: np.ndarray) -> tuple[BandPair, Alignment]:
+    images = (whole((1000 + 100 * pixels).astype(np.float32)) for pixels in (fixed, moving))
+    pair = replace(pair_of(*images, {"identity": geometry.overlay(FIXED_PX, MOVING_PX)}), is_coarse=True)
+    seed = find_seed(pair, SeedSettings())
+    issue = Issue(RETRIEVAL, 0.0, 0.2)
+    failed = Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", (issue,), seed)
+    return pair, from_windows(pair, failed)
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    """100 px wider than the reference on every side."""
+    return textured_image(520, 440, seed=3)
+
+
+@pytest.mark.parametrize("other_share", [0.2, 0.5])
+def test_a_coarse_band_with_another_field_of_view_is_predicted_with_its_error(
+    scene: np.ndarray, other_share: float
+) -> None:
+    pair, result = tried(scene[100:340, 100:420], thermal(scene, other_share))
+    assert result.status == "predicted"
+    points = geometry.lattice(*FIXED_PX, 9, 7)
+    assert rms(result.map(points) - geometry.apply(COARSE_TRUTH, points)) < result.prediction.std_px < 0.6
+    assert "predicted from windows in the image" in result.reason
+    failed = replace(result, status="failed", prediction=None)
+    untrusted = replace(failed, seed=replace(failed.seed, trusted=False))
+    assert from_windows(replace(pair, is_coarse=False), failed) is failed  # a band of full resolution
+    assert from_windows(pair, untrusted) is untrusted
+
+
+@pytest.mark.parametrize("kind", ["unrelated", "repetitive"])
+def test_unrelated_and_repetitive_coarse_bands_are_not_predicted(scene: np.ndarray, kind: str) -> None:
+    tile = np.tile(textured_image(40, 40, seed=4), (11, 13))
+    fixed = textured_image(*FIXED_PX, seed=11) if kind == "unrelated" else tile[100:340, 100:420]
+    _, result = tried(fixed, thermal(scene if kind == "unrelated" else tile, 0.2))
+    assert (result.status, result.prediction) == ("failed", None)
