@@ -1,8 +1,9 @@
 """Rasters, pairs and results that the tests of several packages build."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 
+import cv2
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
@@ -57,3 +58,12 @@ def residual_of(centres_px: np.ndarray, shifts_px: np.ndarray, sigma: float = 20
 def rms(vectors: np.ndarray) -> float:
     """Root mean square length of vectors (n, 2)."""
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+
+
+def displaced_views(displacement: Callable[[np.ndarray], np.ndarray], seed: int = 4) -> list[Raster]:
+    """Views of 640 x 480 px in which the moving image shows at x + d(x) what the fixed one shows at x."""
+    fixed, moving = two_views(np.eye(3), 640, 480, seed)
+    grid = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
+    # Two iterations invert x + d(x).
+    back = (grid - displacement(grid - displacement(grid))).astype(np.float32)
+    return [fixed, whole(cv2.remap(moving.pixels, back, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT))]

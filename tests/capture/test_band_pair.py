@@ -11,17 +11,18 @@ import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture import band_pair
 from agalign.capture.align import align_capture_bands
-from agalign.capture.band_pair import BandPair, _candidate_std_px, longest_for, read_pairs
+from agalign.capture.band_pair import _candidate_std_px, longest_for, read_pairs
 from agalign.capture.prediction import observed
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
 from agalign.synthetic.score import score_against_truth
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, Seed
+from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band
-from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
+
+from ..builders import joint_result, pair_of, whole
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -47,15 +48,11 @@ def test_the_reference_is_computed_once_for_all_bands(flight: Path) -> None:
 
 
 def test_without_one_lens_neither_is_corrected(flight: Path) -> None:
-    import dataclasses
-
     capture = discover(flight).captures[0]
-    bands = [dataclasses.replace(b, lens=None) if b.name == "NIR" else b for b in capture.bands]
-    pairs, _ = read_pairs(dataclasses.replace(capture, bands=tuple(bands)), SeedSettings())
-    by_name = {p.name: p for p in pairs}
-    assert by_name["NIR"].space == "pixel"
-    assert by_name["NIR"].fixed.lens is None
-    assert by_name["Red"].fixed.lens is not None
+    bands = [replace(b, lens=None) if b.name == "NIR" else b for b in capture.bands]
+    pairs, _ = read_pairs(replace(capture, bands=tuple(bands)), SeedSettings())
+    without = [(p.name, p.space) for p in pairs if p.fixed.lens is None]
+    assert without == [("NIR", "pixel")]
 
 
 @pytest.mark.parametrize(
@@ -68,6 +65,7 @@ def test_the_reference_is_reduced_for_a_coarse_band(ratio: float, longest: int) 
     assert longest_for(band, mapping) == longest
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path) -> None:
     """160 x 120 px with a reference of 800 x 600 px, and an error of the tags of 0.3 degrees: 4 px of the reference. In
@@ -98,16 +96,12 @@ def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
     """A standard error of 0.2 px of the reference is 0.02 px of a band with pixels ten times as large."""
     pairs, _ = read_pairs(discover(flight).captures[0], SeedSettings())
     pair = pairs[0]
-    joint = JointResult(
-        np.eye(3), 0.1, 0.9, 0.004, 0, (1.0,), "fast", "homography", 0.01, ((0.2 / 2**0.5, 0.2 / 2**0.5),) * 4
-    )
-    seed = Seed("rig", np.eye(3), 30.0)
-    alignment = Alignment(pair.mapping(np.eye(3)), pair.fixed.size_px, "aligned", (), seed, joint)
-    known = observed([pair], {pair.name: alignment}, discover(flight).captures[0])
-    assert known.std_px[pair.name] == pytest.approx(0.2)
-    coarse = replace(alignment, mapping=pair.mapping(np.diag([0.1, 0.1, 1.0])))
-    known = observed([pair], {pair.name: coarse}, discover(flight).captures[0])
-    assert known.std_px[pair.name] == pytest.approx(0.02)
+    joint, seed = joint_result(std_px=0.2 / 2**0.5), Seed("rig", np.eye(3), 30.0)
+    for pixels, std_px in ((1.0, 0.2), (0.1, 0.02)):
+        mapping = pair.mapping(np.diag([pixels, pixels, 1.0]))
+        alignment = Alignment(mapping, pair.fixed.size_px, "aligned", (), seed, joint)
+        known = observed([pair], {pair.name: alignment}, discover(flight).captures[0])
+        assert known.std_px[pair.name] == pytest.approx(std_px)
 
 
 def test_the_error_of_a_rig_is_converted_to_px_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,9 +115,9 @@ def test_the_error_of_a_rig_is_converted_to_px_of_the_reference(monkeypatch: pyt
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
 def test_the_tolerance_of_a_candidate_is_in_px_of_the_fixed_image_at_any_scale(scale: float) -> None:
     """A candidate with a standard error of 4 px accepts mappings within 12 px of the fixed image."""
-    fixed, moving = (Raster(np.zeros(shape, np.float32), np.ones(shape, bool)) for shape in ((300, 400), (30, 40)))
+    fixed, moving = (whole(np.zeros(shape, np.float32)) for shape in ((300, 400), (30, 40)))
     candidate = geometry.compose(np.diag([scale, scale, 1.0]), geometry.translation(7.0, -5.0))
-    pair = BandPair.of_images("nir", fixed, moving, {"rig": candidate}, {"rig": 4.0})
+    pair = pair_of(fixed, moving, {"rig": candidate}, rig=4.0)
     for offset_px, is_expected in ((8.0, True), (11.5, True), (12.5, False), (20.0, False)):
         mapping = geometry.compose(candidate, geometry.translation(0.6 * offset_px, 0.8 * offset_px))
         assert pair.is_expected(mapping) is is_expected

@@ -60,9 +60,13 @@ def model(run: Run) -> FlightModel:
     return load_model(path, lambda: torch.device("cpu"))
 
 
-def error_px(five: Path, capture: str, file: str, matrix: np.ndarray) -> float:
-    truth = json.loads((five / "truth.json").read_text())[capture]["bands"][file]
-    return geometry.corner_error_px(matrix, np.array(truth["fixed_to_moving"]), 400, 300)
+def learned(five: Path, start: FlightModel | None = None) -> FlightModel:
+    return learn_flight(discover(five).captures, Settings(), lambda *_: None, start=start)
+
+
+def bands_of(five: Path, number: int, model: FlightModel) -> dict[str, Alignment]:
+    """The bands of a capture, aligned with the flight's model."""
+    return align_capture_bands(discover(five).captures[number], Settings(), model, lambda *_: None)
 
 
 def test_the_rig_of_the_flight_is_learned(model: FlightModel) -> None:
@@ -70,18 +74,21 @@ def test_the_rig_of_the_flight_is_learned(model: FlightModel) -> None:
     assert set(model.rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
 
 
-def test_a_valid_model_is_kept_and_an_outdated_one_is_learned_again(five: Path, model: FlightModel) -> None:
-    captures = discover(five).captures
-    again = learn_flight(captures, Settings(), lambda *_: None, start=model)
+def test_a_valid_model_is_kept(five: Path, model: FlightModel) -> None:
+    again = learned(five, model)
     assert again.net is model.net
     assert again.rig is model.rig
+
+
+@pytest.mark.full
+def test_an_outdated_model_is_learned_again(five: Path, model: FlightModel) -> None:
     apart_px = dict(zip(model.bands, (12.0, -12.0, 9.0, -9.0), strict=True))
     elsewhere = {b: geometry.translation(apart_px[b], apart_px[b] / 3) @ m for b, m in model.rig.mean.items()}
     moved = replace(model, rig=replace(model.rig, mean=elsewhere), mappings=elsewhere)
-    relearned = learn_flight(captures, Settings(), lambda *_: None, start=moved)
-    assert relearned.rig is not moved.rig
+    assert learned(five, moved).rig is not moved.rig
 
 
+@pytest.mark.full
 def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
     five: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -95,31 +102,29 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
         }
 
     monkeypatch.setattr(learning_tasks, "verify_together", not_nir)
-    model = learn_flight(discover(five).captures, Settings(), lambda *_: None)
-    assert "NIR" in model.rig.mean
+    assert "NIR" in learned(five).rig.mean
 
 
 def test_mappings_that_learning_refined_are_verified_and_not_refined_again(
     five: Path, model: FlightModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    captures = discover(five).captures
-    refined: list[str] = []
+    refined: list[int] = []
 
     def statuses(number: int, model: FlightModel) -> set[str]:
-        """Return the statuses of the bands of a capture. If its pairs are refined, its name is added to `refined`."""
+        """Return the statuses of the bands of a capture. If its pairs are refined, it is added to `refined`."""
 
         def refine(*arguments: Any) -> Results:
-            refined.append(captures[number].name)
+            refined.append(number)
             return refine_with(*arguments)
 
         monkeypatch.setattr(align, "refine_with", refine)
-        return {a.status for a in align_capture_bands(captures[number], Settings(), model, lambda *_: None).values()}
+        return {a.status for a in bands_of(five, number, model).values()}
 
     assert statuses(0, model) == {"aligned"}
     assert refined == []
     assert statuses(2, model) == {"aligned", "predicted"}  # its NIR is noise, so learning could not align it
     assert statuses(0, replace(model, refined={})) == {"aligned"}
-    assert refined == ["IMG_0003", "IMG_0001"]
+    assert refined == [2, 0]
     # Mappings of other images, here shifted by 30 px, do not pass verification.
     shift = geometry.translation(30.0, 0.0)
     shifted = {
@@ -130,20 +135,19 @@ def test_mappings_that_learning_refined_are_verified_and_not_refined_again(
         for key, pairs in model.refined.items()
     }
     assert statuses(0, replace(model, refined=shifted)) == {"aligned"}
-    assert refined == ["IMG_0003", "IMG_0001", "IMG_0001"]
+    assert refined == [2, 0, 0]
 
 
 def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, model: FlightModel) -> None:
-    capture = discover(five).captures[2]
-    result = align_capture_bands(capture, Settings(), model, lambda *_: None)
-    assert {b: a.status for b, a in result.items()} == {
-        "Blue": "aligned", "Red": "aligned", "NIR": "predicted", "Red edge": "aligned",
-    }  # fmt: skip
+    result = bands_of(five, 2, model)
+    assert [b for b, a in result.items() if a.status == "aligned"] == ["Blue", "Red", "Red edge"]
     nir = result["NIR"]
+    assert nir.status == "predicted"
     assert nir.prediction.source == "bands"
-    assert error_px(five, "IMG_0003", "IMG_0003_4.tif", nir.fixed_to_moving) < 3 * nir.prediction.std_px
+    truth = json.loads((five / "truth.json").read_text())["IMG_0003"]["bands"]["IMG_0003_4.tif"]["fixed_to_moving"]
+    error_px = geometry.corner_error_px(nir.fixed_to_moving, np.array(truth), 400, 300)
+    assert error_px < 3 * nir.prediction.std_px
     assert "from the capture's other bands" in (nir.reason or "")
-    assert result["Red"].prediction is not None
     assert result["Red"].prediction.off_px is not None
 
 
@@ -169,11 +173,9 @@ def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
 
 def test_an_alignment_that_contradicts_the_rig_is_rejected(five: Path, model: FlightModel) -> None:
     """The images match with a shift of one period, which contradicts the other bands."""
-    moved = {
-        b: geometry.compose(geometry.translation(25, 0), m) if b == "NIR" else m for b, m in model.rig.mean.items()
-    }
-    wrong = replace(model, rig=replace(model.rig, mean=moved))
-    result = align_capture_bands(discover(five).captures[0], Settings(), wrong, lambda *_: None)
+    mean = model.rig.mean
+    moved = mean | {"NIR": geometry.compose(geometry.translation(25, 0), mean["NIR"])}
+    result = bands_of(five, 0, replace(model, rig=replace(model.rig, mean=moved)))
     assert result["NIR"].status == "predicted"
     assert result["NIR"].issues[0].code == "unexpected_px"
     assert result["NIR"].issues[0].value == pytest.approx(25, abs=3)
@@ -209,8 +211,7 @@ def test_a_rotated_band_is_not_predicted_by_the_rig(five: Path, model: FlightMod
         about = cv2.getRotationMatrix2D((199.5, 149.5), 5.0, 1.0)
         image = cv2.warpAffine(dataset.read(1), about, (400, 300), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         dataset.write(image, 1)
-    capture = next(c for c in discover(copy).captures if c.name == "IMG_0001")
-    result = align_capture_bands(capture, Settings(), model, lambda *_: None)
+    result = bands_of(copy, 0, model)
     assert result["Red"].status == "failed"
     assert result["Red"].issues[0].code == "unexpected_px"
     assert result["NIR"].status == "aligned"

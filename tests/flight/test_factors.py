@@ -53,8 +53,8 @@ def test_a_displaced_mapping_differs_by_its_coefficients() -> None:
 
 
 def test_the_median_mapping_ignores_an_outlier() -> None:
-    matrices = [geometry.translation(x, 2.0) for x in (3.0, 3.0, 90.0)]
-    np.testing.assert_allclose(median_mapping(matrices, SIZE), geometry.translation(3.0, 2.0), atol=1e-6)
+    matrices = [geometry.translation(x, 2.0) for x in (3.0, 3.1, 90.0)]
+    assert distance_px(median_mapping(matrices, SIZE), matrices[0], SIZE) < 0.2
     assert median_mapping(matrices[2:], SIZE) is matrices[2]
 
 
@@ -69,16 +69,12 @@ def test_factors_are_recovered_from_all_bands() -> None:
     np.testing.assert_allclose(covariance[0], np.linalg.inv(normal), rtol=1e-3)
 
 
-def test_unused_factors_are_0() -> None:
+def test_unused_factors_are_0_and_an_outlier_band_hardly_changes_the_others() -> None:
     differences = np.einsum("bakf,cf->cbak", DESIGNS, np.array([[3.0, 0, 0, 0, 0]]))
     result, _ = least_squares(DISTANCE, differences, np.full((1, 3), 1e4))
     assert result[0, 0] == pytest.approx(3.0, abs=1e-3)
     assert not result[0, 1:].any()
-
-
-def test_an_outlier_band_hardly_changes_the_factors() -> None:
-    factors = np.array([[3.0, 0.0, 0.0, 0.0, 0.0]])
-    differences = np.einsum("bakf,cf->cbak", DESIGNS, factors)
+    # One band is an outlier.
     differences[0, 2, :, 0] += 5.0
     result, _ = least_squares(DISTANCE, differences, np.full((1, 3), 1e3))
     assert result[0, 0] == pytest.approx(3.0, abs=0.1)

@@ -13,6 +13,9 @@ from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, P
 
 AREA = ((20.0, 10.0), (39.0, 10.0), (39.0, 29.0), (20.0, 29.0))
 PLAIN = Radiometry("radiance", 1000.0, 65536.0, 2.0)
+GREEN = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
+HELD = replace(GREEN, panel=Panel("look"))
+GROUND, HIGH = Position(52.0, 5.0, 93.0), Position(52.0, 5.0, 112.0)
 
 
 def panel_file(path: Path, level: int = 33768) -> Band:
@@ -28,19 +31,15 @@ def capture(band: Band, moment: str = "2026-06-21T10:00:00", **more: object) -> 
     return Capture("IMG_0001", Path(), (band,), 0, CameraIdentity("a", "b", "1"), captured_at=moment, **more)
 
 
-def reading(moment: str, factor: float, band: Band | None = None) -> PanelReading:
-    band = band or Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
-    return PanelReading(capture(band, moment), (BandReading(band, 0.5, 0.5 / factor),))
+def reading(moment: str, factor: float) -> PanelReading:
+    return PanelReading(capture(GREEN, moment), (BandReading(GREEN, 0.5, 0.5 / factor),))
 
 
-def test_the_factor_is_reflectance_over_radiance(tmp_path: Path) -> None:
-    (result,) = read_panel(capture(panel_file(tmp_path / "a.tif")), {}).bands
+def test_the_factor_is_reflectance_by_the_tags_or_the_user_over_radiance(tmp_path: Path) -> None:
+    shown = capture(panel_file(tmp_path / "a.tif"))
+    (result,) = read_panel(shown, {}).bands
     assert result.radiance == pytest.approx(1.0)
     assert (result.albedo, result.factor) == (0.4, pytest.approx(0.4))
-
-
-def test_the_user_s_reflectance_overrides_the_tags(tmp_path: Path) -> None:
-    shown = capture(panel_file(tmp_path / "a.tif"))
     assert read_panel(shown, {"": 0.6}).bands[0].factor == pytest.approx(0.6)
     assert read_panel(shown, {"": 0.6, "green": 0.7}).bands[0].factor == pytest.approx(0.7)
     assert read_panel(shown, {"red": 0.6}).bands[0].factor == pytest.approx(0.4)
@@ -55,53 +54,51 @@ def test_a_panel_that_cannot_be_measured_has_no_factor(tmp_path: Path, level: in
 
 def test_illumination_is_interpolated_in_time_and_constant_outside() -> None:
     panels = [reading("2026-06-21T10:00:00", 2.0), reading("2026-06-21T11:00:00", 4.0)]
-    of = panels[0].capture.bands[0]
-
-    def at(moment: str) -> dict[str, float]:
-        return reflectance_factors(capture(of, f"2026-06-21T{moment}"), panels)
-
-    assert at("09:00:00") == {"Green": pytest.approx(2.0)}
-    assert at("10:30:00") == {"Green": pytest.approx(1 / 0.375)}
-    assert at("12:00:00") == {"Green": pytest.approx(4.0)}
-    assert reflectance_factors(capture(of, "2026-06-23T10:30:00"), panels) == {}
-    assert reflectance_factors(replace(capture(of), camera=CameraIdentity("a", "b", "2")), panels) == {}
+    for hour, factor in (("09:00", 2.0), ("10:30", 1 / 0.375), ("12:00", 4.0)):
+        assert reflectance_factors(capture(GREEN, f"2026-06-21T{hour}:00"), panels) == {"Green": pytest.approx(factor)}
+    assert reflectance_factors(capture(GREEN, "2026-06-23T10:30:00"), panels) == {}
+    assert reflectance_factors(replace(capture(GREEN), camera=CameraIdentity("a", "b", "2")), panels) == {}
 
 
 def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:
-    band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
-    held = replace(band, panel=Panel("look"))
-    ground = PanelReading(capture(held, position=Position(52.0, 5.0, 93.0)), ())
-    high = capture(band, position=Position(52.0, 5.0, 112.0), pose=Pose(30.0))
+    ground, high = PanelReading(capture(HELD, position=GROUND), ()), capture(GREEN, position=HIGH, pose=Pose(30.0))
     result = with_height(high, [ground])
     assert result.pose.height_m == pytest.approx(20.0)
     assert with_height(high, []) == high
-    in_scene = replace(band, panel=Panel("QR code", in_scene=True))
-    assert with_height(high, [PanelReading(capture(in_scene, position=Position(52.0, 5.0, 93.0)), ())]) == high
+    in_scene = replace(GREEN, panel=Panel("QR code", in_scene=True))
+    assert with_height(high, [PanelReading(capture(in_scene, position=GROUND), ())]) == high
     with_tags = replace(high, pose=Pose(30.0, height_m=25.0))
     assert with_height(with_tags, [ground]) == with_tags
     assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
 
 
+def captures_in_seconds(undated: int | None = None) -> list[Capture]:
+    """Twenty captures, named by the second in which they were taken."""
+    moments = ["" if k == undated else f"2026-06-21T10:00:{k:02d}" for k in range(20)]
+    return [replace(capture(GREEN, moment), name=f"{k}") for k, moment in enumerate(moments)]
+
+
 def test_the_search_for_panels_ends_after_three_captures_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
-    flight = [replace(capture(band, f"2026-06-21T10:00:{k:02d}"), name=f"{k}") for k in range(20)]
-    looked: list[str] = []
+    flight, looked, shown = captures_in_seconds(), [], (0, 1, 2, 3, 5, 18)
 
-    def warped_pair(one: Capture, _without_code: bool) -> Capture:
-        looked.append(one.name)
-        shown = one.name in ("0", "1", "2", "3", "5", "18")
-        return replace(one, bands=(replace(band, panel=Panel("look") if shown else None),))
+    def detected(one: Capture, _without_code: bool) -> Capture:
+        looked.append(int(one.name))
+        return replace(one, bands=(HELD if looked[-1] in shown else GREEN,))
 
-    monkeypatch.setattr("agalign.flight.panels._with_detected_panel", warped_pair)
-    result = with_panels(flight)
-    assert [c.name for c in result if c.panel] == ["0", "1", "2", "3", "5", "18"]
-    assert sorted(map(int, looked)) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 15, 16, 17, 18, 19]
+    monkeypatch.setattr("agalign.flight.panels._with_detected_panel", detected)
+    assert [int(c.name) for c in with_panels(flight) if c.panel] == list(shown)
+    assert sorted(looked) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 15, 16, 17, 18, 19]
+    for few, names in ((flight[7:8], [7]), (flight[7:9], [7, 7, 8]), ([], [])):
+        looked.clear()
+        assert len(with_panels(few)) == len(few)
+        assert sorted(looked) == names
+    # One unknown time leaves the captures in their order.
     looked.clear()
-    with_panels(flight[7:8])
-    assert looked == ["7"]
-    with_panels(flight[7:9])
-    assert sorted(looked) == ["7", "7", "8"]
-    assert with_panels([]) == []
+    monkeypatch.setattr(
+        "agalign.flight.panels._with_detected_panel", lambda one, _without_code: looked.append(int(one.name)) or one
+    )
+    with_panels(captures_in_seconds(undated=10))
+    assert sorted(looked) == [0, 1, 2, 17, 18, 19]
 
 
 @pytest.mark.slow
@@ -118,49 +115,27 @@ def test_panels_are_searched_in_the_first_and_last_captures(tmp_path: Path) -> N
 def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
     """Without a GPS fix the clock starts in 1970; such a panel does not match captures without a time."""
     undated, of_1970 = reading("", 2.0), reading("1970-01-01T01:00:00", 2.0)
-    of = undated.capture.bands[0]
     assert (undated.capture.time_s, of_1970.capture.time_s) == (None, 3600.0)
-    assert reflectance_factors(capture(of, ""), [of_1970]) == {}
+    assert reflectance_factors(capture(GREEN, ""), [of_1970]) == {}
     assert reflectance_factors(of_1970.capture, [undated]) == {}
     assert reflectance_factors(undated.capture, [undated]) == {}
     assert reflectance_factors(of_1970.capture, [undated, of_1970]) == {"Green": pytest.approx(2.0)}
-
-
-def test_without_a_time_no_panel_is_at_the_height_of_the_ground() -> None:
-    band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
-    held = replace(band, panel=Panel("look"))
-    ground = PanelReading(capture(held, "1970-01-01T01:00:00", position=Position(52.0, 5.0, 93.0)), ())
-    high = capture(band, "", position=Position(52.0, 5.0, 112.0), pose=Pose(30.0))
+    # Nor is one at the height of the ground.
+    ground = PanelReading(capture(HELD, "1970-01-01T01:00:00", position=GROUND), ())
+    high = capture(GREEN, "", position=HIGH, pose=Pose(30.0))
     assert with_height(high, [ground]) == high
     undated = replace(ground, capture=replace(ground.capture, captured_at=""))
     assert with_height(replace(high, captured_at="1970-01-01T01:00:00"), [undated]).pose == high.pose
 
 
-def test_one_unknown_time_leaves_the_captures_of_a_flight_in_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    band = Band("Green", Path("x.tif"), 1, 64, 48, "uint16")
-    moments = ["" if k == 10 else f"2026-06-21T10:00:{k:02d}" for k in range(20)]
-    flight = [replace(capture(band, moment), name=f"{k}") for k, moment in enumerate(moments)]
-    looked: list[str] = []
-    monkeypatch.setattr(
-        "agalign.flight.panels._with_detected_panel", lambda one, _without_code: looked.append(one.name) or one
-    )
-    with_panels(flight)
-    assert sorted(map(int, looked)) == [0, 1, 2, 17, 18, 19]
-
-
 @pytest.mark.parametrize(
     ("code", "in_scene", "expected"),
-    [
-        ("RP04", False, (True, True)),
-        ("RP04", True, (True, False)),
-        ("", False, (True, True)),
-        ("", True, (False, False)),
-    ],
+    [("RP04", False, (True, True)), ("RP04", True, (True, False)), ("", False, (True, True)), ("", True, (False,) * 2)],
 )
 def test_a_square_in_a_scene_is_a_panel_only_with_a_code(
     monkeypatch: pytest.MonkeyPatch, code: str, in_scene: bool, expected: tuple[bool, bool]
 ) -> None:
     """A roof resembles a panel. Only captures of a panel are excluded."""
     monkeypatch.setattr("agalign.flight.panels._detect", lambda *_, **__: DetectedPanel(code, AREA, in_scene))
-    (result,) = with_panels([capture(Band("Green", Path("x.tif"), 1, 64, 48, "uint16"))], without_code=True)
+    (result,) = with_panels([capture(GREEN)], without_code=True)
     assert (result.panel is not None, result.is_of_a_panel) == expected

@@ -1,6 +1,7 @@
 """Predictions of a simple rig: each term of the standard error separately."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,21 +23,22 @@ SIZE = 640, 480
 FROM_BANDS_PX = MovingFilePx(0.1)
 
 
-def capture(
-    distance_px: float, seconds: float | None = None, altitude_m: float | None = None,
-    motion: tuple[float, float] | None = None, steps_px: tuple[float, float] = (0.0, 0.0),
-) -> CaptureFactors:  # fmt: skip
-    return CaptureFactors(seconds, altitude_m, motion, (distance_px, 0.0, 0.0, *steps_px))
+def capture(distance_px: float, seconds: float | None = None, **more: Any) -> CaptureFactors:
+    factors = distance_px, 0.0, 0.0, *more.get("steps_px", (0.0, 0.0))
+    return CaptureFactors(seconds, more.get("altitude_m"), more.get("motion"), factors)
 
 
 def rig(*captures: CaptureFactors, baseline_std: float = 0.0) -> Rig:
     """Two bands with baselines along x and y; the distance is the only factor."""
-    bands = ("Red", "NIR")
-    return Rig(
-        SIZE, {"Red": geometry.translation(30, -5), "NIR": geometry.translation(-12, 8)},
-        {"Red": (0.6, 0.0), "NIR": (0.0, 0.8)}, {"Red": 1.0, "NIR": 0.5}, dict.fromkeys(bands, baseline_std),
-        ("distance",), captures, dict.fromkeys(bands, FROM_BANDS_PX),
-    )  # fmt: skip
+    mean = {"Red": geometry.translation(30, -5), "NIR": geometry.translation(-12, 8)}
+    baselines, delays = {"Red": (0.6, 0.0), "NIR": (0.0, 0.8)}, {"Red": 1.0, "NIR": 0.5}
+    stds = dict.fromkeys(mean, baseline_std), ("distance",), captures, dict.fromkeys(mean, FROM_BANDS_PX)
+    return Rig(SIZE, mean, baselines, delays, *stds)
+
+
+@pytest.fixture
+def some() -> Rig:
+    return rig(capture(1.0), capture(-1.0), capture(0.0))
 
 
 def showing(rig: Rig, band: str, distance_px: float, std_px: float = 0.01) -> Observation:
@@ -45,26 +47,19 @@ def showing(rig: Rig, band: str, distance_px: float, std_px: float = 0.01) -> Ob
     return Observation(None, {band: mapping}, {band: MovingFilePx(std_px)})
 
 
-def test_a_band_is_predicted_along_its_baseline() -> None:
-    some = rig(capture(1.0), capture(-1.0), capture(0.0))
+def test_a_band_is_predicted_along_its_baseline(some: Rig) -> None:
     predicted = predict_band(some, "NIR", showing(some, "Red", 2.0))
     assert predicted.source == "bands"
     # The wide prior biases the factor by one thousandth.
     assert distance_px(predicted.fixed_to_moving, geometry.translation(-12, 8 + 0.8 * 2.0), SIZE) < 0.01
 
 
-def test_an_unobserved_quarter_adds_the_error_of_the_lenses() -> None:
-    some = rig(capture(1.0), capture(-1.0), capture(0.0))
+def test_an_unobserved_quarter_adds_the_error_of_the_lenses(some: Rig) -> None:
     half = replace(some, extrapolation_px={"NIR": MovingFilePx(0.7)})
-    assert some.covers("NIR")
-    assert not half.covers("NIR")
-    assert not some.covers("Green")
-    known = showing(some, "Red", 2.0)
-    std_px, half_px = (predict_band(r, "NIR", known).std_px for r in (some, half))
-    assert half_px == pytest.approx(np.hypot(std_px, 0.7))
-    assert predict_band(half, "Red", showing(some, "NIR", 2.0)).std_px == pytest.approx(
-        predict_band(some, "Red", showing(some, "NIR", 2.0)).std_px
-    )
+    assert (some.covers("NIR"), half.covers("NIR"), some.covers("Green")) == (True, False, False)
+    for band, other, extra_px in (("NIR", "Red", 0.7), ("Red", "NIR", 0.0)):
+        std_px, half_px = (predict_band(r, band, showing(some, other, 2.0)).std_px for r in (some, half))
+        assert half_px == pytest.approx(np.hypot(std_px, extra_px))
 
 
 def test_the_mean_square_of_few_captures_is_inflated() -> None:
@@ -83,8 +78,7 @@ def test_factors_outside_the_learned_range_add_the_error_of_the_baseline() -> No
     assert predict_band(rough, "NIR", near).std_px == predict_band(exact, "NIR", near).std_px
 
 
-def test_an_uncertain_mapping_makes_the_prediction_uncertain() -> None:
-    some = rig(capture(1.0), capture(-1.0), capture(0.0))
+def test_an_uncertain_mapping_makes_the_prediction_uncertain(some: Rig) -> None:
     sure = predict_band(some, "NIR", showing(some, "Red", 1.0, std_px=0.05)).std_px
     unsure = predict_band(some, "NIR", showing(some, "Red", 1.0, std_px=1.0)).std_px
     # The baselines are 0.6 and 0.8: 1 px in Red corresponds to 0.8 / 0.6 px in NIR.
@@ -92,8 +86,7 @@ def test_an_uncertain_mapping_makes_the_prediction_uncertain() -> None:
     assert unsure == pytest.approx(0.8 / 0.6 / np.sqrt(2), rel=0.5)
 
 
-def test_excess_residuals_of_bands_make_the_prediction_uncertain() -> None:
-    some = rig(capture(1.0), capture(-1.0), capture(0.0))
+def test_excess_residuals_of_bands_make_the_prediction_uncertain(some: Rig) -> None:
     known = showing(some, "Red", 1.0)
     across = geometry.compose(geometry.translation(0.0, 3.0), known.mappings["Red"])
     disagreeing = replace(known, mappings={"Red": across})
@@ -103,8 +96,8 @@ def test_excess_residuals_of_bands_make_the_prediction_uncertain() -> None:
     assert np.sqrt(3.0**2 - FROM_BANDS_PX**2) < unusual < 3.6
 
 
-def test_without_factors_every_capture_is_the_mean() -> None:
-    still = replace(rig(capture(1.0), capture(-1.0), capture(0.0)), factors=())
+def test_without_factors_every_capture_is_the_mean(some: Rig) -> None:
+    still = replace(some, factors=())
     known = showing(rig(), "Red", 0.0)
     predicted = predict_band(still, "NIR", known)
     assert predicted.source == "flight"
@@ -136,12 +129,8 @@ def test_factors_are_interpolated_in_time_with_the_error_of_a_brownian_bridge() 
 
 
 def test_the_distance_is_interpolated_in_height_and_the_rest_in_time() -> None:
-    known = [
-        capture(2.0 * k, seconds=float(k), altitude_m=50.0 + k, steps_px=(float(k), 0.0)) for k in range(3)
-    ]  # fmt: skip
-    estimate = estimated_factors(capture(0.0, seconds=2.0, altitude_m=50.5), known, "altitude_m")
-    assert estimate is not None
-    factors, std, gap = estimate
+    known = [capture(2.0 * k, float(k), altitude_m=50.0 + k, steps_px=(float(k), 0.0)) for k in range(3)]
+    factors, std, gap = estimated_factors(capture(0.0, 2.0, altitude_m=50.5), known, "altitude_m")
     assert (factors[0], factors[3], std[0], std[3], gap) == pytest.approx((1.0, 2.0, 2.0 * 0.5, 0.0, 0.5))
     assert estimated_factors(capture(0.0, seconds=1.0), known, "altitude_m") is None
 
@@ -151,14 +140,14 @@ def test_shifts_are_a_linear_function_of_the_motion() -> None:
     in_time, flight = (estimated_factors(capture(0.0, 0.0, motion=(3.0, 1.0)), known, e) for e in ("seconds", "flight"))
     np.testing.assert_allclose(in_time[0], [7.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
     np.testing.assert_allclose(flight[0], [0.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
-    unknown = estimated_factors(capture(0.0), known, "flight")
-    assert not unknown[0].any()
+    assert not estimated_factors(capture(0.0), known, "flight")[0].any()
 
 
 def test_an_unseen_altitude_adds_an_error() -> None:
     captures = [capture(0.5 * k, altitude_m=60.0 + k) for k in range(3)]
-    here = predict_band(rig(*captures), "Red", Observation(None, {}, {}, altitude_m=61.0)).std_px
-    above = predict_band(rig(*captures), "Red", Observation(None, {}, {}, altitude_m=66.0)).std_px
+    here, above = (
+        predict_band(rig(*captures), "Red", Observation(None, {}, {}, altitude_m)).std_px for altitude_m in (61.0, 66.0)
+    )
     # Precision of the slope: the prior's, and three altitudes a metre apart with at least 0.5 px of scatter.
     slope_std = 1 / np.sqrt(1 / 1.5**2 + 2 / 0.5**2)
     climb_px = 0.6 * 4 * (slope_std + 0.5)
@@ -169,10 +158,9 @@ def test_with_few_captures_only_two_estimators_are_used() -> None:
     """Heights would predict these captures exactly; with five captures that may be chance."""
     captures = [capture(float(k % 3), seconds=float(k * 7 % 6), altitude_m=50.0 + k % 3) for k in range(6)]
     known = Observation(2.5, {}, {}, altitude_m=51.0)
-    assert predict_band(rig(*captures), "NIR", known).source == "neighbours"
-    six = predict_band(rig(*captures), "NIR", known).std_px
-    five = predict_band(rig(*captures[:5]), "NIR", known).std_px
-    assert six < 0.5 * five
+    six, five = (predict_band(rig(*captures[:count]), "NIR", known) for count in (6, 5))
+    assert six.source == "neighbours"
+    assert six.std_px < 0.5 * five.std_px
 
 
 def test_the_extremes_exclude_outliers() -> None:

@@ -16,9 +16,10 @@ from agalign.relief.adjustment import (
 )
 from agalign.synthetic import cameras
 from agalign.values import geometry
-from agalign.values.alignment import Residual
 from agalign.values.mapping import PixelMapping
 from agalign.values.relief import Parallax, Relief
+
+from ..builders import residual_of
 
 SIZE = 640, 480
 BASELINES = np.array([[-0.8, 0.0], [0.0, -0.6], [-0.8, -0.6], [-0.4, -0.3]])
@@ -61,10 +62,14 @@ def assert_recovered(model: Adjustment | None, sign: int = 1, tolerance_px: floa
     assert np.abs(shifts_by_corners(model, POINTS, SIZE) - planes).max() < tolerance_px
 
 
+def without_fields(windows: WindowShifts, layout: np.ndarray | None = None) -> Adjustment | None:
+    return adjust(windows, SIZE, layout, with_fields=False)
+
+
 @pytest.mark.parametrize("unit", [1.0, 0.001, 40.0])
 def test_the_model_is_recovered_despite_noise_and_wrong_peaks(unit: float) -> None:
     """Whatever the unit of the layout."""
-    model = adjust(shifts(), SIZE, BASELINES * unit, with_fields=False)
+    model = without_fields(shifts(), BASELINES * unit)
     assert_recovered(model)
     assert np.nanmedian(model.residuals_px) < 0.15
     assert 0.1 < (model.residuals_px > 2).mean() < 0.25
@@ -72,7 +77,7 @@ def test_the_model_is_recovered_despite_noise_and_wrong_peaks(unit: float) -> No
 
 def test_windows_may_be_missing_in_some_bands() -> None:
     some = shifts(missing=0.3)
-    model = adjust(some, SIZE, BASELINES, with_fields=False)
+    model = without_fields(some, BASELINES)
     assert_recovered(model)
     np.testing.assert_array_equal(np.isfinite(model.residuals_px), some.weights > 0)
 
@@ -81,7 +86,7 @@ def test_windows_may_be_missing_in_some_bands() -> None:
 def test_an_unrelated_band_does_not_bias_the_others(layout: np.ndarray | None) -> None:
     windows = shifts(wrong=0.0)
     windows.shifts_px[:, 0] = np.random.default_rng(2).uniform(-20, 20, (len(POINTS), 2))
-    model = adjust(windows, SIZE, layout, with_fields=False)
+    model = without_fields(windows, layout)
     others = model.baselines[1:] / np.linalg.norm(model.baselines[1:], axis=1).max()
     wanted = BASELINES[1:] * np.sign(np.sum(others * BASELINES[1:]))
     np.testing.assert_allclose(others, wanted / np.linalg.norm(wanted, axis=1).max(), atol=0.03)
@@ -93,24 +98,17 @@ def test_priors_do_not_depend_on_the_noise_of_a_band() -> None:
     rng = np.random.default_rng(0)
     shift = heights()[::6, None, None] * BASELINES + rng.normal(0, 0.02, (len(few), 4, 2))
     shift[:, 1] += rng.normal((20, -20), 1.5, (len(few), 2))
-    model = adjust(WindowShifts(few, few, shift, np.ones((len(few), 4))), SIZE, BASELINES, with_fields=False)
+    model = without_fields(WindowShifts(few, few, shift, np.ones((len(few), 4))), BASELINES)
     assert model is not None
     error_px = shifts_by_corners(model, few, SIZE)[:, 1] - [20, -20]
     assert np.abs(error_px.mean(axis=0)).max() < 0.5
 
 
-def test_only_the_sign_of_the_layout_must_be_right() -> None:
+def test_the_layout_determines_only_the_sign() -> None:
     rough = BASELINES + np.random.default_rng(5).normal(0, 0.15, BASELINES.shape)
-    assert_recovered(adjust(shifts(), SIZE, rough, with_fields=False))
-
-
-def test_the_layout_determines_the_sign() -> None:
-    assert_recovered(adjust(shifts(), SIZE, BASELINES, with_fields=False))
-    assert_recovered(adjust(shifts(), SIZE, -BASELINES, with_fields=False), sign=-1)
-
-
-def test_without_a_layout_only_the_sign_is_unknown() -> None:
-    model = adjust(shifts(), SIZE, with_fields=False)
+    assert_recovered(without_fields(shifts(), rough))
+    assert_recovered(without_fields(shifts(), -BASELINES), sign=-1)
+    model = without_fields(shifts())
     assert_recovered(model, sign=1 if (model.baselines * BASELINES).sum() > 0 else -1)
 
 
@@ -119,7 +117,7 @@ def test_the_reference_plane_contains_most_windows() -> None:
     tilted = shifts()
     tilt = 0.01 * (POINTS[:, 0] - 320) - 0.02 * (POINTS[:, 1] - 240) + 5
     tilted = replace(tilted, shifts_px=tilted.shifts_px + tilt[:, None, None] * BASELINES)
-    model = adjust(tilted, SIZE, BASELINES, with_fields=False)
+    model = without_fields(tilted, BASELINES)
     assert np.percentile(np.abs(model.parallax_px - heights()), 75) < 0.15
 
 
@@ -146,29 +144,26 @@ def test_lens_fields_are_recovered_next_to_parallax() -> None:
         # The smoothness reduces the field in the corners.
         assert np.percentile(np.linalg.norm(error, axis=1), 95) < 0.25
         assert np.median(np.linalg.norm(error, axis=1)) < 0.08
-    without = adjust(windows, SIZE, BASELINES, with_fields=False)
+    without = without_fields(windows, BASELINES)
     assert without.fields == [None] * 4
     assert np.all(without.scales_px > 1.05 * model.scales_px)
 
 
-@pytest.mark.parametrize(("baselines", "on_a_line"), [
-    (BASELINES, False),
-    (BASELINES[[0, 1]], False),
-    (np.array([[-1.0, 0.5], [0.4, -0.2], [-0.2, 0.1]]), True),
-    (np.array([[-1.0, 0.5], [0.4, -0.15]]), True),
-])  # fmt: skip
-def test_baselines_on_a_line(baselines: np.ndarray, on_a_line: bool) -> None:
-    assert are_on_a_line(baselines) == on_a_line
+def test_baselines_on_a_line() -> None:
+    assert are_on_a_line(np.array([[-1.0, 0.5], [0.4, -0.2], [-0.2, 0.1]]))
+    assert are_on_a_line(np.array([[-1.0, 0.5], [0.4, -0.15]]))
+    assert not are_on_a_line(BASELINES)
+    assert not are_on_a_line(BASELINES[[0, 1]])
 
 
 def test_too_few_windows_give_no_model() -> None:
     windows = shifts()
     few = WindowShifts(POINTS[:7], POINTS[:7], windows.shifts_px[:7], windows.weights[:7])
-    assert adjust(few, SIZE, with_fields=False) is None
+    assert without_fields(few) is None
     # Eight windows suffice if they are measured in all bands.
     nothing = replace(windows, weights=np.where(np.arange(4) == 2, 0.0, windows.weights))
-    assert adjust(nothing, SIZE, with_fields=False) is None
-    assert adjust(windows, SIZE, np.zeros((4, 2)), with_fields=False) is None
+    assert without_fields(nothing) is None
+    assert without_fields(windows, np.zeros((4, 2))) is None
 
 
 def test_parallax_is_the_projection_onto_the_baselines() -> None:
@@ -182,22 +177,18 @@ def test_parallax_is_the_projection_onto_the_baselines() -> None:
 # ---- windows of several bands
 
 
-def residual(centres: np.ndarray, shift: np.ndarray, sigma: float = 20.0) -> Residual:
-    return Residual.of(centres, shift, np.full(len(centres), sigma))
-
-
 def test_windows_are_matched_by_their_centres() -> None:
     at = np.array([[10.0, 20.0], [30.0, 20.0], [50.0, 20.0]])
-    one = residual(at, np.array([[1.0, 0], [2, 0], [np.nan, np.nan]]))
-    other = residual(at[[2, 0]], np.array([[3.0, 0], [4, 0]]), sigma=60.0)
+    one = residual_of(at, np.array([[1.0, 0], [2, 0], [np.nan, np.nan]]))
+    other = residual_of(at[[2, 0]], np.array([[3.0, 0], [4, 0]]), sigma=60.0)
     plain = PixelMapping(np.eye(3))
     windows = WindowShifts.of([one, other], [plain, plain])
     np.testing.assert_array_equal(windows.centres_px, at)
     np.testing.assert_array_equal(windows.shifts_px[..., 0], [[1, 4], [2, np.nan], [np.nan, 3]])
     # Weights grow with the peak height up to a limit; windows without a measurement have weight 0.
     np.testing.assert_allclose(windows.weights, [[0.25, 2], [0.25, 0], [0, 2]])
-    assert WindowShifts.of([residual(at, np.full((3, 2), np.nan))], [plain]).weights.tolist() == [[0.0]] * 3
-    assert len(WindowShifts.of([residual(at[:0], at[:0])], [plain])) == 0
+    assert WindowShifts.of([residual_of(at, (np.nan, np.nan))], [plain]).weights.tolist() == [[0.0]] * 3
+    assert len(WindowShifts.of([residual_of(at[:0], at[:0])], [plain])) == 0
 
 
 def test_shifts_are_those_of_undistorted_pixels() -> None:
@@ -206,7 +197,7 @@ def test_shifts_are_those_of_undistorted_pixels() -> None:
     relief = Relief(np.full(SIZE[::-1], 5.0, np.float32), np.ones(SIZE[::-1], np.float32))
     mapping = PixelMapping(np.eye(3), lens, None, parallax=Parallax(relief, (0.6, -0.8)))
     centre, shift = np.array([[40.0, 30.0]]), np.array([[3.0, 2.0]])
-    windows = WindowShifts.of([residual(centre, shift)], [mapping])
+    windows = WindowShifts.of([residual_of(centre, shift)], [mapping])
     plane = mapping.of_the_plane
     np.testing.assert_allclose(windows.points_px, plane.undistorted(centre))
     expected = plane.undistorted(centre + shift) - plane.undistorted(centre)
@@ -230,5 +221,4 @@ def test_noise_of_the_reference_is_not_parallax(
     for shifts_px, is_depth in ((noise, False), (shifts().shifts_px, True)):
         windows = WindowShifts(POINTS, POINTS, shifts_px[:, bands], np.ones((len(POINTS), len(bands))))
         known = None if layout is None else layout[bands]
-        model = adjust(windows, SIZE, known, with_fields=False)
-        assert are_of_lenses(model.baselines, known) == is_depth
+        assert are_of_lenses(without_fields(windows, known).baselines, known) == is_depth

@@ -8,10 +8,11 @@ import pytest
 
 from agalign.relief import dense
 from agalign.relief.dense import DenseMatching, View
-from agalign.values.image import FloatImage, Raster
+from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.relief import Relief
 
+from ..builders import whole
 from ..conftest import textured_image
 
 WIDTH, HEIGHT = 320, 240
@@ -21,17 +22,13 @@ BAR = slice(40, 200), slice(150, 162)
 BASELINES = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
-def raster(pixels: FloatImage) -> Raster:
-    return Raster(pixels, np.ones(pixels.shape, bool))
-
-
 def layers(area: tuple[slice, slice], near_px: int, shift: tuple[float, float]) -> Raster:
     """A textured area in front of a textured background, displaced by its parallax."""
     ground, front = (np.asarray(textured_image(WIDTH, HEIGHT, seed), np.float32) for seed in (1, 2))
     dx, dy = (round(s * near_px) for s in shift)
     rows, columns = area
     ground[rows.start + dy : rows.stop + dy, columns.start + dx : columns.stop + dx] = front[area]
-    return raster(ground)
+    return whole(ground)
 
 
 def views(area: tuple[slice, slice], near_px: int, baselines: Sequence[tuple[float, float]]) -> list[View]:
@@ -76,9 +73,9 @@ def test_windows_outside_a_moving_image_do_not_match() -> None:
     """At the right border, two of three bands do not show the ground: only the other one determines it."""
     plane = PixelMapping(np.array([[1.0, 0, 40], [0, 1, 0], [0, 0, 1]]))
     ground = np.asarray(textured_image(WIDTH + 40, HEIGHT, 3), np.float32)
-    seen = [View(raster(ground[:, 40:]), PixelMapping(np.eye(3)), (0.0, 1.0))]
-    seen += [View(raster(ground[:, :-40]), plane, b) for b in ((1.0, 0.0), (-1.0, 0.0))]
-    matching = DenseMatching(raster(ground[:, 40:]), seen, (-8.0, 8.0))
+    seen = [View(whole(ground[:, 40:]), PixelMapping(np.eye(3)), (0.0, 1.0))]
+    seen += [View(whole(ground[:, :-40]), plane, b) for b in ((1.0, 0.0), (-1.0, 0.0))]
+    matching = DenseMatching(whole(ground[:, 40:]), seen, (-8.0, 8.0))
     (relief,) = matching.refined(seen, [range(3)])
     assert np.abs(relief.parallax_px).max() < 1.0
 
@@ -95,7 +92,7 @@ def test_thirty_bands_do_not_overflow() -> None:
 def test_a_relief_depends_only_on_the_selected_bands() -> None:
     seen = views(BOX, 12, BASELINES)
     matching = of_views(seen, BOX, 12)
-    noise = raster(np.random.default_rng(0).uniform(0, 1, (HEIGHT, WIDTH)).astype(np.float32))
+    noise = whole(np.random.default_rng(0).uniform(0, 1, (HEIGHT, WIDTH)).astype(np.float32))
     (alone,) = matching.refined(seen, [[0, 1]])
     _, other = matching.refined([*seen[:2], *(View(noise, v.plane, v.baseline) for v in seen[2:])], [range(4), [0, 1]])
     np.testing.assert_array_equal(other.parallax_px, alone.parallax_px)

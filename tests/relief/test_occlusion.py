@@ -36,10 +36,6 @@ def test_a_nearer_box_occludes_the_ground_next_to_it(baseline: tuple[float, floa
     np.testing.assert_array_equal(occluded(layers(), baseline), shadow(BOX, dx, dy))
 
 
-def test_a_band_without_a_baseline_has_no_occlusions() -> None:
-    assert not occluded(layers(), (0.0, 0.0)).any()
-
-
 def test_a_hole_is_occluded_by_its_edge() -> None:
     """The edge at which the ground occludes the hole."""
     hidden = occluded(layers(near_px=-NEAR_PX), (1.0, 0.0))
@@ -55,16 +51,18 @@ def test_only_differences_of_parallax_matter() -> None:
     np.testing.assert_array_equal(occluded(raised, (1.0, 0.0)), occluded(layers(), (1.0, 0.0)))
 
 
-def test_low_relief_of_a_surface_occludes_nothing() -> None:
+def test_low_relief_and_a_band_without_a_baseline_have_no_occlusions() -> None:
+    assert not occluded(layers(), (0.0, 0.0)).any()
     slope = np.linspace(0, 20, WIDTH, dtype=np.float32)[None, :].repeat(HEIGHT, axis=0)
     for baseline in ((1.0, 0.0), (-0.7, 0.7)):
         assert not occluded(Relief(slope, np.ones_like(slope)), baseline).any()
         assert not occluded(layers(near_px=0.9), baseline).any()
 
 
-@pytest.mark.parametrize("box", [
-    (slice(0, 15), slice(0, 12)), (slice(45, HEIGHT), slice(80, WIDTH)), (slice(0, HEIGHT), slice(0, 8)),
-])  # fmt: skip
+BORDERS = (slice(0, 15), slice(0, 12)), (slice(45, HEIGHT), slice(80, WIDTH)), (slice(0, HEIGHT), slice(0, 8))
+
+
+@pytest.mark.parametrize("box", BORDERS)
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_box_at_the_border_occludes_only_pixels_inside(box: tuple[slice, slice], sign: int) -> None:
     """Pixels displaced out of the image occlude nothing, neither each other nor pixels at the other side."""
@@ -96,9 +94,7 @@ def test_a_reduced_relief() -> None:
 def by_definition(relief: Relief, baseline: tuple[float, float], min_step_px: float) -> Mask:
     """The z-buffer, pixel by pixel, before the closing and the removal of small areas."""
     z = relief.parallax_px.astype(float)
-    at = {}
-    for (y, x), value in np.ndenumerate(z):
-        at[y, x] = round(y + baseline[1] * value), round(x + baseline[0] * value)
+    at = {(y, x): (round(y + baseline[1] * v), round(x + baseline[0] * v)) for (y, x), v in np.ndenumerate(z)}
     nearest: dict[tuple[int, int], float] = {}
     for pixel, cell in at.items():
         nearest[cell] = max(nearest.get(cell, -np.inf), z[pixel])
@@ -140,12 +136,8 @@ def test_pixels_that_match_are_nearer(sign: int) -> None:
     assert nearer_sign(matched(sign, BASELINES), BASELINES) == sign
 
 
-def test_the_sign_is_unknown_if_occluded_pixels_match_too() -> None:
+def test_the_sign_is_unknown_without_occlusions_or_if_occluded_pixels_match_too() -> None:
     assert nearer_sign(matched(1, BASELINES, behind=0.9), BASELINES) == 0
-
-
-def test_the_sign_is_unknown_without_occlusions() -> None:
-    flat = layers(near_px=0.0)
-    assert nearer_sign(flat, BASELINES) == 0
+    assert nearer_sign(layers(near_px=0.0), BASELINES) == 0
     small = Relief(layers((slice(20, 22), slice(30, 32))).parallax_px, matched(1, BASELINES).confidence)
     assert nearer_sign(small, BASELINES / 6) == 0

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from agalign.relief.range import inverse_range
 from agalign.values import lens
@@ -20,29 +21,18 @@ PLANE_M, NEAR_M, SLOPE = 2.0, 1.1, 0.25
 """Range of the plane at the centre and of a box, and the slope of the plane relative to the image."""
 
 
-def camera_matrix(focal_px: float) -> np.ndarray:
-    return np.array([[focal_px, 0, 160], [0, focal_px, 119], [0, 0, 1.0]])
-
-
-def rotation(angles: tuple[float, float, float]) -> np.ndarray:
-    x, y, z = angles
-    cx, sx, cy, sy, cz, sz = np.cos(x), np.sin(x), np.cos(y), np.sin(y), np.cos(z), np.sin(z)
-    about_x, about_y = (
-        np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]),
-        np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]),
-    )
-    return np.asarray(np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1.0]]) @ about_y @ about_x)
-
-
 K = np.array([[400.0, 0, 158], [0, 402, 121], [0, 0, 1]])
+
+
+def tilted_plane(x: np.ndarray) -> np.ndarray:
+    """Z = PLANE_M + SLOPE X with X = Z (x - cx) / f."""
+    return PLANE_M / (1 - SLOPE * (x - K[0, 2]) / K[0, 0])
 
 
 def truth(points: np.ndarray, reference: Lens) -> np.ndarray:
     """Range (...) at raw pixels: a tilted plane with a box parallel to the image above it."""
     x, y = np.moveaxis(lens.undistort(reference, points), -1, 0)
-    # Z = PLANE_M + SLOPE X with X = Z (x - cx) / f
-    plane = PLANE_M / (1 - SLOPE * (x - K[0, 2]) / K[0, 0])
-    return np.where((np.abs(x - 200) < 40) & (np.abs(y - 90) < 30), NEAR_M, plane)
+    return np.where((np.abs(x - 200) < 40) & (np.abs(y - 90) < 30), NEAR_M, tilted_plane(x))
 
 
 @pytest.mark.parametrize("reference", [REFERENCE, DISTORTED])
@@ -53,22 +43,20 @@ def test_range_of_a_plane_and_a_box(reference: Lens, bands: int) -> None:
     normal = np.array([-SLOPE, 0.0, 1.0])  # of the plane: normal . X = PLANE_M
     unit = np.linalg.norm(PLACES_M[:bands], axis=1).max() * K[0, 0]
     # Parallax is proportional to 1 / Z minus the plane's at the same pixel.
-    plane_m = PLANE_M / (1 - SLOPE * (lens.undistort(reference, points)[..., 0] - K[0, 2]) / K[0, 0])
+    plane_m = tilted_plane(lens.undistort(reference, points)[..., 0])
     parallax_px = unit * (1 / range_m - 1 / plane_m)
     mappings, infinite = [], []
     for place, focal_px, angles in list(zip(PLACES_M, FOCAL_PX, ANGLES, strict=True))[:bands]:
-        turn, there = rotation(angles), camera_matrix(focal_px)
+        turn = Rotation.from_euler("xyz", angles).as_matrix()
+        there = np.array([[focal_px, 0, 160], [0, focal_px, 119], [0, 0, 1.0]])
         translation = np.array([*place, 0.0])
         # X' = R (X - place); on the plane 1 = normal . X / PLANE_M.
         by_plane = there @ turn @ (np.eye(3) - np.outer(translation, normal) / PLANE_M) @ np.linalg.inv(K)
         infinite.append(there @ turn @ np.linalg.inv(K))
         # With this t, H (x + t z) ~ K' R (X - place) for all points of the line of sight.
         baseline = -K[:2, :2] @ place / unit / (1 - normal @ translation / PLANE_M)
-        parallax = Parallax(
-            Relief(parallax_px.astype(np.float32), np.ones(SIZE[::-1], np.float32)), (baseline[0], baseline[1])
-        )
-        mapping = PixelMapping(by_plane, reference, None, parallax=parallax)
-        mappings.append(mapping)
+        relief = Relief(parallax_px.astype(np.float32), np.ones(SIZE[::-1], np.float32))
+        mappings.append(PixelMapping(by_plane, reference, None, parallax=Parallax(relief, tuple(baseline))))
     inverse_m = inverse_range(mappings, infinite, -PLACES_M[:bands], reference, points, parallax_px)
     np.testing.assert_allclose(inverse_m * range_m, 1, atol=1e-3)
     assert np.ptp(range_m) > 0.8

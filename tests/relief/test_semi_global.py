@@ -57,13 +57,16 @@ def test_the_minimum_of_a_parabola(at: float, dtype: type) -> None:
     assert sub_label_minimum(costs)[0, 0] == pytest.approx(at, abs=1e-3)
 
 
-@pytest.mark.parametrize(("costs", "label"), [
-    ([1, 5, 9, 20], 0),
-    ([20, 9, 5, 1], 3),
-    ([4, 4, 4, 4], 0),  # no minimum at all
-    ([9, 5, 5, 9], 1.5),  # halfway
-    ([9, 2, 4, 2], 1 + 0.5 * 5 / 9),  # the first of two: (9 - 4) / (2 * (9 - 4 + 4))
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("costs", "label"),
+    [
+        ([1, 5, 9, 20], 0),
+        ([20, 9, 5, 1], 3),
+        ([4, 4, 4, 4], 0),  # no minimum at all
+        ([9, 5, 5, 9], 1.5),  # halfway
+        ([9, 2, 4, 2], 1 + 0.5 * 5 / 9),  # the first of two: (9 - 4) / (2 * (9 - 4 + 4))
+    ],
+)
 def test_at_the_borders_there_is_no_parabola(costs: list[float], label: float) -> None:
     volume = np.array(costs, np.float32)[:, None, None]
     assert sub_label_minimum(volume)[0, 0] == pytest.approx(label, abs=1e-6)
