@@ -8,12 +8,13 @@ from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.displacement import DisplacementField
-from agalign.values.image import Raster, Tile
+from agalign.values.image import Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 from agalign.verify import displacement_field
 from agalign.verify.displacement_field import (
     DisplacementEstimator,
+    DisplacementResult,
     Shifts,
     _folds,
     _Gain,
@@ -23,7 +24,7 @@ from agalign.verify.displacement_field import (
     fitted_field,
 )
 
-from ..conftest import textured_image, textured_pair
+from ..builders import displaced_views, residual_of, texture
 
 SIZE = 640, 480
 
@@ -38,9 +39,14 @@ def centres() -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(32, 640, 32.0), np.arange(32, 480, 32.0)), -1).reshape(-1, 2)
 
 
-def weights(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return equal weights and peak heights for all windows."""
-    return np.ones(len(at)), np.full(len(at), 20.0)
+def shifts_at(at: np.ndarray, shifts_px: np.ndarray) -> Shifts:
+    """Shifts with equal weights and peak heights."""
+    return Shifts(at, shifts_px, np.ones(len(at)), np.full(len(at), 20.0))
+
+
+def estimator() -> DisplacementEstimator:
+    image = texture(*SIZE)
+    return DisplacementEstimator(image.valid, structure_field(image))
 
 
 def test_a_smooth_field_is_fitted_despite_noise_and_wrong_peaks() -> None:
@@ -49,7 +55,7 @@ def test_a_smooth_field_is_fitted_despite_noise_and_wrong_peaks() -> None:
     shifts = bump(at) + 0.08 * rng.normal(size=at.shape)
     wrong = rng.random(len(at)) < 0.05
     shifts[wrong] += rng.uniform(-20, 20, (wrong.sum(), 2))
-    field = fitted_field(Shifts(at, shifts, *weights(at)), 1.0, 48, SIZE)
+    field = fitted_field(shifts_at(at, shifts), 1.0, 48, SIZE)
     error = np.linalg.norm(field(at) - bump(at), axis=1)
     assert np.sqrt((error**2).mean()) < 0.09
     assert np.linalg.norm(bump(at), axis=1).max() > 1.2
@@ -58,7 +64,7 @@ def test_a_smooth_field_is_fitted_despite_noise_and_wrong_peaks() -> None:
 def test_the_field_vanishes_far_from_all_measurements() -> None:
     at = centres()
     near = at[at[:, 0] < 200]
-    field = fitted_field(Shifts(near, np.tile([2.0, 0.0], (len(near), 1)), *weights(near)), 1.0, 48, (6400, 480))
+    field = fitted_field(shifts_at(near, np.tile([2.0, 0.0], (len(near), 1))), 1.0, 48, (6400, 480))
     assert field(np.array([[100.0, 240.0]]))[0, 0] == pytest.approx(2.0, abs=0.05)
     assert abs(field(np.array([[6000.0, 240.0]]))[0]).max() < 0.2
 
@@ -71,23 +77,14 @@ def test_folding_is_detected() -> None:
     assert not _is_one_to_one(DisplacementField(32.0, steep), SIZE)
 
 
-def displaced_pair(height: float) -> tuple[Raster, Raster]:
-    """A pair with a moving image displaced by the bump, and the bump as a displacement field of the reference."""
-    import cv2
-
-    fixed, moving = textured_pair(geometry.translation(0, 0), *SIZE, seed=4)
-    grid = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1).astype(np.float64)
-    # moving(x + d(x)) = fixed(x): the inverse of x + d(x) is computed by two iterations.
-    back = grid - bump(grid - bump(grid, height), height)
-    displaced_image = cv2.remap(moving, back.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    valid = np.ones(fixed.shape, bool)
-    return Raster(fixed, valid), Raster(displaced_image, valid)
+def refined(height: float) -> DisplacementResult:
+    """The result for a moving image displaced by the bump."""
+    fixed, moving = displaced_views(lambda points: bump(points, height))
+    return Reference(fixed).displacement_field.refine(moving, PixelMapping(geometry.identity()))
 
 
 def test_displacements_between_bands_are_followed() -> None:
-    fixed, moving = displaced_pair(1.5)
-    result = Reference(fixed).displacement_field.refine(moving, PixelMapping(geometry.identity()))
-    assert result.field is not None
+    result = refined(1.5)
     at = geometry.lattice(*SIZE, 17, 13)
     before, after = (np.linalg.norm(d, axis=1) for d in (bump(at), result.field(at) - bump(at)))
     assert np.percentile(after, 95) < 0.35 * np.percentile(before, 95)
@@ -95,14 +92,13 @@ def test_displacements_between_bands_are_followed() -> None:
 
 
 def test_no_field_is_added_where_a_homography_suffices() -> None:
-    fixed, moving = displaced_pair(0.0)
-    result = Reference(fixed).displacement_field.refine(moving, PixelMapping(geometry.identity()))
+    result = refined(0.0)
     assert result.field is None or np.abs(result.field(geometry.lattice(*SIZE, 17, 13))).max() < 0.05
 
 
 def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:
     at = centres()
-    field = fitted_field(Shifts(at, bump(at), *weights(at)), 1.0, 48, SIZE)
+    field = fitted_field(shifts_at(at, bump(at)), 1.0, 48, SIZE)
     mapping = PixelMapping(geometry.translation(5, 3), local=field)
     points = geometry.lattice(*SIZE, 9, 7)
     np.testing.assert_allclose(mapping(points), points + field(points) + (5, 3))
@@ -126,10 +122,9 @@ def test_windows_are_predicted_without_those_that_share_pixels() -> None:
 
 
 def test_a_field_that_clearly_increases_p95_is_rejected() -> None:
-    better = _Gain(1.0, before_p95_px=1.59, after_p95_px=1.62, loss=0.1, sigma=9.0)
-    worse = _Gain(1.0, before_p95_px=1.59, after_p95_px=1.69, loss=0.1, sigma=9.0)
-    assert better.is_significant(4.0)
-    assert not worse.is_significant(4.0)
+    for after_p95_px, is_significant in ((1.62, True), (1.69, False)):
+        gain = _Gain(1.0, before_p95_px=1.59, after_p95_px=after_p95_px, loss=0.1, sigma=9.0)
+        assert gain.is_significant(4.0) == is_significant
     assert not _Gain(1.0).is_significant(4.0)
 
 
@@ -178,12 +173,9 @@ def test_a_field_fitted_to_noise_does_not_predict_held_out_windows(chance: int) 
     """Random shifts: a fine field fits them, but does not predict others."""
     rng, at = np.random.default_rng(chance), centres()
     shifts = rng.uniform(-4, 4, at.shape)
-    residual = Residual.of(at, shifts, np.full(len(at), 20.0))
-    valid = np.ones(SIZE[::-1], bool)
-    estimator = DisplacementEstimator(valid, structure_field(Raster(textured_image(*SIZE), valid)))
-    gain = estimator._best_gain(Shifts.of(residual))
-    assert not gain.is_significant(4.0)
-    field = estimator._field(Shifts.of(residual), 0.001)
+    measured = Shifts.of(residual_of(at, shifts))
+    assert not estimator()._best_gain(measured).is_significant(4.0)
+    field = estimator()._field(measured, 0.001)
     explained = np.linalg.norm(shifts - field(at), axis=1)
     assert np.median(explained) < 0.8 * np.median(np.linalg.norm(shifts, axis=1))
 
@@ -192,12 +184,10 @@ def test_the_reported_residual_is_cross_validated() -> None:
     """Smooth displacements plus noise of each window: the field fits both and predicts the first."""
     rng, at = np.random.default_rng(0), centres()
     jumps = rng.normal(0, 0.7, at.shape)
-    shifts = Shifts(at, bump(at, 6.0) + jumps, *weights(at))
-    valid = np.ones(SIZE[::-1], bool)
-    estimator = DisplacementEstimator(valid, structure_field(Raster(textured_image(*SIZE), valid)))
+    shifts = shifts_at(at, bump(at, 6.0) + jumps)
     own, others = (
         np.median(np.linalg.norm(shifts.shifts_px - prediction, axis=1))
-        for prediction in (estimator._field(shifts, 0.3)(at), estimator._cross_predicted(shifts, at, 64, 0.3))
+        for prediction in (estimator()._field(shifts, 0.3)(at), estimator()._cross_predicted(shifts, at, 64, 0.3))
     )
     assert others > 1.1 * own
     assert others == pytest.approx(np.median(np.linalg.norm(jumps, axis=1)), rel=0.25)
@@ -206,14 +196,12 @@ def test_the_reported_residual_is_cross_validated() -> None:
 def test_predictions_exclude_windows_that_share_pixels() -> None:
     """An outlier changes the prediction at its own position only by the robust weights of the other windows."""
     at = centres()
-    estimator = DisplacementEstimator(np.ones(SIZE[::-1], bool), np.zeros(SIZE[::-1], np.complex64))
-    quiet = Shifts(at, bump(at), *weights(at))
+    quiet = shifts_at(at, bump(at))
     one = int(np.argmin(np.linalg.norm(at - (320, 256), axis=1)))
     moved = quiet.shifts_px.copy()
     moved[np.abs(at - at[one]).max(axis=1) < 64] += 3.0
     loud = replace(quiet, shifts_px=moved)
-    before, after = (estimator._cross_predicted(s, at, 64, 1.0)[one] for s in (quiet, loud))
-    np.testing.assert_allclose(before, after, atol=0.05 * 3.0)
+    before, after = (estimator()._cross_predicted(s, at, 64, 1.0) for s in (quiet, loud))
+    np.testing.assert_allclose(before[one], after[one], atol=0.05 * 3.0)
     neighbour = int(np.argmin(np.linalg.norm(at - at[one] - (96, 0), axis=1)))
-    changed = (estimator._cross_predicted(s, at, 64, 1.0)[neighbour] for s in (quiet, loud))
-    assert np.linalg.norm(next(changed) - next(changed)) > 0.02
+    assert np.linalg.norm(before[neighbour] - after[neighbour]) > 0.02

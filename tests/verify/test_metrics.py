@@ -1,9 +1,12 @@
+import cv2
 import numpy as np
 import pytest
 import SimpleITK as sitk
 from skimage.metrics import normalized_mutual_information, structural_similarity
 
 from agalign.capture.reference import Reference
+from agalign.pixels.structure import structure_field
+from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.image import Raster
 from agalign.verify.metrics import (
@@ -14,18 +17,15 @@ from agalign.verify.metrics import (
     mutual_information,
     normalised_mutual_information,
 )
+from agalign.verify.residuals import FixedWindows
 
-from ..conftest import textured_image, textured_pair
+from ..builders import texture, two_views
+from ..conftest import textured_image
 
-EVERYWHERE = np.ones((240, 320), bool)
 
-
-def similarity(fixed: np.ndarray, moving: np.ndarray, valid: np.ndarray) -> dict[str, float]:
+def similarity(fixed: np.ndarray, moving: np.ndarray, valid: np.ndarray | None = None) -> dict[str, float]:
+    valid = np.ones(fixed.shape, bool) if valid is None else valid
     return FixedSimilarity(Raster(fixed, valid)).to(Raster(moving, valid))
-
-
-def tile_residuals(fixed: Raster, moving: Raster) -> Residual:
-    return Reference(fixed).windows.residuals(moving)
 
 
 def elastix_mattes(fixed: np.ndarray, moving: np.ndarray) -> float:
@@ -66,110 +66,124 @@ def test_mattes_mi_equals_its_definition() -> None:
 
 
 def test_mattes_mi_is_close_to_that_of_itk() -> None:
-    fixed, moving = textured_pair(np.eye(3))
+    fixed, moving = (view.pixels for view in two_views(np.eye(3)))
     method = sitk.ImageRegistrationMethod()
     method.SetMetricAsMattesMutualInformation(numberOfHistogramBins=32)
     method.SetMetricSamplingStrategy(method.NONE)
     method.SetInterpolator(sitk.sitkLinear)
     method.SetInitialTransform(sitk.TranslationTransform(2))
     theirs = method.MetricEvaluate(sitk.GetImageFromArray(fixed), sitk.GetImageFromArray(moving))
-    actual = similarity(fixed, moving, np.ones(fixed.shape, bool))["mattes_mi"]
+    actual = similarity(fixed, moving)["mattes_mi"]
     assert actual < 0
     assert actual == pytest.approx(theirs, rel=0.05)
 
 
-def test_nmi_is_two_for_a_copy_and_one_for_independence() -> None:
-    copy = np.eye(32) / 32
-    assert normalised_mutual_information(copy) == pytest.approx(2)
+def test_nmi_is_scikit_image_s_two_for_a_copy_and_one_for_independence() -> None:
+    assert normalised_mutual_information(np.eye(32) / 32) == pytest.approx(2)
     assert normalised_mutual_information(np.full((32, 32), 1 / 1024)) == pytest.approx(1)
+    one, other = (view.pixels for view in two_views(np.eye(3)))
+    joint, _, _ = np.histogram2d(one.ravel(), other.ravel(), 32)
+    result = normalised_mutual_information(joint / joint.sum())
+    assert result == pytest.approx(normalized_mutual_information(one, other, bins=32), abs=1e-6)
 
 
 def test_the_spline_is_a_partition_of_unity() -> None:
     x = np.linspace(0, 1, 11)
-    total = sum(cubic_spline(x - k) for k in range(-3, 4))
-    np.testing.assert_allclose(total, 1)
+    np.testing.assert_allclose(sum(cubic_spline(x - k) for k in range(-3, 4)), 1)
 
 
 def test_gradient_correlation_ignores_reversed_contrast() -> None:
     image = textured_image(320, 240)
-    assert similarity(image, -2 * image, EVERYWHERE)["gradient_correlation"] == pytest.approx(1, abs=1e-5)
-    assert abs(similarity(image, textured_image(320, 240, 1), EVERYWHERE)["gradient_correlation"]) < 0.1
+    assert similarity(image, -2 * image)["gradient_correlation"] == pytest.approx(1, abs=1e-5)
+    assert abs(similarity(image, textured_image(320, 240, 1))["gradient_correlation"]) < 0.1
 
 
 def test_structure_ssim_agrees_with_scikit_image() -> None:
-    import cv2
-
     a, b = textured_image(320, 240), textured_image(320, 240) + 0.5 * textured_image(320, 240, 1)
 
     def gradient(image: np.ndarray) -> np.ndarray:
         g = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8))
         return (g - g.mean()) / g.std()
 
-    _, full = structural_similarity(
-        gradient(a),
-        gradient(b),
-        data_range=1.0,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
-    )
-    actual = similarity(a, b.astype(np.float32), EVERYWHERE)["structure_ssim"]
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "full": True}
+    _, full = structural_similarity(gradient(a), gradient(b), data_range=1.0, **options)
+    actual = similarity(a, b.astype(np.float32))["structure_ssim"]
     assert actual == pytest.approx(full[5:-5, 5:-5].mean(), abs=5e-3)
 
 
 def test_similarity_uses_only_valid_pixels() -> None:
-    fixed, moving = textured_pair(np.eye(3))
+    fixed, moving = (view.pixels for view in two_views(np.eye(3)))
     valid = np.ones(fixed.shape, bool)
     valid[:, :100] = False
     spoiled = fixed.copy()
     spoiled[:, :100] = 1e6
     whole = similarity(spoiled, moving, valid)
     assert whole["overlap"] == pytest.approx(0.75)
-    crop = similarity(fixed[:, 100:].copy(), moving[:, 100:].copy(), valid[:, 100:])
+    crop = similarity(fixed[:, 100:].copy(), moving[:, 100:].copy())
     assert whole["mattes_mi"] == pytest.approx(crop["mattes_mi"], abs=1e-6)
     assert whole["ncc"] == pytest.approx(crop["ncc"], abs=1e-6)
-    assert similarity(fixed, moving, ~np.ones(fixed.shape, bool)) == {"overlap": 0.0}
+    assert similarity(fixed, moving, np.zeros(fixed.shape, bool)) == {"overlap": 0.0}
+
+
+def residuals(fixed: Raster, moving: Raster) -> Residual:
+    return Reference(fixed).windows.residuals(moving)
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.4, -0.25), (3.0, 2.0)])
 def test_tile_residuals_measure_a_known_shift(shift: tuple[float, float]) -> None:
-    matrix = np.eye(3)
-    matrix[:2, 2] = shift
-    fixed, moving = textured_pair(matrix)
-    valid = np.ones(fixed.shape, bool)
-    residual = tile_residuals(Raster(fixed, valid), Raster(moving, valid))
+    residual = residuals(*two_views(geometry.translation(*shift)))
     assert residual.coverage == 1.0
     np.testing.assert_allclose(np.median(residual.shifts_px, axis=0), shift, atol=0.08)
     assert residual.median_px == pytest.approx(np.hypot(*shift), abs=0.1)
 
 
 def test_tile_residuals_of_unrelated_images_are_large_or_unmeasured() -> None:
-    valid = np.ones((320, 400), bool)
-    pair = [Raster(textured_image(400, 320, s), valid) for s in (1, 2)]
-    residual = tile_residuals(*pair)
+    residual = residuals(texture(seed=1), texture(seed=2))
     assert residual.coverage < 0.6 or residual.median_px > 3
 
 
-def test_tiles_without_structure_are_skipped() -> None:
-    fixed, moving = textured_pair(np.eye(3))
-    valid = np.ones(fixed.shape, bool)
+def test_windows_without_valid_pixels_are_skipped() -> None:
+    fixed, moving = two_views(np.eye(3))
+    valid = np.ones(fixed.valid.shape, bool)
     valid[:, 200:] = False
-    residual = tile_residuals(Raster(fixed, valid), Raster(moving, valid))
+    residual = residuals(Raster(fixed.pixels, valid), Raster(moving.pixels, valid))
     assert len(residual.centres_px) > 0
     assert residual.centres_px[:, 0].max() < 200
-
-
-def test_windows_without_valid_pixels_are_skipped() -> None:
-    one, other = textured_pair(np.eye(3))
-    nowhere = Raster(other, np.zeros(other.shape, bool))
-    result = tile_residuals(Raster(one, np.ones(one.shape, bool)), nowhere)
+    result = residuals(fixed, Raster(moving.pixels, ~fixed.valid))
     assert len(result.centres_px) == 0
     assert (result.median_px, result.coverage) == (np.inf, 0.0)
 
 
-def test_normalised_mutual_information_is_scikit_image_s() -> None:
-    one, other = textured_pair(np.eye(3), 320, 240)
-    joint, _, _ = np.histogram2d(one.ravel(), other.ravel(), 32)
-    result = normalised_mutual_information(joint / joint.sum())
-    assert result == pytest.approx(normalized_mutual_information(one, other, bins=32), abs=1e-6)
+# ---- windows of verification share no pixels with windows of the fit
+
+
+def covered(windows: FixedWindows, size_px: tuple[int, int]) -> np.ndarray:
+    result = np.zeros(size_px[::-1], bool)
+    for x, y in windows.origins:
+        result[y : y + windows.side, x : x + windows.side] = True
+    return result
+
+
+@pytest.mark.parametrize("size_px", [(640, 480), (701, 389), (512, 384)])
+def test_the_windows_of_a_fit_and_of_its_verification_share_no_pixel(size_px: tuple[int, int]) -> None:
+    reference = Reference(texture(*size_px))
+    fit, held_out = (covered(w, size_px) for w in (reference.fit_windows, reference.held_out_windows))
+    assert not (fit & held_out).any()
+    # Both are all over the image.
+    for mask in (fit, held_out):
+        assert mask.mean() > 0.3
+        height, width = mask.shape
+        for rows in (mask[: height // 2], mask[height // 2 :]):
+            assert all(half.mean() > 0.15 for half in (rows[:, : width // 2], rows[:, width // 2 :]))
+    assert reference.fit_windows.side != reference.held_out_windows.side
+
+
+def test_three_by_three_windows_in_each_field() -> None:
+    image = texture(512, 384)
+    for white in (False, True):
+        windows = FixedWindows.on_chessboard(image.valid, structure_field(image), 48, white=white)
+        assert len(windows.origins) == 9 * 6
+        fields = {(x // 128, y // 128) for x, y in windows.origins}
+        assert {(column + row) % 2 for column, row in fields} == {int(white)}
+        assert all(x % 128 + 48 <= 128 and y % 128 + 48 <= 128 for x, y in windows.origins)
+    np.testing.assert_array_equal(windows.centres_px, np.array(windows.origins) + 23.5)

@@ -5,12 +5,13 @@ import pytest
 import agalign
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.values.image import Raster
 from agalign.verify.repetition import alias_peak
 
+from ..builders import whole
 from ..conftest import textured_image
 
 PERIOD = 26.0
+TRUTH = geometry.translation(9.0, -6.0)
 
 
 def planted(shift: tuple[float, float], seed: int, sign: float = 1.0) -> np.ndarray:
@@ -23,7 +24,7 @@ def planted(shift: tuple[float, float], seed: int, sign: float = 1.0) -> np.ndar
 
 
 def spectrum(image: np.ndarray) -> np.ndarray:
-    return windowed_spectra(structure_field(Raster(image, np.ones(image.shape, bool))))
+    return windowed_spectra(structure_field(whole(image)))
 
 
 def test_the_alias_peak_is_one_period_away() -> None:
@@ -40,19 +41,19 @@ def test_a_unique_scene_has_no_alias_peak() -> None:
     assert alias_peak(spectrum(image), spectrum(other)).ratio < 0.4
 
 
+IMAGES = planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7)
+
+
 @pytest.mark.parametrize("off", [(0.0, 0.0), (2.0, 1.0), (PERIOD, 0.0)])
 def test_a_repetitive_scene_without_prior_information_is_not_aligned(off: tuple[float, float]) -> None:
-    truth = geometry.translation(9.0, -6.0)
-    images = planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7)
-    result = agalign.align(*images, seed=geometry.compose(truth, geometry.translation(*off)))
+    result = agalign.align(*IMAGES, seed=geometry.compose(TRUTH, geometry.translation(*off)))
     assert result.status != "aligned"
     assert result.issues[0].code == "repeats"
     assert "px fits nearly as well" in (result.reason or "")
 
 
 def test_a_seed_with_an_error_below_half_a_period_resolves_aliases() -> None:
-    truth = geometry.translation(9.0, -6.0)
-    near = geometry.compose(truth, geometry.translation(3.0, 2.0))
-    result = agalign.align(planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7), seed=near, seed_std_px=3.0)
+    near = geometry.compose(TRUTH, geometry.translation(3.0, 2.0))
+    result = agalign.align(*IMAGES, seed=near, seed_std_px=3.0)
     assert result.status == "aligned"
-    assert geometry.corner_error_px(result.fixed_to_moving, truth, 400, 300) < 1.0
+    assert geometry.corner_error_px(result.fixed_to_moving, TRUTH, 400, 300) < 1.0

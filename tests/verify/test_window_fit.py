@@ -1,14 +1,35 @@
-"""Fits of homographies and lens shapes to windows: accuracy, standard errors, wrong peaks."""
+"""Fits of homographies and lens shapes to windows: accuracy, standard errors, wrong peaks, areas without windows."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
 from agalign.values import geometry
-from agalign.values.alignment import Residual
+from agalign.values.alignment import Alignment, Prediction, Residual, Seed
 from agalign.values.displacement import DisplacementField
+from agalign.values.issues import sentence
 from agalign.values.mapping import PixelMapping
-from agalign.verify.lens_shapes import lens_shapes, lens_std_px, over_corners_and_lens
+from agalign.verify.checks import KINDS
+from agalign.verify.expected_error import expected_error_px
+from agalign.verify.extrapolation_check import (
+    EXTRAPOLATED,
+    issues_of_extrapolation,
+    points_in_frame,
+    unobserved_quarters,
+)
+from agalign.verify.lens_shapes import (
+    CALIBRATED,
+    LENS_STD,
+    lens_shapes,
+    lens_std_px,
+    over_corners_and_lens,
+    unmodelled_std_px,
+)
 from agalign.verify.window_fit import WindowFit, fit_windows
+
+from ..builders import joint_result, residual_of, rms
 
 SIZE = 1280, 960
 CENTRES = np.stack(np.meshgrid(np.arange(56.0, 1280, 112), np.arange(56.0, 960, 112)), -1).reshape(-1, 2)
@@ -22,18 +43,11 @@ IDENTITY = PixelMapping(np.eye(3))
 
 def windows(truth_px: np.ndarray, centres_px: np.ndarray = CENTRES, noise_px: float = 0.05, seed: int = 0) -> Residual:
     exact = over_corners_and_lens(centres_px, SIZE)[:, :, : len(truth_px)] @ truth_px
-    shifts = exact + np.random.default_rng(seed).normal(0, noise_px, exact.shape)
-    return Residual.of(centres_px, shifts, np.full(len(centres_px), 20.0))
+    return residual_of(centres_px, exact + np.random.default_rng(seed).normal(0, noise_px, exact.shape))
 
 
 def fitted(residual: Residual, lens: bool = False, mapping: PixelMapping = IDENTITY) -> WindowFit:
-    fit = fit_windows(mapping, residual, SIZE, lens_std_px(SIZE, calibrated=False) if lens else None)
-    assert fit is not None
-    return fit
-
-
-def rms(vectors: np.ndarray) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+    return fit_windows(mapping, residual, SIZE, lens_std_px(SIZE, calibrated=False) if lens else None)
 
 
 def test_the_windows_correct_the_homography_through_the_displacement_field() -> None:
@@ -58,14 +72,11 @@ def test_exact_shifts_are_fitted_exactly_and_the_common_error_remains() -> None:
     assert 0.01 <= std_px.min() <= std_px.max() < 0.015
 
 
-def test_eight_parameters_without_a_prior_need_twelve_windows() -> None:
-    assert fit_windows(IDENTITY, windows(CORNERS_PX, CENTRES[::8][:11]), SIZE) is None
-    assert fit_windows(IDENTITY, windows(CORNERS_PX, CENTRES[::8][:12]), SIZE) is not None
-
-
-def test_windows_on_a_line_leave_corners_unknown() -> None:
-    fit = fitted(windows(CORNERS_PX, CENTRES[:12]))
-    assert np.sqrt(np.diag(fit.covariance_px2)).max() > 100
+def test_eight_parameters_without_a_prior_need_twelve_windows_not_on_a_line() -> None:
+    assert fitted(windows(CORNERS_PX, CENTRES[::8][:11])) is None
+    assert fitted(windows(CORNERS_PX, CENTRES[::8][:12])) is not None
+    on_a_line = fitted(windows(CORNERS_PX, CENTRES[:12]))
+    assert np.sqrt(np.diag(on_a_line.covariance_px2)).max() > 100
 
 
 @pytest.mark.parametrize("lens", [False, True])
@@ -73,7 +84,7 @@ def test_wrong_peaks_do_not_bias_the_fit(lens: bool) -> None:
     clean = windows(TRUTH_PX if lens else CORNERS_PX, noise_px=0.03)
     shifts = clean.shifts_px.copy()
     shifts[np.random.default_rng(1).permutation(len(shifts))[:20]] += (6.0, -3.0)
-    fit = fitted(Residual.of(CENTRES, shifts, clean.peaks_sigma), lens)
+    fit = fitted(residual_of(CENTRES, shifts), lens)
     jacobian = over_corners_and_lens(EVERYWHERE, SIZE)[:, :, : len(fit.mean_px)]
     assert rms(jacobian @ (fit.mean_px - TRUTH_PX[: len(fit.mean_px)])) < 0.05
     # With a fifth fewer windows the standard errors are larger.
@@ -95,6 +106,31 @@ def test_the_covariance_equals_the_scatter_of_repeated_fits() -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(scatter)), np.sqrt(np.diag(expected)), rtol=0.25)
 
 
+# ---- lens shapes
+
+
+def test_the_radial_shapes_are_those_of_opencv_and_1_long_at_the_corners() -> None:
+    corners = geometry.corners(*SIZE)
+    np.testing.assert_allclose(np.linalg.norm(lens_shapes(corners, SIZE)[:, :, :2], axis=1), 1.0)
+    focal, centre = 1500.0, (np.array(SIZE) - 1) / 2
+    half_diagonal = float(np.linalg.norm(centre))
+    camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
+    rays = np.column_stack([(EVERYWHERE - centre) / focal, np.ones(len(EVERYWHERE))])
+    # k1, k2, p1, p2 that displace a corner by 1 px each
+    k = [focal**2 / half_diagonal**3, focal**4 / half_diagonal**5, focal / half_diagonal**2 / 3]
+    for shape, coefficients in enumerate([(k[0], 0, 0, 0), (0, k[1], 0, 0), (0, 0, 0, k[2]), (0, 0, k[2], 0)]):
+        moved = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera, np.array(coefficients))[0][:, 0]
+        np.testing.assert_allclose(moved - EVERYWHERE, lens_shapes(EVERYWHERE, SIZE)[:, :, shape], atol=1e-9)
+
+
+def test_unmodelled_distortion_grows_with_extrapolation_and_shrinks_with_calibration() -> None:
+    whole, half = (unmodelled_std_px(c, SIZE, calibrated=False) for c in (CENTRES, LEFT))
+    assert 0.1 < whole < 0.25
+    assert 0.5 < half < 1.0
+    assert unmodelled_std_px(LEFT, SIZE, calibrated=True) == pytest.approx(CALIBRATED * half)
+    np.testing.assert_allclose(lens_std_px(SIZE, calibrated=False), 800 * np.array(LENS_STD))
+
+
 def test_windows_in_one_half_determine_the_lens_in_the_other_half_to_the_stated_error() -> None:
     ratios = []
     for seed in range(30):
@@ -108,13 +144,79 @@ def test_windows_in_one_half_determine_the_lens_in_the_other_half_to_the_stated_
 def test_more_windows_leave_less_error_and_none_leave_the_prior() -> None:
     few, many = (fitted(windows(TRUTH_PX, c), lens=True) for c in (LEFT[LEFT[:, 0] < 300], CENTRES))
     assert many.std_px(EVERYWHERE) < 0.2 < few.std_px(EVERYWHERE) < 5
-    unknown = fitted(Residual.of(np.empty((0, 2)), np.empty((0, 2)), np.empty(0)), lens=True)
+    unknown = fitted(residual_of(np.empty((0, 2)), (0, 0)), lens=True)
     assert unknown.std_px(EVERYWHERE) > 5
     assert not unknown.mean_px.any()
+    mapping, inside = many.applied_to(IDENTITY), EVERYWHERE[(EVERYWHERE > 50).all(axis=1)]
+    np.testing.assert_allclose(mapping.local(inside), lens_shapes(inside, SIZE) @ many.mean_px[8:], atol=0.02)
 
 
-def test_the_lens_shapes_become_the_displacement_field() -> None:
-    fit = fitted(windows(TRUTH_PX, noise_px=0.01), lens=True)
-    mapping, inside = fit.applied_to(IDENTITY), EVERYWHERE[(EVERYWHERE > 50).all(axis=1)]
-    assert mapping.local is not None
-    np.testing.assert_allclose(mapping.local(inside), lens_shapes(inside, SIZE) @ fit.mean_px[8:], atol=0.02)
+# ---- quarters of the image without a measured window
+
+
+def test_windows_that_end_near_the_centre_do_not_cover_the_other_half() -> None:
+    assert unobserved_quarters(CENTRES, SIZE) == []
+    # An eighth of the width beyond the centre is 800 px.
+    assert unobserved_quarters(CENTRES[CENTRES[:, 0] < 790], SIZE) == ["top right", "bottom right"]
+    assert unobserved_quarters(CENTRES[CENTRES[:, 0] < 900], SIZE) == []
+    assert unobserved_quarters(CENTRES[CENTRES[:, 1] > 480], SIZE) == ["top left", "top right"]
+    three = CENTRES[(np.array(SIZE) / 2 > CENTRES).any(axis=1)]
+    in_fourth = np.array([[1000.0, 800.0], [1100.0, 800.0]])
+    assert unobserved_quarters(three, SIZE) == ["bottom right"]
+    assert unobserved_quarters(np.vstack([three, in_fourth[:1]]), SIZE) == ["bottom right"]
+    assert unobserved_quarters(np.vstack([three, in_fourth]), SIZE) == []
+
+
+def test_areas_outside_the_moving_image_need_no_window() -> None:
+    frame = points_in_frame(PixelMapping(geometry.translation(640, 0)), SIZE, SIZE)
+    assert frame[:, 0].max() < 640
+    assert unobserved_quarters(LEFT, SIZE, frame) == []
+    assert len(points_in_frame(IDENTITY, SIZE, SIZE)) == 24 * 18
+
+
+def test_only_measured_windows_count_and_the_reason_names_the_quarters() -> None:
+    frame, in_left = points_in_frame(IDENTITY, SIZE, SIZE), CENTRES[:, :1] < 600
+    residual = residual_of(CENTRES, np.where(in_left, (0.1, 0.0), (np.nan, np.nan)))
+    (issue,) = issues_of_extrapolation(residual, SIZE, frame)
+    assert issue.kind is EXTRAPOLATED is KINDS["extrapolated"]
+    assert "top right and bottom right" in sentence(issue)
+    assert issue.value == 2
+    assert issues_of_extrapolation(residual_of(CENTRES, (0, 0)), SIZE, frame) == ()
+
+
+# ---- expected errors near windows and far from them, of predictions and of seeds
+
+
+def alignment(corner_std_px: list[float], residual: Residual | None) -> Alignment:
+    joint = joint_result(std_px=0.1, covariance=np.diag(np.repeat(corner_std_px, 2) ** 2))
+    return Alignment(IDENTITY, (640, 480), "aligned", (), Seed("identity", np.eye(3), 1.0), joint, residual)
+
+
+def expected_px(known: Alignment, *point: float) -> float:
+    return float(expected_error_px(known, (640, 480), np.array([point]))[0])
+
+
+def columns(count: int) -> Residual:
+    """Columns of windows with a shift of 0.3 px, and 2 px as 95th percentile."""
+    centres = np.stack(np.meshgrid(50.0 + 100 * np.arange(count), 50.0 + 100 * np.arange(4)), -1).reshape(-1, 2)
+    return replace(residual_of(centres, (0.3, 0.0)), p95_px=2.0)
+
+
+def test_the_expected_error_is_the_covariance_at_corners_and_the_residual_near_windows() -> None:
+    known = alignment([0.1, 0.5, 0.5, 0.1], None)
+    for x, std_px in ((0.0, 0.1), (639.0, 0.5)):
+        assert expected_px(known, x, 0.0) == pytest.approx(np.sqrt(2) * std_px)
+    half, everywhere = (alignment([0.01] * 4, columns(count)) for count in (3, 7))
+    assert 0.25 < expected_px(half, 60.0, 240.0) < 0.35
+    assert 1.9 < expected_px(half, 620.0, 240.0) < 2.1
+    assert 0.25 < expected_px(everywhere, 620.0, 240.0) < 0.35
+
+
+def test_predictions_have_their_standard_error_and_seeds_none() -> None:
+    known = alignment([0.01] * 4, None)
+    predicted = replace(known, status="predicted", prediction=Prediction(np.eye(3), "bands", 0.4))
+    assert expected_px(predicted, 60.0, 240.0) == pytest.approx(0.4)
+    # The standard error of a thermal band is in its own pixels, which are ten times as large.
+    thermal = replace(predicted, mapping=PixelMapping(np.diag([0.1, 0.1, 1.0])))
+    assert expected_px(thermal, 60.0, 240.0) == pytest.approx(4.0)
+    assert np.isinf(expected_px(replace(known, status="seed_only"), 60.0, 240.0))
