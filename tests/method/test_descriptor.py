@@ -1,50 +1,55 @@
+"""The descriptor network, its losses, its optimiser and the weights that it starts from."""
+
+from typing import get_args
+
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
+from agalign.config import JointSettings
 from agalign.errors import ConfigurationError
-from agalign.method.descriptor import Descriptor
+from agalign.method.adam import Adam
+from agalign.method.descriptor import REFERENCE, Descriptor, distance, retrieval
+from agalign.method.fast import in_batch_loss
+from agalign.method.paper import contrastive_loss
+from agalign.method.starter import start_from, start_from_starter
+from agalign.method.state import JointState, ThetaStart
+from agalign.values.choices import Sharing
 
-PATCHES = torch.randn(12, 1, 16, 16, generator=torch.Generator().manual_seed(0))
+G = torch.Generator().manual_seed(0)
+PATCHES = torch.randn(12, 1, 16, 16, generator=G)
 
 
-def parameters_of(net: Descriptor) -> dict[str, set[int]]:
+def touched(net: Descriptor, side: int) -> set[int]:
     """Return the parameters with a gradient of a side's descriptor."""
-    result = {}
-    for name, side in (("fixed", 0), ("moving", 1)):
-        net.zero_grad()
-        net(PATCHES, side).sum().backward()
-        result[name] = {id(p) for p in net.parameters() if p.grad is not None and bool((p.grad != 0).any())}
-    return result
+    net.zero_grad()
+    net(PATCHES, side).sum().backward()
+    return {id(p) for p in net.parameters() if p.grad is not None and bool((p.grad != 0).any())}
 
 
 @pytest.mark.parametrize(("sharing", "shared"), [("siamese", 6), ("pseudo-siamese", 4), ("unshared", 0)])
 def test_sides_share_weights_by_the_kind_of_sharing(sharing: str, shared: int) -> None:
-    ids = parameters_of(Descriptor(sharing))
-    assert len(ids["fixed"]) == len(ids["moving"]) == 6
-    assert len(ids["fixed"] & ids["moving"]) == shared
+    net = Descriptor(sharing)
+    fixed, moving = touched(net, 0), touched(net, 1)
+    assert (len(fixed), len(moving), len(fixed & moving)) == (6, 6, shared)
 
 
 def test_the_paper_network_is_conv_tanh_pool_conv_tanh_fc() -> None:
     net = Descriptor("siamese")
     plain = nn.Sequential(net.first[0].convolution, nn.Tanh(), nn.MaxPool2d(2), *net.trunk[0])
     torch.testing.assert_close(net(PATCHES, 0), plain(PATCHES), atol=1e-5, rtol=1e-5)
-    assert [tuple(p.shape) for p in net.parameters()] == [
-        (32, 1, 5, 5), (32,), (64, 32, 3, 3), (64,), (256, 1024), (256,),
-    ]  # fmt: skip
+    shapes = [(32, 1, 5, 5), (32,), (64, 32, 3, 3), (64,), (256, 1024), (256,)]
+    assert [tuple(p.shape) for p in net.parameters()] == shapes
 
 
-def test_half_of_a_half_rectified_layer_ignores_contrast_reversal() -> None:
-    net = Descriptor(half_rectified=True)
+def test_half_of_a_half_rectified_layer_ignores_contrast_reversal_and_lengths_are_1() -> None:
+    net = Descriptor(half_rectified=True, unit_length=True)
     nn.init.zeros_(net.first[0].convolution.bias)
     one, other = net.first[0](PATCHES), net.first[0](-PATCHES)
     torch.testing.assert_close(one[:, 16:], other[:, 16:])
     assert not torch.allclose(one[:, :16], other[:, :16])
-
-
-def test_unit_length() -> None:
-    lengths = Descriptor(unit_length=True)(PATCHES, 1).norm(dim=1)
-    torch.testing.assert_close(lengths, torch.ones(12))
+    torch.testing.assert_close(net(PATCHES, 1).norm(dim=1), torch.ones(12))
 
 
 def test_channels_may_differ_between_the_sides() -> None:
@@ -54,9 +59,107 @@ def test_channels_may_differ_between_the_sides() -> None:
         Descriptor("siamese", (3, 1))
 
 
-@pytest.mark.parametrize("sharing", ["siamese", "pseudo-siamese", "unshared"])
-def test_describing_several_sides_equals_describing_each_side(sharing: str) -> None:
+@pytest.mark.parametrize("sharing", get_args(Sharing))
+def test_describing_several_sides_equals_describing_each_side(sharing: Sharing) -> None:
     net = Descriptor(sharing, (1, 1, 1), unit_length=True)
     together = net.describe([PATCHES, PATCHES[:5], PATCHES[3:]], [0, 1, 2])
     for result, (patches, side) in zip(together, ((PATCHES, 0), (PATCHES[:5], 1), (PATCHES[3:], 2)), strict=True):
         torch.testing.assert_close(result, net(patches, side), atol=1e-6, rtol=1e-5)
+
+
+# ---- starter
+
+
+def started(sharing: Sharing, channels: tuple[int, ...]) -> Descriptor:
+    net = Descriptor(sharing, channels, half_rectified=True, unit_length=True)
+    start_from_starter(net)
+    return net
+
+
+@pytest.mark.parametrize("sharing", get_args(Sharing))
+def test_every_side_starts_with_equal_weights(sharing: Sharing) -> None:
+    net = started(sharing, (1, 1, 1))
+    for side in (1, 2):
+        torch.testing.assert_close(net(PATCHES, REFERENCE), net(PATCHES, side))
+    assert net.is_trained
+
+
+def test_three_equal_channels_have_the_descriptor_of_one() -> None:
+    net = started("pseudo-siamese", (3, 1))
+    torch.testing.assert_close(net(PATCHES.repeat(1, 3, 1, 1), REFERENCE), net(PATCHES, 1))
+
+
+def test_patches_are_distinguished_despite_reversed_contrast() -> None:
+    net = started("siamese", (1,))
+    f, reversed_f = net(PATCHES, REFERENCE), net(-PATCHES, REFERENCE)
+    d = torch.cdist(f, f) + 10 * torch.eye(len(f))
+    assert (f - reversed_f).norm(dim=1).median() < d.min(dim=1).values.median()
+
+
+def test_recipe_fast_starts_from_the_starter_by_default() -> None:
+    def first(*start: ThetaStart) -> torch.Tensor:
+        state = JointState(JointSettings(device="cpu"), lambda *_: None)
+        return state.fast_descriptor([1, 1], *start)(PATCHES, 1)
+
+    torch.testing.assert_close(first(), started("pseudo-siamese", (1, 1))(PATCHES, 1))
+    assert (first() - first("random")).abs().max() > 0.1
+
+
+def test_each_side_takes_the_chosen_side() -> None:
+    learnt = Descriptor("unshared", [1, 1, 1], half_rectified=True, unit_length=True)
+    two = Descriptor("unshared", [1, 1], half_rectified=True, unit_length=True)
+    start_from(two, learnt.state_dict(), (REFERENCE, 2))
+    with torch.no_grad():
+        torch.testing.assert_close(two(PATCHES, REFERENCE), learnt(PATCHES, REFERENCE))
+        torch.testing.assert_close(two(PATCHES, 1), learnt(PATCHES, 2))
+        assert (two(PATCHES, 1) - learnt(PATCHES, 1)).abs().max() > 1e-3
+
+
+# ---- losses
+
+F = torch.randn(30, 8, generator=G, dtype=torch.float64)
+F_PRIME = F + 0.3 * torch.randn(30, 8, generator=G, dtype=torch.float64)
+ALL = torch.ones(30, 30, dtype=torch.bool)
+
+
+def test_distance_and_its_gradient_at_zero() -> None:
+    np.testing.assert_allclose(distance(F, F_PRIME), np.linalg.norm(F - F_PRIME, axis=1), atol=1e-9)
+    x = F.clone().requires_grad_()
+    distance(x, F).sum().backward()
+    assert torch.isfinite(x.grad).all()
+
+
+def test_contrastive_loss_is_the_sum_in_the_paper() -> None:
+    positive, negative = torch.tensor([0.2, 0.5]), torch.tensor([0.4, 1.7])
+    assert float(contrastive_loss(positive, negative)) == pytest.approx(0.7 + 0.6)
+
+
+def test_in_batch_is_symmetric_cross_entropy_without_the_excluded_negatives() -> None:
+    f, f_prime = (nn.functional.normalize(x, dim=1) for x in (F, F_PRIME))
+    logits = (f @ f_prime.T / 0.07).numpy()
+    forward, backward = (np.log(np.exp(logits).sum(axis=axis)) - np.diag(logits) for axis in (1, 0))
+    assert float(in_batch_loss(f, f_prime, ALL)) == pytest.approx((forward.mean() + backward.mean()) / 2)
+    assert float(in_batch_loss(f, f, ~ALL)) == pytest.approx(0.0)
+
+
+def test_retrieval_counts_exact_nearest_neighbours() -> None:
+    swapped, unrelated = F.clone(), torch.randn(30, 8, generator=G, dtype=torch.float64)
+    swapped[[0, 1]] = swapped[[1, 0]]
+    assert retrieval(F, F, ALL) == retrieval(F, F.flip(0), ~ALL) == 1.0
+    assert retrieval(F, swapped, ALL) == pytest.approx(28 / 30)
+    assert retrieval(F, unrelated, ALL) < 0.3
+
+
+def test_every_step_of_adam_equals_that_of_torch() -> None:
+    ours, theirs = (nn.ModuleList([nn.Linear(5, 3), nn.Linear(5, 3)]) for _ in range(2))
+    theirs.load_state_dict(ours.state_dict())
+    actual, reference = Adam(ours.parameters(), 0.01), torch.optim.Adam(theirs.parameters(), 0.01)
+    for step in range(20):
+        which = step % 2  # the other half has no gradient and must stay
+        x = torch.randn(8, 5)
+        actual.step(ours[which](x).square().mean())
+        reference.zero_grad()
+        theirs[which](x).square().mean().backward()
+        reference.step()
+        for a, b in zip(ours.parameters(), theirs.parameters(), strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)

@@ -1,3 +1,4 @@
+import re
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -23,10 +24,9 @@ from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.choices import Recipe
 from agalign.values.displacement import DisplacementField
-from agalign.values.image import Raster
 from agalign.values.lens import Lens
 
-from ..conftest import textured_pair
+from ..builders import two_views, whole
 from .pretended_device import NAME, PretendedDevice
 
 
@@ -78,12 +78,13 @@ def test_without_float64_on_the_device_psi_is_solved_for_on_the_cpu(monkeypatch:
 
 
 def test_out_of_memory_is_always_a_memory_error() -> None:
-    with pytest.raises(MemoryError, match="not enough memory"), one_memory_error():
-        raise RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory")
-    with pytest.raises(MemoryError, match="MPS"), one_memory_error():
-        raise RuntimeError("MPS backend out of memory (MPS allocated: 8.00 GB)")
-    with pytest.raises(RuntimeError, match="something else"), one_memory_error():
-        raise RuntimeError("something else, of memory")
+    for text, error in (
+        ("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory", MemoryError),
+        ("MPS backend out of memory (MPS allocated: 8.00 GB)", MemoryError),
+        ("something else, of memory", RuntimeError),
+    ):
+        with pytest.raises(error, match=re.escape(text)), one_memory_error():
+            raise RuntimeError(text)
 
 
 GPU = Callable[[bool], PretendedDevice]
@@ -102,20 +103,20 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> GPU:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("recipe", "has_float64"), [("fast", True), ("fast", False), ("paper", False)])
+@pytest.mark.parametrize(
+    ("recipe", "has_float64"),
+    [("fast", False), *(pytest.param(*kind, marks=pytest.mark.full) for kind in (("fast", True), ("paper", False)))],
+)
 def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64: bool) -> None:
-    fixed, moving = textured_pair(geometry.translation(6.0, -4.0), 260, 200)
-    rgb, lens = np.stack([fixed, 0.5 * fixed, -fixed]), Lens(260.0, 260.0, 130.0, 100.0, (0.01,))
-    valid = np.ones(fixed.shape, bool)
-    fields = [DisplacementField(60.0, np.full((5, 6, 2), 0.1))]
+    fixed, moving = (view.pixels for view in two_views(geometry.translation(6.0, -4.0), 260, 200))
+    lens, fields = Lens(260.0, 260.0, 130.0, 100.0, (0.01,)), [DisplacementField(60.0, np.full((5, 6, 2), 0.1))]
+    short = {"schedule": Schedule(max_steps=10, enough_retrieval=2.0), "training": Training(200, 1)}
 
     def align(name: str) -> JointResult:
-        images, seed = [Raster(pixels, valid, lens) for pixels in (rgb, moving)], geometry.translation(7.0, -5.0)
-        group = ImageGroup(images[0], images[1:], [seed], [1], [False], max_shift_px=[9.0], fields=fields)
-        (result,) = align_from_scratch(
-            group, JointSettings(recipe=recipe, device=name), lambda *_: None,
-            schedule=Schedule(max_steps=10, enough_retrieval=2.0), training=Training(200, 1),
-        )  # fmt: skip
+        rgb, band = whole(np.stack([fixed, 0.5 * fixed, -fixed]), lens), whole(moving, lens)
+        seed, settings = geometry.translation(7.0, -5.0), JointSettings(recipe=recipe, device=name)
+        group = ImageGroup(rgb, [band], [seed], [1], [False], max_shift_px=[9.0], fields=fields)
+        (result,) = align_from_scratch(group, settings, lambda *_: None, **short)
         assert isinstance(result, JointResult)
         return result
 
@@ -128,6 +129,7 @@ def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64
     assert on_gpu.iterations == on_cpu.iterations > 0
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_a_flight_on_a_gpu_has_the_result_of_the_cpu(gpu: GPU, flight: Path, tmp_path: Path) -> None:
     """Learning, the model file, keypoint matching and refinement with the frozen network."""

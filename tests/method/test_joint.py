@@ -15,7 +15,8 @@ from agalign.values.alignment import JointResult
 from agalign.values.image import Raster
 from agalign.values.issues import NO_CONTRAST, Issue
 
-from ..conftest import mean_error_px, textured_image, textured_pair
+from ..builders import texture, two_views, whole
+from ..conftest import mean_error_px
 
 pytestmark = pytest.mark.slow
 
@@ -23,110 +24,96 @@ TRUTH = np.array([[1.004, 0.006, 6.0], [-0.005, 0.998, -4.0], [4e-6, -6e-6, 1.0]
 NEAR = geometry.translation(7.5, -5.5)
 
 
-def rasters(matrix: np.ndarray, seed: int = 0) -> tuple[Raster, Raster]:
-    fixed, moving = textured_pair(matrix, seed=seed)
-    valid = np.ones(fixed.shape, bool)
-    return Raster(fixed, valid), Raster(moving, valid)
-
-
 def scratch(
-    fixed: Raster, moving: Raster, seed: np.ndarray, settings: JointSettings, **how: Any
+    fixed: Raster, moving: Raster, seed: np.ndarray, settings: JointSettings | None = None, **how: Any
 ) -> JointResult | Issue:
     group = ImageGroup.of_one(fixed, moving, seed, trusted=True)
-    return align_from_scratch(group, settings, lambda *_: None, **how)[0]
+    return align_from_scratch(group, settings or JointSettings(), lambda *_: None, **how)[0]
 
 
-def run(settings: JointSettings, **how: Any) -> JointResult:
-    result = scratch(*rasters(TRUTH), NEAR, settings, **how)
-    assert isinstance(result, JointResult)
-    return result
+def error_px(result: JointResult, truth: np.ndarray = TRUTH) -> float:
+    return mean_error_px(result.fixed_to_moving, truth, 400, 320)
 
 
 @pytest.mark.parametrize("start", ["random", "starter"])
 def test_fast_recovers_a_homography_through_reversed_contrast(start: ThetaStart) -> None:
-    result = run(JointSettings(), start=start)
-    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.08
+    result = scratch(*two_views(TRUTH), NEAR, start=start)
+    assert error_px(result) < 0.08
     assert result.retrieval > 0.8
     assert result.chance < 0.01
     assert result.model_family == "homography"
 
 
-def test_the_same_rng_seed_gives_the_same_result_and_another_gives_another() -> None:
-    short: dict[str, Any] = {"start": "random", "schedule": Schedule(max_steps=50)}
-    one, same = (run(JointSettings(rng_seed=4), **short) for _ in range(2))
-    other = run(JointSettings(rng_seed=5), **short)
+def test_results_depend_on_the_rng_seed_and_leave_the_global_random_state_unchanged() -> None:
+    before = torch.get_rng_state()
+    one, same, other = (
+        scratch(*two_views(TRUTH), NEAR, JointSettings(rng_seed=k), start="random", schedule=Schedule(max_steps=50))
+        for k in (4, 4, 5)
+    )
+    assert torch.equal(before, torch.get_rng_state())
     np.testing.assert_array_equal(one.fixed_to_moving, same.fixed_to_moving)
     assert one.retrieval == same.retrieval
     assert not np.array_equal(one.fixed_to_moving, other.fixed_to_moving)
 
 
-def test_the_global_random_state_is_unchanged() -> None:
-    torch.manual_seed(1)
-    before = torch.get_rng_state()
-    run(JointSettings(), start="random", schedule=Schedule(max_steps=50))
-    assert torch.equal(before, torch.get_rng_state())
-
-
 def test_a_translation_stays_a_translation() -> None:
-    start = geometry.translation(4.0, -2.0)
-    fixed, moving = rasters(geometry.translation(6.0, -4.0))
-    settings = JointSettings(model_family="translation")
-    result = scratch(fixed, moving, start, settings)
+    views, settings = two_views(geometry.translation(6.0, -4.0)), JointSettings(model_family="translation")
+    result = scratch(*views, geometry.translation(4.0, -2.0), settings)
     np.testing.assert_allclose(result.fixed_to_moving[:2, :2], np.eye(2), atol=1e-6)
     np.testing.assert_allclose(result.fixed_to_moving[2], [0, 0, 1], atol=1e-9)
     np.testing.assert_allclose(result.fixed_to_moving[:2, 2], [6, -4], atol=0.08)
 
 
 def test_unrelated_images_are_not_distinguished() -> None:
-    valid = np.ones((320, 400), bool)
-    pair = [Raster(textured_image(400, 320, s), valid) for s in (8, 9)]
-    result = scratch(*pair, np.eye(3), JointSettings())
+    result = scratch(texture(seed=8), texture(seed=9), np.eye(3))
     assert result.code == "retrieval"
     assert result.value is not None
     assert result.value < 0.1
 
 
 def test_rgb_against_a_single_band() -> None:
-    fixed, moving = rasters(TRUTH)
-    rgb = np.stack([fixed.pixels, 0.5 * fixed.pixels + 1, textured_image(400, 320, 3)])
-    result = scratch(Raster(rgb, fixed.valid), moving, NEAR, JointSettings())
-    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < 0.15
+    fixed, moving = two_views(TRUTH)
+    rgb = np.stack([fixed.pixels, 0.5 * fixed.pixels + 1, texture(seed=3).pixels])
+    assert error_px(scratch(whole(rgb), moving, NEAR)) < 0.15
 
 
 def test_images_without_contrast_or_overlap_have_an_issue() -> None:
-    fixed, moving = rasters(TRUTH)
-    flat = Raster(np.zeros_like(fixed.pixels), fixed.valid)
-    assert scratch(flat, moving, NEAR, JointSettings()) == Issue(NO_CONTRAST)
-    without_overlap = geometry.translation(390, 0)
-    result = scratch(fixed, moving, without_overlap, JointSettings())
+    fixed, moving = two_views(TRUTH)
+    assert scratch(whole(np.zeros_like(fixed.pixels)), moving, NEAR) == Issue(NO_CONTRAST)
+    result = scratch(fixed, moving, geometry.translation(390, 0))
     assert result.code == "few_keypoints"
 
 
+@pytest.mark.full
 def test_one_network_for_two_bands_and_an_unrelated_one() -> None:
-    fixed, moving = rasters(TRUTH)
-    unrelated_image = Raster(textured_image(400, 320, 9), fixed.valid)
-    other = Raster(np.tanh(fixed.pixels), fixed.valid)
-    group = ImageGroup(fixed, [moving, unrelated_image, other], [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
+    fixed, moving = two_views(TRUTH)
+    images = [moving, texture(seed=9), whole(np.tanh(fixed.pixels))]
+    group = ImageGroup(fixed, images, [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
     result = align_from_scratch(group, JointSettings(), lambda *_: None)
     assert [type(r) for r in result] == [JointResult, Issue, JointResult]
-    assert mean_error_px(result[0].fixed_to_moving, TRUTH, 400, 320) < 0.1
+    assert error_px(result[0]) < 0.1
     assert result[1].code == "retrieval"
-    assert mean_error_px(result[2].fixed_to_moving, np.eye(3), 400, 320) < 0.1
+    assert error_px(result[2], np.eye(3)) < 0.1
 
 
-@pytest.mark.parametrize(("sharing", "left"), [("siamese", 0.35), ("pseudo-siamese", 0.35), ("unshared", 0.9)])
+@pytest.mark.parametrize(
+    ("sharing", "left"),
+    [
+        ("pseudo-siamese", 0.35),
+        pytest.param("siamese", 0.35, marks=pytest.mark.full),
+        pytest.param("unshared", 0.9, marks=pytest.mark.full),
+    ],
+)
 def test_paper_recipe_reduces_the_error(sharing: str, left: float) -> None:
     # Unshared networks learn most slowly, as the paper expects; three epochs are few.
     settings = JointSettings(recipe="paper", sharing=sharing)
-    fixed, moving = textured_pair(TRUTH)
+    fixed, moving = two_views(TRUTH)
     # The siamese network is for one modality, so the contrast is not reversed.
-    valid = np.ones(fixed.shape, bool)
-    moving = -moving if sharing == "siamese" else moving
-    result = scratch(Raster(fixed, valid), Raster(moving, valid), NEAR, settings, training=Training(2000, 3))
+    moving = whole(-moving.pixels) if sharing == "siamese" else moving
+    result = scratch(fixed, moving, NEAR, settings, training=Training(2000, 3))
     assert result.recipe == "paper"
     assert result.levels == (0.25, 0.5, 1.0)
-    start = mean_error_px(NEAR, TRUTH, 400, 320)
-    assert mean_error_px(result.fixed_to_moving, TRUTH, 400, 320) < left * start
+    assert error_px(result) < left * mean_error_px(NEAR, TRUTH, 400, 320)
 
 
 def test_levels_halve_down_to_the_coarsest() -> None:
@@ -136,7 +123,7 @@ def test_levels_halve_down_to_the_coarsest() -> None:
 def test_a_distant_start_is_found_by_searching_the_loss() -> None:
     """An offset of an eighth of the image, too large for steps on psi alone."""
     truth = geometry.translation(6.0, -4.0)
-    fixed, moving = rasters(truth)
+    fixed, moving = two_views(truth)
     state = JointState(JointSettings(device="cpu"), lambda *_: None)
     net = state.fast_descriptor([1, 1])
     group = ImageGroup.of_one(fixed, moving, geometry.translation(46.0, 26.0))

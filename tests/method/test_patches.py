@@ -57,23 +57,21 @@ def test_keypoint_warp_equals_finite_differences_of_an_affine_mapping() -> None:
 
 def test_keypoint_warp_divides_by_the_denominator() -> None:
     h = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [2e-3, 0, 1.0]], dtype=torch.float64)
-    p = Keypoints(torch.tensor([[50.0, 0.0]]).double(), torch.tensor([0.0]).double(), torch.tensor([2.0]).double())
+    p = Keypoints(*(torch.tensor(v).double() for v in ([[50.0, 0.0]], [0.0], [2.0])))
     assert float(warp_keypoints(p, h).scale) == pytest.approx(2 / 1.1)
 
 
 def test_bilinear_is_linear_interpolation_at_pixel_centres() -> None:
     image = np.random.default_rng(0).normal(size=(2, 90, 110))
     grid = patch_positions(keypoints())
-    got = bilinear(torch.from_numpy(image), grid)
-    for channel in range(2):
-        where = [grid[..., 1].numpy(), grid[..., 0].numpy()]
-        expected = map_coordinates(image[channel], where, order=1, mode="nearest")
-        np.testing.assert_allclose(got[:, channel].numpy(), expected, atol=1e-10)
+    where = [grid[..., 1].numpy(), grid[..., 0].numpy()]
+    expected = [map_coordinates(channel, where, order=1, mode="nearest") for channel in image]
+    np.testing.assert_allclose(bilinear(torch.from_numpy(image), grid), np.stack(expected, 1), atol=1e-10)
 
 
 def test_patch_agrees_with_kornias_rotated_crop() -> None:
     image = torch.randn(1, 1, 100, 100, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    p = Keypoints(torch.tensor([[50.0, 47.0]]).double(), torch.tensor([0.6]).double(), torch.tensor([1.3]).double())
+    p = Keypoints(*(torch.tensor(v).double() for v in ([[50.0, 47.0]], [0.6], [1.3])))
     actual = bilinear(image[0], patch_positions(p))[0, 0]
     cos, sin = 1.3 * np.cos(0.6), 1.3 * np.sin(0.6)
     # Patch pixel (u, v) -> image pixel, as a 3x3; kornia warps with the map from source to destination.

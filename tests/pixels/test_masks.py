@@ -1,7 +1,14 @@
+"""Masks, conversions to grey and the texture of the sky."""
+
 import numpy as np
 import pytest
 
+from agalign.pixels.grey import channel_mean, eight_bit, luma
 from agalign.pixels.masks import data_mask, learnable, undeclared_fill
+from agalign.pixels.sky import MAX_SKY_TEXTURE, relative_texture
+from agalign.values.image import Raster
+
+from ..builders import whole
 
 
 def test_data_mask() -> None:
@@ -23,11 +30,9 @@ def test_only_constant_areas_at_the_border_are_fill() -> None:
     assert not fill[30:34, 40:44].any()
     assert fill.sum() == 600 + 100
 
-
-def test_a_few_dark_pixels_at_the_border_are_content() -> None:
-    image = np.full((200, 200), 100, np.uint8)
-    image[0, :3] = 0
-    assert not undeclared_fill(image).any()
+    few = np.full((200, 200), 100, np.uint8)
+    few[0, :3] = 0
+    assert not undeclared_fill(few).any()
 
 
 def test_saturated_areas_and_their_neighbours_are_masked() -> None:
@@ -48,3 +53,59 @@ def test_common_fill_values_of_floats_are_masked(fill: float) -> None:
     # Fill values are only assumed for floats without a declared nodata value.
     assert data_mask(np.array([[-9999.0, 7.0]]), 7.0).tolist() == [[True, False]]
     assert data_mask(np.array([[-9999]], np.int16), None).all()
+
+
+# ---- grey
+
+RGB = np.stack([np.full((2, 3), value, np.float32) for value in (10.0, 20.0, 60.0)])
+
+
+def test_luma_is_the_weighted_mean_of_red_green_and_blue() -> None:
+    np.testing.assert_allclose(luma(RGB), np.full((2, 3), 0.299 * 10 + 0.587 * 20 + 0.114 * 60), rtol=1e-6)
+    np.testing.assert_allclose(luma(RGB[:2]), np.full((2, 3), 15.0))
+    np.testing.assert_array_equal(luma(RGB[0]), RGB[0])
+
+
+def test_channel_mean_has_equal_weights() -> None:
+    result = channel_mean(whole(RGB))
+    np.testing.assert_allclose(result.pixels, np.full((2, 3), 30.0))
+    assert result.pixels.dtype == np.float32
+    one = whole(RGB[0])
+    assert channel_mean(one) is one
+
+
+def test_eight_bit_spans_the_valid_pixels() -> None:
+    image = np.linspace(0, 100, 101, dtype=np.float32)[None]
+    valid = image < 51
+    result = eight_bit(image, valid)
+    assert result[0, 0] == 0
+    assert result[0, 50] == 255
+    assert result[0, 100] == 255
+
+
+# ---- texture of the sky
+
+
+def gradient() -> np.ndarray:
+    y, x = np.mgrid[-1:1:48j, -1:1:64j]
+    return np.asarray(20000 * (1 + 0.4 * y - 0.2 * x * y) * (1 - 0.3 * (x**2 + y**2)))
+
+
+def test_vignetting_is_not_texture_but_faint_waves_are() -> None:
+    rng = np.random.default_rng(0)
+    smooth = gradient() * (1 + 0.004 * rng.standard_normal((48, 64)))
+    assert relative_texture(whole(smooth)) == pytest.approx(0.004, rel=0.2)
+    waves = gradient() * (1 + 0.05 * np.sin(np.arange(64) * 1.1))
+    assert relative_texture(whole(waves)) > 2 * MAX_SKY_TEXTURE
+
+
+def test_texture_is_relative_to_the_light_above_the_black_level() -> None:
+    pixels = 100 + 10 * (np.indices((48, 64)).sum(axis=0) % 2)
+    plain, lifted = relative_texture(whole(pixels)), relative_texture(whole(pixels + 5000.0), black_level=5000.0)
+    assert plain == pytest.approx(lifted, rel=1e-3)
+
+
+def test_saturated_or_black_images_have_no_texture_value() -> None:
+    bright = whole(gradient())
+    assert relative_texture(Raster(bright.pixels, np.arange(48 * 64).reshape(48, 64) % 3 == 0)) is None
+    assert relative_texture(whole(np.zeros((48, 64)))) is None

@@ -36,14 +36,25 @@ def test_a_calibrated_window_equals_a_part_of_the_image() -> None:
     np.testing.assert_allclose(calibrated(raw[10:30, 20:50], radiometry, 20, 10), whole[10:30, 20:50], rtol=1e-6)
 
 
-def test_reflectance_of_the_synthetic_flight_is_the_truth(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The images of a synthetic capture."""
+    folder = tmp_path_factory.mktemp("radiometry")
+    synthetic.make_flight(folder, 1, (320, 240), rng_seed=1)
+    return folder / "0000SET" / "000"
+
+
+@pytest.fixture(scope="module")
+def blue(images: Path) -> Path:
+    return images / "IMG_0001_1.tif"
+
+
+def test_reflectance_of_the_synthetic_flight_is_the_truth(images: Path) -> None:
     rng = np.random.default_rng(1)
     pose = rig.Pose(28.0, 20.0, 0.0, 0.0, 0.0, 0.0)
-    synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
     ground = paint_ground(rng, [pose], (320, 240))
     for spec in cameras.BANDS:
-        path = tmp_path / "0000SET" / "000" / f"IMG_0001_{spec.rig_index + 1}.tif"
-        band = by(path, "sun")
+        band = by(images / f"IMG_0001_{spec.rig_index + 1}.tif", "sun")
         assert band.radiometry.quantity == "reflectance"
         bright = np.full_like(ground.crop, 0.3 * max(spec.soil, spec.crop))
         raw = synthetic.render(bright, ground, spec, pose, (320, 240), rng)
@@ -53,18 +64,28 @@ def test_reflectance_of_the_synthetic_flight_is_the_truth(tmp_path: Path) -> Non
         assert np.median(result[:40, :40]) == pytest.approx(np.median(result[100:140, 140:180]), rel=0.02)
 
 
+def with_tags(path: Path, **changes: object) -> Radiometry | None:
+    """The radiometry of a file with changed tags."""
+    (band,) = MicaSense().bands(path, Tags(**{**vars(read_tags(path)), **changes}), probe(path))
+    return band.radiometry
+
+
 @pytest.mark.parametrize("missing", ["RadiometricCalibration", "ExposureTime", "ISOSpeed", "black"])
-def test_without_its_tags_there_is_no_radiometry(tmp_path: Path, missing: str) -> None:
-    synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
-    path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
-    tags = read_tags(path)
+def test_without_its_tags_there_is_no_radiometry(blue: Path, missing: str) -> None:
+    tags = read_tags(blue)
     exif = {k: v for k, v in tags.exif.items() if missing not in k}
     xmp = {k: v for k, v in tags.xmp.items() if k[1] != missing}
     black = None if missing == "black" else tags.black_level
-    (band,) = MicaSense().bands(
-        path, Tags(**{**vars(tags), "exif": exif, "xmp": xmp, "black_level": black}), probe(path)
-    )
-    assert band.radiometry is None
+    assert with_tags(blue, exif=exif, xmp=xmp, black_level=black) is None
+
+
+@pytest.mark.parametrize("value", [None, "-5", "0", "nan"])
+def test_without_a_plausible_light_sensor_it_is_radiance(blue: Path, value: str | None) -> None:
+    xmp = {k: v for k, v in read_tags(blue).xmp.items() if value or k[0] != "micasense.com/DLS"}
+    if value is not None:
+        xmp["micasense.com/DLS", "HorizontalIrradiance"] = (value,)
+    radiometry = with_tags(blue, xmp=xmp)
+    assert (radiometry.quantity, radiometry.by_sun) == ("radiance", None)
 
 
 def by(path: Path, choice: RadiometryChoice, factors: dict[str, float] | None = None) -> Band:
@@ -73,20 +94,18 @@ def by(path: Path, choice: RadiometryChoice, factors: dict[str, float] | None = 
     return with_radiometry(Capture("IMG_0001", Path(), bands, 0), choice, factors or {}).bands[0]
 
 
-def test_the_chosen_radiometry_is_applied(tmp_path: Path) -> None:
-    synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
-    path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
-    raw, camera, sun = (by(path, choice).radiometry for choice in ("off", "camera", "sun"))
+def test_the_chosen_radiometry_is_applied(blue: Path) -> None:
+    raw, camera, sun = (by(blue, choice).radiometry for choice in ("off", "camera", "sun"))
     assert raw == camera
     assert (camera.quantity, sun.quantity) == ("radiance", "reflectance")
     assert (camera.source, sun.source) == ("camera calibration", "light sensor")
     assert sun.gain == pytest.approx(camera.gain * np.pi / 0.8)
-    panel = by(path, "panel", {"Blue": 2.5}).radiometry
+    panel = by(blue, "panel", {"Blue": 2.5}).radiometry
     assert panel.source == "panel"
     assert (panel.quantity, panel.gain) == ("reflectance", pytest.approx(2.5 * camera.gain))
-    assert by(path, "panel", {"Green": 2.5}).radiometry is None
-    assert by(path, "auto", {"Blue": 2.5}).radiometry == panel
-    assert by(path, "auto").radiometry == sun
+    assert by(blue, "panel", {"Green": 2.5}).radiometry is None
+    assert by(blue, "auto", {"Blue": 2.5}).radiometry == panel
+    assert by(blue, "auto").radiometry == sun
 
 
 def test_rgb_companions_do_not_prevent_reflectance() -> None:
@@ -104,25 +123,6 @@ def test_thermal_bands_are_not_converted() -> None:
         (result,) = with_radiometry(Capture("IMG_0001", Path(), (band,), 0), choice, {}).bands
         assert result.radiometry == kelvin
     assert calibrated(np.full((2, 2), 30115, np.uint16), kelvin, 0, 0) == pytest.approx(28.0)
-
-
-@pytest.mark.parametrize("value", ["-5", "0", "nan"])
-def test_an_implausible_light_sensor_value_is_ignored(tmp_path: Path, value: str) -> None:
-    synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
-    path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
-    tags = read_tags(path)
-    xmp = {**tags.xmp, ("micasense.com/DLS", "HorizontalIrradiance"): (value,)}
-    (band,) = MicaSense().bands(path, Tags(**{**vars(tags), "xmp": xmp}), probe(path))
-    assert band.radiometry.by_sun is None
-
-
-def test_without_a_light_sensor_it_is_radiance(tmp_path: Path) -> None:
-    synthetic.make_flight(tmp_path, 1, (320, 240), rng_seed=1)
-    path = tmp_path / "0000SET" / "000" / "IMG_0001_1.tif"
-    tags = read_tags(path)
-    xmp = {k: v for k, v in tags.xmp.items() if k[0] != "micasense.com/DLS"}
-    (band,) = MicaSense().bands(path, Tags(**{**vars(tags), "xmp": xmp}), probe(path))
-    assert (band.radiometry.quantity, band.radiometry.by_sun) == ("radiance", None)
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,10 @@ from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import Peak, correlation_surface, find_peak, structure_field
 from agalign.values.image import Raster
 
+from ..builders import whole
 from ..conftest import textured_image
 
 WIDTH, HEIGHT = 400, 320
-EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
 OFFSETS = ((0, 0), (13, -8), (-21, 5), (9, 17))
 """Offsets of the four bands, px."""
 REGISTERED = ((0, 0),) * len(OFFSETS)
@@ -26,7 +26,7 @@ def bands(offsets: Sequence[tuple[int, int]] = OFFSETS, scene: np.ndarray | None
     for k, (x, y) in enumerate(offsets):
         seen = scene[40 - y : 40 - y + HEIGHT, 40 - x : 40 - x + WIDTH] * (-1) ** k
         noisy = (1000 + 100 * (k + 1) * (seen + 0.05 * rng.normal(size=seen.shape))).astype(np.float32)
-        result.append(Raster(noisy, EVERYWHERE))
+        result.append(whole(noisy))
     return result
 
 
@@ -60,8 +60,7 @@ def test_bands_peak_at_their_offset_once_the_common_pattern_is_removed(
     assert np.linalg.norm(shifts - OFFSETS[1:], axis=1).min() > 0.5, "the pattern hides the offsets"
     with caplog.at_level(logging.DEBUG):
         fixed, *moving = without_common_stripes(images)
-    for image, offset in zip(moving, OFFSETS[1:], strict=True):
-        np.testing.assert_allclose(peak(fixed, image).shift_px, offset, atol=0.1)
+    np.testing.assert_allclose([peak(fixed, image).shift_px for image in moving], OFFSETS[1:], atol=0.1)
     assert all((word in caplog.text) == (axis in axes) for axis, word in enumerate(("columns", "rows")))
 
 
@@ -99,7 +98,7 @@ def test_crop_rows_along_the_columns_are_not_removed(
 
 def test_invalid_pixels_are_excluded_and_stay_0() -> None:
     clean = bands()
-    valid = EVERYWHERE.copy()
+    valid = np.ones((HEIGHT, WIDTH), bool)
     valid[:, 100:160] = valid[200:230] = False
     images = [Raster(np.where(valid, i.pixels, np.float32(0)), valid) for i in striped(clean, pattern(0))]
     for before, after in zip(images, without_common_stripes(images), strict=True):
@@ -112,13 +111,10 @@ def test_invalid_pixels_are_excluded_and_stay_0() -> None:
 
 def test_images_of_another_size_or_of_several_channels_are_not_compared() -> None:
     images = striped(bands(), pattern(0))
-    colour = Raster(np.stack([images[0].pixels] * 3), EVERYWHERE)
-    small = Raster(images[1].pixels[:100, :100], EVERYWHERE[:100, :100])
+    colour, small = whole(np.stack([images[0].pixels] * 3)), whole(images[1].pixels[:100, :100])
     alone = [images[0], colour, small]
     assert is_same(without_common_stripes(alone), alone)
     first, second, third, *others = without_common_stripes([images[0], colour, small, *images[1:]])
-    assert second is colour
-    assert third is small
-    expected = without_common_stripes(images)
-    for one, other in zip([first, *others], expected, strict=True):
+    assert is_same([second, third], [colour, small])
+    for one, other in zip([first, *others], without_common_stripes(images), strict=True):
         np.testing.assert_array_equal(one.pixels, other.pixels)

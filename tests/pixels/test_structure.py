@@ -6,16 +6,14 @@ from agalign.pixels.resample import shrink, textured
 from agalign.pixels.structure import correlation_surface, find_peak, gradient_magnitude, structure_field
 from agalign.values.image import Raster
 
+from ..builders import texture, whole
 from ..conftest import textured_image
 
-EVERYWHERE = np.ones((240, 320), bool)
+IMAGE = texture(320, 240)
 
 
 def test_contrast_reversal_does_not_change_the_field() -> None:
-    image = textured_image(320, 240)
-    one = structure_field(Raster(image, EVERYWHERE))
-    other = structure_field(Raster(-image, EVERYWHERE))
-    np.testing.assert_allclose(one, other, atol=1e-5)
+    np.testing.assert_allclose(structure_field(IMAGE), structure_field(whole(-IMAGE.pixels)), atol=1e-5)
 
 
 @pytest.mark.parametrize("shift", [(7.0, -4.0), (-20.5, 11.25)])
@@ -24,7 +22,7 @@ def test_the_peak_is_at_the_shift(shift: tuple[float, float]) -> None:
     matrix = np.array([[1, 0, -shift[0]], [0, 1, -shift[1]]])
     moved = -cv2.warpAffine(big, matrix, (480, 400), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP)
     crop = np.s_[80:320, 80:400]
-    fields = [structure_field(Raster(i[crop], EVERYWHERE)) for i in (big, moved)]
+    fields = [structure_field(whole(i[crop])) for i in (big, moved)]
     peak = find_peak(correlation_surface(*fields), 16)
     # With cv2.WARP_INVERSE_MAP, moved(p) = big(p - shift): content at p is moved to p + shift.
     np.testing.assert_allclose(peak.shift_px, shift, atol=0.15)
@@ -32,21 +30,19 @@ def test_the_peak_is_at_the_shift(shift: tuple[float, float]) -> None:
 
 
 def test_unrelated_images_have_no_significant_peak() -> None:
-    fields = [structure_field(Raster(textured_image(320, 240, s), EVERYWHERE)) for s in (1, 2)]
+    fields = [structure_field(texture(320, 240, s)) for s in (1, 2)]
     peak = find_peak(correlation_surface(*fields), 16)
     assert peak.sigma < 8
     assert peak.sigma < 1.4 * peak.runner_up_sigma
 
 
 def test_invalid_pixels_leave_no_edge() -> None:
-    valid = EVERYWHERE.copy()
+    valid = np.ones((240, 320), bool)
     valid[100:140, 100:180] = False
-    image = np.where(valid, textured_image(320, 240), -50).astype(np.float32)
-    whole = structure_field(Raster(textured_image(320, 240), EVERYWHERE))
-    holed = structure_field(Raster(image, valid))
+    holed = structure_field(Raster(np.where(valid, IMAGE.pixels, np.float32(-50)), valid))
     assert np.abs(holed[~valid]).max() == 0
     far = cv2.erode(valid.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
-    assert np.abs(holed - whole)[far].mean() < 0.02
+    assert np.abs(holed - structure_field(IMAGE))[far].mean() < 0.02
 
 
 def test_shrinking_averages_and_keeps_invalid_pixels_out() -> None:
@@ -60,9 +56,9 @@ def test_shrinking_averages_and_keeps_invalid_pixels_out() -> None:
 
 
 def test_textured() -> None:
-    assert textured(Raster(textured_image(320, 240), EVERYWHERE))
-    assert not textured(Raster(np.full((240, 320), 7, np.float32), EVERYWHERE))
-    assert not textured(Raster(textured_image(320, 240), ~EVERYWHERE))
+    assert textured(IMAGE)
+    assert not textured(whole(np.full((240, 320), 7, np.float32)))
+    assert not textured(Raster(IMAGE.pixels, ~IMAGE.valid))
 
 
 def at_offset(image: np.ndarray, offset: int) -> np.ndarray:

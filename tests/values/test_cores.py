@@ -7,35 +7,28 @@ import pytest
 from agalign.values import cores
 from agalign.values.cores import cgroup_quota, limit_default_threads, usable_cores
 
-
-def test_the_quota_of_a_container_is_that_of_its_own_control_group(tmp_path: Path) -> None:
-    own = tmp_path / "self"
-    own.write_text("0::/\n")
-    assert cgroup_quota(tmp_path, own) is None
-    (tmp_path / "cpu.max").write_text("max 100000\n")
-    assert cgroup_quota(tmp_path, own) is None
-    (tmp_path / "cpu.max").write_text("150000 100000\n")
-    assert cgroup_quota(tmp_path, own) == 1.5
+V1 = {"cpu/docker/ab/cpu.cfs_period_us": "100000"}
 
 
-def test_the_smallest_quota_on_the_way_to_the_root_counts(tmp_path: Path) -> None:
-    own, slice_ = tmp_path / "self", tmp_path / "batch" / "job"
-    own.write_text("0::/batch/job\n")
-    slice_.mkdir(parents=True)
-    (slice_ / "cpu.max").write_text("400000 100000\n")
-    (slice_.parent / "cpu.max").write_text("300000 100000\n")
-    assert cgroup_quota(tmp_path, own) == 3.0
-
-
-def test_control_groups_of_version_1(tmp_path: Path) -> None:
-    own, folder = tmp_path / "self", tmp_path / "cpu" / "docker" / "ab"
-    own.write_text("4:memory:/docker/other\n3:cpu,cpuacct:/docker/ab\n")
-    folder.mkdir(parents=True)
-    (folder / "cpu.cfs_period_us").write_text("100000\n")
-    (folder / "cpu.cfs_quota_us").write_text("-1\n")
-    assert cgroup_quota(tmp_path, own) is None
-    (folder / "cpu.cfs_quota_us").write_text("50000\n")
-    assert cgroup_quota(tmp_path, own) == 0.5
+@pytest.mark.parametrize(
+    ("groups", "files", "expected"),
+    [
+        ("0::/", {}, None),
+        ("0::/", {"cpu.max": "max 100000"}, None),
+        ("0::/", {"cpu.max": "150000 100000"}, 1.5),
+        # The smallest quota on the way to the root counts.
+        ("0::/batch/job", {"batch/job/cpu.max": "400000 100000", "batch/cpu.max": "300000 100000"}, 3.0),
+        ("4:memory:/docker/other\n3:cpu,cpuacct:/docker/ab", V1 | {"cpu/docker/ab/cpu.cfs_quota_us": "-1"}, None),
+        ("4:memory:/docker/other\n3:cpu,cpuacct:/docker/ab", V1 | {"cpu/docker/ab/cpu.cfs_quota_us": "50000"}, 0.5),
+    ],
+)
+def test_the_quota_of_a_container_is_that_of_its_control_groups(
+    tmp_path: Path, groups: str, files: dict[str, str], expected: float | None
+) -> None:
+    for name, text in {"self": groups, **files}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(f"{text}\n")
+    assert cgroup_quota(tmp_path, tmp_path / "self") == expected
 
 
 @pytest.mark.parametrize(("quota", "expected"), [(None, 8), (2.5, 3), (0.2, 1), (64.0, 8)])

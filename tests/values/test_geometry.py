@@ -24,11 +24,8 @@ def test_inverse_undoes(matrix: np.ndarray) -> None:
 
 @given(matrices, matrices)
 def test_compose_applies_the_last_first(one: np.ndarray, other: np.ndarray) -> None:
-    assert_allclose(
-        geometry.apply(geometry.compose(one, other), points),
-        geometry.apply(one, geometry.apply(other, points)),
-        atol=1e-6,
-    )
+    expected = geometry.apply(one, geometry.apply(other, points))
+    assert_allclose(geometry.apply(geometry.compose(one, other), points), expected, atol=1e-6)
 
 
 @given(matrices, st.sampled_from([0.25, 0.5, 2.0]), st.sampled_from([0.5, 1.0]))
@@ -37,12 +34,6 @@ def test_rescale_commutes_with_resizing(matrix: np.ndarray, fixed_scale: float, 
     small_points = (points + 0.5) * fixed_scale - 0.5
     expected = (geometry.apply(matrix, points) + 0.5) * moving_scale - 0.5
     assert_allclose(geometry.apply(scaled, small_points), expected, atol=1e-6)
-
-
-def test_halving_keeps_the_outer_edges() -> None:
-    # Edges of a 10 px row lie at -0.5 and 9.5; of its 5 px half at -0.5 and 4.5.
-    half = PixelScale(0.5, 0.5).matrix
-    assert_allclose(geometry.apply(half, [[-0.5, -0.5], [9.5, 9.5]]), [[-0.5, -0.5], [4.5, 4.5]])
 
 
 @pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.eye(2), np.full((3, 3), np.nan), np.diag([1.0, 1.0, 0.0])])
@@ -101,15 +92,9 @@ def test_a_homography_is_fitted_to_the_points_that_it_maps(matrix: np.ndarray) -
     assert_allclose(geometry.apply(fitted, lattice), geometry.apply(matrix, lattice), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "points_px",
-    [
-        np.column_stack([np.arange(6.0), 2 * np.arange(6.0)]),
-        np.where(np.eye(6, 2) > 0, np.nan, points[[0, 1, 2, 3, 0, 1]]),
-        points[:3],
-    ],
-    ids=["on one line", "not finite", "three points"],
-)
-def test_no_homography_is_fitted_to_degenerate_points(points_px: np.ndarray) -> None:
-    with pytest.raises(GeometryError):
-        geometry.fit_homography(points_px, points_px)
+def test_no_homography_is_fitted_to_degenerate_points() -> None:
+    on_a_line = np.column_stack([np.arange(6.0), 2 * np.arange(6.0)])
+    not_finite = np.where(np.eye(6, 2) > 0, np.nan, points[[0, 1, 2, 3, 0, 1]])
+    for points_px in (on_a_line, not_finite, points[:3]):
+        with pytest.raises(GeometryError):
+            geometry.fit_homography(points_px, points_px)

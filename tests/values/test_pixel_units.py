@@ -34,6 +34,7 @@ def check(band: Band, between_images: Alignment[FixedImagePx]) -> None:
 """
 
 
+@pytest.mark.full
 def test_mypy_rejects_units_that_do_not_match(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lines = [ACCEPTED, *REJECTED.values()]
     snippet = tmp_path / "snippet.py"

@@ -40,14 +40,13 @@ def _nothing_is_left() -> Iterator[None]:
 
 
 def worker_processes() -> list[psutil.Process]:
-    def is_worker(process: psutil.Process) -> bool:
-        try:
-            started_by_server = process.ppid() != os.getpid()
-            return started_by_server and process.status() != psutil.STATUS_ZOMBIE
-        except psutil.NoSuchProcess:
-            return False
-
-    return [p for p in psutil.Process().children(recursive=True) if is_worker(p)]
+    """Return the living processes that the fork server started."""
+    result = []
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            if process.ppid() != os.getpid() and process.status() != psutil.STATUS_ZOMBIE:
+                result.append(process)
+    return result
 
 
 def pool(function: Callable[[Any], Any], processes: int = 1, **more: Any) -> ProcessPool[Any, Any]:
@@ -140,46 +139,38 @@ def ended_while(
     point: str, number: int, times: int, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Callable[[Any], Any], object]:
     """(function, argument) of a task during which its worker gets a signal."""
-    mark = folder / "mark"
-    if point == "receiving":
-        at_first(monkeypatch, point, number, times)
-        return tasks.received, bytes(LARGE)
+    task = folder / "mark", number, times
     if point == "unpickling":
-        return tasks.received, tasks.WhenUnpickled(mark, number, times)
+        return tasks.received, tasks.WhenUnpickled(*task)
     if point == "computing":
-        return tasks.signalled, (mark, number, times)
+        return tasks.signalled, task
     at_first(monkeypatch, point, number, times)
-    return tasks.zeros, LARGE
+    return (tasks.received, bytes(LARGE)) if point == "receiving" else (tasks.zeros, LARGE)
 
 
 POINTS = ("receiving", "unpickling", "computing", "sending")
 
 
-@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize(("kills", "processes"), [(1, 1), (1, 2), (2, 1)])
 @pytest.mark.parametrize("point", POINTS)
-def test_a_worker_killed_once_costs_nothing(
-    point: str, processes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_worker_killed_once_costs_nothing_and_twice_its_task(
+    point: str, kills: int, processes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    function, argument = ended_while(point, signal.SIGKILL, 1, tmp_path, monkeypatch)
+    function, argument = ended_while(point, signal.SIGKILL, kills, tmp_path, monkeypatch)
     with pool(function, processes) as workers:
+        if kills == 2:
+            (outcome,) = workers.run([argument])
+            assert told(outcome) == "WorkerDiedError: signal 9"
         (outcome,) = workers.run([argument])
     assert outcome.value() in ("done", bytes(LARGE))
 
 
-@pytest.mark.parametrize("point", POINTS)
-def test_a_worker_killed_twice_costs_its_task_and_names_the_signal(
-    point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    function, argument = ended_while(point, signal.SIGKILL, 2, tmp_path, monkeypatch)
-    with pool(function) as workers:
-        (outcome,) = workers.run([argument])
-        assert told(outcome) == "WorkerDiedError: signal 9"
-        (outcome,) = workers.run([argument])
-        assert outcome.error is None
+def in_full_run(*values: object) -> Any:
+    return pytest.param(*values, marks=pytest.mark.full)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("point", POINTS)
+@pytest.mark.parametrize("point", ["computing", *map(in_full_run, ("receiving", "unpickling", "sending"))])
 def test_a_stopped_worker_is_late(point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The other worker finishes meanwhile, and the task is not tried again."""
     function, argument = ended_while(point, signal.SIGSTOP, 1, tmp_path, monkeypatch)
@@ -247,9 +238,8 @@ def test_a_system_that_is_short_of_something(what: str, monkeypatch: pytest.Monk
     def short(*_: object, **__: object) -> None:
         raise RuntimeError("can't start new thread") if what == "thread" else OSError(11, "Resource unavailable")
 
-    owner, name = {
-        "pipe": (type(CONTEXT), "Pipe"), "thread": (threading.Thread, "start"), "process": (CONTEXT.Process, "start"),
-    }[what]  # fmt: skip
+    owners = {"pipe": type(CONTEXT), "thread": threading.Thread, "process": CONTEXT.Process}
+    owner, name = owners[what], "Pipe" if what == "pipe" else "start"
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, short)
         workers = pool(tasks.received, 2)
@@ -335,6 +325,7 @@ def test_a_killed_fork_server_costs_nothing() -> None:
         assert [o.value() for o in outcomes] == [1.0] * 3
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_a_hundred_kills_at_random_moments() -> None:
     """Eight workers, on however many cores."""
@@ -378,9 +369,20 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("whom", ["group", "parent"])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
-@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+@pytest.mark.parametrize(
+    ("method", "number", "whom"),
+    [
+        ("forkserver", signal.SIGKILL, "parent"),
+        ("forkserver", signal.SIGINT, "group"),
+        ("spawn", signal.SIGTERM, "parent"),
+        *(
+            in_full_run(method, number, whom)
+            for method in ("forkserver", "spawn")
+            for number in (signal.SIGTERM, signal.SIGKILL, signal.SIGINT)
+            for whom in ("group", "parent")
+        ),
+    ],
+)
 def test_no_process_outlives_its_parent(method: str, number: int, whom: str, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

@@ -1,6 +1,7 @@
 """An alignment resamples images of any type and layout by its complete mapping, and inverts it."""
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from agalign.errors import InputError
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
+from agalign.values.choices import Interpolation
 from agalign.values.displacement import DisplacementField
 from agalign.values.image import Tile
 from agalign.values.mapping import PixelMapping
@@ -94,16 +96,16 @@ def test_the_type_is_kept(dtype: str, gain: float, offset: float) -> None:
 @pytest.mark.parametrize("dtype", ["int32", "float64"])
 def test_types_of_more_than_24_bits_are_not_rounded(dtype: str) -> None:
     """16,777,217 is the first integer that float32 does not have."""
+    image, shift = np.full(SIZE[::-1], 16_777_217, dtype), alignment(PixelMapping(geometry.translation(3, 2)))
     for interpolation in ("nearest", "bilinear"):
-        warped, valid = alignment(PixelMapping(geometry.translation(3, 2))).warp(
-            np.full(SIZE[::-1], 16_777_217, dtype), interpolation=interpolation
-        )
+        warped, valid = shift.warp(image, interpolation=interpolation)
         assert (warped[valid] == 16_777_217).all()
 
 
-def test_masks_are_resampled() -> None:
+@pytest.mark.parametrize("interpolation", get_args(Interpolation))
+def test_masks_are_resampled(interpolation: Interpolation) -> None:
     result = alignment(MAPPINGS["field"])
-    warped, valid = result.warp(scene(pixels()) > 0)
+    warped, valid = result.warp(scene(pixels()) > 0, interpolation=interpolation)
     assert warped.dtype == bool
     expected = scene(result.map(pixels()))
     clear = valid & (np.abs(expected) > 0.15)
@@ -129,9 +131,8 @@ def test_unusable_pixels_are_never_used(unusable: str, interpolation: str) -> No
     assert in_hole.sum() > 500
     assert not valid[in_hole].any()
     assert valid[~in_hole & inside].mean() > 0.98
-    assert np.abs(warped[:, valid] - scene(result.map(pixels()))[valid]).max() < (
-        0.15 if interpolation != "lanczos" else 0.05
-    )
+    max_error = 0.05 if interpolation == "lanczos" else 0.15
+    assert np.abs(warped[:, valid] - scene(result.map(pixels()))[valid]).max() < max_error
     filled = warped[:, ~valid]
     assert ((filled == 1000.0) if unusable == "nodata" else np.isnan(filled)).all()
 
