@@ -18,44 +18,45 @@ from agalign.errors import InputError, NoSuchBandError
 from agalign.synthetic import flight as synthetic
 from agalign.values.capture import Band
 
+SMALL = np.arange(64, dtype=np.uint16).reshape(8, 8)
 
-def write(path: Path, seed: int = 0, bands: int = 1) -> None:
+
+def write(path: Path, bands: int = 1) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng(seed)
-    shape = (64, 80) if bands == 1 else (bands, 64, 80)
     planar = None if bands == 1 else "separate"
-    pixels = rng.integers(1, 4000, shape, dtype=np.uint16)
+    pixels = np.random.default_rng(0).integers(1, 4000, (bands, 64, 80), dtype=np.uint16).squeeze()
     tifffile.imwrite(path, pixels, photometric="minisblack", planarconfig=planar)
 
 
-def labels(folder: Path, **options: object) -> list[str]:
-    return [c.label for c in discover(folder, DiscoverOptions(**options)).captures]
+def write_all(folder: Path, *names: str) -> Path:
+    """Write a TIFF file of one band for each name."""
+    for name in names:
+        write(folder / f"{name}.tif")
+    return folder
+
+
+def found(folder: Path, **options: object) -> dict[str, list[str]]:
+    """The names of the bands by the label of their capture."""
+    return {c.label: [b.name for b in c.bands] for c in discover(folder, DiscoverOptions(**options)).captures}
 
 
 def test_a_micasense_flight(flight: Path) -> None:
-    result = discover(flight)
-    assert [c.label for c in result.captures] == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
+    result, names = discover(flight), ["Blue", "Green", "Red", "NIR", "Red edge"]
+    assert found(flight) == {"0000SET/000/IMG_0001": names, "0000SET/000/IMG_0002": names}
     assert result.problems == ()
     first = result.captures[0]
-    assert [b.name for b in first.bands] == ["Blue", "Green", "Red", "NIR", "Red edge"]
     assert first.reference.name == "Green"
     assert first.capture_id == "synthetic00000000001"
     assert all(b.lens is not None and b.to_rig is not None for b in first.bands)
-
-
-def test_ignoring_metadata_keeps_the_captures_but_not_the_lenses(flight: Path) -> None:
-    result = discover(flight, DiscoverOptions(ignore_metadata=True))
-    assert len(result.captures) == 2
-    assert all(b.lens is None and b.to_rig is None for c in result.captures for b in c.bands)
+    without = discover(flight, DiscoverOptions(ignore_metadata=True))
+    assert len(without.captures) == 2
+    assert all(b.lens is None and b.to_rig is None for c in without.captures for b in c.bands)
 
 
 def test_names_that_repeat_in_sub_folders_are_different_captures(flight: Path, tmp_path: Path) -> None:
     for name in ("0000SET", "0001SET mit Größe"):
         shutil.copytree(flight / "0000SET" / "000", tmp_path / name / "000")
-    result = discover(tmp_path)
-    assert len(result.captures) == 4
-    assert len({c.label for c in result.captures}) == 4
-    assert all(len(c.bands) == 5 for c in result.captures)
+    assert [len(bands) for bands in found(tmp_path).values()] == [5] * 4
 
 
 def test_missing_bands_and_unreadable_files_are_told(flight: Path, tmp_path: Path) -> None:
@@ -71,27 +72,20 @@ def test_missing_bands_and_unreadable_files_are_told(flight: Path, tmp_path: Pat
 
 
 def test_one_file_a_band(tmp_path: Path) -> None:
-    for name in ("north_red", "north_nir", "north_green", "south_red", "south_nir"):
-        write(tmp_path / f"{name}.tif")
-    result = discover(tmp_path)
-    assert [(c.name, c.reference.name, len(c.bands)) for c in result.captures] == [
-        ("north", "green", 3),
-        ("south", "nir", 2),
-    ]
+    write_all(tmp_path, "north_red", "north_nir", "north_green", "south_red", "south_nir")
+    assert [c.reference.name for c in discover(tmp_path).captures] == ["green", "nir"]
+    assert found(tmp_path) == {"north": ["green", "nir", "red"], "south": ["nir", "red"]}
 
 
 def test_bands_alone_in_their_folder_are_named_by_it(tmp_path: Path) -> None:
-    for name in ("red", "nir"):
-        write(tmp_path / "plot 7" / f"{name}.tif")
-    (capture,) = discover(tmp_path).captures
-    assert capture.label == "plot 7/plot 7"
+    write_all(tmp_path / "plot 7", "red", "nir")
+    assert found(tmp_path) == {"plot 7/plot 7": ["nir", "red"]}
 
 
 def test_a_band_without_tags_joins_the_capture_of_its_name(flight: Path, tmp_path: Path) -> None:
     """Editing a file often removes its tags: the others of the capture still have theirs."""
     shutil.copytree(flight / "0000SET" / "000", tmp_path / "in")
-    write(tmp_path / "in" / "IMG_0001_1.tif")
-    write(tmp_path / "in" / "IMG_0009_1.tif")
+    write_all(tmp_path / "in", "IMG_0001_1", "IMG_0009_1")
     result = discover(tmp_path / "in")
     first = result.captures[0]
     assert [(c.name, len(c.bands)) for c in result.captures] == [("IMG_0001", 5), ("IMG_0002", 5)]
@@ -122,38 +116,25 @@ def test_pictures_one_a_band_by_name_are_a_capture(tmp_path: Path, suffix: str, 
             write_picture(tmp_path / f"plot_{plot}_{band}.{suffix}", channels)
         write_picture(tmp_path / f"plot_{plot}_rgb.{suffix}", 3)
     result = discover(tmp_path)
-    assert [(c.name, [b.name for b in c.bands]) for c in result.captures] == [
-        ("plot_1", ["550nm", "nir", "red"]), ("plot_2", ["550nm", "nir", "red"]),
-    ]  # fmt: skip
+    assert found(tmp_path) == {"plot_1": ["550nm", "nir", "red"], "plot_2": ["550nm", "nir", "red"]}
     assert result.captures[0].reference.wavelength_nm == 550
     assert result.eight_bit == result.captures
     assert result.problems == ()
 
 
 def test_quick_looks_among_tiffs_take_no_part(tmp_path: Path) -> None:
-    for band in ("red", "nir"):
-        write(tmp_path / f"a_{band}.tif")
-        write_picture(tmp_path / f"a_{band}.jpg")
-    write_picture(tmp_path / "map_red.png")
-    write_picture(tmp_path / "chart.png")
-    write_picture(tmp_path / "photo_1.jpg", 3)
-    write_picture(tmp_path / "photo_2.jpg", 3)
+    write_all(tmp_path, "a_red", "a_nir")
+    for name in ("a_red.jpg", "a_nir.jpg", "map_red.png", "chart.png", "photo_1.jpg", "photo_2.jpg"):
+        write_picture(tmp_path / name, 3 if "photo" in name else 1)
     result = discover(tmp_path)
-    assert [(c.name, [b.name for b in c.bands]) for c in result.captures] == [("a", ["nir", "red"])]
+    assert found(tmp_path) == {"a": ["nir", "red"]}
     assert (result.problems, result.eight_bit) == ((), ())
 
 
 def test_a_pattern_names_the_bands_of_pictures(tmp_path: Path) -> None:
     for number in (1, 2):
         write_picture(tmp_path / f"a_{number}.png")
-    assert labels(tmp_path, pattern="{capture}_{band}.png") == ["a"]
-
-
-def test_one_band_of_a_picture_has_no_companion(tmp_path: Path) -> None:
-    write_picture(tmp_path / "a_red.png")
-    result = discover(tmp_path)
-    assert result.captures == ()
-    assert [p.path.name for p in result.problems] == ["a_red.png"]
+    assert found(tmp_path, pattern="{capture}_{band}.png") == {"a": ["1", "2"]}
 
 
 def test_a_multiband_file_is_a_capture(tmp_path: Path) -> None:
@@ -163,25 +144,20 @@ def test_a_multiband_file_is_a_capture(tmp_path: Path) -> None:
     assert [(b.name, b.band_index) for b in capture.bands] == [(f"band_{i}", i) for i in range(1, 5)]
 
 
-def test_pattern(tmp_path: Path) -> None:
-    for name in ("A-of-7", "B-of-7", "A-of-8", "B-of-8"):
-        write(tmp_path / f"{name}.tif")
-    assert labels(tmp_path, pattern="{band}-of-{capture}.tif") == ["7", "8"]
-
-
-def test_a_band_without_companions_is_a_problem_not_a_capture(tmp_path: Path) -> None:
-    write(tmp_path / "lonely_red.tif")
+@pytest.mark.parametrize("name", ["lonely_red.tif", "lonely_red.png"])
+def test_a_band_without_companions_is_a_problem_not_a_capture(tmp_path: Path, name: str) -> None:
+    (write if name.endswith("tif") else write_picture)(tmp_path / name)
     result = discover(tmp_path)
     assert result.captures == ()
-    assert "lonely_red.tif" in result.problems[0].text
-    assert "--pattern" in result.problems[0].text
+    (problem,) = result.problems
+    assert problem.path.name == name
+    assert name in problem.text
+    assert "--pattern" in problem.text
 
 
 def test_two_captures_of_one_name_do_not_overwrite_each_other(tmp_path: Path) -> None:
     write(tmp_path / "field.tif", bands=3)
-    for name in ("field_red", "field_nir"):
-        write(tmp_path / f"{name}.tif")
-    assert labels(tmp_path) == ["field", "field-2"]
+    assert list(found(write_all(tmp_path, "field_red", "field_nir"))) == ["field", "field-2"]
 
 
 def test_reference_by_name(flight: Path) -> None:
@@ -189,34 +165,32 @@ def test_reference_by_name(flight: Path) -> None:
     result = discover(flight, DiscoverOptions(reference="swir"))
     assert result.captures == ()
     assert "swir" in result.problems[0].text
+    assert {type(p.error) for p in result.problems} == {NoSuchBandError}
 
 
 def test_output_folders_are_not_looked_into(flight: Path, tmp_path: Path) -> None:
     shutil.copytree(flight, tmp_path / "f")
     write(tmp_path / "f" / "out" / "x.tif", bands=2)
-    assert "out/x" in labels(tmp_path / "f")
-    assert "out/x" not in labels(tmp_path / "f", skip=(tmp_path / "f" / "out",))
+    assert "out/x" in found(tmp_path / "f")
+    assert "out/x" not in found(tmp_path / "f", skip=(tmp_path / "f" / "out",))
     for name in ("summary.csv", "index.html"):
         (tmp_path / "f" / "out" / name).touch()
-    assert "out/x" not in labels(tmp_path / "f")
+    assert "out/x" not in found(tmp_path / "f")
 
 
 def test_bands_sort_by_number(tmp_path: Path) -> None:
-    for k in (1, 2, 10):
-        write(tmp_path / f"IMG_0001_{k}.tif")
+    write_all(tmp_path, "IMG_0001_10", "IMG_0001_1", "IMG_0001_2")
     (capture,) = discover(tmp_path).captures
     assert [b.path.name for b in capture.bands] == ["IMG_0001_1.tif", "IMG_0001_2.tif", "IMG_0001_10.tif"]
     assert capture.name == "IMG_0001"
 
 
 def test_where_there_is_nothing(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no \.tif"):
-        discover(tmp_path)
-    with pytest.raises(InputError, match="does not exist"):
-        discover(tmp_path / "nowhere")
-    write(tmp_path / "a.tif")
-    with pytest.raises(InputError, match="is a file"):
-        discover(tmp_path / "a.tif")
+    write(tmp_path / "below" / "a.tif")
+    (tmp_path / "empty").mkdir()
+    for name, message in (("empty", r"no \.tif"), ("nowhere", "does not exist"), ("below/a.tif", "is a file")):
+        with pytest.raises(InputError, match=message):
+            discover(tmp_path / name)
 
 
 def test_a_panel_of_another_flight_is_a_capture_of_its_own(flight: Path, tmp_path: Path) -> None:
@@ -230,37 +204,30 @@ def test_a_panel_of_another_flight_is_a_capture_of_its_own(flight: Path, tmp_pat
 
 
 def test_a_pattern_splits_names_where_the_band_begins(tmp_path: Path) -> None:
-    for name in ("IMG_0007_1", "IMG_0007_2", "IMG_0009_1", "IMG_0009_2", "north_red_edge", "north_red"):
-        write(tmp_path / f"{name}.tif")
-    result = discover(tmp_path, DiscoverOptions(pattern="{capture}_{band}.tif"))
-    bands = {c.name: [b.name for b in c.bands] for c in result.captures}
-    assert bands == {"IMG_0007": ["1", "2"], "IMG_0009": ["1", "2"], "north": ["red", "red_edge"]}
-    assert result.problems == ()
+    write_all(tmp_path, "IMG_0007_1", "IMG_0007_2", "north_red_edge", "north_red")
+    assert found(tmp_path, pattern="{capture}_{band}.tif") == {"IMG_0007": ["1", "2"], "north": ["red", "red_edge"]}
+    write_all(tmp_path / "b", "A-of-7", "B-of-7", "A-of-8", "B-of-8")
+    assert found(tmp_path / "b", pattern="{band}-of-{capture}.tif") == {"7": ["A", "B"], "8": ["A", "B"]}
 
 
 def test_a_pattern_that_makes_one_band_of_two_files_is_told(tmp_path: Path) -> None:
-    for name in ("a_1_red", "a_2_red", "a_1_nir"):
-        write(tmp_path / f"{name}.tif")
+    write_all(tmp_path, "a_1_red", "a_2_red", "a_1_nir")
     result = discover(tmp_path, DiscoverOptions(pattern="{capture}_*_{band}.tif"))
     (problem,) = result.problems
     assert "a_2_red.tif: is band 'red' of one capture with a_1_red.tif" in problem.text
 
 
 def test_the_day_of_a_date_is_no_band(tmp_path: Path) -> None:
-    for name in ("field_2023-05-12", "field_2023-06-03"):
-        write(tmp_path / f"{name}.tif")
+    write_all(tmp_path, "field_2023-05-12", "field_2023-06-03")
     result = discover(tmp_path)
     assert not result.captures
     assert ["no companion" in p.text for p in result.problems] == [True, True]
-    write(tmp_path / "field_2023-05-12_red.tif")
-    write(tmp_path / "field_2023-05-12_nir.tif")
-    assert [c.name for c in discover(tmp_path).captures] == ["field_2023-05-12"]
+    write_all(tmp_path, "field_2023-05-12_red", "field_2023-05-12_nir")
+    assert list(found(tmp_path)) == ["field_2023-05-12"]
 
 
-def test_digits_that_are_no_numbers_are_sorted_all_the_same(tmp_path: Path) -> None:
-    for name in ("1²2_red", "1²2_nir", "10_red", "10_nir"):
-        write(tmp_path / f"{name}.tif")
-    assert len(discover(tmp_path).captures) == 2
+def test_digits_that_are_not_numbers_are_sorted(tmp_path: Path) -> None:
+    assert len(found(write_all(tmp_path, "1²2_red", "1²2_nir", "10_red", "10_nir"))) == 2
 
 
 def test_a_capture_lies_where_its_reference_says(flight: Path, tmp_path: Path) -> None:
@@ -274,12 +241,6 @@ def test_a_capture_lies_where_its_reference_says(flight: Path, tmp_path: Path) -
     assert capture.position.latitude == pytest.approx(52, abs=0.01)
 
 
-def test_a_reference_that_no_capture_has_is_an_error_of_its_own_class(flight: Path) -> None:
-    result = discover(flight, DiscoverOptions(reference="SWIR"))
-    assert not result.captures
-    assert {type(p.error) for p in result.problems} == {NoSuchBandError}
-
-
 def test_positions_that_cannot_be_are_none(tmp_path: Path) -> None:
     def gps(latitude: float, longitude: float) -> dict[str, object]:
         return {"GPSLatitude": (latitude, 0.0, 0.0), "GPSLongitude": (longitude, 0.0, 0.0), "GPSAltitude": 1e9}
@@ -291,21 +252,23 @@ def test_positions_that_cannot_be_are_none(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_only_a_number_is_not_hidden(tmp_path: Path) -> None:
-    image = np.arange(64, dtype=np.uint16).reshape(8, 8)
     for name in ("_1.tif", "_2.tif"):
-        tifffile.imwrite(tmp_path / name, image, extratags=[(271, 2, 0, "MicaSense", True)])
+        tifffile.imwrite(tmp_path / name, SMALL, extratags=[(271, 2, 0, "MicaSense", True)])
     (capture,) = discover(tmp_path).captures
     assert capture.name == "capture"
+
+
+def write_fields(folder: Path, count: int) -> None:
+    for number in range(count):
+        for band in ("red", "nir"):
+            tifffile.imwrite(folder / f"f{number}_{band}.tif", SMALL)
 
 
 def test_names_are_looked_at_a_few_times_each_however_many_there_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    image = np.arange(64, dtype=np.uint16).reshape(8, 8)
-    count, asked = 150, []
-    for number in range(count):
-        for band in ("red", "nir"):
-            tifffile.imwrite(tmp_path / f"f{number}_{band}.tif", image)
+    count, asked = 40, []
+    write_fields(tmp_path, count)
     real = Generic.capture_name
     monkeypatch.setattr(Generic, "capture_name", lambda self, path: asked.append(path) or real(self, path))
     assert len(discover(tmp_path).captures) == count
@@ -313,11 +276,9 @@ def test_names_are_looked_at_a_few_times_each_however_many_there_are(
 
 
 @pytest.mark.slow
-def test_several_processes_find_what_one_finds(tmp_path: Path) -> None:
-    image = np.arange(64, dtype=np.uint16).reshape(8, 8)
-    for number in range(510):
-        for band in ("red", "nir"):
-            tifffile.imwrite(tmp_path / f"f{number}_{band}.tif", image)
+def test_several_processes_find_what_one_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("agalign.cameras.read_files._MIN_FILES_FOR_PROCESSES", 20)
+    write_fields(tmp_path, 12)
     (tmp_path / "f3_nir.tif").write_bytes(b"no image")
     one, several = (discover(tmp_path, DiscoverOptions(jobs=jobs)) for jobs in (1, 2))
     assert one.captures == several.captures

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 
 import agalign
 from agalign.cameras import rig_seed
+from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.parrot import Sequoia
@@ -35,7 +37,7 @@ from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
-from .test_vendors import DJI, MICASENSE, SIZE, VENDORS, packet, write_capture
+from .test_vendors import DJI, MICASENSE, SIZE, VENDORS, packet, write_capture, write_file
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -48,12 +50,14 @@ def both(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "0000SET" / "000"
 
 
+def band_of(path: Path, camera: Camera | None = None) -> Band:
+    """The band of a file of one band, by default of a MicaSense camera."""
+    (band,) = (camera or MicaSense()).bands(path, read_tags(path), probe(path))
+    return band
+
+
 def bands_in(folder: Path) -> dict[str, Band]:
-    result = {}
-    for path in sorted(folder.glob("IMG_0001_*.tif")):
-        (band,) = MicaSense().bands(path, read_tags(path), probe(path))
-        result[band.name] = band
-    return result
+    return {band.name: band for band in map(band_of, sorted(folder.glob("IMG_0001_*.tif")))}
 
 
 @pytest.mark.slow
@@ -131,15 +135,22 @@ def test_the_bands_pixels_are_the_stacks(both: Path) -> None:
     assert [f["file"] for f in data["output"]["band_files"]] == [b["file"] for b in data["bands"]]
 
 
-def carried(tmp_path: Path, vendor: str, file: str, reference: str, grid: OutputGrid, **options: bool) -> Tags:
+UNCHANGED = OutputGrid(0, 0, *SIZE)
+
+
+def transferred(source: Path, reference: Band | Path, grid: OutputGrid, out: str = "out.tif", **options: bool) -> Path:
+    """Write a file with the tags of the source on a grid of the reference."""
+    band = Band("reference", reference, 1, *SIZE, "uint16") if isinstance(reference, Path) else reference
+    tags = band_tags(source, band, grid, lambda x, y: (x, y), **options)
+    path = write_file(source.parent / out, shape=(grid.height, grid.width))
+    add_directories(path, tags.first, tags.exif, tags.gps)
+    return path
+
+
+def carried(tmp_path: Path, vendor: str, file: str, reference: str, grid: OutputGrid) -> Tags:
     """The tags of a file that got what is carried from `file`."""
     write_capture(tmp_path, VENDORS[vendor])
-    band = Band("reference", tmp_path / reference, 1, *SIZE, "uint16")
-    tags = band_tags(tmp_path / file, band, grid, lambda x, y: (x, y), **options)
-    out = tmp_path / "out.tif"
-    tifffile.imwrite(out, np.zeros((grid.height, grid.width), np.uint16), photometric="minisblack", metadata=None)
-    add_directories(out, tags.first, tags.exif, tags.gps)
-    return read_tags(out)
+    return read_tags(transferred(tmp_path / file, tmp_path / reference, grid))
 
 
 def test_djis_geometry_is_the_references(tmp_path: Path) -> None:
@@ -163,34 +174,22 @@ def test_an_upside_down_principal_point_counts_from_the_other_end(tmp_path: Path
 
 
 def test_undistorted_pixels_have_no_distortion(tmp_path: Path) -> None:
-    result = carried(
-        tmp_path, "RedEdge", "IMG_0007_4.tif", "IMG_0007_2.tif", OutputGrid(0, 0, 160, 120, undistorted=True)
-    )
+    undistorted = replace(UNCHANGED, undistorted=True)
+    result = carried(tmp_path, "RedEdge", "IMG_0007_4.tif", "IMG_0007_2.tif", undistorted)
     assert result.numbers(NAMESPACE, "PerspectiveDistortion") == (0.0,) * 5
 
 
 def test_radiometry_takes_what_it_used(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["RedEdge"])
-    values = {(NAMESPACE, "VignettingCenter"): ("80", "60"), (NAMESPACE, "BandName"): ("NIR",),
-              (MICASENSE, "RadiometricCalibration"): ("1", "2", "3")}  # fmt: skip
-    add_directories(
-        tmp_path / "IMG_0007_4.tif", {XMP: byte_string(packet(values, "sequences")), 50714: short(5)}, {}, {}
-    )
+    values = {(NAMESPACE, "VignettingCenter"): ("80", "60"), (NAMESPACE, "BandName"): ("NIR",)}
+    values[MICASENSE, "RadiometricCalibration"] = "1", "2", "3"
+    source = tmp_path / "IMG_0007_4.tif"
+    add_directories(source, {XMP: byte_string(packet(values, "sequences")), 50714: short(5)}, {}, {})
     for radiometry in (False, True):
-        result = carried_from(tmp_path, radiometry=radiometry)
+        result = read_tags(transferred(source, tmp_path / "IMG_0007_2.tif", UNCHANGED, radiometry=radiometry))
         assert ((NAMESPACE, "VignettingCenter") in result.xmp) != radiometry
         assert ((MICASENSE, "RadiometricCalibration") in result.xmp) != radiometry
         assert (result.black_level is None) == radiometry
-
-
-def carried_from(folder: Path, *, radiometry: bool) -> Tags:
-    grid = OutputGrid(0, 0, 160, 120)
-    reference = Band("Green", folder / "IMG_0007_2.tif", 1, *SIZE, "uint16")
-    tags = band_tags(folder / "IMG_0007_4.tif", reference, grid, lambda x, y: (x, y), radiometry=radiometry)
-    out = folder / "out.tiff"
-    tifffile.imwrite(out, np.zeros((120, 160), np.float32), photometric="minisblack", metadata=None)
-    add_directories(out, tags.first, tags.exif, tags.gps)
-    return read_tags(out)
 
 
 def test_a_source_that_cannot_be_followed_gives_nothing(tmp_path: Path) -> None:
@@ -204,12 +203,9 @@ def test_a_source_that_cannot_be_followed_gives_nothing(tmp_path: Path) -> None:
 def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["Sequoia"])
     path = tmp_path / "IMG_180413_080658_0000_GRE.TIF"
-    (reference,) = Sequoia().bands(path, read_tags(path), probe(path))
-    tags = band_tags(path, reference, OutputGrid(0, 0, *SIZE, undistorted=True), lambda x, y: (x, y))
-    out = tmp_path / "out_GRE.TIF"
-    tifffile.imwrite(out, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
-    add_directories(out, tags.first, tags.exif, tags.gps)
-    (result,) = Sequoia().bands(out, read_tags(out), probe(out))
+    reference = band_of(path, Sequoia())
+    out = transferred(path, reference, replace(UNCHANGED, undistorted=True), "out_GRE.TIF")
+    result = band_of(out, Sequoia())
     assert not any(result.lens.distortion)
     assert result.lens.fx_px == pytest.approx(reference.lens.fx_px, rel=1e-6)
     assert result.lens.cx_px == pytest.approx(reference.lens.cx_px, abs=1e-3)
@@ -217,16 +213,11 @@ def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
 
 def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
     values = {(NAMESPACE, "PrincipalPoint"): ("2.4", "1.8"), (NAMESPACE, "PerspectiveFocalLength"): ("1451.8",)}
-    path = tmp_path / "IMG_0001_2.tif"
-    tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
-    exif = {37386: rational(5.45)}
-    add_directories(path, {271: text("MicaSense"), 700: byte_string(packet(values, "elements"))}, exif, {})
-    (before,) = MicaSense().bands(path, read_tags(path), probe(path))
-    tags = band_tags(path, before, OutputGrid(40, 30, 200, 150, scale=PixelScale(2.0, 2.0)), lambda x, y: (x, y))
-    out = tmp_path / "IMG_0002_2.tif"
-    tifffile.imwrite(out, np.zeros((150, 200), np.uint16), photometric="minisblack", metadata=None)
-    add_directories(out, tags.first, tags.exif, tags.gps)
-    (after,) = MicaSense().bands(out, read_tags(out), probe(out))
+    first = {271: text("MicaSense"), XMP: byte_string(packet(values, "elements"))}
+    path = write_file(tmp_path / "IMG_0001_2.tif", first, {37386: rational(5.45)})
+    before = band_of(path)
+    doubled = OutputGrid(40, 30, 200, 150, scale=PixelScale(2.0, 2.0))
+    after = band_of(transferred(path, before, doubled, "IMG_0002_2.tif"))
     assert after.lens.fx_px == pytest.approx(2 * before.lens.fx_px)
     assert after.lens.cx_px == pytest.approx(2 * (before.lens.cx_px + 0.5) - 0.5 - 40, abs=1e-3)
 
@@ -234,9 +225,8 @@ def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
 @pytest.mark.parametrize("centre", [("1e14", "1e14"), ("nan", "0"), ("99999", "99999")])
 def test_a_centre_of_vignetting_that_lies_nowhere_is_left_out(tmp_path: Path, centre: tuple[str, str]) -> None:
     values = {(NAMESPACE, "VignettingCenter"): centre, (NAMESPACE, "VignettingPolynomial"): ("1e-4",)}
-    path = tmp_path / "IMG_0001_2.tif"
-    tifffile.imwrite(path, np.zeros(SIZE[::-1], np.uint16), photometric="minisblack", metadata=None)
-    add_directories(path, {271: text("MicaSense"), 700: byte_string(packet(values, "elements"))}, {}, {})
+    first = {271: text("MicaSense"), XMP: byte_string(packet(values, "elements"))}
+    path = write_file(tmp_path / "IMG_0001_2.tif", first)
     band = Band("Green", path, 1, *SIZE, "uint16")
     tags = band_tags(path, band, OutputGrid(0, 0, *SIZE), lambda x, y: (math.nan, math.nan))
     assert b"VignettingCenter" not in tags.first[XMP].data or centre[0] == "nan"

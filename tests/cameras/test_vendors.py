@@ -116,11 +116,23 @@ def packet(values: Values, dialect: str) -> bytes:
     ).encode()
 
 
+def write_file(
+    path: Path,
+    first: Mapping[int, Entry] | None = None,
+    exif: Mapping[int, Entry] | None = None,
+    shape: tuple[int, ...] = SIZE[::-1],
+) -> Path:
+    """A TIFF file of zeros with tags; of several bands where the shape has three numbers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    planar = "separate" if len(shape) == 3 else None
+    pixels = np.zeros(shape, np.uint16)
+    tifffile.imwrite(path, pixels, photometric="minisblack", planarconfig=planar, metadata=None)
+    add_directories(path, dict(first or {}), dict(exif or {}), {})
+    return path
+
+
 def write_capture(folder: Path, vendor: Vendor, dialect: str = "attributes", damage: str = "") -> None:
     for name, (band, nm, values) in vendor.files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        tifffile.imwrite(path, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
         spectral = {(NAMESPACE, "BandName"): (band,), (NAMESPACE, "CentralWavelength"): (f"{nm}",)}
         xmp = packet({**spectral, **values}, dialect)
         if damage == "empty":
@@ -128,14 +140,13 @@ def write_capture(folder: Path, vendor: Vendor, dialect: str = "attributes", dam
         elif damage == "malformed":
             xmp = xmp[: len(xmp) // 2]
         elif damage == "no numbers":
-            keep = {(NAMESPACE, "BandName"), (MICASENSE, "CaptureId"), (DJI, "CaptureUUID"),
-                    (NAMESPACE, "CaptureUUID")}  # fmt: skip
-            xmp = packet({k: v if k in keep else ("-inf;nan",) for k, v in {**spectral, **values}.items()}, dialect)
+            keep = "BandName", "CaptureId", "CaptureUUID"
+            xmp = packet({k: v if k[1] in keep else ("-inf;nan",) for k, v in {**spectral, **values}.items()}, dialect)
         first = {271: text(vendor.make), 272: text(vendor.model), 274: short(vendor.orientation)}
         if damage != "missing":
             first[700] = byte_string(xmp)
-        exif: dict[int, Entry] = {0xA20E: rational(266.67), 0xA20F: rational(266.67), 0xA210: short(4)}
-        add_directories(path, first, exif, {})
+        exif = {0xA20E: rational(266.67), 0xA20F: rational(266.67), 0xA210: short(4)}
+        write_file(folder / name, first, exif)
 
 
 def only_capture(folder: Path, options: DiscoverOptions | None = None) -> Capture:
@@ -145,12 +156,22 @@ def only_capture(folder: Path, options: DiscoverOptions | None = None) -> Captur
     return capture
 
 
+LABELS = {
+    "RedEdge": "IMG_0007",
+    "Phantom 4": "DJI_001",
+    "Mavic 3": "DJI_20230607112233_0001",
+    "Sequoia": "IMG_180413_080658_0000",
+    "6X": "IMG_00012",
+}
+
+
 @pytest.mark.parametrize("dialect", ["attributes", "elements", "sequences"])
 @pytest.mark.parametrize("name", VENDORS)
 def test_a_capture_is_grouped_named_and_seeded(tmp_path: Path, name: str, dialect: str) -> None:
     vendor = VENDORS[name]
     write_capture(tmp_path, vendor, dialect)
     capture = only_capture(tmp_path)
+    assert capture.label == LABELS[name]
     assert {b.name: b.wavelength_nm for b in capture.bands} == {band: nm for band, nm, _ in vendor.files.values()}
     assert capture.reference.name == "Green"
     assert capture.capture_id == "abc"
@@ -167,10 +188,8 @@ def test_damaged_tags_leave_the_names_of_the_files(tmp_path: Path, name: str, da
     vendor = VENDORS[name]
     write_capture(tmp_path, vendor, damage=damage)
     capture = only_capture(tmp_path)
-    result = {b.name for b in capture.bands}
-    assert result == (
-        {band for band, _, _ in vendor.files.values()} if damage == "no numbers" else set(vendor.names_without_xmp)
-    )
+    named = {band for band, _, _ in vendor.files.values()} if damage == "no numbers" else vendor.names_without_xmp
+    assert {b.name for b in capture.bands} == named
     assert all(b.lens is None or np.isfinite(b.lens.matrix).all() for b in capture.bands)
 
 
@@ -178,35 +197,20 @@ def test_one_file_with_damaged_tags_finds_its_capture(tmp_path: Path) -> None:
     for name in ("RedEdge", "Phantom 4", "Sequoia"):
         folder = tmp_path / name
         write_capture(folder, VENDORS[name])
-        stray = sorted(folder.iterdir())[-1]
-        stray.unlink()
-        tifffile.imwrite(stray, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
-        add_directories(stray, {271: text(VENDORS[name].make)}, {}, {})
+        write_file(sorted(folder.iterdir())[-1], {271: text(VENDORS[name].make)})
         assert len(only_capture(folder).bands) == len(VENDORS[name].files)
 
 
-def test_names_of_captures(tmp_path: Path) -> None:
-    expected = {
-        "RedEdge": "IMG_0007", "Phantom 4": "DJI_001", "Mavic 3": "DJI_20230607112233_0001",
-        "Sequoia": "IMG_180413_080658_0000", "6X": "IMG_00012",
-    }  # fmt: skip
-    for name, label in expected.items():
-        write_capture(tmp_path / name, VENDORS[name])
-        assert only_capture(tmp_path / name).label == label
-
-
-def test_phantom_4_shifts_by_its_optical_centres(tmp_path: Path) -> None:
-    write_capture(tmp_path, VENDORS["Phantom 4"])
+@pytest.mark.parametrize(("name", "shift_px"), [("Phantom 4", (3, -3)), ("Mavic 3", (-3, 0))])
+def test_optical_centres_and_the_common_plane_give_the_seed(
+    tmp_path: Path, name: str, shift_px: tuple[float, float]
+) -> None:
+    write_capture(tmp_path, VENDORS[name])
     bands = {b.name: b for b in only_capture(tmp_path).bands}
-    np.testing.assert_allclose(rig_seed(bands["Green"], bands["NIR"]), geometry.translation(3, -3), atol=1e-12)
-
-
-def test_mavic_3_goes_through_the_common_plane(tmp_path: Path) -> None:
-    write_capture(tmp_path, VENDORS["Mavic 3"])
-    bands = {b.name: b for b in only_capture(tmp_path).bands}
-    np.testing.assert_allclose(rig_seed(bands["Green"], bands["NIR"]), geometry.translation(-3, 0), atol=1e-9)
-    result = bands["NIR"].lens
-    assert (result.fx_px, result.cx_px, result.cy_px, result.distortion[0]) == (170, 81.5, 57.5, -0.1)
+    np.testing.assert_allclose(rig_seed(bands["Green"], bands["NIR"]), geometry.translation(*shift_px), atol=1e-9)
+    if name == "Mavic 3":
+        result = bands["NIR"].lens
+        assert (result.fx_px, result.cx_px, result.cy_px, result.distortion[0]) == (170, 81.5, 57.5, -0.1)
 
 
 def test_sequoia_fisheye_is_the_vendors_formula(tmp_path: Path) -> None:
@@ -243,9 +247,8 @@ def test_orientation_3_turns_lens_and_rig(tmp_path: Path) -> None:
 
 def test_mapir_groups_by_what_follows_the_serial(tmp_path: Path) -> None:
     for serial, nm in (("A1", 450), ("B2", 550), ("C3", 850)):
-        path = tmp_path / f"capture_{serial}_0001_20260101_101010_123.tiff"
-        tifffile.imwrite(path, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
-        add_directories(path, {272: text(f"LATT-M3M-L41-F{nm}")}, {}, {})
+        name = f"capture_{serial}_0001_20260101_101010_123.tiff"
+        write_file(tmp_path / name, {272: text(f"LATT-M3M-L41-F{nm}")})
     capture = only_capture(tmp_path)
     assert {b.name: b.wavelength_nm for b in capture.bands} == {"Blue": 450, "Green": 550, "NIR": 850}
     assert capture.name == "capture_0001_20260101_101010_123"
@@ -261,17 +264,14 @@ def photograph(path: Path, make: str, values: Values | None = None) -> None:
 
 def test_the_colour_photograph_takes_part_where_asked(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["Phantom 4"])
-    photograph(tmp_path / "DJI_0010.JPG", "DJI", {
-        (DJI, "CaptureUUID"): ("abc",), (DJI, "RelativeOpticalCenterX"): ("4",),
-        (DJI, "RelativeOpticalCenterY"): ("6",),
-    })  # fmt: skip
+    values = {"CaptureUUID": "abc", "RelativeOpticalCenterX": "4", "RelativeOpticalCenterY": "6"}
+    photograph(tmp_path / "DJI_0010.JPG", "DJI", {(DJI, k): (v,) for k, v in values.items()})
     assert len(only_capture(tmp_path).bands) == 5
     capture = only_capture(tmp_path, DiscoverOptions(with_rgb=True))
     assert [b.name for b in capture.bands[5:]] == ["RGB Red", "RGB Green", "RGB Blue"]
     assert capture.reference.name == "Green"
-    np.testing.assert_allclose(
-        rig_seed(capture.reference, capture.bands[5]), geometry.translation(1.5, 8.25), atol=1e-12
-    )
+    seed = rig_seed(capture.reference, capture.bands[5])
+    np.testing.assert_allclose(seed, geometry.translation(1.5, 8.25), atol=1e-12)
 
 
 def test_double_4k_is_a_capture_of_two_photographs(tmp_path: Path) -> None:
@@ -283,20 +283,15 @@ def test_double_4k_is_a_capture_of_two_photographs(tmp_path: Path) -> None:
 
 
 def test_a_double_4k_lists_its_bands_and_calls_one_garbage(tmp_path: Path) -> None:
-    lens = {
-        (NAMESPACE, "PrincipalPoint"): ("3.1,2.325",), (NAMESPACE, "PerspectiveFocalLength"): ("3484",),
-        (NAMESPACE, "PerspectiveDistortion"): ("-0.093", "0.122", "0", "0", "0"),
-    }  # fmt: skip
-    for folder, names, wavelengths in (
-        ("nRGB", ("Red", "Green", "Blue"), ("650", "548", "446")),
-        ("NDRE", ("RedEdge", "Garbage", "NIR"), ("720", "0", "840")),
+    info = RasterInfo(160, 120, ("uint8",) * 3, (None,) * 3, (None,) * 3, (None,) * 3, None, None)
+    for folder, names, wavelengths, expected in (
+        ("nRGB", ("Red", "Green", "Blue"), ("650", "548", "446"), {"Red": 1, "Green": 2, "Blue": 3}),
+        ("NDRE", ("RedEdge", "Garbage", "NIR"), ("720", "0", "840"), {"Red edge": 1, "NIR": 3}),
     ):
         path = tmp_path / folder / "IMG_00042.jpg"
-        info = RasterInfo(160, 120, ("uint8",) * 3, (None,) * 3, (None,) * 3, (None,) * 3, None, None)
-        tags = Tags(make="Sentera", xmp=lens | {BAND_NAME: names, (NAMESPACE, "CentralWavelength"): wavelengths})
+        tags = Tags(make="Sentera", xmp={BAND_NAME: names, (NAMESPACE, "CentralWavelength"): wavelengths})
         bands = Sentera().bands(path, tags, info)
-        assert [b.band_index for b in bands] == ([1, 2, 3] if folder == "nRGB" else [1, 3])
-        assert [b.name for b in bands] == (["Red", "Green", "Blue"] if folder == "nRGB" else ["Red edge", "NIR"])
+        assert {b.name: b.band_index for b in bands} == expected
         assert bands[0].wavelength_nm == float(wavelengths[0])
         assert Sentera().capture_folder(path) == tmp_path
 
@@ -311,14 +306,11 @@ def test_three_bands_of_one_lens_are_no_capture(tmp_path: Path) -> None:
 
 
 def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
-    values = {
-        "SensorGain": "2", "ExposureTime": "1000", "BlackLevel": "4096", "Irradiance": "5000",
-        "SensorGainAdjustment": "0.9", "CalibratedOpticalCenterX": "80", "CalibratedOpticalCenterY": "60",
-        "VignettingData": "1e-4,0,0,0,0,0",
-    }  # fmt: skip
+    values = {"SensorGain": "2", "ExposureTime": "1000", "BlackLevel": "4096", "Irradiance": "5000"}
+    values |= {"CalibratedOpticalCenterX": "80", "CalibratedOpticalCenterY": "60"}
+    values |= {"SensorGainAdjustment": "0.9", "VignettingData": "1e-4,0,0,0,0,0"}
     tags = Tags(make="DJI", xmp={(DJI, k): (v,) for k, v in values.items()})
-    write_capture(tmp_path, VENDORS["Phantom 4"])
-    path = tmp_path / "DJI_0012.TIF"
+    path = write_file(tmp_path / "DJI_0012.TIF")
     (band,) = Dji().bands(path, tags, probe(path))
     assert band.radiometry.gain == pytest.approx(0.9 / (2 * 1e-3))
     assert band.radiometry.by_sun == (pytest.approx(1 / 5000), "relative reflectance")
@@ -327,22 +319,15 @@ def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
 
 def test_one_damaged_file_makes_no_band_that_others_lack(tmp_path: Path) -> None:
     for number in range(3):
-        folder = tmp_path / f"{number:03d}"
-        write_capture(folder, VENDORS["RedEdge"])
-    stray = tmp_path / "001" / "IMG_0007_3.tif"
-    stray.unlink()
-    tifffile.imwrite(stray, np.zeros((SIZE[1], SIZE[0]), np.uint16), photometric="minisblack", metadata=None)
-    add_directories(stray, {271: text("MicaSense"), 272: text("RedEdge-M")}, {}, {})
+        write_capture(tmp_path / f"{number:03d}", VENDORS["RedEdge"])
+    write_file(tmp_path / "001" / "IMG_0007_3.tif", {271: text("MicaSense"), 272: text("RedEdge-M")})
     missing = {c.folder.name: c.missing_bands for c in discover(tmp_path).captures}
     assert missing == {"000": (), "001": ("Red",), "002": ()}
 
 
 def test_a_stack_with_a_vendors_make_is_a_stack(tmp_path: Path) -> None:
     for make in ("MicaSense", "DJI", "Parrot", "Sentera", "MAPIR"):
-        path = tmp_path / f"{make}.tif"
-        pixels = np.zeros((5, 120, 160), np.uint16)
-        tifffile.imwrite(path, pixels, photometric="minisblack", planarconfig="separate", metadata=None)
-        add_directories(path, {271: text(make)}, {}, {})
+        write_file(tmp_path / f"{make}.tif", {271: text(make)}, shape=(5, 120, 160))
     result = discover(tmp_path)
     assert not result.problems
     assert [len(c.bands) for c in result.captures] == [5] * 5
@@ -350,20 +335,15 @@ def test_a_stack_with_a_vendors_make_is_a_stack(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("folder", ["NDVI 2024", "NDVI"])
 def test_a_flat_folder_named_like_a_band(tmp_path: Path, folder: str) -> None:
-    for k, nm in enumerate((475, 550, 840)):
-        path = tmp_path / folder / f"IMG_0001_{nm}_30.tif"
-        path.parent.mkdir(exist_ok=True)
-        tifffile.imwrite(path, np.zeros((120, 160), np.uint16), photometric="minisblack", metadata=None)
-        name = ("Blue", "Green", "NIR")[k]
+    for name, nm in {"Blue": 475, "Green": 550, "NIR": 840}.items():
         xmp = packet({(NAMESPACE, "BandName"): (name,)}, "attributes")
-        add_directories(path, {271: text("Sentera"), 700: byte_string(xmp)}, {}, {})
+        first = {271: text("Sentera"), 700: byte_string(xmp)}
+        write_file(tmp_path / folder / f"IMG_0001_{nm}_30.tif", first)
     (capture,) = discover(tmp_path / folder).captures
     assert {b.name for b in capture.bands} == {"Blue", "Green", "NIR"}
     assert capture.label == "IMG_0001"
 
 
 def test_black_levels_may_be_fractions(tmp_path: Path) -> None:
-    path = tmp_path / "x.tif"
-    tifffile.imwrite(path, np.zeros((120, 160), np.uint16), photometric="minisblack", metadata=None)
-    add_directories(path, {50714: rational(4800, 4801, 4799, 4800)}, {}, {})
+    path = write_file(tmp_path / "x.tif", {50714: rational(4800, 4801, 4799, 4800)})
     assert read_tags(path).black_level == pytest.approx(4800)
