@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from agalign.cameras import default_reference, known_cameras, rig_seed
-from agalign.cameras.base import rotation
 from agalign.cameras.generic import Generic
 from agalign.cameras.mapir import Mapir
 from agalign.cameras.metadata import Tags, read_tags
@@ -44,13 +43,6 @@ def test_rig_seed_is_the_truth_at_infinity(flight: Path) -> None:
         assert seed is not None
         truth = rig.true_homography(reference, spec, far, (480, 360))
         assert geometry.corner_error_px(seed, truth, 480, 360) < 0.01
-
-
-def test_rotation_order_and_hand() -> None:
-    np.testing.assert_allclose(rotation(90, 0, 0) @ [0, 1, 0], [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(rotation(0, 90, 0) @ [0, 0, 1], [1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(rotation(0, 0, 90) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(rotation(30, 40, 50), rotation(30, 0, 0) @ rotation(0, 40, 0) @ rotation(0, 0, 50))
 
 
 MICASENSE, SENTERA = "micasense.com/MicaSense", "sentera.com"

@@ -164,12 +164,22 @@ def test_djis_geometry_is_the_references(tmp_path: Path) -> None:
     assert result.numbers(DJI, "CalibratedHMatrix")[2] == 0.5
 
 
-def test_an_upside_down_principal_point_counts_from_the_other_end(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("grid", "expected_px"),
+    [
+        # Stored: (160 - 80, 120 - 58.67) - (30, 20); seen upright it counts from 120, 90.
+        (OutputGrid(30, 20, 120, 90), (120 - (160 - 80.0 - 30), 90 - (120 - 58.667 - 20))),
+        # Twice as many pixels: 2 (p + 0.5) - 0.5 in both orientations, as pixel centres are at whole numbers.
+        (OutputGrid(0, 0, 320, 240, scale=PixelScale(2.0, 2.0)), (2 * (80.0 + 0.5) - 0.5, 2 * (58.667 + 0.5) - 0.5)),
+    ],
+)
+def test_an_upside_down_principal_point_counts_from_the_other_end(
+    tmp_path: Path, grid: OutputGrid, expected_px: tuple[float, float]
+) -> None:
     files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
-    result = carried(tmp_path, "Sequoia", *files, OutputGrid(30, 20, 120, 90))
-    # Stored: (160 - 80, 120 - 58.67) - (30, 20); seen upright it counts from 120, 90.
-    x, y = (v * 266.67 for v in result.numbers(NAMESPACE, "PrincipalPoint"))
-    assert (x, y) == pytest.approx((120 - (160 - 80.0 - 30), 90 - (120 - 58.667 - 20)), abs=0.01)
+    result = carried(tmp_path, "Sequoia", *files, grid)
+    point_px = [v * 266.67 * grid.scale.x for v in result.numbers(NAMESPACE, "PrincipalPoint")]
+    assert point_px == pytest.approx(expected_px, abs=0.02)
     assert result.orientation == 3
 
 
@@ -230,13 +240,3 @@ def test_a_centre_of_vignetting_that_lies_nowhere_is_left_out(tmp_path: Path, ce
     band = Band("Green", path, 1, *SIZE, "uint16")
     tags = band_tags(path, band, OutputGrid(0, 0, *SIZE), lambda x, y: (math.nan, math.nan))
     assert b"VignettingCenter" not in tags.first[XMP].data or centre[0] == "nan"
-
-
-def test_a_turned_principal_point_stays_on_its_pixel_at_any_resolution(tmp_path: Path) -> None:
-    """The centre of a pixel is at whole numbers: turned by 180 degrees, pixel p is size - 1 - p."""
-    files = "IMG_180413_080658_0000_NIR.TIF", "IMG_180413_080658_0000_GRE.TIF"
-    density, seen = 266.67, (80.0, 58.667)
-    result = carried(tmp_path, "Sequoia", *files, OutputGrid(0, 0, 320, 240, scale=PixelScale(2.0, 2.0)))
-    x, y = (v * 2 * density for v in result.numbers(NAMESPACE, "PrincipalPoint"))
-    # Of an image of twice as many pixels: 2 (p + 0.5) - 0.5, whichever way it is seen.
-    assert (x, y) == pytest.approx((2 * (seen[0] + 0.5) - 0.5, 2 * (seen[1] + 0.5) - 0.5), abs=0.02)

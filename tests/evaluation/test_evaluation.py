@@ -30,26 +30,17 @@ from agalign.values import geometry
 from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, Issue
 
-from ..conftest import textured_image, textured_pair
+from ..builders import pair_of, texture, two_views, whole
 
 pytestmark = pytest.mark.slow
 
 TRUTH = np.array([[1.004, 0.006, 6.0], [-0.005, 0.998, -4.0], [4e-6, -6e-6, 1.0]])
 
 
-def raster(image: np.ndarray) -> Raster:
-    return Raster(image, np.ones(image.shape[-2:], bool))
-
-
-def rasters(matrix: np.ndarray, seed: int = 0) -> tuple[Raster, Raster]:
-    fixed, moving = textured_pair(matrix, seed=seed)
-    return raster(fixed), raster(moving)
-
-
 def write_pair(folder: Path, matrix: np.ndarray, seed: int) -> PairFiles:
     paths = folder / f"{seed}a.png", folder / f"{seed}b.png"
-    for path, one in zip(paths, textured_pair(matrix, seed=seed), strict=True):
-        cv2.imwrite(str(path), (np.clip(one * 40 + 128, 1, 254)).astype(np.uint8))
+    for path, one in zip(paths, two_views(matrix, seed=seed), strict=True):
+        cv2.imwrite(str(path), (np.clip(one.pixels * 40 + 128, 1, 254)).astype(np.uint8))
     return PairFiles(f"pair {seed}", "textures", *paths, matrix)
 
 
@@ -70,7 +61,7 @@ def test_homography_error_is_the_mean_over_the_matches() -> None:
 
 
 def test_keypoints_whose_patch_leaves_an_image_do_not_count() -> None:
-    fixed, moving = rasters(geometry.translation(120.0, 0.0))
+    fixed, moving = two_views(geometry.translation(120.0, 0.0))
     keypoints = sift_keypoints(fixed)
     kept = visible_in_both(keypoints, geometry.translation(120.0, 0.0), fixed, moving)
     assert 0 < len(kept) < len(keypoints)
@@ -78,7 +69,7 @@ def test_keypoints_whose_patch_leaves_an_image_do_not_count() -> None:
 
 
 def test_sift_and_daisy_of_a_mosaic_are_those_of_single_patches() -> None:
-    fixed = raster(textured_image(400, 320))
+    fixed = texture()
     keypoints = sift_keypoints(fixed, maximum=30)
     patches = grey_patches(fixed, patch_positions(keypoints, 64))
     alone = torch.cat([sift_of_patches(p[None]) for p in patches])
@@ -90,8 +81,8 @@ def test_sift_and_daisy_of_a_mosaic_are_those_of_single_patches() -> None:
 
 @pytest.mark.parametrize("name", ["sift", "daisy"])
 def test_hand_made_descriptors_find_copies_and_nothing_in_unrelated_images(name: str) -> None:
-    fixed, other = raster(textured_image(400, 320)), raster(textured_image(400, 320, 5))
-    keypoints = visible_in_both(sift_keypoints(fixed, maximum=200), np.eye(3), fixed, fixed)
+    fixed, other = texture(), texture(seed=5)
+    keypoints = visible_in_both(sift_keypoints(fixed, maximum=50), np.eye(3), fixed, fixed)
     for moving, low, high in ((fixed, 0.99, 1.0), (other, 0.0, 0.05)):
         describe = method_named(name)(PairTask(fixed, moving, np.eye(3))).describe
         assert describe is not None
@@ -107,14 +98,12 @@ def test_starts_are_off_by_the_share_asked_for() -> None:
 
 
 def test_names_of_methods(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="unknown method 'surf'"):
-        method_named("surf")
-    with pytest.raises(ConfigurationError, match="unknown method 'fast:twins'"):
-        method_named("fast:twins")
-    with pytest.raises(InputError, match=r"none\.pt: not a TorchScript module"):
-        method_named(str(tmp_path / "none.pt"))
-    with pytest.raises(InputError, match=r"none\.safetensors"):
-        method_named(str(tmp_path / "none.safetensors"))
+    for name in ("surf", "fast:twins"):
+        with pytest.raises(ConfigurationError, match=f"unknown method '{name}'"):
+            method_named(name)
+    for name, message in (("none.pt", r"none\.pt: not a TorchScript module"), ("none.safetensors", r"none\.safe")):
+        with pytest.raises(InputError, match=message):
+            method_named(str(tmp_path / name))
 
 
 def test_a_torchscript_file_takes_part(tmp_path: Path) -> None:
@@ -122,7 +111,7 @@ def test_a_torchscript_file_takes_part(tmp_path: Path) -> None:
     with torch.no_grad():
         flat = torch.nn.Sequential(torch.nn.AvgPool2d(4), torch.nn.Flatten(), torch.nn.LayerNorm(64))
         torch.jit.trace(flat, torch.zeros(2, 1, 32, 32)).save(str(path))
-    fixed = raster(textured_image(400, 320))
+    fixed = texture()
     keypoints = visible_in_both(sift_keypoints(fixed, maximum=200), np.eye(3), fixed, fixed)
     describe = method_named(f"{path}@32")(PairTask(fixed, fixed, np.eye(3))).describe
     assert describe is not None
@@ -147,7 +136,7 @@ def test_what_is_learnt_on_a_pair_beats_sift_where_contrast_is_reversed(tmp_path
 
 
 def test_the_loss_is_least_at_the_truth(tmp_path: Path) -> None:
-    fixed, moving = rasters(TRUTH)
+    fixed, moving = two_views(TRUTH)
     settings = JointSettings(recipe="paper", device="cpu")
     offsets = np.array([-40.0, 0.0, 40.0])
     surface = loss_surface(fixed, moving, TRUTH, offsets, settings, Training(keypoints=800, epochs=1))
@@ -159,18 +148,21 @@ def test_the_loss_is_least_at_the_truth(tmp_path: Path) -> None:
 # ---- learning from pairs
 
 
-def rough_pair(name: str, fixed: Raster, moving: Raster, settings: Settings) -> BandPair:
+UNRELATED = texture(seed=70), texture(seed=71)
+ON_CPU = Settings(joint=JointSettings(device="cpu"))
+
+
+def rough_pair(name: str, fixed: Raster, moving: Raster) -> BandPair:
     return BandPair.of_images(name, fixed, moving, {"user": np.eye(3)})
 
 
 @pytest.fixture(scope="module")
 def learnt(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    unrelated = raster(textured_image(400, 320, 70)), raster(textured_image(400, 320, 71))
-    settings = Settings(joint=JointSettings(device="cpu"))
-    pairs = [rough_pair(str(k), *rasters(TRUTH, k), settings) for k in (1, 2)]
-    pairs.append(rough_pair("unrelated", *unrelated, settings))
+    pairs = [rough_pair(str(k), *two_views(TRUTH, seed=k)) for k in (1, 2)]
     lessons: list[Lesson] = []
-    model = learn_descriptor(pairs, settings, steps_a_pair=30, on_pair=lessons.append)
+    model = learn_descriptor(
+        [*pairs, rough_pair("unrelated", *UNRELATED)], ON_CPU, steps_a_pair=30, on_pair=lessons.append
+    )
     assert [(k.name, k.status) for k in lessons[:2]] == [("1", "aligned"), ("2", "aligned")]
     assert lessons[2].status != "aligned"
     path = tmp_path_factory.mktemp("learnt") / "learnt.safetensors"
@@ -187,14 +179,12 @@ def test_a_descriptor_learnt_on_pairs_serves_one_that_it_has_not_seen(learnt: Pa
 
 
 def test_nothing_aligned_is_nothing_to_learn_from() -> None:
-    settings = Settings(joint=JointSettings(device="cpu"))
-    one, other = (raster(textured_image(400, 320, seed)) for seed in (70, 71))
-    unrelated = rough_pair("u", one, other, settings)
+    unrelated = rough_pair("u", *UNRELATED)
     with pytest.raises(InputError, match="no pair could be aligned"):
-        learn_descriptor([unrelated], settings)
-    colour = rough_pair("c", raster(np.stack([textured_image(400, 320)] * 3)), other, settings)
+        learn_descriptor([unrelated], ON_CPU)
+    colour = rough_pair("c", whole(np.stack([texture().pixels] * 3)), UNRELATED[1])
     with pytest.raises(InputError, match="different channels"):
-        learn_descriptor([unrelated, colour], settings)
+        learn_descriptor([unrelated, colour], ON_CPU)
 
 
 # ---- matching
@@ -208,7 +198,7 @@ def turned(angle_deg: float) -> np.ndarray:
 
 def test_matching_finds_what_is_turned_and_far_away(learnt: Path) -> None:
     truth = turned(25.0)
-    fixed, moving = rasters(truth, 4)
+    fixed, moving = two_views(truth, seed=4)
     model = load_model(learnt, lambda: torch.device("cpu"))
     for net in (starter_for_matching((1, 1)), matching_network(model.net, 1, (1, 1))):
         result = match_seed(net, fixed, moving)
@@ -218,9 +208,8 @@ def test_matching_finds_what_is_turned_and_far_away(learnt: Path) -> None:
 
 
 def test_matching_finds_nothing_in_unrelated_images() -> None:
-    pair = raster(textured_image(400, 320, 70)), raster(textured_image(400, 320, 71))
-    assert match_seed(starter_for_matching((1, 1)), *pair) is None
-    result = find_seed(BandPair.of_images("moving", *pair, {"identity": np.eye(3)}), SeedSettings(force="match"))
+    assert match_seed(starter_for_matching((1, 1)), *UNRELATED) is None
+    result = find_seed(pair_of(*UNRELATED), SeedSettings(force="match"))
     assert result == Issue(NO_SUCH_SEED, detail="match")
 
 

@@ -6,12 +6,10 @@ import pytest
 from agalign.flight.factors import (
     FACTOR_STD_PX,
     affine_difference,
-    coordinates,
     design_tensor,
     displaced,
     distance_px,
     least_squares,
-    mapping_weight,
     median_mapping,
 )
 from agalign.values import geometry
@@ -22,24 +20,10 @@ DESIGNS = np.tensordot(LENSES, design_tensor(("distance", "tilt", "motion")), 1)
 DISTANCE = np.tensordot(LENSES, design_tensor(("distance",)), 1)
 
 
-def test_the_design_has_the_columns_of_each_factor() -> None:
-    columns = {factor: design_tensor(factor).any(axis=(0, 1, 2)).tolist() for factor in ((), ("distance",))}
-    assert columns == {(): [False] * 5, ("distance",): [True] + [False] * 4}
-    assert design_tensor(("tilt", "motion")).any(axis=(0, 1, 2)).tolist() == [False] + [True] * 4
-    np.testing.assert_array_equal(design_tensor(("reference",)), design_tensor(("motion",)))
-
-
 def test_the_model_shifts_a_band_along_its_baseline_and_by_its_delay() -> None:
     tensor = design_tensor(("distance", "tilt", "motion"))
     change = np.tensordot([0.6, -0.8, 0.5], tensor, 1) @ np.array([1.0, 2.0, 3.0, 4.0, 5.0])
     np.testing.assert_allclose(change, [[0.6 + 0.5 * 4, 1.2, 1.8], [-0.8 + 0.5 * 5, -1.6, -2.4]])
-
-
-def test_the_coordinates_have_mean_0_and_variance_1() -> None:
-    g = coordinates(SIZE)
-    np.testing.assert_array_equal(g[:, 0], 1.0)
-    np.testing.assert_allclose(g[:, 1:].mean(axis=0), 0.0, atol=1e-12)
-    np.testing.assert_allclose(g[:, 1:].std(axis=0), 1.0)
 
 
 def test_a_displaced_mapping_differs_by_its_coefficients() -> None:
@@ -80,14 +64,3 @@ def test_unused_factors_are_0_and_an_outlier_band_hardly_changes_the_others() ->
     assert result[0, 0] == pytest.approx(3.0, abs=0.1)
     result, _ = least_squares(DISTANCE, differences, np.full((1, 3), 1e3), robust=False)
     assert abs(result[0, 0] - 3.0) > 0.5
-
-
-def test_without_any_band_the_factors_are_the_prior() -> None:
-    result, covariance = least_squares(np.zeros((0, 2, 3, 5)), np.zeros((1, 0, 2, 3)), np.zeros((1, 0)))
-    np.testing.assert_array_equal(result, 0.0)
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance[0])), FACTOR_STD_PX)
-
-
-def test_a_weight_is_the_inverse_of_all_variances() -> None:
-    assert mapping_weight(0.3, 0.4) == pytest.approx(1 / (0.3**2 + 0.4**2 + 0.05**2))
-    assert mapping_weight(0.0) == pytest.approx(400.0)

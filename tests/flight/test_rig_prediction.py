@@ -135,25 +135,6 @@ def test_the_distance_is_interpolated_in_height_and_the_rest_in_time() -> None:
     assert estimated_factors(capture(0.0, seconds=1.0), known, "altitude_m") is None
 
 
-def test_shifts_are_a_linear_function_of_the_motion() -> None:
-    known = [capture(7.0, 0.0, motion=(x, y), steps_px=(1 + 2 * x, 3 * y)) for x, y in ((0, 0), (1, 0), (0, 1), (2, 2))]
-    in_time, flight = (estimated_factors(capture(0.0, 0.0, motion=(3.0, 1.0)), known, e) for e in ("seconds", "flight"))
-    np.testing.assert_allclose(in_time[0], [7.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
-    np.testing.assert_allclose(flight[0], [0.0, 0.0, 0.0, 7.0, 3.0], atol=1e-9)
-    assert not estimated_factors(capture(0.0), known, "flight")[0].any()
-
-
-def test_an_unseen_altitude_adds_an_error() -> None:
-    captures = [capture(0.5 * k, altitude_m=60.0 + k) for k in range(3)]
-    here, above = (
-        predict_band(rig(*captures), "Red", Observation(None, {}, {}, altitude_m)).std_px for altitude_m in (61.0, 66.0)
-    )
-    # Precision of the slope: the prior's, and three altitudes a metre apart with at least 0.5 px of scatter.
-    slope_std = 1 / np.sqrt(1 / 1.5**2 + 2 / 0.5**2)
-    climb_px = 0.6 * 4 * (slope_std + 0.5)
-    assert np.sqrt(above**2 - here**2) == pytest.approx(climb_px, rel=1e-6)
-
-
 def test_with_few_captures_only_two_estimators_are_used() -> None:
     """Heights would predict these captures exactly; with five captures that may be chance."""
     captures = [capture(float(k % 3), seconds=float(k * 7 % 6), altitude_m=50.0 + k % 3) for k in range(6)]

@@ -15,7 +15,7 @@ from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError
 from agalign.flight.model import load_model, save_model
 from agalign.method import device
-from agalign.method.device import choose_device, one_memory_error, one_thread, to_float64
+from agalign.method.device import choose_device, one_memory_error, one_thread
 from agalign.method.fast import Schedule
 from agalign.method.joint import align_from_scratch
 from agalign.method.paper import Training
@@ -67,14 +67,6 @@ def test_overlapping_contexts_restore_the_threads_of_torch() -> None:
         assert device._torch_threads_outside == 3
     finally:
         torch.set_num_threads(before)
-
-
-def test_without_float64_on_the_device_psi_is_solved_for_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    tensor = torch.ones(3, dtype=torch.float32)
-    assert to_float64(tensor).dtype == torch.float64
-    monkeypatch.setattr(device, "_has_float64", lambda _: False)
-    assert to_float64(tensor).device.type == "cpu"
-    assert to_float64(tensor).dtype == torch.float64
 
 
 def test_out_of_memory_is_always_a_memory_error() -> None:

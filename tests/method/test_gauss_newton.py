@@ -60,14 +60,6 @@ def test_shift_over_psi_equals_finite_differences() -> None:
         torch.testing.assert_close(jacobian[:, :, k], (plus - minus) / 2e-5, atol=1e-5, rtol=1e-5)
 
 
-def test_shift_over_psi_equals_over_corners_in_other_parameters() -> None:
-    """The Jacobian is implemented in torch and in numpy; both must agree."""
-    p = scattered(10).xy
-    of_corners = shift_over_psi(CORNERS, WIDTH, HEIGHT).reshape(8, 8).numpy()
-    expected = geometry.over_corners(p.numpy(), WIDTH, HEIGHT) @ of_corners
-    np.testing.assert_allclose(shift_over_psi(p, WIDTH, HEIGHT), expected, atol=1e-9)
-
-
 def test_shift_gradient_of_a_linear_descriptor() -> None:
     p = scattered(20)
     slope = torch.randn(256, 2, dtype=torch.float64)

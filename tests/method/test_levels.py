@@ -108,12 +108,6 @@ def test_patches_are_sampled_through_the_lens() -> None:
     torch.testing.assert_close(result, positions[..., 0], atol=0.02, rtol=0)
 
 
-def test_level_matrices_are_converted_to_full_resolution_and_back() -> None:
-    matrix = np.array([[1.01, 0.02, 5.0], [-0.01, 0.99, -3.0], [1e-5, -2e-5, 1.0]])
-    level = level_of(scale=0.5, matrix=matrix)
-    np.testing.assert_allclose(level.full_matrix(level.homography(matrix, 0), 0), matrix, atol=1e-4)
-
-
 def test_positions_are_displaced_by_the_local_value_of_the_field() -> None:
     """The rig's field is in px of the full image; at half the resolution displacements are half as long."""
     nodes = np.stack(np.meshgrid(np.arange(12) * 32.0, np.arange(9) * 32.0), axis=-1)

@@ -10,7 +10,6 @@ from agalign.method.patches import (
     ALPHA,
     Keypoints,
     bilinear,
-    footprint_radius,
     homography_from_psi,
     patch_positions,
     psi_from_homography,
@@ -97,9 +96,3 @@ def test_gradient_over_psi_equals_finite_differences() -> None:
         step[k] = 0.02
         numeric = (value(psi.detach() + step) - value(psi.detach() - step)) / 0.04
         assert float(gradient[k]) == pytest.approx(float(numeric), rel=0.03, abs=0.02 * float(gradient.abs().max()))
-
-
-def test_footprint_radius_reaches_the_farthest_sample() -> None:
-    p = keypoints()
-    farthest = (patch_positions(p) - p.xy[:, None, None]).norm(dim=-1).amax(dim=(1, 2))
-    torch.testing.assert_close(farthest, footprint_radius(p.scale))

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -5,8 +6,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from agalign.errors import GeometryError
-from agalign.values import geometry
+from agalign.values import geometry, lens
+from agalign.values.lens import Lens
 from agalign.values.pixel_units import PixelScale
+from agalign.values.robust import MIN_SHIFT_SCALE_PX, cauchy_weights, shift_scale_px
 
 small = st.floats(-0.2, 0.2)
 matrices = st.builds(
@@ -98,3 +101,48 @@ def test_no_homography_is_fitted_to_degenerate_points() -> None:
     for points_px in (on_a_line, not_finite, points[:3]):
         with pytest.raises(GeometryError):
             geometry.fit_homography(points_px, points_px)
+
+
+# ---- lenses
+
+MODEL = Lens(1453.0, 1453.0, 652.0, 489.0, (-0.109, 0.156, -0.0003, 0.0005, -0.05))
+POINTS = np.random.default_rng(0).uniform((0, 0), (1279, 959), (200, 2))
+
+
+def test_distort_is_opencvs_projection() -> None:
+    rays = np.column_stack([(POINTS - (MODEL.cx_px, MODEL.cy_px)) / MODEL.fx_px, np.ones(len(POINTS))])
+    expected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), MODEL.matrix, np.array(MODEL.distortion))
+    assert_allclose(lens.distort(MODEL, POINTS), expected[:, 0], atol=1e-8)
+
+
+def test_undistort_inverts_distort() -> None:
+    assert_allclose(lens.distort(MODEL, lens.undistort(MODEL, POINTS)), POINTS, atol=1e-5)
+
+
+def test_shapes_are_kept_and_no_lens_is_the_identity() -> None:
+    grid = POINTS.reshape(10, 20, 2)
+    assert lens.undistort(MODEL, grid).shape == grid.shape
+    assert_allclose(lens.undistort(None, grid), grid)
+    assert_allclose(lens.distort(Lens(1000, 1000, 5, 5), grid), grid)
+
+
+def test_a_resized_image_has_a_resized_lens() -> None:
+    scale = PixelScale(0.5, 0.25)
+    small = lens.rescaled(MODEL, scale)
+    there = (lens.distort(MODEL, POINTS) + 0.5) * scale - 0.5
+    assert_allclose(lens.distort(small, (POINTS + 0.5) * scale - 0.5), there, atol=1e-9)
+    assert lens.rescaled(None, scale) is None
+
+
+# ---- robust statistics
+
+
+def test_cauchy_weights_at_known_residuals() -> None:
+    weights = cauchy_weights([0.0, 2.0, -2.0, 6.0, np.inf], 2.0)
+    np.testing.assert_allclose(weights, [1.0, 0.5, 0.5, 0.1, 0.0])
+
+
+def test_the_scale_of_shifts_is_at_least_their_noise() -> None:
+    assert shift_scale_px(np.array([0.1, 0.2, 9.0])) == 0.2 * 1.4826
+    assert shift_scale_px(np.array([0.001, 0.002, 0.003])) == MIN_SHIFT_SCALE_PX
+    assert shift_scale_px(np.array([])) == MIN_SHIFT_SCALE_PX

@@ -1,6 +1,5 @@
 """The types of pixel grids, and the scale between two of them."""
 
-import json
 import re
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ from mypy import api
 from numpy.testing import assert_allclose
 
 from agalign.values import geometry
-from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, FixedImagePx, PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 REJECTED = {
     "a limit in fixed px and a distance in moving px": "FixedImagePx(1.0) >= MovingImagePx(0.5)",
@@ -74,8 +73,3 @@ def test_scales_relative_to_one_image_give_the_scale_between_two() -> None:
     point = np.array([7.0, 9.0])
     assert_allclose(half.over(third).positions(third.positions(point)), half.positions(point))
     assert SAME_PIXELS.over(half) == half.inverse
-
-
-def test_a_length_is_a_float_wherever_it_goes() -> None:
-    assert json.dumps({"px": FixedImagePx(0.25)}) == '{"px": 0.25}'
-    assert f"{FixedFilePx(1.5):.2f}" == "1.50"

@@ -8,18 +8,12 @@ from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.displacement import DisplacementField
-from agalign.values.image import Tile
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import SAME_PIXELS, PixelScale
-from agalign.verify import displacement_field
 from agalign.verify.displacement_field import (
     DisplacementEstimator,
     DisplacementResult,
     Shifts,
-    _folds,
-    _Gain,
     _is_one_to_one,
-    _near,
     common_field,
     fitted_field,
 )
@@ -96,38 +90,6 @@ def test_no_field_is_added_where_a_homography_suffices() -> None:
     assert result.field is None or np.abs(result.field(geometry.lattice(*SIZE, 17, 13))).max() < 0.05
 
 
-def test_a_mapping_goes_through_its_field_at_any_resolution() -> None:
-    at = centres()
-    field = fitted_field(shifts_at(at, bump(at)), 1.0, 48, SIZE)
-    mapping = PixelMapping(geometry.translation(5, 3), local=field)
-    points = geometry.lattice(*SIZE, 9, 7)
-    np.testing.assert_allclose(mapping(points), points + field(points) + (5, 3))
-    twice = mapping.rescaled(PixelScale(2.0, 2.0), SAME_PIXELS)
-    np.testing.assert_allclose(twice((points + 0.5) * 2 - 0.5), mapping(points), atol=1e-9)
-    dense = mapping.positions(Tile(200, 150, 200, 150))
-    direct = mapping(np.stack(np.meshgrid(np.arange(200, 400), np.arange(150, 300)), -1).astype(float))
-    np.testing.assert_allclose(dense, direct, atol=0.01)
-
-
-def test_windows_are_predicted_without_those_that_share_pixels() -> None:
-    at = centres()
-    fold = _folds(at)
-    assert set(fold) == set(range(16))
-    for k in range(16):
-        out = at[fold == k]
-        kept = at[(fold != k) & ~_near(at, out, 64)]
-        assert len(kept) > len(at) / 3
-        apart = np.abs(out[:, None] - kept[None]).max(axis=-1)
-        assert apart.min() >= 64
-
-
-def test_a_field_that_clearly_increases_p95_is_rejected() -> None:
-    for after_p95_px, is_significant in ((1.62, True), (1.69, False)):
-        gain = _Gain(1.0, before_p95_px=1.59, after_p95_px=after_p95_px, loss=0.1, sigma=9.0)
-        assert gain.is_significant(4.0) == is_significant
-    assert not _Gain(1.0).is_significant(4.0)
-
-
 def of_captures(count: int, height: float, seed: int) -> list[Residual]:
     """Windows of several captures with a common bump and independent noise."""
     at = centres()
@@ -147,22 +109,6 @@ def test_the_common_field_of_captures_is_that_of_the_lenses() -> None:
     # Displacements that differ between captures are not caused by the lenses.
     own = [of_captures(1, h, k)[0] for k, h in enumerate((0.4, -0.4, 0.4, -0.4))]
     assert common_field(own, SIZE) is None
-
-
-def test_smoothness_is_relative_to_the_number_of_captures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Smoothness is per capture: fits without a fold must not be smoother than the final one."""
-    captures = of_captures(5, 0.4, 1)
-    fits: list[tuple[int, float]] = []
-
-    def recorded(shifts: Shifts, smoothness: float, *rest: object) -> DisplacementField:
-        fits.append((len(shifts) // len(centres()), smoothness))
-        return fitted_field(shifts, smoothness, *rest)
-
-    monkeypatch.setattr(displacement_field, "fitted_field", recorded)
-    assert common_field(captures, SIZE) is not None
-    assert {count for count, _ in fits} == {3, 4, 5}
-    per_capture = {smoothness / count for count, smoothness in fits}
-    assert per_capture <= set(displacement_field._COMMON_SMOOTHNESS)
 
 
 # ---- what fits noise cannot pass
