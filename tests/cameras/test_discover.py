@@ -1,3 +1,5 @@
+"""Captures of a folder: which files belong together, and what is missing or unusable."""
+
 import shutil
 from pathlib import Path
 
@@ -11,12 +13,13 @@ from PIL import Image
 from agalign.cameras import metadata
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.generic import Generic
+from agalign.cameras.grouping import with_missing_bands
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.naming import with_unique_band_names
 from agalign.cameras.tiff_directory import EXIF, add_directories, rational, read_directories, text
 from agalign.errors import InputError, NoSuchBandError
 from agalign.synthetic import flight as synthetic
-from agalign.values.capture import Band
+from agalign.values.capture import Band, CameraIdentity, Capture
 
 SMALL = np.arange(64, dtype=np.uint16).reshape(8, 8)
 
@@ -302,3 +305,41 @@ def test_band_names_of_a_capture_are_unique(names: list[str]) -> None:
 def test_repeated_band_names_are_numbered_past_names_in_use(names: str, expected: str) -> None:
     bands = [Band(name, Path("x.tif"), 1, 8, 8, "uint16") for name in names.split()]
     assert [b.name for b in with_unique_band_names(bands)] == expected.split()
+
+
+# ---- captures of one camera
+
+
+RED, BLUE = ("Blue", "Green", "Red"), ("Blue-444", "Green-531")
+
+
+def capture(name: str, serial: str, bands: tuple[str, ...], model: str = "RedEdge-M") -> Capture:
+    files = tuple(Band(b, Path(f"{name}_{b}.tif"), 1, 64, 48, "uint16") for b in bands)
+    return Capture(name, Path(), files, 0, CameraIdentity("MicaSense", model, serial))
+
+
+def missing(*captures: Capture) -> dict[str, tuple[str, ...]]:
+    return {c.name: c.missing_bands for c in with_missing_bands(captures)}
+
+
+def test_two_cameras_of_one_model_lack_none_of_each_other_s_bands() -> None:
+    dual = [capture(f"dual{k}", "RB01+RX02", RED + BLUE) for k in range(3)]
+    assert missing(*dual, capture("panel", "RM01", RED)) == {"dual0": (), "dual1": (), "dual2": (), "panel": ()}
+
+
+def test_a_dual_camera_that_lost_a_half_lacks_it_and_stays_the_same_camera() -> None:
+    dual = [capture(f"dual{k}", "RB01+RX02", RED + BLUE) for k in range(3)]
+    half = capture("half", "RX02", RED)
+    assert missing(*dual, half)["half"] == BLUE
+    assert with_missing_bands([half, *dual])[0].camera.serial == "RB01+RX02"
+    # A half that served in two cameras belongs to neither for certain.
+    other = capture("other", "RB07+RX02", RED + BLUE)
+    assert with_missing_bands([half, *dual, other])[0].camera.serial == "RX02"
+
+
+def test_a_capture_without_a_serial_number_is_of_the_only_camera_of_its_model() -> None:
+    one = [capture(f"a{k}", "RX02", RED) for k in range(2)]
+    assert missing(*one, capture("unknown", "", RED[:2]))["unknown"] == ("Red",)
+    assert missing(*one, capture("b", "RX03", RED), capture("unknown", "", RED[:2]))["unknown"] == ()
+    assert missing(capture("c", "", RED), capture("d", "", RED), capture("e", "", RED[:2]))["e"] == ("Red",)
+    assert missing(*one, capture("altum", "", RED[:2], model="Altum"))["altum"] == ()

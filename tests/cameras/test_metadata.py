@@ -1,3 +1,5 @@
+"""Tags of files and values of XMP packets."""
+
 from pathlib import Path
 
 import pytest
@@ -7,12 +9,14 @@ from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.xmp import Packet
 from agalign.errors import UnreadableFileError
 
+from .test_vendors import packet
+
 ENVELOPE = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">
 <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"
  xmlns:Camera="{camera}" xmlns:other="http://example.org/other/">{body}</rdf:RDF></x:xmpmeta><?xpacket end="w"?>"""
 
 
-def packet(body: str, camera: str = "http://pix4d.com/camera/1.0") -> bytes:
+def enveloped(body: str, camera: str = "http://pix4d.com/camera/1.0") -> bytes:
     return ENVELOPE.format(body=body, camera=camera).encode()
 
 
@@ -29,17 +33,17 @@ def packet(body: str, camera: str = "http://pix4d.com/camera/1.0") -> bytes:
     ],
 )
 def test_a_value_may_be_attribute_element_sequence_or_bag(body: str) -> None:
-    assert Tags(xmp=Packet.parse(packet(body)).values()).numbers(NAMESPACE, "PrincipalPoint") == (2.4, 1.8)
+    assert Tags(xmp=Packet.parse(enveloped(body)).values()).numbers(NAMESPACE, "PrincipalPoint") == (2.4, 1.8)
 
 
 @pytest.mark.parametrize("uri", ["http://pix4d.com/camera/1.0/", "http://pix4d.com/1.0", "http://www.pix4d.com/camera"])
 def test_namespaces_are_places_whatever_their_version_and_slash(uri: str) -> None:
-    values = Packet.parse(packet('<rdf:Description Camera:BandName="Red"/>', uri)).values()
+    values = Packet.parse(enveloped('<rdf:Description Camera:BandName="Red"/>', uri)).values()
     assert values[NAMESPACE, "BandName"] == ("Red",)
 
 
 def test_the_same_name_in_another_namespace_is_another_tag() -> None:
-    tags = Tags(xmp=Packet.parse(packet('<rdf:Description other:Yaw="1"/>')).values())
+    tags = Tags(xmp=Packet.parse(enveloped('<rdf:Description other:Yaw="1"/>')).values())
     assert tags.number("example.org/other", "Yaw") == 1
     assert tags.number("example.org", "Yaw") == 1
     assert tags.number(NAMESPACE, "Yaw") is None
@@ -49,8 +53,8 @@ def test_the_same_name_in_another_namespace_is_another_tag() -> None:
 @pytest.mark.parametrize(
     "bad",
     [
-        b"", b"\0\0\0", b"<x:xmpmeta", packet("<rdf:Description>"), b"not xml at all",
-        packet('<rdf:Description Camera:BandName=""/>'), "<x:xmpmeta></x:xmpmeta>",
+        b"", b"\0\0\0", b"<x:xmpmeta", enveloped("<rdf:Description>"), b"not xml at all",
+        enveloped('<rdf:Description Camera:BandName=""/>'), "<x:xmpmeta></x:xmpmeta>",
     ],
 )  # fmt: skip
 def test_malformed_or_empty_xmp_is_no_xmp(bad: bytes) -> None:
@@ -90,3 +94,46 @@ def test_what_is_no_tiff_is_named(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(UnreadableFileError, match=r"broken\.tif"):
         read_tags(path)
+
+
+# ---- changes of packets
+
+
+VALUES = {(NAMESPACE, "PrincipalPoint"): ("2.4", "1.8"), (NAMESPACE, "BandName"): ("Red",)}
+OTHER = {(NAMESPACE, "PrincipalPoint"): ("9", "8"), (NAMESPACE, "RigRelatives"): ("1", "2", "3")}
+
+
+@pytest.mark.parametrize("dialect", ["attributes", "elements", "sequences"])
+def test_values_are_changed_in_the_form_they_have(dialect: str) -> None:
+    mine = Packet.parse(packet(VALUES, dialect))
+    mine.put((NAMESPACE, "PrincipalPoint"), ["1", "2"])
+    again = Packet.parse(mine.serialised()).values()
+    assert ",".join(again[NAMESPACE, "PrincipalPoint"]) == "1,2"
+    assert again[NAMESPACE, "BandName"] == ("Red",)
+    assert b"Camera:" in mine.serialised()
+
+
+@pytest.mark.parametrize("dialect", ["attributes", "elements", "sequences"])
+@pytest.mark.parametrize("theirs", ["attributes", "elements", "sequences"])
+def test_taking_anothers_values(dialect: str, theirs: str) -> None:
+    mine = Packet.parse(packet(VALUES, dialect))
+    mine.take(Packet.parse(packet(OTHER, theirs)), [(NAMESPACE, "PrincipalPoint"), (NAMESPACE, "RigRelatives")])
+    result = Packet.parse(mine.serialised()).values()
+    values = {k: ",".join(v).replace(" ", "") for k, v in result.items() if k[0] == NAMESPACE}
+    assert values == {
+        (NAMESPACE, "PrincipalPoint"): "9,8", (NAMESPACE, "RigRelatives"): "1,2,3", (NAMESPACE, "BandName"): "Red",
+    }  # fmt: skip
+
+
+def test_taking_from_one_that_has_none_removes() -> None:
+    mine = Packet.parse(packet(VALUES, "elements"))
+    mine.take(Packet(), [(NAMESPACE, "PrincipalPoint")])
+    assert {name for _, name in mine.values()} == {"BandName"}
+
+
+def test_an_empty_packet_stays_empty() -> None:
+    empty = Packet.parse(b"<x:xmpmeta><broken</x:xmpmeta>")
+    empty.put((NAMESPACE, "BandName"), ["x"])
+    empty.take(Packet.parse(packet(OTHER, "elements")), [(NAMESPACE, "PrincipalPoint")])
+    assert empty.serialised() == b""
+    assert empty.values() == {}

@@ -71,12 +71,6 @@ def test_unrelated_images_are_not_distinguished() -> None:
     assert result.value < 0.1
 
 
-def test_rgb_against_a_single_band() -> None:
-    fixed, moving = two_views(TRUTH)
-    rgb = np.stack([fixed.pixels, 0.5 * fixed.pixels + 1, texture(seed=3).pixels])
-    assert error_px(scratch(whole(rgb), moving, NEAR)) < 0.15
-
-
 def test_images_without_contrast_or_overlap_have_an_issue() -> None:
     fixed, moving = two_views(TRUTH)
     assert scratch(whole(np.zeros_like(fixed.pixels)), moving, NEAR) == Issue(NO_CONTRAST)

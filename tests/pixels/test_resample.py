@@ -79,17 +79,6 @@ def test_tiles_join_without_a_seam(tmp_path: Path) -> None:
         assert np.abs(part - whole[window])[valid].max() < 0.5  # 0.005 of the contrast: spline knots differ by tile
 
 
-def test_pixels_outside_are_invalid_and_nodata_is_not_interpolated(tmp_path: Path) -> None:
-    pixels = np.full((100, 140), 500, np.uint16)
-    pixels[40:50, 60:70] = 0
-    band = write_band(tmp_path / "b.tif", pixels, nodata=0)
-    got, valid = resample_tile(band, PixelMapping(geometry.translation(10.5, 0)), Tile(0, 0, 140, 100), "lanczos")
-    assert not valid[:, 130:].any()  # column 129 reads 139.5, outside the last pixel's centre
-    assert valid[:, :128][:35].all()
-    assert not valid[42:48, 51:58].any()
-    assert (got[valid] == 500).all()
-
-
 def test_nearest_takes_every_pixel_that_is_nearest() -> None:
     pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
     positions = np.stack(np.meshgrid(np.array([-0.4, 0.4, 3.4, 3.6]), np.array([0.0])), axis=-1)

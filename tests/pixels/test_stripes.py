@@ -1,12 +1,21 @@
+"""Stripes that all bands have in common."""
+
 import logging
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import rasterio
 
+import agalign
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import Peak, correlation_surface, find_peak, structure_field
+from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic.flight import Shot, plan_flight, write_shots
+from agalign.synthetic.ground import Field
+from agalign.synthetic.score import score_against_truth
 from agalign.values.image import Raster
 
 from ..builders import whole
@@ -118,3 +127,32 @@ def test_images_of_another_size_or_of_several_channels_are_not_compared() -> Non
     assert is_same([second, third], [colour, small])
     for one, other in zip([first, *others], without_common_stripes(images), strict=True):
         np.testing.assert_array_equal(one.pixels, other.pixels)
+
+
+# ---- a capture with stripes
+
+
+SIZE_PX = (480, 360)
+
+
+def stripes(light: Field, _rng: np.random.Generator) -> Field:
+    """White column stripes, equal in all bands, of +-20 % of the range."""
+    low, high = np.percentile(light, (1, 99))
+    pattern = np.random.default_rng(5).uniform(-0.2, 0.2, light.shape[1]).astype(np.float32)
+    return np.asarray(light + (high - low) * pattern, np.float32)
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_a_capture_with_common_stripes_is_aligned(tmp_path: Path) -> None:
+    poses, ground, rng = plan_flight(1, SIZE_PX, rng_seed=3)
+    truth = write_shots(tmp_path, [Shot(poses[0], ground, stripes)], SIZE_PX, REDEDGE, rng)
+    reports = agalign.align_folder(tmp_path, tmp_path / "out")
+    scores = score_against_truth(reports, truth)
+    assert [score.status for score in scores] == ["aligned"] * 4
+    assert max(score.median_px for score in scores) < 0.3
+    (sidecar,) = (report.sidecar for report in reports)
+    x0, y0, width, height = sidecar.output.crop
+    (source,), (stack,) = tmp_path.rglob(sidecar.reference.file), (tmp_path / "out").rglob(sidecar.output.file)
+    with rasterio.open(source) as read, rasterio.open(stack) as written:
+        pixels = written.read(1 + written.descriptions.index(sidecar.reference.band))
+        np.testing.assert_array_equal(pixels, read.read(1)[y0 : y0 + height, x0 : x0 + width])

@@ -1,11 +1,13 @@
-"""Cores: the limits of containers count."""
+"""Limits of the system and of containers: cores and address space."""
 
 from pathlib import Path
 
 import pytest
 
+from agalign.errors import MemoryLimitError, is_out_of_memory
 from agalign.values import cores
 from agalign.values.cores import cgroup_quota, limit_default_threads, usable_cores
+from agalign.values.memory_limit import MIN_ADDRESS_SPACE_BYTES, check_address_space
 
 V1 = {"cpu/docker/ab/cpu.cfs_period_us": "100000"}
 
@@ -48,3 +50,26 @@ def test_threads_follow_a_quota_and_what_the_user_has_set_stays(monkeypatch: pyt
     monkeypatch.setattr(cores.os, "environ", variables)
     limit_default_threads()
     assert variables == {"OMP_NUM_THREADS": "7", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+# ---- address space
+
+
+resource = pytest.importorskip("resource", reason="address space is limited on POSIX only")
+
+
+@pytest.mark.parametrize("limit_bytes", [resource.RLIM_INFINITY, MIN_ADDRESS_SPACE_BYTES])
+def test_enough_address_space_is_accepted(monkeypatch: pytest.MonkeyPatch, limit_bytes: int) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (limit_bytes, resource.RLIM_INFINITY))
+    check_address_space()
+
+
+def test_too_little_address_space_is_refused_with_both_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1_200_000_000, resource.RLIM_INFINITY))
+    with pytest.raises(MemoryLimitError, match=r"limited to 1\.20 GB \(ulimit -v\); agalign needs 1\.8 GB or more"):
+        check_address_space()
+
+
+@pytest.mark.parametrize("text", ["can't start new thread", "could not create a primitive"])
+def test_what_libraries_raise_when_memory_is_short(text: str) -> None:
+    assert is_out_of_memory(RuntimeError(text))
