@@ -97,8 +97,8 @@ def test_without_metadata_and_from_identity_nothing_is_wrongly_aligned(real_data
     assert max(medians.values()) < 0.5
 
 
-def in_full_run(number: int) -> Any:
-    return pytest.param(number, marks=pytest.mark.full)
+def in_full_run(value: object) -> Any:
+    return pytest.param(value, marks=pytest.mark.full)
 
 
 @pytest.mark.parametrize("number", [5, *map(in_full_run, (25, 31))])
@@ -170,16 +170,17 @@ def test_temperature_is_what_the_altum_says_itself(real_data: Path) -> None:
         assert result.min() - 1 < said < result.max() + 1
 
 
-def test_bananas_from_close_by_with_the_photograph(real_data: Path, tmp_path: Path) -> None:
-    options = DiscoverOptions(with_rgb=True)
+@pytest.mark.parametrize("bands", [("Green", "NIR", "Red"), in_full_run(())])
+def test_bananas_from_close_by(real_data: Path, tmp_path: Path, bands: tuple[str, ...]) -> None:
+    """The full run takes all bands and the photograph."""
+    options = DiscoverOptions(bands=bands, with_rgb=not bands)
     (report,) = agalign.align_folder(real_data / "captures/p4m_bananas", tmp_path, options=options)
-    bands = {b.band: b for b in report.sidecar.bands if b.metrics}
-    photograph = {name for name in bands if name.startswith("RGB")}
-    assert (len(bands), len(photograph)) == (7, 3)
-    multispectral = [bands[b] for b in bands.keys() - photograph]
+    moving = [b for b in report.sidecar.bands if b.metrics]
+    photograph, multispectral = ([b for b in moving if b.band.startswith("RGB") == is_rgb] for is_rgb in (True, False))
+    assert (len(multispectral), len(photograph)) == ((2, 0) if bands else (4, 3))
     assert all(b.status == "aligned" and b.metrics.after.residual_px < 0.5 for b in multispectral)
     # Its lens is farther from the others than these from each other: a fifth of its windows are off by more than a px.
-    assert all(bands[b].status != "aligned" for b in photograph)
+    assert all(b.status != "aligned" for b in photograph)
 
 
 def test_the_two_cameras_of_a_sentera_are_registered(real_data: Path, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ ELSEWHERE = {
     "agalign/flight/model.py": ("tests/batch/test_flight.py",),
     "agalign/values/alignment.py": ("tests/capture/test_band_pair.py", "tests/products/test_sidecar.py"),
     "agalign/values/capture.py": ("tests/cameras/test_cameras.py", "tests/cameras/test_discover.py"),
-    "agalign/values/issues.py": ("tests/verify/test_acceptance.py", "tests/products/test_failures.py"),
+    "agalign/values/issues.py": ("tests/verify/test_checks.py", "tests/products/test_failures.py"),
     "agalign/values/image.py": ("tests/pixels/test_masks.py", "tests/pixels/test_resample.py"),
     "agalign/values/mapping.py": ("tests/pixels/test_resample.py",),
     "agalign/values/text.py": ("tests/products/test_failures.py",),
