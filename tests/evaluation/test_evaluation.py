@@ -82,8 +82,8 @@ def test_sift_and_daisy_of_a_mosaic_are_those_of_single_patches() -> None:
 @pytest.mark.parametrize("name", ["sift", "daisy"])
 def test_hand_made_descriptors_find_copies_and_nothing_in_unrelated_images(name: str) -> None:
     fixed, other = texture(), texture(seed=5)
-    keypoints = visible_in_both(sift_keypoints(fixed, maximum=50), np.eye(3), fixed, fixed)
-    for moving, low, high in ((fixed, 0.99, 1.0), (other, 0.0, 0.05)):
+    keypoints = visible_in_both(sift_keypoints(fixed, maximum=80), np.eye(3), fixed, fixed)
+    for moving, low, high in ((fixed, 0.99, 1.0), (other, 0.0, 0.12)):
         describe = method_named(name)(PairTask(fixed, moving, np.eye(3))).describe
         assert describe is not None
         assert low <= average_precision(*describe(keypoints, np.eye(3))) <= high
@@ -139,7 +139,7 @@ def test_the_loss_is_least_at_the_truth(tmp_path: Path) -> None:
     fixed, moving = two_views(TRUTH)
     settings = JointSettings(recipe="paper", device="cpu")
     offsets = np.array([-40.0, 0.0, 40.0])
-    surface = loss_surface(fixed, moving, TRUTH, offsets, settings, Training(keypoints=800, epochs=1))
+    surface = loss_surface(fixed, moving, TRUTH, offsets, settings, Training(keypoints=400, epochs=1))
     assert np.unravel_index(np.nanargmin(surface), surface.shape) == (1, 1)
     draw_surface(surface, offsets, tmp_path / "surface.png")
     assert cv2.imread(str(tmp_path / "surface.png")).shape == (552, 552, 3)

@@ -101,6 +101,7 @@ def test_the_search_for_panels_ends_after_three_captures_without_one(monkeypatch
     assert sorted(looked) == [0, 1, 2, 17, 18, 19]
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_panels_are_searched_in_the_first_and_last_captures(tmp_path: Path) -> None:
     make_flight_between_panels(tmp_path, 7, (640, 480))
