@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +21,8 @@ from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, probe
 from agalign.products.sidecar_file import find_sidecars
 from agalign.values import geometry
+
+from .builders import in_full_run
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
@@ -95,10 +96,6 @@ def test_without_metadata_and_from_identity_nothing_is_wrongly_aligned(real_data
     medians = pair_medians(tmp_path, real_data / "flights/rededge_m_rowcrop/ties.json")
     assert medians
     assert max(medians.values()) < 0.5
-
-
-def in_full_run(value: object) -> Any:
-    return pytest.param(value, marks=pytest.mark.full)
 
 
 @pytest.mark.parametrize("number", [5, *map(in_full_run, (25, 31))])

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +32,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
 
-from ..builders import joint_result, residual_of, whole
+from ..builders import in_full_run, joint_result, residual_of, whole
 from ..conftest import textured_image
 
 CAMERA = replace(
@@ -282,10 +281,6 @@ def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float
 
 
 # ---- what fits noise cannot pass
-
-
-def in_full_run(kind: str) -> Any:
-    return pytest.param(kind, marks=pytest.mark.full)
 
 
 def foreign(image: np.ndarray, kind: str, seed: int) -> np.ndarray:

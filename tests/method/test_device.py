@@ -1,7 +1,7 @@
 import re
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from agalign.values.choices import Recipe
 from agalign.values.displacement import DisplacementField
 from agalign.values.lens import Lens
 
-from ..builders import two_views, whole
+from ..builders import in_full_run, two_views, whole
 from .pretended_device import NAME, PretendedDevice
 
 
@@ -42,29 +42,14 @@ def test_overlapping_contexts_restore_the_threads_of_torch() -> None:
     """A worker of a cluster processes several captures in threads of one process."""
     before = torch.get_num_threads()
     torch.set_num_threads(3)
-    first_is_in, second_is_in, first_is_out = (threading.Event() for _ in range(3))
-
-    def first() -> None:
-        with one_thread():
-            first_is_in.set()
-            second_is_in.wait(5)
-        first_is_out.set()
-
-    def second() -> None:
-        first_is_in.wait(5)
-        with one_thread():
-            second_is_in.set()
-            first_is_out.wait(5)
-
+    first, second = ExitStack(), ExitStack()
     try:
-        threads = [threading.Thread(target=t) for t in (first, second)]
-        for t in threads:
-            t.start()
-        for t in threads:
-            t.join(10)
-        # OpenMP has one number per thread; new threads take the number of torch.
-        assert device._active == 0
-        assert device._torch_threads_outside == 3
+        for context in (first, second):
+            context.enter_context(one_thread())
+        for context, threads in ((first, 1), (second, 3)):
+            assert torch.get_num_threads() == 1
+            context.close()
+            assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
 
@@ -97,7 +82,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> GPU:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("recipe", "has_float64"),
-    [("fast", False), *(pytest.param(*kind, marks=pytest.mark.full) for kind in (("fast", True), ("paper", False)))],
+    [("fast", False), in_full_run("fast", True), in_full_run("paper", False)],
 )
 def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64: bool) -> None:
     fixed, moving = (view.pixels for view in two_views(geometry.translation(6.0, -4.0), 260, 200))

@@ -15,7 +15,7 @@ from agalign.values.alignment import JointResult
 from agalign.values.image import Raster
 from agalign.values.issues import NO_CONTRAST, Issue
 
-from ..builders import texture, two_views, whole
+from ..builders import in_full_run, texture, two_views, whole
 from ..conftest import mean_error_px
 
 pytestmark = pytest.mark.slow
@@ -92,11 +92,7 @@ def test_one_network_for_two_bands_and_an_unrelated_one() -> None:
 
 @pytest.mark.parametrize(
     ("sharing", "left"),
-    [
-        ("pseudo-siamese", 0.35),
-        pytest.param("siamese", 0.35, marks=pytest.mark.full),
-        pytest.param("unshared", 0.9, marks=pytest.mark.full),
-    ],
+    [("pseudo-siamese", 0.35), in_full_run("siamese", 0.35), in_full_run("unshared", 0.9)],
 )
 def test_paper_recipe_reduces_the_error(sharing: str, left: float) -> None:
     # Unshared networks learn most slowly, as the paper expects; three epochs are few.

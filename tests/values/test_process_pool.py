@@ -22,6 +22,7 @@ from agalign.values import process_pool, worker_process
 from agalign.values.process_pool import Outcome, ProcessPool, WorkerDiedError
 from agalign.values.worker_process import Worker
 
+from ..builders import in_full_run
 from . import pool_tasks as tasks
 
 CONTEXT = get_context("forkserver" if sys.platform == "linux" else "spawn")
@@ -163,10 +164,6 @@ def test_a_worker_killed_once_costs_nothing_and_twice_its_task(
             assert told(outcome) == "WorkerDiedError: signal 9"
         (outcome,) = workers.run([argument])
     assert outcome.value() in ("done", bytes(LARGE))
-
-
-def in_full_run(*values: object) -> Any:
-    return pytest.param(*values, marks=pytest.mark.full)
 
 
 @pytest.mark.slow
@@ -369,20 +366,9 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("method", "number", "whom"),
-    [
-        ("forkserver", signal.SIGKILL, "parent"),
-        ("forkserver", signal.SIGINT, "group"),
-        ("spawn", signal.SIGTERM, "parent"),
-        *(
-            in_full_run(method, number, whom)
-            for method in ("forkserver", "spawn")
-            for number in (signal.SIGTERM, signal.SIGKILL, signal.SIGINT)
-            for whom in ("group", "parent")
-        ),
-    ],
-)
+@pytest.mark.parametrize("whom", ["parent", in_full_run("group")])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, in_full_run(signal.SIGINT)])
+@pytest.mark.parametrize("method", ["forkserver", in_full_run("spawn")])
 def test_no_process_outlives_its_parent(method: str, number: int, whom: str, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
