@@ -6,7 +6,6 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from _pytest.mark import ParameterSet
 
 from agalign.capture.band_pair import BandPair
 from agalign.values.alignment import JointResult, Residual
@@ -71,6 +70,6 @@ def displaced_views(displacement: Callable[[np.ndarray], np.ndarray], seed: int 
     return [fixed, whole(cv2.remap(moving.pixels, back, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT))]
 
 
-def in_full_run(*values: object) -> ParameterSet:
+def in_full_run(*values: object) -> object:
     """Values of a parametrised test that the default run leaves out."""
     return pytest.param(*values, marks=pytest.mark.full)
