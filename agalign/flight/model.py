@@ -19,9 +19,8 @@ from safetensors.torch import save
 
 from agalign._version import __version__
 from agalign.errors import InputError, is_out_of_memory
-from agalign.flight.refined_file import refined_from_json, refined_to_json
 from agalign.flight.rig import Rig
-from agalign.flight.rig_file import rig_from_json, rig_to_json
+from agalign.flight.rig_file import refined_from_json, refined_to_json, rig_from_json, rig_to_json
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import matching_network
 from agalign.values.alignment import RefinedPair

@@ -1,6 +1,7 @@
-"""The rig as JSON, and reading it from a model file without torch, as reports of a run require."""
+"""The rig and the refined mappings of a model file as JSON. The rig can be read without torch, as reports require."""
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,18 @@ from safetensors import safe_open
 
 from agalign.errors import InputError
 from agalign.flight.rig import CaptureFactors, Rig
+from agalign.values.alignment import JointResult, RefinedPair, Seed
 from agalign.values.displacement import DisplacementField
 from agalign.values.files import open_regular
+from agalign.values.geometry import normalised
+from agalign.values.pixel_units import FixedImagePx
 
 
 def rig_to_json(rig: Rig) -> str:
     """Serialise a rig without the values of its displacement fields."""
     facts = {k: v for k, v in vars(rig).items() if k not in ("mean", "fields", "captures")}
-    facts["mean"] = {b: m.tolist() for b, m in rig.mean.items()}
-    facts["seen"] = [vars(c) for c in rig.captures]
-    return json.dumps(facts | {"field_steps_px": {b: f.step_px for b, f in rig.fields.items()}})
+    facts |= {"mean": rig.mean, "seen": rig.captures}
+    return json.dumps(facts | {"field_steps_px": {b: f.step_px for b, f in rig.fields.items()}}, default=_plain)
 
 
 def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
@@ -31,13 +34,15 @@ def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
     facts = json.loads(text)
     steps = facts.pop("field_steps_px")
     width, height = facts.pop("size_px")
-    return Rig(
-        size_px=(int(width), int(height)), mean={b: np.array(m) for b, m in facts.pop("mean").items()},
-        baselines={b: (x, y) for b, (x, y) in facts.pop("baselines").items()},
-        factors=tuple(facts.pop("factors")),
-        captures=tuple(_capture_factors(c) for c in facts.pop("seen")),
-        fields={b: DisplacementField(steps[b], values) for b, values in fields.items()}, **facts,
-    )  # fmt: skip
+    facts["mean"] = {b: np.array(m) for b, m in facts["mean"].items()}
+    facts["baselines"] = {b: (x, y) for b, (x, y) in facts["baselines"].items()}
+    facts["factors"] = tuple(facts["factors"])
+    captures = tuple(
+        CaptureFactors(**one | {"motion": one["motion"] and tuple(one["motion"]), "factors": tuple(one["factors"])})
+        for one in facts.pop("seen")
+    )
+    displacements = {b: DisplacementField(steps[b], values) for b, values in fields.items()}
+    return Rig(size_px=(int(width), int(height)), captures=captures, fields=displacements, **facts)
 
 
 def read_rig(path: Path) -> tuple[str, Rig | None]:
@@ -55,9 +60,37 @@ def read_rig(path: Path) -> tuple[str, Rig | None]:
         raise InputError(f"{path}: its rig cannot be read ({reason})") from None
 
 
-def _capture_factors(facts: Mapping[str, Any]) -> CaptureFactors:
-    motion = facts["motion"]
-    return CaptureFactors(
-        facts["seconds"], facts["altitude_m"], None if motion is None else (motion[0], motion[1]),
-        tuple(facts["factors"]),
-    )  # fmt: skip
+def refined_to_json(refined: Mapping[str, Mapping[str, RefinedPair]]) -> str:
+    """Serialise refined mappings by capture and band; numbers are read again exactly."""
+    facts = {
+        key: {
+            # The loss is NaN with a frozen network.
+            band: vars(pair) | {"result": {k: v for k, v in vars(pair.result).items() if k != "loss"}}
+            for band, pair in pairs.items()
+        }
+        for key, pairs in refined.items()
+    }
+    return json.dumps(facts, sort_keys=True, default=_plain)
+
+
+def refined_from_json(text: str) -> dict[str, dict[str, RefinedPair]]:
+    """Deserialise refined mappings. Raises AttributeError, KeyError, TypeError or ValueError for damaged text."""
+    return {key: {band: _pair(facts) for band, facts in of.items()} for key, of in json.loads(text).items()}
+
+
+def _pair(facts: Mapping[str, Any]) -> RefinedPair:
+    seed, result = (
+        {**part, "fixed_to_moving": normalised(part["fixed_to_moving"])} for part in (facts["seed"], facts["result"])
+    )
+    if result["corner_covariance_px2"] is not None:
+        result["corner_covariance_px2"] = np.array(result["corner_covariance_px2"])
+    result["corner_std_xy_px"] = tuple((x, y) for x, y in result["corner_std_xy_px"])
+    result["levels"] = tuple(result["levels"])
+    (fixed_width, fixed_height), (moving_width, moving_height) = facts["sizes_px"]
+    sizes_px = (fixed_width, fixed_height), (moving_width, moving_height)
+    return RefinedPair(Seed(**seed), JointResult[FixedImagePx](loss=math.nan, **result), sizes_px)
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists and records as their fields, for `json.dumps`."""
+    return value.tolist() if isinstance(value, np.ndarray) else vars(value)
