@@ -11,8 +11,8 @@ import cv2
 from agalign.errors import AgalignError
 from agalign.products.flight_map import link_indices
 from agalign.products.index_bands import bands_of, unit_of
-from agalign.products.index_rasters import IndexReport, write_rasters
-from agalign.products.index_table import IndexRow, row_of, update_table
+from agalign.products.index_rasters import write_rasters
+from agalign.products.index_table import IndexReport, IndexRow, row_of, update_table
 from agalign.products.indices import Index
 from agalign.products.sidecar_file import read_result, run_sidecars, update_products
 from agalign.values.cores import usable_cores

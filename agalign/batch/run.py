@@ -28,13 +28,12 @@ from agalign.pixels.radiometry import with_radiometry
 from agalign.products.flight_map import FlightMap
 from agalign.products.footprint import above_elevation, with_approximate_georeference
 from agalign.products.index_product import check_indices
-from agalign.products.panels import write_panels
+from agalign.products.panels import write_panels, write_sky
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths
-from agalign.products.run_record import RunState, Tally, begun, problem_of, write_run_record
+from agalign.products.run_record import RunPart, RunState, begun
 from agalign.products.sidecar import CaptureResult
 from agalign.products.sidecar_file import read_result
-from agalign.products.sky import write_sky
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
@@ -98,32 +97,31 @@ def run_flight(
     if given is not None:
         flight_settings = settings.flight.model_copy(update={"start": given.fingerprint})
         settings = settings.model_copy(update={"flight": flight_settings})
-    with locked(out), _recorded(flight, out, settings, options.command) as tally:
-        for report in _reports(flight, out, settings, options, _with_seconds(listener, tally), given):
-            tally.add(report.label, report.state, report.result, report.problems)
+    with locked(out), _recorded(flight, out, settings, options.command) as record:
+        for report in _reports(flight, out, settings, options, _with_seconds(listener, record), given):
+            record.add(report.label, report.state, report.result, report.problems)
             if report.state == "done":
-                tally.capture_seconds[report.label] = report.seconds
+                record.capture_seconds[report.label] = report.seconds
             for (_, stage), seconds in report.stages.items():
-                tally.stage_seconds[stage] += seconds
+                record.add_seconds(stage, seconds)
             yield report
             if report.problems and is_full(out):
                 raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
 
 
 @contextmanager
-def _recorded(flight: FolderScan, out: Path, settings: Settings, command: str) -> Iterator[Tally]:
+def _recorded(flight: FolderScan, out: Path, settings: Settings, command: str) -> Iterator[RunPart]:
     """Write the run record at the beginning and at the end of a run, also after an interruption."""
-    tally, began = Tally(), time.monotonic()
-    tally.captures["found"] = len(flight.captures)
-    tally.problems += [problem_of(str(p.path), p.text) for p in flight.problems]
-    run = begun(flight.folder, settings, flight.captures, command)
+    record, began = begun(flight.folder, settings, flight.captures, command), time.monotonic()
+    for problem in flight.problems:
+        record.add_problem(str(problem.path), problem.text)
 
     def write(state: RunState) -> None:
-        write_run_record(out, run, tally, state, time.monotonic() - began)
+        record.write(out, state, time.monotonic() - began)
 
     write("running")
     try:
-        yield tally
+        yield record
     except BaseException:
         with suppress(OutputError):
             write("interrupted")
@@ -131,9 +129,9 @@ def _recorded(flight: FolderScan, out: Path, settings: Settings, command: str) -
     write("finished")
 
 
-def _with_seconds(listener: Listener, tally: Tally) -> Listener:
+def _with_seconds(listener: Listener, record: RunPart) -> Listener:
     def on_learnt(camera: str, seconds: float) -> None:
-        tally.stage_seconds["learning a flight"] += seconds
+        record.add_seconds("learning a flight", seconds)
         listener.on_learnt(camera, seconds)
 
     return replace(listener, on_learnt=on_learnt)

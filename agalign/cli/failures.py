@@ -7,7 +7,7 @@ from agalign.cli.terminal import Terminal
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
-    from agalign.products.failures import FailureGroup
+    from agalign.products.report.facts import FailureGroup
 
 _MAX_NAMED = 3
 

@@ -29,7 +29,7 @@ from agalign.cli.terminal import (
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from agalign.products.index_rasters import IndexReport
+    from agalign.products.index_table import IndexReport
     from agalign.products.indices import Index
 
 _EXAMPLES = examples(

@@ -156,7 +156,7 @@ def verify(
     """Compare the files of a run with their checksums."""
     terminal = Terminal(quiet=False, verbose=False, log_json=False)
     with exits(terminal):
-        from agalign.products.verify_outputs import verify_outputs
+        from agalign.products.sidecar_file import verify_outputs
 
         captures = damaged = 0
         for _, problems in verify_outputs(out):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from agalign.batch import CaptureReport, RunOptions
     from agalign.cameras.discover import DiscoverOptions, FolderScan
     from agalign.config import Settings
-    from agalign.products.failures import FailureGroups
+    from agalign.products.report.facts import FailureGroups
     from agalign.products.sidecar import BandResult, CaptureResult
     from agalign.values.capture import Capture
 
@@ -130,7 +130,7 @@ def load_ahead() -> None:
 
 
 def _no_failures() -> "FailureGroups":
-    from agalign.products.failures import FailureGroups
+    from agalign.products.report.facts import FailureGroups
 
     return FailureGroups()
 

@@ -27,10 +27,10 @@ class CameraOverview:
     """Minimum and maximum altitude in the tags, above sea level or an ellipsoid."""
     gsd_m: float | None
     """Median ground sample distance of the reference."""
-    gsd_per_height: float | None
-    """Ground sample distance per metre of height, from the focal length of the reference."""
     radiometry: tuple[RadiometryChoice, ...]
     """Values of `--radiometry` that the tags of all captures support; panels are not considered."""
+    gsd_per_height: float | None = None
+    """Ground sample distance per metre of height, from the focal length of the reference."""
 
     @property
     def text(self) -> str:

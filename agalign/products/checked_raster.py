@@ -1,9 +1,14 @@
 """GeoTIFFs that appear complete or not at all: each finished file is read back and compared with what was written."""
 
 import errno
+import math
+import os
+import re
+import threading
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +16,48 @@ import numpy as np
 import rasterio
 import tifffile
 from numpy.typing import NDArray
+from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from agalign.errors import OutputError
 from agalign.pixels.raster import GDAL_ENVIRONMENT, innermost_cause, without_warnings
-from agalign.products.quiet_libtiff import without_libtiff_messages
 from agalign.values import geometry
 from agalign.values.capture import Georeference
 from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid
 
+WORK_TILE_PX = 2048
+"""Side of the tiles that are processed one after another: it limits the memory."""
 _BLOCK_PX = 256
 """Side of the blocks within a GeoTIFF: GDAL's default."""
 _INCOMPLETE = "the file came out incomplete; is the disk full?"
+_LIBTIFF_LINE = re.compile(rb"^_?(?:tiff|TIFF)\w+: .*\n?", re.MULTILINE)
+_MAX_BYTES = 1 << 16
+"""Capacity of a pipe on Linux: what exceeds it is lost."""
+_REDIRECTED = threading.RLock()
+"""File descriptor 2 belongs to the process: one thread redirects it, and others wait before they write."""
+
+FLOAT_OPTIONS: Mapping[str, Any] = {"compress": "deflate", "predictor": 3, "nodata": math.nan}
+"""Creation options of layers of float32."""
+
+Block = tuple[NDArray[Any], int, int, int]
+"""Pixels (height, width), band of the raster from 1, and position (x, y) of their top-left pixel in the raster."""
+
+
+@dataclass(frozen=True)
+class LayerDescription:
+    """Metadata of one band of a raster."""
+
+    name: str
+    unit: str = ""
+    tags: Mapping[str, str] = field(default_factory=dict)
+    imagery: Mapping[str, str] = field(default_factory=dict)
+    """Tags of GDAL's domain IMAGERY."""
+    scale_offset: tuple[float, float] = (1.0, 0.0)
+    """(scale, offset): value = scale * number in the file + offset."""
+    colour: ColorInterp | None = None
 
 
 class CheckedRaster:
@@ -38,6 +70,22 @@ class CheckedRaster:
     def __init__(self, dataset: Any) -> None:
         self.dataset = dataset
         self._written: list[tuple[int, Window, int]] = []
+
+    def describe(self, layers: Sequence[LayerDescription], tags: Mapping[str, str]) -> None:
+        """Set the metadata of all bands, and the tags of the file that are not empty."""
+        dataset = self.dataset
+        dataset.update_tags(**{k: v for k, v in tags.items() if v})
+        if any(layer.scale_offset != (1.0, 0.0) for layer in layers):
+            dataset.scales, dataset.offsets = zip(*(layer.scale_offset for layer in layers), strict=True)
+        if any(layer.unit for layer in layers):
+            dataset.units = [layer.unit for layer in layers]
+        colours = [layer.colour for layer in layers]
+        if None not in colours:
+            dataset.colorinterp = colours
+        for index, layer in enumerate(layers, start=1):
+            dataset.set_band_description(index, layer.name)
+            dataset.update_tags(index, **layer.tags)
+            dataset.update_tags(index, ns="IMAGERY", **layer.imagery)
 
     def write(self, pixels: NDArray[Any], index: int, x0: int = 0, y0: int = 0) -> None:
         """Write pixels (height, width) into band `index`, counted from 1, with the top-left pixel at (x0, y0)."""
@@ -80,6 +128,46 @@ def checked_raster(
         raise OutputError(f"{path}: cannot be written ({innermost_cause(error)})") from None
 
 
+def write_layers(
+    path: Path,
+    profile: dict[str, Any],
+    layers: Sequence[LayerDescription],
+    tags: Mapping[str, str],
+    blocks: Iterable[Block],
+    finish: Callable[[Path], None] | None = None,
+) -> None:
+    """Write a raster with these layers and tags block by block, as `checked_raster` does. Raises OutputError."""
+    with checked_raster(path, profile, finish) as raster:
+        raster.describe(layers, tags)
+        for block in blocks:
+            raster.write(*block)
+
+
+@contextmanager
+def without_libtiff_messages() -> Iterator[None]:
+    """Drop what libtiff prints to standard error inside the block, such as for a full disk; other text is printed at
+    its end. `checked_raster` detects and reports the incomplete file itself.
+    """
+    with _REDIRECTED:
+        read_end, write_end = os.pipe()
+        os.set_blocking(read_end, False)
+        os.set_blocking(write_end, False)
+        stderr = os.dup(2)
+        os.dup2(write_end, 2)
+        os.close(write_end)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)  # closes the last write end of the pipe in this process
+            os.close(stderr)
+            printed = b""
+            with suppress(BlockingIOError):  # a child process started in the block has the write end open too
+                printed = os.read(read_end, _MAX_BYTES)
+            os.close(read_end)
+            with suppress(OSError):
+                os.write(2, _LIBTIFF_LINE.sub(b"", printed))
+
+
 def check_complete(path: Path) -> None:
     """Raise OSError for a TIFF in which a tile or strip is missing or truncated.
 
@@ -94,10 +182,9 @@ def check_complete(path: Path) -> None:
 
 def tiled_profile(width: int, height: int, count: int, dtype: str, **options: Any) -> dict[str, Any]:
     """Return rasterio's profile of a tiled GeoTIFF with these further creation options."""
-    return {
-        "driver": "GTiff", "width": width, "height": height, "count": count, "dtype": dtype, "tiled": True,
-        "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "bigtiff": "if_safer", **options,
-    }  # fmt: skip
+    size = {"width": width, "height": height, "count": count, "dtype": dtype}
+    blocks = {"tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "bigtiff": "if_safer"}
+    return {"driver": "GTiff"} | size | blocks | options
 
 
 def grid_profile(
@@ -117,6 +204,21 @@ def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any
     scale = np.diag([1 / grid.scale.x, 1 / grid.scale.y, 1.0])
     transform = georeference.transform @ scale @ geometry.translation(grid.x0, grid.y0)
     return {"transform": Affine(*transform[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
+
+
+def georeference_tags(georeference: Georeference | None) -> dict[str, str]:
+    """Return tags that mark a georeference by the camera's pose as approximate; empty for that of an input file."""
+    if georeference is None or georeference.accuracy_m is None:
+        return {}
+    return {
+        "GEOREFERENCE": "approximate, from GPS position, altitude, yaw and focal length; no ground control",
+        "GEOREFERENCE_ACCURACY_M": f"{georeference.accuracy_m:g}",
+    }
+
+
+def predictor(kind: str) -> int:
+    """Return the TIFF predictor for a kind of numpy type: 3 for floating point, 2 for integers."""
+    return 3 if kind == "f" else 2
 
 
 def _checksum(pixels: NDArray[Any]) -> int:

@@ -128,11 +128,8 @@ def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset
                 long_name=str(name), units=RELIEF_UNITS[name]
             )
     dataset: xarray.Dataset = xr.Dataset(result)
-    dataset.attrs = {
-        "capture": sidecar.capture, "capture_id": sidecar.capture_id, "flight_id": sidecar.flight_id,
-        "captured_at": sidecar.captured_at, "camera": f"{sidecar.camera.make} {sidecar.camera.model}".strip(),
-        "reference_band": sidecar.reference.band,
-    }  # fmt: skip
+    dataset.attrs = {k: getattr(sidecar, k) for k in ("capture", "capture_id", "flight_id", "captured_at")}
+    dataset.attrs |= {"camera": sidecar.camera.name, "reference_band": sidecar.reference.band}
     return dataset if dataset.rio.crs is not None else _in_pixels(dataset)
 
 

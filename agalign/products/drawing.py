@@ -1,5 +1,8 @@
-"""Drawing text on pictures, and writing them as PNG."""
+"""The bands of a capture as reduced grey images, text on pictures, and PNG files."""
 
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -7,21 +10,85 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from agalign.errors import OutputError
+from agalign.errors import OutputError, UnreadableFileError
+from agalign.pixels.raster import read_preview
+from agalign.values.capture import Band, Capture
 from agalign.values.files import complete_file
+from agalign.values.image import OutputGrid, reduced_size_px
 
+Grey = NDArray[np.uint8]
+"""(height, width)"""
+_MAX_SIDE_PX = 2048
+"""Longer side of the images: larger than most screens."""
+_PERCENTILES = 1.5, 98.5
+"""Percentiles of a band that are shown as black and white."""
+_SAMPLE_PIXELS = 20_000
+"""Pixels from which the percentiles are calculated, with an error of 0.1 %."""
 Picture = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""
 _TEXT_COLOUR = 40, 40, 40
 
 
+@dataclass(frozen=True)
+class ReducedBands:
+    """The bands of a capture on its output grid, reduced to the size of a screen."""
+
+    before: Mapping[str, Grey]
+    """The raw file, resized to that of the reference, of each band that can be read."""
+    after: Mapping[str, Grey]
+    """The aligned pixels of each band that was written."""
+    size_px: tuple[int, int]
+    """(width, height) of all images."""
+
+
+def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> ReducedBands:
+    """Read the bands of a capture, given file and index of each written band. Raises UnreadableFileError for those."""
+    size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / _MAX_SIDE_PX))
+    before = {}
+    for band in capture.bands:
+        with suppress(UnreadableFileError):  # the band pair has failed with this reason
+            before[band.name] = _grey(_before(band, capture.reference, grid, size_px))
+    window = 0, 0, grid.width, grid.height
+    after = {name: _grey(read_preview(*place, window, size_px)) for name, place in places.items()}
+    return ReducedBands(before, after, size_px)
+
+
+def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, int]) -> NDArray[np.float32]:
+    sx, sy = (n / (s * m) for n, s, m in zip(band.size_px, grid.scale, reference.size_px, strict=True))
+    window = (round(grid.x0 * sx), round(grid.y0 * sy), max(1, round(grid.width * sx)), max(1, round(grid.height * sy)))
+    return read_preview(band.path, band.band_index, window, size_px)
+
+
+def _grey(plane: NDArray[np.float32]) -> Grey:
+    """The grey values between percentiles of the plane itself: raw numbers and reflectance have different ranges."""
+    low, high = _limits(plane)
+    scaled = np.subtract(plane, np.float32(low))
+    scaled *= np.float32(255.0 / (high - low))
+    cv2.patchNaNs(scaled, 0.0)
+    return np.asarray(np.clip(scaled, 0, 255, out=scaled).astype(np.uint8))
+
+
+def _limits(plane: NDArray[np.float32]) -> tuple[float, float]:
+    sample = plane.ravel()[:: max(1, plane.size // _SAMPLE_PIXELS)]
+    sample = sample[np.isfinite(sample) & (sample != 0)]
+    if sample.size == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(sample, _PERCENTILES)
+    return float(low), max(float(high), float(low) + 1e-9)
+
+
 def write_png(image: Picture, path: Path) -> None:
     """Write a picture atomically. Raises OutputError."""
     with complete_file(path) as partial:
-        encoded, data = cv2.imencode(".png", image[..., ::-1])
-        if not encoded:
-            raise OutputError(f"{path}: cannot be encoded")
-        partial.write_bytes(data.tobytes())
+        partial.write_bytes(encoded(image[..., ::-1], path))
+
+
+def encoded(image: Picture, path: Path, *options: int) -> bytes:
+    """Return an image, in OpenCV's order of colours, in the format of the path's suffix. Raises OutputError."""
+    is_encoded, data = cv2.imencode(path.suffix, image, options)
+    if not is_encoded:
+        raise OutputError(f"{path}: cannot be encoded")
+    return bytes(data.tobytes())
 
 
 def with_text(

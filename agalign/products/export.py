@@ -1,20 +1,80 @@
-"""Exports of a run for other programs: band files in one folder, or matrices."""
+"""Exports of a run for other programs: band files in one folder, or the mappings as matrices for programs that warp the
+original images themselves.
+
+MicaSense's notebooks undistort each band with OpenCV's optimal new camera matrix, then warp it with
+`cv2.warpPerspective(..., flags=cv2.WARP_INVERSE_MAP)`. With K and N the old and the new camera matrix of a band, and H
+the mapping between undistorted pixels, their matrix is N_band K_band^-1 H K_reference N_reference^-1.
+"""
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.cameras import known_cameras
+from agalign.cameras.folder_walk import natural_order
+from agalign.cameras.read_files import ImageFile, read_file
+from agalign.cameras.scan import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, OutputError
-from agalign.products.export_matrices import AlignedCapture, write_micasense, write_opencv
-from agalign.products.sidecar import Sidecar
+from agalign.products.run_record import read_run_record
+from agalign.products.sidecar import BandPart, Sidecar
 from agalign.products.sidecar_file import read_sidecar, run_sidecars
+from agalign.products.text_files import write_csv
+from agalign.values import geometry, lens
 from agalign.values.choices import ExportProgram
-from agalign.values.files import write_text
+from agalign.values.files import complete_file, write_text
+from agalign.values.geometry import Matrix, Points
+from agalign.values.lens import Lens
 
 NOTE_FILE = "README.txt"
 _IMAGES = "images"
+_NOTES: dict[ExportProgram, str] = {
+    "odm": """\
+OpenDroneMap, WebODM: the bands of each capture are aligned, and have the tags of one camera.
+  --skip-band-alignment --primary-band '{reference}' --radiometric-calibration {calibration}\
+ --texturing-skip-global-seam-leveling
+{reference} is the reference band, which is not resampled.
+The files contain {contents}""",
+    "metashape": """\
+Agisoft Metashape: Workflow, Add Folder, 'Multi-camera system'.
+Tools, Camera Calibration: leave the slave offsets at zero (no 'Adjust location', no 'Adjust rotation').
+Tools, Set Primary Channel: {reference}.""",
+    "pix4d": """\
+Pix4Dmapper, Pix4Dfields: add all images; template 'Ag Multispectral'.
+Leave the rig's relative parameters as 'Known': they are zero, the bands are aligned.
+Radiometric processing needs raw numbers and the captures of the panel from the flight's own folder.""",
+}
+"""Instructions for the other program."""
+_Row = tuple[str, str, str, float]
+"""Capture, band, status, largest distance of the matrix from the complete mapping, px."""
+_TABLE = "matrices.csv"
+
+
+@dataclass(frozen=True)
+class AlignedCapture:
+    """A capture of a run."""
+
+    sidecar: Sidecar
+    path: Path
+    """Path of the sidecar."""
+    folder: Path
+    """Its folder, relative to the output folder of the run."""
+
+    @property
+    def label(self) -> str:
+        """The capture's name below the output folder."""
+        return (self.folder / self.sidecar.capture).as_posix()
+
+    @property
+    def flat_name(self) -> str:
+        """The label as a single file name: the folders of a memory card contain captures of the same name."""
+        return "_".join((*self.folder.parts, self.sidecar.capture))
 
 
 @dataclass
@@ -54,7 +114,7 @@ def export(
         report.files, report.notes = write_opencv(good, target)
     else:
         report.files = _band_files(good, out, target / _IMAGES, copy=copy)
-        report.notes = _NOTES[program](good[0].sidecar)
+        report.notes = _notes(program, good[0].sidecar)
     report.captures = len(good)
     write_text(target / NOTE_FILE, "\n".join(report.notes) + "\n")
     return report
@@ -99,39 +159,157 @@ def _placed(source: Path, target: Path, *, copy: bool) -> Path:
     return target
 
 
-# ---- instructions for the other program
+def _notes(program: ExportProgram, sidecar: Sidecar) -> list[str]:
+    radiometry = None if sidecar.output is None else sidecar.output.radiometry
+    calibration, contents = "none", f"{radiometry}: OpenDroneMap must not calibrate them again."
+    if radiometry is None:
+        calibration = "camera+sun"
+        contents = "raw numbers: camera+sun needs the light sensor's tags; without them use camera."
+    text = _NOTES[program].format(reference=sidecar.reference.band, calibration=calibration, contents=contents)
+    return text.splitlines()
 
 
-def _for_odm(sidecar: Sidecar) -> list[str]:
-    reference, output = sidecar.reference.band, sidecar.output
-    radiometry = None if output is None else output.radiometry
-    calibration = "none" if radiometry is not None else "camera+sun"
-    return [
-        "OpenDroneMap, WebODM: the bands of each capture are aligned, and have the tags of one camera.",
-        f"  --skip-band-alignment --primary-band '{reference}' --radiometric-calibration {calibration}"
-        " --texturing-skip-global-seam-leveling",
-        f"{reference} is the reference band, which is not resampled.",
-        "The files contain raw numbers: camera+sun needs the light sensor's tags; without them use camera."
-        if radiometry is None else f"The files contain {radiometry}: OpenDroneMap must not calibrate them again.",
-    ]  # fmt: skip
+def write_opencv(captures: Sequence[AlignedCapture], target: Path) -> tuple[list[Path], list[str]]:
+    """Write <capture>.npz for each capture, and a table of the distances from the complete mappings.
 
-
-def _for_metashape(sidecar: Sidecar) -> list[str]:
-    return [
-        "Agisoft Metashape: Workflow, Add Folder, 'Multi-camera system'.",
-        "Tools, Camera Calibration: leave the slave offsets at zero (no 'Adjust location', no 'Adjust rotation').",
-        f"Tools, Set Primary Channel: {sidecar.reference.band}.",
+    Returns the files and notes for the user. Raises OutputError.
+    """
+    files: list[Path] = []
+    rows: list[_Row] = []
+    for capture in captures:
+        bands, name = _in_order(capture.sidecar), capture.flat_name
+        grids = [_grid(band) for band in bands]
+        matrices = [geometry.fit_homography(*grid) if len(grid[0]) else geometry.identity() for grid in grids]
+        errors_px = [_max_distance_px(matrix, *grid) for matrix, grid in zip(matrices, grids, strict=True)]
+        rows += [(name, b.band, b.status, error_px) for b, error_px in zip(bands, errors_px, strict=True)]
+        arrays: dict[str, NDArray[np.generic]] = {"bands": np.array([b.band for b in bands])}
+        for k, (points_px, mapped_px) in enumerate(grids):
+            arrays |= {f"grid_reference_px_{k}": points_px, f"grid_moving_px_{k}": mapped_px}
+        arrays |= {"matrices": np.stack(matrices), "max_error_px": np.array(errors_px)}
+        files.append(target / f"{name}.npz")
+        with complete_file(files[-1]) as partial:
+            np.savez(partial, allow_pickle=False, **arrays)
+    return [*files, _write_table(rows, target)], [
+        "OpenCV: <capture>.npz holds `bands`, and `matrices` (n, 3, 3) from raw pixels of the reference to a band's:",
+        "  cv2.warpPerspective(band, matrices[k], (width, height), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP)",
+        "`max_error_px` is the largest distance from the complete mapping, which includes lenses and relief. That is",
+        "sampled in `grid_reference_px_k` and `grid_moving_px_k` (n, 2). (0, 0) is the centre of a pixel.",
+        _largest_distance(rows),
     ]
 
 
-def _for_pix4d(sidecar: Sidecar) -> list[str]:  # noqa: ARG001
-    return [
-        "Pix4Dmapper, Pix4Dfields: add all images; template 'Ag Multispectral'.",
-        "Leave the rig's relative parameters as 'Known': they are zero, the bands are aligned.",
-        "Radiometric processing needs raw numbers and the captures of the panel from the flight's own folder.",
+def write_micasense(
+    captures: Sequence[AlignedCapture], out: Path, target: Path, source: Path | None
+) -> tuple[list[Path], list[str]]:
+    """Write <capture>_warp_matrices.npy for each capture, and <serial>_warp_matrices_opencv.npy for each camera.
+
+    Returns the files and notes for the user. Raises InputError if the original images cannot be read,
+    ConfigurationError for other cameras, OutputError.
+    """
+    run = read_run_record(out)
+    folder = source or (None if run is None else Path(run.input))
+    if folder is None:
+        raise InputError(f"{out}: does not name the folder of the images; give it with --source")
+    files: list[Path] = []
+    rows: list[_Row] = []
+    by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
+    first = captures[0].sidecar.reference
+    for capture in captures:
+        bands, name = _in_order(capture.sidecar), capture.flat_name
+        images = [_original(folder / capture.folder / band.file) for band in bands]
+        reference = next(i for i, b in zip(images, bands, strict=True) if b.status == "reference")
+        results = [_in_notebook_px(band, reference, image) for band, image in zip(bands, images, strict=True)]
+        rows += [(name, b.band, b.status, error_px) for b, (_, error_px) in zip(bands, results, strict=True)]
+        stacked = np.stack([matrix for matrix, _ in results])
+        by_camera[images[0].tags.serial or "camera"].append(stacked)
+        files.append(_write_npy(target / f"{name}_warp_matrices.npy", stacked))
+    for serial, of_camera in by_camera.items():
+        complete = [m for m in of_camera if m.shape == of_camera[0].shape]
+        matrices_of_camera = _nearest_to_median(complete, first.size_px)
+        files.append(_write_npy(target / f"{serial}_warp_matrices_opencv.npy", matrices_of_camera))
+    return [*files, _write_table(rows, target)], [
+        "MicaSense imageprocessing: put <serial>_warp_matrices_opencv.npy next to the notebook; it loads that file.",
+        "It is of the most typical capture: for one capture use its own <capture>_warp_matrices.npy,",
+        "  warp_matrices = [m.astype('float32') for m in numpy.load(FILE)]",
+        f"Match index: the place of {first.band} among the bands; warp mode: cv2.MOTION_HOMOGRAPHY.",
+        "Relief and the lenses' displacement fields are not in a matrix; matrices.csv has the largest distance.",
+        _largest_distance(rows),
     ]
 
 
-_NOTES: dict[ExportProgram, Callable[[Sidecar], list[str]]] = {
-    "odm": _for_odm, "metashape": _for_metashape, "pix4d": _for_pix4d,
-}  # fmt: skip
+def _in_order(sidecar: Sidecar) -> list[BandPart]:
+    """The bands in the order of their numbers in the file names."""
+    return sorted(sidecar.bands, key=lambda b: (natural_order(b.file), b.band_index))
+
+
+def _grid(band: BandPart) -> tuple[Points, Points]:
+    """(raw pixels (n, 2) of the reference, corresponding raw pixels of the band); n = 0 for the reference itself."""
+    if band.grid is None:
+        return np.empty((0, 2)), np.empty((0, 2))
+    return np.array(band.grid.reference_px), np.array(band.grid.moving_px)
+
+
+def _original(path: Path) -> ImageFile:
+    if not path.is_file():
+        raise InputError(f"{path}: the image is not there; give the folder of the flight's images with --source")
+    return read_file(path, known_cameras(), DiscoverOptions())
+
+
+def _in_notebook_px(band: BandPart, reference: ImageFile, image: ImageFile) -> tuple[Matrix, float]:
+    """(the matrix between the pixels that the notebooks warp, its largest distance from the complete mapping, px)."""
+    reference_lens, band_lens = _lens(reference), _lens(image)
+    new_reference, new_band = _new_camera_matrix(reference_lens, reference), _new_camera_matrix(band_lens, image)
+    points_px, mapped_px = _grid(band)
+    undistorted, mapped = lens.undistort(reference_lens, points_px), lens.undistort(band_lens, mapped_px)
+    homography = band.homography
+    if not len(points_px):
+        matrix = geometry.identity()
+    elif homography is not None and homography.space == "undistorted":
+        matrix = np.array(homography.fixed_to_moving)
+    else:
+        matrix = geometry.fit_homography(undistorted, mapped)
+    error_px = _max_distance_px(matrix, undistorted, mapped)
+    to_new, from_new = new_band @ np.linalg.inv(band_lens.matrix), reference_lens.matrix @ np.linalg.inv(new_reference)
+    return geometry.compose(to_new, matrix, from_new), error_px
+
+
+def _lens(image: ImageFile) -> Lens:
+    result = image.bands[0].lens if image.bands else None
+    if image.camera.name != "MicaSense" or result is None:
+        raise ConfigurationError(f"{image.path}: no lens tags of a MicaSense camera; use --for opencv")
+    return result
+
+
+def _new_camera_matrix(band_lens: Lens, image: ImageFile) -> Matrix:
+    distortion = np.array((*band_lens.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5])  # k1, k2, p1, p2, k3
+    matrix, _ = cv2.getOptimalNewCameraMatrix(band_lens.matrix, distortion, image.bands[0].size_px, 1)
+    return np.asarray(matrix, np.float64)
+
+
+def _nearest_to_median(captures: Sequence[NDArray[np.float64]], size_px: tuple[int, int]) -> NDArray[np.float64]:
+    """The matrices (bands, 3, 3) of the capture whose mapped corners are nearest to the median of all captures."""
+    corners_px = geometry.corners(*size_px)
+    mapped = np.array([[geometry.apply(m, corners_px) for m in matrices] for matrices in captures])
+    distances_px = np.linalg.norm(mapped - np.median(mapped, axis=0), axis=-1)
+    return captures[int(distances_px.mean(axis=(1, 2)).argmin())]
+
+
+def _max_distance_px(matrix: Matrix, points_px: Points, mapped_px: Points) -> float:
+    distances_px = np.linalg.norm(geometry.apply(matrix, points_px) - mapped_px, axis=1)
+    return float(distances_px.max(initial=0.0))
+
+
+def _largest_distance(rows: Sequence[_Row]) -> str:
+    capture, band, _, error_px = max(rows, key=lambda row: row[3])
+    return f"Largest distance from the complete mapping: {error_px:.2f} px ({capture} {band})."
+
+
+def _write_table(rows: Sequence[_Row], target: Path) -> Path:
+    write_csv(target / _TABLE, ("capture", "band", "status", "max_error_px"), ((*r[:3], f"{r[3]:.4f}") for r in rows))
+    return target / _TABLE
+
+
+def _write_npy(path: Path, matrices: NDArray[np.float64]) -> Path:
+    with complete_file(path) as partial:
+        np.save(partial, matrices)
+    return path

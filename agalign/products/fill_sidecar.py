@@ -1,54 +1,25 @@
 """The sidecar of a capture, from its alignments and the files that were written."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
-from pathlib import Path
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
 from agalign._version import __version__
 from agalign.flight.fingerprint import fingerprint
-from agalign.products.band_files import BandFiles
+from agalign.products.aligned_files import BandFiles, Stack
 from agalign.products.product import ProductContext, WrittenFile
 from agalign.products.relief_map import ReliefMap
-from agalign.products.sidecar import (
-    BandPart,
-    CameraPart,
-    FieldPart,
-    FilePart,
-    GeometryPart,
-    GridPart,
-    HomographyPart,
-    IssuePart,
-    JointPart,
-    LensPart,
-    Matrix3x3,
-    MetricsPart,
-    OutputPart,
-    PlacePart,
-    PositionPart,
-    PredictionPart,
-    ProductPart,
-    ReferencePart,
-    ReliefPart,
-    ResidualTile,
-    SeedPart,
-    Sidecar,
-    SimilarityPart,
-    is_delivered,
-)
-from agalign.products.stack import Stack
+from agalign.products.sidecar import BandPart, Sidecar, is_delivered
 from agalign.values import geometry
-from agalign.values.alignment import JointResult, Prediction, Residual
-from agalign.values.capture import Band, Capture
+from agalign.values.alignment import Residual
+from agalign.values.capture import Band
 from agalign.values.choices import CaptureStatus
-from agalign.values.displacement import DisplacementField
 from agalign.values.files import file_checksum
-from agalign.values.geometry import Matrix, Points
-from agalign.values.lens import Lens
+from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.relief import Relief
@@ -64,8 +35,7 @@ errors are at the border, where the derivatives are estimated from one side."""
 def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:
     """Return `ok` if every moving band is delivered, `failed` if all failed, else `degraded`."""
     moving = [b for b in bands if b.status != "reference"]
-    predicted_px = [None if b.prediction is None else b.prediction.std_px for b in moving]
-    if all(is_delivered(b.status, px, accept_predicted_px) for b, px in zip(moving, predicted_px, strict=True)):
+    if all(is_delivered(b.status, b.prediction, accept_predicted_px) for b in moving):
         return "ok"
     return "failed" if all(b.status == "failed" for b in moving) else "degraded"
 
@@ -79,72 +49,52 @@ def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Side
     bands = [_band_part(context, band) for band in capture.bands]
     accept_predicted_px = context.settings.check.accept_predicted_px
     status = capture_status(bands, accept_predicted_px)
-    return Sidecar(
-        agalign=__version__,
-        capture=capture.name,
-        capture_id=capture.capture_id,
-        flight_id=capture.flight_id,
-        captured_at=capture.captured_at,
-        position=None if capture.position is None else PositionPart(**asdict(capture.position)),
-        camera=CameraPart(make=capture.camera.make, model=capture.camera.model, serial=capture.camera.serial),
-        status="degraded" if status == "ok" and capture.missing_bands else status,
-        missing_bands=list(capture.missing_bands),
-        reference=ReferencePart(
-            band=reference.name,
-            file=reference.path.name,
-            band_index=reference.band_index,
-            width=reference.width_px,
-            height=reference.height_px,
-        ),
-        bands=bands,
-        output=_output_part(context) if context.layers else None,
-        preview=next((f.preview for f in context.written if f.preview is not None), None),
-        accept_predicted_px=accept_predicted_px,
-        products=[_product_part(file, context) for file in context.written],
-        not_written=list(not_written),
-        settings=fingerprint(capture, context.settings),
-    )
+    facts = {
+        "agalign": __version__,
+        "capture": capture.name,
+        "capture_id": capture.capture_id,
+        "flight_id": capture.flight_id,
+        "captured_at": capture.captured_at,
+        "position": capture.position,
+        "camera": capture.camera,
+        "status": "degraded" if status == "ok" and capture.missing_bands else status,
+        "missing_bands": capture.missing_bands,
+        "reference": _source(reference) | {"width": reference.width_px, "height": reference.height_px},
+        "bands": bands,
+        "output": _output(context) if context.layers else None,
+        "preview": next((f.preview for f in context.written if f.preview is not None), None),
+        "accept_predicted_px": accept_predicted_px,
+        "products": [_file(f, context) | {"kind": f.kind, "sha256": file_checksum(f.path)} for f in context.written],
+        "not_written": not_written,
+        "settings": fingerprint(capture, context.settings),
+    }
+    return Sidecar.model_validate(facts)
 
 
-def _output_part(context: ProductContext) -> OutputPart:
+def _output(context: ProductContext) -> dict[str, Any]:
     """The stack and the band files; older readers use these fields instead of `products`."""
-    stacks, band_files = _file_parts(Stack.kind, context), _file_parts(BandFiles.kind, context)
-    stack = stacks[0] if stacks else None
-    values = {part.nodata for part in stacks or band_files}
-    grid = context.grid
-    return OutputPart(
-        file=None if stack is None else stack.file,
-        bytes=None if stack is None else stack.bytes,
-        band_files=band_files,
-        radiometry=None if context.write_settings.radiometry == "off" else _radiometry(context.capture),
-        crop=(grid.x0, grid.y0, grid.width, grid.height),
-        scale=(grid.scale.x, grid.scale.y),
-        undistorted=grid.undistorted,
-        nodata=values.pop() if len(values) == 1 else None,
+    stacks, band_files = (
+        [_file(f, context) | {"nodata": _nodata(f.nodata)} for f in context.written if f.kind == kind]
+        for kind in (Stack.kind, BandFiles.kind)
     )
-
-
-def _file_parts(kind: str, context: ProductContext) -> list[FilePart]:
-    return [
-        FilePart(file=_name(file.path, context), bytes=file.path.stat().st_size, nodata=_nodata(file.nodata))
-        for file in context.written
-        if file.kind == kind
-    ]
-
-
-def _product_part(file: WrittenFile, context: ProductContext) -> ProductPart:
-    """Raises OutputError."""
-    checksum, size = file_checksum(file.path), file.path.stat().st_size
-    return ProductPart(kind=file.kind, file=_name(file.path, context), bytes=size, sha256=checksum)
-
-
-def _name(path: Path, context: ProductContext) -> str:
-    return path.relative_to(context.paths.folder).as_posix()
-
-
-def _radiometry(capture: Capture) -> str | None:
+    stack = stacks[0] if stacks else {"file": None, "bytes": None}
+    values = {part["nodata"] for part in stacks or band_files}
+    grid, capture = context.grid, context.capture
     names = dict.fromkeys(f"{b.radiometry.quantity} by {b.radiometry.source}" for b in capture.bands if b.radiometry)
-    return " and ".join(names) or None
+    return {
+        "file": stack["file"],
+        "bytes": stack["bytes"],
+        "band_files": band_files,
+        "radiometry": None if context.write_settings.radiometry == "off" else " and ".join(names) or None,
+        "crop": (grid.x0, grid.y0, grid.width, grid.height),
+        "scale": grid.scale,
+        "undistorted": grid.undistorted,
+        "nodata": values.pop() if len(values) == 1 else None,
+    }
+
+
+def _file(file: WrittenFile, context: ProductContext) -> dict[str, Any]:
+    return {"file": context.paths.relative(file.path), "bytes": file.path.stat().st_size}
 
 
 def _nodata(value: float | None) -> float | str | None:
@@ -152,23 +102,69 @@ def _nodata(value: float | None) -> float | str | None:
     return "nan" if value is not None and math.isnan(value) else value
 
 
-def _place(context: ProductContext, band: Band) -> PlacePart | None:
-    """The file with the aligned pixels of a band; None if all of them are nodata."""
-    place = context.places.get(band.name)
-    return None if place is None else PlacePart(file=_name(place[0], context), band_index=place[1])
+def _source(band: Band) -> dict[str, Any]:
+    return {"band": band.name, "file": band.path.name, "band_index": band.band_index}
 
 
 def _band_part(context: ProductContext, band: Band) -> BandPart:
-    place = _place(context, band)
-    if band is not context.capture.reference:
-        return _moving_part(context, band, place)
-    return BandPart(
-        band=band.name, wavelength_nm=band.wavelength_nm, file=band.path.name, band_index=band.band_index,
-        status="reference", reason=None, place=place, seconds=0.0,
-    )  # fmt: skip
+    place = context.places.get(band.name)  # None if all pixels are nodata
+    facts = _source(band) | {
+        "wavelength_nm": band.wavelength_nm,
+        "place": None if place is None else {"file": context.paths.relative(place[0]), "band_index": place[1]},
+    }
+    if band is context.capture.reference:
+        return BandPart.model_validate(facts | {"status": "reference", "reason": None, "seconds": 0.0})
+    alignment = context.alignments[band.name]
+    mapping, residual, size_px = alignment.mapping, alignment.residual, context.capture.reference.size_px
+    grid_px = _grid_px(mapping.of_the_plane, size_px)
+    lenses = (mapping.fixed_lens, mapping.moving_lens)
+    field = mapping.local
+    if field is not None:
+        field = field.on_lattice(field.step_px / field.scale.mean, size_px)
+    facts |= {
+        "status": alignment.status,
+        "reason": alignment.reason,
+        "issues": alignment.issues,
+        "homography": alignment,
+        "seed": alignment.seed,
+        "grid": {"reference_px": grid_px, "moving_px": mapping(grid_px)},
+        "joint": alignment.joint,
+        "metrics": {
+            "before": dict(alignment.before),
+            "after": dict(alignment.after) | _residual(residual),
+            "tiles": _tiles(residual),
+        },
+        "geometry": {"kind": alignment.geometry, "held_out_p95_px": alignment.candidates},
+        "lenses": None if None in lenses else lenses,
+        "field": field,
+        "relief": _relief(context, mapping, grid_px),
+        "prediction": alignment.prediction,
+        "seconds": alignment.seconds,
+    }
+    part = BandPart.model_validate(facts)
+    if part.joint is not None:
+        part.joint.accepted = alignment.status == "aligned"
+    return part
 
 
-def _relief_part(context: ProductContext, mapping: PixelMapping, nodes_px: Points) -> ReliefPart | None:
+def _residual(residual: Residual[FixedFilePx] | None) -> dict[str, float]:
+    if residual is None:
+        return {}
+    return {
+        "residual_px": residual.median_px,
+        "residual_p95_px": residual.p95_px,
+        "residual_coverage": residual.coverage,
+    }
+
+
+def _tiles(residual: Residual[FixedFilePx] | None) -> list[dict[str, Any]]:
+    if residual is None:
+        return []
+    windows = zip(residual.centres_px.tolist(), residual.shifts_px.tolist(), strict=True)
+    return [{"centre_px": centre_px, "shift_px": shift_px} for centre_px, shift_px in windows]
+
+
+def _relief(context: ProductContext, mapping: PixelMapping, nodes_px: Points) -> dict[str, Any] | None:
     parallax = mapping.parallax
     if parallax is None:
         return None
@@ -178,59 +174,14 @@ def _relief_part(context: ProductContext, mapping: PixelMapping, nodes_px: Point
         replace(mapping, parallax=replace(parallax, relief=Relief(flat + parallax_px, flat)))(nodes_px)
         for parallax_px in (0, 1)
     )
-    file = next((f.path for f in context.written if f.kind == ReliefMap.kind), None)
-    occluded = 0.0 if parallax.hidden is None else float(parallax.hidden.mean())
-    return ReliefPart(
-        file=None if file is None else _name(file, context), baseline=parallax.baseline, occluded=round(occluded, 4),
-        reference_px=_points(nodes_px), plane_px=_points(at_zero), slope=_points(at_one - at_zero),
-    )  # fmt: skip
-
-
-def _moving_part(context: ProductContext, band: Band, place: PlacePart | None) -> BandPart:
-    reference, alignment = context.capture.reference, context.alignments[band.name]
-    joint, residual = alignment.joint, alignment.residual
-    mapping = alignment.mapping
-    grid_px = _grid_px(mapping.of_the_plane, reference.size_px)
-    after = dict(alignment.after) | _residual_metrics(residual)
-    return BandPart(
-        band=band.name,
-        wavelength_nm=band.wavelength_nm,
-        file=band.path.name,
-        band_index=band.band_index,
-        status=alignment.status,
-        reason=alignment.reason,
-        doubts=[IssuePart(kind=d.code, value=_finite(d.value), limit=_finite(d.limit)) for d in alignment.issues],
-        homography=HomographyPart(fixed_to_moving=_rows(alignment.fixed_to_moving), space=alignment.space),
-        seed=SeedPart(
-            kind=alignment.seed.kind,
-            fixed_to_moving=_rows(alignment.seed.fixed_to_moving),
-            peak_sigma=alignment.seed.peak_sigma,
-            runner_up_sigma=alignment.seed.runner_up_sigma,
-        ),
-        grid=GridPart(reference_px=_points(grid_px), moving_px=_points(mapping(grid_px))),
-        joint=None if joint is None else _joint_part(joint, accepted=alignment.status == "aligned"),
-        metrics=MetricsPart(
-            before=_similarity_part(alignment.before), after=_similarity_part(after), tiles=_tile_parts(residual)
-        ),
-        geometry=GeometryPart(
-            kind=alignment.geometry, held_out_p95_px={k: _finite(round(v, 4)) for k, v in alignment.candidates.items()}
-        ),
-        lenses=_lens_parts(mapping),
-        field=None if mapping.local is None else _field_part(mapping.local, reference.size_px),
-        relief=_relief_part(context, mapping, grid_px),
-        prediction=None if alignment.prediction is None else _prediction_part(alignment.prediction),
-        place=place,
-        seconds=round(alignment.seconds, 3),
-    )
-
-
-def _residual_metrics(residual: Residual[FixedFilePx] | None) -> dict[str, float]:
-    if residual is None:
-        return {}
-    coverage = {"residual_coverage": residual.coverage}
-    if not math.isfinite(residual.median_px):
-        return coverage
-    return {"residual_px": residual.median_px, "residual_p95_px": residual.p95_px} | coverage
+    return {
+        "file": next((context.paths.relative(f.path) for f in context.written if f.kind == ReliefMap.kind), None),
+        "baseline": parallax.baseline,
+        "occluded": 0.0 if parallax.hidden is None else float(parallax.hidden.mean()),
+        "reference_px": nodes_px,
+        "plane_px": at_zero,
+        "slope": at_one - at_zero,
+    }
 
 
 def _grid_px(mapping: PixelMapping, size_px: tuple[int, int]) -> Points:
@@ -250,62 +201,3 @@ def _grid_px(mapping: PixelMapping, size_px: tuple[int, int]) -> Points:
             break
         points_px = finer_px
     return points_px
-
-
-def _lens_parts(mapping: PixelMapping) -> tuple[LensPart, LensPart] | None:
-    if mapping.fixed_lens is None or mapping.moving_lens is None:
-        return None
-    return _lens_part(mapping.fixed_lens), _lens_part(mapping.moving_lens)
-
-
-def _lens_part(lens: Lens) -> LensPart:
-    return LensPart(**(asdict(lens) | {"distortion": list(lens.distortion)}))
-
-
-def _field_part(field: DisplacementField, size_px: tuple[int, int]) -> FieldPart:
-    on_file = field.on_lattice(field.step_px / field.scale.mean, size_px)
-    return FieldPart(step_px=on_file.step_px, displacements_px=[_points(row) for row in on_file.displacements_px])
-
-
-def _prediction_part(prediction: Prediction) -> PredictionPart:
-    off_px = None if prediction.off_px is None else round(prediction.off_px, 4)
-    return PredictionPart(source=prediction.source, std_px=round(prediction.std_px, 4), off_px=off_px)
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
-def _joint_part(joint: JointResult[FixedFilePx], *, accepted: bool) -> JointPart:
-    return JointPart(
-        accepted=accepted, loss=_finite(joint.loss), retrieval=joint.retrieval, chance=joint.chance,
-        iterations=joint.iterations, levels=list(joint.levels), recipe=joint.recipe, model_family=joint.model_family,
-        last_step_px=joint.last_step_px, corner_std_px=round(joint.corner_std_px, 6),
-        corner_std_xy_px=[(round(x, 4), round(y, 4)) for x, y in joint.corner_std_xy_px],
-    )  # fmt: skip
-
-
-def _similarity_part(metrics: Mapping[str, float]) -> SimilarityPart:
-    # Digits beyond the sixth depend on the order in which threads add up.
-    return SimilarityPart(**{k: round(v, 6) if math.isfinite(v) else None for k, v in metrics.items()})
-
-
-def _tile_parts(residual: Residual[FixedFilePx] | None) -> list[ResidualTile]:
-    if residual is None:
-        return []
-    return [
-        ResidualTile(
-            centre_px=(round(c[0], 2), round(c[1], 2)),
-            shift_px=(round(s[0], 4), round(s[1], 4)) if math.isfinite(s[0]) else (None, None),
-        )
-        for c, s in zip(residual.centres_px.tolist(), residual.shifts_px.tolist(), strict=True)
-    ]
-
-
-def _rows(matrix: Matrix) -> Matrix3x3:
-    a, b, c = (tuple(row) for row in matrix.tolist())
-    return a, b, c
-
-
-def _points(points_px: NDArray[np.float64]) -> list[tuple[float, float]]:
-    return [(x, y) for x, y in np.round(points_px, 4).tolist()]

@@ -44,22 +44,25 @@ class FlightMap:
             geometry = {"type": "Polygon", "coordinates": [ring[::-1].round(_DECIMALS).tolist()]}
         elif position is not None:
             geometry = {"type": "Point", "coordinates": [position.longitude, position.latitude]}
-        by_pose = ring is not None and capture.reference.georeference is None and pose is not None
+        georeference = capture.reference.georeference
+        accuracy_m = None if georeference is None else georeference.accuracy_m
+        if ring is not None and georeference is None and pose is not None:
+            accuracy_m = accuracy_of_footprint_m(shown)
         properties = {
-            "capture": capture.label, "status": status,
-            "camera": f"{capture.camera.make} {capture.camera.model}".strip(), "captured_at": capture.captured_at,
-            "longitude": None if position is None else position.longitude,
-            "latitude": None if position is None else position.latitude,
-            "altitude_m": None if position is None else position.altitude_m,
+            "capture": capture.label,
+            "status": status,
+            "camera": f"{capture.camera.make} {capture.camera.model}".strip(),
+            "captured_at": capture.captured_at,
+            **{name: getattr(position, name, None) for name in ("longitude", "latitude", "altitude_m")},
             "height_m": None if pose is None or pose.height_m is None else round(pose.height_m, 1),
             "height_from": None if pose is None or pose.height_m is None else pose.height_from,
             "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
-            "accuracy_m": accuracy_of_footprint_m(shown) if by_pose else _georeference_accuracy_m(capture),
-        }  # fmt: skip
-        properties |= _of_result(result) | _links(capture, result)
-        self._features[capture.label] = {
-            "type": "Feature", "id": capture.label, "geometry": geometry, "properties": properties,
-        }  # fmt: skip
+            "accuracy_m": accuracy_m,
+            **_of_result(result),
+            **_links(capture, result),
+        }
+        feature = {"type": "Feature", "id": capture.label, "geometry": geometry, "properties": properties}
+        self._features[capture.label] = feature
 
     def write(self) -> Path | None:
         """Write the file atomically and return it; None if no capture has a position. Raises OutputError.
@@ -125,20 +128,17 @@ def _links(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
     files = [(part.kind, (paths.folder / part.file).as_posix()) for part in result.products]
     by_kind = dict(files)
     return {
-        "sidecar": paths.sidecar.as_posix(), "stack": by_kind.get("stack"), "picture": by_kind.get("picture"),
+        "sidecar": paths.sidecar.as_posix(),
+        "stack": by_kind.get("stack"),
+        "picture": by_kind.get("picture"),
         "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
-    }  # fmt: skip
+    }
 
 
 def _grid(capture: Capture, result: CaptureResult | None) -> OutputGrid:
     if result is None or result.output is None:
         return OutputGrid(0, 0, *capture.reference.size_px)
     return OutputGrid(*result.output.crop, PixelScale(*result.output.scale))
-
-
-def _georeference_accuracy_m(capture: Capture) -> float | None:
-    georeference = capture.reference.georeference
-    return None if georeference is None else georeference.accuracy_m
 
 
 def _of_result(result: CaptureResult | None) -> dict[str, Any]:

@@ -63,9 +63,7 @@ def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.flo
     # Rays rotated by the pitch, then by the roll: components (forward, right, downward).
     pitch, roll, heading = np.radians((pose.pitch_deg, pose.roll_deg, pose.heading_deg))
     forward, downward = -down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) + down * np.sin(pitch)
-    right, downward = (
-        right * np.cos(roll) - downward * np.sin(roll), downward * np.cos(roll) + right * np.sin(roll),
-    )  # fmt: skip
+    right, downward = (right * np.cos(roll) - downward * np.sin(roll), downward * np.cos(roll) + right * np.sin(roll))
     if not (downward > 0).all():
         return None
     forward_m, right_m = pose.height_m * forward / downward, pose.height_m * right / downward

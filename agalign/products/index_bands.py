@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from agalign.errors import InputError
-from agalign.pixels.raster import innermost_cause, open_raster
+from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
 from agalign.products.sidecar import CaptureResult, is_delivered
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 from agalign.values.quality import UNUSABLE
@@ -59,10 +58,9 @@ def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> 
     result = []
     # Layer 1 of the quality raster is that of all bands together.
     for layer, part in enumerate(sidecar.bands, start=2):
-        std_px = None if part.prediction is None else part.prediction.std_px
         problem = ""
-        if not is_delivered(part.status, std_px, limit_px) or part.place is None:
-            error = "" if std_px is None else f" to {std_px:.1f} px, not {limit_px:g}"
+        if not is_delivered(part.status, part.prediction, limit_px) or part.place is None:
+            error = "" if part.prediction is None else f" to {part.prediction.std_px:.1f} px, not {limit_px:g}"
             problem = f"{part.band} is {part.status}{error} ({part.reason})"
         file, index = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
         quality = (folder / flags.file, layer, flags.sha256) if mask_qa and flags is not None else None
@@ -85,9 +83,9 @@ class BandReader(ExitStack):
 
     def __init__(self) -> None:
         super().__init__()
-        self._files: dict[Path, rasterio.DatasetReader] = {}
+        self._files: dict[Path, OpenRaster] = {}
 
-    def file(self, path: Path, index: int) -> rasterio.DatasetReader:
+    def file(self, path: Path, index: int) -> OpenRaster:
         """Return the open file. Raises InputError if it cannot be read or has no band `index`, counted from 1."""
         if path not in self._files:
             self._files[path] = self.enter_context(open_raster(path))
@@ -129,9 +127,7 @@ class BandReader(ExitStack):
         return result
 
 
-def _scaled(
-    source: rasterio.DatasetReader, index: int, window: Window, shape: tuple[int, int] | None = None
-) -> FloatImage:
+def _scaled(source: OpenRaster, index: int, window: Window, shape: tuple[int, int] | None = None) -> FloatImage:
     """A window in the unit of the file's scale and offset, nan for nodata, resampled to `shape` (height, width)."""
     scale, offset, nodata = source.scales[index - 1], source.offsets[index - 1], source.nodatavals[index - 1]
     pixels = _read(source, index, window, shape).astype(np.float32)
@@ -145,9 +141,8 @@ def _scaled(
 
 
 def _read(
-    source: rasterio.DatasetReader, index: int, window: Window, shape: tuple[int, int] | None = None, *,
-    masks: bool = False,
-) -> NDArray[Any]:  # fmt: skip
+    source: OpenRaster, index: int, window: Window, shape: tuple[int, int] | None = None, *, masks: bool = False
+) -> NDArray[Any]:
     """The pixels of a window, or their masks. Raises InputError."""
     try:
         return np.asarray((source.read_masks if masks else source.read)(index, window=window, out_shape=shape))

@@ -10,8 +10,7 @@ from agalign.errors import ConfigurationError, InputError
 from agalign.products.index_bands import IndexBand
 from agalign.products.index_rasters import write_rasters
 from agalign.products.indices import bands_for, index_named
-from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import GEOTIFF
+from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.sidecar import is_delivered
 from agalign.values.capture import Band, Capture
 from agalign.values.files import file_checksum
@@ -22,10 +21,7 @@ class IndexRasters(Product):
 
     kind = "index"
     is_required = False
-
-    def is_enabled(self, settings: WriteSettings) -> bool:
-        """True with `--index`."""
-        return bool(settings.indices)
+    option = "indices"
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
         """Return <capture>_<index>.tif and .png."""
@@ -83,13 +79,12 @@ def _bands(context: ProductContext) -> list[IndexBand]:
     checksums: dict[Path, str] = {}
     result = []
     for band in context.capture.bands:
-        alignment = context.alignments.get(band.name)  # None for the reference
-        status = "reference" if alignment is None else alignment.status
-        prediction = None if alignment is None else alignment.prediction
-        delivered = is_delivered(status, None if prediction is None else prediction.std_px, limit_px)
+        alignment = context.alignments.get(band.name)
+        status, prediction = ("reference", None) if alignment is None else (alignment.status, alignment.prediction)
         file, index = places.get(band.name, (Path(), 1))
-        problem = "" if delivered and band.name in places else f"{band.name} is {status}"
-        if not problem and file not in checksums:
+        delivered = band.name in places and is_delivered(status, prediction, limit_px)
+        if delivered and file not in checksums:
             checksums[file] = file_checksum(file)
+        problem = "" if delivered else f"{band.name} is {status}"
         result.append(IndexBand(band.name, band.wavelength_nm, file, index, checksums.get(file, ""), problem))
     return result

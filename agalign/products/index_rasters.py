@@ -8,7 +8,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
@@ -16,54 +18,36 @@ from numpy.typing import NDArray
 from agalign._version import __version__
 from agalign.errors import AgalignError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.products.checked_raster import CheckedRaster, check_complete, checked_raster, tiled_profile
-from agalign.products.index_bands import RAW, BandReader, IndexBand
-from agalign.products.index_picture import picture_size, write_picture
-from agalign.products.index_statistics import (
-    NO_STATISTICS,
-    STATISTICS_TAG,
-    IndexStatistics,
-    read_statistics,
-    statistics_in,
+from agalign.products.checked_raster import (
+    FLOAT_OPTIONS,
+    WORK_TILE_PX,
+    CheckedRaster,
+    LayerDescription,
+    check_complete,
+    checked_raster,
+    tiled_profile,
 )
+from agalign.products.drawing import with_text, write_png
+from agalign.products.index_bands import RAW, BandReader, IndexBand
+from agalign.products.index_table import STATISTICS_TAG, IndexReport, IndexStatistics, read_statistics, statistics_in
 from agalign.products.indices import Index, bands_for, compute
 from agalign.values.image import FloatImage, Tile
 from agalign.values.resample import tiles
 
-_WORK_TILE_PX = 2048
-"""Side of the tiles that are calculated one after another: it limits the memory."""
 _MAX_STATISTICS_PX = 4_000_000
 """Percentiles of larger rasters are calculated from every second, third … row and column."""
 _MIN_SPAN = 1e-3
 """Smallest difference between the ends of the colour scale of a picture."""
 _SOURCE_TAG = "INDEX_MADE_FROM"
-_COPIED_TAGS = (
-    "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M",
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class IndexReport:
-    """The result of one index of one capture."""
-
-    capture: str
-    index: str
-    path: Path | None = None
-    """The raster; None if it could not be written."""
-    statistics: IndexStatistics = NO_STATISTICS
-    problem: str = ""
-    kept: bool = False
-    """True if an earlier command wrote the raster from the same bands with the same formula."""
-
-    @property
-    def median(self) -> float:
-        """Median of the valid pixels."""
-        return self.statistics.median
-
-    @property
-    def raw_numbers(self) -> bool:
-        """True if the bands are neither reflectance nor radiance."""
-        return self.statistics.unit == RAW
+_COPIED_TAGS = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
+_BARS = 120
+_PICTURE_PX = 720
+"""Longer side of the image at the top left of the picture; the report overlays it on the composite."""
+_COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
+"""Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
+_NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
+"""Greys for raw numbers, whose values do not distinguish soil and vegetation."""
+_NODATA_COLOUR = (225, 190, 215)
 
 
 @dataclass
@@ -178,9 +162,7 @@ def _write(rasters: Sequence[_Raster], reader: BandReader) -> list[IndexStatisti
     """Write rasters tile by tile, reading each band once. Raises OutputError, InputError for a band."""
     first = rasters[0].bands[0]
     like = reader.file(first.file, first.band_index)
-    profile = tiled_profile(
-        like.width, like.height, 1, "float32", nodata=math.nan, compress="deflate", predictor=3
-    )  # fmt: skip
+    profile = tiled_profile(like.width, like.height, 1, "float32", **FLOAT_OPTIONS)
     if like.crs is not None and not like.transform.is_identity:
         profile |= {"crs": like.crs, "transform": like.transform}
     step = max(1, math.ceil(math.sqrt(like.width * like.height / _MAX_STATISTICS_PX)))
@@ -188,7 +170,7 @@ def _write(rasters: Sequence[_Raster], reader: BandReader) -> list[IndexStatisti
         for raster in rasters:
             raster.file = stack.enter_context(checked_raster(raster.target, profile))
             _describe(raster, like)
-        for tile in tiles(Tile(0, 0, like.width, like.height), _WORK_TILE_PX):
+        for tile in tiles(Tile(0, 0, like.width, like.height), WORK_TILE_PX):
             _write_tile(rasters, reader, tile, step)
         statistics = [_statistics(raster, like.width * like.height) for raster in rasters]
         for raster, one in zip(rasters, statistics, strict=True):
@@ -197,12 +179,12 @@ def _write(rasters: Sequence[_Raster], reader: BandReader) -> list[IndexStatisti
 
 
 def _describe(raster: _Raster, like: OpenRaster) -> None:
-    index, dataset = raster.index, raster.file.dataset
-    dataset.set_band_description(1, index.name)
+    index = raster.index
     tags = {k: v for k, v in like.tags().items() if k in _COPIED_TAGS}
     tags |= {"TIFFTAG_SOFTWARE": "agalign", "INDEX": index.name, "INDEX_SOURCE": index.source}
     tags |= {"INDEX_FORMULA": _formula_text(index), _SOURCE_TAG: raster.source}
-    dataset.update_tags(**tags, **({"INPUT": "raw numbers, not reflectance"} if raster.unit == RAW else {}))
+    tags["INPUT"] = "raw numbers, not reflectance" if raster.unit == RAW else ""
+    raster.file.describe([LayerDescription(index.name)], tags)
 
 
 def _write_tile(rasters: Sequence[_Raster], reader: BandReader, tile: Tile, step: int) -> None:
@@ -239,8 +221,51 @@ def _draw(raster: _Raster, statistics: IndexStatistics) -> None:
     with open_raster(raster.target) as dataset:
         width, height = picture_size(dataset.width, dataset.height)
         values = dataset.read(1, out_shape=(height, width))
-    is_raw = raster.unit == RAW
     capture = raster.target.stem.removesuffix(f"_{raster.index.name}")
-    title = f"{raster.index.name.upper()} of {capture}" + (": raw numbers, not reflectance" if is_raw else "")
-    span = statistics.low, statistics.high
-    write_picture(values, raster.samples[0], span, title, raster.target.with_suffix(".png"), neutral=is_raw)
+    note = ": raw numbers, not reflectance" if raster.unit == RAW else ""
+    title = f"{raster.index.name.upper()} of {capture}{note}"
+    write_picture(values, raster.samples[0], statistics, title, raster.target.with_suffix(".png"))
+
+
+def picture_size(width: int, height: int) -> tuple[int, int]:
+    """Return (width, height) px of the image in the picture of a raster of this size."""
+    scale = min(1.0, _PICTURE_PX / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def write_picture(
+    values: NDArray[np.float32], sample: NDArray[np.float32], statistics: IndexStatistics, title: str, path: Path
+) -> None:
+    """Write an image (height, width) of an index and the histogram of a sample of its values in the same colours.
+
+    Raw numbers are drawn in greys. Raises OutputError.
+    """
+    span, neutral = (statistics.low, statistics.high), statistics.unit == RAW
+    shape = values.shape
+    width, margin, bars = max(shape[1], 360), 24, 90
+    # In float64: a value clipped in float32 may be just outside the span.
+    counts = np.histogram(sample.astype(float).clip(*span), _BARS, span)[0]
+    sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
+    sheet[: shape[0], : shape[1]] = _coloured(values, span, neutral=neutral)
+    base = shape[0] + margin + bars
+    edges = np.linspace(margin, width - margin, _BARS + 1).round().astype(int)
+    centres = np.linspace(*span, 2 * _BARS + 1, dtype=np.float32)[1::2]
+    colours = _coloured(centres[None], span, neutral=neutral)[0]
+    # The first and last bins also contain the values beyond the span.
+    heights = (bars * counts / max(int(counts[1:-1].max(initial=1)), 1)).clip(0, bars).round().astype(int)
+    for left, right, height, colour in zip(edges, edges[1:], heights.tolist(), colours.tolist(), strict=False):
+        cv2.rectangle(sheet, (int(left), base - height), (int(right) - 1, base), colour, -1)
+    for value in np.linspace(*span, 5):
+        at = round(margin + (value - span[0]) / (span[1] - span[0]) * (width - 2 * margin))
+        sheet = with_text(sheet, f"{value:.3g}" if abs(value) >= 100 else f"{value:.2f}", (at, base + 18), anchor="ms")
+    write_png(with_text(sheet, title, (margin, shape[0] + 18), 16), path)
+
+
+def _coloured(values: NDArray[Any], span: tuple[float, float], *, neutral: bool) -> NDArray[np.uint8]:
+    """Values (height, width) as colours (height, width, 3)."""
+    ramp = _NEUTRAL if neutral else _COLOURS
+    share = np.nan_to_num(np.clip((values - span[0]) / (span[1] - span[0]), 0, 1))
+    stops = np.linspace(0, 1, len(ramp))
+    result = np.stack([np.interp(share, stops, channel) for channel in ramp.T], axis=-1)
+    result[~np.isfinite(values)] = _NODATA_COLOUR
+    return np.asarray(result.round(), np.uint8)

@@ -1,27 +1,91 @@
-"""OUT/indices.csv: a row per capture and index, with the statistics of its values."""
+"""Results of indices: the statistics in the tags of a raster, and OUT/indices.csv, a row per capture and index."""
 
 import csv
 import io
+import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from agalign.products.csv_file import write_csv
-from agalign.products.index_rasters import IndexReport
-from agalign.products.index_statistics import IndexStatistics, read_statistics
+from agalign.errors import AgalignError
+from agalign.pixels.raster import open_raster
+from agalign.products.index_bands import RAW
 from agalign.products.sidecar import CaptureResult
+from agalign.products.text_files import write_csv
 from agalign.values.text import without_formula
 
+STATISTICS_TAG = "INDEX_STATISTICS"
 INDICES_FILE = "indices.csv"
-COLUMNS = (
-    "folder", "capture", "captured_at", "latitude", "longitude", "index", "median", "p5", "p95", "valid_share", "input",
-    "low", "high", "file", "problem",
-)  # fmt: skip
-_STATISTICS = ("median", "p5", "p95", "valid_share", "low", "high")
-"""Columns with a number of `IndexStatistics`."""
-
+_OF_CAPTURE = ("folder", "capture", "captured_at", "latitude", "longitude", "index")
+_OF_STATISTICS = ("median", "p5", "p95", "valid_share", "input", "low", "high")
+COLUMNS = (*_OF_CAPTURE, *_OF_STATISTICS, "file", "problem")
 _Key = tuple[str, str, str]
 """(folder, capture, index)."""
+
+
+@dataclass(frozen=True)
+class IndexStatistics:
+    """The values of an index raster; nan if no pixel is valid."""
+
+    median: float = math.nan
+    p5: float = math.nan
+    p95: float = math.nan
+    valid_share: float = 0.0
+    unit: str = ""
+    """Unit of the bands: reflectance, radiance, or raw numbers."""
+    low: float = math.nan
+    """Value at the lower end of the colour scale of the picture."""
+    high: float = math.nan
+    """Value at the upper end of the colour scale."""
+
+    def as_json(self) -> dict[str, float | str | None]:
+        """Return the fields by name, with null for nan, which JSON does not have."""
+        return {k: v if isinstance(v, str) or math.isfinite(v) else None for k, v in vars(self).items()}
+
+
+@dataclass(frozen=True)
+class IndexReport:
+    """The result of one index of one capture."""
+
+    capture: str
+    index: str
+    path: Path | None = None
+    """The raster; None if it could not be written."""
+    statistics: IndexStatistics = IndexStatistics()
+    problem: str = ""
+    kept: bool = False
+    """True if an earlier command wrote the raster from the same bands with the same formula."""
+
+    @property
+    def median(self) -> float:
+        """Median of the valid pixels."""
+        return self.statistics.median
+
+    @property
+    def raw_numbers(self) -> bool:
+        """True if the bands are neither reflectance nor radiance."""
+        return self.statistics.unit == RAW
+
+
+def statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
+    """Return the statistics in the tags of a raster; None if there are none."""
+    try:
+        fields: dict[str, Any] = json.loads(tags[STATISTICS_TAG])
+        unit = str(fields.pop("unit"))
+        return IndexStatistics(unit=unit, **{k: math.nan if v is None else float(v) for k, v in fields.items()})
+    except (KeyError, ValueError, TypeError):
+        return None
+
+
+def read_statistics(path: Path) -> IndexStatistics | None:
+    """Return the statistics of an index raster; None for another file, or one that cannot be read."""
+    try:
+        with open_raster(path) as source:
+            return statistics_in(source.tags())
+    except AgalignError:
+        return None
 
 
 @dataclass(frozen=True)
@@ -55,10 +119,8 @@ def row_of(report: IndexReport, sidecar: CaptureResult, folder: str, out: Path) 
     file = "" if report.path is None else report.path.relative_to(out).as_posix()
     place = sidecar.position
     latitude, longitude = (None, None) if place is None else (place.latitude, place.longitude)
-    return IndexRow(
-        folder, sidecar.capture, sidecar.captured_at, latitude, longitude, report.index, file, report.statistics,
-        report.problem,
-    )  # fmt: skip
+    of_capture = folder, sidecar.capture, sidecar.captured_at, latitude, longitude
+    return IndexRow(*of_capture, report.index, file, report.statistics, report.problem)
 
 
 def rows_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexRow]:
@@ -106,12 +168,11 @@ def update_table(out: Path, rows: Sequence[IndexRow]) -> list[IndexRow]:
 
 def _row(cells: Mapping[str, str]) -> IndexRow:
     cells = {k: _unquoted(v) for k, v in cells.items()}
-    numbers = {k: float(cells[k] or "nan") for k in _STATISTICS}
+    numbers = {k: float(cells[k] or "nan") for k in _OF_STATISTICS if k != "input"}
     latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
-    return IndexRow(
-        cells["folder"], cells["capture"], cells["captured_at"], latitude, longitude, cells["index"], cells["file"],
-        IndexStatistics(unit=cells["input"], **numbers), cells["problem"],
-    )  # fmt: skip
+    of_capture = cells["folder"], cells["capture"], cells["captured_at"], latitude, longitude
+    statistics = IndexStatistics(unit=cells["input"], **numbers)
+    return IndexRow(*of_capture, cells["index"], cells["file"], statistics, cells["problem"])
 
 
 def _unquoted(text: str) -> str:

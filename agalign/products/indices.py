@@ -1,11 +1,15 @@
-"""Spectral indices, and the choice of their bands by wavelength or name."""
+"""Spectral indices, their formulas, and the choice of their bands by wavelength or name.
 
+Formulas such as (N-R)/(N+R) are parsed as Python and evaluated without executing code.
+"""
+
+import ast
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
@@ -13,31 +17,101 @@ from typing import Any, Literal
 import numpy as np
 
 from agalign.errors import ConfigurationError, InputError
-from agalign.products.formula import evaluate, symbols_of
 from agalign.values.image import FloatImage
 
+_MAX_LENGTH = 300
+"""Characters of a formula: longer ones could exhaust Python's recursion limit."""
+_MAX_NUMBER = 1e30
+"""Numbers must fit into float32."""
+_OPERATORS: Mapping[type, Callable[[Any, Any], Any]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.Pow: np.power,
+}
+_SIGNS: Mapping[type, Callable[[Any], Any]] = {ast.UAdd: np.positive, ast.USub: np.negative}
+_FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {"sqrt": np.sqrt, "log": np.log, "exp": np.exp, "abs": np.abs}
 Role = Literal["blue", "green", "red", "red edge", "nir"]
 """The part of the spectrum that a band of an index is from."""
-_RANGES_NM: dict[Role, tuple[float, float, float]] = {
-    "blue": (430, 475, 510), "green": (520, 560, 590), "red": (620, 668, 695), "red edge": (697, 717, 760),
-    "nir": (765, 840, 920),
-}  # fmt: skip
-"""Shortest, nominal and longest centre wavelength of each role."""
-_NAMES: dict[Role, tuple[str, ...]] = {
-    "blue": ("blue", "blu", "b"), "green": ("green", "gre", "grn", "g"), "red": ("red", "r"),
-    "red edge": ("red edge", "rededge", "red_edge", "red-edge", "reg", "re"),
-    "nir": ("nir", "near infrared", "near infra-red", "near-infrared", "n"),
-}  # fmt: skip
+_ROLES: dict[Role, tuple[tuple[float, float, float], tuple[str, ...]]] = {
+    "blue": ((430, 475, 510), ("blue", "blu", "b")),
+    "green": ((520, 560, 590), ("green", "gre", "grn", "g")),
+    "red": ((620, 668, 695), ("red", "r")),
+    "red edge": ((697, 717, 760), ("red edge", "rededge", "red_edge", "red-edge", "reg", "re")),
+    "nir": ((765, 840, 920), ("nir", "near infrared", "near infra-red", "near-infrared", "n")),
+}
+"""(shortest, nominal and longest centre wavelength, nm; names) of each role."""
 _NOT_NARROW = ("pan", "rgb", "lwir", "thermal")
 """Starts of the names of bands that have no role, whatever their centre wavelength."""
-_LETTERS: dict[str, Role] = {
-    "B": "blue", "G": "green", "R": "red", "RE": "red edge", "RE1": "red edge", "N": "nir",
-}  # fmt: skip
+_LETTERS: dict[str, Role] = {"B": "blue", "G": "green", "R": "red", "RE": "red edge", "RE1": "red edge", "N": "nir"}
 """The names of bands in formulas, as in the catalogue Awesome Spectral Indices."""
 _CATALOGUE, _CONSTANTS = "spyndex/data/spectral-indices-dict.json", "spyndex/data/constants.json"
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
 _TEST_FACTOR = 1000.0
 """A formula whose value is the same after multiplication of all bands by this does not depend on their unit."""
+
+
+def symbols_of(formula: str) -> tuple[str, ...]:
+    """Return the different names in a formula, in the order of their first use.
+
+    Allowed are names, numbers, + - * / ** (or ^), parentheses, and sqrt, log, exp and abs. Raises ConfigurationError
+    for anything else.
+    """
+    return tuple(dict.fromkeys(_names(_parsed(formula), formula)))
+
+
+def evaluate(formula: str, values: Mapping[str, FloatImage]) -> FloatImage:
+    """Return the value of a formula, float32, given an array for each name; not finite where it is undefined."""
+    with np.errstate(all="ignore"):
+        return np.asarray(_value(_parsed(formula), values), np.float32)
+
+
+@lru_cache(maxsize=64)
+def _parsed(formula: str) -> ast.expr:
+    if len(formula) > _MAX_LENGTH:
+        raise ConfigurationError(f"the formula has {len(formula)} characters; at most {_MAX_LENGTH} are allowed")
+    try:
+        return ast.parse(formula.strip().replace("^", "**"), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise ConfigurationError(f"'{formula}' is not a formula; write one like (N-R)/(N+R)") from None
+
+
+def _names(node: ast.expr, formula: str) -> Iterator[str]:
+    match node:
+        case ast.Name(id=name):
+            yield name
+        case ast.Constant(value=int() | float() as value) if abs(value) < _MAX_NUMBER:
+            pass
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+            yield from _names(left, formula)
+            yield from _names(right, formula)
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in _SIGNS:
+            yield from _names(operand, formula)
+        case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
+            yield from _names(argument, formula)
+        case _:
+            part = ast.unparse(node)
+            raise ConfigurationError(
+                f"'{part}' is not allowed in a formula; use band letters, numbers, + - * / **, parentheses, "
+                f"{', '.join(_FUNCTIONS)}"
+            )
+
+
+def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
+    match node:
+        case ast.Name(id=name):
+            return values[name]
+        case ast.Constant(value=value):
+            # float32 overflows to infinity; Python's integers would grow without limit, as in 9**9**9.
+            return np.float32(value)  # type: ignore[arg-type]
+        case ast.BinOp(left=left, op=op, right=right):
+            return _OPERATORS[type(op)](_value(left, values), _value(right, values))
+        case ast.UnaryOp(op=op, operand=operand):
+            return _SIGNS[type(op)](_value(operand, values))
+        case ast.Call(func=ast.Name(id=name), args=[argument]):
+            return _FUNCTIONS[name](_value(argument, values))
+    raise AssertionError(ast.dump(node))  # `_names` has refused it
 
 
 @dataclass(frozen=True)
@@ -75,10 +149,11 @@ _BUILT_IN = (
     Index("vari", "(G - R) / (G + R - B)", (-0.5, 0.5), "Gitelson et al. 2002"),
     Index("savi", "1.5 * (N - R) / (N + R + 0.5)", (-0.2, 1.0), "Huete 1988", any_unit=False),
     Index("osavi", "1.16 * (N - R) / (N + R + 0.16)", (-0.2, 1.0), "Rondeaux et al. 1996", any_unit=False),
-    Index("msavi", "(2 * N + 1 - sqrt((2 * N + 1) ** 2 - 8 * (N - R))) / 2", (-0.2, 1.0), "Qi et al. 1994",
-          any_unit=False),
+    Index(
+        "msavi", "(2 * N + 1 - sqrt((2 * N + 1) ** 2 - 8 * (N - R))) / 2", (-0.2, 1.0), "Qi et al. 1994", any_unit=False
+    ),
     Index("evi", "2.5 * (N - R) / (N + 6 * R - 7.5 * B + 1)", (-0.2, 1.0), "Huete et al. 2002", any_unit=False),
-)  # fmt: skip
+)
 INDICES: Mapping[str, Index] = {index.name: index for index in _BUILT_IN}
 
 
@@ -159,7 +234,7 @@ def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float
     roles = [role_of(name, wavelength_nm) for name, wavelength_nm in zip(names, wavelengths_nm, strict=True)]
     result = []
     for role in index.roles:
-        _, nominal_nm, _ = _RANGES_NM[role]
+        (_, nominal_nm, _), _ = _ROLES[role]
         candidates = [i for i, own_role in enumerate(roles) if own_role == role]
         if not candidates:
             raise InputError(f"{index.name} needs a {role} band; there are {', '.join(names)}")
@@ -173,8 +248,8 @@ def role_of(name: str, wavelength_nm: float | None) -> Role | None:
     """Return the role of a band by its wavelength if that is known, else by its name; None for a band without one."""
     if name.lower().startswith(_NOT_NARROW):
         return None
-    for role, (shortest_nm, _, longest_nm) in _RANGES_NM.items():
-        if name.lower() in _NAMES[role] if wavelength_nm is None else shortest_nm <= wavelength_nm <= longest_nm:
+    for role, ((shortest_nm, _, longest_nm), names) in _ROLES.items():
+        if name.lower() in names if wavelength_nm is None else shortest_nm <= wavelength_nm <= longest_nm:
             return role
     return None
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,9 +117,12 @@ def _layers(capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], 
 
 
 def _crop(
-    capture: Capture, mapped: list[tuple[PixelMapping, Band]], pixels: _OutputPixels, settings: WriteSettings,
+    capture: Capture,
+    mapped: list[tuple[PixelMapping, Band]],
+    pixels: _OutputPixels,
+    settings: WriteSettings,
     rig: Rig | None,
-) -> Tile:  # fmt: skip
+) -> Tile:
     """The rectangle of the output pixels that is written."""
     frame = Tile(0, 0, *pixels.size_px)
     if settings.crop == "none":
@@ -155,11 +159,11 @@ def _covers(mappings: list[tuple[PixelMapping, Band]], tile: Tile) -> bool:
     x, y = (np.linspace(a, a + n - 1, _BORDER_POINTS) for a, n in ((tile.x0, tile.width), (tile.y0, tile.height)))
     sides = [(x, np.full_like(x, v)) for v in y[[0, -1]]] + [(np.full_like(y, v), y) for v in x[[0, -1]]]
     border = np.concatenate([np.stack(side, axis=-1) for side in sides])
-    return all(_is_inside(mapping(border), band).all() for mapping, band in mappings)
+    return all(is_inside(mapping(border), band).all() for mapping, band in mappings)
 
 
-def _is_inside(positions: NDArray[np.float64], band: Band) -> Mask:
-    """True for positions (..., 2) within the image of a band; False for nan."""
+def is_inside(positions: NDArray[np.floating[Any]], band: Band) -> Mask:
+    """Return True for positions (..., 2) within the image of a band; False for nan."""
     with np.errstate(invalid="ignore"):
         return np.asarray(((positions >= 0) & (positions <= np.subtract(band.size_px, 1))).all(axis=-1))
 
@@ -180,7 +184,7 @@ def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height
     x, y = _cell_edges(width_px, step), _cell_edges(height_px, step)
     inside = np.ones((len(y), len(x)), dtype=bool)
     for mapping, band in mappings:
-        inside &= _is_inside(mapping.at_crossings(x, y), band)
+        inside &= is_inside(mapping.at_crossings(x, y), band)
     # A cell is inside if its four corners are: between them the mapping is almost linear.
     cells = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:] & inside[1:, 1:]
     result = _largest_rectangle(cells, np.diff(x), np.diff(y))

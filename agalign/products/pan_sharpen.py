@@ -9,7 +9,7 @@ which is 1 only on average. Bands outside the range of P are resampled and not s
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,11 +25,10 @@ from agalign.config import WriteSettings
 from agalign.errors import InputError
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.products.checked_raster import checked_raster
+from agalign.products.checked_raster import Block, LayerDescription, predictor, write_layers
 from agalign.products.layout import Layer, output_layers
-from agalign.products.nodata import with_nodata
-from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import GEOTIFF, predictor, write_raster
+from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.raster_file import with_nodata, write_raster
 from agalign.products.sidecar import is_delivered
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
@@ -55,10 +54,7 @@ class PanSharpened(Product):
 
     kind = "pan_sharpened"
     suffix = ".pan.tif"
-
-    def is_enabled(self, settings: WriteSettings) -> bool:
-        """True with `--pan-sharpen`."""
-        return settings.pan_sharpen
+    option = "pan_sharpen"
 
     def check(self, capture: Capture) -> None:
         """Raise InputError for a capture without a panchromatic band or colour photograph."""
@@ -82,9 +78,8 @@ class PanSharpened(Product):
 def panchromatic(capture: Capture) -> list[Band]:
     """Return the panchromatic band, else the three bands of the colour photograph; empty if there is neither."""
     broad = [
-        b for b in capture.bands
-        if b.name.lower().startswith("pan") or (b.bandwidth_nm or 0.0) >= _MIN_PAN_WIDTH_NM
-    ]  # fmt: skip
+        b for b in capture.bands if b.name.lower().startswith("pan") or (b.bandwidth_nm or 0.0) >= _MIN_PAN_WIDTH_NM
+    ]
     return [b for b in broad if not is_thermal(b)][:1] or [b for b in capture.bands if b.companion]
 
 
@@ -102,10 +97,8 @@ class _Sources:
 def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | None:
     """None if the panchromatic band is not delivered, or no band is within its spectral range."""
     pan, limit_px = panchromatic(context.capture), context.settings.check.accept_predicted_px
-    delivered = {
-        name: a for name, a in context.usable.items()
-        if is_delivered(a.status, None if a.prediction is None else a.prediction.std_px, limit_px)
-    }  # fmt: skip
+    usable = context.usable
+    delivered = {name: a for name, a in usable.items() if is_delivered(a.status, a.prediction, limit_px)}
     if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *delivered}:
         return None
     layers, grid = output_layers(context.capture, delivered, settings, context.rig)
@@ -177,14 +170,17 @@ def _sharpen(
     light, _ = _read(file, sample, black_levels, nodata)
     weights = weights_of([light[k] for k in in_range], light[count:].mean(axis=0), max(sources.grid.scale))
     profile = file.profile | {"count": count, "compress": "deflate", "predictor": predictor(dtype.kind)}
-    with checked_raster(target, profile) as raster:
-        _describe(raster.dataset, file, sources, weights)
+
+    def blocks() -> Iterator[Block]:
         for tile in tiles(Tile(0, 0, file.width, file.height), _WORK_TILE_PX):
             light, valid = _read(file, tile, black_levels, nodata)
             ratio = brovey_ratio([light[k] for k in in_range], light[count:].mean(axis=0), weights)
             for k, is_sharpened in enumerate(sources.is_sharpened):
                 values = (light[k] * ratio if is_sharpened else light[k]) + black_levels[k]
-                raster.write(_pixels(values, valid[k], dtype, nodata), k + 1, tile.x0, tile.y0)
+                yield _pixels(values, valid[k], dtype, nodata), k + 1, tile.x0, tile.y0
+
+    tags = {k: v for k, v in file.tags().items() if k != "AREA_OR_POINT"}
+    write_layers(target, profile, _descriptions(file, sources, weights), tags, blocks())
 
 
 def _black_level(band: Band, settings: WriteSettings) -> float:
@@ -210,14 +206,13 @@ def _pixels(values: FloatImage, valid: Mask, dtype: np.dtype[Any], nodata: float
     return result if nodata is None else with_nodata(result, valid, nodata)
 
 
-def _describe(dataset: Any, source: OpenRaster, sources: _Sources, weights: NDArray[np.float64]) -> None:
+def _descriptions(source: OpenRaster, sources: _Sources, weights: NDArray[np.float64]) -> list[LayerDescription]:
     pan = sources.pan[0].band
     pan_name = "the colour photograph" if pan.companion else pan.name
-    remaining = iter(weights.tolist())
-    dataset.update_tags(**{k: v for k, v in source.tags().items() if k != "AREA_OR_POINT"})
-    dataset.units = source.units[: len(sources.bands)]
+    remaining, result = iter(weights.tolist()), []
     for index, (layer, is_sharpened) in enumerate(zip(sources.bands, sources.is_sharpened, strict=True), start=1):
         text = f"weighted Brovey by {pan_name}, weight {next(remaining):.4g}" if is_sharpened else "no"
-        dataset.set_band_description(index, layer.band.name)
-        dataset.update_tags(index, **source.tags(index), PANSHARPENED=text)
-        dataset.update_tags(index, ns="IMAGERY", **source.tags(index, ns="IMAGERY"))
+        tags = source.tags(index) | {"PANSHARPENED": text}
+        unit, imagery = source.units[index - 1] or "", source.tags(index, ns="IMAGERY")
+        result.append(LayerDescription(layer.band.name, unit, tags, imagery))
+    return result

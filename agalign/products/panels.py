@@ -1,22 +1,24 @@
-"""OUT/panels.json with the measurements on calibration panels, and a picture of each panel with the measured area."""
+"""Captures of calibration panels and of the sky: OUT/panels.json, OUT/sky.json and a picture of each panel."""
 
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from agalign.errors import AgalignError
 from agalign.flight.panels import BandReading, PanelReading
+from agalign.flight.sky import SkyCapture, sky_radiance
 from agalign.pixels.raster import read_preview
 from agalign.products.drawing import Picture, with_text, write_png
-from agalign.products.json_file import read_model, write_model
-from agalign.values.capture import PanelSource
+from agalign.products.text_files import read_model, write_model
+from agalign.values.capture import Band, Capture, PanelSource
 from agalign.values.pixel_units import PixelScale
 
-PANELS_FILE = "panels.json"
+PANELS_FILE, SKY_FILE = "panels.json", "sky.json"
 _TILE_PX, _TITLE_PX, _GAP_PX = 320, 24, 6
 """Width of a band in the picture, height of its title, distance to the next band."""
 _PERCENTILES = 1.0, 99.5
@@ -44,12 +46,24 @@ class PanelBandPart(_Part):
     """Reason why the band cannot be used."""
 
 
-class PanelPart(_Part):
-    """One capture of a panel."""
+class SkyBandPart(_Part):
+    """One band of a capture of the sky."""
 
+    band: str
+    file: str
+    radiance: float | None
+    """Median over the image, W / m^2 / sr / nm; null if it is unknown or half of the band is saturated."""
+
+
+class _CapturePart(_Part):
     folder: str
     capture: str
     captured_at: str
+
+
+class PanelPart(_CapturePart):
+    """One capture of a panel."""
+
     seen_by: PanelSource
     serial: str
     picture: str
@@ -68,6 +82,19 @@ class PanelPart(_Part):
         return f"{name} (reflectance {reflectance}; recognised by its {self.seen_by}): {use}"
 
 
+class SkyPart(_CapturePart):
+    """One capture of the sky."""
+
+    cues: list[str]
+    """Evidence that the capture shows the sky, in words."""
+    bands: list[SkyBandPart]
+
+    @property
+    def sentence(self) -> str:
+        """State in words why the capture is not aligned."""
+        return f"shows the sky ({', '.join(self.cues)}): not aligned"
+
+
 class PanelsFile(_Part):
     """All captures of panels of a run."""
 
@@ -75,30 +102,37 @@ class PanelsFile(_Part):
     panels: list[PanelPart]
 
 
+class SkyFile(_Part):
+    """All captures of the sky of a run."""
+
+    schema_: Annotated[Literal["agalign-sky/1"], Field(alias="schema")] = "agalign-sky/1"
+    captures: list[SkyPart]
+
+
 def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]:
-    """Write OUT/panels.json and <capture>.panel.png; without panels, remove the panels.json of an earlier run.
+    """Write OUT/panels.json and <capture>.panel.png, and return the captures; without any, remove an earlier file.
 
     Raises OutputError.
     """
-    path = out / PANELS_FILE
-    if not readings:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
-        return []
     parts = []
     for reading in readings:
-        capture = reading.capture
-        picture = out / capture.folder / f"{capture.name}.panel.png"
+        picture = out / reading.capture.folder / f"{reading.capture.name}.panel.png"
         write_png(_sheet(reading), picture)
-        parts.append(
-            PanelPart(
-                folder=capture.folder.as_posix(), capture=capture.name, captured_at=capture.captured_at,
-                seen_by=reading.panel.seen_by, serial=reading.panel.serial, picture=picture.relative_to(out).as_posix(),
-                in_scene=reading.panel.in_scene,
-                bands=[_band_part(b) for b in reading.bands],
-            )
-        )  # fmt: skip
-    write_model(path, PanelsFile(panels=parts))
+        panel, bands = reading.panel, [_panel_band(b) for b in reading.bands]
+        facts = {"seen_by": panel.seen_by, "serial": panel.serial, "picture": picture.relative_to(out).as_posix()}
+        facts |= _identity(reading.capture) | {"in_scene": panel.in_scene, "bands": bands}
+        parts.append(PanelPart.model_validate(facts))
+    write_model(out / PANELS_FILE, PanelsFile(panels=parts) if parts else None)
+    return parts
+
+
+def write_sky(sky: Sequence[SkyCapture], out: Path) -> list[SkyPart]:
+    """Write OUT/sky.json and return its captures; without any, remove that of an earlier run. Raises OutputError."""
+    parts = []
+    for one in sky:
+        bands = [{"band": b.name, "file": b.path.name, "radiance": _radiance(b)} for b in one.capture.bands]
+        parts.append(SkyPart.model_validate(_identity(one.capture) | {"cues": one.cues, "bands": bands}))
+    write_model(out / SKY_FILE, SkyFile(captures=parts) if parts else None)
     return parts
 
 
@@ -108,14 +142,33 @@ def read_panels(out: Path) -> list[PanelPart]:
     return [] if file is None else file.panels
 
 
-def _band_part(reading: BandReading) -> PanelBandPart:
-    panel, factor = reading.band.panel, reading.factor
-    return PanelBandPart(
-        band=reading.band.name, file=reading.band.path.name,
-        area_px=[] if panel is None else [(round(x, 2), round(y, 2)) for x, y in panel.corners_px],
-        albedo=reading.albedo, radiance=reading.radiance, reflectance_per_radiance=factor,
-        problem=reading.problem or (None if factor is not None else "its reflectance or the band's is not known"),
-    )  # fmt: skip
+def read_sky(out: Path) -> list[SkyPart]:
+    """Return the captures of the sky of an earlier run. Raises SidecarError for a file that agalign did not write."""
+    file = read_model(out / SKY_FILE, SkyFile)
+    return [] if file is None else file.captures
+
+
+def _identity(capture: Capture) -> dict[str, Any]:
+    return {"folder": capture.folder.as_posix(), "capture": capture.name, "captured_at": capture.captured_at}
+
+
+def _panel_band(reading: BandReading) -> dict[str, Any]:
+    band, factor = reading.band, reading.factor
+    return {
+        "band": band.name,
+        "file": band.path.name,
+        "area_px": [] if band.panel is None else [(round(x, 2), round(y, 2)) for x, y in band.panel.corners_px],
+        "albedo": reading.albedo,
+        "radiance": reading.radiance,
+        "reflectance_per_radiance": factor,
+        "problem": reading.problem or (None if factor is not None else "its reflectance or the band's is not known"),
+    }
+
+
+def _radiance(band: Band) -> float | None:
+    with suppress(AgalignError):
+        return sky_radiance(band)
+    return None
 
 
 def _sheet(reading: PanelReading) -> Picture:

@@ -1,21 +1,31 @@
 """The interface `Product` of each kind of output of a capture, and its arguments and results."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from agalign.config import Settings, WriteSettings
 from agalign.flight.rig import Rig
+from agalign.products.checked_raster import (
+    FLOAT_OPTIONS,
+    Block,
+    LayerDescription,
+    georeference_tags,
+    grid_profile,
+    write_layers,
+)
+from agalign.products.drawing import ReducedBands, read_reduced_bands
 from agalign.products.layout import Layer
-from agalign.products.reduced_bands import ReducedBands, read_reduced_bands
 from agalign.products.sidecar import PreviewPart
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import FixedFilePx
+
+GEOTIFF = "image/tiff; application=geotiff"
 
 
 @dataclass(frozen=True)
@@ -38,6 +48,10 @@ class CapturePaths:
     def sidecar(self) -> Path:
         """The capture's sidecar."""
         return self.file(".json")
+
+    def relative(self, path: Path) -> str:
+        """Return a path below the folder of the capture, relative to it and with forward slashes."""
+        return path.relative_to(self.folder).as_posix()
 
 
 @dataclass(frozen=True)
@@ -128,10 +142,12 @@ class Product(ABC):
     """False if a failure is only reported and the capture counts as done."""
     needs_layers: ClassVar[bool] = True
     """False if the product is also written for captures without usable moving bands."""
+    option: ClassVar[str | None] = None
+    """Name of the setting in `WriteSettings` that requests the product; None if it is always written."""
 
-    def is_enabled(self, settings: WriteSettings) -> bool:  # noqa: ARG002
+    def is_enabled(self, settings: WriteSettings) -> bool:
         """Return True if the settings request the product."""
-        return True
+        return self.option is None or bool(getattr(settings, self.option))
 
     def check(self, capture: Capture) -> None:  # noqa: B027
         """Raise an AgalignError if the capture or the installation lacks something that the product needs.
@@ -149,3 +165,20 @@ class Product(ABC):
 
         Raises OutputError, or UnreadableFileError for an input.
         """
+
+    def write_layers(
+        self,
+        context: ProductContext,
+        layers: Sequence[LayerDescription],
+        blocks: Iterable[Block],
+        asset: StacAsset,
+        *,
+        tags: Mapping[str, str] | None = None,
+        dtype: str = "float32",
+        options: Mapping[str, Any] = FLOAT_OPTIONS,
+    ) -> list[WrittenFile]:
+        """Write one raster on the grid of the capture, with its georeference, and return it. Raises OutputError."""
+        path, georeference = context.paths.file(self.suffix), context.capture.reference.georeference
+        profile = grid_profile(context.grid, georeference, len(layers), dtype, **options)
+        write_layers(path, profile, layers, {**(tags or {}), **georeference_tags(georeference)}, blocks)
+        return [WrittenFile(self.kind, path, asset)]

@@ -1,4 +1,4 @@
-"""A raster of quality flags on the grid of the aligned files: a layer for all bands together, and one for each band."""
+"""Rasters of the expected alignment error and of quality flags on the grid of the aligned files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,20 +7,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.config import WriteSettings
-from agalign.pixels.radiometry import calibrated, to_reflectance
+from agalign.pixels.radiometry import to_reflectance
 from agalign.pixels.raster import read_tile
-from agalign.pixels.resample import resample_tile
 from agalign.pixels.sun_glint import sun_glint
-from agalign.products.error_map import error_lattice_px, error_on_tile
+from agalign.products.checked_raster import WORK_TILE_PX, LayerDescription
 from agalign.products.indices import Role, role_of
-from agalign.products.layout import Layer
-from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import GEOTIFF, write_flags
+from agalign.products.layout import Layer, is_inside
+from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.raster_file import layer_pixels
+from agalign.values import geometry
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Radiometry
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
+from agalign.values.pixel_units import FixedFilePx
 from agalign.values.quality import MEANINGS, Quality
+from agalign.values.resample import tiles
+from agalign.verify.expected_error import expected_error_px
 
+_LATTICE_PX = 16
+"""Distance of the nodes at which the error, which is smooth, is calculated."""
+_STEP_PX = 0.001
+"""Errors are rounded to this step, below their accuracy: the raster compresses better."""
 _ALL_BANDS = "all bands"
 """Name of the first layer: flags that are set in any band."""
 _MIN_WEIGHT = 1e-3
@@ -29,8 +36,53 @@ _ERROR_FLAGS = {0.5: Quality.ERROR_OVER_HALF_PX, 1.0: Quality.ERROR_OVER_1_PX}
 """Flags by the expected error, px of the reference, that they indicate."""
 _ASSESSED = "water by NDWI > 0 (McFeeters 1996), glint by the excess of near infrared (Hedley et al. 2005)"
 _NOT_ASSESSED = "not assessed: the reflectance of green and near infrared is not known"
-
 Flags = NDArray[np.uint16]
+
+
+class ErrorMap(Product):
+    """The expected error of each moving band that is written."""
+
+    kind = "error_map"
+    suffix = ".error.tif"
+    option = "error_map"
+
+    def write(self, context: ProductContext) -> list[WrittenFile]:
+        """Write <capture>.error.tif: float32, px of the reference's file, a layer for each moving band."""
+        usable, size_px, grid = context.usable, context.capture.reference.size_px, context.grid
+        layers = [
+            LayerDescription(name, tags={"units": "px of the reference", "STATUS": alignment.status})
+            for name, alignment in usable.items()
+        ]
+        blocks = ((_error_px(a, size_px, grid), index, 0, 0) for index, a in enumerate(usable.values(), start=1))
+        return self.write_layers(context, layers, blocks, StacAsset("error", GEOTIFF, ("metadata",)))
+
+
+def error_lattice_px(
+    alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid
+) -> NDArray[np.float32]:
+    """Return the expected error (rows, columns) on a lattice over a grid, px of the reference's file; nan where it is
+    unknown. `size_px` is (width, height) of that file.
+    """
+    columns, rows = (max(2, -(-n // _LATTICE_PX)) for n in (grid.width, grid.height))
+    points = grid.reference_positions(geometry.lattice(grid.width, grid.height, columns, rows))
+    nodes = expected_error_px(alignment, size_px, points).reshape(rows, columns)
+    return np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
+
+
+def error_on_tile(nodes: NDArray[np.float32], grid: OutputGrid, tile: Tile) -> NDArray[np.float32]:
+    """Return the expected error (height, width) on a tile of a grid, linearly interpolated from `error_lattice_px`."""
+    rows, columns = nodes.shape
+    # Positions of the pixels of the grid, in nodes.
+    x, y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in ((columns, grid.width), (rows, grid.height)))
+    x0, y0 = tile.x0 - grid.x0, tile.y0 - grid.y0
+    positions = np.meshgrid(x[x0 : x0 + tile.width], y[y0 : y0 + tile.height])
+    return np.asarray(cv2.remap(nodes, *positions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+
+
+def _error_px(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
+    """Expected error (height, width) on a grid, rounded."""
+    result = error_on_tile(error_lattice_px(alignment, size_px, grid), grid, grid.tile)
+    return np.asarray(np.round(result / _STEP_PX) * _STEP_PX, np.float32)
 
 
 class QualityRaster(Product):
@@ -38,15 +90,11 @@ class QualityRaster(Product):
 
     kind = "qa"
     suffix = ".qa.tif"
-
-    def is_enabled(self, settings: WriteSettings) -> bool:
-        """True with `--qa`."""
-        return settings.qa
+    option = "qa"
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.qa.tif. Raises OutputError, or UnreadableFileError for an input."""
-        path, grid = context.paths.file(self.suffix), context.grid
-        size_px = context.capture.reference.size_px
+        grid, size_px = context.grid, context.capture.reference.size_px
         nodes = {name: error_lattice_px(a, size_px, grid) for name, a in context.usable.items()}
         water = _WaterBands.of(context.layers)
         predicted = {name for name, alignment in context.usable.items() if alignment.status == "predicted"}
@@ -62,12 +110,19 @@ class QualityRaster(Product):
             return [np.bitwise_or.reduce(bands), *bands]
 
         tags = {
-            "flag_masks": ", ".join(str(int(flag)) for flag in Quality), "flag_meanings": MEANINGS,
+            "flag_masks": ", ".join(str(int(flag)) for flag in Quality),
+            "flag_meanings": MEANINGS,
             "SUN_GLINT": _NOT_ASSESSED if water is None else _ASSESSED,
-        }  # fmt: skip
-        names = [_ALL_BANDS, *(layer.band.name for layer in context.layers)]
-        write_flags(path, names, grid, context.capture.reference.georeference, tags, flags_on)
-        return [WrittenFile(self.kind, path, StacAsset("qa", GEOTIFF, ("metadata",)))]
+        }
+        layers = [LayerDescription(name) for name in (_ALL_BANDS, *(layer.band.name for layer in context.layers))]
+        blocks = (
+            (flags, index, tile.x0 - grid.x0, tile.y0 - grid.y0)
+            for tile in tiles(grid.tile, WORK_TILE_PX)
+            for index, flags in enumerate(flags_on(tile), start=1)
+        )
+        # There is no nodata value: 0 means that no flag is set.
+        options, asset = {"compress": "deflate", "interleave": "band"}, StacAsset("qa", GEOTIFF, ("metadata",))
+        return self.write_layers(context, layers, blocks, asset, tags=tags, dtype="uint16", options=options)
 
 
 def _bit(flag: Quality) -> np.uint16:
@@ -85,11 +140,10 @@ def _flags(
     if is_predicted:
         result |= _bit(Quality.PREDICTED)
     outside, nodata, saturated, occluded = _of_source(layer, tile)
-    for mask, flag in (
-        (outside, Quality.OUTSIDE), (nodata, Quality.NODATA), (saturated, Quality.SATURATED),
-        (occluded, Quality.OCCLUDED),
-    ):  # fmt: skip
-        result[mask] |= _bit(flag)
+    result[outside] |= _bit(Quality.OUTSIDE)
+    result[nodata] |= _bit(Quality.NODATA)
+    result[saturated] |= _bit(Quality.SATURATED)
+    result[occluded] |= _bit(Quality.OCCLUDED)
     if layer.band.name in nodes:
         error_px = error_on_tile(nodes[layer.band.name], grid, tile)
         for limit_px, flag in _ERROR_FLAGS.items():
@@ -105,9 +159,7 @@ def _of_source(layer: Layer, tile: Tile) -> tuple[Mask, Mask, Mask, Mask]:
         pixels, valid = read_tile(band, tile)
         return none, ~valid, _saturated(pixels, valid, band.saturation_value), none
     positions = layer.mapping.positions(tile, np.float32)
-    end = np.subtract(band.size_px, 1)
-    with np.errstate(invalid="ignore"):
-        inside: Mask = np.asarray(((positions >= 0) & (positions <= end)).all(axis=-1))
+    inside = is_inside(positions, band)
     occluded = inside & layer.mapping.hidden(tile)
     if not inside.any():
         return ~inside, none, none, none
@@ -160,9 +212,5 @@ class _WaterBands:
 
 def _reflectance(layer: Layer, radiometry: Radiometry, tile: Tile) -> FloatImage:
     """Reflectance (height, width) on a tile, nan for invalid pixels."""
-    if layer.mapping is not None:
-        pixels, valid = resample_tile(layer.band, layer.mapping, tile, "bilinear", radiometry)
-    else:
-        raw, valid = read_tile(layer.band, tile)
-        pixels = calibrated(raw, radiometry, tile.x0, tile.y0)
+    pixels, valid = layer_pixels(layer, tile, "bilinear", radiometry)
     return np.where(valid, pixels, np.nan).astype(np.float32)

@@ -1,7 +1,10 @@
-"""Rasters on the output grid: aligned bands as GeoTIFF or COG, layers of float32, and quality flags."""
+"""Aligned bands on the output grid as GeoTIFF or COG: pixels, nodata value and tags."""
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,35 +18,53 @@ from agalign.cameras.tag_transfer import TransferredTags
 from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import GDAL_ENVIRONMENT, read_tile, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, read_window, without_warnings
 from agalign.pixels.resample import resample_tile
-from agalign.products.checked_raster import CheckedRaster, checked_raster, grid_profile
+from agalign.products.checked_raster import (
+    WORK_TILE_PX,
+    Block,
+    LayerDescription,
+    georeference_tags,
+    grid_profile,
+    predictor,
+    write_layers,
+)
 from agalign.products.indices import Role, role_of
-from agalign.products.layout import Layer
-from agalign.products.nodata import Pixels, nodata_value, with_nodata
-from agalign.products.raster_tags import describe, georeference_tags
-from agalign.values.capture import Capture, Georeference
+from agalign.products.layout import Layer, is_inside
+from agalign.products.product import GEOTIFF
+from agalign.values.capture import Band, Capture, Quantity, Radiometry
+from agalign.values.choices import Interpolation
 from agalign.values.image import Mask, OutputGrid, Tile
-from agalign.values.mapping import PixelMapping
 from agalign.values.resample import tiles
 
-GEOTIFF = "image/tiff; application=geotiff"
-COG = "image/tiff; application=geotiff; profile=cloud-optimized"
-_WORK_TILE_PX = 2048
-"""Side of the tiles that are processed one after another: it limits the memory."""
+_COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 _FILL_DISTANCE_PX = 100.0
 """Search distance of the interpolation of occluded pixels: GDAL's default, wider than any occlusion."""
 _COG_BLOCK_PX = 512
 """GDAL's default for a COG."""
-_COLOURS: Mapping[Role, ColorInterp] = {
-    "red": ColorInterp.red, "green": ColorInterp.green, "blue": ColorInterp.blue,
-}  # fmt: skip
+_COLOURS: Mapping[Role, ColorInterp] = {"red": ColorInterp.red, "green": ColorInterp.green, "blue": ColorInterp.blue}
+_MAX_CANDIDATES = 1 << 16
+"""All values of a 16-bit type; for larger types the first ones are sufficient."""
+UNITS: Mapping[Quantity, str] = {
+    "radiance": "W m-2 sr-1 nm-1",
+    "relative radiance": "",
+    "reflectance": "1",
+    "relative reflectance": "1",
+    "temperature": "degC",
+}
+"""Units in the notation of UDUNITS."""
+
+Pixels = NDArray[np.generic]
 
 
 def write_raster(
-    capture: Capture, layers: Sequence[Layer], grid: OutputGrid, path: Path, settings: WriteSettings,
+    capture: Capture,
+    layers: Sequence[Layer],
+    grid: OutputGrid,
+    path: Path,
+    settings: WriteSettings,
     tags: TransferredTags | None = None,
-) -> float | None:  # fmt: skip
+) -> float | None:
     """Write layers as the bands of one file atomically; return its nodata value.
 
     The type is that of the layers if all have the same, else the smallest type that represents them all; float32 after
@@ -77,68 +98,54 @@ def write_raster(
             _to_cog(partial, compression)
 
     profile = grid_profile(grid, capture.reference.georeference, len(layers), dtype.name, **options)
-    with checked_raster(path, profile, finish) as raster:
-        describe(raster.dataset, capture, layers, settings)
-        if len(layers) > 1:
-            raster.dataset.colorinterp = _colours(layers)
-        for index, layer in enumerate(layers, start=1):
-            _write_layer(raster, index, layer, grid, nodata, settings)
+    blocks = _blocks(layers, grid, dtype, nodata, settings)
+    write_layers(path, profile, _descriptions(layers, raw=raw), _tags(capture, layers, raw=raw), blocks, finish)
     return nodata
-
-
-def write_layers(
-    path: Path, layers: Mapping[str, NDArray[np.float32]], grid: OutputGrid, georeference: Georeference | None,
-    units: Mapping[str, str] | None = None, tags: Mapping[str, Mapping[str, str]] | None = None,
-) -> None:  # fmt: skip
-    """Write float32 layers (height, width) by name, with their units and tags, atomically; nodata is nan.
-
-    Raises OutputError.
-    """
-    options = {"compress": "deflate", "predictor": predictor("f"), "nodata": np.nan}
-    with checked_raster(path, grid_profile(grid, georeference, len(layers), "float32", **options)) as raster:
-        raster.dataset.update_tags(**georeference_tags(georeference))
-        for index, (name, values) in enumerate(layers.items(), start=1):
-            raster.write(values, index)
-            raster.dataset.set_band_description(index, name)
-            if units is not None:
-                raster.dataset.set_band_unit(index, units[name])
-            if tags is not None:
-                raster.dataset.update_tags(index, **tags[name])
-
-
-def write_flags(
-    path: Path, names: Sequence[str], grid: OutputGrid, georeference: Georeference | None, tags: Mapping[str, str],
-    flags_on: Callable[[Tile], Sequence[NDArray[np.uint16]]],
-) -> None:  # fmt: skip
-    """Write uint16 layers with these names atomically. `flags_on` returns all layers (height, width) on a tile of the
-    grid. There is no nodata value: 0 means that no flag is set.
-
-    Raises OutputError.
-    """
-    options = {"compress": "deflate", "interleave": "band"}
-    with checked_raster(path, grid_profile(grid, georeference, len(names), "uint16", **options)) as raster:
-        raster.dataset.update_tags(**tags, **georeference_tags(georeference))
-        for index, name in enumerate(names, start=1):
-            raster.dataset.set_band_description(index, name)
-        for tile in tiles(grid.tile, _WORK_TILE_PX):
-            for index, flags in enumerate(flags_on(tile), start=1):
-                raster.write(flags, index, tile.x0 - grid.x0, tile.y0 - grid.y0)
 
 
 def media_type(settings: WriteSettings) -> str:
     """Return the media type of the files that `write_raster` writes."""
-    return COG if settings.format == "cog" else GEOTIFF
+    return _COG if settings.format == "cog" else GEOTIFF
 
 
-def predictor(kind: str) -> int:
-    """Return the TIFF predictor for a kind of numpy type: 3 for floating point, 2 for integers."""
-    return 3 if kind == "f" else 2
+def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, str]:
+    """The tags of a file."""
+    known = [] if raw else [layer.band.radiometry for layer in layers if layer.band.radiometry is not None]
+    tags = {
+        "TIFFTAG_SOFTWARE": "agalign",
+        "TIFFTAG_DATETIME": capture.captured_at[:19].replace("-", ":").replace("T", " "),
+        "CAPTURE_ID": capture.capture_id,
+        "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
+        "REFERENCE_BAND": capture.reference.name,
+        "RADIOMETRY": " and ".join(dict.fromkeys(r.quantity for r in known)),
+        "RADIOMETRY_SOURCE": " and ".join(dict.fromkeys(r.source for r in known)),
+    }
+    return tags | georeference_tags(capture.reference.georeference)
 
 
-def _colours(layers: Sequence[Layer]) -> list[ColorInterp]:
+def _descriptions(layers: Sequence[Layer], *, raw: bool) -> list[LayerDescription]:
+    result = []
+    for layer, colour in zip(layers, _colours(layers), strict=True):
+        band = layer.band
+        quantity = None if raw or band.radiometry is None else band.radiometry.quantity
+        tags, imagery = {} if quantity is None else {"QUANTITY": str(quantity)}, {}
+        if band.wavelength_nm is not None:
+            tags |= {"wavelength": f"{band.wavelength_nm:g}", "wavelength_units": "nm"}
+            imagery = {"CENTRAL_WAVELENGTH_UM": f"{band.wavelength_nm / 1000:g}"}
+            if band.bandwidth_nm is not None:
+                tags["fwhm"] = f"{band.bandwidth_nm:g}"
+                imagery["FWHM_UM"] = f"{band.bandwidth_nm / 1000:g}"
+        unit, scale_offset = "" if quantity is None else UNITS[quantity], band.scale_offset if raw else (1.0, 0.0)
+        result.append(LayerDescription(band.name, unit, tags, imagery, scale_offset, colour))
+    return result
+
+
+def _colours(layers: Sequence[Layer]) -> Sequence[ColorInterp | None]:
     """The colour interpretation of each layer. If there are red, green and blue, the first band of each is displayed as
-    such by viewers; else the first layer is grey.
+    such by viewers; else the first layer is grey. None for a single layer.
     """
+    if len(layers) == 1:
+        return [None]
     roles = [None if b.companion else role_of(b.name, b.wavelength_nm) for b in (layer.band for layer in layers)]
     if not set(_COLOURS) <= set(roles):
         return [ColorInterp.gray, *[ColorInterp.undefined] * (len(layers) - 1)]
@@ -148,17 +155,17 @@ def _colours(layers: Sequence[Layer]) -> list[ColorInterp]:
     return result
 
 
-def _write_layer(
-    raster: CheckedRaster, index: int, layer: Layer, grid: OutputGrid, nodata: float | None, settings: WriteSettings
-) -> None:
-    dtype = np.dtype(raster.dataset.dtypes[0])
-    for tile in tiles(grid.tile, _WORK_TILE_PX):
-        pixels, valid = _tile_of(layer, tile, settings)
-        if pixels is None:
-            pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
-        elif nodata is not None and not (valid.all() and layer.is_copied):
-            pixels = with_nodata(pixels.astype(dtype, copy=False), valid, nodata)
-        raster.write(pixels.astype(dtype, copy=False), index, tile.x0 - grid.x0, tile.y0 - grid.y0)
+def _blocks(
+    layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any], nodata: float | None, settings: WriteSettings
+) -> Iterator[Block]:
+    for index, layer in enumerate(layers, start=1):
+        for tile in tiles(grid.tile, WORK_TILE_PX):
+            pixels, valid = _tile_of(layer, tile, settings)
+            if pixels is None:
+                pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
+            elif nodata is not None and not (valid.all() and layer.is_copied):
+                pixels = with_nodata(pixels.astype(dtype, copy=False), valid, nodata)
+            yield pixels.astype(dtype, copy=False), index, tile.x0 - grid.x0, tile.y0 - grid.y0
 
 
 def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels | None, Mask]:
@@ -166,20 +173,22 @@ def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels 
     if layer.is_gap:
         return None, np.zeros((tile.height, tile.width), dtype=bool)
     radiometry = None if settings.radiometry == "off" else layer.band.radiometry
-    if layer.mapping is None:
-        pixels, valid = read_tile(layer.band, tile)
-        return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
-    pixels, valid = resample_tile(layer.band, layer.mapping, tile, settings.interpolation, radiometry)
-    if settings.fill_occluded:
-        return _with_occluded(pixels, valid, _fillable(layer, layer.mapping, tile))
+    pixels, valid = layer_pixels(layer, tile, settings.interpolation, radiometry)
+    if settings.fill_occluded and layer.mapping is not None:
+        positions = layer.mapping.positions(tile)
+        fillable = layer.mapping.hidden(tile) & is_inside(positions, layer.band)
+        return _with_occluded(pixels, valid, fillable)
     return pixels, valid
 
 
-def _fillable(layer: Layer, mapping: PixelMapping, tile: Tile) -> Mask:
-    """(height, width), True for pixels of a tile that are occluded in the band and inside its image."""
-    positions = mapping.positions(tile)
-    inside = ((positions >= 0) & (positions <= np.subtract(layer.band.size_px, 1))).all(axis=-1)
-    return np.asarray(mapping.hidden(tile) & inside)
+def layer_pixels(
+    layer: Layer, tile: Tile, interpolation: Interpolation, radiometry: Radiometry | None
+) -> tuple[Pixels, Mask]:
+    """Return the pixels of a layer (height, width) on a tile, calibrated if `radiometry` is given, and their mask."""
+    if layer.mapping is not None:
+        return resample_tile(layer.band, layer.mapping, tile, interpolation, radiometry)
+    pixels, valid = read_tile(layer.band, tile)
+    return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
 
 
 def _with_occluded(pixels: Pixels, valid: Mask, occluded: Mask) -> tuple[Pixels, Mask]:
@@ -210,3 +219,65 @@ def _to_cog(path: Path, compression: str) -> None:
         cog.replace(path)
     finally:
         cog.unlink(missing_ok=True)
+
+
+def nodata_value(
+    capture: Capture, layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any], settings: WriteSettings
+) -> float | None:
+    """Return the nodata value of a file with these layers; None if every pixel is valid. Raises UnreadableFileError."""
+    if settings.radiometry != "off":
+        return math.nan
+    declared = capture.reference.nodata
+    if declared is not None and _fits(declared, dtype):
+        return declared
+    if dtype.kind == "f":
+        return math.nan  # input files may contain nan without declaring it
+    return _unused_value(layers, grid, dtype) if _has_invalid_pixels(layers, grid) else None
+
+
+def with_nodata(pixels: Pixels, valid: Mask, nodata: float) -> Pixels:
+    """Return pixels (height, width) with nodata where they are not valid.
+
+    Valid pixels that equal nodata change by the smallest step of their type.
+    """
+    if not math.isnan(nodata):
+        pixels = np.where(valid & (pixels == nodata), pixels.dtype.type(_next_value(nodata, pixels.dtype)), pixels)
+    return np.where(valid, pixels, pixels.dtype.type(nodata))
+
+
+def _next_value(nodata: float, dtype: np.dtype[Any]) -> float:
+    if dtype.kind == "f":
+        return nodata + float(np.spacing(np.abs(dtype.type(nodata)) + 1))
+    return nodata + 1 if nodata < np.iinfo(str(dtype)).max else nodata - 1
+
+
+def _has_invalid_pixels(layers: Sequence[Layer], grid: OutputGrid) -> bool:
+    masked = (layer.band.nodata is not None or layer.band.has_mask for layer in layers)
+    return grid.has_gaps or any(layer.is_gap for layer in layers) or any(masked)
+
+
+def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any]) -> float:
+    """The first of 0, the largest value of the type, 1, 2 … that no copied band contains; 0 if there is none.
+
+    Copied pixels then keep their values.
+    """
+    copied = [_values_in(layer.band, grid.tile) for layer in layers if layer.is_copied]
+    limits = np.iinfo(str(dtype))
+    candidates = itertools.chain([0, limits.max], range(1, min(limits.max, _MAX_CANDIDATES)))
+    return float(next((v for v in candidates if not any((values == v).any() for values in copied)), 0))
+
+
+def _values_in(band: Band, tile: Tile) -> Pixels:
+    """The different values of a band in a rectangle of its file."""
+    with open_raster(band.path) as source:
+        result = [
+            np.unique(read_window(source, band, t.x0, t.y0, t.width, t.height)[0]) for t in tiles(tile, WORK_TILE_PX)
+        ]
+    return np.unique(np.concatenate(result))
+
+
+def _fits(value: float, dtype: np.dtype[Any]) -> bool:
+    if dtype.kind == "f":
+        return True
+    limits = np.iinfo(str(dtype))
+    return float(value).is_integer() and limits.min <= value <= limits.max

@@ -52,9 +52,15 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
     size_px = content.reference.width, content.reference.height
     issues = tuple(Issue(KINDS[i.kind], i.value, i.limit) for i in part.issues)
     return Alignment(
-        mapping, size_px, part.status, issues, seed, residual=_residual(part), seconds=part.seconds,
+        mapping,
+        size_px,
+        part.status,
+        issues,
+        seed,
+        residual=_residual(part),
+        seconds=part.seconds,
         candidates=candidates,
-    )  # fmt: skip
+    )
 
 
 def _lens(part: LensPart) -> Lens:

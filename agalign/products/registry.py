@@ -1,16 +1,13 @@
 """Every product of a capture, in the order in which they are written."""
 
-from agalign.products.band_files import BandFiles
-from agalign.products.error_map import ErrorMap
+from agalign.products.aligned_files import BandFiles, Stack
 from agalign.products.index_product import IndexRasters
 from agalign.products.pan_sharpen import PanSharpened
-from agalign.products.picture import BeforeAfterPicture
-from agalign.products.preview import Preview
+from agalign.products.preview import BeforeAfterPicture, Preview
 from agalign.products.product import Product
-from agalign.products.quality_raster import QualityRaster
+from agalign.products.quality_raster import ErrorMap, QualityRaster
 from agalign.products.relief_map import ReliefMap
 from agalign.products.stac import StacItem
-from agalign.products.stack import Stack
 from agalign.products.tie_points import TiePoints
 
 PRODUCTS: tuple[Product, ...] = (

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras import rig_seed
-from agalign.config import WriteSettings
 from agalign.errors import GeometryError
-from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import GEOTIFF, write_layers
+from agalign.products.checked_raster import LayerDescription
+from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.relief.range import inverse_range
 from agalign.values import lens
 from agalign.values.alignment import Alignment
@@ -20,33 +19,29 @@ from agalign.values.relief import Relief
 
 RELIEF_UNITS = {"parallax": "px", "confidence": "1", "range": "m"}
 """Units by layer of the raster."""
-_STEP_PX, _STEP_CONFIDENCE = 0.01, 0.01
-"""Values are rounded to these steps: less than their errors, and the raster compresses better."""
+_STEP = 0.01
+"""Parallax and confidence are rounded to this step: less than their errors, and the raster compresses better."""
 _MAX_RANGE_M = 1e5
 """Larger ranges are nan: the parallax cannot be distinguished from that of an infinite range."""
 
 
 class ReliefMap(Product):
-    """The relief that displaces the bands of a capture; the mapping in the sidecar refers to it."""
+    """The relief that displaces the bands of a capture, whenever one was estimated; the sidecar refers to it."""
 
     kind = "relief"
     suffix = ".relief.tif"
-
-    def is_enabled(self, settings: WriteSettings) -> bool:  # noqa: ARG002
-        """Return True: the raster is written whenever a relief was estimated."""
-        return True
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.relief.tif."""
         relief = relief_of(context.usable)
         if relief is None:
             return []
-        path = context.paths.file(self.suffix)
         layers = relief_layers(context.capture, context.usable, relief, context.grid)
         if not context.write_settings.relief_map:
             layers = {"parallax": layers["parallax"]}
-        write_layers(path, layers, context.grid, context.capture.reference.georeference, RELIEF_UNITS)
-        return [WrittenFile(self.kind, path, StacAsset("relief", GEOTIFF, ("data",)))]
+        descriptions = [LayerDescription(name, RELIEF_UNITS[name]) for name in layers]
+        blocks = ((values, index, 0, 0) for index, values in enumerate(layers.values(), start=1))
+        return self.write_layers(context, descriptions, blocks, StacAsset("relief", GEOTIFF, ("data",)))
 
 
 def relief_of(alignments: Mapping[str, Alignment[FixedFilePx]]) -> Relief | None:
@@ -55,9 +50,12 @@ def relief_of(alignments: Mapping[str, Alignment[FixedFilePx]]) -> Relief | None
 
 
 def relief_layers(
-    capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], relief: Relief, grid: OutputGrid,
+    capture: Capture,
+    alignments: Mapping[str, Alignment[FixedFilePx]],
+    relief: Relief,
+    grid: OutputGrid,
     size_px: tuple[int, int] | None = None,
-) -> dict[str, NDArray[np.float32]]:  # fmt: skip
+) -> dict[str, NDArray[np.float32]]:
     """Return layers (height, width) on a grid: `parallax` in px of the reference's file along a baseline of length 1,
     `confidence` from 0 to 1, and `range` in metres along the optical axis, nan where it is unknown.
 
@@ -71,16 +69,18 @@ def relief_layers(
     parallax_px = relief(points)
     confidence = Relief(relief.confidence, relief.confidence, relief.scale)(points)
     return {
-        "parallax": _rounded(parallax_px, _STEP_PX),
-        "confidence": _rounded(confidence, _STEP_CONFIDENCE),
+        "parallax": _rounded(parallax_px),
+        "confidence": _rounded(confidence),
         "range": _range_m(capture, alignments, points, parallax_px),
     }
 
 
 def _range_m(
-    capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], points: NDArray[np.float64],
+    capture: Capture,
+    alignments: Mapping[str, Alignment[FixedFilePx]],
+    points: NDArray[np.float64],
     parallax_px: NDArray[np.float64],
-) -> NDArray[np.float32]:  # fmt: skip
+) -> NDArray[np.float32]:
     """Range (height, width), nan if baselines, focal length or the orientation of the lenses are unknown."""
     reference, at_infinity, baselines_m, mappings = capture.reference, [], [], []
     for band in capture.moving:
@@ -104,5 +104,5 @@ def _range_m(
     return np.asarray(range_m, np.float32)
 
 
-def _rounded(values: NDArray[np.float64], step: float) -> NDArray[np.float32]:
-    return np.asarray(np.round(values / step) * step, np.float32)
+def _rounded(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    return np.asarray(np.round(values / _STEP) * _STEP, np.float32)

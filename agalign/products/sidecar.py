@@ -4,20 +4,60 @@ All pixel coordinates are x right, y down, (0, 0) the centre of the top-left pix
 the reference to a pixel of the moving band; `grid` samples the complete mapping between the raw pixels of the files.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
 
+from agalign.values.alignment import Prediction
 from agalign.values.choices import CaptureStatus, Geometry, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.files import is_inside
+from agalign.values.issues import IssueKind
 from agalign.verify.checks import KINDS
 
 SCHEMA = "agalign/1"
-
 Row = tuple[float, float, float]
-Matrix3x3 = tuple[Row, Row, Row]
 PointPx = tuple[float, float]
+Count = Annotated[int, Field(gt=0)]
+
+
+@dataclass(frozen=True)
+class _FromProgram:
+    """A conversion of the program's values. Values in a file are in their final form, and validated without it."""
+
+    convert: Callable[[Any], Any]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        schema = handler(source)
+        converted = core_schema.no_info_before_validator_function(self.convert, schema)
+        return core_schema.json_or_python_schema(json_schema=schema, python_schema=converted)
+
+
+def _measured(decimals: int | None = None) -> _FromProgram:
+    """Convert a number that is not finite to None, and others to these decimals."""
+
+    def convert(value: object) -> object:
+        if not isinstance(value, float):
+            return value
+        return None if not math.isfinite(value) else value if decimals is None else round(value, decimals)
+
+    return _FromProgram(convert)
+
+
+def _from_array(positions_px: object) -> object:
+    return np.round(np.asarray(positions_px), 4).tolist()
+
+
+Matrix3x3 = Annotated[tuple[Row, Row, Row], _FromProgram(lambda matrix: np.asarray(matrix).tolist())]
+PointsPx = Annotated[list[PointPx], _FromProgram(_from_array)]
+Finite = Annotated[float | None, _measured()]
+Fraction4 = Annotated[float | None, _measured(4)]
+Fraction6 = Annotated[float | None, _measured(6)]
+"""Digits beyond the sixth depend on the order in which threads add up."""
 
 
 def _inside_folder(name: str) -> str:
@@ -26,20 +66,18 @@ def _inside_folder(name: str) -> str:
     return name
 
 
-def rounded(value: float | None) -> float | None:
-    """Return a measured value to the four decimals that tables and the report have."""
-    return None if value is None else round(value, 4)
-
-
 RelativeFile = Annotated[str, AfterValidator(_inside_folder)]
 """A file in the sidecar's folder or below. A sidecar may come from anyone, and agalign reads and removes the files that
 it lists.
 """
-Count = Annotated[int, Field(gt=0)]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, populate_by_name=True, use_attribute_docstrings=True)
+    """Validated from the JSON of a sidecar, or from the program's record with attributes of these names."""
+
+    model_config = ConfigDict(
+        extra="forbid", allow_inf_nan=False, populate_by_name=True, use_attribute_docstrings=True, from_attributes=True
+    )
 
 
 class _Result(_Part):
@@ -57,6 +95,11 @@ class CameraPart(_Part):
     """Model."""
     serial: str
     """Serial numbers, joined by `+` if there are several."""
+
+    @property
+    def name(self) -> str:
+        """Manufacturer and model; empty if both are unknown."""
+        return f"{self.make} {self.model}".strip()
 
 
 class PositionPart(_Part):
@@ -83,6 +126,11 @@ class ReferencePart(_Part):
     """Width of the file, px."""
     height: Count
     """Height of the file, px."""
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of the file."""
+        return self.width, self.height
 
 
 class HomographyPart(_Part):
@@ -131,7 +179,7 @@ class FieldPart(_Part):
 
     step_px: float
     """Spacing of the nodes; the first one is the centre of the top-left pixel."""
-    displacements_px: list[list[PointPx]]
+    displacements_px: Annotated[list[list[PointPx]], _FromProgram(_from_array)]
     """Displacements (x, y) by row and column of the nodes; cubic splines between them."""
 
 
@@ -141,9 +189,9 @@ class GridPart(_Part):
     is more curved. If there is a `relief`, use that instead.
     """
 
-    reference_px: list[PointPx]
+    reference_px: PointsPx
     """Raw pixels of the reference file, row by row."""
-    moving_px: list[PointPx]
+    moving_px: PointsPx
     """The corresponding raw pixels of the band's file."""
 
 
@@ -153,14 +201,25 @@ def _known_kind(code: str) -> str:
     return code
 
 
+def _code(kind: object) -> object:
+    return kind.code if isinstance(kind, IssueKind) else kind
+
+
+IssueCode = Annotated[
+    str, AfterValidator(_known_kind), _FromProgram(_code), Field(json_schema_extra={"enum": list(KINDS)})
+]
+
+
 class IssuePart(_Part):
     """A reason against accepting the alignment."""
 
-    kind: Annotated[str, AfterValidator(_known_kind), Field(json_schema_extra={"enum": list(KINDS)})]
+    kind: Annotated[
+        str, AfterValidator(_known_kind), _FromProgram(_code), Field(json_schema_extra={"enum": list(KINDS)})
+    ]
     """Code of the reason."""
-    value: float | None
+    value: Finite
     """Measured value."""
-    limit: float | None
+    limit: Finite
     """Limit of the check."""
 
 
@@ -169,7 +228,7 @@ class JointPart(_Part):
 
     accepted: bool = True
     """False if the result was rejected: `homography` and `grid` are then those of the seed or the prediction."""
-    loss: float | None
+    loss: Finite
     """Final loss; null if nothing was learned."""
     retrieval: float
     """Share of held-out patches with their true counterpart as nearest descriptor in the other band."""
@@ -187,9 +246,9 @@ class JointPart(_Part):
     """Mapping that was fitted."""
     last_step_px: float
     """Largest movement of a corner in the last step, px."""
-    corner_std_px: float
+    corner_std_px: Annotated[float, _measured(6)]
     """Standard error of the least certain corner, px of the reference."""
-    corner_std_xy_px: list[PointPx]
+    corner_std_xy_px: PointsPx
     """Standard errors along x and y at the corners of the reference, clockwise from the top left, px of the reference.
     """
 
@@ -197,32 +256,32 @@ class JointPart(_Part):
 class SimilarityPart(_Part):
     """Similarity of the pixels that are valid in both bands; of large images a regular sample of 250,000 or more."""
 
-    mattes_mi: float | None = None
+    mattes_mi: Fraction6 = None
     """Negative mutual information by Mattes, nats, 32 bins, as in elastix: lower is better."""
-    nmi: float | None = None
+    nmi: Fraction6 = None
     """Normalised mutual information, 1 to 2: higher is better."""
-    ncc: float | None = None
+    ncc: Fraction6 = None
     """Normalised cross-correlation; negative if contrast is reversed."""
-    gradient_correlation: float | None = None
+    gradient_correlation: Fraction6 = None
     """Correlation of gradient magnitudes: higher is better."""
-    structure_ssim: float | None = None
+    structure_ssim: Fraction6 = None
     """SSIM of the structure images: higher is better."""
-    overlap: float | None = None
+    overlap: Fraction6 = None
     """Share of the image in which both bands are valid."""
-    residual_px: float | None = None
+    residual_px: Fraction6 = None
     """Median length of the local shifts of the windows, px; after alignment only."""
-    residual_p95_px: float | None = None
+    residual_p95_px: Fraction6 = None
     """Their 95th percentile, px."""
-    residual_coverage: float | None = None
+    residual_coverage: Fraction6 = None
     """Share of the textured windows in which a shift was measured."""
 
 
 class ResidualTile(_Part):
     """Local shift of one window after alignment."""
 
-    centre_px: PointPx
+    centre_px: tuple[Annotated[float, _measured(2)], Annotated[float, _measured(2)]]
     """Centre of the window, px of the reference."""
-    shift_px: tuple[float | None, float | None]
+    shift_px: tuple[Fraction4, Fraction4]
     """Shift along x and y, px; null if none could be measured."""
 
 
@@ -233,11 +292,6 @@ class MetricsResult(_Result):
     """Files as they are."""
     after: SimilarityPart
     """Bands as written."""
-
-    def similarity(self) -> dict[str, tuple[float | None, float | None]]:
-        """Return (before, after) by the name of each measure of similarity."""
-        names = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
-        return {n: (rounded(getattr(self.before, n)), rounded(getattr(self.after, n))) for n in names}
 
 
 class MetricsPart(MetricsResult):
@@ -256,8 +310,18 @@ class GeometryPart(_Part):
     """`homography`: nothing; `field`: a smooth displacement field; `relief`: the parallax of the capture;
     `relief and field`: both.
     """
-    held_out_p95_px: dict[Geometry, float | None]
+    held_out_p95_px: dict[Geometry, Fraction4]
     """p95 of the shifts of windows that were left out of the fits, px, for each geometry that was fitted."""
+
+    @property
+    def homography_p95_px(self) -> float | None:
+        """The p95 of a homography."""
+        return self.held_out_p95_px.get("homography")
+
+    @property
+    def p95_px(self) -> float | None:
+        """The p95 of the geometry that was chosen."""
+        return self.held_out_p95_px.get(self.kind)
 
 
 class ReliefPart(_Part):
@@ -271,13 +335,13 @@ class ReliefPart(_Part):
     """Displacement per px of parallax, undistorted px of the reference; the longest baseline of the capture has length
     1.
     """
-    occluded: float
+    occluded: Annotated[float, _measured(4)]
     """Share of the reference pixels that are occluded in this band."""
-    reference_px: list[PointPx]
+    reference_px: PointsPx
     """Nodes on the reference file, row by row: those of `grid`."""
-    plane_px: list[PointPx]
+    plane_px: PointsPx
     """Where the reference plane maps the nodes, raw px of the moving file."""
-    slope: list[PointPx]
+    slope: PointsPx
     """Px of the moving file per px of parallax, at the nodes."""
 
 
@@ -288,9 +352,9 @@ class PredictionPart(_Part):
     """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (extrapolated
     from the windows of a part of the image).
     """
-    std_px: float
+    std_px: Annotated[float, _measured(4)]
     """Standard error over the image (root mean square), px of the band's own file."""
-    off_px: float | None
+    off_px: Fraction4
     """Distance of the image's own alignment from the prediction, px of the band's own file; null if there is none."""
 
 
@@ -334,7 +398,7 @@ class BandResult(_Result):
     """Prediction by the rig of the flight, or by extrapolation."""
     place: PlacePart | None = None
     """Where the aligned pixels are."""
-    seconds: float
+    seconds: Annotated[float, _measured(3)]
     """Processing time of the band pair."""
 
 
@@ -502,8 +566,10 @@ class Sidecar(CaptureResult):
         return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude={"bands": {"__all__": tables}}))
 
 
-def is_delivered(status: PairStatus, std_px: float | None, accept_predicted_px: float) -> bool:
-    """Return True for the reference, an aligned band, or a predicted band whose standard error `std_px` is accepted."""
+def is_delivered(
+    status: PairStatus, prediction: Prediction | PredictionPart | None, accept_predicted_px: float
+) -> bool:
+    """Return True for the reference, an aligned band, or a predicted band whose standard error is accepted."""
     if status == "predicted":
-        return std_px is not None and std_px <= accept_predicted_px
+        return prediction is not None and prediction.std_px <= accept_predicted_px
     return status in ("reference", "aligned")

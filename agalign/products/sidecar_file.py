@@ -1,16 +1,16 @@
-"""Writing, reading and finding sidecars."""
+"""Writing, reading and finding sidecars, and comparing the files of a run with their checksums."""
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from agalign.errors import InputError, SidecarError
-from agalign.products.json_file import compact_lists
 from agalign.products.sidecar import SCHEMA, CaptureResult, Sidecar
+from agalign.products.text_files import compact_lists
 from agalign.values.files import file_checksum, open_regular, write_text
 
 _MAX_BYTES = 1 << 26
@@ -40,9 +40,10 @@ def update_products(path: Path, files: Sequence[Path]) -> None:
     sidecar = read_sidecar(path)
     products = [
         part.model_copy(update={"bytes": file.stat().st_size, "sha256": file_checksum(file)})
-        if (file := replaced.get(part.file)) is not None else part
+        if (file := replaced.get(part.file)) is not None
+        else part
         for part in sidecar.products
-    ]  # fmt: skip
+    ]
     write_sidecar(path, sidecar.model_copy(update={"products": products}))
 
 
@@ -127,3 +128,35 @@ def _problem(error: ValidationError) -> str:
         quoted = value if len(value) <= _MAX_QUOTED else f"{value[:_MAX_QUOTED]}…"
         return f"schema is {quoted}, not {SCHEMA!r}; run again with --overwrite"
     return f"{field}: {first['msg']}; run again with --overwrite"
+
+
+def verify_outputs(out: Path) -> Iterator[tuple[Path, list[str]]]:
+    """Yield (sidecar, problems of the sidecar and the files that it lists) for every capture below `out`.
+
+    Raises InputError if there is no sidecar.
+    """
+    for path in run_sidecars(out):
+        try:
+            yield path, list(_problems_of_outputs(path))
+        except SidecarError as error:
+            yield path, [str(error)]
+
+
+def _problems_of_outputs(path: Path) -> Iterator[str]:
+    sidecar = read_result(path)
+    with open_regular(path) as file:
+        text = file.read()
+    if sidecar.checksum is not None and sidecar.checksum != content_checksum(text):
+        yield f"{path}: was changed after it was written; run again with --overwrite"
+    for kind in sidecar.not_written:
+        yield f"{path}: its {kind} could not be written; run again"
+    for part in sidecar.products:
+        target = path.parent / part.file
+        try:
+            with open_regular(target) as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            yield f"{target}: cannot be read ({error.strerror or error}); run again"
+        else:
+            if digest != part.sha256:
+                yield f"{target}: is not what was written; delete it and run again"

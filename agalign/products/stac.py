@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agalign.cameras.base import is_thermal
-from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError
 from agalign.flight.fingerprint import hashed
 from agalign.flight.groups import camera_key, flight_key, flights_of
@@ -24,7 +23,7 @@ from agalign.products.footprint import footprint
 from agalign.products.indices import role_of
 from agalign.products.pan_sharpen import panchromatic
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
-from agalign.products.raster_tags import UNITS
+from agalign.products.raster_file import UNITS
 from agalign.values.capture import Band, Capture
 from agalign.values.files import write_text
 from agalign.values.image import OutputGrid
@@ -45,10 +44,7 @@ class StacItem(Product):
 
     kind = "stac_item"
     suffix = ".stac.json"
-
-    def is_enabled(self, settings: WriteSettings) -> bool:
-        """True with `--stac`."""
-        return settings.stac
+    option = "stac"
 
     def check(self, capture: Capture) -> None:  # noqa: ARG002
         """Raise ConfigurationError if pystac is not installed."""
@@ -86,12 +82,12 @@ def _write_collection(capture: Capture, items: Sequence[Path], out: Path) -> Pat
     """Write the collection of the flight of `capture`."""
     import pystac
 
-    target = out / _collection_file(capture)
-    collection = pystac.Collection(
-        id=_collection_id(capture), license="other",
-        extent=_extent([_read_item(path) for path in items]),
-        description=f"Captures of {camera_key(capture)} with co-registered bands",
-    )  # fmt: skip
+    target, read = out / _collection_file(capture), [_read_item(path) for path in items]
+    extent = pystac.Extent.from_items(read)
+    if all(item.bbox is None for item in read):
+        extent.spatial = pystac.SpatialExtent([[-180.0, -90.0, 180.0, 90.0]])
+    description = f"Captures of {camera_key(capture)} with co-registered bands"
+    collection = pystac.Collection(_collection_id(capture), description, extent, license="other")
     collection.add_link(pystac.Link("root", f"./{target.name}", _JSON))
     for path in items:
         collection.add_link(pystac.Link("item", f"./{path.relative_to(out).as_posix()}", _GEOJSON))
@@ -123,16 +119,6 @@ def _collection_file(capture: Capture) -> str:
     return f"{_collection_id(capture)}{_COLLECTION_SUFFIX}"
 
 
-def _extent(items: Sequence["pystac.Item"]) -> "pystac.Extent":
-    import pystac
-
-    boxes = [i.bbox for i in items if i.bbox is not None]
-    world = [-180.0, -90.0, 180.0, 90.0]
-    box = [*np.min(boxes, axis=0)[:2].tolist(), *np.max(boxes, axis=0)[2:].tolist()] if boxes else world
-    times = [i.datetime for i in items if i.datetime is not None]
-    return pystac.Extent(pystac.SpatialExtent([box]), pystac.TemporalExtent([[min(times), max(times)]]))
-
-
 def _item(context: ProductContext) -> "pystac.Item":
     """The item of a capture, without assets and links."""
     import pystac
@@ -141,10 +127,8 @@ def _item(context: ProductContext) -> "pystac.Item":
     capture, grid = context.capture, context.grid
     shape, box = _geometry(capture, grid)
     moment, source = _moment(capture)
-    item = pystac.Item(
-        id=capture.label, geometry=shape, bbox=box, datetime=moment,
-        properties={"agalign:datetime_source": source, "agalign:reference_band": capture.reference.name},
-    )  # fmt: skip
+    properties = {"agalign:datetime_source": source, "agalign:reference_band": capture.reference.name}
+    item = pystac.Item(capture.label, geometry=shape, bbox=box, datetime=moment, properties=properties)
     if capture.camera.model:
         item.properties["instruments"] = [f"{capture.camera.make} {capture.camera.model}".strip()]
     ProjectionExtension.ext(item, add_if_missing=True).apply(**_projection(capture, grid))
@@ -210,10 +194,8 @@ def _describe_bands(
         raster.append(
             RasterBand.create(data_type=DataType(dtype), nodata=missing, unit=unit, scale=scale, offset=offset)
         )
-        facts = {
-            "name": band.name, "data_type": dtype, "nodata": missing, "unit": unit, "eo:common_name": name,
-            "eo:center_wavelength": middle, "eo:full_width_half_max": width,
-        }  # fmt: skip
+        facts = {"name": band.name, "data_type": dtype, "nodata": missing, "unit": unit, "eo:common_name": name}
+        facts |= {"eo:center_wavelength": middle, "eo:full_width_half_max": width}
         common.append({k: v for k, v in facts.items() if v is not None})
     EOExtension.ext(asset, add_if_missing=True).bands = eo
     RasterExtension.ext(asset, add_if_missing=True).bands = raster

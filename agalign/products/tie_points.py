@@ -14,8 +14,8 @@ import numpy as np
 from agalign.config import WriteSettings
 from agalign.errors import GeometryError
 from agalign.pixels.raster import transformed
-from agalign.products.csv_file import write_csv
 from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.text_files import write_csv
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture, Georeference
@@ -25,9 +25,8 @@ from agalign.values.geometry import Points
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.text import harmless
 
-_COLUMNS = (
-    "band", "status", "reference_x_px", "reference_y_px", "moving_x_px", "moving_y_px", "residual_px", "weight",
-)  # fmt: skip
+_COLUMNS = ("band", "status", "reference_x_px", "reference_y_px", "moving_x_px", "moving_y_px", "residual_px", "weight")
+_MEASURED = "reference_px", "moving_px", "residual_px", "weight"
 _WGS84 = "EPSG:4326"
 _DECIMALS, _DEGREE_DECIMALS = 4, 8
 """Of px and weights; of degrees: a millimetre."""
@@ -52,10 +51,7 @@ class TiePoints(Product):
 
     kind = "tie_points"
     suffix = ".ties.csv"
-
-    def is_enabled(self, settings: WriteSettings) -> bool:
-        """True with `--tie-points`."""
-        return settings.tie_points
+    option = "tie_points"
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
         """Return the CSV and the GeoJSON file."""
@@ -64,20 +60,14 @@ class TiePoints(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.ties.csv and <capture>.ties.geojson."""
         table, features = self.paths(context.capture, context.paths, context.write_settings)
-        points = list(_points(context))
+        ties = ((b, a) for b in context.capture.moving if (a := context.usable.get(b.name)) is not None and a.ties)
+        points = [point for band, alignment in ties for point in tie_points(band, alignment)]
         write_csv(table, _COLUMNS, map(_cells, points))
         write_text(features, _geojson(points, context.capture.reference.georeference))
         return [
             WrittenFile(self.kind, table, StacAsset("tie_points", "text/csv", ("metadata",))),
             WrittenFile(self.kind, features, StacAsset("tie_points_geojson", "application/geo+json", ("metadata",))),
         ]
-
-
-def _points(context: ProductContext) -> Iterator[TiePoint]:
-    for band in context.capture.moving:
-        alignment = context.usable.get(band.name)
-        if alignment is not None and alignment.ties is not None:
-            yield from tie_points(band, alignment)
 
 
 def tie_points(band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoint]:
@@ -112,18 +102,15 @@ def _geojson(points: Sequence[TiePoint], georeference: Georeference | None) -> s
     features = [
         {
             "type": "Feature",
-            "geometry": {
-                "type": "Point", "coordinates": [round(x, _DEGREE_DECIMALS), round(y, _DEGREE_DECIMALS)],
-            },
+            "geometry": {"type": "Point", "coordinates": [round(x, _DEGREE_DECIMALS), round(y, _DEGREE_DECIMALS)]},
             "properties": {
-                "band": harmless(p.band), "status": p.status,
-                "reference_px": [round(v, _DECIMALS) for v in p.reference_px],
-                "moving_px": [round(v, _DECIMALS) for v in p.moving_px],
-                "residual_px": round(p.residual_px, _DECIMALS), "weight": round(p.weight, _DECIMALS),
+                "band": harmless(p.band),
+                "status": p.status,
+                **{name: np.round(getattr(p, name), _DECIMALS).tolist() for name in _MEASURED},
             },
         }
         for p, (x, y) in zip(points, places.tolist(), strict=True)
-    ]  # fmt: skip
+    ]
     return json.dumps({"type": "FeatureCollection", "coordinates_in": unit, "features": features}) + "\n"
 
 

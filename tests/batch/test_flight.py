@@ -23,7 +23,7 @@ from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.method import joint as method_joint
 from agalign.method.fast import Schedule, learn
 from agalign.method.state import JointState
-from agalign.products import picture
+from agalign.products import preview
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.synthetic.score import score_against_truth
@@ -338,7 +338,7 @@ def test_a_picture_that_fails_is_told_and_costs_no_more(
     def fails(*_: object) -> None:
         raise OutputError("a.png: cannot be written")
 
-    monkeypatch.setattr(picture, "write_picture", fails)
+    monkeypatch.setattr(preview, "write_picture", fails)
     reports = list(run_flight(discover(flight), out_with_model, SETTINGS))
     assert [r.shortcomings for r in reports] == [("a.png: cannot be written",)] * 2
     assert not any(r.good for r in reports)

@@ -13,8 +13,8 @@ import tifffile
 
 import agalign
 from agalign.config import Settings, WriteSettings
+from agalign.products.drawing import ReducedBands
 from agalign.products.preview import ReliefView, preview_bytes, write_preview
-from agalign.products.reduced_bands import ReducedBands
 from agalign.products.report import write_pages
 from agalign.synthetic import flight as synthetic
 

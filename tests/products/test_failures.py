@@ -1,6 +1,6 @@
 """What fell short, told once for each cause."""
 
-from agalign.products.failures import FailureGroups
+from agalign.products.report.facts import FailureGroups
 from agalign.products.sidecar import BandResult, CameraPart, CaptureResult, IssuePart, ReferencePart
 from agalign.verify.checks import KINDS
 

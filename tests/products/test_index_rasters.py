@@ -10,15 +10,12 @@ from synthetic_flights.aligned import make_aligned
 
 from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run
 from agalign.errors import ConfigurationError
-from agalign.products.formula import evaluate, symbols_of
 from agalign.products.index_bands import RAW
-from agalign.products.index_rasters import IndexReport
-from agalign.products.index_table import read_table
-from agalign.products.indices import INDICES, Index, index_named, index_of_formula
+from agalign.products.index_table import IndexReport, read_table
+from agalign.products.indices import INDICES, Index, evaluate, index_named, index_of_formula, symbols_of
 from agalign.products.report import write_pages
 from agalign.products.sidecar import ProductPart
-from agalign.products.sidecar_file import read_sidecar, write_sidecar
-from agalign.products.verify_outputs import verify_outputs
+from agalign.products.sidecar_file import read_sidecar, verify_outputs, write_sidecar
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 NDVI, NDRE = INDICES["ndvi"], INDICES["ndre"]

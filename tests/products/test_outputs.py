@@ -17,11 +17,11 @@ from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture.tag_seeds import geo_seed
 from agalign.config import CheckSettings, JointSettings, ReliefSettings, SeedSettings, Settings, WriteSettings
 from agalign.errors import ConfigurationError, InputError
-from agalign.products.band_files import band_file_names
-from agalign.products.index_rasters import IndexReport
+from agalign.products.aligned_files import band_file_names
+from agalign.products.index_table import IndexReport
 from agalign.products.indices import INDICES
 from agalign.products.layout import output_layers
-from agalign.products.verify_outputs import verify_outputs
+from agalign.products.sidecar_file import verify_outputs
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed

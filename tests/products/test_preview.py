@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from agalign.products.drawing import ReducedBands
 from agalign.products.preview import ReliefView, preview_bytes, write_preview
-from agalign.products.reduced_bands import ReducedBands
 
 from ..conftest import textured_image
 

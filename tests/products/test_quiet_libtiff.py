@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from agalign.products.quiet_libtiff import without_libtiff_messages
+from agalign.products.checked_raster import without_libtiff_messages
 
 
 def test_only_the_lines_of_libtiff_are_kept_back(capfd: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,6 @@ import agalign
 from agalign.errors import InputError, SidecarError
 from agalign.flight.rig_file import read_rig
 from agalign.products.report import pages, pages_exist, write_pages
-from agalign.products.report.facts import CaptureEntry
 from agalign.products.report.rigs import CHART_HEIGHT, drifts_of, rig_views
 from agalign.synthetic import flight as synthetic
 
@@ -130,7 +129,7 @@ def test_the_rig_is_read_without_its_network(out: Path, tmp_path: Path) -> None:
     assert rig is not None
     assert set(rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
     (view,) = rig_views(out, pytest.fail)
-    assert [b.name for b in view.bands] == list(rig.mean)
+    assert [b["band"] for b in view.bands] == list(rig.mean)
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "a.safetensors").write_bytes(path.read_bytes()[:2000])
     with pytest.raises(InputError, match=r"a\.safetensors: its rig cannot be read"):
@@ -140,8 +139,9 @@ def test_the_rig_is_read_without_its_network(out: Path, tmp_path: Path) -> None:
     assert len(said) == 1
 
 
-def told(label: str, offsets: dict[str, tuple[float, float]]) -> CaptureEntry:
-    return CaptureEntry(label, f"2026-06-21T10:00:{label}", "ok", "camera", None, 1.0, offsets)
+def told(label: str, offsets: dict[str, tuple[float, float]]) -> dict[str, object]:
+    bands = [{"band": name, "status": "aligned", "offset_px": offset} for name, offset in offsets.items()]
+    return {"label": label, "captured_at": f"2026-06-21T10:00:{label}", "camera": "camera", "bands": bands}
 
 
 def test_drift_is_drawn_along_the_direction_of_change_and_breaks_where_nothing_is_known() -> None:

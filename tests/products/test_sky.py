@@ -15,8 +15,8 @@ import agalign
 from agalign.batch import RunOptions
 from agalign.config import SeedSettings, Settings
 from agalign.errors import SidecarError
+from agalign.products.panels import SKY_FILE, read_sky
 from agalign.products.report import write_pages
-from agalign.products.sky import SKY_FILE, read_sky
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 ONLY_SEED = Settings(seed=SeedSettings(only=True))

@@ -9,8 +9,7 @@ import pytest
 
 from agalign.errors import InputError
 from agalign.products.sidecar import ProductPart
-from agalign.products.sidecar_file import content_checksum, write_sidecar
-from agalign.products.verify_outputs import verify_outputs
+from agalign.products.sidecar_file import content_checksum, verify_outputs, write_sidecar
 
 from .test_sidecar import example
 

@@ -7,7 +7,7 @@ import rasterio
 
 from agalign.config import Settings, WriteSettings
 from agalign.errors import OutputError
-from agalign.products.band_files import BandFiles
+from agalign.products.aligned_files import BandFiles
 from agalign.products.checked_raster import CheckedRaster
 from agalign.products.layout import Layer
 from agalign.products.product import CapturePaths, ProductContext

@@ -1,6 +1,7 @@
-"""The data that the report shows about each capture, compact enough for a thousand captures."""
+"""The data that the report shows about each capture, compact enough for a thousand captures, and the bands that are not
+aligned, grouped by cause, with a remedy for each cause.
+"""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,41 +11,95 @@ from urllib.parse import quote
 
 import numpy as np
 
-from agalign.products.failures import FailureGroups
 from agalign.products.index_bands import RAW
 from agalign.products.index_table import IndexRow
-from agalign.products.sidecar import (
-    BandPart,
-    BandResult,
-    CaptureResult,
-    GridPart,
-    JointPart,
-    MetricsResult,
-    Sidecar,
-    rounded,
-)
+from agalign.products.run_record import RefusalPart
+from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, Sidecar
+from agalign.values.issues import MISSING_BAND, Remedy
+from agalign.verify.checks import KINDS
 
+_SEVERITY = {"failed": 0, "seed_only": 1, "missing": 2, "predicted": 3}
+"""Order of the statuses, the most severe first."""
+_NO_REASON = Remedy("no reason was recorded", "run again with --overwrite")
 SCHEMA = "agalign-report/1"
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""
 _MAX_SCALE_DIFFERENCE = 0.1
 """An offset between two files is not meaningful if their scales differ by a larger share."""
+_SIMILARITY = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
+BAND_COLUMNS = {
+    "band": "band",
+    "wavelength_nm": "wavelength_nm",
+    "status": "status",
+    "reason": "reason",
+    "seed": "seed.kind",
+    "retrieval": "joint.retrieval",
+    "corner_std_px": "joint.corner_std_px",
+    "residual_px": "metrics.after.residual_px",
+    "residual_p95_px": "metrics.after.residual_p95_px",
+    "residual_coverage": "metrics.after.residual_coverage",
+    "geometry": "geometry.kind",
+    "homography_p95_px": "geometry.homography_p95_px",
+    "geometry_p95_px": "geometry.p95_px",
+    "prediction_from": "prediction.source",
+    "prediction_std_px": "prediction.std_px",
+    "prediction_off_px": "prediction.off_px",
+    **{f"{name}_{when}": f"metrics.{when}.{name}" for name in _SIMILARITY for when in ("before", "after")},
+    "seconds": "seconds",
+}
+"""Field of a band in the sidecar by column of OUT/summary.csv."""
+_OF_PAIRS = tuple(BAND_COLUMNS)[:9]
+"""The columns that the report has too, under the same names."""
 
 
-@dataclass(frozen=True)
-class CaptureEntry:
-    """A capture, as the templates of the report use it."""
+@dataclass
+class FailureGroup:
+    """The bands of a run with the same status and the same cause."""
 
-    label: str
-    captured_at: str
     status: str
-    camera: str
-    position: tuple[float, float] | None
-    """Latitude and longitude, degrees."""
-    seconds: float
-    """Processing time of its band pairs."""
-    offsets_px: dict[str, tuple[float, float]]
-    """Offset (x, y) of each delivered band from the reference, in the centre of the reference."""
+    remedy: Remedy
+    bands: list[RefusalPart] = field(default_factory=list)
+
+    @property
+    def advice(self) -> str:
+        """The remedy; for predicted bands, also when they may be used as they are."""
+        if self.status != "predicted":
+            return self.remedy.advice
+        usable = "use those with a standard error of at most 1 px (prediction.std_px in the sidecar), as indices do"
+        return f"{usable}; {self.remedy.advice}"
+
+    @property
+    def captures(self) -> int:
+        """Number of captures with such a band."""
+        return len({b.capture for b in self.bands})
+
+
+@dataclass
+class FailureGroups:
+    """The groups of a run, whose captures are added one by one."""
+
+    _by_cause: dict[tuple[str, Remedy], FailureGroup] = field(default_factory=dict)
+
+    def add(self, label: str, result: CaptureResult) -> None:
+        """Add the bands of a capture that are missing or not aligned."""
+        for band in result.bands:
+            if band.status not in ("reference", "aligned"):
+                self._put(label, band.band, band.status, band.reason or "", _remedy_of(band))
+        for name in result.missing_bands:
+            self._put(label, name, "missing", MISSING_BAND.cause, MISSING_BAND)
+
+    def groups(self) -> list[FailureGroup]:
+        """Return the groups, the most severe first, and the largest first of those."""
+        return sorted(self._by_cause.values(), key=lambda g: (_SEVERITY[g.status], -len(g.bands), g.remedy.cause))
+
+    def _put(self, capture: str, band: str, status: str, reason: str, remedy: Remedy) -> None:
+        group = self._by_cause.setdefault((status, remedy), FailureGroup(status, remedy))
+        group.bands.append(RefusalPart(capture=capture, band=band, status=status, reason=reason))
+
+
+def _remedy_of(band: BandResult) -> Remedy:
+    """The remedy of the first issue, which is the one in `reason`."""
+    return KINDS[band.issues[0].kind].remedy if band.issues else _NO_REASON
 
 
 @dataclass(frozen=True)
@@ -70,12 +125,11 @@ class BandRow:
 class Facts:
     """The data of the captures below an output folder, which are added one by one."""
 
-    out: Path
-    entries: list[CaptureEntry] = field(default_factory=list)
+    captures: list[dict[str, Any]] = field(default_factory=list)
+    """As in the data of the report."""
     bands: list[BandResult] = field(default_factory=list)
     """All moving bands of all captures."""
     failures: FailureGroups = field(default_factory=FailureGroups)
-    _captures: list[dict[str, Any]] = field(default_factory=list)
     _offsets_px: dict[str, list[float]] = field(default_factory=dict)
     """Median length of the offset of each band, in every capture."""
     _lattices: dict[tuple[float, ...], int] = field(default_factory=dict)
@@ -84,34 +138,55 @@ class Facts:
     def add(self, folder: str, sidecar: Sidecar) -> None:
         """Add a capture, given its folder relative to the output folder."""
         result = sidecar.result()
-        pairs = [self._pair(b, sidecar) for b in sidecar.bands]
+        label = Path(folder, sidecar.capture).as_posix()
         moving = [b for b in result.bands if b.status != "reference"]
-        position = sidecar.position
-        entry = CaptureEntry(
-            Path(folder, sidecar.capture).as_posix(), sidecar.captured_at, sidecar.status, _camera(result),
-            None if position is None else (position.latitude, position.longitude), sum(b.seconds for b in moving),
-            {p["band"]: p["offset_px"] for p in pairs if p["status"] in ("aligned", "predicted") and p["offset_px"]},
-        )  # fmt: skip
+        pairs = [self._pair(b, sidecar) for b in sidecar.bands]
         for pair in pairs:
             if pair["apart_px"] is not None:
                 self._offsets_px.setdefault(pair["band"], []).append(pair["apart_px"])
         self.bands += moving
-        self.failures.add(entry.label, result)
-        self.entries.append(entry)
-        self._captures.append(self._capture(Path(folder), sidecar, entry, pairs))
+        self.failures.add(label, result)
+        output, preview, position, path = sidecar.output, sidecar.preview, sidecar.position, Path(folder)
+        grid = output or OutputPart(file=None, bytes=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
+        files = {part.kind: part.file for part in sidecar.products}
+        relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
+        facts: dict[str, Any] = {
+            "label": label,
+            "captured_at": sidecar.captured_at,
+            "camera": sidecar.camera.name or "unknown camera",
+            "status": sidecar.status,
+            "position": None if position is None else (position.latitude, position.longitude),
+            "altitude_m": None if position is None else position.altitude_m,
+            "missing": sidecar.missing_bands,
+            "reference": sidecar.reference.band,
+            "seconds": round(sum(b.seconds for b in moving), 2),
+            "crop": grid.crop,
+            "scale": grid.scale,
+            "radiometry": grid.radiometry,
+            "stack": _link(path, files.get("stack")),
+            "relief": _link(path, relief),
+            "sidecar": _link(path, f"{sidecar.capture}.json"),
+            "picture": _link(path, files.get("picture")),
+            "preview": None,
+            "bands": pairs,
+            "indices": [],
+        }
+        if preview is not None:
+            detail = [round(v, 5) for v in preview.detail]
+            facts["preview"] = preview.model_dump() | {"file": _link(path, preview.file), "detail": detail}
+        self.captures.append(facts)
 
     def add_indices(self, rows: Sequence[IndexRow]) -> None:
         """Add the spectral indices of captures that were added before."""
-        by_label = {c["label"]: c["indices"] for c in self._captures}
+        by_label = {c["label"]: c["indices"] for c in self.captures}
         for row in rows:
             if row.file and row.label in by_label:
-                statistics = row.statistics
-                by_label[row.label].append({
-                    "name": row.index, "median": _finite(statistics.median), "p5": _finite(statistics.p5),
-                    "p95": _finite(statistics.p95), "valid": statistics.valid_share,
-                    "span": (statistics.low, statistics.high), "unit": statistics.unit, "raw": statistics.unit == RAW,
-                    "file": quote(row.file), "picture": quote(Path(row.file).with_suffix(".png").as_posix()),
-                })  # fmt: skip
+                statistics = row.statistics.as_json()
+                facts = {name: rounded(statistics[name]) for name in ("median", "p5", "p95")}
+                facts |= {"name": row.index, "valid": row.statistics.valid_share, "unit": row.statistics.unit}
+                facts |= {"span": (statistics["low"], statistics["high"]), "raw": row.statistics.unit == RAW}
+                picture = Path(row.file).with_suffix(".png").as_posix()
+                by_label[row.label].append(facts | {"file": quote(row.file), "picture": quote(picture)})
 
     @property
     def residuals_px(self) -> list[float]:
@@ -125,95 +200,67 @@ class Facts:
             pairs = [b for b in self.bands if b.band == name]
             residuals_px = [r for b in pairs if (r := _residual_px(b)) is not None]
             offsets_px = self._offsets_px.get(name)
-            rows.append(
-                BandRow(
-                    name, sum(b.status == "aligned" for b in pairs), len(pairs),
-                    median(offsets_px) if offsets_px else None, median(residuals_px) if residuals_px else None,
-                    max(residuals_px, default=None), median(b.seconds for b in pairs),
-                )
-            )  # fmt: skip
+            row = BandRow(
+                name,
+                aligned=sum(b.status == "aligned" for b in pairs),
+                pairs=len(pairs),
+                offset_px=median(offsets_px) if offsets_px else None,
+                residual_px=median(residuals_px) if residuals_px else None,
+                worst_px=max(residuals_px, default=None),
+                seconds=median(b.seconds for b in pairs),
+            )
+            rows.append(row)
         return rows
 
     def as_json(self) -> dict[str, Any]:
         """Return the data of the schema `agalign-report/1`, whose types the script of the page declares."""
-        return {
-            "schema": SCHEMA, "captures": self._captures, "shift_step_px": _SHIFT_STEP_PX,
-            "lattices": [list(centres) for centres in self._lattices],
-        }  # fmt: skip
-
-    def _capture(
-        self, folder: Path, sidecar: Sidecar, entry: CaptureEntry, pairs: Sequence[dict[str, Any]]
-    ) -> dict[str, Any]:
-        output, preview, reference = sidecar.output, sidecar.preview, sidecar.reference
-        crop = (0, 0, reference.width, reference.height) if output is None else output.crop
-        picture = folder / f"{sidecar.capture}.png"
-        relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
-        return {
-            "label": entry.label, "captured_at": entry.captured_at, "camera": entry.camera, "status": entry.status,
-            "position": entry.position, "altitude_m": None if sidecar.position is None else sidecar.position.altitude_m,
-            "missing": sidecar.missing_bands, "reference": reference.band, "seconds": round(entry.seconds, 2),
-            "crop": crop, "scale": (1.0, 1.0) if output is None else output.scale,
-            "radiometry": None if output is None else output.radiometry,
-            "stack": _link(folder / output.file) if output is not None and output.file else None,
-            "relief": None if relief is None else _link(folder / relief),
-            "sidecar": _link(folder / f"{sidecar.capture}.json"),
-            "picture": _link(picture) if (self.out / picture).is_file() else None,
-            "preview": None if preview is None else {
-                **preview.model_dump(exclude={"file"}), "file": _link(folder / preview.file),
-                "detail": [round(v, 5) for v in preview.detail],
-            },
-            "bands": pairs, "indices": [],
-        }  # fmt: skip
+        facts = {"schema": SCHEMA, "captures": self.captures, "shift_step_px": _SHIFT_STEP_PX}
+        return facts | {"lattices": [list(centres) for centres in self._lattices]}
 
     def _pair(self, band: BandPart, sidecar: Sidecar) -> dict[str, Any]:
-        prediction = band.prediction
-        tiles = [] if band.metrics is None else band.metrics.tiles
-        offset_px, distance_px = _band_offset(band.grid, sidecar)
+        row = table_row(band)
+        metrics, tiles = band.metrics, [] if band.metrics is None else band.metrics.tiles
+        similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
         lattice = tuple(v for t in tiles for v in t.centre_px)
-        return {
-            "band": band.band, "wavelength_nm": band.wavelength_nm, "status": band.status, "reason": band.reason,
-            "seed": band.seed.kind if band.seed else None, "seconds": round(band.seconds, 2),
-            "written": band.place is not None, "offset_px": offset_px, "apart_px": distance_px,
-            **_residual(band.metrics), **_joint(band.joint),
-            "prediction": None if prediction is None else prediction.model_dump(by_alias=True),
+        offset_px, apart_px = _band_offset(band.grid, sidecar)
+        return {name: row[name] for name in _OF_PAIRS} | {
+            "seconds": round(band.seconds, 2),
+            "written": band.place is not None,
+            "offset_px": offset_px,
+            "apart_px": apart_px,
+            "coverage": row["residual_coverage"],
+            "similarity": None if metrics is None else similarity,
+            "prediction": None if band.prediction is None else band.prediction.model_dump(by_alias=True),
             "geometry": None if band.geometry is None else band.geometry.model_dump(),
-            "occluded": None if band.relief is None else band.relief.occluded,
+            "occluded": value_at(band, "relief.occluded"),
             "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
             "shifts": [None if v is None else round(v / _SHIFT_STEP_PX) for t in tiles for v in t.shift_px],
-        }  # fmt: skip
+        }
 
 
-def _link(path: Path) -> str:
-    return quote(path.as_posix())
+def value_at(part: object, path: str) -> Any:
+    """Return a field of nested models, with four decimals; None if a model on the path is None."""
+    for name in path.split("."):
+        part = None if part is None else getattr(part, name)
+    return rounded(part)
 
 
-def _residual(metrics: MetricsResult | None) -> dict[str, Any]:
-    """Residuals after alignment, and the similarity before and after."""
-    if metrics is None:
-        return dict.fromkeys(("residual_px", "residual_p95_px", "coverage", "similarity"))
-    after = metrics.after
-    return {
-        "residual_px": rounded(after.residual_px), "residual_p95_px": rounded(after.residual_p95_px),
-        "coverage": rounded(after.residual_coverage), "similarity": metrics.similarity(),
-    }  # fmt: skip
+def table_row(band: BandPart) -> dict[str, Any]:
+    """Return the row of a band pair in OUT/summary.csv, by column."""
+    return {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
 
 
-def _joint(joint: JointPart | None) -> dict[str, float | None]:
-    if joint is None:
-        return {"retrieval": None, "corner_std_px": None}
-    return {"retrieval": rounded(joint.retrieval), "corner_std_px": rounded(joint.corner_std_px)}
+def rounded(value: Any) -> Any:
+    """Return a measured value with the four decimals that tables and the report have; others unchanged."""
+    return round(value, 4) if isinstance(value, float) else value
 
 
-def _camera(result: CaptureResult) -> str:
-    return f"{result.camera.make} {result.camera.model}".strip() or "unknown camera"
+def _link(folder: Path, name: str | None) -> str | None:
+    return None if name is None else quote((folder / name).as_posix())
 
 
 def _residual_px(band: BandResult) -> float | None:
     return band.metrics.after.residual_px if band.status == "aligned" and band.metrics else None
-
-
-def _finite(value: float) -> float | None:
-    return rounded(value) if math.isfinite(value) else None
 
 
 def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:
@@ -228,6 +275,6 @@ def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, 
     if not (np.abs(moving_span - reference_span) < _MAX_SCALE_DIFFERENCE * reference_span).all():
         return None, None
     offsets = moving_px - reference_px
-    centre = np.array([sidecar.reference.width - 1, sidecar.reference.height - 1]) / 2
+    centre = (np.array(sidecar.reference.size_px) - 1) / 2
     dx, dy = offsets[np.linalg.norm(reference_px - centre, axis=1).argmin()].tolist()
     return (round(dx, 3), round(dy, 3)), round(float(np.median(np.linalg.norm(offsets, axis=1))), 3)

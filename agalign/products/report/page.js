@@ -301,7 +301,7 @@ function indexNames() {
 }
 
 /**
- * As agalign/products/index_picture.py has them.
+ * As agalign/products/index_rasters.py has them.
  * @param {number} share @param {boolean} raw
  */
 function indexColour(share, raw) {

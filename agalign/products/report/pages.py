@@ -18,17 +18,17 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
-from agalign.products.failures import FailureGroup
 from agalign.products.index_table import IndexRow, rows_of_run, update_table
-from agalign.products.panels import PANELS_FILE, PanelPart, read_panels
-from agalign.products.report.facts import Facts
+from agalign.products.panels import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
+from agalign.products.report.facts import BAND_COLUMNS, Facts, FailureGroup, table_row
 from agalign.products.report.rigs import drifts_of, rig_views
 from agalign.products.run_record import RunPart, read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
-from agalign.products.sky import SKY_FILE, SkyPart, read_sky
-from agalign.products.summary import panel_rows, sky_rows, summary_rows, write_summary
+from agalign.products.text_files import write_csv
 from agalign.values.files import write_text
+from agalign.values.text import without_formula
 
+SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS)
 REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
 _SLOWEST = 5
 
@@ -55,7 +55,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     rows: list[dict[str, object]] = []
     indices: list[IndexRow] = []
     unreadable: list[str] = []
-    facts = Facts(out)
+    facts = Facts()
     for path in find_sidecars(out):
         folder = path.parent.relative_to(out).as_posix()
         try:
@@ -63,7 +63,8 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         except SidecarError as error:
             unreadable.append(str(error))
             continue
-        rows += summary_rows(folder, sidecar)
+        moving = [b for b in sidecar.bands if b.status != "reference"]
+        rows += [{"folder": folder, "capture": sidecar.capture, **table_row(b)} for b in moving]
         indices += rows_of_run(sidecar, folder, out)
         facts.add(folder, sidecar)
     panels: list[PanelPart] = []
@@ -73,12 +74,13 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         panels, sky, run = read_panels(out), read_sky(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
-    rows += [row for panel in panels for row in panel_rows(panel)]
-    rows += [row for part in sky for row in sky_rows(part)]
-    write_summary(rows, out / SUMMARY_FILE)
+    rows += [row for panel in panels if not panel.in_scene for row in _rows_not_aligned(panel, "panel")]
+    rows += [row for part in sky for row in _rows_not_aligned(part, "sky")]
+    cells = ([without_formula(row.get(name)) for name in SUMMARY_COLUMNS] for row in rows)
+    write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, cells)
     facts.add_indices(update_table(out, indices))
     failures = facts.failures.groups()
-    slowest = sorted(((c.label, c.seconds) for c in facts.entries), key=lambda c: -c[1])[:_SLOWEST]
+    slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:_SLOWEST]
     write_text(out / REPORT_FILE, _page(out, facts, panels, sky, run, unreadable.append))
     if unreadable:
         with suppress(OSError):
@@ -98,10 +100,20 @@ def pages_exist(out: Path) -> bool:
         return False
 
 
+def _rows_not_aligned(part: PanelPart | SkyPart, status: str) -> list[dict[str, object]]:
+    """A row for each band of a capture of a panel or of the sky; other columns are empty."""
+    facts = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
+    return [{**facts, "band": band.band} for band in part.bands]
+
+
 def _page(
-    out: Path, facts: Facts, panels: Sequence[PanelPart], sky: Sequence[SkyPart], run: RunPart | None,
+    out: Path,
+    facts: Facts,
+    panels: Sequence[PanelPart],
+    sky: Sequence[SkyPart],
+    run: RunPart | None,
     on_problem: Callable[[str], None],
-) -> str:  # fmt: skip
+) -> str:
     environment = Environment(
         loader=PackageLoader("agalign.products.report", "."),
         autoescape=select_autoescape(["j2"]),
@@ -116,13 +128,14 @@ def _page(
         script=script,
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         facts=_script_json(facts.as_json()),
-        captures=facts.entries,
-        counts=Counter(c.status for c in facts.entries),
+        captures=facts.captures,
+        counts=Counter(c["status"] for c in facts.captures),
         statuses=Counter(b.status for b in facts.bands),
         pairs=len(facts.bands),
-        cameras=Counter(c.camera for c in facts.entries),
+        cameras=Counter(c["camera"] for c in facts.captures),
         residuals_px=facts.residuals_px,
-        seconds=_Seconds.of(facts, run),
+        capture_seconds=median(c["seconds"] for c in facts.captures) if facts.captures else None,
+        run_seconds=run.seconds if run is not None and run.captures.get("done") == len(facts.captures) else None,
         failures=facts.failures.groups(),
         problems=[] if run is None else run.problems,
         settings=_changed_settings(run),
@@ -130,10 +143,10 @@ def _page(
         unfinished=run is not None and run.state == "interrupted",
         bands=facts.by_band(),
         rigs=rig_views(out, on_problem),
-        drifts=drifts_of(facts.entries),
+        drifts=drifts_of(facts.captures),
         panels=panels,
         sky=sky,
-        mapped=sum(c.position is not None for c in facts.entries),
+        mapped=sum(c["position"] is not None for c in facts.captures),
     )
 
 
@@ -144,10 +157,11 @@ def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
     defaults = Settings().model_dump(mode="json")
     return [
         (f"{stage}.{name}", json.dumps(value, ensure_ascii=False))
-        for stage, values in run.settings.items() if isinstance(values, dict)
+        for stage, values in run.settings.items()
+        if isinstance(values, dict)
         for name, value in values.items()
         if value != defaults.get(stage, {}).get(name) and (stage, name) != ("flight", "start")
-    ]  # fmt: skip
+    ]
 
 
 def _resource(name: str) -> str:
@@ -158,21 +172,3 @@ def _script_json(facts: dict[str, Any]) -> str:
     """JSON for an HTML script element, escaped so that no text in it ends the element."""
     text = json.dumps(facts, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
-
-
-@dataclass(frozen=True)
-class _Seconds:
-    """Processing times."""
-
-    capture: float | None
-    """Median over the captures."""
-    run: float | None
-    """Duration of the run, if one run processed all captures."""
-
-    @classmethod
-    def of(cls, facts: Facts, run: RunPart | None) -> "_Seconds":
-        did_all = run is not None and run.captures.get("done") == len(facts.entries)
-        return cls(
-            median(c.seconds for c in facts.entries) if facts.entries else None,
-            run.seconds if run is not None and did_all else None,
-        )

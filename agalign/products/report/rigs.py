@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from agalign.errors import InputError
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.rig_prediction import band_summaries
-from agalign.products.report.facts import CaptureEntry
 from agalign.values import geometry
 
 PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
@@ -23,28 +23,9 @@ _PLAN_SHARE, _CHART_SHARE = 0.36, 0.92
 """Largest distance from the centre: share of the width of a plan, and of half the height of a chart."""
 _MIN_CHART_PX = 0.2
 """Smallest range of a drift chart."""
+_DELIVERED = ("aligned", "predicted")
 _MAX_POINTS = 400
 """Points of a line: the drift of more captures is averaged."""
-
-
-@dataclass(frozen=True)
-class BandView:
-    """A band of a rig: the position of its lens, errors of its prediction, and the residuals of its lens model."""
-
-    name: str
-    hue: float
-    x: float
-    y: float
-    """Position of the lens in the plan of the rig."""
-    offset_px: tuple[float, float]
-    from_bands_px: float
-    """Error of the prediction from the other bands of a capture."""
-    from_flight_px: float
-    """Error of the prediction from the mean of the flight."""
-    field_px: float | None
-    """Size of the displacement field of the lens."""
-    arrows: tuple[tuple[float, float, float, float], ...]
-    """(x1, y1, x2, y2) of the displacement field."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +36,10 @@ class RigView:
     captures: int
     shared: str
     field_height: float
-    bands: tuple[BandView, ...]
+    bands: tuple[dict[str, Any], ...]
+    """Rows of `band_summaries` with `hue`, the position `x`, `y` of the lens in the plan of the rig, and `arrows`
+    (x1, y1, x2, y2) of its displacement field.
+    """
 
 
 @dataclass(frozen=True)
@@ -105,12 +89,8 @@ def _rig_view(camera: str, rig: Rig) -> RigView:
     bands = []
     for number, row in enumerate(rows):
         x, y = (PLAN_WIDTH / 2 + to_plan * v for v in row["baseline"])
-        bands.append(
-            BandView(
-                row["band"], hue_of(number, len(rows)), x, y, tuple(row["offset_px"]), row["from_bands_px"],
-                row["from_flight_px"], row["field_px"], _arrows(rig, row["band"]),
-            )
-        )  # fmt: skip
+        drawn = {"hue": hue_of(number, len(rows)), "x": x, "y": y, "arrows": _arrows(rig, row["band"])}
+        bands.append(row | drawn)
     shared = ", ".join(rig.factors) or "nothing"
     return RigView(camera, len(rig.captures), shared, FIELD_WIDTH * height / width, tuple(bands))
 
@@ -130,19 +110,25 @@ def hue_of(number: int, count: int) -> float:
     return round(205 + 360 * number / max(count, 1)) % 360
 
 
-def drifts_of(captures: Sequence[CaptureEntry]) -> list[Drift]:
-    """Return a chart, in the order of time, for each camera with three captures or more."""
+def drifts_of(captures: Sequence[dict[str, Any]]) -> list[Drift]:
+    """Return a chart, in the order of time, for each camera with three captures or more, given the report's data."""
     result = []
-    for camera in dict.fromkeys(c.camera for c in captures):
-        in_order = sorted((c for c in captures if c.camera == camera), key=lambda c: (c.captured_at, c.label))
-        names = list(dict.fromkeys(name for c in in_order for name in c.offsets_px))
+    for camera in dict.fromkeys(c["camera"] for c in captures):
+        in_order = sorted((c for c in captures if c["camera"] == camera), key=lambda c: (c["captured_at"], c["label"]))
+        offsets_px = [
+            {b["band"]: b["offset_px"] for b in c["bands"] if b["status"] in _DELIVERED and b["offset_px"]}
+            for c in in_order
+        ]
+        names = list(dict.fromkeys(name for of_capture in offsets_px for name in of_capture))
         if len(in_order) >= 3 and names:
-            result.append(_drift(camera, in_order, names))
+            lines, full_px = _lines(offsets_px, names)
+            result.append(Drift(camera, full_px, len(in_order), lines, in_order[0]["label"], in_order[-1]["label"]))
     return result
 
 
-def _drift(camera: str, captures: Sequence[CaptureEntry], names: Sequence[str]) -> Drift:
-    offsets_px = np.array([[c.offsets_px.get(name, (np.nan, np.nan)) for c in captures] for name in names])
+def _lines(captures: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[tuple[Line, ...], float]:
+    """A line for each band, given offsets (x, y) by band of all captures, and the largest difference."""
+    offsets_px = np.array([[c.get(name, (np.nan, np.nan)) for c in captures] for name in names])
     differences = [_principal_component(band_offsets_px) for band_offsets_px in offsets_px]
     # The sign of a principal component is arbitrary: choose that of the first band.
     differences = [d if np.nansum(differences[0] * d) >= 0 else -d for d in differences]
@@ -152,7 +138,7 @@ def _drift(camera: str, captures: Sequence[CaptureEntry], names: Sequence[str]) 
         Line(name, hue_of(number, len(names)), _polylines(values, full, step))
         for number, (name, values) in enumerate(zip(names, differences, strict=True))
     )
-    return Drift(camera, full, len(captures), lines, captures[0].label, captures[-1].label)
+    return lines, full
 
 
 def _principal_component(offsets_px: NDArray[np.float64]) -> NDArray[np.float64]:

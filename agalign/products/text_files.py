@@ -1,6 +1,10 @@
-"""JSON files that are written from pydantic models and read back."""
+"""Tables as CSV, and pydantic models as JSON that is read back."""
 
+import csv
+import io
 import re
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,8 +28,12 @@ def compact_lists(text: str) -> str:
     return re.sub(r"(?<=[0-9le])\n *\]", "]", text)
 
 
-def write_model(path: Path, model: BaseModel) -> None:
-    """Write a model atomically as indented JSON. Raises OutputError."""
+def write_model(path: Path, model: BaseModel | None) -> None:
+    """Write a model atomically as indented JSON; None removes the file of an earlier run. Raises OutputError."""
+    if model is None:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        return
     write_text(path, compact_lists(model.model_dump_json(by_alias=True, indent=1)) + "\n")
 
 
@@ -39,3 +47,12 @@ def read_model(path: Path, model: type[Model]) -> Model | None:
         return None
     except (OSError, ValidationError):
         raise SidecarError(f"{path}: cannot be read; run again") from None
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table atomically; None becomes an empty cell. Raises OutputError."""
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    write_text(path, table.getvalue())

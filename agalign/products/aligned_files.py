@@ -1,4 +1,4 @@
-"""An aligned file for each input file, with its name and tags, for photogrammetry programs."""
+"""The rasters of the aligned bands: a stack, or a file for each input file for photogrammetry programs."""
 
 import math
 from collections import Counter
@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras.pix4d import FromSource
-from agalign.cameras.tag_transfer import band_tags
+from agalign.cameras.tag_transfer import band_tags, capture_tags
 from agalign.config import WriteSettings
 from agalign.pixels.raster import TIFF_SUFFIXES
 from agalign.products.layout import Layer
 from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import media_type, write_raster
 from agalign.values import geometry
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
@@ -51,10 +51,8 @@ class BandFiles(Product):
 
     def _write_file(self, context: ProductContext, name: Path, layers: list[Layer]) -> WrittenFile:
         settings, grid, path = context.write_settings, context.grid, context.paths.folder / name
-        tags = band_tags(
-            layers[0].band.path, context.capture.reference, grid, _from_source(layers[0], grid),
-            radiometry=settings.radiometry != "off",
-        )  # fmt: skip
+        reference, from_source = context.capture.reference, _from_source(layers[0], grid)
+        tags = band_tags(layers[0].band.path, reference, grid, from_source, radiometry=settings.radiometry != "off")
         nodata = write_raster(context.capture, layers, grid, path, settings, tags)
         asset = StacAsset(name.as_posix(), media_type(settings), ("data",))
         return WrittenFile(self.kind, path, asset, tuple(layer.band.name for layer in layers), nodata)
@@ -66,36 +64,24 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
     It has the name of the input file, with the band's name if several bands of that file have a lens each, and with the
     folder if input files of the same name are in several folders.
     """
-    split = _files_to_split(capture)
-    by_folder = _needs_folders(capture)
+    bands_per_file = Counter(b.path for b in capture.bands)
+    # Files of several bands with a lens each.
+    split = {b.path for b in capture.bands if not b.one_lens and bands_per_file[b.path] > 1}
+    has_namesakes = len({p.stem for p in bands_per_file}) < len(bands_per_file)
+    by_folder = has_namesakes and len({p.parent for p in bands_per_file}) > 1
     names: dict[str, Path] = {}
     taken: dict[Path, Path] = {}
     for band in capture.bands:
         stem = f"{band.path.stem}_{_safe_name(band.name)}" if band.path in split else band.path.stem
         folder = band.path.parent.name if by_folder else ""
-        name = Path(folder, f"{stem}{_tiff_suffix(band)}")
+        suffix = band.path.suffix if band.path.suffix.lower() in TIFF_SUFFIXES else ".tif"
+        name = Path(folder, f"{stem}{suffix}")
         # The name of the stack, or of another input file with a different suffix.
         if name == Path(f"{capture.name}.tif") or taken.get(name, band.path) != band.path:
             name = Path(folder, f"{stem}_{band.path.suffix[1:].lower()}.tif")
         taken[name] = band.path
         names[band.name] = name
     return names
-
-
-def _files_to_split(capture: Capture) -> set[Path]:
-    """Input files of several bands with a lens each."""
-    bands_per_file = Counter(b.path for b in capture.bands)
-    return {b.path for b in capture.bands if not b.one_lens and bands_per_file[b.path] > 1}
-
-
-def _needs_folders(capture: Capture) -> bool:
-    """True if input files in several folders have the same name."""
-    files = {b.path for b in capture.bands}
-    return len({p.stem for p in files}) < len(files) and len({p.parent for p in files}) > 1
-
-
-def _tiff_suffix(band: Band) -> str:
-    return band.path.suffix if band.path.suffix.lower() in TIFF_SUFFIXES else ".tif"
 
 
 def _safe_name(text: str) -> str:
@@ -122,3 +108,22 @@ def _from_source(layer: Layer, grid: OutputGrid) -> FromSource:
         return x_px, y_px
 
     return from_source
+
+
+class Stack(Product):
+    """A raster of all bands in the capture's order; a band that failed is all nodata."""
+
+    kind = "stack"
+    suffix = ".tif"
+
+    def is_enabled(self, settings: WriteSettings) -> bool:
+        """True unless only files of single bands are written."""
+        return settings.layout != "bands"
+
+    def write(self, context: ProductContext) -> list[WrittenFile]:
+        """Write <capture>.tif."""
+        settings, path = context.write_settings, context.paths.file(self.suffix)
+        tags = capture_tags(context.capture.reference, context.grid)
+        nodata = write_raster(context.capture, context.layers, context.grid, path, settings, tags)
+        asset = StacAsset("stack", media_type(settings), ("data",))
+        return [WrittenFile(self.kind, path, asset, tuple(la.band.name for la in context.layers), nodata)]
