@@ -9,103 +9,72 @@ bands = agalign.open_capture("out/IMG_0007.json")   # an xarray Dataset
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from agalign._version import __version__
+from agalign._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from agalign.api import align, align_capture, align_folder, warp_onto
-    from agalign.batch import CaptureReport, FlightReports, RunOptions
-    from agalign.cameras.discover import DiscoverOptions, FolderScan, discover
-    from agalign.config import (
-        CheckSettings,
-        FlightSettings,
-        JointSettings,
-        ReliefSettings,
-        SeedSettings,
-        Settings,
-        WriteSettings,
-    )
-    from agalign.errors import (
-        AgalignError,
-        ConfigurationError,
-        GeometryError,
-        InputError,
-        MemoryLimitError,
-        NoContrastError,
-        NoSuchBandError,
-        NotEnoughTextureError,
-        OutputError,
-        SidecarError,
-        UnreadableFileError,
-        WorkerError,
-    )
-    from agalign.products.dataset import open_capture, open_flight
-    from agalign.products.read_alignment import read_alignment
-    from agalign.values.alignment import Alignment, Prediction, Residual, Seed
-    from agalign.values.pixel_units import FixedFilePx, FixedImagePx, MovingFilePx
+    from agalign.api import align as align
+    from agalign.api import align_capture as align_capture
+    from agalign.api import align_folder as align_folder
+    from agalign.api import warp_onto as warp_onto
+    from agalign.batch.report import CaptureReport as CaptureReport
+    from agalign.batch.report import FlightReports as FlightReports
+    from agalign.cameras.discover import FolderScan as FolderScan
+    from agalign.cameras.discover import discover as discover
+    from agalign.config import CheckSettings as CheckSettings
+    from agalign.config import DiscoverOptions as DiscoverOptions
+    from agalign.config import FlightSettings as FlightSettings
+    from agalign.config import JointSettings as JointSettings
+    from agalign.config import ReliefSettings as ReliefSettings
+    from agalign.config import RunOptions as RunOptions
+    from agalign.config import SeedSettings as SeedSettings
+    from agalign.config import Settings as Settings
+    from agalign.config import WriteSettings as WriteSettings
+    from agalign.errors import AgalignError as AgalignError
+    from agalign.errors import ConfigurationError as ConfigurationError
+    from agalign.errors import GeometryError as GeometryError
+    from agalign.errors import InputError as InputError
+    from agalign.errors import MemoryLimitError as MemoryLimitError
+    from agalign.errors import NoContrastError as NoContrastError
+    from agalign.errors import NoSuchBandError as NoSuchBandError
+    from agalign.errors import NotEnoughTextureError as NotEnoughTextureError
+    from agalign.errors import OutputError as OutputError
+    from agalign.errors import SidecarError as SidecarError
+    from agalign.errors import UnreadableFileError as UnreadableFileError
+    from agalign.errors import WorkerError as WorkerError
+    from agalign.products.dataset import open_capture as open_capture
+    from agalign.products.dataset import open_flight as open_flight
+    from agalign.products.read_alignment import read_alignment as read_alignment
+    from agalign.values.alignment import Alignment as Alignment
+    from agalign.values.alignment import Prediction as Prediction
+    from agalign.values.alignment import Residual as Residual
+    from agalign.values.alignment import Seed as Seed
+    from agalign.values.pixel_units import FixedFilePx as FixedFilePx
+    from agalign.values.pixel_units import FixedImagePx as FixedImagePx
+    from agalign.values.pixel_units import MovingFilePx as MovingFilePx
 
-__all__ = [
-    "AgalignError",
-    "Alignment",
-    "CaptureReport",
-    "CheckSettings",
-    "ConfigurationError",
-    "DiscoverOptions",
-    "FixedFilePx",
-    "FixedImagePx",
-    "FlightReports",
-    "FlightSettings",
-    "FolderScan",
-    "GeometryError",
-    "InputError",
-    "JointSettings",
-    "MemoryLimitError",
-    "MovingFilePx",
-    "NoContrastError",
-    "NoSuchBandError",
-    "NotEnoughTextureError",
-    "OutputError",
-    "Prediction",
-    "ReliefSettings",
-    "Residual",
-    "RunOptions",
-    "Seed",
-    "SeedSettings",
-    "Settings",
-    "SidecarError",
-    "UnreadableFileError",
-    "WorkerError",
-    "WriteSettings",
-    "__version__",
-    "align",
-    "align_capture",
-    "align_folder",
-    "discover",
-    "open_capture",
-    "open_flight",
-    "read_alignment",
-    "warp_onto",
-]
-
-_OTHER_MODULES = {
-    "agalign.api": ("align", "align_capture", "align_folder", "warp_onto"),
-    "agalign.batch": ("CaptureReport", "FlightReports", "RunOptions"),
-    "agalign.cameras.discover": ("DiscoverOptions", "FolderScan", "discover"),
-    "agalign.products.dataset": ("open_capture", "open_flight"),
-    "agalign.products.read_alignment": ("read_alignment",),
-    "agalign.values.alignment": ("Alignment", "Prediction", "Residual", "Seed"),
-    "agalign.values.pixel_units": ("FixedFilePx", "FixedImagePx", "MovingFilePx"),
+_NAMES = {
+    "api": "align align_capture align_folder warp_onto",
+    "batch.report": "CaptureReport FlightReports",
+    "cameras.discover": "FolderScan discover",
+    "config": "CheckSettings DiscoverOptions FlightSettings JointSettings ReliefSettings RunOptions SeedSettings "
+    "Settings WriteSettings",
+    "errors": "AgalignError ConfigurationError GeometryError InputError MemoryLimitError NoContrastError "
+    "NoSuchBandError NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError",
+    "products.dataset": "open_capture open_flight",
+    "products.read_alignment": "read_alignment",
+    "values.alignment": "Alignment Prediction Residual Seed",
+    "values.pixel_units": "FixedFilePx FixedImagePx MovingFilePx",
 }
-"""Modules of the public names that are neither settings nor errors."""
+"""Public names by module. A module is imported at the first use of one of its names (PEP 562): torch takes seconds."""
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted([*_MODULES, "__version__"])
 
 
 def __getattr__(name: str) -> Any:
-    """Import the module of a public name at its first use (PEP 562): importing torch takes seconds."""
-    if name not in __all__:
+    if name not in _MODULES:
         raise AttributeError(f"module 'agalign' has no attribute '{name}'")
-    rest = "agalign.config" if name.endswith("Settings") else "agalign.errors"
-    module = next((module for module, names in _OTHER_MODULES.items() if name in names), rest)
-    return getattr(import_module(module), name)
+    return getattr(import_module(f"agalign.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__

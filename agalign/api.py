@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agalign.batch import CaptureReport, FlightReports, RunOptions, run_flight
-from agalign.batch.capture import CaptureOutcome, process_capture, quiet
-from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.batch.capture import process_capture, quiet
+from agalign.batch.report import CaptureReport, FlightReports
+from agalign.batch.run import run_flight
+from agalign.cameras.discover import discover
 from agalign.capture.align import align_pairs
 from agalign.capture.band_pair import BandPair, Candidates
 from agalign.capture.from_windows import without_extrapolated
 from agalign.capture.verification import with_metrics
-from agalign.config import Settings
+from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
 from agalign.pixels.masks import raster_of
 from agalign.pixels.radiometry import with_radiometry
@@ -96,7 +97,7 @@ def warp_onto(
     return by_homography.warp(moving, valid=valid, interpolation=interpolation)
 
 
-def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureOutcome:
+def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureReport:
     """Align a capture that `discover` returned, and write its stack and sidecar below `out`.
 
     Raises UnreadableFileError if its reference band cannot be read, and OutputError.

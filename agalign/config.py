@@ -1,16 +1,24 @@
-"""Settings: one immutable, validated model for each stage.
+"""Settings and options: one immutable model for each stage, for the search for captures and for the run.
 
-An unknown name or an invalid value raises pydantic's ValidationError. docs/options.md lists all settings. Other
-parameters are constants in the modules that use them, with their reasons.
+An unknown name of a setting or an invalid value raises pydantic's ValidationError. The docstring of a field is also the
+help text of its command-line option, and its row in docs/options.md. Other parameters are constants in the modules that
+use them, with their reasons.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from operator import not_
+from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from agalign.errors import ConfigurationError
 from agalign.values.choices import (
+    MAX_PIXELS,
     MAX_RNG_SEED,
+    BandOrder,
     Compression,
     Crop,
     FamilyChoice,
@@ -21,11 +29,113 @@ from agalign.values.choices import (
     Recipe,
     ReliefUse,
     Resolution,
+    SeedChoice,
     SeedKind,
     Sharing,
 )
 
-Positive = Annotated[int, Field(gt=0)]
+
+def names_in(text: str | None) -> tuple[str, ...]:
+    """Return the names in a list separated by commas."""
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+
+
+def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
+    """Return (band in lower case, reflectance) from 'Blue=0.51,NIR=0.49', or ("", reflectance) from one number.
+
+    Raises ConfigurationError for a reflectance that is not in (0, 1].
+    """
+    result = []
+    for part in names_in(text):
+        name, _, number = part.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = 0.0
+        if not 0 < value <= 1:
+            raise ConfigurationError(f"--panel-albedo {text}: '{part}' is not a reflectance between 0 and 1")
+        result.append((name.strip().lower(), value))
+    return tuple(result)
+
+
+@dataclass(frozen=True)
+class Option:
+    """The command-line option of a field, where it differs from the field."""
+
+    name: str = ""
+    """Its name as an identifier; by default that of the field."""
+    short: str = ""
+    """A second name of one letter, with its dash."""
+    type: Any = None
+    default: Any = None
+    """Its default; by default that of the field, if `type` is that of the field."""
+    parse: Callable[[Any], Any] = lambda value: value
+    """Returns the value of the field for that of the option."""
+    show_default: bool = True
+    alone: str = ""
+    """Its value if it is given without one."""
+    former: str = ""
+    """A deprecated name, with its dashes."""
+
+
+def _yes_or_no(yes: str, no: str) -> BeforeValidator:
+    """Accept True and False for two values of a setting."""
+    return BeforeValidator(lambda value: {True: yes, False: no}[value] if isinstance(value, bool) else value)
+
+
+_LIST = Option(type=str | None, parse=names_in)
+_GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()), show_default=False)
+
+
+@dataclass(frozen=True)
+class DiscoverOptions:
+    """Options of `discover`."""
+
+    pattern: str | None = None
+    """Pattern of file names of other cameras, as '{capture}_{band}.tif'."""
+    reference: str | None = None
+    """Name of the reference band; by default green."""
+    ignore_metadata: bool = False
+    """Use no lens or rig tags."""
+    with_rgb: bool = False
+    """Also align the camera's colour photograph (JPEG), as three bands."""
+    bands: Annotated[tuple[str, ...], _LIST] = ()
+    """Names of the bands to align, separated by commas; by default all."""
+    order: BandOrder = "index"
+    """Order of the bands: as numbered by the camera, by wavelength, or by name."""
+    skip: tuple[Path, ...] = ()
+    """Folders to leave out, such as the output folder."""
+    max_pixels: Annotated[int, Field(ge=1)] = MAX_PIXELS
+    """Refuse images with more pixels than this, without reading them."""
+    jobs: int = 1
+    """Processes that read the tags of many files; with more than one the calling script must be importable."""
+    include: Annotated[tuple[str, ...], _GLOBS] = ()
+    """Use only files that match this glob by path or name; repeatable."""
+    exclude: Annotated[tuple[str, ...], _GLOBS] = ()
+    """Ignore files that match this glob, such as '*/test/*'; repeatable."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How to run; no option changes the result of a capture."""
+
+    overwrite: bool = False
+    """Process finished captures again."""
+    jobs: Annotated[int, Field(ge=0), Option(short="-j", default=0, show_default=False)] = 1
+    """Captures processed at the same time; by default one per core."""  # 0 is one per core
+    align_panels: bool = False
+    """Also align captures of calibration panels and of the sky."""
+    # Any executor in Python, such as `dask_executor`.
+    executor: Annotated[Executor | None, Option("dask", type=str | None)] = None
+    """Address of a Dask scheduler, as tcp://host:8786; its workers need the same folders. 'local' starts worker
+    processes on this machine."""
+    retry_failed: bool = False
+    """Process captures again if a band is not aligned or missing."""
+    # An `executor` of the caller ignores it; `dask_executor` has its own.
+    timeout_s: Annotated[float | None, Field(ge=1), Option("timeout")] = None
+    """Seconds after which a capture is abandoned; by default unlimited."""
+    command: str = ""
+    """Command line, for run record and report."""
 
 
 class Stage(BaseModel):
@@ -44,23 +154,22 @@ class JointSettings(Stage):
     """Joint optimisation of the descriptor and the homographies."""
 
     recipe: Recipe = "fast"
-    """`paper` is the published algorithm; `fast` gives the same result sooner."""
+    """Algorithm: fast, or the published one (paper)."""
     sharing: Sharing = "pseudo-siamese"
-    """Layers that the networks of reference and moving band share: all (siamese), all but the first (pseudo-siamese),
-    or none (unshared)."""
+    """Layers that the networks of both bands share: all, all but the first, or none."""
     model_family: FamilyChoice = "auto"
-    """Mapping to fit; `auto` is the most general one that the images determine."""
+    """Mapping to fit; auto is the most general one that the images determine."""
     device: str = "auto"
-    """Torch device: cpu, cuda, cuda:1 and so on; `auto` is CUDA if it is available."""
+    """Torch device: auto, cpu, cuda, cuda:1 …"""
     rng_seed: Annotated[int, Field(ge=0, le=MAX_RNG_SEED)] = 0
-    """The same seed gives the same result, bit by bit."""
+    """Seed of all random numbers; the same seed gives the same result."""
 
 
 class FlightSettings(Stage):
     """One network for many captures."""
 
-    together: bool = True
-    """False learns a network for each capture."""
+    together: Annotated[bool, Option("each_alone", default=False, parse=not_)] = True
+    """Learn a network per capture instead of one per flight."""
     start: str = ""
     """Fingerprint of the model that a run starts from, set by `run_flight`; runs with another one repeat a capture."""
 
@@ -68,85 +177,91 @@ class FlightSettings(Stage):
 class SeedSettings(Stage):
     """Initial alignment."""
 
-    force: SeedKind | None = None
-    """Use only this kind of seed."""
-    only: bool = False
+    force: Annotated[
+        SeedKind | None,
+        Option("seed", type=SeedChoice, default="auto", parse=lambda kind: None if kind == "auto" else kind),
+    ] = None
+    """Use only this kind of initial alignment; by default the best of all."""
+    only: Annotated[bool, Option("only_seed")] = False
     """Stop after the initial alignment."""
 
 
 class CheckSettings(Stage):
     """Acceptance of predicted bands. The limits of the checks are in their modules in `verify`."""
 
-    accept_predicted_px: Annotated[float, Field(ge=0)] = 1.0
-    """Largest standard error at which a predicted band counts as usable, px of its file."""
+    accept_predicted_px: Annotated[float, Field(ge=0), Option("accept_predicted")] = 1.0
+    """Largest standard error, px, at which a predicted band counts as usable."""
 
 
 class ReliefSettings(Stage):
     """Correction of parallax over trees, terraces, buildings and benches."""
 
-    use: ReliefUse = "auto"
-    """`auto` estimates one relief for all bands of a capture if its windows show parallax. A single moving lens, whose
-    relief no other band can verify, gets a smooth displacement field instead, if left-out windows confirm it."""
-
-    @field_validator("use", mode="before")
-    @classmethod
-    def _yes_or_no(cls, value: object) -> object:
-        return {True: "always", False: "never"}.get(value, value) if isinstance(value, bool) else value
+    # A single moving lens gets a smooth displacement field instead, if left-out windows confirm it: no other band can
+    # verify its relief.
+    use: Annotated[ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always", former="--local")] = (
+        "auto"
+    )
+    """Correct parallax (trees, terraces, buildings, close range) by one relief for all bands of a capture. auto: if
+    windows show parallax. --relief alone means always."""
 
 
 class WriteSettings(Stage):
     """Output files."""
 
+    # RMS error on a random image of waves of up to 0.25 cycles/px, relative to its standard deviation: Lanczos 1.4 %,
+    # OpenCV's cubic kernel 3.0 %, bilinear 16 %.
     interpolation: Interpolation = "lanczos"
-    """RMS error on a random image of waves of up to 0.25 cycles/px, relative to its standard deviation: Lanczos 1.4 %,
-    OpenCV's cubic kernel 3.0 %, bilinear 16 %."""
+    """Resampling of the moving bands."""
     crop: Crop = "flight"
-    """Area to write: shared by all bands of all captures (`flight`), by all bands of the capture (`common`), or the
-    whole frame of the reference (`none`)."""
+    """Area to write. flight: shared by all bands of all captures; common: shared by all bands of the capture; none: the
+    whole frame of the reference."""
     format: RasterFormat = "gtiff"
+    """Write tiled GeoTIFF or cloud-optimised GeoTIFF."""
     compression: Compression = "auto"
-    """auto is Zstandard for stacks and Deflate for files of single bands."""
+    """Lossless compression; auto is zstd for stacks and deflate for single bands."""
     undistort: bool = False
     """Remove the lens distortion of the reference from the output."""
     layout: Layout = "stack"
-    """One stack per capture, one file per input file, or both."""
+    """Write one stack per capture, one file with tags per input file, or both."""
     resolution: Resolution = "reference"
     """Pixel size of the output: that of the reference, or of the finest band."""
     georeference: bool = False
-    """Write an approximate georeference from position, altitude, yaw and focal length."""
-    ground_elevation_m: float | None = None
-    """Elevation of the ground in the height system of the camera's GPS, if neither tags nor a panel give the height."""
+    """Write an approximate georeference from GPS, altitude and yaw; a tag has its expected error."""
+    ground_elevation_m: Annotated[float | None, Option("ground_elevation", show_default=False)] = None
+    """Elevation of the ground, m, in the height system of the camera's GPS; for footprints, if the tags contain no
+    height above ground."""
     statistics: bool = False
-    """Store minimum, maximum, mean and standard deviation of the aligned bands in their files."""
+    """Store minimum, maximum, mean and standard deviation in aligned bands (gdalinfo -stats)."""
     qa: bool = False
-    """Write a raster of quality flags."""
+    """Write a raster of quality flags (saturated, occluded, glint …), <capture>.qa.tif."""
     stac: bool = False
-    """Write a STAC item for each capture."""
-    indices: tuple[str, ...] = ()
-    """Names of the spectral indices to write, such as ndvi and ndre."""
+    """Write a STAC item per capture and a collection per flight."""
+    indices: Annotated[
+        tuple[str, ...],
+        Option("index", type=str | None, parse=lambda text: names_in((text or "").lower()), show_default=False),
+    ] = ()
+    """Also write spectral indices, names separated by commas: ndvi, ndre …; 'agalign indices' adds others."""
     pan_sharpen: bool = False
-    """Also write the narrow bands at the resolution of the panchromatic band."""
+    """Also write the bands at the resolution of the panchromatic band, or of the colour photograph with --with-rgb:
+    <capture>.pan.tif."""
     error_map: bool = False
-    """Write a raster of the expected error at every pixel."""
+    """Write a raster of the expected error at every pixel, <capture>.error.tif."""
     tie_points: bool = False
-    """Write the measured windows of each band as CSV and GeoJSON."""
+    """Write the measured tie points of each band with residual and weight: <capture>.ties.csv and .ties.geojson."""
     relief_map: bool = False
-    """Add confidence and range to the raster of the relief."""
+    """Add confidence and range (m) to the raster of a capture's relief."""
     fill_occluded: bool = False
-    """Interpolate pixels that are occluded in a band, instead of writing nodata."""
-    radiometry: RadiometryChoice = "off"
-    """Write float32 instead of raw numbers: radiance by the camera's calibration (`camera`), reflectance by light
-    sensor (`sun`) or by panel; `auto` is panel if available for all bands, else sun, else camera. Thermal bands are
-    written in degrees C.
-    """
-    panel_albedo: tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...] = ()
-    """(band in lower case, reflectance 0 to 1) of the calibration panel; an empty name stands for all other bands. It
-    takes precedence over tags and QR code. If it is given, panels without tags and code are recognised too."""
-
-    @field_validator("radiometry", mode="before")
-    @classmethod
-    def _yes_or_no(cls, value: object) -> object:
-        return {True: "auto", False: "off"}.get(value, value) if isinstance(value, bool) else value
+    """Interpolate pixels that are occluded in a band; by default they are nodata."""
+    radiometry: Annotated[RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
+    """Write float32. camera: radiance by the camera's calibration; sun, panel: reflectance by light sensor or
+    calibration panel; auto (--radiometry alone): panel if available for all bands, else sun, else camera. Thermal bands
+    are written in degrees C."""
+    # (band in lower case, reflectance); an empty name stands for all other bands.
+    panel_albedo: Annotated[
+        tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)
+    ] = ()
+    """Reflectance of the calibration panel, as 0.51 or as Blue=0.51,NIR=0.49; by default from tags or QR code. With
+    this option, panels without tags and code are recognised too."""
 
 
 class Settings(Stage):

@@ -1,5 +1,7 @@
 """Exceptions of agalign. Their text is one line with the cause and the remedy."""
 
+import re
+
 
 class AgalignError(Exception):
     """Base of the exceptions of agalign; the text is one line for the user."""
@@ -60,11 +62,11 @@ class MemoryLimitError(AgalignError):
 
 
 _MEMORY_MESSAGES = (
-    "not enough memory", "can't allocate memory", "Cannot allocate memory", "bad_alloc", "Insufficient memory",
-    "can't start new thread", "could not create a primitive", "out of memory",
-)  # fmt: skip
+    "not enough memory|can't allocate memory|Cannot allocate memory|bad_alloc|Insufficient memory|"
+    "can't start new thread|could not create a primitive|out of memory"
+)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Return True for MemoryError and for other errors with the message of a library that is out of memory."""
-    return isinstance(error, MemoryError) or any(message in str(error) for message in _MEMORY_MESSAGES)
+    return isinstance(error, MemoryError) or re.search(_MEMORY_MESSAGES, str(error)) is not None

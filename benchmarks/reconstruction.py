@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
 from agalign.cameras.read_files import read_file
-from agalign.cameras.scan import DiscoverOptions
+from agalign.config import DiscoverOptions
 from agalign.pixels.raster import open_raster, without_warnings
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.capture import Band

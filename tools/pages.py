@@ -2,7 +2,7 @@
 
     python tools/pages.py [--check]
 
-Options come from the command line (`agalign align --help`), fields from `agalign/sidecar.schema.json`, reasons from
+Options come from `agalign/config.py` and the command `align`, fields from `agalign/sidecar.schema.json`, reasons from
 `agalign/values/issues.py` and the checks in `agalign/verify`. Each table is between two comments in its page.
 """
 
@@ -11,83 +11,44 @@ import re
 import sys
 import typing
 from collections.abc import Callable, Iterable
-from enum import Enum
-from functools import cache, partial
-from operator import attrgetter
+from operator import attrgetter, not_
 from pathlib import Path
 from typing import Any
 
-import typer
-
 import agalign
-from agalign.cli.align import align
-from agalign.cli.main import app
-from agalign.config import Settings
+from agalign.cli.command import field_options
+from agalign.cli.main import COMMANDS
+from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.values.issues import Issue, sentence
 from agalign.verify.checks import KINDS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"
 
-OTHER_NAMES = {
-    "seed.force": "--seed",
-    "seed.only": "--only-seed",
-    "flight.together": "--each-alone",
-    "relief.use": "--relief",
-    "write.indices": "--index",
-    "executor": "--dask",
-}
-"""Options of settings with another name; all others have the name of the setting without its unit."""
-UNIT = re.compile("_(px|m|s)$")
-OWNERS = {
-    "Settings": Settings(),
-    "DiscoverOptions": agalign.DiscoverOptions(),
-    "RunOptions": agalign.RunOptions(),
-}
-COMMAND_LINE_ONLY = ("--model", "--dry-run", "--config", "--quiet", "--verbose", "--log-json")
 
+def options(owner: str) -> str:
+    """One row per option of an owner in `Given`: its name, the Python name, type, default in Python, and help text.
 
-def names_of(owner: object) -> dict[str, str]:
-    """{option: setting} of a settings object, in its order."""
-    parts = owner if isinstance(owner, Settings) else [("", owner)]
-    paths = [f"{part}.{name}".lstrip(".") for part, of_part in parts for name in type(of_part).__annotations__]
-    options = {
-        OTHER_NAMES.get(path, "--" + UNIT.sub("", path.split(".")[-1]).replace("_", "-")): path for path in paths
-    }
-    elsewhere = {"--jobs"} if isinstance(owner, agalign.DiscoverOptions) else set()  # it is also one of a run
-    return {option: path for option, path in options.items() if option in command_line_options().keys() - elsewhere}
-
-
-def options(owner: object) -> str:
-    """One row per option: its name, the Python name, type, default in Python, and help text."""
+    Options of the command line only are in the table of `run`.
+    """
     rows = [("option", "Python", "type", "default", "effect")]
-    of_command = command_line_options()
-    for option, name in names_of(owner).items():
-        opposite = " (opposite)" if option == "--each-alone" else ""
-        default = f"`{attrgetter(name)(owner)}`"
-        rows.append((f"`{option}`", f"`{name}`{opposite}", of_command[option][0], default, of_command[option][1]))
-    if isinstance(owner, agalign.RunOptions):
-        listed = {option for one in OWNERS.values() for option in names_of(one)}
-        if unlisted := of_command.keys() - {*listed, *COMMAND_LINE_ONLY, "--out"}:
-            raise SystemExit(f"tools/pages.py: no setting has the name of {', '.join(sorted(unlisted))}")
-        for option in COMMAND_LINE_ONLY:
-            kind, text = of_command[option]
-            rows.append((f"`{option}`", "argument `model`" if option == "--model" else "", kind, "", text))
+    defaults = {"settings": Settings(), "discover": DiscoverOptions(), "run": RunOptions()}[owner]
+    for parameter in COMMANDS["align"].parameters():
+        option = field_options().get(parameter.name)
+        if owner != (option.owner if option else "run") or parameter.name in ("folder", "out"):
+            continue
+        kind, info = typing.get_args(parameter.annotation)
+        python, default = "argument `model`" if parameter.name == "model" else "", ""
+        if option is not None:
+            name, opposite = ".".join(option.path), " (opposite)" if option.option.parse is not_ else ""
+            python, default = f"`{name}`{opposite}", f"`{attrgetter(name)(defaults)}`"
+        rows.append((f"`--{parameter.name.replace('_', '-')}`", python, type_name(kind), default, effect(info.help)))
     return table(rows)
 
 
-@cache
-def command_line_options() -> dict[str, tuple[str, str]]:
-    """{option: (type, help text)} of `agalign align`."""
-    hints = typing.get_type_hints(align)
-    command: Any = typer.main.get_command(app)
-    result = {}
-    for parameter in command.commands["align"].params:
-        name = next((option for option in parameter.opts if option.startswith("--")), None)
-        if name is not None:
-            text = re.sub(r"(?<![`<\w])(--[a-z-]+)", r"`\1`", parameter.help)
-            result[name] = (type_name(hints[parameter.name]), text.replace("<", "\\<"))
-    return result
+def effect(text: str) -> str:
+    """Return a help text as Markdown."""
+    return re.sub(r"(?<![`<\w])(--[a-z-]+)", r"`\1`", text).replace("<", "\\<")
 
 
 def type_name(kind: Any) -> str:
@@ -95,8 +56,6 @@ def type_name(kind: Any) -> str:
     kinds = [k for k in (typing.get_args(kind) or (kind,)) if k is not type(None)]
     if typing.get_origin(kind) is list:
         return "repeatable"
-    if isinstance(kinds[0], type) and issubclass(kinds[0], Enum):
-        return ", ".join(f"`{member.value}`" for member in kinds[0])
     if typing.get_origin(kinds[0]) is typing.Literal or isinstance(kinds[0], str):
         values = kinds if isinstance(kinds[0], str) else typing.get_args(kinds[0])
         return ", ".join(f"`{value}`" for value in values)
@@ -152,7 +111,11 @@ def table(rows: Iterable[tuple[str, ...]]) -> str:
 
 
 TABLES: dict[str, dict[str, Callable[[], str]]] = {
-    "options.md": {name: partial(options, owner) for name, owner in OWNERS.items()},
+    "options.md": {
+        "Settings": lambda: options("settings"),
+        "DiscoverOptions": lambda: options("discover"),
+        "RunOptions": lambda: options("run"),
+    },
     "sidecar.md": {"fields": fields},
     "troubleshooting.md": {"reasons": reasons},
 }

@@ -3,22 +3,20 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from agalign.config import RunOptions as RunOptions
+
 if TYPE_CHECKING:
-    from agalign.batch.output_folder import prepare_output
-    from agalign.batch.report import CaptureReport, FlightReports
-    from agalign.batch.run import Listener, RunOptions, run_flight
-    from agalign.batch.workers import dask_executor
+    from agalign.batch.output_folder import prepare_output as prepare_output
+    from agalign.batch.report import CaptureReport as CaptureReport
+    from agalign.batch.run import Listener as Listener
+    from agalign.batch.run import run_flight as run_flight
+    from agalign.batch.workers import dask_executor as dask_executor
 
-__all__ = ["CaptureReport", "FlightReports", "Listener", "RunOptions", "dask_executor", "prepare_output", "run_flight"]
-
-_MODULES = {
-    "CaptureReport": "report", "FlightReports": "report", "Listener": "run", "RunOptions": "run",
-    "dask_executor": "workers", "prepare_output": "output_folder", "run_flight": "run",
-}  # fmt: skip
+_MODULES = {"dask_executor": "workers", "prepare_output": "output_folder", "CaptureReport": "report"}
 
 
 def __getattr__(name: str) -> Any:
     """Import the module of a name at its first use (PEP 562): indices and locks need no torch."""
-    if name not in _MODULES:
+    if name not in (*_MODULES, "Listener", "run_flight"):
         raise AttributeError(f"module 'agalign.batch' has no attribute '{name}'")
-    return getattr(import_module(f"agalign.batch.{_MODULES[name]}"), name)
+    return getattr(import_module(f"agalign.batch.{_MODULES.get(name, 'run')}"), name)

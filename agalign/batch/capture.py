@@ -1,49 +1,50 @@
-"""Align one capture and write its products and its sidecar."""
+"""Align one capture and write its products and its sidecar, also as the task of a worker."""
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
+import cv2
+
+from agalign.batch.report import CaptureReport, StageClock
+from agalign.batch.workers import failure_text
 from agalign.capture.align import PairProgress, align_capture_bands
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, SidecarError
-from agalign.flight.model import FlightModel
-from agalign.flight.rig import Rig
+from agalign.flight.model import FlightModel, load_model
+from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.index_rasters import outdated_rasters
 from agalign.products.layout import output_layers
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.registry import PRODUCTS
-from agalign.products.sidecar import Sidecar
 from agalign.products.sidecar_file import read_result, write_sidecar
-from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import OutputGrid
-from agalign.values.pixel_units import FixedFilePx
+from agalign.values.processes import follow_parent
+
+_FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
+_LOG = logging.getLogger(__name__)
 
 
 def quiet(*_: object) -> None:
     """A progress callback that reports nothing."""
 
 
-@dataclass(frozen=True)
-class CaptureOutcome:
-    """A capture's sidecar and where it was written."""
-
-    sidecar: Sidecar
-    path: Path
-    shortcomings: tuple[str, ...] = ()
-    """Messages about optional products that could not be written."""
-
-
 def process_capture(
-    capture: Capture, out: Path, settings: Settings, progress: PairProgress = quiet,
-    model: FlightModel | None = None, max_preview_bytes: int = preview_bytes(1),
-) -> CaptureOutcome:  # fmt: skip
-    """Align a capture, write its products and its sidecar, and return the sidecar with its path.
+    capture: Capture,
+    out: Path,
+    settings: Settings,
+    progress: PairProgress = quiet,
+    model: FlightModel | None = None,
+    max_preview_bytes: int = preview_bytes(1),
+) -> CaptureReport:
+    """Align a capture, write its products and its sidecar, and return its report, without times.
 
     The other bands are aligned where one cannot be. The bands already have the chosen radiometry (`with_radiometry`).
     With the `model` of the flight, a network is learned from scratch only for bands that the model cannot align. The
@@ -52,7 +53,7 @@ def process_capture(
     installation lacks what a product needs, and OutputError.
     """
     paths = CapturePaths.of(capture, out)
-    _refuse_to_overwrite(capture, out, settings.write)
+    refuse_to_overwrite([capture], out, settings.write)
     if settings.write.radiometry != "off":
         _require_radiometry(capture, settings.write.radiometry)
     for product in PRODUCTS:
@@ -60,24 +61,17 @@ def process_capture(
             product.check(capture)
     alignments = align_capture_bands(capture, settings, model, progress)
     progress(capture.reference.name, "writing", 0.0)
-    context = _context(capture, paths, settings, alignments, None if model is None else model.rig, max_preview_bytes)
+    rig, whole = None if model is None else model.rig, OutputGrid(0, 0, *capture.reference.size_px)
+    context = ProductContext(capture, paths, settings, alignments, (), whole, rig, max_preview_bytes)
+    if context.usable:
+        layers, grid = output_layers(capture, context.usable, settings.write, rig)
+        context = replace(context, layers=layers, grid=grid)
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
     sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures)))
     # Products that need the same file fail with the same message.
-    return CaptureOutcome(sidecar, paths.sidecar, tuple(dict.fromkeys(failures.values())))
-
-
-def _context(
-    capture: Capture, paths: CapturePaths, settings: Settings, alignments: Mapping[str, Alignment[FixedFilePx]],
-    rig: Rig | None, max_preview_bytes: int,
-) -> ProductContext:  # fmt: skip
-    whole = OutputGrid(0, 0, *capture.reference.size_px)
-    context = ProductContext(capture, paths, settings, alignments, (), whole, rig, max_preview_bytes)
-    if not context.usable:
-        return context
-    layers, grid = output_layers(capture, context.usable, settings.write, rig)
-    return replace(context, layers=layers, grid=grid)
+    shortcomings = tuple(dict.fromkeys(failures.values()))
+    return CaptureReport(capture.label, "done", sidecar.result(), paths.sidecar, shortcomings=shortcomings)
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:
@@ -101,12 +95,22 @@ def paths_written(capture: Capture, out: Path, settings: WriteSettings) -> list[
     return [paths.sidecar, *(p for product in PRODUCTS for p in product.paths(capture, paths, settings))]
 
 
-def _refuse_to_overwrite(capture: Capture, out: Path, settings: WriteSettings) -> None:
-    """Raise ConfigurationError where an output would replace an image of the capture itself."""
-    sources = {band.path.resolve() for band in capture.bands}
-    for path in paths_written(capture, out, settings):
-        if path.resolve() in sources:
-            raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder")
+def refuse_to_overwrite(captures: Sequence[Capture], out: Path, settings: WriteSettings) -> None:
+    """Raise ConfigurationError if an output would replace an input image or an output of another capture."""
+    sources = {band.path.resolve() for capture in captures for band in capture.bands}
+    resolved: dict[Path, Path] = {}
+    written: dict[str, Capture] = {}
+    for capture in captures:
+        for path in paths_written(capture, out, settings):
+            if path.parent not in resolved:
+                resolved[path.parent] = path.parent.resolve()
+            if resolved[path.parent] / path.name in sources:
+                raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder")
+            other = written.setdefault(str(path).lower(), capture)
+            if other is not capture:
+                raise ConfigurationError(
+                    f"{path}: would be written of {other.label} and of {capture.label}; rename one's files"
+                )
 
 
 def discard_outputs(capture: Capture, out: Path, settings: WriteSettings) -> None:
@@ -138,3 +142,53 @@ def _require_radiometry(capture: Capture, choice: RadiometryChoice) -> None:
     without = [b.name for b in capture.bands if b.radiometry is None and not b.companion]
     if without:
         raise InputError(f"{capture.reference.path}: {_REMEDIES[choice].format(bands=', '.join(without))}")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One capture to process, as sent to a worker."""
+
+    capture: Capture
+    out: Path
+    settings: Settings
+    model: Path | None
+    max_preview_bytes: int = preview_bytes(1)
+
+    def absolute(self) -> "Task":
+        """Return the task with absolute paths: workers may have another working folder."""
+        model = None if self.model is None else self.model.absolute()
+        return replace(self, capture=self.capture.with_absolute_paths(), out=self.out.absolute(), model=model)
+
+
+def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
+    """Process one capture and return its report, which includes errors."""
+    label, clock = task.capture.label, StageClock(on_pair)
+    keep_freed_memory()
+    try:
+        model = None if task.model is None else loaded_model(task.model, task.settings.joint.device)
+        with one_thread(), one_memory_error():
+            report = process_capture(task.capture, task.out, task.settings, clock, model, task.max_preview_bytes)
+    except (AgalignError, MemoryError, *_FAULTS) as error:
+        # A defect of agalign in one capture must not stop the others.
+        report = CaptureReport(label, "error", error=failure_text(error))
+        _LOG.debug("%s: %s", label, report.error, exc_info=True)
+    return replace(report, seconds=clock.seconds, stages=clock.stages())
+
+
+def start_worker(threads: int) -> None:
+    """Initialise a worker process."""
+    follow_parent()
+    limit_threads(threads)
+
+
+def loaded_model(path: Path, device: str) -> FlightModel:
+    """Return the model in a file, which each worker reads again if it has been changed. Raises InputError."""
+    changed_ns = 0
+    with suppress(OSError):
+        changed_ns = path.stat().st_mtime_ns
+    return _loaded_model(path, device, changed_ns)
+
+
+@lru_cache(maxsize=8)
+def _loaded_model(path: Path, device: str, _changed_ns: int) -> FlightModel:
+    return load_model(path, lambda: choose_device(device))

@@ -1,13 +1,14 @@
 """Spectral indices of all captures of a run: serially, in processes of this machine, or on an executor."""
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 
+from agalign.batch.workers import Run, failure_text, on_executor, own_processes, serially
 from agalign.errors import AgalignError
 from agalign.products.flight_map import link_indices
 from agalign.products.index_bands import bands_of, unit_of
@@ -16,25 +17,10 @@ from agalign.products.index_table import IndexReport, IndexRow, row_of, update_t
 from agalign.products.indices import Index
 from agalign.products.sidecar_file import read_result, run_sidecars, update_products
 from agalign.values.cores import usable_cores
-from agalign.values.process_pool import ProcessPool
-from agalign.values.processes import follow_parent, threads_of_children, worker_context
+from agalign.values.processes import follow_parent
 
 _CAPTURES_WORTH_A_PROCESS = 8
 """Starting a process takes as long as the indices of this many captures."""
-_CAPTURES_A_PROCESS = 500
-_MAX_WAITING_TASKS = 1000
-
-
-@dataclass(frozen=True)
-class IndexOptions:
-    """How to calculate indices; no option changes their values."""
-
-    overwrite: bool = False
-    """Calculate indices again that an earlier command wrote from the same bands."""
-    jobs: int = 0
-    """Number of processes, each for one capture at a time; 0 is one per core."""
-    executor: Executor | None = None
-    """Executor that processes the captures instead; its workers need the same folders."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +36,10 @@ class IndexTask:
     overwrite: bool
     mask_qa: bool = False
     """Mask pixels that the quality raster flags as unusable."""
+
+    def absolute(self) -> "IndexTask":
+        """Return the task with absolute paths: workers may have another working folder."""
+        return replace(self, out=self.out.absolute(), sidecar=self.sidecar.absolute(), target=self.target.absolute())
 
     @property
     def folder(self) -> Path:
@@ -86,21 +76,47 @@ def unit_of_run(tasks: Sequence[IndexTask]) -> str:
     return ""
 
 
-def run_indices(tasks: Sequence[IndexTask], options: IndexOptions | None = None) -> Iterator[CaptureIndices]:
+def run_indices(
+    tasks: Sequence[IndexTask], jobs: int = 0, executor: Executor | None = None
+) -> Iterator[CaptureIndices]:
     """Write the indices of all captures, yield the reports of each, and finally write the table indices.csv.
 
+    `jobs` is the number of processes, each for one capture at a time; 0 is one per core. An `executor` processes the
+    captures instead; its workers need the same folders.
     A failed capture is reported and does not stop the others. Raises WorkerError if no worker process can be started,
     and OutputError if the table cannot be written.
     """
-    options = options or IndexOptions()
     rows: list[IndexRow] = []
     try:
-        for done in _results(tasks, options):
-            rows += done.rows
-            yield done
+        with _chosen_run(len(tasks), jobs or usable_cores(), executor) as run:
+            absolute = tasks if run is serially else [task.absolute() for task in tasks]
+            for number, result in run(do_indices, absolute, limited=True):
+                try:
+                    done = result()
+                except Exception as error:
+                    done = _failed(tasks[number], failure_text(error))
+                rows += done.rows
+                yield done
     finally:
         if rows:  # also after an interruption
             link_indices(tasks[0].target, update_table(tasks[0].target, rows))
+
+
+@contextmanager
+def _chosen_run(captures: int, cores: int, executor: Executor | None) -> Iterator[Run]:
+    processes = min(cores, captures // _CAPTURES_WORTH_A_PROCESS)
+    if executor is not None:
+        yield on_executor(executor)
+    elif processes > 1:
+        with own_processes(processes, _start_worker, preload=__name__) as run:
+            yield run
+    else:
+        yield serially
+
+
+def _start_worker(_threads: int) -> None:
+    follow_parent()
+    cv2.setNumThreads(1)
 
 
 def do_indices(task: IndexTask) -> CaptureIndices:
@@ -123,55 +139,3 @@ def do_indices(task: IndexTask) -> CaptureIndices:
 
 def _failed(task: IndexTask, problem: str) -> CaptureIndices:
     return CaptureIndices([IndexReport(task.label, index.name, problem=problem) for index in task.indices])
-
-
-def _results(tasks: Sequence[IndexTask], options: IndexOptions) -> Iterator[CaptureIndices]:
-    processes = min(options.jobs or usable_cores(), len(tasks) // _CAPTURES_WORTH_A_PROCESS)
-    if options.executor is not None:
-        yield from _on_executor(options.executor, tasks)
-    elif processes > 1:
-        yield from _in_processes(tasks, processes)
-    else:
-        yield from map(do_indices, tasks)
-
-
-def _in_processes(tasks: Sequence[IndexTask], processes: int) -> Iterator[CaptureIndices]:
-    with (
-        threads_of_children(1),
-        ProcessPool(
-            do_indices, processes, worker_context(__name__), _start_worker, max_tasks_per_worker=_CAPTURES_A_PROCESS
-        ) as pool,
-    ):
-        for outcome in pool.run(_absolute(tasks)):
-            yield _result(outcome.value, outcome.argument)
-
-
-def _on_executor(executor: Executor, tasks: Sequence[IndexTask]) -> Iterator[CaptureIndices]:
-    from agalign.batch.workers import DaskExecutor, finished_by  # imports torch
-
-    def submit(task: IndexTask) -> "Future[CaptureIndices]":
-        return executor.submit(do_indices, task)
-
-    loss = executor.loss if isinstance(executor, DaskExecutor) else str
-    for task, result in finished_by(submit, _absolute(tasks), _MAX_WAITING_TASKS, loss):
-        yield _result(result, task)
-
-
-def _absolute(tasks: Sequence[IndexTask]) -> list[IndexTask]:
-    """Return the tasks with absolute paths: workers may have another working folder."""
-    return [replace(t, out=t.out.absolute(), sidecar=t.sidecar.absolute(), target=t.target.absolute()) for t in tasks]
-
-
-def _result(result: Callable[[], CaptureIndices], task: IndexTask) -> CaptureIndices:
-    try:
-        return result()
-    except Exception:
-        from agalign.batch.workers import result_or_problem
-
-        done, problem = result_or_problem(result)
-        return _failed(task, problem) if done is None else done
-
-
-def _start_worker() -> None:
-    follow_parent()
-    cv2.setNumThreads(1)

@@ -9,16 +9,16 @@ from functools import partial
 import numpy as np
 
 from agalign.batch.learning_tasks import (
-    ChooseAndRefine,
     LearningCapture,
-    ObserveRig,
-    OneThread,
     RigObservation,
-    TryModel,
+    choose_and_refine,
+    in_one_thread,
     initial_network,
     load_capture,
     log_failure,
+    observe_rig,
     portable,
+    try_model,
 )
 from agalign.config import Settings
 from agalign.flight.factors import median_mapping
@@ -35,10 +35,10 @@ from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
 from agalign.values.alignment import RefinedPair, Residual
-from agalign.values.apply import A, Apply, R
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedFilePx, MovingFilePx
+from agalign.values.process_pool import A, Apply, R
 from agalign.verify.displacement_field import common_field
 from agalign.verify.extrapolation_check import unobserved_quarters
 from agalign.verify.lens_shapes import unmodelled_std_px
@@ -56,9 +56,13 @@ _MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48
 @one_memory_error()
 @without_warnings()
 def learn_flight(
-    captures: Sequence[Capture], settings: Settings, progress: Progress, start: FlightModel | None = None,
-    apply: Apply = map, threads: int = 1,
-) -> FlightModel | None:  # fmt: skip
+    captures: Sequence[Capture],
+    settings: Settings,
+    progress: Progress,
+    start: FlightModel | None = None,
+    apply: Apply = map,
+    threads: int = 1,
+) -> FlightModel | None:
     """Return a model learned from a few captures spread over the flight; None if none of them could be aligned.
 
     `apply` processes single captures, and `threads` train the network; the result does not depend on them. `start` is
@@ -68,10 +72,11 @@ def learn_flight(
     keep_freed_memory()
     captures = [capture.with_absolute_paths() for capture in captures]
 
-    def in_one_thread(function: Callable[[A], R], arguments: Sequence[A]) -> Iterator[R]:
-        return apply(OneThread(function), arguments)
+    def apply_in_one_thread(function: Callable[[A], R], arguments: Sequence[A]) -> Iterator[R]:
+        task = partial(in_one_thread, function)
+        return apply(task, arguments)
 
-    learned = _FlightLearner(captures, settings, progress, start, in_one_thread, threads).learned()
+    learned = _FlightLearner(captures, settings, progress, start, apply_in_one_thread, threads).learned()
     return None if learned is None else replace(learned, fingerprint=learning_fingerprint(captures, settings))
 
 
@@ -146,11 +151,11 @@ class _FlightLearner:
         if model.rig is None or not set(self._bands) <= set(model.bands):
             return None
         some = [self.captures[len(self.captures) * k // 3] for k in (1, 2)]
-        task = TryModel(portable(model), self.settings)
-        tests = list(self.apply(task, some))
-        if sum(t.aligned for t in tests) < len(self._bands) or any(t.aligned != t.predicted for t in tests):
+        tests = list(self.apply(partial(try_model, portable(model), self.settings), some))
+        known = [(self._key(c), *test) for c, test in zip(some, tests, strict=True) if test is not None]
+        if len(known) < len(some) or sum(aligned for _, aligned, _ in known) < len(self._bands):
             return None
-        return {self._key(c): t.refined for c, t in zip(some, tests, strict=True) if len(t.refined) == t.aligned}
+        return {key: refined for key, aligned, refined in known if len(refined) == aligned}
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if learning fails."""
@@ -164,7 +169,7 @@ class _FlightLearner:
         others = [(c,) for c in spread[: _MIN_RIG_CAPTURES - len(stretches)]]
         patches = FLIGHT_PATCHES if len(stretches) >= MIN_CAPTURES else PATCHES
         start = None if self.start is None else portable(self.start)
-        task = ChooseAndRefine(self._bands, self.settings, patches, start, self._has_rig)
+        task = partial(choose_and_refine, self._bands, self.settings, patches, start, observe=self._has_rig)
         refined = []
         for one in self.apply(task, [*stretches, *others]):
             refined.append(one)
@@ -209,7 +214,7 @@ class _FlightLearner:
             return result
         again = [c for c in self.captures if c.label in result and result[c.label].misaligned]
         waiting = [*again, *(c for c in _spread(self.captures, count) if c.label not in result)]
-        task = ObserveRig(portable(model), self.settings)
+        task = partial(observe_rig, portable(model), self.settings)
         while waiting:
             counts = Counter(band for o in result.values() for band in o.residuals)
             missing = count - min(counts.values(), default=0)
@@ -237,14 +242,12 @@ class _FlightLearner:
         fields = list(self.apply(fit, list(residuals.values())))
         calibrated = self.captures[0].reference.lens is not None
         extrapolation_px = _extrapolation_px(rig, residuals, calibrated=calibrated)
-        return replace(
-            rig, extrapolation_px=extrapolation_px,
-            fields={
-                band: field
-                for band, field in zip(residuals, fields, strict=True)
-                if field is not None and band not in extrapolation_px
-            },
-        )  # fmt: skip
+        known = {
+            band: field
+            for band, field in zip(residuals, fields, strict=True)
+            if field is not None and band not in extrapolation_px
+        }
+        return replace(rig, extrapolation_px=extrapolation_px, fields=known)
 
 
 def _extrapolation_px(

@@ -4,7 +4,6 @@ import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Generic
 
 import numpy as np
 
@@ -24,26 +23,21 @@ from agalign.method.joint import Results, refine_with
 from agalign.method.starter import start_from
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, RefinedPair, Residual, Seed
-from agalign.values.apply import A, R
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
+from agalign.values.process_pool import A, R
 
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class OneThread(Generic[A, R]):
-    """A function that uses one thread; memory errors of libraries are MemoryError."""
-
-    function: Callable[[A], R]
-
-    @one_thread()
-    @one_memory_error()
-    def __call__(self, argument: A) -> R:
-        keep_freed_memory()
-        return self.function(argument)
+@one_thread()
+@one_memory_error()
+def in_one_thread(function: Callable[[A], R], argument: A) -> R:
+    """Call a function that uses one thread; memory errors of libraries are MemoryError."""
+    keep_freed_memory()
+    return function(argument)
 
 
 def portable(model: FlightModel) -> FlightModel:
@@ -76,10 +70,9 @@ class RigObservation:
         """Return the observation with the bands of another one of the same capture."""
         mine, others = self.observation, other.observation
         mappings, std_px = {**mine.mappings, **others.mappings}, {**mine.std_px, **others.std_px}
-        return RigObservation(
-            replace(mine, mappings=mappings, std_px=std_px), {**self.residuals, **other.residuals},
-            {**self.refined, **other.refined}, other.misaligned,
-        )  # fmt: skip
+        residuals, refined = {**self.residuals, **other.residuals}, {**self.refined, **other.refined}
+        observation = replace(mine, mappings=mappings, std_px=std_px)
+        return RigObservation(observation, residuals, refined, other.misaligned)
 
 
 @dataclass(frozen=True)
@@ -149,9 +142,12 @@ class LoadedCapture:
 
 
 def load_capture(
-    capture: Capture, bands: Sequence[str], settings: Settings, start: FlightModel | None,
+    capture: Capture,
+    bands: Sequence[str],
+    settings: Settings,
+    start: FlightModel | None,
     known: Mapping[str, RefinedPair] | None = None,
-) -> LoadedCapture | None:  # fmt: skip
+) -> LoadedCapture | None:
     """Read a capture and find its seeds, or use those of the `known` pairs by band; None if no band can be used.
 
     Bands have their index in `bands` as index in the network. Seeds of kind `match` use the network of `start`.
@@ -183,96 +179,79 @@ def initial_network(bands: Sequence[str], settings: Settings, start: FlightModel
     return net
 
 
-@dataclass(frozen=True)
-class ChooseAndRefine:
-    """Task: choose the best of some captures to learn from, and refine it by the initial network.
+def choose_and_refine(
+    bands: tuple[str, ...],
+    settings: Settings,
+    patches: int,
+    start: FlightModel | None,
+    captures: Sequence[Capture],
+    *,
+    observe: bool,
+) -> LearningCapture | None:
+    """Choose the best of some captures to learn from, and refine it by the initial network.
 
     The chosen one is the first with trusted seeds for all bands, else the one with the highest correlation peaks.
-    Captures without common structure, as of water or fog, are not usable; without any other, the result is None.
+    Captures without common structure, as of water or fog, are not usable; without any other, the result is None. With
+    `observe`, the flight has enough captures for a rig.
     """
-
-    bands: tuple[str, ...]
-    settings: Settings
-    patches: int
-    start: FlightModel | None
-    observe: bool
-    """The flight has enough captures for a rig."""
-
-    def __call__(self, captures: Sequence[Capture]) -> LearningCapture | None:
-        start = None if self.start is None else _on_device(self.start, self.settings)
-        best: LoadedCapture | None = None
-        for capture in captures:
-            loaded = load_capture(capture, self.bands, self.settings, start)
-            if loaded is not None and (best is None or loaded.similarity_sigma > best.similarity_sigma):
-                best = loaded
-            if best is not None and best.is_trusted:
-                break
-        if best is None:
-            return None
-        net = initial_network(self.bands, self.settings, start)
-        if not (net.is_trained and best.is_trusted):
-            return LearningCapture(best.capture, is_good_enough=False)
-        try:
-            return best.refined_by(net, self.settings, self.patches, observe=self.observe, is_final=False)
-        except Exception as error:
-            log_failure(f"{best.capture.label} cannot be learned from", error)
-            return None
+    start = None if start is None else _on_device(start, settings)
+    best: LoadedCapture | None = None
+    for capture in captures:
+        loaded = load_capture(capture, bands, settings, start)
+        if loaded is not None and (best is None or loaded.similarity_sigma > best.similarity_sigma):
+            best = loaded
+        if best is not None and best.is_trusted:
+            break
+    if best is None:
+        return None
+    net = initial_network(bands, settings, start)
+    if not (net.is_trained and best.is_trusted):
+        return LearningCapture(best.capture, is_good_enough=False)
+    try:
+        return best.refined_by(net, settings, patches, observe=observe, is_final=False)
+    except Exception as error:
+        log_failure(f"{best.capture.label} cannot be learned from", error)
+        return None
 
 
-@dataclass(frozen=True)
-class ObserveRig:
-    """Task: align a capture, or the given bands of it, by the network and the mappings of a model without a rig.
+def observe_rig(
+    model: FlightModel, settings: Settings, argument: tuple[Capture, frozenset[str] | None]
+) -> RigObservation | None:
+    """Align a capture, or the given bands of it, by the network and the mappings of a model without a rig.
 
     None if that fails.
     """
-
-    model: FlightModel
-    settings: Settings
-
-    def __call__(self, argument: tuple[Capture, frozenset[str] | None]) -> RigObservation | None:
-        capture, bands = argument
-        try:
-            model = _on_device(self.model, self.settings)
-            pairs, _ = read_pairs(capture, self.settings.seed, model)
-            pairs = [p for p in pairs if p.has_rig_pixels and (bands is None or p.name in bands)]
-            aligner = PairAligner(self.settings, model, quiet, is_observation=True)
-            return _observation(pairs, aligner.align(pairs, None, scratch=False), aligner.refined, capture)
-        except Exception as error:
-            log_failure(f"{capture.label} does not determine the rig", error)
-            return None
+    capture, bands = argument
+    try:
+        model = _on_device(model, settings)
+        pairs, _ = read_pairs(capture, settings.seed, model)
+        pairs = [p for p in pairs if p.has_rig_pixels and (bands is None or p.name in bands)]
+        aligner = PairAligner(settings, model, quiet, is_observation=True)
+        return _observation(pairs, aligner.align(pairs, None, scratch=False), aligner.refined, capture)
+    except Exception as error:
+        log_failure(f"{capture.label} does not determine the rig", error)
+        return None
 
 
-@dataclass(frozen=True)
-class ModelTest:
-    """Aligned bands of a capture by a model."""
+def try_model(model: FlightModel, settings: Settings, capture: Capture) -> tuple[int, Mapping[str, RefinedPair]] | None:
+    """Align a capture by an earlier model; return (number of aligned bands, refined mappings of all bands).
 
-    aligned: int
-    predicted: int
-    """Number of aligned bands that the rig predicts from the others."""
-    refined: Mapping[str, RefinedPair] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class TryModel:
-    """Task: align a capture by an earlier model and count the aligned bands that its rig predicts."""
-
-    model: FlightModel
-    settings: Settings
-
-    def __call__(self, capture: Capture) -> ModelTest:
-        model, limit_px = _on_device(self.model, self.settings), self.settings.check.accept_predicted_px
-        assert model.rig is not None
-        try:
-            pairs, _ = read_pairs(capture, self.settings.seed, model)
-            aligner = PairAligner(self.settings, model, quiet, is_observation=True)
-            result = aligner.align(pairs, None, scratch=False)
-            checked = with_predictions(pairs, result, model.rig, capture)
-        except Exception as error:
-            log_failure(f"{capture.label} is not aligned by the model", error)
-            return ModelTest(0, 0)
-        aligned = [checked[name] for name, a in result.items() if a.status == "aligned"]
-        predicted = [a for a in aligned if a.prediction is not None and a.prediction.std_px <= limit_px]
-        return ModelTest(len(aligned), len(predicted), aligner.refined)
+    None if its rig does not predict each aligned band from the others accurately enough.
+    """
+    model = _on_device(model, settings)
+    assert model.rig is not None
+    try:
+        pairs, _ = read_pairs(capture, settings.seed, model)
+        aligner = PairAligner(settings, model, quiet, is_observation=True)
+        result = aligner.align(pairs, None, scratch=False)
+        checked = with_predictions(pairs, result, model.rig, capture)
+    except Exception as error:
+        log_failure(f"{capture.label} is not aligned by the model", error)
+        return 0, {}
+    predictions = [checked[name].prediction for name, a in result.items() if a.status == "aligned"]
+    if any(p is None or p.std_px > settings.check.accept_predicted_px for p in predictions):
+        return None
+    return len(predictions), aligner.refined
 
 
 def _are_good_enough(results: Results) -> bool:
@@ -282,9 +261,11 @@ def _are_good_enough(results: Results) -> bool:
 
 
 def _observation(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], refined: Mapping[str, RefinedPair],
+    pairs: Sequence[BandPair],
+    result: Mapping[str, Alignment[FixedImagePx]],
+    refined: Mapping[str, RefinedPair],
     capture: Capture,
-) -> RigObservation:  # fmt: skip
+) -> RigObservation:
     in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
     residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
     misaligned = frozenset(

@@ -3,20 +3,29 @@
 import stat
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Self
 
-from agalign.batch.capture import discard_outputs, paths_written, quiet
+from agalign.batch.capture import (
+    Task,
+    discard_outputs,
+    do_capture,
+    loaded_model,
+    quiet,
+    refuse_to_overwrite,
+    start_worker,
+)
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.batch.output_folder import is_full, locked
 from agalign.batch.report import CaptureReport
-from agalign.batch.runners import Runner, choose_runner
-from agalign.batch.workers import Task, loaded_model, stamp
+from agalign.batch.workers import Run, failure_text, in_order, on_executor, own_processes, serially
 from agalign.cameras.discover import FolderScan
 from agalign.capture.align import PairProgress
-from agalign.config import Settings, WriteSettings
+from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
 from agalign.flight.fingerprint import fingerprint
 from agalign.flight.groups import flight_camera, flights_of, is_flight_of, model_names
@@ -25,6 +34,7 @@ from agalign.flight.panels import PanelReading, read_panel, reflectance_factors,
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device
 from agalign.pixels.radiometry import with_radiometry
+from agalign.pixels.raster import without_warnings
 from agalign.products.flight_map import FlightMap
 from agalign.products.footprint import above_elevation, with_approximate_georeference
 from agalign.products.index_product import check_indices
@@ -37,30 +47,12 @@ from agalign.products.sidecar_file import read_result
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
+from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
 
 _MAX_THREADS = 4
-"""Maximum number of threads that train a network; more wait for the interpreter's lock."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """How to run; no option changes the result of a capture."""
-
-    overwrite: bool = False
-    """Process finished captures again."""
-    jobs: int = 1
-    """Captures to process at the same time; 0 is one per core. Few captures are processed one after another."""
-    align_panels: bool = False
-    """Also align captures of calibration panels and of the sky."""
-    executor: Executor | None = None
-    """Executor that processes the captures, such as `dask_executor`; its workers need the same folders."""
-    retry_failed: bool = False
-    """Process captures again if a band is not aligned or missing."""
-    timeout_s: float | None = None
-    """Seconds after which the process of a capture is killed; ignored with an `executor` (`dask_executor` has its
-    own)."""
-    command: str = ""
-    """Command line, for run record and report."""
+"""Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
+_MAX_READ_AHEAD_BYTES = 64 << 20
+"""Larger files could displace files of the current capture from the page cache."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +69,13 @@ class Listener:
 
 
 def run_flight(
-    flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None,
-    listener: Listener | None = None, model: Path | None = None,
-) -> Iterator[CaptureReport]:  # fmt: skip
+    flight: FolderScan,
+    out: Path,
+    settings: Settings,
+    options: RunOptions | None = None,
+    listener: Listener | None = None,
+    model: Path | None = None,
+) -> Iterator[CaptureReport]:
     """Align the captures and yield the report of each; captures finished by an earlier run are kept.
 
     First a model is learned for every camera and flight, starting from `model` if given, and saved below OUT/models. A
@@ -89,16 +85,12 @@ def run_flight(
     no worker process can be started or worker processes end one after another, InputError or ConfigurationError for
     `model`, ConfigurationError for a device.
     """
-    options, listener = options or RunOptions(), listener or Listener()
-    choose_device(settings.joint.device)
-    check_indices(flight.captures, settings.write)
-    _refuse_to_overwrite(flight, out, settings.write)
-    given = None if model is None else _given_model(model, flight, settings)
-    if given is not None:
-        flight_settings = settings.flight.model_copy(update={"start": given.fingerprint})
-        settings = settings.model_copy(update={"flight": flight_settings})
-    with locked(out), _recorded(flight, out, settings, options.command) as record:
-        for report in _reports(flight, out, settings, options, _with_seconds(listener, record), given):
+    run = _FlightRun(flight, out, settings, options or RunOptions(), listener or Listener())
+    run.check()
+    if model is not None:
+        run = run.starting_from(model)
+    with locked(out), _recorded(run) as record:
+        for report in run.reports(record):
             record.add(report.label, report.state, report.result, report.problems)
             if report.state == "done":
                 record.capture_seconds[report.label] = report.seconds
@@ -109,15 +101,30 @@ def run_flight(
                 raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
 
 
+def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None) -> dict[str, str]:
+    """Return what `run_flight` would do with each capture, by label. Writes nothing.
+
+    Raises ConfigurationError like `run_flight` does.
+    """
+    run = _FlightRun(flight, out, settings, options or RunOptions())
+    run.check()
+    sky, panels, captures = run.selected()
+    states = {s.capture.label: "left out as sky" for s in sky}
+    states |= {p.capture.label: "read as calibration panels" for p in panels if p.capture.is_of_a_panel}
+    states |= {c.label: "to be aligned" if run.kept(c) is None else "kept from an earlier run" for c in captures}
+    return {c.label: states[c.label] for c in flight.captures}
+
+
 @contextmanager
-def _recorded(flight: FolderScan, out: Path, settings: Settings, command: str) -> Iterator[RunPart]:
+def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     """Write the run record at the beginning and at the end of a run, also after an interruption."""
-    record, began = begun(flight.folder, settings, flight.captures, command), time.monotonic()
-    for problem in flight.problems:
+    began = time.monotonic()
+    record = begun(run.flight.folder, run.settings, run.flight.captures, run.options.command)
+    for problem in run.flight.problems:
         record.add_problem(str(problem.path), problem.text)
 
     def write(state: RunState) -> None:
-        record.write(out, state, time.monotonic() - began)
+        record.write(run.out, state, time.monotonic() - began)
 
     write("running")
     try:
@@ -129,82 +136,134 @@ def _recorded(flight: FolderScan, out: Path, settings: Settings, command: str) -
     write("finished")
 
 
-def _with_seconds(listener: Listener, record: RunPart) -> Listener:
-    def on_learnt(camera: str, seconds: float) -> None:
+@dataclass(frozen=True)
+class _FlightRun:
+    """The steps of `run_flight`."""
+
+    flight: FolderScan
+    out: Path
+    settings: Settings
+    options: RunOptions
+    listener: Listener = Listener()
+    given: FlightModel | None = None
+    """Model to start from."""
+
+    def check(self) -> None:
+        """Raise ConfigurationError for a device, an index or an output folder that cannot be used."""
+        choose_device(self.settings.joint.device)
+        check_indices(self.flight.captures, self.settings.write)
+        if self.out.resolve() == self.flight.folder.resolve():
+            raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
+        refuse_to_overwrite(self.flight.captures, self.out, self.settings.write)
+
+    def starting_from(self, path: Path) -> Self:
+        """Return the run with a model. Raises ConfigurationError if it does not fit the settings or the cameras."""
+        settings = self.settings
+        if not settings.learns_flights:
+            raise ConfigurationError("a model needs one network per flight, which only recipe fast learns")
+        model = load_model(path, lambda: choose_device(settings.joint.device))
+        if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
+            raise ConfigurationError(f"{path}: was learned unshared; add --sharing unshared")
+        flights = flights_of(self.flight.captures)
+        if flights and not any(is_flight_of(captures, model.camera) for captures in flights):
+            here = flight_camera(flights[0])
+            raise ConfigurationError(f"{path}: was learned for {model.camera}; the images here are of {here}")
+        flight_settings = settings.flight.model_copy(update={"start": model.fingerprint})
+        return replace(self, given=model, settings=settings.model_copy(update={"flight": flight_settings}))
+
+    def selected(self) -> tuple[list[SkyCapture], list[PanelReading], list[Capture]]:
+        """Return (captures of the sky, readings of calibration panels, captures to align, with their radiometry and
+        georeference); a scene that contains a panel is in both of the last two.
+
+        Raises ConfigurationError if no capture has the metadata for a georeference that the settings ask for.
+        """
+        write, albedos = self.settings.write, dict(self.settings.write.panel_albedo)
+        sky: list[SkyCapture] = []
+        panels: list[PanelReading] = []
+        captures = list(self.flight.captures)
+        if not self.options.align_panels:
+            sky, captures = sky_captures(captures)
+            captures = list(with_panels(captures, without_code=bool(albedos)))
+            panels = [read_panel(c, albedos) for c in captures if c.panel is not None]
+            captures = [c for c in captures if not c.is_of_a_panel]
+        captures = [_calibrated(capture, panels, write) for capture in captures]
+        if write.georeference and captures and all(c.reference.georeference is None for c in captures):
+            raise ConfigurationError(
+                "--georeference: no capture has position, altitude, yaw and focal length in its tags, and a height "
+                "above the ground; where only the height is missing, give --ground-elevation"
+            )
+        return sky, panels, captures
+
+    def kept(self, capture: Capture) -> CaptureResult | None:
+        """Return the result of an earlier run; None if the capture must be processed (again)."""
+        earlier = None if self.options.overwrite else finished_before(capture, self.out, self.settings)
+        return None if earlier is None or (self.options.retry_failed and earlier.status != "ok") else earlier
+
+    def reports(self, record: RunPart) -> Iterator[CaptureReport]:
+        """Yield the report of each capture; add the time of learning to the record."""
+        out, settings, flight_map = self.out, self.settings, FlightMap(self.out)
+        sky, panels, captures = self.selected()
+        for excluded, facts in zip(sky, write_sky(sky, out), strict=True):
+            discard_outputs(excluded.capture, out, settings.write)
+            flight_map.add(excluded.capture, "sky")
+            yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence)
+        for reading, part in zip(panels, write_panels(panels, out), strict=True):
+            if reading.capture.is_of_a_panel:
+                discard_outputs(reading.capture, out, settings.write)
+                flight_map.add(reading.capture, "panel")
+                yield CaptureReport(reading.capture.label, "panel", panel=part.sentence)
+        # Captures of each flight, name of its model, and those captures that must be processed.
+        unfinished: list[tuple[Sequence[Capture], str, list[Capture]]] = []
+        groups = flights_of(captures)
+        for group, name in zip(groups, model_names(groups), strict=True):
+            pending = []
+            for capture in group:
+                kept = self.kept(capture)
+                if kept is None:
+                    pending.append(capture)
+                else:
+                    flight_map.add(capture, kept.status, kept)
+                    yield CaptureReport(capture.label, "kept", kept, CapturePaths.of(capture, out).sidecar)
+            if pending:
+                unfinished.append((group, name, pending))
+        on_cpu = choose_device(settings.joint.device).type == "cpu"
+        cores = self.options.jobs or (usable_cores() if on_cpu else 1)
+        with _chosen_run(sum(len(pending) for _, _, pending in unfinished), cores, self.options) as run:
+            tasks: list[Task] = []
+            learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
+            for of_flight, name, pending in unfinished:
+                path = self._model(of_flight, out / "models" / name, learn, record)
+                tasks += [Task(c, out, settings, path, preview_bytes(len(self.flight.captures))) for c in pending]
+            by_label = {c.label: c for c in captures}
+            for report in capture_reports(run, tasks, self.listener, self.options.timeout_s):
+                status = "failed" if report.result is None else report.result.status
+                flight_map.add(by_label[report.label], status, report.result)
+                yield report
+        flight_map.write()
+        if settings.write.stac:
+            write_collections(captures, out)
+
+    def _model(
+        self, captures: Sequence[Capture], path: Path, learn: Callable[..., FlightModel | None], record: RunPart
+    ) -> Path | None:
+        """Return the path of the flight's model, from this or an earlier run; None if no model could be learned."""
+        settings, given = self.settings, self.given
+        if not settings.learns_flights:
+            return None
+        if path.is_file():
+            with suppress(AgalignError):
+                if loaded_model(path, settings.joint.device).fingerprint == learning_fingerprint(captures, settings):
+                    return path
+        began = time.monotonic()
+        start = given if given is not None and is_flight_of(captures, given.camera) else None
+        model = learn(captures, settings, lambda _stage, share: self.listener.on_learning(path.stem, share), start)
+        seconds = time.monotonic() - began
         record.add_seconds("learning a flight", seconds)
-        listener.on_learnt(camera, seconds)
-
-    return replace(listener, on_learnt=on_learnt)
-
-
-def _reports(
-    flight: FolderScan, out: Path, settings: Settings, options: RunOptions, listener: Listener,
-    given: FlightModel | None,
-) -> Iterator[CaptureReport]:  # fmt: skip
-    sky, captures = _sky(flight.captures, options)
-    flight_map = FlightMap(out)
-    for excluded, facts in zip(sky, write_sky(sky, out), strict=True):
-        discard_outputs(excluded.capture, out, settings.write)
-        flight_map.add(excluded.capture, "sky")
-        yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence)
-    panels, captures = _panels(captures, settings.write, options)
-    for reading, part in zip(panels, write_panels(panels, out), strict=True):
-        if not reading.capture.is_of_a_panel:
-            continue
-        discard_outputs(reading.capture, out, settings.write)
-        flight_map.add(reading.capture, "panel")
-        yield CaptureReport(reading.capture.label, "panel", panel=part.sentence)
-    # Captures of each flight, name of its model, and those captures that must be processed.
-    unfinished: list[tuple[Sequence[Capture], str, list[Capture]]] = []
-    captures = [_calibrated(capture, panels, settings.write) for capture in captures]
-    _require_georeference(captures, settings.write)
-    groups = flights_of(captures)
-    for group, name in zip(groups, model_names(groups), strict=True):
-        pending = []
-        for capture in group:
-            kept = _kept(capture, out, settings, options)
-            if kept is None:
-                pending.append(capture)
-            else:
-                flight_map.add(capture, kept.status, kept)
-                yield CaptureReport(capture.label, "kept", kept, CapturePaths.of(capture, out).sidecar)
-        if pending:
-            unfinished.append((group, name, pending))
-    count, cores = sum(len(pending) for _, _, pending in unfinished), _cores(options, settings)
-    with choose_runner(
-        count, cores, options.executor, options.timeout_s, listener.on_start, listener.on_pair
-    ) as runner:
-        tasks: list[Task] = []
-        for of_flight, name, pending in unfinished:
-            path = _learn(of_flight, out / "models" / name, settings, listener, given, runner, min(_MAX_THREADS, cores))
-            tasks += [Task(c, out, settings, path, preview_bytes(len(flight.captures))) for c in pending]
-        by_label = {c.label: c for c in captures}
-        for report in runner.reports(tasks):
-            status = "failed" if report.result is None else report.result.status
-            flight_map.add(by_label[report.label], status, report.result)
-            yield report
-    flight_map.write()
-    if settings.write.stac:
-        write_collections(captures, out)
-
-
-def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None) -> dict[str, str]:
-    """Return what `run_flight` would do with each capture, by label. Writes nothing.
-
-    Raises ConfigurationError like `run_flight` does.
-    """
-    options = options or RunOptions()
-    choose_device(settings.joint.device)
-    check_indices(flight.captures, settings.write)
-    _refuse_to_overwrite(flight, out, settings.write)
-    sky, captures = _sky(flight.captures, options)
-    panels, captures = _panels(captures, settings.write, options)
-    states = {s.capture.label: "left out as sky" for s in sky}
-    states |= {p.capture.label: "read as calibration panels" for p in panels if p.capture.is_of_a_panel}
-    for raw in captures:
-        kept = _kept(_calibrated(raw, panels, settings.write), out, settings, options)
-        states[raw.label] = "to be aligned" if kept is None else "kept from an earlier run"
-    return {c.label: states[c.label] for c in flight.captures}
+        self.listener.on_learnt(path.stem, seconds)
+        if model is None:
+            return None
+        save_model(model, path)
+        return path
 
 
 def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
@@ -218,102 +277,57 @@ def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: Writ
     return with_approximate_georeference(capture) if settings.georeference else capture
 
 
-def _require_georeference(captures: Sequence[Capture], settings: WriteSettings) -> None:
-    """Raise ConfigurationError if an approximate georeference is asked for and no capture has the metadata for it."""
-    if settings.georeference and captures and all(c.reference.georeference is None for c in captures):
-        raise ConfigurationError(
-            "--georeference: no capture has position, altitude, yaw and focal length in its tags, and a height above "
-            "the ground; where only the height is missing, give --ground-elevation"
-        )
+@contextmanager
+def _chosen_run(captures: int, cores: int, options: RunOptions) -> Iterator[Run]:
+    """Choose where to process a number of captures.
+
+    They run on the executor if there is one; in processes if there are enough captures for two, or for a timeout
+    (threads cannot be killed); else in threads, or serially with one core or capture.
+    """
+    limited = options.timeout_s is not None and captures > 0
+    processes = min(cores, captures if limited else captures // CAPTURES_WORTH_A_PROCESS)
+    threads = min(cores, captures, _MAX_THREADS)
+    if options.executor is not None:
+        yield on_executor(options.executor)
+    elif processes > 1 or limited:
+        with own_processes(processes, start_worker, timeout_s=options.timeout_s) as run:
+            yield run
+    elif threads > 1:
+        # Warning filters are global: threads that change and restore them would interfere.
+        with without_warnings(), ThreadPoolExecutor(threads) as executor:
+            yield on_executor(executor)
+    else:
+        yield serially
 
 
-def _kept(capture: Capture, out: Path, settings: Settings, options: RunOptions) -> CaptureResult | None:
-    """Return the result of an earlier run; None if the capture must be processed (again)."""
-    earlier = None if options.overwrite else finished_before(capture, out, settings)
-    return None if earlier is None or (options.retry_failed and earlier.status != "ok") else earlier
+def capture_reports(
+    run: Run, tasks: Sequence[Task], listener: Listener, timeout_s: float | None
+) -> Iterator[CaptureReport]:
+    """Yield the report of each task as it completes. In this process, the listener is called, and the files of the next
+    capture are read into the page cache meanwhile.
+    """
+    if run is not serially:
+        for number, result in run(do_capture, [task.absolute() for task in tasks], limited=True):
+            try:
+                report = result()
+            except Exception as error:
+                report = CaptureReport(tasks[number].capture.label, "error", error=failure_text(error, timeout_s))
+            yield report
+        return
+    with ThreadPoolExecutor(1) as reader:
+        for number, task in enumerate(tasks, start=1):
+            listener.on_start(task.capture)
+            for following in tasks[number : number + 1]:
+                reader.submit(_read_ahead, following.capture)
+            yield do_capture(task, listener.on_pair)
 
 
-def _sky(captures: Sequence[Capture], options: RunOptions) -> tuple[list[SkyCapture], list[Capture]]:
-    """Return (captures of the sky, other captures)."""
-    return ([], list(captures)) if options.align_panels else sky_captures(captures)
-
-
-def _panels(
-    captures: Sequence[Capture], settings: WriteSettings, options: RunOptions
-) -> tuple[list[PanelReading], list[Capture]]:
-    """Return (readings of calibration panels, captures to align); a scene that contains a panel is in both."""
-    if options.align_panels:
-        return [], list(captures)
-    albedos = dict(settings.panel_albedo)
-    seen = with_panels(captures, without_code=bool(albedos))
-    panels = [read_panel(c, albedos) for c in seen if c.panel is not None]
-    return panels, [c for c in seen if not c.is_of_a_panel]
-
-
-def _cores(options: RunOptions, settings: Settings) -> int:
-    """Return how many captures to process at a time by default: one per core, or one on a GPU."""
-    on_cpu = choose_device(settings.joint.device).type == "cpu"
-    return options.jobs or (usable_cores() if on_cpu else 1)
-
-
-def _given_model(path: Path, flight: FolderScan, settings: Settings) -> FlightModel:
-    """Load the model to start from. Raises ConfigurationError if it does not fit the settings or the cameras."""
-    if not settings.learns_flights:
-        raise ConfigurationError("a model needs one network per flight, which only recipe fast learns")
-    model = load_model(path, lambda: choose_device(settings.joint.device))
-    if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
-        raise ConfigurationError(f"{path}: was learned unshared; add --sharing unshared")
-    flights = flights_of(flight.captures)
-    if flights and not any(is_flight_of(captures, model.camera) for captures in flights):
-        here = flight_camera(flights[0])
-        raise ConfigurationError(f"{path}: was learned for {model.camera}; the images here are of {here}")
-    return model
-
-
-def _learn(
-    captures: Sequence[Capture], path: Path, settings: Settings, listener: Listener, given: FlightModel | None,
-    runner: Runner, threads: int,
-) -> Path | None:  # fmt: skip
-    """Return the path of the flight's model, from this or an earlier run; None if no model could be learned."""
-    if not settings.learns_flights:
-        return None
-    start = given if given is not None and is_flight_of(captures, given.camera) else None
-    device = settings.joint.device
-    if path.is_file():
-        with suppress(AgalignError):
-            if loaded_model(path, device, stamp(path)).fingerprint == learning_fingerprint(captures, settings):
-                return path
-
-    def progress(_stage: str, share: float) -> None:
-        listener.on_learning(path.stem, share)
-
-    began = time.monotonic()
-    model = learn_flight(captures, settings, progress, start, runner.apply, threads)
-    listener.on_learnt(path.stem, time.monotonic() - began)
-    if model is None:
-        return None
-    save_model(model, path)
-    return path
-
-
-def _refuse_to_overwrite(flight: FolderScan, out: Path, settings: WriteSettings) -> None:
-    """Raise ConfigurationError if an output would replace an input image or an output of another capture."""
-    if out.resolve() == flight.folder.resolve():
-        raise ConfigurationError(f"{out}: is the folder of the images; choose another output folder with -o")
-    sources = {band.path.resolve() for capture in flight.captures for band in capture.bands}
-    resolved: dict[Path, Path] = {}
-    written: dict[str, Capture] = {}
-    for capture in flight.captures:
-        for path in paths_written(capture, out, settings):
-            if path.parent not in resolved:
-                resolved[path.parent] = path.parent.resolve()
-            if resolved[path.parent] / path.name in sources:
-                raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder with -o")
-            other = written.setdefault(str(path).lower(), capture)
-            if other is not capture:
-                raise ConfigurationError(
-                    f"{path}: would be written of {other.label} and of {capture.label}; rename one's files"
-                )
+def _read_ahead(capture: Capture) -> None:
+    """Read the files of a capture into the page cache."""
+    for path in {b.path for b in capture.bands}:
+        with suppress(OSError):
+            if path.stat().st_size <= _MAX_READ_AHEAD_BYTES:
+                path.read_bytes()
 
 
 def finished_before(capture: Capture, out: Path, settings: Settings) -> CaptureResult | None:

@@ -1,237 +1,173 @@
-"""Processing a capture as a task: in this process, in worker processes, or on the workers of a cluster."""
+"""Calling a function with each of many tasks: in this process, in threads, in worker processes, or on the workers of a
+cluster.
+"""
 
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    wait,
-)
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from importlib import import_module
 from itertools import islice
-from pathlib import Path
-from typing import Any, TypeVar
-
-import cv2
+from typing import Any, Protocol
 
 from agalign._version import __version__
-from agalign.batch.capture import process_capture, quiet
-from agalign.batch.report import CaptureReport, StageClock
-from agalign.capture.align import PairProgress
-from agalign.config import Settings
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
-from agalign.flight.model import FlightModel, load_model
-from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
-from agalign.products.preview import preview_bytes
-from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
-from agalign.values.process_pool import ProcessPool, WorkerDiedError
-from agalign.values.processes import WORKER_MODULE, follow_parent, threads_of_children, worker_context
+from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
+from agalign.values.processes import WORKER_MODULE, threads_of_children, worker_context
 
-_FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 _LOG = logging.getLogger(__name__)
 _DASK_TIMEOUT_S = 10
 _POLL_INTERVAL_S = 5.0
 """Interval at which the state of a cluster is checked while no task completes."""
 _TIMEOUT_EXIT_CODE = 75
-_OUT_OF_MEMORY = "out of memory; try again with fewer --jobs, or with more memory"
-_CAPTURES_A_PROCESS = 500
-"""Number of captures after which a process is replaced: libraries leak some kilobytes per capture."""
+_RUN_AGAIN = "run again to process the remaining captures"
+_TASKS_A_PROCESS = 500
+"""Number of tasks after which a process is replaced: libraries leak some kilobytes per capture."""
+_MAX_WAITING_TASKS = 1000
+"""Maximum number of tasks submitted to an executor at a time: enough for any cluster, and little memory."""
 
 
-@dataclass(frozen=True)
-class Task:
-    """One capture to process, as sent to a worker."""
+class Run(Protocol):
+    """Calls a function with each task, and yields the tasks as they complete: the index of each, and a function that
+    returns or raises its result.
 
-    capture: Capture
-    out: Path
-    settings: Settings
-    model: Path | None
-    max_preview_bytes: int = preview_bytes(1)
-
-    def absolute(self) -> "Task":
-        """Return the task with absolute paths: workers may have another working folder."""
-        model = None if self.model is None else self.model.absolute()
-        return replace(self, capture=self.capture.with_absolute_paths(), out=self.out.absolute(), model=model)
-
-
-T = TypeVar("T")
-R = TypeVar("R")
-Submit = Callable[[T], Future[R]]
-CallPool = ProcessPool[Callable[[], Any], Any]
-"""Worker processes that call functions."""
-OnStart = Callable[[Capture], None]
-
-
-def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
-    """Process one capture and return its report, which includes errors."""
-    label, clock = task.capture.label, StageClock(on_pair)
-    keep_freed_memory()
-    try:
-        device = task.settings.joint.device
-        model = None if task.model is None else loaded_model(task.model, device, stamp(task.model))
-        with one_thread(), one_memory_error():
-            outcome = process_capture(task.capture, task.out, task.settings, clock, model, task.max_preview_bytes)
-    except AgalignError as error:
-        problem = str(error)
-    except MemoryError:
-        problem = _OUT_OF_MEMORY
-    except _FAULTS as error:
-        # A defect of agalign in one capture must not stop the others.
-        problem = f"agalign failed on it ({type(error).__name__}: {error}); please report this"
-        _LOG.debug("%s: %s", label, problem, exc_info=True)
-    else:
-        return CaptureReport(
-            label, "done", outcome.sidecar.result(), outcome.path, shortcomings=outcome.shortcomings,
-            seconds=clock.seconds, stages=clock.stages(),
-        )  # fmt: skip
-    return CaptureReport(label, "error", error=problem, seconds=clock.seconds, stages=clock.stages())
-
-
-def done_by(
-    submit: Submit[Task, CaptureReport], tasks: Sequence[Task], maximum: int, timeout_s: float | None = None,
-    loss: Callable[[], str] = str,
-) -> Iterator[CaptureReport]:  # fmt: skip
-    """Yield the report of each task of an executor. Raises WorkerError like `finished_by`."""
-    for task, result in finished_by(submit, tasks, maximum, loss):
-        yield _report_of(result, task, timeout_s)
-
-
-def finished_by(
-    submit: Submit[T, R], tasks: Sequence[T], maximum: int, loss: Callable[[], str] = str
-) -> Iterator[tuple[T, Callable[[], R]]]:
-    """Yield each task of an executor as it completes, with a function that returns or raises its result.
-
-    At most `maximum` tasks are submitted at a time, which limits memory. `loss` returns the reason why no task can
-    complete any more, or an empty string. Raises WorkerError with that reason.
+    Function, tasks and results can be pickled, except in this process. Only calls that are `limited` end at the time
+    limit. Raises WorkerError if no worker can be started, or if workers end one after another.
     """
-    futures: dict[Future[R], T] = {}
-    remaining = iter(tasks)
-    try:
-        for task in islice(remaining, maximum):
-            futures[_submitted(submit, task)] = task
-        while futures:
-            done, _ = wait(futures, _POLL_INTERVAL_S, FIRST_COMPLETED)
-            if not done and (reason := loss()):  # futures of a lost cluster may never be done
-                raise WorkerError(reason)
-            for future in done:
-                task = futures.pop(future)
-                if (future.cancelled() or future.exception() is not None) and (reason := loss()):
-                    raise WorkerError(reason)
-                yield task, future.result
-                for following in islice(remaining, 1):
-                    futures[_submitted(submit, following)] = following
-    finally:
-        for future in futures:
-            future.cancel()
+
+    def __call__(
+        self, function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False
+    ) -> Iterator[tuple[int, Callable[[], R]]]: ...
 
 
-def _submitted(submit: Submit[T, R], task: T) -> "Future[R]":
-    """Submit a task and return its future; if the executor is broken, its error is the outcome of the task."""
-    try:
-        return submit(task)
-    except BrokenExecutor as error:
-        failed: Future[R] = Future()
-        failed.set_exception(error)
-        return failed
+def serially(
+    function: Callable[[A], R],
+    tasks: Sequence[A],
+    /,
+    *,
+    limited: bool = False,  # noqa: ARG001 - of the protocol
+) -> Iterator[tuple[int, Callable[[], R]]]:
+    """Run the tasks in this process and thread: each when its result is requested."""
+    for number, task in enumerate(tasks):
+        yield number, partial(function, task)
 
 
-def done_in(pool: CallPool, tasks: Sequence[Task], timeout_s: float | None = None) -> Iterator[CaptureReport]:
-    """Yield the report of each task of a process pool. Raises WorkerError if no worker process can be started."""
-    for outcome in pool.run([partial(do_capture, task) for task in tasks], timeout_s):
-        yield _report_of(outcome.value, tasks[outcome.number], timeout_s)
+@contextmanager
+def own_processes(
+    processes: int,
+    initializer: Callable[[int], object],
+    *,
+    preload: str = WORKER_MODULE,
+    timeout_s: float | None = None,
+) -> Iterator[Run]:
+    """Run tasks in processes of this machine, which start in the background.
 
+    `initializer` gets the number of threads of a process, and `preload` is a module that imports what it needs. The
+    process of a task that exceeds the timeout is killed.
+    """
+    threads, context = max(1, usable_cores() // processes), worker_context(preload)
+    with (
+        threads_of_children(threads),
+        ProcessPool(_call, processes, context, initializer, (threads,), max_tasks_per_worker=_TASKS_A_PROCESS) as pool,
+    ):
 
-def applied_in(pool: CallPool, function: Callable[[T], R], arguments: Sequence[T]) -> Iterator[R]:
-    """Apply a function to arguments in a process pool, like `values.apply.Apply`."""
-    outcomes = pool.run([partial(function, argument) for argument in arguments])
-    return _in_order((outcome.number, outcome.value) for outcome in outcomes)
+        def run(
+            function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False
+        ) -> Iterator[tuple[int, Callable[[], R]]]:
+            calls = [partial(function, task) for task in tasks]
+            for outcome in pool.run(calls, timeout_s if limited else None):
+                yield outcome.number, outcome.value
 
-
-def applied_by(executor: Executor, function: Callable[[T], R], arguments: Sequence[T], maximum: int) -> Iterator[R]:
-    """Apply a function to arguments on an executor, like `values.apply.Apply`; at most `maximum` at a time."""
-    executor = executor.without_timeout() if isinstance(executor, DaskExecutor) else executor
-    loss = executor.loss if isinstance(executor, DaskExecutor) else str
-
-    def submit(number: int) -> Future[R]:
-        return executor.submit(function, arguments[number])
-
-    return _in_order(finished_by(submit, range(len(arguments)), maximum, loss))
-
-
-def _in_order(finished: Iterable[tuple[int, Callable[[], R]]]) -> Iterator[R]:
-    """Yield the results of numbered tasks in the order of the numbers. Raises WorkerError for lost workers."""
-    waiting: dict[int, Callable[[], R]] = {}
-    following = 0
-    for number, result in finished:
-        waiting[number] = result
-        while following in waiting:
-            yield _value_of(waiting.pop(following))
-            following += 1
-
-
-def _value_of(result: Callable[[], R]) -> R:
-    try:
-        return result()
-    except (AgalignError, MemoryError):
-        raise
-    except (Exception, CancelledError) as error:
-        _, problem = result_or_problem(result)
-        raise WorkerError(f"the flight cannot be learned: {problem}") from error
-
-
-def _report_of(result: Callable[[], CaptureReport], task: Task, timeout_s: float | None) -> CaptureReport:
-    report, problem = result_or_problem(result, timeout_s)
-    return CaptureReport(task.capture.label, "error", error=problem) if report is None else report
-
-
-def result_or_problem(result: Callable[[], R], timeout_s: float | None = None) -> tuple[R | None, str]:
-    """Return (result of a task, ""), or (None, one line about its failure)."""
-    try:
-        return result(), ""
-    except TimeoutError:
-        problem = f"stopped after {timeout_s or 0:g} s (--timeout)"
-    except WorkerDiedError as error:
-        problem = (
-            f"its worker process was killed ({error}; out of memory?); run again to process the remaining captures"
-        )
-    except BrokenExecutor:
-        problem = "the executor lost its processes (out of memory?); run again to process the remaining captures"
-    except MemoryError:
-        problem = _OUT_OF_MEMORY
-    except AgalignError as error:
-        problem = str(error)
-    except (Exception, CancelledError) as error:
-        first_line = next(iter(str(error).splitlines()), type(error).__name__)
-        if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
-            problem = f"the cluster lost it ({first_line}); run again to process the remaining captures"
-        else:
-            problem = f"agalign failed on it ({type(error).__name__}: {first_line}); please report this"
-    return None, problem
+        yield run
 
 
 def _call(function: Callable[[], Any]) -> Any:
     return function()
 
 
-@contextmanager
-def own_processes(jobs: int) -> Iterator[CallPool]:
-    """Start a pool of `jobs` worker processes, which import their libraries in the background."""
-    threads = max(1, usable_cores() // jobs)
-    context = worker_context(WORKER_MODULE)
-    with (
-        threads_of_children(threads),
-        ProcessPool(_call, jobs, context, start_worker, (threads,), max_tasks_per_worker=_CAPTURES_A_PROCESS) as pool,
-    ):
-        yield pool
+def on_executor(executor: Executor) -> Run:
+    """Run tasks on an executor of the caller, which is not shut down."""
+
+    def run(
+        function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False
+    ) -> Iterator[tuple[int, Callable[[], R]]]:
+        chosen = executor if limited or not isinstance(executor, DaskExecutor) else executor.without_timeout()
+        loss = chosen.loss if isinstance(chosen, DaskExecutor) else str
+        futures: dict[Future[R], int] = {}
+        remaining = iter(enumerate(tasks))
+
+        def submit(count: int) -> None:
+            for number, task in islice(remaining, count):
+                futures[_submitted(chosen, function, task)] = number
+
+        try:
+            submit(_MAX_WAITING_TASKS)
+            while futures:
+                done, _ = wait(futures, _POLL_INTERVAL_S, FIRST_COMPLETED)
+                if not done and (reason := loss()):  # futures of a lost cluster may never be done
+                    raise WorkerError(reason)
+                for future in done:
+                    if (future.cancelled() or future.exception() is not None) and (reason := loss()):
+                        raise WorkerError(reason)
+                    yield futures.pop(future), future.result
+                    submit(1)
+        finally:
+            for future in futures:
+                future.cancel()
+
+    return run
+
+
+def _submitted(executor: Executor, function: Callable[[A], R], task: A) -> "Future[R]":
+    """Submit a task and return its future; if the executor is broken, its error is the outcome of the task."""
+    try:
+        return executor.submit(function, task)
+    except BrokenExecutor as error:
+        failed: Future[R] = Future()
+        failed.set_exception(error)
+        return failed
+
+
+def in_order(run: Run, function: Callable[[A], R], tasks: Sequence[A], /) -> Iterator[R]:
+    """Yield the results in the order of the tasks, as `values.process_pool.Apply`."""
+    waiting: dict[int, Callable[[], R]] = {}
+    following = 0
+    for number, result in run(function, tasks):
+        waiting[number] = result
+        while following in waiting:
+            try:
+                value = waiting.pop(following)()
+            except (AgalignError, MemoryError):
+                raise
+            except Exception as error:
+                raise WorkerError(f"the flight cannot be learned: {failure_text(error)}") from error
+            yield value
+            following += 1
+
+
+def failure_text(error: Exception, timeout_s: float | None = None) -> str:
+    """Return one line about the error of a task or of its worker."""
+    match error:
+        case TimeoutError() if timeout_s is not None:
+            return f"stopped after {timeout_s:g} s (--timeout)"
+        case WorkerDiedError():
+            return (
+                f"its worker process was killed ({error}; out of memory?); run again to process the remaining captures"
+            )
+        case BrokenExecutor():
+            return f"the executor lost its processes (out of memory?); {_RUN_AGAIN}"
+        case MemoryError():
+            return "out of memory; try again with fewer --jobs, or with more memory"
+        case AgalignError():
+            return str(error)
+    first_line = next(iter(str(error).splitlines()), type(error).__name__)
+    if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
+        return f"the cluster lost it ({first_line}); {_RUN_AGAIN}"
+    return f"agalign failed on it ({type(error).__name__}: {first_line}); please report this"
 
 
 LOCAL = "local"
@@ -253,7 +189,10 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
     except ImportError:
         raise ConfigurationError("Dask is not installed; pip install 'agalign[dask]'") from None
     with ExitStack() as stack:
-        stack.enter_context(_quiet_dask())
+        # The run reports a lost scheduler in one line; Dask logs tracebacks.
+        for logger in map(logging.getLogger, ("distributed.client", "distributed.deploy.spec", "tornado")):
+            stack.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL)
         try:
             if address == LOCAL:
                 # The profile appears on the dashboard only, and takes a few percent of the time.
@@ -293,20 +232,6 @@ def _check_versions(client: Any) -> None:
         raise ConfigurationError(f"the Dask worker at {worker} {problem}; install agalign {__version__} there")
 
 
-@contextmanager
-def _quiet_dask() -> Iterator[None]:
-    """Silence the tracebacks that Dask logs for a lost scheduler; the run reports it in one line."""
-    loggers = [logging.getLogger(name) for name in ("distributed.client", "distributed.deploy.spec", "tornado")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
-
-
 class DaskExecutor(Executor):
     """The workers of a Dask cluster. A task that exceeds the timeout ends its worker."""
 
@@ -337,6 +262,8 @@ def _on_worker(version: str, function: Callable[..., Any], *arguments: Any, **na
     """
     if version != __version__:
         raise ConfigurationError(f"a Dask worker has agalign {__version__}; install agalign {version} there")
+    from agalign.method.device import limit_threads
+
     limit_threads(1)
     return function(*arguments, **named)
 
@@ -351,22 +278,3 @@ def _within(timeout_s: float | None, function: Callable[..., Any], *arguments: A
         return function(*arguments, **named)
     finally:
         alarm.cancel()
-
-
-def start_worker(threads: int) -> None:
-    """Initialise a worker process."""
-    follow_parent()
-    limit_threads(threads)
-
-
-def stamp(path: Path) -> int:
-    """Return the modification time of a model, ns: it changes when the model is learned again."""
-    with suppress(OSError):
-        return path.stat().st_mtime_ns
-    return 0
-
-
-@lru_cache(maxsize=8)
-def loaded_model(path: Path, device: str, _stamp: int) -> FlightModel:
-    """Return the model in a file, which each worker reads once per `stamp`. Raises InputError."""
-    return load_model(path, lambda: choose_device(device))

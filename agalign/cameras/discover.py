@@ -7,7 +7,8 @@ from agalign.cameras.folder_walk import IMAGE_KINDS, check_folder, image_files, 
 from agalign.cameras.grouping import capture_of, group_files, pattern_clashes, with_missing_bands
 from agalign.cameras.naming import band_file_owners, with_unique_capture_names
 from agalign.cameras.read_files import ImageFile, read_files
-from agalign.cameras.scan import DiscoverOptions, FolderScan, Problem
+from agalign.cameras.scan import FolderScan, Problem
+from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, NoSuchBandError
 from agalign.pixels.raster import TIFF_SUFFIXES
 from agalign.values.capture import Capture

@@ -13,7 +13,8 @@ from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import Tags
 from agalign.cameras.naming import with_unique_band_names
 from agalign.cameras.read_files import ImageFile
-from agalign.cameras.scan import DiscoverOptions, Problem
+from agalign.cameras.scan import Problem
+from agalign.config import DiscoverOptions
 from agalign.errors import InputError
 from agalign.pixels.raster import TIFF_SUFFIXES
 from agalign.values.capture import Band, CameraIdentity, Capture

@@ -10,7 +10,8 @@ from agalign.cameras import known_cameras
 from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
-from agalign.cameras.scan import DiscoverOptions, Problem
+from agalign.cameras.scan import Problem
+from agalign.config import DiscoverOptions
 from agalign.errors import UnreadableFileError
 from agalign.pixels.radiometry import is_physical
 from agalign.pixels.raster import TIFF_SUFFIXES, RasterInfo, probe

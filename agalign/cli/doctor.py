@@ -10,7 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from agalign._version import __version__
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, Terminal, exits, shown
+from agalign.cli.command import Command
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, Terminal
 from agalign.values.cores import usable_cores
 
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless", "rasterio", "tifffile", "scikit-image", "pydantic")
@@ -25,39 +26,40 @@ _MIN_FREE_DISK_GB = 5.0
 _GB = 1e9
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command()(doctor)
-
-
-def doctor(
+def _doctor(
+    terminal: Terminal,
     folder: Annotated[Path, typer.Argument(help="Folder for aligned files.")] = Path(),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> int:
     """Check this machine: versions, devices, threads, memory, disk and extras."""
-    terminal = Terminal(quiet=False, verbose=False, log_json=False)
-    with exits(terminal):
-        facts = {"machine": _machine(), "disk": _disk(folder), "devices": _devices(), "extras": _extras()}
-        problems = _problems(facts)
-        if as_json:
-            typer.echo(json.dumps(facts | {"problems": problems}, indent=1))
-        else:
-            _show(facts, terminal)
-            for text in problems:
-                terminal.problem(text)
-            if not problems:
-                terminal.result("no problems found")
-        raise typer.Exit(EXIT_NOTHING if problems else EXIT_OK)
+    facts = {"machine": _machine(), "disk": _disk(folder), "devices": _devices(), "extras": _extras()}
+    problems = _problems(facts)
+    if as_json:
+        typer.echo(json.dumps(facts | {"problems": problems}, indent=1))
+    else:
+        _show(facts, terminal)
+        for text in problems:
+            terminal.problem(text)
+        if not problems:
+            terminal.result("no problems found")
+    return EXIT_NOTHING if problems else EXIT_OK
+
+
+doctor = Command(_doctor)
 
 
 def _machine() -> dict[str, Any]:
     from agalign.pixels.raster import gdal_version
 
     return {
-        "agalign": __version__, "python": platform.python_version(), "system": platform.platform(),
-        **{name: _version(name) for name in _LIBRARIES}, "gdal": gdal_version(),
-        "cores": usable_cores(), "memory_gb": _memory_gb(),
-    }  # fmt: skip
+        "agalign": __version__,
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        **{name: _version(name) for name in _LIBRARIES},
+        "gdal": gdal_version(),
+        "cores": usable_cores(),
+        "memory_gb": _memory_gb(),
+    }
 
 
 def _version(distribution: str) -> str | None:
@@ -78,10 +80,8 @@ def _memory_gb() -> float | None:
 
 def _disk(folder: Path) -> dict[str, Any]:
     existing = next((p for p in (folder.absolute(), *folder.absolute().parents) if p.is_dir()), Path.cwd())
-    return {
-        "folder": str(existing), "free_gb": round(shutil.disk_usage(existing).free / _GB, 1),
-        "writable": os.access(existing, os.W_OK),
-    }  # fmt: skip
+    free_gb = round(shutil.disk_usage(existing).free / _GB, 1)
+    return {"folder": str(existing), "free_gb": free_gb, "writable": os.access(existing, os.W_OK)}
 
 
 def _devices() -> list[dict[str, Any]]:
@@ -121,20 +121,18 @@ def _problems(facts: dict[str, Any]) -> list[str]:
 
 
 def _show(facts: dict[str, Any], terminal: Terminal) -> None:
-    from rich.table import Table
-
     machine, disk = facts["machine"], facts["disk"]
-    table = Table("This machine", "", show_lines=False)
-    for name, value in machine.items():
-        table.add_row(name.replace("_gb", ", GB"), shown("unknown" if value is None else str(value)))
+    rows = [
+        (name.replace("_gb", ", GB"), "unknown" if value is None else str(value)) for name, value in machine.items()
+    ]
     writable = "" if disk["writable"] else ", not writable"
-    table.add_row("disk", shown(f"{disk['free_gb']:.1f} GB free at {disk['folder']}{writable}"))
+    rows.append(("disk", f"{disk['free_gb']:.1f} GB free at {disk['folder']}{writable}"))
     for device in facts["devices"]:
         threads = f", {device['threads']} threads" if device["threads"] else ""
-        table.add_row(f"device {device['device']}", shown(device["problem"] or device["what"] + threads))
-    terminal.result(table)
-    table = Table("Extra", "What it adds", "")
-    for row in facts["extras"]:
-        state = f"pip install 'agalign[{row['extra']}]'" if row["missing"] else "installed"
-        table.add_row(row["extra"], row["adds"], shown(state))
-    terminal.result(table)
+        rows.append((f"device {device['device']}", device["problem"] or device["what"] + threads))
+    terminal.table(("This machine", ""), rows)
+    extras = [
+        (row["extra"], row["adds"], f"pip install 'agalign[{row['extra']}]'" if row["missing"] else "installed")
+        for row in facts["extras"]
+    ]
+    terminal.table(("Extra", "What it adds", ""), extras)

@@ -8,19 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from agalign.cli.align import (
-    BandNames,
-    Exclude,
-    IgnoreMetadata,
-    Include,
-    Order,
-    Pattern,
-    Reference,
-    WithRgb,
-    band_names,
-)
-from agalign.cli.config_file import config_text
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, exits, in_json, shown
+from agalign.cli.align import align
+from agalign.cli.command import Command, Given, config_text
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, MAX_LISTED, Terminal, in_json, shown
 from agalign.errors import ConfigurationError, UnreadableFileError
 from agalign.values.text import counted
 
@@ -32,98 +22,76 @@ _NO_BAND = (
     "a colour photograph or a part of no capture; name files '<capture>_<band>.tif', give --pattern, or use "
     "--with-rgb for photographs next to the bands of a capture"
 )
-_MAX_REASONS = 10
 _MODEL_SUFFIX = ".safetensors"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command()(info)
-
-
-def info(
-    ctx: typer.Context,
+def _info(
+    terminal: Terminal,
+    given: Given,
     folder: Annotated[
         Path | None,
         typer.Argument(
             help="Folder with images, or the model of a run (OUT/models/….safetensors).", show_default=False
         ),
     ] = None,
-    pattern: Pattern = None,
-    reference: Reference = None,
-    bands: BandNames = None,
-    order: Order = "index",
-    with_rgb: WithRgb = False,
-    ignore_metadata: IgnoreMetadata = False,
-    include: Include = None,
-    exclude: Exclude = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
     options: Annotated[
         bool, typer.Option("--options", help="Print a --config file with all options of 'agalign align'.")
     ] = False,
-) -> None:
+) -> int:
     """List cameras, captures, bands and missing files of a folder, or show the rig of a model."""
-    terminal = Terminal(quiet=False, verbose=False, log_json=False)
-    with exits(terminal):
-        if options:
-            typer.echo(config_text(_align_command(ctx)))
-            raise typer.Exit(EXIT_OK)
-        if folder is None:
-            raise ConfigurationError("give a folder with images, a model, or --options")
-        if folder.is_file() and folder.suffix == _MODEL_SUFFIX:
-            _show_model(folder, terminal, as_json=as_json)
-            raise typer.Exit(EXIT_OK)
-        from agalign.cameras.discover import DiscoverOptions
-        from agalign.cli.run import find_captures
-        from agalign.flight.overview import camera_overviews
-        from agalign.flight.panels import with_panels
-        from agalign.flight.sky import sky_captures
+    if options:
+        typer.echo(config_text(align.built("align")))
+        return EXIT_OK
+    if folder is None:
+        raise ConfigurationError("give a folder with images, a model, or --options")
+    if folder.is_file() and folder.suffix == _MODEL_SUFFIX:
+        _show_model(folder, terminal, as_json=as_json)
+        return EXIT_OK
+    from agalign.cli.run import find_captures
+    from agalign.config import DiscoverOptions
+    from agalign.flight.overview import camera_overviews
+    from agalign.flight.panels import with_panels
+    from agalign.flight.sky import sky_captures
 
-        discover_options = DiscoverOptions(
-            pattern, reference, ignore_metadata, with_rgb, band_names(bands), order, include=tuple(include or ()),
-            exclude=tuple(exclude or ()),
-        )  # fmt: skip
-        flight = find_captures(folder, discover_options, terminal, silent=as_json, required=False)
-        if not flight.captures and not as_json:
-            _show_unused(flight, terminal)
-            raise typer.Exit(EXIT_NOTHING)
-        sky, others = sky_captures(flight.captures)
-        sky_cues = {s.capture.label: list(s.cues) for s in sky}
-        by_label = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
-        unreadable = _unreadable_files(flight)
-        rows = [
-            _facts(by_label[c.label])
-            | {"sky": sky_cues.get(c.label, []), "unreadable_files": [p.name for p in unreadable.get(c.label, [])]}
-            for c in flight.captures
-        ]
-        cameras = camera_overviews(flight.captures)
-        if as_json:
-            problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
-            typer.echo(json.dumps({"folder": str(folder), "cameras": [vars(c) for c in cameras], "captures": rows,
-                                   "problems": problems}, indent=1))  # fmt: skip
-        else:
-            for camera in cameras:
-                terminal.result(shown(camera.text))
-            _show_captures(rows, len(flight.problems), terminal)
-        raise typer.Exit(EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK)
+    flight = find_captures(folder, DiscoverOptions(**given["discover"]), terminal, silent=as_json, required=False)
+    if not flight.captures and not as_json:
+        _show_unused(flight, terminal)
+        return EXIT_NOTHING
+    sky, others = sky_captures(flight.captures)
+    sky_cues = {s.capture.label: list(s.cues) for s in sky}
+    by_label = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
+    unreadable = _unreadable_files(flight)
+    rows = [
+        _facts(by_label[c.label])
+        | {"sky": sky_cues.get(c.label, []), "unreadable_files": [p.name for p in unreadable.get(c.label, [])]}
+        for c in flight.captures
+    ]
+    cameras = camera_overviews(flight.captures)
+    if as_json:
+        problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
+        facts = {"folder": str(folder), "cameras": [vars(c) for c in cameras], "captures": rows, "problems": problems}
+        typer.echo(json.dumps(facts, indent=1))
+    else:
+        for camera in cameras:
+            terminal.result(shown(camera.text))
+        _show_captures(rows, len(flight.problems), terminal)
+    return EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK
 
 
-def _align_command(ctx: typer.Context) -> Any:
-    assert ctx.parent is not None
-    return ctx.parent.command.get_command(ctx.parent, "align")  # type: ignore[attr-defined]
+info = Command(_info, {"Input": "pattern reference bands order with_rgb ignore_metadata include exclude"})
 
 
 def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:
     """Print the captures of a folder as a table, the calibration panels and sky captures, and a line of totals."""
-    from rich.table import Table
-
-    table = Table("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
+    headers = ("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
+    table = []
     for row in rows:
         bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
-        size = "{width} x {height}".format(**row["bands"][0])
-        cells = (row["label"], row["camera"], row["captured_at"][:19], bands, size, ", ".join(row["seeds"]))
-        table.add_row(*(shown(c) for c in cells), shown(", ".join(_missing(row))))
-    terminal.result(table)
+        size, seeds = "{width} x {height}".format(**row["bands"][0]), ", ".join(row["seeds"])
+        missing = [*row["missing_bands"], *(f"{name} (unreadable)" for name in row["unreadable_files"])]
+        table.append((row["label"], row["camera"], row["captured_at"][:19], bands, size, seeds, ", ".join(missing)))
+    terminal.table(headers, table)
     for row in rows:
         if row["panel"] is not None:
             where = " in a scene that is aligned" if row["panel_in_scene"] else ""
@@ -133,10 +101,6 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
     total_bands = sum(len(r["bands"]) for r in rows)
     parts = counted(len(rows), "capture"), counted(total_bands, "band"), counted(problems, "problem")
     terminal.result(", ".join(parts))
-
-
-def _missing(row: dict[str, Any]) -> list[str]:
-    return [*row["missing_bands"], *(f"{name} (unreadable)" for name in row["unreadable_files"])]
 
 
 def _unreadable_files(flight: "FolderScan") -> dict[str, list[Path]]:
@@ -165,14 +129,12 @@ def _show_unused(flight: "FolderScan", terminal: Terminal) -> None:
     for suffix, number in other_files(flight.folder).items():
         reasons[suffix, f"not an image that agalign reads ({IMAGE_KINDS})"] += number
     terminal.problem(f"{flight.folder}: no capture of two or more bands in it")
-    for (kind, reason), total in reasons.most_common(_MAX_REASONS):
+    for (kind, reason), total in reasons.most_common(MAX_LISTED):
         terminal.result(shown(f"{counted(total, kind + ' file')}: {reason}"))
 
 
 def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     """Print the contents of a model. Raises InputError if the file is not a model."""
-    from rich.table import Table
-
     from agalign.flight.model import load_model
     from agalign.flight.rig_prediction import band_summaries
     from agalign.method.device import choose_device
@@ -189,22 +151,15 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     if not rows:
         terminal.result("no rig: too few captures were aligned")
         return
-    table = Table("Band", title="The rig: offset of each band, and error of its prediction (RMS, px)")
-    for name in (
-        "Offset at the centre",
-        "Baseline",
-        "By bands",
-        "By neighbours",
-        "By the flight",
-        "Largest lens displacement",
-    ):
-        table.add_column(name, justify="right")
+    headers = "Band", "Offset at the centre", "Baseline", "By bands", "By neighbours", "By the flight"
+    table = []
     for row in rows:
         (dx, dy), (bx, by) = row["offset_px"], row["baseline"]
         errors = (f"{row[k]:.2f}" for k in ("from_bands_px", "from_neighbours_px", "from_flight_px"))
         field = "none" if row["field_px"] is None else f"{row['field_px']:.2f}"
-        table.add_row(shown(row["band"]), f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field)
-    terminal.result(table)
+        table.append((row["band"], f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field))
+    title = "The rig: offset of each band, and error of its prediction (RMS, px)"
+    terminal.table((*headers, "Largest lens displacement"), table, title, texts=1)
     shared = ", ".join(factors) or "nothing"
     terminal.result(f"rig learned from {captures} captures; variations that the bands of a capture share: {shared}")
 
@@ -217,12 +172,19 @@ def _facts(capture: "Capture") -> dict[str, Any]:
     offered = {kind for b in capture.moving for kind in seed_candidates(capture.reference, b, SeedSettings())}
     bands = [
         {
-            "name": b.name, "file": str(b.path), "band_index": b.band_index, "wavelength_nm": b.wavelength_nm,
-            "width": b.width_px, "height": b.height_px, "dtype": b.dtype, "nodata": in_json(b.nodata),
-            "lens_model": b.lens is not None, "reference": b is capture.reference,
+            "name": b.name,
+            "file": str(b.path),
+            "band_index": b.band_index,
+            "wavelength_nm": b.wavelength_nm,
+            "width": b.width_px,
+            "height": b.height_px,
+            "dtype": b.dtype,
+            "nodata": in_json(b.nodata),
+            "lens_model": b.lens is not None,
+            "reference": b is capture.reference,
         }
         for b in capture.bands
-    ]  # fmt: skip
+    ]
     return {
         "label": capture.label,
         "camera": f"{capture.camera.make} {capture.camera.model}".strip() or "unknown",

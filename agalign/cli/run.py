@@ -1,6 +1,5 @@
 """Aligning a flight from the command line: progress line, reports of captures, and summary."""
 
-import gc
 import re
 import threading
 import time
@@ -12,24 +11,23 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.table import Column, Table
-
-from agalign.cli.failures import explain
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, Terminal, shown
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, MAX_LISTED, Terminal, shown
 from agalign.errors import NoSuchBandError, OutputError, WorkerError
 from agalign.values.cores import limit_default_threads
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
-    from agalign.batch import CaptureReport, RunOptions
-    from agalign.cameras.discover import DiscoverOptions, FolderScan
-    from agalign.config import Settings
-    from agalign.products.report.facts import FailureGroups
+    from concurrent.futures import Executor
+
+    from agalign.batch import CaptureReport
+    from agalign.cameras.discover import FolderScan
+    from agalign.config import DiscoverOptions, RunOptions, Settings
+    from agalign.products.report.facts import FailureGroup, FailureGroups
     from agalign.products.sidecar import BandResult, CaptureResult
     from agalign.values.capture import Capture
 
-_MAX_LISTED_FILES = 10
-"""Maximum number of listed files with the same problem."""
+_MAX_NAMED = 3
+"""Maximum number of named bands with the same cause of failure."""
 
 
 def find_captures(
@@ -45,37 +43,29 @@ def find_captures(
     flight = discover(folder, options)
     if not silent:
         print_problems(flight, terminal)
-    if not flight.captures and not required:
-        return flight
-    if not flight.captures:
+    if required and not flight.captures:
         if any(isinstance(p.error, NoSuchBandError) for p in flight.problems):
             raise NoSuchBandError(f"{folder}: no capture has a band '{options.reference}'")
         raise InputError(
             f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' lists its files, and why each "
             "kind is not used"
         )
-    bands = sum(len(c.bands) for c in flight.captures)
-    if not silent:
-        terminal.event(
-            "found",
-            f"{counted(len(flight.captures), 'capture')}, {counted(bands, 'band')} in {folder}",
-            captures=len(flight.captures),
-            bands=bands,
+    if silent or not flight.captures:
+        return flight
+    captures, bands = len(flight.captures), sum(len(c.bands) for c in flight.captures)
+    text = f"{counted(captures, 'capture')}, {counted(bands, 'band')} in {folder}"
+    terminal.event("found", text, captures=captures, bands=bands)
+    if flight.eight_bit:
+        text = (
+            f"{counted(len(flight.eight_bit), 'capture')} with 8 bits per band: 256 levels, and the tone "
+            "curve of a picture, limit radiometry and indices; export 16-bit TIFFs where the camera has them"
         )
-        if flight.eight_bit:
-            terminal.event("eight_bit", _eight_bit_note(flight), captures=len(flight.eight_bit))
+        terminal.event("eight_bit", text, captures=len(flight.eight_bit))
     return flight
 
 
-def _eight_bit_note(flight: "FolderScan") -> str:
-    return (
-        f"{counted(len(flight.eight_bit), 'capture')} with 8 bits per band: 256 levels, and the tone "
-        "curve of a picture, limit radiometry and indices; export 16-bit TIFFs where the camera has them"
-    )
-
-
 def print_problems(flight: "FolderScan", terminal: Terminal) -> None:
-    """Print the problems of files: at most `_MAX_LISTED_FILES` lines per cause, and the number of further files.
+    """Print the problems of files: at most `MAX_LISTED` lines per cause, and the number of further files.
 
     With --log-json, print a line for each file.
     """
@@ -85,13 +75,13 @@ def print_problems(flight: "FolderScan", terminal: Terminal) -> None:
         # Group by message without numbers, because sizes differ between files with the same cause.
         cause = re.sub(r"\d+", "0", problem.text.replace(str(problem.path), "").replace(problem.path.name, ""))
         counts[cause] += 1
-        if terminal.log_json or counts[cause] <= _MAX_LISTED_FILES:
+        if terminal.log_json or counts[cause] <= MAX_LISTED:
             terminal.problem(problem.text, file=problem.path)
             listed[cause] = problem.path.name
     for cause, count in counts.items():
-        if count > _MAX_LISTED_FILES and not terminal.log_json:
+        if count > MAX_LISTED and not terminal.log_json:
             terminal.problem(
-                f"{flight.folder}: {count - _MAX_LISTED_FILES} more files with the same problem as {listed[cause]}; "
+                f"{flight.folder}: {count - MAX_LISTED} more files with the same problem as {listed[cause]}; "
                 "'agalign info --json' lists all"
             )
 
@@ -113,51 +103,30 @@ def print_plan(flight: "FolderScan", out: Path, settings: "Settings", options: "
 
 
 def load_ahead() -> None:
-    """Import torch and other large libraries in a thread, which takes two seconds, while the files are read.
-
-    The garbage collector is paused during the imports, and later ignores their million objects, which saves 0.5 s.
-    """
+    """Import torch and other large libraries in a thread, which takes two seconds, while the files are read."""
     limit_default_threads()
 
     def load() -> None:
-        gc.disable()
         with suppress(Exception):  # reported at the next import
-            import_module("agalign.batch.run")
-        gc.freeze()
-        gc.enable()
+            import_module("agalign.batch.preload")
 
     threading.Thread(target=load, daemon=True).start()
-
-
-def _no_failures() -> "FailureGroups":
-    from agalign.products.report.facts import FailureGroups
-
-    return FailureGroups()
-
-
-@dataclass
-class BandTotals:
-    """Results of one band in all captures of a run."""
-
-    statuses: Counter[str] = field(default_factory=Counter)
-    residuals_px: list[float] = field(default_factory=list)
-    """Median residuals of the aligned pairs."""
-    seconds: list[float] = field(default_factory=list)
 
 
 @dataclass
 class RunTotals:
     """Totals of a run so far; reports are not kept, which limits memory."""
 
+    good: bool
+    """All captures are good, no file has a problem, and the report is written."""
+    failures: "FailureGroups"
     states: Counter[str] = field(default_factory=Counter)
-    bands: dict[str, BandTotals] = field(default_factory=dict)
+    bands: dict[str, list[tuple[str, float | None, float]]] = field(default_factory=dict)
+    """(status, median residual in px if it is known, seconds) of the pairs of each band."""
     useful: bool = False
     """At least one band pair is aligned or predicted."""
-    good: bool = True
-    """All captures are good, no file has a problem, and the report is written."""
     radiometry: Counter[str] = field(default_factory=Counter)
     """Number of captures by the quantity that raw numbers were converted to."""
-    failures: "FailureGroups" = field(default_factory=_no_failures)
 
     def add(self, report: "CaptureReport") -> None:
         """Add the report of a capture."""
@@ -170,33 +139,40 @@ class RunTotals:
         if report.result.output is not None and report.result.output.radiometry is not None:
             self.radiometry[report.result.output.radiometry] += 1
         for band in report.result.bands:
-            if band.status == "reference":
-                continue
-            totals = self.bands.setdefault(band.band, BandTotals())
-            totals.statuses[band.status] += 1
-            totals.seconds.append(band.seconds)
-            residual = band.metrics.after.residual_px if band.metrics else None
-            if band.status == "aligned" and residual is not None:
-                totals.residuals_px.append(residual)
+            if band.status != "reference":
+                residual_px = band.metrics.after.residual_px if band.metrics else None
+                self.bands.setdefault(band.band, []).append((band.status, residual_px, band.seconds))
 
 
 def run(
-    flight: "FolderScan", out: Path, settings: "Settings", terminal: Terminal, options: "RunOptions", *,
-    dask: str | None = None, model: Path | None = None, each: "Callable[[CaptureReport], None]" = lambda _: None,
-) -> RunTotals:  # fmt: skip
+    flight: "FolderScan",
+    out: Path,
+    settings: "Settings",
+    terminal: Terminal,
+    options: "RunOptions",
+    *,
+    dask: str | None = None,
+    model: Path | None = None,
+    each: "Callable[[CaptureReport], object]" = lambda _: None,
+) -> RunTotals:
     """Align the captures, print progress, and return the totals.
 
     Raises OutputError or WorkerError if no capture could be processed.
     """
     from agalign.batch import Listener, run_flight
-    from agalign.batch.workers import dask_executor
+    from agalign.products.report.facts import FailureGroups
 
-    totals = RunTotals(good=not flight.problems)
+    totals, pace = RunTotals(not flight.problems, FailureGroups()), _Pace()
     started = time.monotonic()
-    cluster = nullcontext() if dask is None else dask_executor(dask, options.jobs, options.timeout_s)
-    with cluster as executor, _progress(terminal, len(flight.captures)) as show:
+    with (
+        cluster(dask, options.jobs, options.timeout_s) as executor,
+        progress(terminal, len(flight.captures)) as show_line,
+    ):
         options = replace(options, executor=executor)
         current: Capture | None = None
+
+        def show(share: float, text: str) -> None:
+            show_line(totals.states.total(), share, text, pace.of(totals.states))
 
         def on_start(capture: "Capture") -> None:
             nonlocal current
@@ -205,7 +181,7 @@ def run(
 
         def on_learning(camera: str, share: float) -> None:
             terminal.check()
-            show(totals, 0.0, f"learning from {camera}: {share:.0%} at most")
+            show(0.0, f"learning from {camera}: {share:.0%} at most")
 
         def on_learnt(camera: str, seconds: float) -> None:
             terminal.event("learnt", camera=camera, seconds=round(seconds, 2))
@@ -216,7 +192,7 @@ def run(
             names = [b.name for b in current.moving]
             index = names.index(band) if band in names else len(names)
             finished = index + (0.85 * share if stage in ("learning", "refining") else 0.0)
-            show(totals, finished / max(len(names), 1), f"{current.label} {band}: {stage}")
+            show(finished / max(len(names), 1), f"{current.label} {band}: {stage}")
 
         try:
             listener = Listener(on_start, on_pair, on_learning, on_learnt)
@@ -224,7 +200,7 @@ def run(
                 terminal.check()
                 totals.add(report)
                 each(report)
-                show(totals, 0.0, report.label)
+                show(0.0, report.label)
                 _print_report(report, terminal, totals.states.total(), len(flight.captures))
         except (OutputError, WorkerError) as error:
             if not totals.states:
@@ -256,30 +232,40 @@ def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
 
 
 @contextmanager
-def _progress(terminal: Terminal, captures: int) -> Iterator[Callable[[RunTotals, float, str], None]]:
+def cluster(dask: str | None, jobs: int, timeout_s: float | None = None) -> "Iterator[Executor | None]":
+    """Connect to a Dask cluster if its address is given."""
+    from agalign.batch.workers import dask_executor
+
+    with nullcontext() if dask is None else dask_executor(dask, jobs, timeout_s) as executor:
+        yield executor
+
+
+@contextmanager
+def progress(terminal: Terminal, captures: int) -> "Iterator[Callable[[int, float, str, str], None]]":
     """Show a progress line on a terminal; yield the function that updates it.
 
-    Its arguments are the totals, the finished share of the current capture, and a description.
+    Its arguments are the number of finished captures, the finished share of the current one, a description, and a rate.
     """
     if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
-        yield lambda _outcome, _share, _text: None
+        yield lambda *_: None
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.table import Column
 
     columns = (
-        BarColumn(bar_width=20), TextColumn("{task.fields[done]} of {task.total} captures"),
-        TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        BarColumn(bar_width=20),
+        TextColumn("{task.fields[done]} of {task.total} captures"),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
         TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis")),
-    )  # fmt: skip
-    with Progress(*columns, console=terminal.err, transient=True) as progress:
-        task = progress.add_task("starting", total=captures, done=0, rate="")
-        pace = _Pace()
+    )
+    with Progress(*columns, console=terminal.err, transient=True) as line:
+        task = line.add_task("starting", total=captures, done=0, rate="")
 
-        def show(totals: RunTotals, share: float, text: str) -> None:
-            done = totals.states.total()
-            progress.update(
-                task, completed=done + share, done=done, rate=pace.of(totals.states), description=shown(text)
-            )
+        def show(done: int, share: float, text: str, rate: str) -> None:
+            line.update(task, completed=done + share, done=done, rate=rate, description=shown(text))
 
         yield show
 
@@ -307,12 +293,10 @@ class _Pace:
 def _print_report(report: "CaptureReport", terminal: Terminal, number: int, count: int) -> None:
     """Print or log a finished capture: its stages with --log-json, its pairs also with --verbose."""
     heading = f"[{number}/{count}] {report.label}"
-    if report.panel is not None:
-        terminal.event("panel", f"{heading}: {report.panel}", capture=report.label, panel=report.panel)
-        return
-    if report.sky is not None:
-        terminal.event("sky", f"{heading}: {report.sky}", capture=report.label, sky=report.sky)
-        return
+    for kind, text in (("panel", report.panel), ("sky", report.sky)):
+        if text is not None:
+            terminal.event(kind, f"{heading}: {text}", capture=report.label, **{kind: text})
+            return
     for text in report.problems:
         terminal.problem(f"{report.label}: {text}", capture=report.label)
     if terminal.log_json:
@@ -336,20 +320,31 @@ def _print_capture(
     also = f", {predicted} predicted" if predicted else ""
     how = "kept from an earlier run" if report.state == "kept" else f"{report.seconds:.1f} s"
     terminal.event(
-        "capture", f"{heading}: {aligned} of {len(pairs)} aligned{also}, {how}",
-        capture=report.label, state=report.state, status=result.status, aligned=aligned, predicted=predicted,
-        pairs=len(pairs), seconds=round(report.seconds, 3),
-    )  # fmt: skip
+        "capture",
+        f"{heading}: {aligned} of {len(pairs)} aligned{also}, {how}",
+        capture=report.label,
+        state=report.state,
+        status=result.status,
+        aligned=aligned,
+        predicted=predicted,
+        pairs=len(pairs),
+        seconds=round(report.seconds, 3),
+    )
 
 
 def _print_pair(capture: str, band: "BandResult", terminal: Terminal) -> None:
     residual = band.metrics.after.residual_px if band.metrics else None
     measured = "" if residual is None else f", residual {residual:.3f} px"
     terminal.event(
-        "pair", f"    {band.band}: {band.status}{measured}, {band.seconds:.1f} s",
-        capture=capture, band=band.band, status=band.status, reason=band.reason, residual_px=residual,
+        "pair",
+        f"    {band.band}: {band.status}{measured}, {band.seconds:.1f} s",
+        capture=capture,
+        band=band.band,
+        status=band.status,
+        reason=band.reason,
+        residual_px=residual,
         seconds=band.seconds,
-    )  # fmt: skip
+    )
     if band.status != "aligned":
         terminal.problem(f"{capture} {band.band}: {band.status}: {band.reason}", capture=capture, band=band.band)
 
@@ -357,7 +352,7 @@ def _print_pair(capture: str, band: "BandResult", terminal: Terminal) -> None:
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
     if totals.bands:
-        terminal.result(_table(totals))
+        _print_table(totals, terminal)
     explain(totals.failures.groups(), terminal)
     for quantity, count in totals.radiometry.items():
         terminal.result(shown(f"Written as {quantity}: {counted(count, 'capture')}"))
@@ -372,17 +367,40 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     return EXIT_OK if totals.good else EXIT_PARTIAL
 
 
-def _table(totals: RunTotals) -> Table:
-    """Return a table with a row per band: number of pairs by status, residuals, time."""
+def explain(failures: "Sequence[FailureGroup]", terminal: Terminal) -> None:
+    """Print each group of failures: number of bands, cause, captures, and remedy."""
+    for group in failures:
+        status, first = group.status.replace("_", " "), group.bands[0]
+        if len(group.bands) == 1:
+            text, named = f"{first.capture} {first.band}: {status}: {first.reason}", []
+        else:
+            bands, captures = counted(len(group.bands), "band"), counted(group.captures, "capture")
+            text = f"{status}: {bands} of {captures}: {group.remedy.cause}"
+            names = [f"{b.capture} {b.band}" for b in group.bands]
+            more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
+            named = [f"{', '.join(names[:_MAX_NAMED])}{more}: {first.reason}"]
+        terminal.problem(
+            text,
+            (*named, f"try: {group.advice}"),
+            status=group.status,
+            bands=len(group.bands),
+            captures=group.captures,
+            advice=group.advice,
+        )
+
+
+def _print_table(totals: RunTotals, terminal: Terminal) -> None:
+    """Print a row per band: number of pairs by status, residuals, time."""
     from statistics import median
 
-    statuses = sum((band.statuses for band in totals.bands.values()), Counter[str]())
-    table = Table("Band", title=f"{statuses['aligned']} of {statuses.total()} band pairs aligned")
-    for name in ("Aligned", "Predicted", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair"):
-        table.add_column(name, justify="right")
-    for name, band in totals.bands.items():
-        counts = [str(band.statuses[s]) for s in ("aligned", "predicted", "seed_only", "failed")]
-        known = band.residuals_px
-        worst = (f"{median(known):.3f}", f"{max(known):.3f}") if known else ("-", "-")
-        table.add_row(shown(name), *counts, *worst, f"{median(band.seconds):.1f}")
-    return table
+    counts = Counter(status for pairs in totals.bands.values() for status, _, _ in pairs)
+    headers = ("Band", "Aligned", "Predicted", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair")
+    rows = []
+    for name, pairs in totals.bands.items():
+        of_band = Counter(status for status, _, _ in pairs)
+        known = [residual for status, residual, _ in pairs if status == "aligned" and residual is not None]
+        numbers = [str(of_band[status]) for status in ("aligned", "predicted", "seed_only", "failed")]
+        numbers += [f"{median(known):.3f}", f"{max(known):.3f}"] if known else ["-", "-"]
+        rows.append((name, *numbers, f"{median(seconds for _, _, seconds in pairs):.1f}"))
+    title = f"{counts['aligned']} of {counts.total()} band pairs aligned"
+    terminal.table(headers, rows, title, texts=1)

@@ -9,15 +9,13 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from agalign.errors import AgalignError, ConfigurationError, is_out_of_memory
-from agalign.values.choices import MAX_RNG_SEED
 from agalign.values.text import harmless
 
 if TYPE_CHECKING:
@@ -27,6 +25,8 @@ EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL = 0, 1, 2, 3
 _SIGNAL_EXIT_CODE = 128
 """Added to the number of the signal that ended the program, as shells do: 130 for SIGINT, 143 for SIGTERM."""
 _PLAIN_WIDTH = 160
+MAX_LISTED = 10
+"""Maximum number of listed problems of one kind."""
 INTERRUPTED = "interrupted; finished captures are kept, and the same command resumes the run"
 RAW_NUMBERS = (
     "the bands are raw numbers, not reflectance: their indices are not comparable between captures or cameras, and are "
@@ -78,7 +78,7 @@ def _console(**options: Any) -> "Console":
 class Terminal:
     """Prints results to standard output, progress and problems to standard error."""
 
-    def __init__(self, *, quiet: bool, verbose: bool, log_json: bool) -> None:
+    def __init__(self, *, quiet: bool = False, verbose: bool = False, log_json: bool = False) -> None:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
         self._stopped_by: int | None = None
         # Lines in a file or a pipe are not wrapped to a terminal's width.
@@ -109,6 +109,19 @@ class Terminal:
         """Print a result to standard output, unless --quiet or --log-json."""
         if not self.quiet and not self.log_json:
             self.out.print(thing)
+
+    def table(
+        self, headers: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None, texts: int = 99
+    ) -> None:
+        """Print a table like a result; the columns after the first `texts` are aligned to the right."""
+        from rich.table import Table
+
+        table = Table(*headers[:texts], title=title)
+        for name in headers[texts:]:
+            table.add_column(name, justify="right")
+        for row in rows:
+            table.add_row(*map(shown, row))
+        self.result(table)
 
     def check(self) -> None:
         """Raise Stopped if a signal has requested the end: an exception from a signal handler is lost in callbacks of C
@@ -141,26 +154,10 @@ class Terminal:
                 signal.signal(number, handler)
 
 
-of_input = partial(typer.Option, rich_help_panel="Input")
-of_alignment = partial(typer.Option, rich_help_panel="Alignment")
-of_output = partial(typer.Option, rich_help_panel="Output")
-of_running = partial(typer.Option, rich_help_panel="Running")
-of_expert = partial(typer.Option, rich_help_panel="Expert")
-"""Options for one panel of the help."""
-
-
 def examples(*lines: tuple[str, str]) -> str:
     """Return the epilog of a help text from (command, description)."""
     quoted = [(command.replace("[", r"\["), what.replace("[", r"\[")) for command, what in lines]
     return "\n\n".join(["Examples:", *(f"[bold]{command}[/]  {what}" for command, what in quoted)])
-
-
-RngSeed = Annotated[
-    int, of_running(min=0, max=MAX_RNG_SEED, help="Seed of all random numbers; the same seed gives the same result.")
-]
-Quiet = Annotated[bool, of_running("--quiet", "-q", help="Print problems only.")]
-Verbose = Annotated[bool, of_running("--verbose", "-v", help="Print a line per band pair.")]
-LogJson = Annotated[bool, of_running("--log-json", help="Print one JSON object per line to standard error.")]
 
 
 @contextmanager

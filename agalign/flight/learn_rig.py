@@ -17,8 +17,8 @@ from agalign.flight.factors import (
     median_mapping,
 )
 from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig
-from agalign.values.apply import Apply
 from agalign.values.geometry import Matrix
+from agalign.values.process_pool import Apply
 from agalign.values.robust import cauchy_weights
 
 Array = NDArray[np.float64]

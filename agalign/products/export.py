@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from agalign.cameras import known_cameras
 from agalign.cameras.folder_walk import natural_order
 from agalign.cameras.read_files import ImageFile, read_file
-from agalign.cameras.scan import DiscoverOptions
+from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar import BandPart, Sidecar

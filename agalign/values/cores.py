@@ -1,12 +1,18 @@
-"""How many processor cores this process may use."""
+"""How many processor cores, and how much address space, this process may use."""
 
 import math
 import os
 import sys
 from pathlib import Path
 
+from agalign.errors import MemoryLimitError
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables with the number of threads that libraries start; they read them once, at their import."""
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUP = Path("/proc/self/cgroup")
+MIN_ADDRESS_SPACE_BYTES = 1_800_000_000
+"""Below about 1.6 GB the libraries crash, abort or hang, which cannot be caught."""
 
 
 def usable_cores() -> int:
@@ -25,7 +31,7 @@ def limit_default_threads() -> None:
     """
     quota = cgroup_quota() if sys.platform == "linux" else None
     if quota is not None:
-        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        for name in THREAD_VARIABLES:
             os.environ.setdefault(name, str(usable_cores()))
 
 
@@ -69,3 +75,17 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except OSError:
         return ""
+
+
+def check_address_space() -> None:
+    """Raise MemoryLimitError if the address space (`ulimit -v`) is too small for the libraries."""
+    if sys.platform == "win32":
+        return
+    import resource
+
+    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit_bytes != resource.RLIM_INFINITY and limit_bytes < MIN_ADDRESS_SPACE_BYTES:
+        raise MemoryLimitError(
+            f"the address space of this process is limited to {limit_bytes / 1e9:.2f} GB (ulimit -v); agalign needs "
+            f"{MIN_ADDRESS_SPACE_BYTES / 1e9:g} GB or more; raise that limit"
+        )

@@ -12,7 +12,8 @@ import pytest
 import torch
 
 import agalign
-from agalign.batch import CaptureReport, RunOptions, learning_tasks, run_flight, workers
+from agalign.batch import CaptureReport, RunOptions, learning_tasks, run_flight
+from agalign.batch import capture as batch_capture
 from agalign.batch import learn as batch_learn
 from agalign.batch.learn import learning_fingerprint
 from agalign.cameras.discover import DiscoverOptions, discover
@@ -207,14 +208,14 @@ def test_one_broken_reference_stops_neither_learning_nor_the_others(flight: Path
 def test_a_fault_in_one_capture_costs_no_other(
     flight: Path, out_with_model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = workers.process_capture
+    real = batch_capture.process_capture
 
     def faulty(capture: Capture, *arguments: object) -> object:
         if capture.name == "IMG_0001":
             raise ZeroDivisionError("of nothing")
         return real(capture, *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(workers, "process_capture", faulty)
+    monkeypatch.setattr(batch_capture, "process_capture", faulty)
     reports = {r.label: r for r in agalign.align_folder(flight, out_with_model)}
     assert reports["0000SET/000/IMG_0002"].good
     problem = reports["0000SET/000/IMG_0001"].error
@@ -226,7 +227,7 @@ def test_a_want_of_memory_is_said_so(flight: Path, tmp_path: Path, monkeypatch: 
     def greedy(*_: object) -> object:
         raise RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory")
 
-    monkeypatch.setattr(workers, "process_capture", greedy)
+    monkeypatch.setattr(batch_capture, "process_capture", greedy)
     reports = agalign.align_folder(flight, tmp_path, settings=Settings(flight=FlightSettings(together=False)))
     assert [r.state for r in reports] == ["error", "error"]
     assert all("out of memory" in (r.error or "") for r in reports)

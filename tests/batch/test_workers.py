@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -16,17 +17,10 @@ import pytest
 
 import agalign
 from agalign.batch import RunOptions, dask_executor, run_flight, workers
+from agalign.batch.capture import Task, start_worker
 from agalign.batch.report import CaptureReport
-from agalign.batch.workers import (
-    DaskExecutor,
-    Task,
-    applied_by,
-    applied_in,
-    do_capture,
-    done_by,
-    done_in,
-    own_processes,
-)
+from agalign.batch.run import Listener, capture_reports
+from agalign.batch.workers import DaskExecutor, Run, in_order, on_executor, own_processes
 from agalign.cameras.discover import discover
 from agalign.config import SeedSettings, Settings
 from agalign.errors import ConfigurationError, WorkerError
@@ -80,6 +74,10 @@ def seeds_only(flight: Path, out: Path) -> list[Task]:
     return [Task(c, out, Settings(seed=SeedSettings(only=True)), None) for c in discover(flight).captures]
 
 
+def reports_of(run: Run, tasks: list[Task]) -> Iterator[CaptureReport]:
+    return capture_reports(run, tasks, Listener(), timeout_s=10)
+
+
 def only_worker() -> psutil.Process:
     (worker,) = (c for c in psutil.Process().children(recursive=True) if c.ppid() != os.getpid())
     return worker
@@ -87,8 +85,8 @@ def only_worker() -> psutil.Process:
 
 def test_a_process_killed_once_costs_no_capture(flight: Path, tmp_path: Path) -> None:
     tasks = seeds_only(flight, tmp_path)
-    with own_processes(1) as pool:
-        reports = done_in(pool, tasks * 4)
+    with own_processes(1, start_worker) as run:
+        reports = reports_of(run, tasks * 4)
         states = [next(reports).state]
         only_worker().kill()
         states += [r.state for r in reports]
@@ -99,8 +97,8 @@ def test_a_process_killed_twice_costs_its_capture(flight: Path, tmp_path: Path) 
     capture, *_ = tasks = seeds_only(flight, tmp_path)
     mark = tmp_path / "mark"
     deadly = replace(capture, settings=KillsWhenRead(mark, 2))
-    with own_processes(1) as pool:
-        reports = {r.label: r for r in done_in(pool, [deadly, *tasks[1:]])}
+    with own_processes(1, start_worker) as run:
+        reports = {r.label: r for r in reports_of(run, [deadly, *tasks[1:]])}
     lost = reports.pop(capture.capture.label)
     assert (lost.state, lost.error) == (
         "error",
@@ -113,31 +111,37 @@ def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(
     tmp_path: Path,
 ) -> None:
     """The first argument takes longest; the loss of a worker twice, as by a lack of memory, is one line."""
-    with own_processes(2) as pool:
-        assert list(applied_in(pool, sleep, [0.6, 0.0, 0.1])) == [0.6, 0.0, 0.1]
+    with own_processes(2, start_worker) as run:
+        assert list(in_order(run, sleep, [0.6, 0.0, 0.1])) == [0.6, 0.0, 0.1]
     with ThreadPoolExecutor(2) as threads:
-        assert list(applied_by(threads, sleep, [0.3, 0.0, 0.1], 2)) == [0.3, 0.0, 0.1]
-    with own_processes(1) as pool, pytest.raises(WorkerError, match="the flight cannot be learned: its worker process"):
-        list(applied_in(pool, partial(signal_self, number=signal.SIGKILL, times=2), [tmp_path / "mark"]))
-    with own_processes(1) as pool, pytest.raises(MemoryError):
-        list(applied_in(pool, without_memory, [0]))
+        assert list(in_order(on_executor(threads), sleep, [0.3, 0.0, 0.1])) == [0.3, 0.0, 0.1]
+    with (
+        own_processes(1, start_worker) as run,
+        pytest.raises(WorkerError, match="the flight cannot be learned: its worker process"),
+    ):
+        list(in_order(run, partial(signal_self, number=signal.SIGKILL, times=2), [tmp_path / "mark"]))
+    with own_processes(1, start_worker) as run, pytest.raises(MemoryError):
+        list(in_order(run, without_memory, [0]))
 
 
 def test_a_stopped_process_is_told_as_late(flight: Path, tmp_path: Path) -> None:
     capture, *_ = tasks = seeds_only(flight, tmp_path)
     deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", 1, signal.SIGSTOP))
-    with own_processes(1) as pool:
-        reports = {r.label: r for r in done_in(pool, [deadly, *tasks[1:]], timeout_s=10)}
+    with own_processes(1, start_worker, timeout_s=10) as run:
+        reports = {r.label: r for r in reports_of(run, [deadly, *tasks[1:]])}
     assert reports.pop(capture.capture.label).error == "stopped after 10 s (--timeout)"
     assert [r.state for r in reports.values()] == ["done"] * (len(tasks) - 1)
 
 
-def test_an_executor_that_loses_its_processes_costs_the_captures(flight: Path, tmp_path: Path) -> None:
+def test_an_executor_that_loses_its_processes_costs_the_captures(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also those that it refuses to take afterwards."""
+    monkeypatch.setattr(workers, "_MAX_WAITING_TASKS", 1)
     capture, *_ = seeds_only(flight, tmp_path)
     deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", 1))
     with ProcessPoolExecutor(1, get_context("spawn")) as executor:
-        reports = list(done_by(lambda task: executor.submit(do_capture, task), [deadly, capture, capture], 1))
+        reports = list(reports_of(on_executor(executor), [deadly, capture, capture]))
     assert {r.error for r in reports} == {
         "the executor lost its processes (out of memory?); run again to process the remaining captures"
     }
@@ -214,15 +218,16 @@ def test_a_lost_dask_scheduler_ends_the_run_in_one_line(
     monkeypatch.setattr(workers, "_POLL_INTERVAL_S", 0.01)
     executor = DaskExecutor(Client({}, "connecting"), None)
 
-    def submit(_: Task) -> "Future[CaptureReport]":
+    def submit(*_: object) -> "Future[CaptureReport]":
         future: Future[CaptureReport] = Future()
         if ends:
             future.cancel()
             future.set_running_or_notify_cancel()
         return future
 
+    monkeypatch.setattr(executor, "submit", submit)
     with pytest.raises(WorkerError, match=r"^the Dask scheduler does not answer any more; finished captures are kept"):
-        list(done_by(submit, seeds_only(flight, tmp_path), 1, loss=executor.loss))
+        list(reports_of(on_executor(executor), seeds_only(flight, tmp_path)))
 
 
 def test_workers_start_without_a_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:

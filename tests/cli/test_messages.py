@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from agalign.cameras.discover import DiscoverOptions, discover
@@ -48,6 +47,12 @@ def test_wrong_arguments_are_one_line_in_plain_words(arguments: list[str], line:
     assert only.startswith(f"agalign: {line}")
     assert "nput should" not in only
     assert "Value error" not in only
+
+
+def test_no_argument_prints_the_help() -> None:
+    done = CliRunner().invoke(app, [], prog_name="agalign")
+    assert done.exit_code == 2
+    assert "Commands:" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -168,7 +173,5 @@ def test_expert_options_are_a_panel_at_the_end() -> None:
 def test_the_list_of_commands_has_whole_sentences() -> None:
     """Their ends are found by full stops: that of an abbreviation would cut a sentence."""
     listed = " ".join(CliRunner().invoke(app, ["--help"]).output.split())
-    for command in typer.main.get_command(app).commands.values():  # type: ignore[attr-defined]
-        if not command.hidden:
-            first_sentence = " ".join(command.help.split("\n\n")[0].split())
-            assert first_sentence in listed
+    for command in main.COMMANDS.values():
+        assert command.hidden or command.summary in listed

@@ -8,7 +8,7 @@ import pytest
 import rasterio
 from synthetic_flights.aligned import make_aligned
 
-from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run
+from agalign.batch.index_run import index_tasks, run_indices, unit_of_run
 from agalign.errors import ConfigurationError
 from agalign.products.index_bands import RAW
 from agalign.products.index_table import IndexReport, read_table
@@ -21,9 +21,9 @@ pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreference
 NDVI, NDRE = INDICES["ndvi"], INDICES["ndre"]
 
 
-def run(out: Path, *indices: Index, target: Path | None = None, **options: object) -> list[IndexReport]:
-    tasks = index_tasks(out, indices or (NDVI,), target or out, overwrite=bool(options.pop("overwrite", False)))
-    return [r for done in run_indices(tasks, IndexOptions(jobs=1, **options)) for r in done.reports]  # type: ignore[arg-type]
+def run(out: Path, *indices: Index, target: Path | None = None, overwrite: bool = False) -> list[IndexReport]:
+    tasks = index_tasks(out, indices or (NDVI,), target or out, overwrite=overwrite)
+    return [r for done in run_indices(tasks, jobs=1) for r in done.reports]
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
     make_aligned(tmp_path, 20)
     serial = {r.capture: r.statistics for r in run(tmp_path, target=tmp_path / "a")}
     tasks = index_tasks(tmp_path, [NDVI], tmp_path / "b")
-    parallel = {r.capture: r.statistics for d in run_indices(tasks, IndexOptions(jobs=2)) for r in d.reports}
+    parallel = {r.capture: r.statistics for d in run_indices(tasks, jobs=2) for r in d.reports}
     assert parallel == serial
     one, other = (tmp_path / n / "0000SET" / "IMG_0007_ndvi.tif" for n in "ab")
     assert one.read_bytes() == other.read_bytes()

@@ -20,7 +20,7 @@ from agalign.cameras.discover import discover
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.tag_transfer import capture_tags
 from agalign.cameras.xmp import Packet
-from agalign.cli.align import albedos
+from agalign.config import albedos
 from agalign.errors import AgalignError, InputError, SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.method.descriptor import Descriptor

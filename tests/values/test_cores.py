@@ -6,8 +6,13 @@ import pytest
 
 from agalign.errors import MemoryLimitError, is_out_of_memory
 from agalign.values import cores
-from agalign.values.cores import cgroup_quota, limit_default_threads, usable_cores
-from agalign.values.memory_limit import MIN_ADDRESS_SPACE_BYTES, check_address_space
+from agalign.values.cores import (
+    MIN_ADDRESS_SPACE_BYTES,
+    cgroup_quota,
+    check_address_space,
+    limit_default_threads,
+    usable_cores,
+)
 
 V1 = {"cpu/docker/ab/cpu.cfs_period_us": "100000"}
 

@@ -18,9 +18,9 @@ import psutil
 import pytest
 
 from agalign.errors import WorkerError
-from agalign.values import process_pool, worker_process
+from agalign.values import process_pool
 from agalign.values.process_pool import Outcome, ProcessPool, WorkerDiedError
-from agalign.values.worker_process import Worker
+from agalign.values.processes import Worker
 
 from ..builders import in_full_run
 from . import pool_tasks as tasks
@@ -89,9 +89,9 @@ def test_workers_are_replaced_after_their_tasks() -> None:
 )
 def test_what_fails_costs_its_task_and_no_worker(function: Callable[[int], object], said: str) -> None:
     with pool(function) as workers:
-        before = workers._places[0].worker
+        before = workers._workers[0]
         outcomes = [told(o) for o in workers.run([1, 2])]
-        assert workers._places[0].worker is before
+        assert workers._workers[0] is before
     assert all(said in str(o) for o in outcomes)
     assert len(outcomes) == 2
 
@@ -277,7 +277,7 @@ def killing(workers: ProcessPool[Any, Any], stop: threading.Event, rest_s: Calla
 
     def kill() -> None:
         while not stop.wait(rest_s()):
-            alive = [p.worker.process.pid for p in list(workers._places) if p.worker._launched]
+            alive = [w.process.pid for w in list(workers._workers) if w._launched]
             alive = [pid for pid in alive if pid and pid not in killed]
             if alive:
                 killed.append(rng.choice(alive))
@@ -391,4 +391,3 @@ def test_no_process_outlives_its_parent(method: str, number: int, whom: str, tmp
 
 def test_the_exit_code_of_a_worker_that_never_started() -> None:
     assert str(WorkerDiedError(None)) == "killed"
-    assert not worker_process.is_out_of_memory(None)

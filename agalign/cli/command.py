@@ -1,0 +1,246 @@
+"""Commands: their options are parameters of their functions, and fields of the settings (`agalign.config`).
+
+An option of a field has its type, default, range and docstring (the help text).
+"""
+
+import ast
+import inspect
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+
+import typer
+from typer.core import TyperCommand
+
+from agalign.cli.terminal import Terminal, exits
+
+if TYPE_CHECKING:
+    from agalign.config import Option
+
+_COMMAND_LINE_ONLY = {"help", "config", "dry-run"}
+"""Options that a configuration file cannot have."""
+Given = dict[str, dict[str, Any]]
+"""Values of the options of a command that belong to fields, by name of the field: `settings` by stage and field, for
+`Settings.model_validate`, `discover` of `DiscoverOptions`, `run` of `RunOptions`."""
+
+
+def _parameter(name: str, kind: Any, default: Any, *flags: str, **info: Any) -> inspect.Parameter:
+    annotation = Annotated[kind, typer.Option(*filter(None, flags), **info)]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+_TERMINAL = {
+    "quiet": _parameter("quiet", bool, False, "--quiet", "-q", help="Print problems only."),
+    "verbose": _parameter("verbose", bool, False, "--verbose", "-v", help="Print a line per band pair."),
+    "log_json": _parameter(
+        "log_json", bool, False, "--log-json", help="Print one JSON object per line to standard error."
+    ),
+}
+
+
+@dataclass(frozen=True)
+class FieldOption:
+    """The command-line option of a field."""
+
+    owner: str
+    """Key in `Given`."""
+    path: tuple[str, ...]
+    """Names of the stage, if any, and of the field."""
+    option: "Option"
+    kind: Any
+    default: Any
+    info: Mapping[str, Any]
+    """Help text and range."""
+
+    @property
+    def name(self) -> str:
+        """Return the name of the option as an identifier."""
+        return self.option.name or self.path[-1]
+
+    @property
+    def flag(self) -> str:
+        """Return the long name of the option, with its dashes."""
+        return f"--{self.name.replace('_', '-')}"
+
+    def parameter(self, changes: Mapping[str, Any]) -> inspect.Parameter:
+        """Return it as a parameter of a function; `changes` replace its default or help text."""
+        info = {"default": self.default, "show_default": self.option.show_default, **self.info, **changes}
+        return _parameter(self.name, self.kind, info.pop("default"), self.flag, self.option.short, **info)
+
+    def store(self, value: Any, given: Given) -> None:
+        """Add the value of the option to the values of its owner."""
+        values = given[self.owner]
+        for stage in self.path[:-1]:
+            values = values.setdefault(stage, {})
+        values[self.path[-1]] = self.option.parse(value)
+
+
+@cache
+def field_options() -> dict[str, FieldOption]:
+    """Return the options of all fields by name, in the order of the fields."""
+    from agalign.config import DiscoverOptions, RunOptions, Settings
+
+    owners = {"settings": Settings(), "discover": DiscoverOptions(), "run": RunOptions()}
+    return {option.name: option for owner, value in owners.items() for option in _options_of(owner, value, ())}
+
+
+def _options_of(owner: str, value: Any, path: tuple[str, ...]) -> Iterator[FieldOption]:
+    from agalign.config import Option, Stage
+
+    body = ast.parse(inspect.getsource(type(value))).body[0].body  # type: ignore[attr-defined]
+    helps = {
+        ast.unparse(one.target): " ".join(ast.literal_eval(text.value).split())
+        for one, text in pairwise(body)
+        if isinstance(one, ast.AnnAssign) and isinstance(text, ast.Expr)
+    }
+    hints = get_type_hints(type(value), include_extras=True)
+    for name in inspect.get_annotations(type(value)):
+        default, kind = getattr(value, name), hints[name]
+        if isinstance(default, Stage):
+            yield from _options_of(owner, default, (*path, name))
+            continue
+        metadata = getattr(kind, "__metadata__", ())
+        limits = [limit for of_field in metadata for limit in getattr(of_field, "metadata", ())]
+        info = {"help": helps.get(name)}
+        info |= {end: getattr(m, of) for m in limits for end, of in (("min", "ge"), ("max", "le")) if hasattr(m, of)}
+        option = next((m for m in metadata if isinstance(m, Option)), Option())
+        if metadata:
+            kind = option.type or get_args(kind)[0]
+        if option.type is not None or option.default is not None:
+            default = option.default
+        yield FieldOption(owner, (*path, name), option, kind, default, info)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the program."""
+
+    function: Callable[..., int | None]
+    """Takes the `terminal`, the values `given` for fields if there are any, and its own parameters; returns the exit
+    code. Its docstring is the help text."""
+    panels: Mapping[str, str] = field(default_factory=dict)
+    """Names of options by panel of the help: own parameters, fields, and options of the terminal."""
+    changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Help texts and defaults of fields that differ for this command."""
+    on_interrupt: str = "interrupted"
+    epilog: str | None = None
+    panel: str | None = None
+    """Panel in the list of commands."""
+    hidden: bool = False
+
+    @property
+    def summary(self) -> str:
+        """The first paragraph of the help text, a sentence."""
+        return " ".join((inspect.getdoc(self.function) or "").split("\n\n")[0].split())
+
+    def parameters(self) -> list[inspect.Parameter]:
+        """Return the parameters of the command line: own ones outside of panels, then those of each panel."""
+        own = dict(inspect.signature(self.function).parameters)
+        result = []
+        for panel, names in self.panels.items():
+            for name in names.split():
+                shared = own.pop(name, None) or _TERMINAL.get(name)
+                result.append(shared or field_options()[name].parameter(self.changes.get(name, {})))
+                get_args(result[-1].annotation)[1].rich_help_panel = panel
+        result = [*(own[name] for name in own if name not in ("terminal", "given")), *result]
+        return [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in result]
+
+    def built(self, name: str) -> Any:
+        """Return the command of typer."""
+        parameters, own = self.parameters(), inspect.signature(self.function).parameters
+        fields = [p.name for p in parameters if p.name not in {*own, *_TERMINAL}]
+
+        def call(**values: Any) -> None:
+            terminal = Terminal(**{name: values.pop(name, False) for name in _TERMINAL})
+            with exits(terminal, self.on_interrupt):
+                given: Given = defaultdict(dict)
+                for name in fields:
+                    field_options()[name].store(values.pop(name), given)
+                if fields:
+                    values["given"] = given
+                raise typer.Exit(self.function(terminal, **values) or 0)
+
+        call.__doc__ = self.function.__doc__
+        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+        cls = _LenientCommand if fields else TyperCommand
+        app.command(name, cls=cls, epilog=self.epilog, hidden=self.hidden, rich_help_panel=self.panel)(call)
+        return typer.main.get_command(app)
+
+
+class _LenientCommand(TyperCommand):
+    """A command that takes options under their former names, and some options without a value."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments, after options are renamed and get their missing values."""
+        own = {param.name for param in self.params}
+        for one in field_options().values():
+            if one.option.alone and one.name in own:
+                args = _completed(args, one)
+        return super().parse_args(ctx, args)
+
+
+def _completed(args: list[str], one: FieldOption) -> list[str]:
+    result = []
+    for argument, following in pairwise([*args, ""]):
+        name, equals, value = argument.partition("=")
+        if name and name == one.option.former:
+            Terminal(log_json="--log-json" in args).problem(f"{name} is deprecated; use {one.flag}")
+            name = one.flag
+        result.append(f"{name}{equals}{value}")
+        if name == one.flag and not equals and following not in get_args(one.kind):
+            result.append(one.option.alone)
+    return result
+
+
+def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
+    """Use the values of a TOML file (`--config agalign.toml`) as defaults of the command's options.
+
+    Its keys are the long options without the leading dashes. The command line takes precedence. Raises BadParameter for
+    a file that is not TOML, and for an unknown key.
+    """
+    if path is None:
+        return None
+    import tomllib
+
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise typer.BadParameter(f"{path} does not exist") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise typer.BadParameter(f"{path} cannot be read as TOML ({error})") from None
+    options = _file_options(ctx.command)
+    defaults: dict[str, Any] = {}
+    for key, value in values.items():
+        name = key.replace("_", "-")
+        if name not in options:
+            near = get_close_matches(name, options, 1)
+            raise typer.BadParameter(f"{path}: no option '{key}'" + (f"; did you mean '{near[0]}'?" if near else ""))
+        if isinstance(value, dict) or (isinstance(value, list) and not options[name].multiple):
+            raise typer.BadParameter(f"{path}: '{key}' takes one value")
+        single = options[name].multiple and not isinstance(value, list)
+        defaults[options[name].name] = [value] if single else value
+    ctx.default_map = {**(ctx.default_map or {}), **defaults}
+    return path
+
+
+def config_text(command: Any) -> str:
+    """Return a configuration file with all options of a command and their defaults as comments."""
+    lines = ["# Options of 'agalign align', for --config. Remove the # in front of what you set."]
+    for name, option in _file_options(command).items():
+        default = "" if option.default is None or callable(option.default) else option.default
+        help_text = " ".join((option.help or "").split())
+        lines += ["", f"# {help_text}", f"# {name} = {json.dumps(default, ensure_ascii=False)}"]
+    return "\n".join(lines)
+
+
+def _file_options(command: Any) -> dict[str, Any]:
+    """Return the options of a command by their long names without the leading dashes."""
+    named = {max(p.opts, key=len).lstrip("-"): p for p in command.params if p.param_type_name == "option"}
+    return {name: option for name, option in named.items() if name not in _COMMAND_LINE_ONLY}

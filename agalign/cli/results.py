@@ -1,0 +1,249 @@
+"""The commands that use the output folder of a run: `report`, `verify`, `export` and `indices`."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from agalign.cli.command import Command, Given
+from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, MAX_LISTED, RAW_NUMBERS, Terminal, examples, shown
+from agalign.values.choices import ExportProgram
+
+if TYPE_CHECKING:
+    from agalign.products.index_table import IndexReport
+    from agalign.products.indices import Index
+
+Out = Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)]
+
+
+def _report(
+    terminal: Terminal,
+    out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.", show_default=False)],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the content of the report as JSON.")] = False,
+) -> int:
+    """Rebuild the report and the summary from the sidecars."""
+    from agalign.batch.output_folder import locked
+    from agalign.cli.run import explain
+    from agalign.errors import InputError
+    from agalign.products.report import write_pages
+    from agalign.products.sidecar_file import find_sidecars
+
+    if not out.is_dir() or not find_sidecars(out):
+        raise InputError(f"{out}: no sidecars there; give the output folder of a run")
+    unreadable: list[str] = []
+    with locked(out):
+        pages = write_pages(out, unreadable.append)
+    for text in unreadable:
+        terminal.problem(text)
+    if as_json:
+        typer.echo(json.dumps(pages.facts, indent=1))
+        return EXIT_PARTIAL if unreadable else EXIT_OK
+    explain(pages.failures, terminal)
+    terminal.table(("Slowest", "Seconds"), [(label, f"{seconds:.1f}") for label, seconds in pages.slowest])
+    for path in (pages.report, pages.summary):
+        terminal.result(shown(str(path)))
+    return EXIT_PARTIAL if unreadable else EXIT_OK
+
+
+def _verify(terminal: Terminal, out: Out) -> int:
+    """Compare the files of a run with their checksums."""
+    from agalign.products.sidecar_file import verify_outputs
+
+    captures = damaged = 0
+    for _, problems in verify_outputs(out):
+        captures, damaged = captures + 1, damaged + bool(problems)
+        for text in problems:
+            terminal.problem(text)
+    terminal.result(f"{captures - damaged} of {captures} captures match their checksums")
+    return EXIT_PARTIAL if damaged else EXIT_OK
+
+
+def _export(
+    terminal: Terminal,
+    out: Out,
+    program: Annotated[
+        ExportProgram,
+        typer.Option(
+            "--for",
+            show_default=False,
+            help="Band files with tags for odm, metashape or pix4d; warp matrices for micasense or opencv.",
+        ),
+    ],
+    target: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Output folder; by default OUT with the program's name added.")
+    ] = None,
+    copy: Annotated[bool, typer.Option("--copy", help="Copy the band files instead of creating hard links.")] = False,
+    source: Annotated[
+        Path | None, typer.Option(help="Folder with the original images, if they were moved; for micasense only.")
+    ] = None,
+) -> int:
+    """Export aligned captures for photogrammetry programs, MicaSense's notebooks or OpenCV."""
+    from agalign.products.export import export as run_export
+
+    run_folder = out.resolve()
+    folder = target or run_folder.parent / f"{run_folder.name}-{program}"
+    report = run_export(out, folder, program, copy=copy, source=source)
+    for label, reason in report.left_out[:MAX_LISTED]:
+        terminal.problem(f"{label}: left out: {reason}", capture=label)
+    if len(report.left_out) > MAX_LISTED:
+        terminal.problem(f"{len(report.left_out) - MAX_LISTED} more captures are left out")
+    for line in report.notes:
+        terminal.result(shown(line))
+    text = f"{report.captures} captures, {len(report.files)} files in {folder}"
+    terminal.event("export", captures=report.captures, files=len(report.files), folder=str(folder))
+    terminal.result(shown(text))
+    return EXIT_PARTIAL if report.left_out else EXIT_OK
+
+
+report = Command(_report)
+verify = Command(_verify)
+export = Command(
+    _export,
+    {"Output": "program target copy source", "Running": "quiet log_json"},
+    epilog=examples(
+        ("agalign export aligned/ --for odm", "band files in one folder, and the options for OpenDroneMap"),
+        ("agalign export aligned/ --for micasense", "warp matrices for MicaSense's notebooks"),
+        ("agalign export aligned/ --for opencv -o matrices/", "homographies and sampled mappings for scripts"),
+    ),
+)
+
+
+def _indices(
+    terminal: Terminal,
+    given: Given,
+    out: Out,
+    index: Annotated[
+        str | None,
+        typer.Option(
+            "--index",
+            "-i",
+            show_default=False,
+            help="Names separated by commas: ndvi (the default), ndre, gndvi, ndwi, savi, evi …",
+        ),
+    ] = None,
+    formula: Annotated[
+        list[str] | None,
+        typer.Option(
+            show_default=False, help="A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable."
+        ),
+    ] = None,
+    target: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="Folder for the rasters; by default next to the stacks.", show_default=False),
+    ] = None,
+    mask_qa: Annotated[
+        bool, typer.Option("--mask-qa", help="Omit saturated, occluded and glint pixels; the run needs --qa.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> int:
+    """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics."""
+    from agalign.batch.index_run import index_tasks, run_indices, unit_of_run
+    from agalign.batch.output_folder import locked
+    from agalign.cli.run import cluster, progress
+    from agalign.products.index_bands import RAW
+    from agalign.products.index_table import INDICES_FILE
+
+    chosen = chosen_indices(index, formula or [])
+    folder, jobs = target or out, given["run"]["jobs"]
+    tasks = index_tasks(out, chosen, folder, overwrite=given["run"]["overwrite"], mask_qa=mask_qa)
+    terminal.event("found", captures=len(tasks), indices=len(chosen))
+    announced = unit_of_run(tasks) == RAW
+    if announced:
+        terminal.problem(RAW_NUMBERS)
+    dask = given["run"]["executor"]
+    with locked(folder), cluster(dask, jobs) as executor, progress(terminal, len(tasks)) as show:
+        reports: list[IndexReport] = []
+        for number, done in enumerate(run_indices(tasks, jobs, executor), start=1):
+            terminal.check()
+            reports += done.reports
+            for report in done.reports:
+                _print(report, terminal)
+            show(number, 0.0, done.reports[0].capture, "")
+        if target is None:
+            _rebuild_report(out, terminal)
+    written = [r for r in reports if r.path is not None]
+    if any(r.raw_numbers for r in written) and not announced:
+        terminal.problem(RAW_NUMBERS)
+    if as_json:
+        typer.echo(json.dumps({"folder": str(folder), "indices": [_facts(r) for r in reports]}, indent=1))
+    elif written:
+        _print_table([one.name for one in chosen], reports, terminal)
+        terminal.result(shown(f"Statistics: {folder / INDICES_FILE}"))
+    return EXIT_NOTHING if not written else EXIT_OK if len(written) == len(reports) else EXIT_PARTIAL
+
+
+indices = Command(
+    _indices,
+    {
+        "Output": "index formula target mask_qa",
+        "Running": "jobs dask overwrite as_json quiet verbose log_json",
+    },
+    {"overwrite": {"help": "Compute again what an earlier command wrote."}},
+    on_interrupt="interrupted; written indices are kept, and the same command resumes the run",
+    epilog=examples(
+        ("agalign indices aligned/", "NDVI of every capture, next to its stack"),
+        ("agalign indices aligned/ --index ndvi,ndre,savi -o indices/", "three indices, into another folder"),
+        ("agalign indices aligned/ --formula 'mine=(N-RE)/(N+RE)'", "a formula of the bands B, G, R, RE and N"),
+    ),
+)
+
+
+def chosen_indices(names: str | None, formulas: Sequence[str]) -> "list[Index]":
+    """Return the indices of a list of names and of formulas; ndvi if neither is given. Raises ConfigurationError."""
+    from agalign.errors import ConfigurationError
+    from agalign.products.indices import index_named, index_of_formula
+
+    requested = (names or ("" if formulas else "ndvi")).split(",")
+    chosen = [index_named(name) for name in requested if name.strip()] + [index_of_formula(f) for f in formulas]
+    repeated = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
+    if repeated or not chosen:
+        problem = f"'{repeated[0]}' is given twice" if repeated else "--index is empty"
+        raise ConfigurationError(f"{problem}; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
+    return chosen
+
+
+def _print(report: "IndexReport", terminal: Terminal) -> None:
+    if report.problem:
+        terminal.problem(f"{report.capture}: {report.problem}", capture=report.capture, index=report.index)
+        return
+    kept = ", kept" if report.kept else ""
+    text = f"{report.capture} {report.index}: median {report.median:.3f}{kept}"
+    terminal.event("index", text if terminal.verbose else "", **_facts(report))
+
+
+def _facts(report: "IndexReport") -> dict[str, Any]:
+    """Return a report as a JSON object; unknown values are null."""
+    return {
+        "capture": report.capture,
+        "index": report.index,
+        "path": None if report.path is None else str(report.path),
+        **report.statistics.as_json(),
+        "raw_numbers": report.raw_numbers,
+        "kept": report.kept,
+        "problem": report.problem or None,
+    }
+
+
+def _rebuild_report(out: Path, terminal: Terminal) -> None:
+    """Rebuild the report of the run, which shows the indices, if there is one."""
+    from agalign.products.report import REPORT_FILE, write_pages
+
+    if (out / REPORT_FILE).is_file():
+        write_pages(out, terminal.problem)
+
+
+def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", terminal: Terminal) -> None:
+    """Print a row per index: statistics of the medians of its captures."""
+    from statistics import median
+
+    written, rows = [r for r in reports if r.path is not None], []
+    for name in names:
+        values = [r.median for r in written if r.index == name and math.isfinite(r.median)]
+        if values:
+            numbers = (median(values), min(values), max(values))
+            rows.append((name, str(len(values)), *(f"{number:.3f}" for number in numbers)))
+    title = f"{len(written)} of {len(reports)} written; medians of captures"
+    terminal.table(("Index", "Captures", "Median", "Lowest", "Highest"), rows, title, texts=1)
