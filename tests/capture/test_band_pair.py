@@ -9,14 +9,18 @@ from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.capture import band_pair
 from agalign.capture.align import align_capture_bands
-from agalign.capture.band_pair import longest_for, read_pairs
+from agalign.capture.band_pair import _candidate_std_px, longest_for, read_pairs
 from agalign.capture.prediction import observed
 from agalign.config import SeedSettings, Settings
+from agalign.flight.model import FlightModel
+from agalign.flight.rig import Rig
 from agalign.synthetic.score import score_against_truth
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band
+from agalign.values.pixel_units import PixelScale
 
 from ..builders import joint_result, pair_of, whole
 
@@ -98,6 +102,13 @@ def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
         alignment = Alignment(mapping, pair.fixed.size_px, "aligned", (), seed, joint)
         known = observed([pair], {pair.name: alignment}, discover(flight).captures[0])
         assert known.std_px[pair.name] == pytest.approx(std_px)
+
+
+def test_the_error_of_a_rig_is_converted_to_px_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig((800, 600), {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}, {}, {}, (), (), {"LWIR": 0.5})
+    monkeypatch.setattr(band_pair, "unobserved_error_px", lambda *_, **__: 0.5)
+    model = FlightModel(None, "", ("LWIR",), {}, "", rig)
+    assert _candidate_std_px("LWIR", model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])

@@ -17,7 +17,9 @@ from agalign.capture.relief import (
     _MIN_PARALLAX_PX,
     ReliefCandidate,
     ReliefResult,
+    _Checked,
     _common_parallax_px,
+    _is_chosen,
     aligned_by_relief,
 )
 from agalign.capture.verification import WarpedPair
@@ -278,6 +280,32 @@ def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float
         residual = residual_of(at, z[:, None] * np.array(band.baseline_m) / 0.0367)
         result.append(replace(candidate, warped=replace(candidate.warped, residual=residual)))
     assert shows_relief(result) == shown
+
+
+def checked(relief_px: tuple[float, float], plane_px: tuple[float, float], is_aligned: bool = True) -> _Checked:
+    """A band with a median and a p95 of its windows under the relief and under its homography."""
+    windows = residual_of(np.zeros((9, 2)), (0, 0))
+    residuals = (replace(windows, median_px=median, p95_px=p95) for median, p95 in (plane_px, relief_px))
+    return _Checked("NIR", *residuals, object() if is_aligned else None)
+
+
+@pytest.mark.parametrize(
+    ("relief_px", "plane_px", "is_chosen"),
+    [
+        ((0.10, 0.30), (0.20, 0.50), True),
+        ((0.13, 0.33), (0.08, 6.30), True),  # Most windows are on the plane and some far from it.
+        ((0.08, 0.25), (0.04, 0.12), False),  # a flat scene
+        ((0.30, 0.40), (0.10, 0.50), False),
+        ((0.10, 0.60), (0.30, 0.50), False),
+    ],
+)
+def test_a_relief_may_not_be_worse_than_its_plane(
+    relief_px: tuple[float, float], plane_px: tuple[float, float], is_chosen: bool
+) -> None:
+    """The median of the bands decides; a band that does not pass counts as one without a gain."""
+    band, failed = checked(relief_px, plane_px), checked(relief_px, plane_px, is_aligned=False)
+    assert _is_chosen([band]) == _is_chosen([band, band, failed]) == is_chosen
+    assert not _is_chosen([band, failed, failed])
 
 
 # ---- what fits noise cannot pass

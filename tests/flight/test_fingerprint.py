@@ -26,6 +26,7 @@ def test_every_fact_that_a_result_depends_on_changes_it(flight: Path) -> None:
         {"name": "other"},
         {"band_index": 2},
         {"lens": None},
+        {"lens": replace(band.lens, distortion=(0.0,) * 5)},
         {"to_rig": band.to_rig + 1e-12},
         {"georeference": Georeference(np.eye(3), "EPSG:32632")},
         {"radiometry": None},

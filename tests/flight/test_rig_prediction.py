@@ -13,6 +13,7 @@ from agalign.flight.factors import (
     displaced,
     distance_px,
     least_squares,
+    mapping_weight,
     median_mapping,
 )
 from agalign.flight.rig import CaptureFactors, Observation, Rig
@@ -193,6 +194,10 @@ def test_a_displaced_mapping_differs_by_its_coefficients() -> None:
     # The columns of g are orthonormal, so the norm is the RMS distance.
     assert distance_px(mean, moved, SIZE) == pytest.approx(np.linalg.norm(coefficients), rel=1e-6)
     assert distance_px(mean, mean, SIZE) == 0
+
+
+def test_a_weight_is_the_inverse_of_all_variances() -> None:
+    assert mapping_weight(0.3, 0.4) == pytest.approx(1 / (0.3**2 + 0.4**2 + 0.05**2))
 
 
 def test_the_median_mapping_ignores_an_outlier() -> None:

@@ -6,7 +6,7 @@ import kornia
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
@@ -40,6 +40,7 @@ def keypoints(count: int = 50, seed: int = 0) -> Keypoints:
     )
 
 
+@settings(deadline=None)
 @given(psis)
 def test_psi_round_trip(psi: torch.Tensor) -> None:
     h = homography_from_psi(psi, 320, 240)

@@ -87,7 +87,7 @@ def test_nearest_takes_every_pixel_that_is_nearest() -> None:
     assert valid[0].tolist() == [True, True, True, False]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(deadline=None)
 @given(arrays(bool, st.tuples(st.integers(1, 6), st.integers(1, 6))))
 def test_largest_rectangle_is_the_largest(cells: np.ndarray) -> None:
     rows, columns = cells.shape

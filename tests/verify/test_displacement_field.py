@@ -9,10 +9,12 @@ from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.displacement import DisplacementField
 from agalign.values.mapping import PixelMapping
+from agalign.verify import displacement_field
 from agalign.verify.displacement_field import (
     DisplacementEstimator,
     DisplacementResult,
     Shifts,
+    _Gain,
     _is_one_to_one,
     common_field,
     fitted_field,
@@ -109,6 +111,26 @@ def test_the_common_field_of_captures_is_that_of_the_lenses() -> None:
     # Displacements that differ between captures are not caused by the lenses.
     own = [of_captures(1, h, k)[0] for k, h in enumerate((0.4, -0.4, 0.4, -0.4))]
     assert common_field(own, SIZE) is None
+
+
+def test_smoothness_is_relative_to_the_number_of_captures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Smoothness is per capture: fits without a fold must not be smoother than the final one."""
+    fits: list[tuple[int, float]] = []
+
+    def recorded(shifts: Shifts, smoothness: float, *rest: object) -> DisplacementField:
+        fits.append((len(shifts) // len(centres()), smoothness))
+        return fitted_field(shifts, smoothness, *rest)
+
+    monkeypatch.setattr(displacement_field, "fitted_field", recorded)
+    assert common_field(of_captures(5, 0.4, 1), SIZE) is not None
+    assert {count for count, _ in fits} == {3, 4, 5}
+    assert {smoothness / count for count, smoothness in fits} <= set(displacement_field._COMMON_SMOOTHNESS)
+
+
+def test_a_field_that_clearly_increases_p95_is_rejected() -> None:
+    for after_p95_px, is_significant in ((1.62, True), (1.69, False)):
+        gain = _Gain(1.0, before_p95_px=1.59, after_p95_px=after_p95_px, loss=0.1, sigma=9.0)
+        assert gain.is_significant(4.0) == is_significant
 
 
 # ---- what fits noise cannot pass
