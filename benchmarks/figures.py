@@ -20,7 +20,7 @@ from agalign.config import JointSettings
 from agalign.evaluation.image_pairs import read_image
 from agalign.evaluation.methods import PairTask, method_named
 from agalign.evaluation.surface import draw_surface, loss_surface
-from agalign.method.detect import sift_keypoints, to_8_bit, visible_in_both
+from agalign.method.match import sift_keypoints, to_8_bit, visible_in_both
 from agalign.method.paper import Training
 from agalign.products.drawing import with_text
 from agalign.synthetic import cameras

@@ -18,8 +18,8 @@ from agalign.cameras.discover import discover
 from agalign.capture.band_pair import read_pairs
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.config import JointSettings, SeedSettings
+from agalign.method.descriptor import save_starter
 from agalign.method.fast import Schedule, learn
-from agalign.method.starter import save_starter
 from agalign.method.state import ImageGroup, JointState
 from agalign.synthetic.flight import make_flight
 from agalign.values.alignment import Seed

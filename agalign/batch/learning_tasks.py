@@ -16,11 +16,10 @@ from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Observation
-from agalign.method.descriptor import Descriptor
+from agalign.method.descriptor import Descriptor, start_from
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import DEFAULT_SCHEDULE
 from agalign.method.joint import Results, refine_with
-from agalign.method.starter import start_from
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture

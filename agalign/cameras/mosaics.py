@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from agalign.cameras.base import reference_index
 from agalign.cameras.generic import Generic
+from agalign.cameras.grouping import with_unique_band_names, with_unique_capture_names
 from agalign.cameras.metadata import read_tags
-from agalign.cameras.naming import with_unique_band_names, with_unique_capture_names
 from agalign.errors import InputError
 from agalign.pixels.raster import probe, transformed
 from agalign.values import geometry

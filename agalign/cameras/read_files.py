@@ -1,5 +1,6 @@
 """Reading the tags and bands of many image files, in one process or several."""
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,14 +11,55 @@ from agalign.cameras import known_cameras
 from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
-from agalign.cameras.scan import Problem
-from agalign.config import DiscoverOptions
-from agalign.errors import UnreadableFileError
+from agalign.errors import AgalignError, UnreadableFileError
 from agalign.pixels.radiometry import is_physical
 from agalign.pixels.raster import TIFF_SUFFIXES, RasterInfo, probe
 from agalign.values.capture import Band
+from agalign.values.choices import MAX_PIXELS, BandOrder
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
 from agalign.values.processes import follow_parent
+
+
+@dataclass(frozen=True)
+class DiscoverOptions:
+    """Options of `discover`."""
+
+    pattern: str | None = None
+    """Pattern of file names of other cameras, as '{capture}_{band}.tif'."""
+    reference: str | None = None
+    """Name of the reference band; None for the default of the camera."""
+    ignore_metadata: bool = False
+    """Ignore lens and rig tags."""
+    with_rgb: bool = False
+    """Include the colour photographs that some cameras take with each multispectral capture, as three bands."""
+    bands: tuple[str, ...] = ()
+    """Names of the bands to include; empty for all."""
+    order: BandOrder = "index"
+    """Order of the bands in the stacks: as numbered by the camera, by wavelength, or by name."""
+    skip: tuple[Path, ...] = ()
+    """Folders to leave out, such as the output folder."""
+    max_pixels: int = MAX_PIXELS
+    """Images with more pixels are refused before they are read."""
+    jobs: int = 1
+    """Processes that read the tags of many files; with more than one the calling script must be importable."""
+    include: tuple[str, ...] = ()
+    """Globs of the files to use, by path below the folder or by name; empty for all."""
+    exclude: tuple[str, ...] = ()
+    """Globs of the files to leave out."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A file or capture that is left out, and the reason."""
+
+    path: Path
+    error: AgalignError
+
+    @property
+    def text(self) -> str:
+        """The message, one line with the file and the remedy."""
+        return str(self.error)
+
 
 _FILES_PER_TASK = 100
 """If a file crashes the process, the other files of its task are lost; smaller tasks take more time per file."""
@@ -110,3 +152,9 @@ def _without_impossible_values(band: Band) -> Band:
 def _is_stack(path: Path, info: RasterInfo) -> bool:
     photograph = info.dtypes[0] == "uint8" and len(info.dtypes) in _PHOTOGRAPH_CHANNELS
     return path.suffix.lower() in TIFF_SUFFIXES and len(info.dtypes) > 1 and not photograph
+
+
+def natural_order(name: str) -> list[tuple[bool, int, str]]:
+    """Return a sort key that puts `_2` before `_10`."""
+    parts = re.split(r"(\d+)", name)
+    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part.lower()) for part in parts]

@@ -14,9 +14,8 @@ from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
-from agalign.pixels.grey import channel_mean
 from agalign.pixels.raster import read_for_alignment
-from agalign.pixels.resample import warped
+from agalign.pixels.resample import channel_mean, warped
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import blur_px
 from agalign.values import geometry

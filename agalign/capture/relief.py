@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from agalign.capture.band_pair import BandPair
 from agalign.capture.verification import WarpedPair
 from agalign.errors import GeometryError
-from agalign.pixels.grey import channel_mean
+from agalign.pixels.resample import channel_mean
 from agalign.relief.adjustment import (
     Adjustment,
     WindowShifts,

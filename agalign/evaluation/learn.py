@@ -19,10 +19,10 @@ from agalign.evaluation.image_pairs import find_pairs, read_image
 from agalign.flight.fingerprint import hashed
 from agalign.flight.model import FlightModel
 from agalign.method.descriptor import REFERENCE, Descriptor
-from agalign.method.detect import sift_keypoints, visible_in_both
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import BATCH, LEARNING_RATE, in_batch_loss
 from agalign.method.levels import Level
+from agalign.method.match import sift_keypoints, visible_in_both
 from agalign.method.patches import Keypoints, far_apart, patch_positions
 from agalign.method.refine import MovingBand
 from agalign.method.state import ImageGroup, JointState

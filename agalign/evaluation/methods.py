@@ -23,17 +23,15 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import best_seed, image_groups
 from agalign.config import JointSettings
 from agalign.errors import ConfigurationError, GeometryError, InputError, NoContrastError, NotEnoughTextureError
-from agalign.evaluation.protocol import grey_patches
 from agalign.flight.model import load_model
 from agalign.method.descriptor import Descriptor
 from agalign.method.fast import learn
-from agalign.method.match import matching_network
+from agalign.method.match import matching_network, to_8_bit
 from agalign.method.paper import align_by_paper, pyramid
-from agalign.method.patches import Keypoints, patch_positions, transform
+from agalign.method.patches import Keypoints, bilinear, patch_positions, transform
 from agalign.method.refine import MovingBand, describe_fixed, refine
 from agalign.method.state import ImageGroup, JointState, ThetaStart
-from agalign.pixels.grey import channel_mean, luma
-from agalign.pixels.resample import warped
+from agalign.pixels.resample import channel_mean, luma, warped
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
 from agalign.values.choices import Sharing
@@ -274,3 +272,24 @@ def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -
     matrix = np.eye(3)
     matrix[:2, :2], matrix[:2, 2] = linear, np.array([tx, ty]) + centre - linear @ centre
     return matrix
+
+
+def grey_patches(raster: Raster, grid: Tensor) -> Tensor:
+    """Return grey patches (N, 1, side, side) in [0, 1] at positions (N, side, side, 2) px."""
+    plane = torch.from_numpy(to_8_bit(raster).astype(np.float32) / 255)
+    return bilinear(plane[None], grid)
+
+
+def average_precision(f: Tensor, f_prime: Tensor) -> float:
+    """Return the share of descriptors (N, D) of the first image with the corresponding descriptor as exact L2 nearest
+    neighbour among those of the second (N, D); nan for N = 0.
+    """
+    if len(f) == 0:
+        return math.nan
+    nearest = torch.cat([torch.cdist(some, f_prime).argmin(dim=1) for some in torch.split(f, 512)])
+    return float((nearest == torch.arange(len(f), device=f.device)).float().mean())
+
+
+def homography_error_px(result: Matrix, truth: Matrix, points: NDArray[np.float64]) -> float:
+    """Return the mean distance of points (N, 2) mapped by two homographies, px of the second image."""
+    return float(np.linalg.norm(geometry.apply(result, points) - geometry.apply(truth, points), axis=1).mean())

@@ -12,10 +12,9 @@ import numpy as np
 
 from agalign.errors import InputError
 from agalign.evaluation.image_pairs import PairFiles, read_image
-from agalign.evaluation.methods import Method, Outcome, PairTask
-from agalign.evaluation.protocol import average_precision, homography_error_px
-from agalign.method.detect import sift_keypoints, visible_in_both
+from agalign.evaluation.methods import Method, Outcome, PairTask, average_precision, homography_error_px
 from agalign.method.device import one_memory_error, one_thread
+from agalign.method.match import sift_keypoints, visible_in_both
 from agalign.method.patches import Keypoints
 from agalign.values import geometry
 from agalign.values.geometry import Matrix

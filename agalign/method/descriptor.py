@@ -4,9 +4,13 @@
 Conv(C, 32, 5) - Tanh - MaxPool(2) - Conv(32, 64, 3) - Tanh - FC(256) on 16 x 16 patches.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib import resources
+from pathlib import Path
 
 import torch
+from safetensors.torch import load, save_file
 from torch import Tensor, nn
 
 from agalign.errors import ConfigurationError
@@ -111,3 +115,44 @@ class Descriptor(nn.Module):
         else:
             result = [self.trunk[side](x) for x, side in zip(responses, sides, strict=True)]
         return [nn.functional.normalize(f, dim=1) for f in result] if self.unit_length else result
+
+
+_FILE = "starter.safetensors"
+
+
+def start_from(net: Descriptor, weights: Mapping[str, Tensor], sides: Sequence[int] | None = None) -> None:
+    """Initialise a network with the weights (state_dict) of another.
+
+    Side i takes the weights of side `sides[i]` of the other network, by default i, or of its last side if it has
+    fewer. If the numbers of channels differ, the first layer's weights are summed over the channels and divided
+    equally, so that an image of equal channels has the same descriptors in both networks.
+    """
+    state = net.state_dict()
+    for name, value in state.items():
+        group, side, rest = name.split(".", 2)
+        source = int(side) if sides is None else sides[int(side)]
+        last = max(int(other.split(".")[1]) for other in weights if other.startswith(f"{group}."))
+        weight = weights[f"{group}.{min(source, last)}.{rest}"]
+        if weight.shape != value.shape:
+            weight = weight.sum(dim=1, keepdim=True).expand_as(value) / value.shape[1]
+        state[name] = weight
+    net.load_state_dict(state)
+    net.is_trained = True
+
+
+def start_from_starter(net: Descriptor) -> None:
+    """Initialise a network with the weights in the package: those of a siamese network of recipe fast, learned by the
+    same method on synthetic flights (tools/learn_starter.py).
+    """
+    start_from(net, _weights())
+
+
+def save_starter(net: Descriptor, path: Path) -> None:
+    """Write a siamese network in half precision."""
+    save_file({name: value.detach().cpu().half().contiguous() for name, value in net.state_dict().items()}, path)
+
+
+@cache
+def _weights() -> dict[str, Tensor]:
+    result: dict[str, Tensor] = load(resources.files("agalign.method").joinpath(_FILE).read_bytes())
+    return {name: value.to(torch.float32) for name, value in result.items()}

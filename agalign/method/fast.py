@@ -4,17 +4,16 @@ All given captures share one theta; each image pair has its own psi (the paper p
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from agalign.errors import GeometryError, NotEnoughTextureError
-from agalign.method.adam import Adam
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.levels import Level
 from agalign.method.patches import far_apart, patch_positions, translation
@@ -32,6 +31,37 @@ from agalign.method.refine import (
 )
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL
+
+_BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-8
+
+
+class Adam:
+    """Optimiser of a network's weights, tensors of any shape."""
+
+    def __init__(self, weights: Iterable[nn.Parameter], learning_rate: float) -> None:
+        self.weights = list(weights)
+        self.learning_rate = learning_rate
+        self._moments = [(torch.zeros_like(w), torch.zeros_like(w)) for w in self.weights]
+        self._steps = [0] * len(self.weights)
+
+    @torch.no_grad()
+    def step(self, loss: Tensor) -> None:
+        """Take one step down the gradient of a scalar loss.
+
+        Weights that the loss does not depend on, and their moments, are unchanged.
+        """
+        for weight in self.weights:
+            weight.grad = None
+        torch.autograd.backward(loss)
+        for i, (weight, (first, second)) in enumerate(zip(self.weights, self._moments, strict=True)):
+            if weight.grad is None:
+                continue
+            self._steps[i] += 1
+            first.lerp_(weight.grad, 1 - _BETA_1)
+            second.mul_(_BETA_2).addcmul_(weight.grad, weight.grad, value=1 - _BETA_2)
+            denominator = (second / (1 - _BETA_2 ** self._steps[i])).sqrt_().add_(_EPSILON)
+            weight.addcdiv_(first, denominator, value=-self.learning_rate / (1 - _BETA_1 ** self._steps[i]))
+
 
 BATCH = 128
 """Keypoints in a step on theta; each is a negative for the others."""

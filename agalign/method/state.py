@@ -8,10 +8,9 @@ import torch
 
 from agalign.config import JointSettings
 from agalign.errors import NoContrastError
-from agalign.method.descriptor import Descriptor
+from agalign.method.descriptor import Descriptor, start_from_starter
 from agalign.method.device import choose_device
 from agalign.method.levels import Level, Sampler, make_level
-from agalign.method.starter import start_from_starter
 from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster

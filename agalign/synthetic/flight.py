@@ -14,8 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CloughTocher2DInterpolator
 
-from agalign.synthetic.cameras import REDEDGE
+from agalign.batch import CaptureReport
+from agalign.synthetic.cameras import BLACK_LEVEL, REDEDGE, WHITE_LEVEL
 from agalign.synthetic.ground import Field, Ground, map_px, on_ground, paint_ground, reflectance
 from agalign.synthetic.rig import (
     BandSpec,
@@ -25,7 +27,6 @@ from agalign.synthetic.rig import (
     place_and_rays,
     true_homography,
 )
-from agalign.synthetic.tags import BLACK_LEVEL, WHITE_LEVEL
 from agalign.values import geometry, lens
 from agalign.values.geometry import Points
 from agalign.values.mapping import splined
@@ -222,3 +223,37 @@ def _pose(rng: np.random.Generator, number: int, altitude_m: tuple[float, float]
         roll_deg=float(rng.normal(0, 2)), pitch_deg=float(rng.normal(0, 2)),
         east_m=4.0 * (number % 10), north_m=4.0 * (number // 10),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Score:
+    """Error of a band pair at the tie points of the ground truth."""
+
+    capture: str
+    band: str
+    status: str
+    before_px: float
+    median_px: float
+    p95_px: float
+
+
+def score_against_truth(reports: list[CaptureReport], truth_path: Path) -> list[Score]:
+    """Return the errors of every pair, px, from the grids in the sidecars."""
+    truth = json.loads(truth_path.read_text(encoding="utf-8"))
+    scores = []
+    for report in reports:
+        if report.sidecar is None:
+            continue
+        for band in report.sidecar.bands:
+            known = truth[report.sidecar.capture]["bands"].get(band.file)
+            if known is None or band.grid is None:
+                continue
+            ties = np.asarray(known["ties"], dtype=np.float64)
+            mapping = CloughTocher2DInterpolator(np.asarray(band.grid.reference_px), np.asarray(band.grid.moving_px))
+            error = np.linalg.norm(mapping(ties[:, :2]) - ties[:, 2:], axis=1)
+            before = np.linalg.norm(ties[:, :2] - ties[:, 2:], axis=1)
+            median, p95 = np.nanpercentile(error, (50, 95))
+            scores.append(
+                Score(report.label, band.band, band.status, float(np.median(before)), float(median), float(p95))
+            )
+    return scores

@@ -27,7 +27,7 @@ from agalign.method.state import JointState
 from agalign.products import preview
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
-from agalign.synthetic.score import score_against_truth
+from agalign.synthetic.flight import score_against_truth
 from agalign.values.capture import Capture
 
 pytestmark = pytest.mark.slow

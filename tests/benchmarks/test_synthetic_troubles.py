@@ -11,7 +11,7 @@ from synthetic_flights.troubles import make_troubled_flight, make_two_headings
 
 from agalign.cameras.base import rig_seed
 from agalign.cameras.discover import discover
-from agalign.synthetic import rig, tags
+from agalign.synthetic import cameras, rig
 from agalign.synthetic.flight import Shot, write_shots
 from agalign.synthetic.ground import paint_ground
 from agalign.values import geometry
@@ -37,7 +37,7 @@ def test_half_of_the_pixels_are_saturated(tmp_path: Path) -> None:
     truth = json.loads(make_troubled_flight(tmp_path, 32, SIZE).read_text())
     (name,) = (n for n, t in truth.items() if t["trouble"] == "half saturated")
     pixels = tifffile.imread(next(tmp_path.rglob(f"{name}_2.tif")))
-    assert 0.2 < (pixels > 0.95 * tags.WHITE_LEVEL).mean() < 0.6
+    assert 0.2 < (pixels > 0.95 * cameras.WHITE_LEVEL).mean() < 0.6
 
 
 def test_bands_that_come_late_see_another_place(tmp_path: Path) -> None:

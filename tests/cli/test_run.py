@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from agalign.cameras.scan import FolderScan, Problem
+from agalign.cameras.discover import FolderScan, Problem
 from agalign.cli.run import print_problems
 from agalign.cli.terminal import Terminal
 from agalign.errors import UnreadableFileError

@@ -16,14 +16,20 @@ from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError, InputError
 from agalign.evaluation.image_pairs import PairFiles
 from agalign.evaluation.learn import Lesson, learn_descriptor
-from agalign.evaluation.methods import PairTask, daisy_of_patches, method_named, sift_of_patches
-from agalign.evaluation.protocol import average_precision, grey_patches, homography_error_px
+from agalign.evaluation.methods import (
+    PairTask,
+    average_precision,
+    daisy_of_patches,
+    grey_patches,
+    homography_error_px,
+    method_named,
+    sift_of_patches,
+)
 from agalign.evaluation.run import Starts, as_csv, error_table, evaluate, precision_table
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.flight.model import load_model, save_model
 from agalign.method.descriptor import Descriptor
-from agalign.method.detect import sift_keypoints, visible_in_both
-from agalign.method.match import match_seed, matching_network, starter_for_matching
+from agalign.method.match import match_seed, matching_network, sift_keypoints, starter_for_matching, visible_in_both
 from agalign.method.paper import Training
 from agalign.method.patches import patch_positions
 from agalign.values import geometry
