@@ -1,4 +1,4 @@
-"""Grouping of image files into captures: the files of each capture, its reference band, missing bands and unique names."""
+"""Grouping of image files into captures: its files, reference band, missing bands and unique names."""
 
 import math
 from collections import Counter, defaultdict
