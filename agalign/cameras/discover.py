@@ -42,10 +42,12 @@ class FolderScan:
     def eight_bit(self) -> tuple[Capture, ...]:
         """The captures with a file per band and 8 bits per pixel in each band."""
         return tuple(
-            c for c in self.captures
-            if len({b.path for b in c.bands}) > 1 and all(b.dtype == "uint8" for b in c.bands)
+            c
+            for c in self.captures
+            if len({b.path for b in c.bands}) > 1
+            and all(b.dtype == "uint8" for b in c.bands)
             and not any(b.one_lens for b in c.bands)
-        )  # fmt: skip
+        )
 
 
 def discover(

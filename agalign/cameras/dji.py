@@ -52,8 +52,14 @@ _TO_COLOUR: Name = (_DJI, "DewarpHMatrix")
 
 class _TagTransfer(pix4d.TagTransfer):
     geometry = pix4d.TagTransfer.geometry | {
-        *_CENTRE, *_RELATIVE_CENTRE, _DEWARP_DATA, _FOCAL_LENGTH_PX, _H_MATRIX, _DEWARP_FLAG, _TO_COLOUR,
-    }  # fmt: skip
+        *_CENTRE,
+        *_RELATIVE_CENTRE,
+        _DEWARP_DATA,
+        _FOCAL_LENGTH_PX,
+        _H_MATRIX,
+        _DEWARP_FLAG,
+        _TO_COLOUR,
+    }
     sensor_only = pix4d.TagTransfer.sensor_only | {_VIGNETTING}
     radiometry = pix4d.TagTransfer.radiometry | {(_DJI, "BlackLevel")}
     in_px = (_FOCAL_LENGTH_PX, *_RELATIVE_CENTRE)
@@ -99,9 +105,7 @@ class Dji(Camera):
         band = pix4d.with_wavelength(band_of(path, info, name), tags)
         if calibrated is None or lens is None:
             return (replace(band, lens=lens, to_rig=by_centres, radiometry=_radiometry(tags)),)
-        return (
-            replace(band, lens=lens, to_rig=calibrated, other_to_rig=by_centres, radiometry=_radiometry(tags)),
-        )  # fmt: skip
+        return (replace(band, lens=lens, to_rig=calibrated, other_to_rig=by_centres, radiometry=_radiometry(tags)),)
 
     def with_shared_rig(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
         to_colour = next((m for t in tags if _is_mavic_3(t) and (m := _matrix(t, _TO_COLOUR)) is not None), None)
@@ -116,9 +120,12 @@ class Dji(Camera):
             return None
         height_m = tags.number(_DJI, "RelativeAltitude")
         return Pose(
-            _heading_deg(tags, yaw_deg), pitch_deg + 90, 0.0, height_m if height_m and height_m > 0 else None,
+            _heading_deg(tags, yaw_deg),
+            pitch_deg + 90,
+            0.0,
+            height_m if height_m and height_m > 0 else None,
             tags.number(*_FOCAL_LENGTH_PX),
-        )  # fmt: skip
+        )
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Calculate the motion from the speed over ground (north, east, m/s), the heading of the image's upper edge and
@@ -155,10 +162,15 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     adjusted = tags.number(_DJI, "SensorGainAdjustment") or 1.0
     centre, k = _pair(tags, _CENTRE), tags.numbers(*_VIGNETTING)
     return Radiometry(
-        "relative radiance", black, _FULL_SCALE, adjusted / (gain * exposure_us / 1e6), centre or (0.0, 0.0),
-        k if centre else (), vignetting_divides=False,
+        "relative radiance",
+        black,
+        _FULL_SCALE,
+        adjusted / (gain * exposure_us / 1e6),
+        centre or (0.0, 0.0),
+        k if centre else (),
+        vignetting_divides=False,
         by_sun=(1 / irradiance, "relative reflectance") if irradiance > 0 else None,
-    )  # fmt: skip
+    )
 
 
 def _black_level(tags: Tags) -> float | None:

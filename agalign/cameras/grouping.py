@@ -104,16 +104,21 @@ def _is_picture_band(file: ImageFile) -> bool:
 
 
 def _group_for(
-    file: ImageFile, folder: str, tagged: Mapping[tuple[str, str], list[_GroupKey]],
+    file: ImageFile,
+    folder: str,
+    tagged: Mapping[tuple[str, str], list[_GroupKey]],
     groups: Mapping[_GroupKey, list[ImageFile]],
-) -> list[ImageFile] | None:  # fmt: skip
+) -> list[ImageFile] | None:
     """The group that a single band without tags belongs to by its name; None if there is not exactly one."""
     if file.tags.make or file.tags.xmp or len(file.bands) != 1 or not _is_tiff(file):
         return None
     keys = {
-        key for (where, name), keys in tagged.items() if where == folder
-        for key in keys if groups[key][0].camera.capture_name(file.path) == name != file.path.stem
-    }  # fmt: skip
+        key
+        for (where, name), keys in tagged.items()
+        if where == folder
+        for key in keys
+        if groups[key][0].camera.capture_name(file.path) == name != file.path.stem
+    }
     return groups[keys.pop()] if len(keys) == 1 else None
 
 
@@ -294,8 +299,10 @@ def band_file_owners(captures: Sequence[Capture]) -> dict[str, str]:
     """Return the label of the capture by the band files that it may write, without suffix, below the output folder."""
     return {
         (c.folder / b.path.stem).as_posix().lower(): c.label
-        for c in captures if len({b.path for b in c.bands}) > 1 for b in c.bands
-    }  # fmt: skip
+        for c in captures
+        if len({b.path for b in c.bands}) > 1
+        for b in c.bands
+    }
 
 
 def with_unique_capture_names(

@@ -29,8 +29,12 @@ _CALIBRATION: Name = (_MICASENSE, "RadiometricCalibration")
 _CENTIKELVIN = Radiometry("temperature", 27315.0, 1.0, 0.01)
 """Unit of thermal bands, in agreement with the Altum's tag SceneTemperature."""
 _REDEDGE_M_PARALLAX = {
-    "Blue": (-0.9, 0.0), "Green": (0.0, 0.0), "Red": (0.0, -0.65), "NIR": (-0.9, -0.7), "Red edge": (-0.4, -0.35),
-}  # fmt: skip
+    "Blue": (-0.9, 0.0),
+    "Green": (0.0, 0.0),
+    "Red": (0.0, -0.65),
+    "NIR": (-0.9, -0.7),
+    "Red edge": (-0.4, -0.35),
+}
 """Direction in which the bands of a RedEdge-M, which has no tag for it, move relative to green as the distance of the
 ground decreases. Two flights with two cameras agree within 5 %.
 """
@@ -97,10 +101,16 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     centre, k = tags.numbers(*pix4d.VIGNETTING_CENTRE), tags.numbers(*pix4d.VIGNETTING_POLYNOMIAL)
     has_vignetting = len(centre) == 2
     return Radiometry(
-        "radiance", tags.black_level, _FULL_SCALE, a[0] / (iso / 100) / exposure_s,
-        (centre[0], centre[1]) if has_vignetting else (0.0, 0.0), k if has_vignetting else (), True,
-        a[1] / exposure_s - a[2], (math.pi / irradiance, "reflectance") if irradiance else None,
-    )  # fmt: skip
+        "radiance",
+        tags.black_level,
+        _FULL_SCALE,
+        a[0] / (iso / 100) / exposure_s,
+        (centre[0], centre[1]) if has_vignetting else (0.0, 0.0),
+        k if has_vignetting else (),
+        True,
+        a[1] / exposure_s - a[2],
+        (math.pi / irradiance, "reflectance") if irradiance else None,
+    )
 
 
 def _iso(tags: Tags) -> int | None:

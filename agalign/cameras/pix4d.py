@@ -159,14 +159,26 @@ def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, f
 class TagTransfer:
     """Conversion of XMP values for a band that is written on the reference's grid."""
 
-    geometry: frozenset[Name] = frozenset({
-        PRINCIPAL_POINT, FOCAL_LENGTH, FOCAL_LENGTH_UNITS, DISTORTION, MODEL_TYPE, RIG_RELATIVES,
-        RIG_TRANSLATIONS, (NAMESPACE, "RigRelativesReferenceRigCameraIndex"),
-    })  # fmt: skip
+    geometry: frozenset[Name] = frozenset(
+        {
+            PRINCIPAL_POINT,
+            FOCAL_LENGTH,
+            FOCAL_LENGTH_UNITS,
+            DISTORTION,
+            MODEL_TYPE,
+            RIG_RELATIVES,
+            RIG_TRANSLATIONS,
+            (NAMESPACE, "RigRelativesReferenceRigCameraIndex"),
+        }
+    )
     """Values of lens and rig, which are replaced by those of the reference."""
-    sensor_only: frozenset[Name] = frozenset({
-        (NAMESPACE, "InvalidPixel"), (NAMESPACE, "VignettingPolynomial2D"), (NAMESPACE, "VignettingPolynomial2DName"),
-    })  # fmt: skip
+    sensor_only: frozenset[Name] = frozenset(
+        {
+            (NAMESPACE, "InvalidPixel"),
+            (NAMESPACE, "VignettingPolynomial2D"),
+            (NAMESPACE, "VignettingPolynomial2DName"),
+        }
+    )
     """Values that refer to the sensor's own pixels and are removed."""
     radiometry: frozenset[Name] = frozenset({VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL, (NAMESPACE, "BlackCurrent")})
     """Values of corrections that have been applied to the pixels if radiance or reflectance is written."""

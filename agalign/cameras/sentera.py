@@ -84,9 +84,12 @@ def _listed_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
     lens = pix4d.perspective_lens(tags)
     return tuple(
         replace(
-            band_of(path, info, _BAND_NAMES.get(name, name), index), wavelength_nm=wavelength, one_lens=True,
-            lens=lens, bandwidth_nm=widths[index - 1] if len(widths) == len(names) else None,
+            band_of(path, info, _BAND_NAMES.get(name, name), index),
+            wavelength_nm=wavelength,
+            one_lens=True,
+            lens=lens,
+            bandwidth_nm=widths[index - 1] if len(widths) == len(names) else None,
         )
         for index, (name, wavelength) in enumerate(zip(names, wavelengths, strict=True), start=1)
         if wavelength > 0
-    )  # fmt: skip
+    )

@@ -39,10 +39,18 @@ _NOT_COPIED: set[int] = {Base.MakerNote, Base.ExifInteroperabilityOffset}
 _DENSITIES: set[int] = {Base.FocalPlaneXResolution, Base.FocalPlaneYResolution}
 _GEOMETRIC_EXIF = _DENSITIES | {Base.FocalLength, Base.FocalPlaneResolutionUnit, Base.FocalLengthIn35mmFilm}
 _CAPTURE_EXIF = _GEOMETRIC_EXIF | {
-    Base.ExifVersion, Base.DateTimeOriginal, Base.DateTimeDigitized, Base.OffsetTime, Base.OffsetTimeOriginal,
-    Base.OffsetTimeDigitized, Base.SubsecTime, Base.SubsecTimeOriginal, Base.SubsecTimeDigitized, Base.BodySerialNumber,
+    Base.ExifVersion,
+    Base.DateTimeOriginal,
+    Base.DateTimeDigitized,
+    Base.OffsetTime,
+    Base.OffsetTimeOriginal,
+    Base.OffsetTimeDigitized,
+    Base.SubsecTime,
+    Base.SubsecTimeOriginal,
+    Base.SubsecTimeDigitized,
+    Base.BodySerialNumber,
     Base.LensModel,
-}  # fmt: skip
+}
 """Exif tags for a stack: exposure differs between its bands."""
 
 

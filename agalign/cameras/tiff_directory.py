@@ -16,13 +16,26 @@ EXIF, GPS = 34665, 34853
 """Tags with the offset of a directory as value."""
 XMP = 700
 _NUMBERS: dict[int, str] = {
-    DATATYPE.SHORT: "H", DATATYPE.LONG: "I", DATATYPE.RATIONAL: "II", DATATYPE.SSHORT: "h", DATATYPE.SLONG: "i",
-    DATATYPE.SRATIONAL: "ii", DATATYPE.FLOAT: "f", DATATYPE.DOUBLE: "d",
-}  # fmt: skip
+    DATATYPE.SHORT: "H",
+    DATATYPE.LONG: "I",
+    DATATYPE.RATIONAL: "II",
+    DATATYPE.SSHORT: "h",
+    DATATYPE.SLONG: "i",
+    DATATYPE.SRATIONAL: "ii",
+    DATATYPE.FLOAT: "f",
+    DATATYPE.DOUBLE: "d",
+}
 _FORMATS: dict[int, str] = {
-    **_NUMBERS, DATATYPE.BYTE: "B", DATATYPE.ASCII: "B", DATATYPE.SBYTE: "b", DATATYPE.UNDEFINED: "B",
-    DATATYPE.IFD: "I", DATATYPE.LONG8: "Q", DATATYPE.SLONG8: "q", DATATYPE.IFD8: "Q",
-}  # fmt: skip
+    **_NUMBERS,
+    DATATYPE.BYTE: "B",
+    DATATYPE.ASCII: "B",
+    DATATYPE.SBYTE: "b",
+    DATATYPE.UNDEFINED: "B",
+    DATATYPE.IFD: "I",
+    DATATYPE.LONG8: "Q",
+    DATATYPE.SLONG8: "q",
+    DATATYPE.IFD8: "Q",
+}
 """A value of each type as the module `struct` describes it; a rational is two numbers."""
 _SIZE = {kind: struct.calcsize(f"<{numbers}") for kind, numbers in _FORMATS.items()}
 """Bytes of a value of each type."""

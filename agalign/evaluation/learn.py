@@ -50,9 +50,12 @@ class _Example:
 
 
 def learn_descriptor(
-    pairs: Sequence[BandPair], settings: Settings, *, steps_a_pair: int = 200,
+    pairs: Sequence[BandPair],
+    settings: Settings,
+    *,
+    steps_a_pair: int = 200,
     on_pair: Callable[[Lesson], None] = lambda _: None,
-) -> FlightModel:  # fmt: skip
+) -> FlightModel:
     """Return a model with one network for all pairs, which must have the same numbers of channels.
 
     Raises InputError if no pair can be aligned or their channels differ.

@@ -86,9 +86,16 @@ def evaluate(
                 seconds = time.perf_counter() - began
                 precision, error_px = _scores(outcome, keypoints, truth)
                 yield Result(
-                    pair.name, pair.group, name, shift, len(keypoints), precision, error_px,
-                    error_px / max(moving.size_px), seconds,
-                )  # fmt: skip
+                    pair.name,
+                    pair.group,
+                    name,
+                    shift,
+                    len(keypoints),
+                    precision,
+                    error_px,
+                    error_px / max(moving.size_px),
+                    seconds,
+                )
                 if outcome.fixed_to_moving is None:
                     break
 
@@ -126,8 +133,15 @@ def precision_table(results: Sequence[Result]) -> list[list[str]]:
 
 
 _ERROR_TITLES = (
-    "method", "start off by", "median error, px", "worst, px", "mean, % of the side", "under 1 px", "mAP", "s"
-)  # fmt: skip
+    "method",
+    "start off by",
+    "median error, px",
+    "worst, px",
+    "mean, % of the side",
+    "under 1 px",
+    "mAP",
+    "s",
+)
 
 
 def error_table(results: Sequence[Result]) -> list[list[str]]:
@@ -145,9 +159,15 @@ def _error_row(method: str, shift: float, own: Sequence[Result]) -> list[str]:
     e = np.array([r.error_px for r in own])
     share = float(np.mean([r.error_share for r in own]))
     return [
-        method, f"{shift:.1%}", f"{np.median(e):.3f}", f"{e.max():.2f}", f"{share:.3%}", f"{(e < 1).sum()} of {len(e)}",
-        f"{_mean_precision(own):.3f}", f"{np.median([r.seconds for r in own]):.1f}",
-    ]  # fmt: skip
+        method,
+        f"{shift:.1%}",
+        f"{np.median(e):.3f}",
+        f"{e.max():.2f}",
+        f"{share:.3%}",
+        f"{(e < 1).sum()} of {len(e)}",
+        f"{_mean_precision(own):.3f}",
+        f"{np.median([r.seconds for r in own]):.1f}",
+    ]
 
 
 def _grouped(results: Sequence[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:

@@ -20,10 +20,15 @@ from agalign.values.image import Raster
 
 
 def loss_surface(
-    fixed: Raster, moving: Raster, truth: Matrix, offsets_px: NDArray[np.float64], settings: JointSettings,
-    training: Training = DEFAULT_TRAINING, longer_side_px: int = 512,
+    fixed: Raster,
+    moving: Raster,
+    truth: Matrix,
+    offsets_px: NDArray[np.float64],
+    settings: JointSettings,
+    training: Training = DEFAULT_TRAINING,
+    longer_side_px: int = 512,
     progress: Callable[[float], None] = lambda _: None,
-) -> NDArray[np.float64]:  # fmt: skip
+) -> NDArray[np.float64]:
     """Return the mean loss per keypoint after training with psi fixed at the truth shifted by each (x, y): (n, n).
 
     Rows are along y; nan if too few keypoints remain. Each network is trained from the same random weights by recipe

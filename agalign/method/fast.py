@@ -109,9 +109,12 @@ DEFAULT_SCHEDULE = Schedule()
 
 
 def learn(
-    state: JointState, groups: Sequence[ImageGroup], net: Descriptor, threads: int = 1,
+    state: JointState,
+    groups: Sequence[ImageGroup],
+    net: Descriptor,
+    threads: int = 1,
     schedule: Schedule = DEFAULT_SCHEDULE,
-) -> tuple[int, float]:  # fmt: skip
+) -> tuple[int, float]:
     """Learn theta and every psi of all groups, coarse to fine; theta is carried from level to level.
 
     The homographies are written into the groups. `threads` groups update their psi at the same time; the result does

@@ -114,9 +114,12 @@ class PatchEquations:
 
 
 def solve(
-    equations: PatchEquations, family: ModelFamily | None, *, max_corner_std_px: float = _MAX_CORNER_STD_PX,
+    equations: PatchEquations,
+    family: ModelFamily | None,
+    *,
+    max_corner_std_px: float = _MAX_CORNER_STD_PX,
     max_step_px: float = _MAX_STEP_PX,
-) -> Step:  # fmt: skip
+) -> Step:
     """Solve for the step by iteratively reweighted least squares; it is cut to `max_step_px`.
 
     With `family` None, select the first of FAMILIES with a standard error of the corners of at most

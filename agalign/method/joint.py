@@ -31,9 +31,14 @@ Results = list[JointResult[FixedImagePx] | Issue]
 
 
 def align_from_scratch(
-    group: ImageGroup, settings: JointSettings, progress: Progress, *, start: ThetaStart = "starter",
-    schedule: Schedule = DEFAULT_SCHEDULE, training: Training = DEFAULT_TRAINING,
-) -> Results:  # fmt: skip
+    group: ImageGroup,
+    settings: JointSettings,
+    progress: Progress,
+    *,
+    start: ThetaStart = "starter",
+    schedule: Schedule = DEFAULT_SCHEDULE,
+    training: Training = DEFAULT_TRAINING,
+) -> Results:
     """Optimise theta and every psi for one capture alone.
 
     Only recipe fast uses `start` and `schedule`, only recipe paper uses `training`. Raises ConfigurationError for a

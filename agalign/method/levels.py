@@ -155,9 +155,13 @@ def make_level_image(raster: Raster, scale: float, device: torch.device) -> Leve
 
 
 def make_level(
-    fixed: Raster, moving: Sequence[Raster], mappings: Sequence[Matrix], scale: float,
-    generator: torch.Generator, device: torch.device,
-) -> Level:  # fmt: skip
+    fixed: Raster,
+    moving: Sequence[Raster],
+    mappings: Sequence[Matrix],
+    scale: float,
+    generator: torch.Generator,
+    device: torch.device,
+) -> Level:
     """Reduce the images by `scale`.
 
     The moving images are reduced so that the magnification of their mapping is 1, but never enlarged. `mappings` are
@@ -187,9 +191,14 @@ class Sampler:
     generator: torch.Generator
 
     def draw(
-        self, level: Level, pool: Pool, homographies: Sequence[Tensor], count: int, octaves: float,
+        self,
+        level: Level,
+        pool: Pool,
+        homographies: Sequence[Tensor],
+        count: int,
+        octaves: float,
         spacing_px: float = 1.0,
-    ) -> tuple[Keypoints, Tensor]:  # fmt: skip
+    ) -> tuple[Keypoints, Tensor]:
         """Draw up to `count` keypoints with patches in the valid area of I and of at least one I'.
 
         Returns the keypoints and (N, bands) True for each I' that contains the patch; keypoints in most bands come
@@ -261,9 +270,12 @@ def _max_radius_in_cells(width_px: int, height_px: int) -> tuple[NDArray[np.floa
 
 
 def _pool(
-    has_texture: Mask, max_radius_px: NDArray[np.float32], model: Lens | None, generator: torch.Generator,
+    has_texture: Mask,
+    max_radius_px: NDArray[np.float32],
+    model: Lens | None,
+    generator: torch.Generator,
     device: torch.device,
-) -> Pool:  # fmt: skip
+) -> Pool:
     """Select at random up to _MAX_POSITIONS pixels with texture around which the smallest patch fits."""
     flat = np.flatnonzero(has_texture & (max_radius_px > FOOTPRINT_PX + 1))
     if len(flat) > _MAX_POSITIONS:

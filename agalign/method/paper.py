@@ -97,9 +97,14 @@ def align_by_paper(
     if isinstance(result, Issue):
         return net, result
     return net, replace(
-        result, fixed_to_moving=descent.fixed_to_moving, loss=descent.loss, iterations=steps, levels=scales,
-        recipe="paper", last_step_px=descent.last_step_px,
-    )  # fmt: skip
+        result,
+        fixed_to_moving=descent.fixed_to_moving,
+        loss=descent.loss,
+        iterations=steps,
+        levels=scales,
+        recipe="paper",
+        last_step_px=descent.last_step_px,
+    )
 
 
 @dataclass(frozen=True)
@@ -115,9 +120,16 @@ class Descent:
 
 
 def descend(
-    state: JointState, net: Descriptor, level: Level, pool: Pool, start: Matrix,
-    training: Training = DEFAULT_TRAINING, *, report: Callable[[float], None] = lambda _: None, move: bool = True,
-) -> Descent:  # fmt: skip
+    state: JointState,
+    net: Descriptor,
+    level: Level,
+    pool: Pool,
+    start: Matrix,
+    training: Training = DEFAULT_TRAINING,
+    *,
+    report: Callable[[float], None] = lambda _: None,
+    move: bool = True,
+) -> Descent:
     """Minimise sum L0(x; psi, theta) + sum L1(x, x'; theta) over theta and psi (paper, Eq. 5).
 
     Keypoints x are drawn from `pool`. Without `move`, psi is constant and only theta is learned (paper, Eq. 3). Raises

@@ -259,9 +259,18 @@ def refine(
             return Issue(CORNERS_UNKNOWN)
         held_out, chance = held_out_retrieval(band, homography, test, f_test)
         return JointResult(
-            matrix, math.nan, held_out, chance, 0, (1.0,), "fast", step.family, step.length_px, std,
+            matrix,
+            math.nan,
+            held_out,
+            chance,
+            0,
+            (1.0,),
+            "fast",
+            step.family,
+            step.length_px,
+            std,
             _complete_covariance(step),
-        )  # fmt: skip
+        )
 
     return [
         Issue(RETRIEVAL, group.dropped[b], MIN_RETRIEVAL)

@@ -34,9 +34,14 @@ def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
     """
     factor, _ = radiometry.by_sun or (1.0, None)
     numbers = (
-        radiometry.black_level, radiometry.full_scale, radiometry.gain, factor, radiometry.row_gradient,
-        *radiometry.vignetting, *radiometry.vignetting_centre_px,
-    )  # fmt: skip
+        radiometry.black_level,
+        radiometry.full_scale,
+        radiometry.gain,
+        factor,
+        radiometry.row_gradient,
+        *radiometry.vignetting,
+        *radiometry.vignetting_centre_px,
+    )
     if not np.isfinite(numbers).all() or min(radiometry.gain, radiometry.full_scale, factor) <= 0:
         return False
     width, height = size_px
@@ -48,8 +53,9 @@ def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
         max_value = radiometry.gain / radiometry.full_scale * factor * _MAX_RAW
     return bool(
         (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < _MAX_LOG_FALLOFF).all()
-        and (by_row > 1 / _MAX_FALLOFF).all() and max_value < _MAX_VALUE
-    )  # fmt: skip
+        and (by_row > 1 / _MAX_FALLOFF).all()
+        and max_value < _MAX_VALUE
+    )
 
 
 def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, float]) -> Capture:

@@ -38,16 +38,22 @@ PICTURE_SUFFIXES = JPEG_SUFFIXES | PNG_SUFFIXES
 _BLOCK_CACHE_BYTES = 256 * 2**20
 """Limit of GDAL's block cache per worker; the default is 5 % of the machine's memory. rasterio reads it as bytes."""
 GDAL_ENVIRONMENT = {
-    "GDAL_PAM_ENABLED": "NO", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_NUM_THREADS": "ALL_CPUS",
+    "GDAL_PAM_ENABLED": "NO",
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+    "GDAL_NUM_THREADS": "ALL_CPUS",
     "GDAL_CACHEMAX": _BLOCK_CACHE_BYTES,
-}  # fmt: skip
+}
 """GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
 description that refers to other files or to a server.
 """
 _DRIVERS = {
-    b"II*\0": "GTiff", b"MM\0*": "GTiff", b"II+\0": "GTiff", b"MM\0+": "GTiff", b"\xff\xd8\xff": "JPEG",
+    b"II*\0": "GTiff",
+    b"MM\0*": "GTiff",
+    b"II+\0": "GTiff",
+    b"MM\0+": "GTiff",
+    b"\xff\xd8\xff": "JPEG",
     b"\x89PNG": "PNG",
-}  # fmt: skip
+}
 """GDAL drivers by the first bytes of a file. Some of the other drivers execute code or contact servers."""
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
@@ -110,9 +116,12 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
                 yield dataset
                 return
             with WarpedVRT(
-                dataset, transform=dataset.transform * Affine(1, 0, 0, 0, -1, dataset.height),
-                width=dataset.width, height=dataset.height, resampling=Resampling.nearest,
-            ) as north_up:  # fmt: skip
+                dataset,
+                transform=dataset.transform * Affine(1, 0, 0, 0, -1, dataset.height),
+                width=dataset.width,
+                height=dataset.height,
+                resampling=Resampling.nearest,
+            ) as north_up:
                 yield north_up
     except UnicodeEncodeError:
         raise UnreadableFileError(
@@ -190,11 +199,18 @@ def _probe(path: Path, max_pixels: int) -> RasterInfo:
         if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
             raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
         return RasterInfo(
-            width, height, tuple(dataset.dtypes), tuple(dataset.nodatavals),
-            tuple(dataset.descriptions), wavelengths, alpha[0] if alpha else None, _georeference(dataset),
+            width,
+            height,
+            tuple(dataset.dtypes),
+            tuple(dataset.nodatavals),
+            tuple(dataset.descriptions),
+            wavelengths,
+            alpha[0] if alpha else None,
+            _georeference(dataset),
             MaskFlags.per_dataset in dataset.mask_flag_enums[0],
-            tuple(zip(dataset.scales, dataset.offsets, strict=True)), tuple(dataset.overviews(1)),
-        )  # fmt: skip
+            tuple(zip(dataset.scales, dataset.offsets, strict=True)),
+            tuple(dataset.overviews(1)),
+        )
 
 
 def read_for_alignment(band: Band, longest_side_px: int) -> Raster:

@@ -40,9 +40,13 @@ def resample_tile(
 
 
 def resample_tile_of(
-    dataset: OpenRaster, band: Band, mapping: PixelMapping, tile: Tile, interpolation: Interpolation,
+    dataset: OpenRaster,
+    band: Band,
+    mapping: PixelMapping,
+    tile: Tile,
+    interpolation: Interpolation,
     radiometry: Radiometry | None = None,
-) -> tuple[NDArray[np.generic], Mask]:  # fmt: skip
+) -> tuple[NDArray[np.generic], Mask]:
     """Call `resample_tile` on an open file, so that GDAL's block cache serves neighbouring tiles."""
     positions = mapping.positions(tile, np.float32)
     source = source_window(positions, band.size_px, is_smooth=mapping.is_smooth(tile))

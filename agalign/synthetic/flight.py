@@ -64,9 +64,14 @@ class Shot:
 
 
 def make_flight(
-    folder: Path, captures: int = 3, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0,
-    camera: CameraSpec = REDEDGE, relief_m: float = 0.0, altitude_m: tuple[float, float] = ALTITUDE_M,
-) -> Path:  # fmt: skip
+    folder: Path,
+    captures: int = 3,
+    size_px: tuple[int, int] = (1280, 960),
+    rng_seed: int = 0,
+    camera: CameraSpec = REDEDGE,
+    relief_m: float = 0.0,
+    altitude_m: tuple[float, float] = ALTITUDE_M,
+) -> Path:
     """Write captures of all bands to folder/0000SET/000, and return the path of their ground truth.
 
     The ground truth, folder/truth.json, is {capture: {"reference": file, "bands": {file: {"fixed_to_moving": [[...]],
@@ -91,9 +96,13 @@ def write_shots(
 
 
 def _write(
-    folder: Path, shots: Sequence[Shot], size_px: tuple[int, int], camera: CameraSpec, rng: np.random.Generator,
+    folder: Path,
+    shots: Sequence[Shot],
+    size_px: tuple[int, int],
+    camera: CameraSpec,
+    rng: np.random.Generator,
     before: int = 0,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Write captures after `before` others over other grounds, and return their ground truth."""
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
@@ -190,9 +199,14 @@ def view(painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tu
 
 
 def render(
-    painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, int], rng: np.random.Generator,
+    painted: Field,
+    ground: Ground,
+    band: BandSpec,
+    pose: Pose,
+    size_px: tuple[int, int],
+    rng: np.random.Generator,
     spoil: Spoil | None = None,
-) -> NDArray[np.uint16]:  # fmt: skip
+) -> NDArray[np.uint16]:
     """Return the sensor values (height, width) of a ground painted in the band, as `recorded`."""
     return recorded(view(painted, ground, band, pose, size_px), band, rng, spoil)
 
@@ -219,10 +233,13 @@ def recorded(scene: Field, band: BandSpec, rng: np.random.Generator, spoil: Spoi
 
 def _pose(rng: np.random.Generator, number: int, altitude_m: tuple[float, float]) -> Pose:
     return Pose(
-        altitude_m=float(rng.uniform(*altitude_m)), yaw_deg=float(rng.uniform(-180, 180)),
-        roll_deg=float(rng.normal(0, 2)), pitch_deg=float(rng.normal(0, 2)),
-        east_m=4.0 * (number % 10), north_m=4.0 * (number // 10),
-    )  # fmt: skip
+        altitude_m=float(rng.uniform(*altitude_m)),
+        yaw_deg=float(rng.uniform(-180, 180)),
+        roll_deg=float(rng.normal(0, 2)),
+        pitch_deg=float(rng.normal(0, 2)),
+        east_m=4.0 * (number % 10),
+        north_m=4.0 * (number // 10),
+    )
 
 
 @dataclass(frozen=True)

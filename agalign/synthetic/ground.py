@@ -40,9 +40,12 @@ class Ground:
 
 
 def paint_ground(
-    rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int], relief_m: float = 0.0,
+    rng: np.random.Generator,
+    poses: Sequence[Pose],
+    size_px: tuple[int, int],
+    relief_m: float = 0.0,
     camera: CameraSpec = REDEDGE,
-) -> Ground:  # fmt: skip
+) -> Ground:
     """Return a ground with parcels, rows, tracks and trees, large and fine enough for all bands at all poses."""
     focal = FOCAL_LENGTH_MM * PIXELS_PER_MM * size_px[0] / 1280
     lowest, highest = min(p.altitude_m for p in poses), max(p.altitude_m for p in poses)

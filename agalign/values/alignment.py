@@ -98,10 +98,18 @@ class JointResult(Generic[FixedPx]):
         per_axis = np.outer(np.tile(up, 4), np.tile(up, 4))
         covariance = None if self.corner_covariance_px2 is None else self.corner_covariance_px2 * per_axis
         return JointResult(
-            scales.between_files(self.fixed_to_moving), self.loss, self.retrieval, self.chance, self.iterations,
-            self.levels, self.recipe, self.model_family, self.last_step_px * up.mean,
-            tuple((x * up.x, y * up.y) for x, y in self.corner_std_xy_px), covariance,
-        )  # fmt: skip
+            scales.between_files(self.fixed_to_moving),
+            self.loss,
+            self.retrieval,
+            self.chance,
+            self.iterations,
+            self.levels,
+            self.recipe,
+            self.model_family,
+            self.last_step_px * up.mean,
+            tuple((x * up.x, y * up.y) for x, y in self.corner_std_xy_px),
+            covariance,
+        )
 
 
 @dataclass(frozen=True)
@@ -190,9 +198,11 @@ SAME_SCALES = PairScales()
 """Both images have the pixels of their files."""
 
 _SOURCES: dict[PredictionSource, str] = {
-    "bands": "the capture's other bands", "neighbours": "the captures around it", "flight": "the flight's mean",
+    "bands": "the capture's other bands",
+    "neighbours": "the captures around it",
+    "flight": "the flight's mean",
     "windows": "windows in the image",
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)

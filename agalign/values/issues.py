@@ -74,42 +74,49 @@ _BLANK = Remedy(
 _ASKED = Remedy("only the seed was requested", "omit --seed and --only-seed")
 
 UNREADABLE = IssueKind(
-    "unreadable", "{detail}",
+    "unreadable",
+    "{detail}",
     Remedy("a file cannot be read", "copy it from the card again; the other bands are aligned without it"),
-)  # fmt: skip
+)
 BLANK_REFERENCE = IssueKind("blank_reference", "the reference band is constant or all invalid", _BLANK)
 BLANK_MOVING = IssueKind("blank_moving", "the moving band is constant or all invalid", _BLANK)
 NO_SUCH_SEED = IssueKind("no_such_seed", "this band has no {detail} seed; omit --seed", _ASKED)
 SEED_ASKED_FOR = IssueKind("seed_asked_for", "only the seed was requested", _ASKED)
-NO_CONTRAST = IssueKind(
-    "no_contrast", "no pixel of the reference band has enough contrast to learn from", TEXTURELESS
-)  # fmt: skip
+NO_CONTRAST = IssueKind("no_contrast", "no pixel of the reference band has enough contrast to learn from", TEXTURELESS)
 FEW_KEYPOINTS = IssueKind(
     "few_keypoints", "only {value:.0f} keypoints are in the area that both bands show", TEXTURELESS
-)  # fmt: skip
-NOT_INVERTIBLE = IssueKind(
-    "not_invertible", "the optimisation diverged to a mapping that cannot be inverted", UNLIKE
-)  # fmt: skip
+)
+NOT_INVERTIBLE = IssueKind("not_invertible", "the optimisation diverged to a mapping that cannot be inverted", UNLIKE)
 CORNERS_UNKNOWN = IssueKind(
     "corners_unknown", "the patches do not determine the mapping at the corners of the image", TEXTURELESS
-)  # fmt: skip
+)
 RETRIEVAL = IssueKind(
     "retrieval", "the descriptors do not distinguish held-out patches (retrieval {value:.2f})", TEXTURELESS
-)  # fmt: skip
+)
 """Reported by the descriptor check, and by an estimation that stops early."""
 SEED_DOES_NOT_FIT = IssueKind("seed_does_not_fit", "but the seed does not fit either", UNLIKE)
 """Added to the issues of a result if its seed cannot be used instead."""
 
 OTHER_GEOMETRY = IssueKind(
-    "other_geometry", "the relief that aligns the other bands does not align this one",
+    "other_geometry",
+    "the relief that aligns the other bands does not align this one",
     Remedy(
         "a band was exposed at another time, or parts of the scene moved",
         "look at the picture; --bands omits the band, --relief never aligns all bands without a relief",
     ),
-)  # fmt: skip
+)
 """Reported for a band that only a homography or displacement field aligns, in a capture with a relief."""
 
 KINDS = (
-    UNREADABLE, BLANK_REFERENCE, BLANK_MOVING, NO_SUCH_SEED, SEED_ASKED_FOR, NO_CONTRAST, FEW_KEYPOINTS, NOT_INVERTIBLE,
-    CORNERS_UNKNOWN, RETRIEVAL, OTHER_GEOMETRY,
-)  # fmt: skip
+    UNREADABLE,
+    BLANK_REFERENCE,
+    BLANK_MOVING,
+    NO_SUCH_SEED,
+    SEED_ASKED_FOR,
+    NO_CONTRAST,
+    FEW_KEYPOINTS,
+    NOT_INVERTIBLE,
+    CORNERS_UNKNOWN,
+    RETRIEVAL,
+    OTHER_GEOMETRY,
+)

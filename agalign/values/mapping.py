@@ -167,9 +167,12 @@ def _along(start: int, length: int) -> Points:
 
 
 def splined(
-    mapping: Callable[[Points], Points], x_px: Points, y_px: Points, step_px: int = _KNOT_STEP_PX,
+    mapping: Callable[[Points], Points],
+    x_px: Points,
+    y_px: Points,
+    step_px: int = _KNOT_STEP_PX,
     dtype: DTypeLike = np.float64,
-) -> Points:  # fmt: skip
+) -> Points:
     """A smooth mapping of points (..., 2) at all crossings of columns x (n,) and rows y (m,): (m, n, 2).
 
     A bicubic spline through the mapping's values on a lattice is linear in those values: two matrix products. The

@@ -100,9 +100,7 @@ class Parallax:
         return np.asarray(self.relief(points_px)[..., None] * np.array(self.baseline))
 
 
-def between_levels(
-    at_level: Callable[[float], NDArray[np.floating]], parallax_px: FloatImage
-) -> NDArray[np.floating]:  # fmt: skip
+def between_levels(at_level: Callable[[float], NDArray[np.floating]], parallax_px: FloatImage) -> NDArray[np.floating]:
     """Return a smooth function of parallax and pixel, (height, width, 2), at the parallax of each pixel.
 
     `at_level` evaluates the function for all pixels at one parallax. It is a homography after a shift, followed by a

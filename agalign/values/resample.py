@@ -60,9 +60,13 @@ def planes_of(image: ArrayLike, name: str) -> tuple[NDArray[np.generic], bool]:
 
 
 def resample_planes(
-    planes: NDArray[np.generic], valid: Mask, mapping: PixelMapping, size_px: Size, interpolation: Interpolation,
+    planes: NDArray[np.generic],
+    valid: Mask,
+    mapping: PixelMapping,
+    size_px: Size,
+    interpolation: Interpolation,
     fill: float,
-) -> tuple[NDArray[np.generic], Mask]:  # fmt: skip
+) -> tuple[NDArray[np.generic], Mask]:
     """Resample planes (C, h, w) with the mask `valid` (h, w) to a reference of `size_px` (width, height).
 
     Returns (C, height, width) of the same type, with `fill` where a pixel is not valid, and the mask (height, width).
