@@ -103,7 +103,7 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
             metadata.read_tags(file)
         tag_transfer._directories(file)
         with contextlib.suppress(ValueError):
-            tiff_directory.check_directories(file)
+            tiff_directory.read_directories(file)
 
     def on_names(data: bytes) -> None:
         folder = Path(tempfile.mkdtemp(dir=scratch))

@@ -24,8 +24,6 @@ from agalign.values.files import RUN_FILE
 
 __all__ = ["DiscoverOptions", "FolderScan", "Problem", "discover"]
 
-_MAX_SUFFIXES = 5
-"""Suffixes of other files that a message lists."""
 Progress = Callable[[int, int], None]
 """Called with (number of files read, number of files)."""
 
@@ -67,7 +65,7 @@ def discover(
     if images and not paths:
         raise InputError(f"{folder}: has {len(images)} images, and --include and --exclude leave none")
     if not paths:
-        others = ", ".join(f"{count} {suffix}" for suffix, count in other_files(folder).most_common(_MAX_SUFFIXES))
+        others = ", ".join(f"{count} {suffix}" for suffix, count in other_files(folder).most_common(5))
         only = f"; there are only {others}" if others else ""
         raise InputError(f"{folder}: no {IMAGE_KINDS} file in it or below it{only}")
     files = _read(paths, options, progress, problems)

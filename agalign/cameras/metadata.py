@@ -7,26 +7,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import tifffile
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
-from agalign.cameras.tiff_directory import EXIF, GPS, XMP, check_directories
+from agalign.cameras.tiff_directory import EXIF, GPS, read_directories, values
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import JPEG_SUFFIXES, PNG_SUFFIXES
 from agalign.values.capture import Position
 from agalign.values.text import without_controls
 
-_RATIONAL_TYPES = (5, 10)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
-_MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _BLACK_LEVEL = 271, 272, 274, 306, 50714
-_TAGS = {_MAKE, _MODEL, _ORIENTATION, _DATE_TIME, XMP, EXIF, GPS, _BLACK_LEVEL}
-"""The TIFF tags that are read; values of other tags may be of any length."""
 _MAX_LATITUDE_DEG, _MAX_LONGITUDE_DEG, _MAX_ALTITUDE_M = 90.0, 180.0, 20_000.0
 """Positions beyond these limits come from damaged tags."""
-_BELOW_SEA_LEVEL = (1, b"\x01")
-"""Values of EXIF GPSAltitudeRef for an altitude below sea level: libraries return a BYTE as either."""
 _MAX_TEXT_LENGTH = 200
 """Makes, models and serial numbers are shorter; a damaged tag may contain megabytes."""
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -74,7 +67,7 @@ class Tags:
     @property
     def pixels_per_mm(self) -> float | None:
         """Pixels per mm of the focal plane, from EXIF FocalPlaneXResolution and its unit."""
-        resolution = rational(self.exif.get("FocalPlaneXResolution"))
+        resolution = finite(self.exif.get("FocalPlaneXResolution"))
         unit = self.exif.get("FocalPlaneResolutionUnit", 2)
         mm = _MM_PER_UNIT.get(int(unit)) if isinstance(unit, int) else None
         return resolution / mm if resolution and mm else None
@@ -82,16 +75,12 @@ class Tags:
     @property
     def focal_length_mm(self) -> float | None:
         """EXIF FocalLength."""
-        return rational(self.exif.get("FocalLength"))
+        return finite(self.exif.get("FocalLength"))
 
 
-def rational(value: Any) -> float | None:
-    """Return an EXIF number, or a pair of numerator and denominator, as a finite float; None for anything else."""
-    try:
-        number = value[0] / value[1] if isinstance(value, (tuple, list)) else float(value)
-    except (TypeError, ValueError, ZeroDivisionError, IndexError):
-        return None
-    return number if math.isfinite(number) else None
+def finite(value: Any) -> float | None:
+    """Return a value of Exif as a finite float; None for anything else."""
+    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None
 
 
 def read_tags(path: Path) -> Tags:
@@ -101,53 +90,33 @@ def read_tags(path: Path) -> Tags:
     """
     if path.suffix.lower() in PNG_SUFFIXES:
         return Tags()
-    kind, read = ("JPEG", _jpeg_values) if path.suffix.lower() in JPEG_SUFFIXES else ("TIFF", _tiff_values)
     try:
-        values = read(path)
+        directories = read_directories(path)
     except Exception as error:  # damaged files cause struct.error, KeyError, MemoryError … in the libraries
+        kind = "JPEG" if path.suffix.lower() in JPEG_SUFFIXES else "TIFF"
         raise UnreadableFileError(
             f"{path}: not a readable {kind} ({error or 'empty'}); copy it from the card again"
         ) from None
-    exif = values.get(EXIF)
-    exif = exif if isinstance(exif, dict) else {}
-    orientation = values.get(_ORIENTATION, 1)
+    first, exif, gps = (
+        {names.get(tag, str(tag)): values(entry) for tag, entry in directories[key].items()}
+        for key, names in ((0, ExifTags.TAGS), (EXIF, ExifTags.TAGS), (GPS, ExifTags.GPSTAGS))
+    )
+    orientation = first.get("Orientation", 1)
     return Tags(
-        make=_text(values.get(_MAKE)),
-        model=_text(values.get(_MODEL)),
+        make=_text(first.get("Make")),
+        model=_text(first.get("Model")),
         serial=_text(exif.get("BodySerialNumber")),
-        position=_position(values.get(GPS)),
-        captured_at=_iso_time(exif, values.get(_DATE_TIME)),
+        position=_position(gps),
+        captured_at=_iso_time(exif, first.get("DateTime")),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
-        black_level=_mean(values.get(_BLACK_LEVEL)),
-        xmp=Packet.parse(values.get(XMP, b"")).values(),
+        black_level=_mean(first.get("BlackLevel")),
+        xmp=Packet.parse(first.get("XMLPacket", b"")).values(),
         exif=exif,
     )
 
 
-def _tiff_values(path: Path) -> dict[int, Any]:
-    check_directories(path)
-    with tifffile.TiffFile(path) as tiff:
-        tags = [tag for tag in tiff.pages[0].tags.values() if tag.code in _TAGS]  # type: ignore[union-attr]
-        return {tag.code: _fractions(tag.value) if tag.dtype in _RATIONAL_TYPES else tag.value for tag in tags}
-
-
-def _fractions(value: tuple[int, ...]) -> tuple[float, ...]:
-    """Fractions from a sequence of numerator, denominator, numerator, denominator …; nan for a denominator of 0."""
-    return tuple(n / d if d else math.nan for n, d in zip(value[::2], value[1::2], strict=True))
-
-
-def _jpeg_values(path: Path) -> dict[int, Any]:
-    with Image.open(path, formats=("JPEG",)) as image:
-        exif = image.getexif()
-        named = {ExifTags.TAGS.get(code, str(code)): value for code, value in exif.get_ifd(EXIF).items()}
-        place = {ExifTags.GPSTAGS.get(code, str(code)): value for code, value in exif.get_ifd(GPS).items()}
-        return {**exif, EXIF: named, GPS: place, XMP: image.info.get("xmp", b"")}
-
-
-def _position(gps: Any) -> Position | None:
+def _position(gps: Mapping[str, Any]) -> Position | None:
     """The position in a GPS directory; None without a fix, for which cameras write no coordinates or zeros."""
-    if not isinstance(gps, dict):
-        return None
     latitude_deg = _signed_degrees(gps, "Latitude", "S", _MAX_LATITUDE_DEG)
     longitude_deg = _signed_degrees(gps, "Longitude", "W", _MAX_LONGITUDE_DEG)
     if latitude_deg is None or longitude_deg is None or latitude_deg == longitude_deg == 0:
@@ -164,28 +133,24 @@ def _signed_degrees(gps: Mapping[str, Any], axis: str, negative: str, max_deg: f
 
 
 def _altitude_m(gps: Mapping[str, Any]) -> float | None:
-    """Altitude above sea level; None if it is missing or impossible."""
-    altitude_m = rational(gps.get("GPSAltitude"))
+    """Altitude above sea level, negative with the reference 1; None if it is missing or impossible."""
+    altitude_m = finite(gps.get("GPSAltitude"))
     if altitude_m is None or abs(altitude_m) > _MAX_ALTITUDE_M:
         return None
-    return -altitude_m if gps.get("GPSAltitudeRef") in _BELOW_SEA_LEVEL else altitude_m
+    return -altitude_m if gps.get("GPSAltitudeRef") == b"\x01" else altitude_m
 
 
 def _degrees(value: Any) -> float | None:
-    """Degrees from degrees, minutes and seconds, given as 3 fractions or as 3 numerators and denominators."""
-    if not isinstance(value, (tuple, list)):
+    """Degrees from degrees, minutes and seconds."""
+    if not isinstance(value, tuple) or len(value) != 3 or any(finite(part) is None for part in value):
         return None
-    pairs = [value[i : i + 2] for i in range(0, 6, 2)] if len(value) == 6 else list(value)
-    parts = [rational(pair) for pair in pairs]
-    if len(parts) != 3 or any(part is None for part in parts):
-        return None
-    return float(sum((part or 0.0) / 60**k for k, part in enumerate(parts)))
+    return float(sum(part / 60**k for k, part in enumerate(value)))
 
 
 def _mean(value: Any) -> float | None:
     """The mean of a tag of one or several numbers; None for another type."""
-    numbers = value if isinstance(value, (tuple, list)) else [value]
-    if not numbers or not all(isinstance(n, (int, float)) and math.isfinite(n) for n in numbers):
+    numbers = value if isinstance(value, tuple) else (value,)
+    if not numbers or any(finite(n) is None for n in numbers):
         return None
     return float(sum(numbers)) / len(numbers)
 

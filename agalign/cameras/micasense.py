@@ -12,7 +12,7 @@ from pathlib import Path
 
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, band_of, elevation_of, is_thermal, max_value, rays_to_rig, rotation
-from agalign.cameras.metadata import Tags, rational
+from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.xmp import Name
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose, Radiometry
@@ -94,7 +94,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     time t and row y; reflectance = pi L / E with the irradiance E of the light sensor on a horizontal plane.
     """
     a = tags.numbers(*_CALIBRATION)
-    exposure_s, iso = rational(tags.exif.get("ExposureTime")), _iso(tags)
+    exposure_s, iso = finite(tags.exif.get("ExposureTime")), _iso(tags)
     if len(a) != 3 or not exposure_s or tags.black_level is None or not iso:
         return None
     irradiance = _irradiance(tags)

@@ -29,8 +29,6 @@ VIGNETTING_CENTRE: Name = (NAMESPACE, "VignettingCenter")
 VIGNETTING_POLYNOMIAL: Name = (NAMESPACE, "VignettingPolynomial")
 
 _PANEL_SERIALS: tuple[Name, ...] = (("micasense.com/MicaSense", "PanelSerial"), (NAMESPACE, "PanelSerial"))
-_AREA_NUMBERS = 8
-"""x and y of four corners."""
 _MAX_FOCAL_LENGTH_MM = 100.0
 """Larger numbers are px: lenses of drone cameras have 2 to 50 mm, or 300 px and more."""
 _MAX_OFFSET_M = 0.5
@@ -146,7 +144,7 @@ def panel_in(tags: Tags, size_px: tuple[int, int]) -> Panel | None:
 def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, float], ...]:
     """(x, y) of the corners of ReflectArea; empty if they are not four different points of the image."""
     area = tags.numbers(NAMESPACE, "ReflectArea")
-    if len(area) != _AREA_NUMBERS:
+    if len(area) != 8:
         return ()
     corners = tuple(zip(area[::2], area[1::2], strict=True))
     inside = all(0 <= x < size_px[0] and 0 <= y < size_px[1] for x, y in corners)
@@ -160,24 +158,11 @@ class TagTransfer:
     """Conversion of XMP values for a band that is written on the reference's grid."""
 
     geometry: frozenset[Name] = frozenset(
-        {
-            PRINCIPAL_POINT,
-            FOCAL_LENGTH,
-            FOCAL_LENGTH_UNITS,
-            DISTORTION,
-            MODEL_TYPE,
-            RIG_RELATIVES,
-            RIG_TRANSLATIONS,
-            (NAMESPACE, "RigRelativesReferenceRigCameraIndex"),
-        }
-    )
+        (PRINCIPAL_POINT, FOCAL_LENGTH, FOCAL_LENGTH_UNITS, DISTORTION, MODEL_TYPE, RIG_RELATIVES, RIG_TRANSLATIONS)
+    ) | {(NAMESPACE, "RigRelativesReferenceRigCameraIndex")}
     """Values of lens and rig, which are replaced by those of the reference."""
     sensor_only: frozenset[Name] = frozenset(
-        {
-            (NAMESPACE, "InvalidPixel"),
-            (NAMESPACE, "VignettingPolynomial2D"),
-            (NAMESPACE, "VignettingPolynomial2DName"),
-        }
+        (NAMESPACE, name) for name in ("InvalidPixel", "VignettingPolynomial2D", "VignettingPolynomial2DName")
     )
     """Values that refer to the sensor's own pixels and are removed."""
     radiometry: frozenset[Name] = frozenset({VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL, (NAMESPACE, "BlackCurrent")})
@@ -246,12 +231,8 @@ class TagTransfer:
         return pixels_per_mm(tags)
 
     def is_rotated(self, tags: Tags) -> bool:
-        """Return True if the principal point refers to the image rotated by 180 degrees."""
-        return self.principal_point_follows_orientation and tags.orientation == UPSIDE_DOWN
-
-
-UPSIDE_DOWN = 3
-"""EXIF Orientation of an image that is stored rotated by 180 degrees."""
+        """Return True if the principal point refers to the image rotated by 180 degrees: Orientation 3 of Exif."""
+        return self.principal_point_follows_orientation and tags.orientation == 3
 
 
 def rotated_180(point_px: Sequence[float], size_px: tuple[int, int]) -> tuple[float, float]:

@@ -65,8 +65,6 @@ _FILES_PER_TASK = 100
 """If a file crashes the process, the other files of its task are lost; smaller tasks take more time per file."""
 _MIN_FILES_FOR_PROCESSES = 1000
 """Reading fewer files takes less time than starting processes."""
-_PHOTOGRAPH_CHANNELS = (3, 4)
-"""RGB, or RGB with alpha."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,7 @@ def _without_impossible_values(band: Band) -> Band:
 
 
 def _is_stack(path: Path, info: RasterInfo) -> bool:
-    photograph = info.dtypes[0] == "uint8" and len(info.dtypes) in _PHOTOGRAPH_CHANNELS
+    photograph = info.dtypes[0] == "uint8" and len(info.dtypes) in (3, 4)
     return path.suffix.lower() in TIFF_SUFFIXES and len(info.dtypes) > 1 and not photograph
 
 

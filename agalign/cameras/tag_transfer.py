@@ -10,7 +10,7 @@ from pathlib import Path
 from PIL.ExifTags import Base
 
 from agalign.cameras import camera_of
-from agalign.cameras.metadata import read_tags
+from agalign.cameras.metadata import finite, read_tags
 from agalign.cameras.pix4d import FromSource
 from agalign.cameras.tiff_directory import (
     EXIF,
@@ -19,9 +19,9 @@ from agalign.cameras.tiff_directory import (
     Directory,
     byte_string,
     long,
-    number,
     rational,
     read_directories,
+    values,
 )
 from agalign.cameras.xmp import Packet
 from agalign.errors import UnreadableFileError
@@ -109,7 +109,7 @@ def _on_grid(exif: Directory, reference: Directory, grid: OutputGrid) -> Directo
     """The Exif directory with the focal length and pixel density of the reference, and the size of the output."""
     result = exif | _some(reference, _GEOMETRIC_EXIF)
     for tag in _DENSITIES & result.keys() if grid.scale.mean != 1 else ():
-        density = number(result[tag])
+        density = finite(values(result[tag]))
         if density is not None and density > 0:
             with suppress(ValueError):  # too large for a fraction: a damaged tag
                 result[tag] = rational(grid.scale.mean * density)

@@ -2,54 +2,31 @@
 a finished file. Classic TIFF and BigTIFF in either byte order, by TIFF 6.0 and the EXIF specification.
 """
 
+import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from PIL import Image
-from tifffile import DATATYPE
+from tifffile import DATATYPE, TIFF
+
+from agalign.pixels.raster import JPEG_SUFFIXES
 
 EXIF, GPS = 34665, 34853
 """Tags with the offset of a directory as value."""
 XMP = 700
-_NUMBERS: dict[int, str] = {
-    DATATYPE.SHORT: "H",
-    DATATYPE.LONG: "I",
-    DATATYPE.RATIONAL: "II",
-    DATATYPE.SSHORT: "h",
-    DATATYPE.SLONG: "i",
-    DATATYPE.SRATIONAL: "ii",
-    DATATYPE.FLOAT: "f",
-    DATATYPE.DOUBLE: "d",
-}
-_FORMATS: dict[int, str] = {
-    **_NUMBERS,
-    DATATYPE.BYTE: "B",
-    DATATYPE.ASCII: "B",
-    DATATYPE.SBYTE: "b",
-    DATATYPE.UNDEFINED: "B",
-    DATATYPE.IFD: "I",
-    DATATYPE.LONG8: "Q",
-    DATATYPE.SLONG8: "q",
-    DATATYPE.IFD8: "Q",
-}
-"""A value of each type as the module `struct` describes it; a rational is two numbers."""
-_SIZE = {kind: struct.calcsize(f"<{numbers}") for kind, numbers in _FORMATS.items()}
+_SIZE = {kind: struct.calcsize(f"<{numbers}") for kind, numbers in TIFF.DATA_FORMATS.items()}
 """Bytes of a value of each type."""
 _MAX_BYTES = 1 << 25
-"""Limit of all tags of a file, without the pixels: cameras write a few thousand bytes."""
+"""Limit of the tags of a directory: cameras write a few thousand bytes."""
 _MAX_ENTRIES = 4096
 """Limit of the number of entries in a directory, which may be damaged: cameras write fewer than 100."""
 _MAX_LONG = (1 << 32) - 1
-_MILLION = 1_000_000
 _MAX_MILLIONTHS = 4000
 """Values below this are written as millionths, whose numerators fit into 32 bits."""
-_HEADER_BYTES, _BIG_HEADER_BYTES = 8, 16
-_TIFF, _BIG_TIFF = 42, 43
-"""Version numbers in the header."""
 
 
 @dataclass(frozen=True)
@@ -92,27 +69,32 @@ def rational(*values: float) -> Entry:
     for value in values:
         if not 0 <= value < _MAX_LONG:
             raise ValueError(f"{value} does not fit into a TIFF fraction")
-        denominator = _MILLION if value < _MAX_MILLIONTHS else max(1, int(_MAX_LONG / (value + 1)))
+        denominator = 1_000_000 if value < _MAX_MILLIONTHS else max(1, int(_MAX_LONG / (value + 1)))
         pairs += struct.pack("<II", round(value * denominator), denominator)
     return Entry(DATATYPE.RATIONAL, len(values), pairs)
 
 
-def number(entry: Entry) -> float | None:
-    """Return the first value of an entry of numbers; None for other types and for a denominator of 0."""
-    if entry.type not in _NUMBERS:
-        return None
-    numerator, *rest = struct.unpack_from(f"<{_FORMATS[entry.type]}", entry.data)
-    denominator = rest[0] if rest else 1
-    return float(numerator / denominator) if denominator else None
+def values(entry: Entry) -> Any:
+    """Return the number of an entry, a tuple of several numbers, or the bytes of a text or of the types BYTE and
+    UNDEFINED. Fractions are floats, nan for a denominator of 0.
+    """
+    numbers = TIFF.DATA_FORMATS[entry.type]
+    if numbers[-1] in "Bbs":
+        return entry.data.partition(b"\0")[0] if entry.type == DATATYPE.ASCII else entry.data
+    result = struct.unpack(f"<{int(numbers[0]) * entry.count}{numbers[-1]}", entry.data)
+    if numbers[0] == "2":
+        result = tuple(n / d if d else math.nan for n, d in zip(result[::2], result[1::2], strict=True))
+    return result[0] if len(result) == 1 else result
 
 
 def read_directories(path: Path) -> dict[int, Directory]:
     """Return {0: the first directory, EXIF: …, GPS: …} of a TIFF, or of the Exif part of a JPEG, with its XMP packet.
 
-    Raises ValueError if the file is malformed, OSError if it cannot be read.
+    A file with the suffix of a JPEG is read as one. Raises ValueError, or an error of Pillow, if the file is malformed,
+    OSError if it cannot be read.
     """
-    with path.open("rb") as file:
-        if file.read(2) != b"\xff\xd8":
+    if path.suffix.lower() not in JPEG_SUFFIXES:
+        with path.open("rb") as file:
             return _read_all(file)
     with Image.open(path, formats=("JPEG",)) as image:
         block, packet = image.info.get("exif", b""), image.info.get("xmp", b"")
@@ -120,20 +102,6 @@ def read_directories(path: Path) -> dict[int, Directory]:
     if packet:
         result[0][XMP] = byte_string(packet)
     return result
-
-
-def check_directories(path: Path) -> None:
-    """Raise ValueError if a TIFF is malformed or its tags declare more bytes than any camera writes."""
-    with path.open("rb") as file:
-        layout, at, _ = _header(file)
-        first = _entries(file, layout, at)[0]
-        declared = sum(length for _, _, _, length, _ in first)
-        for tag, kind, _, _, value in first:
-            if tag in (EXIF, GPS) and kind in _SIZE:
-                place = _swapped(value[: _SIZE[kind]], kind, layout.order)
-                declared += sum(e[3] for e in _entries(file, layout, int.from_bytes(place, "little"))[0])
-    if declared > _MAX_BYTES:
-        raise ValueError(f"its tags declare {declared >> 20} MB")
 
 
 def add_directories(path: Path, first: Mapping[int, Entry], exif: Directory, gps: Directory) -> None:
@@ -188,31 +156,32 @@ def _read_all(file: BinaryIO) -> dict[int, Directory]:
 def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
     """(layout, offset of the first directory, position of that offset in the file)."""
     file.seek(0)
-    head = file.read(_BIG_HEADER_BYTES)
+    head = file.read(16)
     order = {b"II": "<", b"MM": ">"}.get(head[:2])
-    if order is None or len(head) < _HEADER_BYTES:
-        raise ValueError("no TIFF header")
-    (version,) = struct.unpack_from(order + "H", head, 2)
-    if version == _BIG_TIFF and len(head) == _BIG_HEADER_BYTES:
+    version = struct.unpack_from(order + "H", head, 2)[0] if order is not None and len(head) >= 8 else 0
+    if order is not None and version == 43 and len(head) == 16:
         return _Layout(order, "Q", "Q"), struct.unpack_from(order + "Q", head, 8)[0], 8
-    if version != _TIFF:
+    if order is None or version != 42:
         raise ValueError("no TIFF header")
     return _Layout(order, "I", "H"), struct.unpack_from(order + "I", head, 4)[0], 4
 
 
 def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory, int]:
-    """(entries, offset of the next directory); entries beyond the limit of all tags are left out."""
+    """(entries, offset of the next directory), without entries of unknown types and those beyond the end of the file.
+
+    Raises ValueError if the entries declare more bytes than any camera writes.
+    """
     entries, following = _entries(file, layout, at)
+    declared = sum(length for _, _, _, length, _ in entries)
+    if declared > _MAX_BYTES:
+        raise ValueError(f"its tags declare {declared >> 20} MB")
     result: Directory = {}
-    remaining_bytes = _MAX_BYTES
     for tag, kind, count, length, value in entries:
-        if length == 0 or length > remaining_bytes:
-            continue
-        remaining_bytes -= length
         if length > layout.inline_bytes:
             file.seek(struct.unpack(layout.order + layout.offset, value)[0])
-            value = _exactly(file, length)
-        result[tag] = Entry(kind, count, _swapped(value[:length], kind, layout.order))
+            value = file.read(length)
+        if 0 < length <= len(value):
+            result[tag] = Entry(kind, count, _swapped(value[:length], kind, layout.order))
     return result, following
 
 
@@ -257,7 +226,7 @@ def _append(file: BinaryIO, data: bytes) -> int:
 
 def _swapped(value: bytes, kind: int, order: str) -> bytes:
     """A value converted between little-endian and a file's byte order."""
-    size = struct.calcsize(f"<{_FORMATS[kind][0]}")
+    size = struct.calcsize(f"<{TIFF.DATA_FORMATS[kind][-1]}")
     if order == "<" or size == 1:
         return value
     return b"".join(value[i : i + size][::-1] for i in range(0, len(value), size))

@@ -38,11 +38,8 @@ class Starts:
         for shift in self.shifts:
             for k in range(1 if shift == 0 else self.directions):
                 angle = first + 2 * math.pi * k / self.directions
-                length = shift * longer_side_px
-                yield (
-                    shift,
-                    geometry.compose(truth, geometry.translation(length * math.cos(angle), length * math.sin(angle))),
-                )
+                dx, dy = shift * longer_side_px * np.array([math.cos(angle), math.sin(angle)])
+                yield shift, geometry.compose(truth, geometry.translation(dx, dy))
 
 
 @dataclass(frozen=True)
@@ -85,17 +82,8 @@ def evaluate(
                     outcome = method(PairTask(fixed, moving, start, device, rng_seed, starts.seeding))
                 seconds = time.perf_counter() - began
                 precision, error_px = _scores(outcome, keypoints, truth)
-                yield Result(
-                    pair.name,
-                    pair.group,
-                    name,
-                    shift,
-                    len(keypoints),
-                    precision,
-                    error_px,
-                    error_px / max(moving.size_px),
-                    seconds,
-                )
+                share = error_px / max(moving.size_px)
+                yield Result(pair.name, pair.group, name, shift, len(keypoints), precision, error_px, share, seconds)
                 if outcome.fixed_to_moving is None:
                     break
 

@@ -258,19 +258,8 @@ def refine(
         if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
             return Issue(CORNERS_UNKNOWN)
         held_out, chance = held_out_retrieval(band, homography, test, f_test)
-        return JointResult(
-            matrix,
-            math.nan,
-            held_out,
-            chance,
-            0,
-            (1.0,),
-            "fast",
-            step.family,
-            step.length_px,
-            std,
-            _complete_covariance(step),
-        )
+        of_step = step.family, step.length_px, std, _complete_covariance(step)
+        return JointResult(matrix, math.nan, held_out, chance, 0, (1.0,), "fast", *of_step)
 
     return [
         Issue(RETRIEVAL, group.dropped[b], MIN_RETRIEVAL)

@@ -66,14 +66,8 @@ class JointState:
 
     def level(self, group: ImageGroup, scale: float, bands: Sequence[int]) -> Level:
         """Build the level of the reference and some moving images at `scale`. Raises NoContrastError."""
-        level = make_level(
-            group.fixed,
-            [group.moving[b] for b in bands],
-            [group.mappings[b] for b in bands],
-            scale,
-            self.sampler.generator,
-            self.device,
-        )
+        moving, mappings = [group.moving[b] for b in bands], [group.mappings[b] for b in bands]
+        level = make_level(group.fixed, moving, mappings, scale, self.sampler.generator, self.device)
         if group.fields:
             level = level.with_fields([group.fields[b] for b in bands])
         if len(level.trainable) == 0:

@@ -44,39 +44,71 @@ class MicaSenseCamera(CameraSpec):
         )
 
     def _xmp(self, band: BandSpec, exposure: Exposure, density: float) -> str:
-        width, height = band.size_px(exposure.size_px)
         model, pose = band.lens(*exposure.size_px), exposure.pose
-        of_light = _MICASENSE_LIGHT.format(
-            middle_x=width / 2,
-            middle_y=height / 2,
-            fall=-exposure.vignetting / ((width / 2) ** 2 + (height / 2) ** 2),
-            gain=_IRRADIANCE / np.pi * EXPOSURE_S * 65536 / (WHITE_LEVEL - BLACK_LEVEL) / band.exposure,
-            irradiance=_IRRADIANCE * 100,
-        )
-        return _MICASENSE.format(
-            model=self.model,
-            name=band.name,
-            wavelength=band.wavelength_nm,
-            fwhm=band.bandwidth_nm,
-            cx=model.cx_px / density,
-            cy=model.cy_px / density,
-            focal=band.focal_length_mm,
-            k1=band.distortion[0],
-            k2=band.distortion[1],
-            k3=band.distortion[4],
-            p1=band.distortion[2],
-            p2=band.distortion[3],
-            rig=", ".join(f"{v + off:.6f}" for v, off in zip(band.rig_degrees, band.tags_off_deg, strict=True)),
-            place=f"{band.baseline_m[0]:.4f}, {band.baseline_m[1]:.4f}, 0",
-            index=band.rig_index,
-            reference=self.bands[self.reference].rig_index,
-            capture=f"synthetic{exposure.number:011d}",
-            altitude=pose.altitude_m,
-            yaw=pose.yaw_deg,
-            pitch=pose.pitch_deg,
-            roll=pose.roll_deg,
-            of_light="" if band.sees == "heat" else of_light,
-        )
+        k1, k2, p1, p2, k3 = band.distortion
+        rig = ", ".join(f"{v + off:.6f}" for v, off in zip(band.rig_degrees, band.tags_off_deg, strict=True))
+        light = "" if band.sees == "heat" else _light_xmp(band, exposure)
+        return f"""<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/">
+ <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:Camera="http://pix4d.com/camera/1.0">
+   <Camera:RigName>{self.model}</Camera:RigName>
+   <Camera:BandName>{band.name}</Camera:BandName>
+   <Camera:CentralWavelength>{band.wavelength_nm:g}</Camera:CentralWavelength>
+   <Camera:WavelengthFWHM>{band.bandwidth_nm:g}</Camera:WavelengthFWHM>
+   <Camera:ModelType>perspective</Camera:ModelType>
+   <Camera:PrincipalPoint>{model.cx_px / density:.8f},{model.cy_px / density:.8f}</Camera:PrincipalPoint>
+   <Camera:PerspectiveFocalLength>{band.focal_length_mm}</Camera:PerspectiveFocalLength>
+   <Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>
+   <Camera:PerspectiveDistortion>
+    <rdf:Seq>
+     <rdf:li>{k1}</rdf:li><rdf:li>{k2}</rdf:li><rdf:li>{k3}</rdf:li><rdf:li>{p1}</rdf:li><rdf:li>{p2}</rdf:li>
+    </rdf:Seq>
+   </Camera:PerspectiveDistortion>
+   <Camera:RigRelatives>{rig}</Camera:RigRelatives>
+   <Camera:RigTranslations>{band.baseline_m[0]:.4f}, {band.baseline_m[1]:.4f}, 0</Camera:RigTranslations>
+   <Camera:Yaw>{pose.yaw_deg:.4f}</Camera:Yaw>
+   <Camera:Pitch>{pose.pitch_deg:.4f}</Camera:Pitch>
+   <Camera:Roll>{pose.roll_deg:.4f}</Camera:Roll>
+   <Camera:RigCameraIndex>{band.rig_index}</Camera:RigCameraIndex>
+   <Camera:RigRelativesReferenceRigCameraIndex>{self.bands[self.reference].rig_index}</Camera:RigRelativesReferenceRigCameraIndex>
+  </rdf:Description>
+  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
+   <MicaSense:FlightId>syntheticflight00001</MicaSense:FlightId>
+   <MicaSense:CaptureId>synthetic{exposure.number:011d}</MicaSense:CaptureId>
+   <MicaSense:PressureAlt>{pose.altitude_m:.3f}</MicaSense:PressureAlt>
+  </rdf:Description>
+{light} </rdf:RDF>
+</x:xmpmeta>
+<?xpacket end="w"?>
+"""
+
+
+def _light_xmp(band: BandSpec, exposure: Exposure) -> str:
+    """Vignetting, radiometric calibration and light sensor."""
+    width, height = band.size_px(exposure.size_px)
+    fall = -exposure.vignetting / ((width / 2) ** 2 + (height / 2) ** 2)
+    gain = _IRRADIANCE / np.pi * EXPOSURE_S * 65536 / (WHITE_LEVEL - BLACK_LEVEL) / band.exposure
+    return f"""  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:Camera="http://pix4d.com/camera/1.0">
+   <Camera:VignettingCenter>
+    <rdf:Seq><rdf:li>{width / 2}</rdf:li><rdf:li>{height / 2}</rdf:li></rdf:Seq>
+   </Camera:VignettingCenter>
+   <Camera:VignettingPolynomial>
+    <rdf:Seq>
+     <rdf:li>0</rdf:li><rdf:li>{fall:.9e}</rdf:li><rdf:li>0</rdf:li>
+     <rdf:li>0</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li>
+    </rdf:Seq>
+   </Camera:VignettingPolynomial>
+  </rdf:Description>
+  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
+   <MicaSense:RadiometricCalibration>
+    <rdf:Seq><rdf:li>{gain:.9e}</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li></rdf:Seq>
+   </MicaSense:RadiometricCalibration>
+  </rdf:Description>
+  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:DLS="http://micasense.com/DLS/1.0/">
+   <DLS:HorizontalIrradiance>{_IRRADIANCE * 100:.6f}</DLS:HorizontalIrradiance>
+  </rdf:Description>
+"""
 
 
 def write_tiff(
@@ -138,130 +170,22 @@ def _degrees(angle_deg: float) -> Entry:
     return rational(int(angle_deg), int(minutes), minutes % 1 * 60)
 
 
-_MICASENSE = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
-<x:xmpmeta xmlns:x="adobe:ns:meta/">
- <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:Camera="http://pix4d.com/camera/1.0">
-   <Camera:RigName>{model}</Camera:RigName>
-   <Camera:BandName>{name}</Camera:BandName>
-   <Camera:CentralWavelength>{wavelength:g}</Camera:CentralWavelength>
-   <Camera:WavelengthFWHM>{fwhm:g}</Camera:WavelengthFWHM>
-   <Camera:ModelType>perspective</Camera:ModelType>
-   <Camera:PrincipalPoint>{cx:.8f},{cy:.8f}</Camera:PrincipalPoint>
-   <Camera:PerspectiveFocalLength>{focal}</Camera:PerspectiveFocalLength>
-   <Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>
-   <Camera:PerspectiveDistortion>
-    <rdf:Seq>
-     <rdf:li>{k1}</rdf:li><rdf:li>{k2}</rdf:li><rdf:li>{k3}</rdf:li><rdf:li>{p1}</rdf:li><rdf:li>{p2}</rdf:li>
-    </rdf:Seq>
-   </Camera:PerspectiveDistortion>
-   <Camera:RigRelatives>{rig}</Camera:RigRelatives>
-   <Camera:RigTranslations>{place}</Camera:RigTranslations>
-   <Camera:Yaw>{yaw:.4f}</Camera:Yaw>
-   <Camera:Pitch>{pitch:.4f}</Camera:Pitch>
-   <Camera:Roll>{roll:.4f}</Camera:Roll>
-   <Camera:RigCameraIndex>{index}</Camera:RigCameraIndex>
-   <Camera:RigRelativesReferenceRigCameraIndex>{reference}</Camera:RigRelativesReferenceRigCameraIndex>
-  </rdf:Description>
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
-   <MicaSense:FlightId>syntheticflight00001</MicaSense:FlightId>
-   <MicaSense:CaptureId>{capture}</MicaSense:CaptureId>
-   <MicaSense:PressureAlt>{altitude:.3f}</MicaSense:PressureAlt>
-  </rdf:Description>
-{of_light} </rdf:RDF>
-</x:xmpmeta>
-<?xpacket end="w"?>
-"""
-
-_MICASENSE_LIGHT = """  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:Camera="http://pix4d.com/camera/1.0">
-   <Camera:VignettingCenter>
-    <rdf:Seq><rdf:li>{middle_x}</rdf:li><rdf:li>{middle_y}</rdf:li></rdf:Seq>
-   </Camera:VignettingCenter>
-   <Camera:VignettingPolynomial>
-    <rdf:Seq>
-     <rdf:li>0</rdf:li><rdf:li>{fall:.9e}</rdf:li><rdf:li>0</rdf:li>
-     <rdf:li>0</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li>
-    </rdf:Seq>
-   </Camera:VignettingPolynomial>
-  </rdf:Description>
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
-   <MicaSense:RadiometricCalibration>
-    <rdf:Seq><rdf:li>{gain:.9e}</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li></rdf:Seq>
-   </MicaSense:RadiometricCalibration>
-  </rdf:Description>
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:DLS="http://micasense.com/DLS/1.0/">
-   <DLS:HorizontalIrradiance>{irradiance:.6f}</DLS:HorizontalIrradiance>
-  </rdf:Description>
-"""
-
-
-BANDS = (
-    BandSpec(
-        "Blue",
-        475,
-        20,
-        0.085,
-        0.042,
-        0.030,
-        0,
-        (0.31, -0.22, 0.12),
-        (-0.03, -0.021),
-        (-0.104, 0.150, -0.0003, 0.0006, -0.03),
-        (11.2, -7.5),
-    ),
-    BandSpec(
-        "Green",
-        560,
-        20,
-        0.125,
-        0.105,
-        0.070,
-        1,
-        (0.0, 0.0, 0.0),
-        (0.0, -0.021),
-        (-0.101, 0.145, 0.0002, -0.0004, -0.02),
-        (-6.3, 4.9),
-    ),
-    BandSpec(
-        "Red",
-        668,
-        10,
-        0.185,
-        0.055,
-        0.040,
-        2,
-        (-0.42, 0.35, -0.18),
-        (0.03, -0.021),
-        (-0.108, 0.158, -0.0001, 0.0003, -0.04),
-        (3.7, 12.6),
-    ),
-    BandSpec(
-        "NIR",
-        840,
-        40,
-        0.265,
-        0.520,
-        0.430,
-        3,
-        (0.55, -0.16, 0.21),
-        (-0.03, 0.021),
-        (-0.110, 0.152, -0.0003, 0.0005, -0.05),
-        (13.5, 9.1),
-    ),
-    BandSpec(
-        "Red edge",
-        717,
-        10,
-        0.225,
-        0.285,
-        0.220,
-        4,
-        (-0.27, -0.31, -0.09),
-        (0.03, 0.021),
-        (-0.106, 0.160, 0.0004, -0.0002, -0.06),
-        (-9.4, -5.8),
-    ),
+_SPECTRA = (
+    ("Blue", 475, 20, 0.085, 0.042, 0.030),
+    ("Green", 560, 20, 0.125, 0.105, 0.070),
+    ("Red", 668, 10, 0.185, 0.055, 0.040),
+    ("NIR", 840, 40, 0.265, 0.520, 0.430),
+    ("Red edge", 717, 10, 0.225, 0.285, 0.220),
 )
+_LENSES = (
+    ((0.31, -0.22, 0.12), (-0.03, -0.021), (-0.104, 0.150, -0.0003, 0.0006, -0.03), (11.2, -7.5)),
+    ((0.0, 0.0, 0.0), (0.0, -0.021), (-0.101, 0.145, 0.0002, -0.0004, -0.02), (-6.3, 4.9)),
+    ((-0.42, 0.35, -0.18), (0.03, -0.021), (-0.108, 0.158, -0.0001, 0.0003, -0.04), (3.7, 12.6)),
+    ((0.55, -0.16, 0.21), (-0.03, 0.021), (-0.110, 0.152, -0.0003, 0.0005, -0.05), (13.5, 9.1)),
+    ((-0.27, -0.31, -0.09), (0.03, 0.021), (-0.106, 0.160, 0.0004, -0.0002, -0.06), (-9.4, -5.8)),
+)
+BANDS = tuple(BandSpec(*_SPECTRA[index], index, *_LENSES[index]) for index in range(len(_SPECTRA)))
+"""Fields of `BandSpec`: name to reflectances, and angles to offset of the principal point."""
 REFERENCE = 1
 
 REDEDGE = MicaSenseCamera("RedEdge-M", BANDS, REFERENCE)

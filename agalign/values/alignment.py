@@ -97,19 +97,14 @@ class JointResult(Generic[FixedPx]):
         up = scales.fixed.inverse
         per_axis = np.outer(np.tile(up, 4), np.tile(up, 4))
         covariance = None if self.corner_covariance_px2 is None else self.corner_covariance_px2 * per_axis
-        return JointResult(
-            scales.between_files(self.fixed_to_moving),
-            self.loss,
-            self.retrieval,
-            self.chance,
-            self.iterations,
-            self.levels,
-            self.recipe,
-            self.model_family,
-            self.last_step_px * up.mean,
-            tuple((x * up.x, y * up.y) for x, y in self.corner_std_xy_px),
-            covariance,
+        result = replace(
+            self,
+            fixed_to_moving=scales.between_files(self.fixed_to_moving),
+            last_step_px=self.last_step_px * up.mean,
+            corner_std_xy_px=tuple((x * up.x, y * up.y) for x, y in self.corner_std_xy_px),
+            corner_covariance_px2=covariance,
         )
+        return cast("JointResult[FixedFilePx]", result)
 
 
 @dataclass(frozen=True)
@@ -315,20 +310,15 @@ class Alignment(Generic[FixedPx]):
     def in_file_px(self: "Alignment[FixedImagePx]", scales: "PairScales", size_px: Size) -> "Alignment[FixedFilePx]":
         """The same between the files of the two bands; `size_px` is (width, height) of the reference's file."""
         up = scales.fixed.inverse
-        return Alignment(
+        return replace(
+            cast("Alignment[FixedFilePx]", self),
             mapping=self.mapping.rescaled(up, scales.moving.inverse),
             size_px=size_px,
-            status=self.status,
-            issues=self.issues,
             seed=replace(self.seed, fixed_to_moving=scales.between_files(self.seed.fixed_to_moving)),
             joint=None if self.joint is None else self.joint.in_file_px(scales),
             residual=None if self.residual is None else self.residual.in_file_px(scales),
             ties=None if self.ties is None else self.ties.in_file_px(scales),
-            seconds=self.seconds,
-            before=self.before,
-            after=self.after,
             candidates={kind: FixedFilePx(p95_px * up.mean) for kind, p95_px in self.candidates.items()},
-            prediction=self.prediction,
         )
 
     @property

@@ -51,12 +51,6 @@ class FixedFilePx(Px):
     __slots__ = ()
 
 
-class MovingImagePx(Px):
-    """Pixels of the moving image that the estimation uses."""
-
-    __slots__ = ()
-
-
 class MovingFilePx(Px):
     """Pixels of the moving band's file."""
 
@@ -68,12 +62,8 @@ FixedPx = TypeVar("FixedPx", FixedImagePx, FixedFilePx)
 
 FixedImagePoints = NewType("FixedImagePoints", NDArray[np.float64])
 """(..., 2) positions in the reference image."""
-FixedFilePoints = NewType("FixedFilePoints", NDArray[np.float64])
-"""(..., 2) positions in the reference band's file."""
 MovingImagePoints = NewType("MovingImagePoints", NDArray[np.float64])
 """(..., 2) positions in the moving image."""
-MovingFilePoints = NewType("MovingFilePoints", NDArray[np.float64])
-"""(..., 2) positions in the moving band's file."""
 
 
 class PixelScale(NamedTuple):

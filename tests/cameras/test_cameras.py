@@ -53,7 +53,7 @@ INFO = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
 
 
 def tags(**camera: str) -> Tags:
-    exif = {"FocalPlaneXResolution": (266666667, 1000000), "FocalPlaneResolutionUnit": 4, "FocalLength": (55, 10)}
+    exif = {"FocalPlaneXResolution": 266.666667, "FocalPlaneResolutionUnit": 4, "FocalLength": 5.5}
     return Tags(make="MicaSense", xmp={(NAMESPACE, k): (v,) for k, v in camera.items()}, exif=exif)
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from agalign.cameras.metadata import Tags, rational, read_tags
+from agalign.cameras.metadata import Tags, finite, read_tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.xmp import Packet
 from agalign.errors import UnreadableFileError
@@ -67,15 +67,16 @@ def test_an_xml_bomb_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "expected"), [((1, 4), 0.25), (3, 3.0), ((1, 0), None), (None, None), ("x", None), (float("inf"), None)]
+    ("value", "expected"),
+    [(0.25, 0.25), (3, 3.0), ((1, 4), None), (None, None), ("x", None), (float("inf"), None)],
 )
-def test_rational(value: object, expected: float | None) -> None:
-    assert rational(value) == expected
+def test_a_finite_number(value: object, expected: float | None) -> None:
+    assert finite(value) == expected
 
 
 @pytest.mark.parametrize(("unit", "density"), [(4, 266.0), (3, 26.6), (2, 266 / 25.4), (5, 266_000.0), (9, None)])
 def test_pixel_density_by_unit(unit: int, density: float | None) -> None:
-    tags = Tags(exif={"FocalPlaneXResolution": (266, 1), "FocalPlaneResolutionUnit": unit})
+    tags = Tags(exif={"FocalPlaneXResolution": 266.0, "FocalPlaneResolutionUnit": unit})
     assert tags.pixels_per_mm == (None if density is None else pytest.approx(density))
 
 

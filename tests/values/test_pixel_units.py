@@ -14,7 +14,7 @@ from agalign.values import geometry
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 REJECTED = {
-    "a limit in fixed px and a distance in moving px": "FixedImagePx(1.0) >= MovingImagePx(0.5)",
+    "a limit in fixed px and a distance in moving px": "FixedFilePx(1.0) >= MovingFilePx(0.5)",
     "pixels of an image and of its file": "FixedFilePx(1.0) >= FixedImagePx(0.5)",
     "a sum over two grids": "FixedFilePx(1.0) + MovingFilePx(0.5)",
     "an alignment between images where one between files is written": "tie_points(band, between_images)",
@@ -27,7 +27,6 @@ from agalign.products.tie_points import tie_points
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx, FixedImagePoints, MovingFilePx, MovingImagePoints
-from agalign.values.pixel_units import MovingImagePx
 def fixed_only(points: FixedImagePoints) -> None: ...
 def check(band: Band, between_images: Alignment[FixedImagePx]) -> None:
 """
