@@ -23,12 +23,9 @@ from agalign.values.capture import Band, Pose
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 
-_PREFERRED_REFERENCES = ("green", "gre", "g")
 _GREEN_NM = 550.0
-_THERMAL = ("lwir", "thermal")
 _MIN_THERMAL_NM = 3000.0
 """Bands at shorter wavelengths record reflected sunlight."""
-_COLOURS = ("Red", "Green", "Blue")
 
 
 class Camera(ABC):
@@ -93,7 +90,7 @@ def default_reference(bands: Sequence[Band]) -> int:
     """
     reflective = [i for i, b in enumerate(bands) if not is_thermal(b)]
     for index in reflective:
-        if re.split(r"[-_ ]", bands[index].name.lower())[0] in _PREFERRED_REFERENCES:
+        if re.split(r"[-_ ]", bands[index].name.lower())[0] in ("green", "gre", "g"):
             return index
     known = [(abs(nm - _GREEN_NM), i) for i in reflective if (nm := bands[i].wavelength_nm) is not None]
     return min(known)[1] if known else next(iter(reflective), 0)
@@ -120,7 +117,7 @@ def listed(bands: Sequence[Band]) -> str:
 def is_thermal(band: Band) -> bool:
     """Return True for a thermal infrared band."""
     by_wavelength = band.wavelength_nm is not None and band.wavelength_nm >= _MIN_THERMAL_NM
-    return by_wavelength or band.name.lower().startswith(_THERMAL)
+    return by_wavelength or band.name.lower().startswith(("lwir", "thermal"))
 
 
 def rig_seed(reference: Band, moving: Band) -> Matrix | None:
@@ -166,7 +163,7 @@ def colour_bands(
     path: Path, info: RasterInfo, lens: Lens | None = None, to_rig: Matrix | None = None
 ) -> tuple[Band, ...]:
     """Return the bands of the colour photograph that a camera takes with its multispectral bands."""
-    names = [f"RGB {colour}" for colour in _COLOURS] if len(info.dtypes) >= 3 else ["RGB"]
+    names = ["RGB Red", "RGB Green", "RGB Blue"] if len(info.dtypes) >= 3 else ["RGB"]
     return tuple(
         replace(band_of(path, info, name, i), lens=lens, to_rig=to_rig, one_lens=True, companion=True)
         for i, name in enumerate(names, start=1)

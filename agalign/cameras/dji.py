@@ -45,7 +45,6 @@ _MAX_UPRIGHT_ROLL_DEG = 90.0
 """Larger gimbal rolls mean upside down: gimbals write a roll near 0 or near 180 degrees."""
 _FULL_SCALE = 65536.0
 """Pixel values are divided by this in DJI's guide: bands are stored as 16 bits."""
-_SPEED = "FlightXSpeed", "FlightYSpeed", "GimbalYawDegree", "RelativeAltitude"
 _VIGNETTING: Name = (_DJI, "VignettingData")
 _TO_COLOUR: Name = (_DJI, "DewarpHMatrix")
 
@@ -131,7 +130,8 @@ class Dji(Camera):
         """Calculate the motion from the speed over ground (north, east, m/s), the heading of the image's upper edge and
         the height above the take-off point.
         """
-        north, east, yaw_deg, height_m = (tags.number(_DJI, name) for name in _SPEED)
+        names = "FlightXSpeed", "FlightYSpeed", "GimbalYawDegree", "RelativeAltitude"
+        north, east, yaw_deg, height_m = (tags.number(_DJI, name) for name in names)
         if north is None or east is None or yaw_deg is None or height_m is None or height_m <= 0:
             return None
         yaw = math.radians(_heading_deg(tags, yaw_deg))

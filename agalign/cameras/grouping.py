@@ -19,11 +19,6 @@ from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.choices import BandOrder
 from agalign.values.files import RUN_FILE
 
-_MIN_BANDS = 2
-"""The reference and a band to align to it."""
-_NAMELESS = "capture"
-"""Name of a capture if the names of its files contain only the band, such as `_1.tif`."""
-
 _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""
 _CameraKey = tuple[str, ...]
@@ -153,7 +148,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
     camera = camera_of(tags)
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
     return Capture(
-        name=(first.path.stem if len(files) == 1 else first.camera.capture_name(first.path)) or _NAMELESS,
+        name=(first.path.stem if len(files) == 1 else first.camera.capture_name(first.path)) or "capture",
         folder=_relative_folder(first.camera.capture_folder(first.path), folder),
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),
@@ -176,22 +171,17 @@ def _tags_of(reference: Band, files: Sequence[ImageFile]) -> Tags:
 
 
 def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Band]:
-    """The bands with these names, or all without names. Raises InputError if there is nothing to align."""
+    """The bands with these names, ignoring case, or all. Raises InputError if there is nothing to align."""
     first = files[0]
-    bands = _with_names([b for file in files for b in file.bands], names)
-    if len(bands) < _MIN_BANDS and names:
+    wanted = {name.lower() for name in names}
+    bands = [b for file in files for b in file.bands if not wanted or b.name.lower() in wanted]
+    if len(bands) < 2 and names:
         raise InputError(f"{first.path}: of this capture, --bands leaves {listed(bands) or 'nothing'}")
-    if len(bands) < _MIN_BANDS:
+    if len(bands) < 2:
         raise InputError(f"{first.path}: a band with no companion; name files '<capture>_<band>.tif' or give --pattern")
     if len(files) == 1 and first.bands[0].one_lens:
         raise InputError(f"{first.path}: its bands come through one lens; there is nothing to align")
     return bands
-
-
-def _with_names(bands: list[Band], names: Sequence[str]) -> list[Band]:
-    """The bands with these names, ignoring case; all without names."""
-    wanted = {name.lower() for name in names}
-    return [b for b in bands if b.name.lower() in wanted] if wanted else bands
 
 
 def _in_order(bands: Sequence[Band], order: BandOrder) -> list[Band]:

@@ -38,9 +38,6 @@ class Mapir(Camera):
         name = next((n for longest_nm, n in _NAMES if wavelength_nm <= longest_nm), f"{wavelength_nm:g}nm")
         return (replace(band_of(path, info, name), wavelength_nm=wavelength_nm),)
 
-    def capture_key(self, path: Path, tags: Tags) -> str:
-        return self.capture_name(path)
-
     def capture_name(self, path: Path) -> str:
         file = _FILE.match(path.stem)
         return f"capture_{file['moment']}" if file else path.stem

@@ -30,7 +30,6 @@ _MAX_RAY_TAN = 3.0
 """Tangent of the largest angle from the axis: 72 degrees, beyond the corners of any Sequoia."""
 _CORNER_MARGIN = 1.1
 """The distortion is fitted up to this multiple of the corners' distance, so that it is accurate at the border."""
-_FIT_SAMPLES = 1000
 _MAX_SHEAR = 1e-3
 """Limit of D and E relative to C: `Lens` has no shear, so that the lens is not used beyond it."""
 _POLYNOMIAL: Name = (pix4d.NAMESPACE, "FisheyePolynomial")
@@ -101,7 +100,7 @@ def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
         theta = 2 / math.pi * np.arctan(r)
         return np.asarray(np.polynomial.polynomial.polyval(theta, polynomial) * math.pi / (2 * slope))
 
-    rays = np.linspace(0.0, _MAX_RAY_TAN, _FIT_SAMPLES)
+    rays = np.linspace(0.0, _MAX_RAY_TAN, 1000)
     corner_ray = np.interp(corner_distance, distorted(rays), rays)
     return Lens(fx, fy, cx, cy, radial_coefficients(distorted, _CORNER_MARGIN * float(corner_ray)))
 

@@ -102,8 +102,11 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     *_, generic = cameras
     camera = generic if _is_stack(path, info) else next(c for c in cameras if c.recognises(tags))
     panel = panel_in(tags, (info.width_px, info.height_px))
-    bands = (replace(b, panel=panel) for b in camera.bands(path, tags, info) if options.with_rgb or not b.companion)
-    return ImageFile(path, camera, tags, tuple(_without_impossible_values(b) for b in bands))
+    bands = [replace(b, panel=panel) for b in camera.bands(path, tags, info) if options.with_rgb or not b.companion]
+    for i, band in enumerate(bands):
+        if band.radiometry is not None and not is_physical(band.radiometry, band.size_px):  # damaged tags
+            bands[i] = replace(band, radiometry=None)
+    return ImageFile(path, camera, tags, tuple(bands))
 
 
 def _read_in_processes(
@@ -118,15 +121,11 @@ def _read_in_processes(
             try:
                 finished[outcome.number] = outcome.value()
             except WorkerDiedError:
-                finished[outcome.number] = [Problem(path, _killed(path)) for path in outcome.argument]
+                what = "reading it, or a file read together with it, killed the process; take it out of the folder"
+                finished[outcome.number] = [Problem(p, UnreadableFileError(f"{p}: {what}")) for p in outcome.argument]
             while next_task in finished:
                 yield from finished.pop(next_task)
                 next_task += 1
-
-
-def _killed(path: Path) -> UnreadableFileError:
-    what = "reading it, or a file read together with it, killed the process"
-    return UnreadableFileError(f"{path}: {what}; take it out of the folder")
 
 
 def _read_task(paths: Sequence[Path], options: DiscoverOptions) -> list[ImageFile | Problem]:
@@ -138,13 +137,6 @@ def _read_task(paths: Sequence[Path], options: DiscoverOptions) -> list[ImageFil
         except UnreadableFileError as error:
             result.append(Problem(path, error))
     return result
-
-
-def _without_impossible_values(band: Band) -> Band:
-    """The band, without a radiometric calibration whose values are impossible because of damaged tags."""
-    if band.radiometry is None or is_physical(band.radiometry, band.size_px):
-        return band
-    return replace(band, radiometry=None)
 
 
 def _is_stack(path: Path, info: RasterInfo) -> bool:

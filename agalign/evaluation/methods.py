@@ -82,8 +82,12 @@ def method_named(name: str) -> Method:
 
     Raises ConfigurationError for other names, InputError for a file that cannot be used.
     """
-    fixed_names: dict[str, Method] = {"sift": _sift, "daisy": _daisy, "elastix": _elastix}
-    if name in _MODULES and importlib.util.find_spec(_MODULES[name]) is None:
+    fixed_names: dict[str, Method] = {
+        "sift": lambda task: _from_patches(task, 64, sift_of_patches),
+        "daisy": lambda task: _from_patches(task, 64, daisy_of_patches),
+        "elastix": _elastix,
+    }
+    if name == "elastix" and importlib.util.find_spec("itk") is None:
         raise ConfigurationError(f"{name} needs more than is installed; pip install 'agalign[evaluate]'")
     if name in fixed_names:
         return fixed_names[name]
@@ -100,9 +104,6 @@ def method_named(name: str) -> Method:
     raise ConfigurationError(
         f"unknown method '{name}'; choose from sift, daisy, elastix, fast:SHARING, paper:SHARING, or a network file"
     )
-
-
-_MODULES = {"elastix": "itk"}
 
 
 # ---- descriptors of agalign
@@ -176,17 +177,8 @@ def _from_patches(task: PairTask, side: int, describe_patches: Callable[[Tensor]
     return Outcome(describe)
 
 
-_HAND_MADE_SIDE = 64
 _MARGIN_SHARE = 8
 """SIFT's outer cells extend beyond the edge of a patch by an eighth of its side."""
-
-
-def _sift(task: PairTask) -> Outcome:
-    return _from_patches(task, _HAND_MADE_SIDE, sift_of_patches)
-
-
-def _daisy(task: PairTask) -> Outcome:
-    return _from_patches(task, _HAND_MADE_SIDE, daisy_of_patches)
 
 
 def _mosaic(patches: Tensor) -> tuple[NDArray[np.float32], int, int]:

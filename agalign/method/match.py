@@ -3,6 +3,7 @@
 """
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -89,7 +90,7 @@ def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MA
         return None
     f = net(image.patches(patch_positions(keypoints)), REFERENCE)
     # Reversed contrast turns the gradient, and with it the orientation of a keypoint, by 180 degrees.
-    orientations = [_rotated(keypoints_prime, angle) for angle in (0.0, torch.pi)]
+    orientations = [replace(keypoints_prime, angle=keypoints_prime.angle + turn) for turn in (0.0, torch.pi)]
     f_prime = torch.cat([net(image_prime.patches(patch_positions(k)), 1) for k in orientations])
     rows, columns = _mutual_nearest(f, f_prime, len(keypoints_prime))
     if len(rows) < _MIN_MATCHES:
@@ -115,10 +116,6 @@ def _keypoints(raster: Raster, device: torch.device, maximum: int) -> tuple[Leve
     undistorted = Keypoints(xy, raw.angle, raw.scale).to(device)
     rows = (image.clearance_at(undistorted.xy) > footprint_radius(undistorted.scale)).nonzero()[:, 0]
     return image, undistorted[rows]
-
-
-def _rotated(keypoints: Keypoints, angle: float) -> Keypoints:
-    return Keypoints(keypoints.xy, keypoints.angle + angle, keypoints.scale)
 
 
 def _mutual_nearest(f: Tensor, f_prime: Tensor, count: int) -> tuple[Tensor, Tensor]:

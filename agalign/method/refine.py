@@ -254,7 +254,8 @@ def refine(
             return Issue(FEW_KEYPOINTS, error.keypoints, error.minimum)
         except GeometryError:
             return Issue(NOT_INVERTIBLE)
-        std = _complete_std(step)
+        s = _SYSTEMATIC_STD_PX
+        std = tuple((math.hypot(x, s), math.hypot(y, s)) for x, y in step.corner_std_xy_px)
         if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
             return Issue(CORNERS_UNKNOWN)
         held_out, chance = held_out_retrieval(band, homography, test, f_test)
@@ -267,12 +268,6 @@ def refine(
         else result(MovingBand(net, level, b, side), h[b])
         for b, side in enumerate(group.sides)
     ]
-
-
-def _complete_std(step: Step) -> tuple[tuple[float, float], ...]:
-    """Return the standard errors (x, y) of the corners with the systematic part."""
-    s = _SYSTEMATIC_STD_PX
-    return tuple((math.hypot(x, s), math.hypot(y, s)) for x, y in step.corner_std_xy_px)
 
 
 def _complete_covariance(step: Step) -> NDArray[np.float64] | None:

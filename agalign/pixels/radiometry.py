@@ -20,7 +20,6 @@ from agalign.values.image import FloatImage
 
 _MAX_FALLOFF = 1000.0
 """Maximum correction of the vignetting and the row gradient."""
-_MAX_LOG_FALLOFF = np.log(_MAX_FALLOFF)
 _MAX_RAW = 65535.0
 """Of 16-bit sensors."""
 _MAX_VALUE = 1e12
@@ -52,7 +51,7 @@ def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
         by_row = 1.0 + radiometry.row_gradient * np.array([0.0, height])
         max_value = radiometry.gain / radiometry.full_scale * factor * _MAX_RAW
     return bool(
-        (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < _MAX_LOG_FALLOFF).all()
+        (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < np.log(_MAX_FALLOFF)).all()
         and (by_row > 1 / _MAX_FALLOFF).all()
         and max_value < _MAX_VALUE
     )

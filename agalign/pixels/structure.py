@@ -71,15 +71,6 @@ class Peak:
     """Height at zero shift."""
 
 
-def correlation_surface(fixed: Field, moving: Field) -> NDArray[np.float32]:
-    """Return the circular correlation of two fields (height, width) under a Hann window; index [dy, dx] is the shift.
-
-    The cross spectrum is divided by the square root of its magnitude: half-way between cross correlation (not divided)
-    and phase correlation (divided by the magnitude).
-    """
-    return correlation_surfaces(windowed_spectra(fixed), windowed_spectra(moving))
-
-
 def windowed_spectra(fields: Field) -> Field:
     """Return the Fourier transform of fields (..., height, width) under a Hann window."""
     height, width = fields.shape[-2:]
@@ -107,7 +98,11 @@ def _each_plane(transform: Callable[[FloatImage], FloatImage], fields: Field) ->
 
 
 def correlation_surfaces(fixed: Field, moving: Field) -> NDArray[np.float32]:
-    """Return the `correlation_surface` of each pair of `windowed_spectra`, (..., height, width)."""
+    """Return the circular correlation of each pair of `windowed_spectra`, (..., height, width); [dy, dx] is the shift.
+
+    The cross spectrum is divided by the square root of its magnitude: half-way between cross correlation (not divided)
+    and phase correlation (divided by the magnitude).
+    """
     return np.asarray(inverse_transform(whitened_cross_spectra(fixed, moving)).real)
 
 
@@ -131,16 +126,12 @@ def peak_positions(cross: Field, near_px: NDArray[np.float64]) -> NDArray[np.flo
     height, width = cross.shape[-2:]
     result = near_px.copy()
     offset = np.array([-1.0, 0.0, 1.0])
-    for step in _REFINEMENT_STEPS_PX:
+    for step in (0.5, 0.25):  # spacings in px
         x, y = (result[:, axis, None] + step * offset for axis in (0, 1))
         rows = _fourier_basis(y, height) @ cross
         patches = (rows @ _fourier_basis(x, width).transpose(0, 2, 1)).real
         result += step * paraboloid_peaks(patches.astype(np.float64))
     return result
-
-
-_REFINEMENT_STEPS_PX = (0.5, 0.25)
-"""Spacings of the points at which a surface is evaluated."""
 
 
 def _fourier_basis(positions_px: NDArray[np.float64], length: int) -> Field:

@@ -2,8 +2,6 @@
 
 import unicodedata
 
-_FORMULA = ("=", "+", "-", "@")
-
 
 def counted(number: int, what: str) -> str:
     """Return a number with its noun: 1 capture, 2 captures."""
@@ -16,7 +14,9 @@ def harmless(text: str) -> str:
     """
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else _written_out(c) for c in text)
+    is_safe = [c.isprintable() or unicodedata.category(c) == "Zs" for c in text]
+    escaped = (c if safe else c.encode("unicode_escape").decode() for c, safe in zip(text, is_safe, strict=True))
+    return "".join(escaped)
 
 
 def without_controls(text: str) -> str:
@@ -29,8 +29,4 @@ def without_formula(value: object) -> object:
     if not isinstance(value, str):
         return value
     text = harmless(value)
-    return f"'{text}" if text.startswith(_FORMULA) else text
-
-
-def _written_out(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
