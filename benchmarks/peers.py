@@ -26,10 +26,9 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import best_seed
 from agalign.errors import AgalignError
 from agalign.evaluation.methods import elastix_affinity
-from agalign.method.detect import to_8_bit
-from agalign.pixels.grey import luma
+from agalign.method.match import to_8_bit
 from agalign.pixels.masks import raster_of
-from agalign.pixels.resample import warped
+from agalign.pixels.resample import luma, warped
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.geometry import Matrix

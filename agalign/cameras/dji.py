@@ -118,13 +118,8 @@ class Dji(Camera):
         if yaw_deg is None or pitch_deg is None:
             return None
         height_m = tags.number(_DJI, "RelativeAltitude")
-        return Pose(
-            _heading_deg(tags, yaw_deg),
-            pitch_deg + 90,
-            0.0,
-            height_m if height_m and height_m > 0 else None,
-            tags.number(*_FOCAL_LENGTH_PX),
-        )
+        height_m = height_m if height_m and height_m > 0 else None
+        return Pose(_heading_deg(tags, yaw_deg), pitch_deg + 90, 0.0, height_m, tags.number(*_FOCAL_LENGTH_PX))
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Calculate the motion from the speed over ground (north, east, m/s), the heading of the image's upper edge and

@@ -18,8 +18,8 @@ from agalign.values.text import without_controls
 
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
-_MAX_LATITUDE_DEG, _MAX_LONGITUDE_DEG, _MAX_ALTITUDE_M = 90.0, 180.0, 20_000.0
-"""Positions beyond these limits come from damaged tags."""
+_MAX_ALTITUDE_M = 20_000.0
+"""Altitudes beyond it come from damaged tags."""
 _MAX_TEXT_LENGTH = 200
 """Makes, models and serial numbers are shorter; a damaged tag may contain megabytes."""
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -117,8 +117,8 @@ def read_tags(path: Path) -> Tags:
 
 def _position(gps: Mapping[str, Any]) -> Position | None:
     """The position in a GPS directory; None without a fix, for which cameras write no coordinates or zeros."""
-    latitude_deg = _signed_degrees(gps, "Latitude", "S", _MAX_LATITUDE_DEG)
-    longitude_deg = _signed_degrees(gps, "Longitude", "W", _MAX_LONGITUDE_DEG)
+    latitude_deg = _signed_degrees(gps, "Latitude", "S", 90.0)
+    longitude_deg = _signed_degrees(gps, "Longitude", "W", 180.0)
     if latitude_deg is None or longitude_deg is None or latitude_deg == longitude_deg == 0:
         return None
     return Position(latitude_deg, longitude_deg, _altitude_m(gps))

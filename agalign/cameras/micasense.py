@@ -94,7 +94,8 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     time t and row y; reflectance = pi L / E with the irradiance E of the light sensor on a horizontal plane.
     """
     a = tags.numbers(*_CALIBRATION)
-    exposure_s, iso = finite(tags.exif.get("ExposureTime")), _iso(tags)
+    exposure_s = finite(tags.exif.get("ExposureTime"))
+    iso = finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
     if len(a) != 3 or not exposure_s or tags.black_level is None or not iso:
         return None
     irradiance = _irradiance(tags)
@@ -111,13 +112,6 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         a[1] / exposure_s - a[2],
         (math.pi / irradiance, "reflectance") if irradiance else None,
     )
-
-
-def _iso(tags: Tags) -> int | None:
-    """The ISO speed; versions of EXIF have different names for it."""
-    values = (tags.exif[n] for n in ("ISOSpeed", "ISOSpeedRatings", "PhotographicSensitivity") if n in tags.exif)
-    value = next(values, None)
-    return value if isinstance(value, int) else None
 
 
 def _irradiance(tags: Tags) -> float | None:

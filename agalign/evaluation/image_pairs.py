@@ -17,8 +17,6 @@ from agalign.values.image import Raster
 
 _HPATCHES_LEVELS = {2: "easy", 3: "easy", 4: "hard", 5: "hard", 6: "tough"}
 """Difficulty by the number of the second image."""
-_HPATCHES_KINDS = {"i": "illumination", "v": "viewpoint"}
-_IMAGE_TYPES = (".ppm", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
 
 
 @dataclass(frozen=True)
@@ -60,13 +58,13 @@ def _from_folder(folder: Path) -> Iterator[PairFiles]:
         number = int(re.sub(r"\D", "", path.name.removeprefix("H_1_").removeprefix("H1to")) or 0)
         hpatches = path.name.startswith("H_")
         fixed, moving = (_image(folder, str(k) if hpatches else f"img{k}") for k in (1, number))
-        kind = _HPATCHES_KINDS.get(folder.name.partition("_")[0]) if hpatches else None
+        kind = {"i": "illumination", "v": "viewpoint"}.get(folder.name.partition("_")[0]) if hpatches else None
         group = f"{kind}, {_HPATCHES_LEVELS.get(number, 'tough')}" if kind else folder.name
         yield PairFiles(f"{folder.name} 1-{number}", group, fixed, moving, _read_homography(path))
 
 
 def _image(folder: Path, stem: str) -> Path:
-    for suffix in _IMAGE_TYPES:
+    for suffix in (".ppm", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"):
         if (folder / f"{stem}{suffix}").is_file():
             return folder / f"{stem}{suffix}"
     raise InputError(f"{folder}: has a homography for {stem} but no such image")

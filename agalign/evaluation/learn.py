@@ -27,19 +27,11 @@ from agalign.method.patches import Keypoints, far_apart, patch_positions
 from agalign.method.refine import MovingBand
 from agalign.method.state import ImageGroup, JointState
 from agalign.values import geometry
+from agalign.values.alignment import Alignment
 from agalign.values.geometry import Matrix
+from agalign.values.pixel_units import FixedImagePx
 
 _MIN_KEYPOINTS = 2
-_MOVING_BAND = "moving"
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """Result of aligning a training pair; the network is trained on pairs with status `aligned`."""
-
-    name: str
-    status: str
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -54,9 +46,11 @@ def learn_descriptor(
     settings: Settings,
     *,
     steps_a_pair: int = 200,
-    on_pair: Callable[[Lesson], None] = lambda _: None,
+    on_pair: Callable[[str, Alignment[FixedImagePx]], None] = lambda *_: None,
 ) -> FlightModel:
     """Return a model with one network for all pairs, which must have the same numbers of channels.
+
+    `on_pair` gets the name and the alignment of each pair; the network is trained on those with status `aligned`.
 
     Raises InputError if no pair can be aligned or their channels differ.
     """
@@ -68,7 +62,7 @@ def learn_descriptor(
     with one_thread(), one_memory_error():
         for pair in pairs:
             result = align_pairs([pair], settings, lambda *_: None)[pair.name]
-            on_pair(Lesson(pair.name, result.status, result.reason or ""))
+            on_pair(pair.name, result)
             if result.status == "aligned":
                 with suppress(NoContrastError, NotEnoughTextureError):
                     examples.append(_example(state, pair, result.fixed_to_moving))
@@ -77,7 +71,7 @@ def learn_descriptor(
         net = state.fast_descriptor([*channels.pop()])
         _learn(net, examples, state, steps_a_pair * len(examples))
     weights = (value.cpu().numpy() for value in net.state_dict().values())
-    return FlightModel(net, "", (_MOVING_BAND,), {}, hashed(*weights))
+    return FlightModel(net, "", ("moving",), {}, hashed(*weights))
 
 
 def _example(state: JointState, pair: BandPair, fixed_to_moving: Matrix) -> _Example:
@@ -120,8 +114,7 @@ def read_rough_pairs(source: Path) -> list[BandPair]:
     result = []
     for files in find_pairs(source):
         fixed, moving = read_image(files.fixed), read_image(files.moving)
-        start = files.fixed_to_moving
-        if start is None:
-            start = geometry.overlay(fixed.size_px, moving.size_px)
+        known = files.fixed_to_moving
+        start = geometry.overlay(fixed.size_px, moving.size_px) if known is None else known
         result.append(BandPair.of_images(files.name, fixed, moving, {"user": start}))
     return result

@@ -32,16 +32,9 @@ def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
     It is finite, its gain is positive, and the corrections of the corners and of the last row are below _MAX_FALLOFF.
     """
     factor, _ = radiometry.by_sun or (1.0, None)
-    numbers = (
-        radiometry.black_level,
-        radiometry.full_scale,
-        radiometry.gain,
-        factor,
-        radiometry.row_gradient,
-        *radiometry.vignetting,
-        *radiometry.vignetting_centre_px,
-    )
-    if not np.isfinite(numbers).all() or min(radiometry.gain, radiometry.full_scale, factor) <= 0:
+    positive = radiometry.gain, radiometry.full_scale, factor
+    of_position = radiometry.row_gradient, *radiometry.vignetting, *radiometry.vignetting_centre_px
+    if not np.isfinite([radiometry.black_level, *positive, *of_position]).all() or min(positive) <= 0:
         return False
     width, height = size_px
     cx, cy = radiometry.vignetting_centre_px

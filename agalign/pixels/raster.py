@@ -35,22 +35,19 @@ JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 PNG_SUFFIXES = frozenset({".png"})
 PICTURE_SUFFIXES = JPEG_SUFFIXES | PNG_SUFFIXES
 """Photographs, or bands exported by other software, mostly in 8 bits."""
-_BLOCK_CACHE_BYTES = 256 * 2**20
-"""Limit of GDAL's block cache per worker; the default is 5 % of the machine's memory. rasterio reads it as bytes."""
 GDAL_ENVIRONMENT = {
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_NUM_THREADS": "ALL_CPUS",
-    "GDAL_CACHEMAX": _BLOCK_CACHE_BYTES,
+    "GDAL_CACHEMAX": 256 * 2**20,
 }
-"""GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
+"""The block cache is limited per worker, in bytes; the default is 5 % of the machine's memory.
+
+GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
 description that refers to other files or to a server.
 """
 _DRIVERS = {
-    b"II*\0": "GTiff",
-    b"MM\0*": "GTiff",
-    b"II+\0": "GTiff",
-    b"MM\0+": "GTiff",
+    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "GTiff"),
     b"\xff\xd8\xff": "JPEG",
     b"\x89PNG": "PNG",
 }

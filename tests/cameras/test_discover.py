@@ -13,9 +13,8 @@ from PIL import Image
 from agalign.cameras import metadata
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.generic import Generic
-from agalign.cameras.grouping import with_missing_bands
+from agalign.cameras.grouping import with_missing_bands, with_unique_band_names
 from agalign.cameras.metadata import read_tags
-from agalign.cameras.naming import with_unique_band_names
 from agalign.cameras.tiff_directory import EXIF, add_directories, rational, read_directories, text
 from agalign.errors import InputError, NoSuchBandError
 from agalign.synthetic import flight as synthetic

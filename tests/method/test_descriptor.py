@@ -9,11 +9,9 @@ from torch import nn
 
 from agalign.config import JointSettings
 from agalign.errors import ConfigurationError
-from agalign.method.adam import Adam
-from agalign.method.descriptor import REFERENCE, Descriptor, distance, retrieval
-from agalign.method.fast import in_batch_loss
+from agalign.method.descriptor import REFERENCE, Descriptor, distance, retrieval, start_from, start_from_starter
+from agalign.method.fast import Adam, in_batch_loss
 from agalign.method.paper import contrastive_loss
-from agalign.method.starter import start_from, start_from_starter
 from agalign.method.state import JointState, ThetaStart
 from agalign.values.choices import Sharing
 

@@ -11,11 +11,10 @@ import rasterio
 
 import agalign
 from agalign.pixels.stripes import without_common_stripes
-from agalign.pixels.structure import Peak, correlation_surface, find_peak, structure_field
+from agalign.pixels.structure import Peak, correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.synthetic.cameras import REDEDGE
-from agalign.synthetic.flight import Shot, plan_flight, write_shots
+from agalign.synthetic.flight import Shot, plan_flight, score_against_truth, write_shots
 from agalign.synthetic.ground import Field
-from agalign.synthetic.score import score_against_truth
 from agalign.values.image import Raster
 
 from ..builders import whole
@@ -53,7 +52,7 @@ def striped(images: Sequence[Raster], *patterns: np.ndarray) -> list[Raster]:
 
 
 def peak(fixed: Raster, moving: Raster) -> Peak:
-    return find_peak(correlation_surface(structure_field(fixed), structure_field(moving)), 16)
+    return find_peak(correlation_surfaces(*(windowed_spectra(structure_field(image)) for image in (fixed, moving))), 16)
 
 
 def is_same(one: Sequence[Raster], other: Sequence[Raster]) -> bool:

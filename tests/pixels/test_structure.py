@@ -3,7 +3,13 @@ import numpy as np
 import pytest
 
 from agalign.pixels.resample import shrink, textured
-from agalign.pixels.structure import correlation_surface, find_peak, gradient_magnitude, structure_field
+from agalign.pixels.structure import (
+    correlation_surfaces,
+    find_peak,
+    gradient_magnitude,
+    structure_field,
+    windowed_spectra,
+)
 from agalign.values.image import Raster
 
 from ..builders import texture, whole
@@ -23,7 +29,7 @@ def test_the_peak_is_at_the_shift(shift: tuple[float, float]) -> None:
     moved = -cv2.warpAffine(big, matrix, (480, 400), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP)
     crop = np.s_[80:320, 80:400]
     fields = [structure_field(whole(i[crop])) for i in (big, moved)]
-    peak = find_peak(correlation_surface(*fields), 16)
+    peak = find_peak(correlation_surfaces(*map(windowed_spectra, fields)), 16)
     # With cv2.WARP_INVERSE_MAP, moved(p) = big(p - shift): content at p is moved to p + shift.
     np.testing.assert_allclose(peak.shift_px, shift, atol=0.15)
     assert peak.sigma > 3 * peak.runner_up_sigma
@@ -31,7 +37,7 @@ def test_the_peak_is_at_the_shift(shift: tuple[float, float]) -> None:
 
 def test_unrelated_images_have_no_significant_peak() -> None:
     fields = [structure_field(texture(320, 240, s)) for s in (1, 2)]
-    peak = find_peak(correlation_surface(*fields), 16)
+    peak = find_peak(correlation_surfaces(*map(windowed_spectra, fields)), 16)
     assert peak.sigma < 8
     assert peak.sigma < 1.4 * peak.runner_up_sigma
 
