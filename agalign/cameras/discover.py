@@ -16,7 +16,8 @@ from agalign.cameras.grouping import (
     with_missing_bands,
     with_unique_capture_names,
 )
-from agalign.cameras.read_files import DiscoverOptions, ImageFile, Problem, natural_order, read_files
+from agalign.cameras.read_files import ImageFile, Problem, natural_order, read_files
+from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, NoSuchBandError
 from agalign.pixels.raster import PICTURE_SUFFIXES, TIFF_SUFFIXES
 from agalign.values.capture import Capture

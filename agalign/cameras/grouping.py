@@ -12,7 +12,8 @@ from agalign.cameras import camera_of
 from agalign.cameras.base import listed, reference_index
 from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import Tags
-from agalign.cameras.read_files import DiscoverOptions, ImageFile, Problem, natural_order
+from agalign.cameras.read_files import ImageFile, Problem, natural_order
+from agalign.config import DiscoverOptions
 from agalign.errors import InputError
 from agalign.pixels.raster import TIFF_SUFFIXES
 from agalign.values.capture import Band, CameraIdentity, Capture

@@ -11,41 +11,13 @@ from agalign.cameras import known_cameras
 from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
+from agalign.config import DiscoverOptions
 from agalign.errors import AgalignError, UnreadableFileError
 from agalign.pixels.radiometry import is_physical
 from agalign.pixels.raster import TIFF_SUFFIXES, RasterInfo, probe
 from agalign.values.capture import Band
-from agalign.values.choices import MAX_PIXELS, BandOrder
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
 from agalign.values.processes import follow_parent
-
-
-@dataclass(frozen=True)
-class DiscoverOptions:
-    """Options of `discover`."""
-
-    pattern: str | None = None
-    """Pattern of file names of other cameras, as '{capture}_{band}.tif'."""
-    reference: str | None = None
-    """Name of the reference band; None for the default of the camera."""
-    ignore_metadata: bool = False
-    """Ignore lens and rig tags."""
-    with_rgb: bool = False
-    """Include the colour photographs that some cameras take with each multispectral capture, as three bands."""
-    bands: tuple[str, ...] = ()
-    """Names of the bands to include; empty for all."""
-    order: BandOrder = "index"
-    """Order of the bands in the stacks: as numbered by the camera, by wavelength, or by name."""
-    skip: tuple[Path, ...] = ()
-    """Folders to leave out, such as the output folder."""
-    max_pixels: int = MAX_PIXELS
-    """Images with more pixels are refused before they are read."""
-    jobs: int = 1
-    """Processes that read the tags of many files; with more than one the calling script must be importable."""
-    include: tuple[str, ...] = ()
-    """Globs of the files to use, by path below the folder or by name; empty for all."""
-    exclude: tuple[str, ...] = ()
-    """Globs of the files to leave out."""
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ def _demo(
     from agalign.batch import CaptureReport, prepare_output
     from agalign.cli.run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
-    from agalign.synthetic.score import make_flight, score_against_truth
+    from agalign.synthetic.flight import make_flight, score_against_truth
 
     source, target = out / "flight", out / "aligned"
     prepare_output(source)

@@ -118,8 +118,10 @@ def _learn(
     from pydantic import ValidationError
 
     from agalign.config import JointSettings, Settings
-    from agalign.evaluation.learn import Lesson, learn_descriptor, read_rough_pairs
+    from agalign.evaluation.learn import learn_descriptor, read_rough_pairs
     from agalign.flight.model import save_model
+    from agalign.values.alignment import Alignment
+    from agalign.values.pixel_units import FixedImagePx
 
     try:
         joint = JointSettings.model_validate({**given["settings"]["joint"], "sharing": sharing})
@@ -127,11 +129,12 @@ def _learn(
         raise ConfigurationError(f"'{sharing}' is unknown; choose from siamese, pseudo-siamese, unshared") from None
     aligned = 0
 
-    def on_pair(lesson: Lesson) -> None:
+    def on_pair(name: str, result: Alignment[FixedImagePx]) -> None:
         nonlocal aligned
-        aligned += lesson.status == "aligned"
-        text = f"{lesson.name}: {lesson.status}" + (f" ({lesson.reason})" if lesson.reason else "")
-        terminal.event("pair", text if terminal.verbose or lesson.status != "aligned" else "", **vars(lesson))
+        aligned += result.status == "aligned"
+        text = f"{name}: {result.status}" + (f" ({result.reason})" if result.reason else "")
+        text = text if terminal.verbose or result.status != "aligned" else ""
+        terminal.event("pair", text, name=name, status=result.status, reason=result.reason or "")
 
     settings = Settings(joint=joint)
     result = read_rough_pairs(pairs)

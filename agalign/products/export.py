@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras import known_cameras
-from agalign.cameras.folder_walk import natural_order
-from agalign.cameras.read_files import ImageFile, read_file
+from agalign.cameras.read_files import ImageFile, natural_order, read_file
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.products.run_record import read_run_record

@@ -16,7 +16,7 @@ from agalign.capture.prediction import observed
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
-from agalign.synthetic.score import score_against_truth
+from agalign.synthetic.flight import score_against_truth
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band

@@ -16,12 +16,13 @@ from agalign.products.index_bands import bands_of
 from agalign.products.index_rasters import write_rasters
 from agalign.products.indices import index_named, index_of_formula
 from agalign.products.layout import Layer
-from agalign.products.quality_raster import MEANINGS, UNUSABLE, Quality, _flags
+from agalign.products.quality_raster import _flags
 from agalign.products.sidecar_file import read_result
 from agalign.values import geometry
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
+from agalign.values.quality import MEANINGS, UNUSABLE, Quality
 
 from .test_outputs import write_band
 
