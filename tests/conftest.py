@@ -1,15 +1,25 @@
-"""Scenes that the tests generate, and the way to the real captures where they are present."""
+"""Scenes that tests generate, outputs that all tests of a run share, and the path of the real captures."""
 
+import json
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
+import hypothesis
 import numpy as np
 import pytest
+import rasterio
+from filelock import FileLock
 from threadpoolctl import threadpool_limits
 
+from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
+
+from .program import agalign
 
 # Each worker has a core of its own. Torch, which nothing above loads, and the programs that tests start read the
 # variable; OpenCV and the libraries of numpy are loaded.
@@ -28,12 +38,118 @@ def real_data() -> Path:
     return REAL_DATA
 
 
+hypothesis.settings.register_profile("short", max_examples=20)
+hypothesis.settings.register_profile("full", max_examples=150)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """More examples are tried in the run of all tests."""
+    hypothesis.settings.load_profile("short" if config.option.markexpr else "full")
+
+
+Shared = Callable[[str, Callable[[Path], object]], Path]
+
+
 @pytest.fixture(scope="session")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A synthetic flight of two small captures; truth.json lies beside the images."""
-    folder = tmp_path_factory.mktemp("flight")
-    synthetic.make_flight(folder, captures=2, size_px=(480, 360), rng_seed=3)
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
+    """Call with a name and a function: the folder of this name, filled by the function once per run of pytest.
+
+    All xdist workers read the same folder, so tests must not change it.
+    """
+    base = tmp_path_factory.getbasetemp()
+    root = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    root.mkdir(exist_ok=True)
+
+    def folder(name: str, fill: Callable[[Path], object]) -> Path:
+        path, is_filled = root / name, root / f"{name}.filled"
+        with FileLock(root / f"{name}.lock"):
+            if not is_filled.exists():
+                shutil.rmtree(path, ignore_errors=True)
+                path.mkdir()
+                fill(path)
+                is_filled.touch()
+        return path
+
     return folder
+
+
+@pytest.fixture(scope="session")
+def flight(shared: Shared) -> Path:
+    """A synthetic flight of two small captures, with truth.json next to the images."""
+    return shared("flight", lambda folder: synthetic.make_flight(folder, captures=2, size_px=(480, 360), rng_seed=3))
+
+
+@pytest.fixture(scope="session")
+def aligned_flight(shared: Shared, flight: Path) -> Path:
+    """`flight` aligned with the default settings: its stacks, sidecars, report and model; the log is next to it."""
+
+    def align(folder: Path) -> None:
+        done = agalign(flight, "-o", folder / "out with spaces é", "--log-json")
+        assert (done.returncode, done.stdout) == (0, "")
+        (folder / "log.jsonl").write_text(done.stderr)
+
+    return shared("aligned_flight", align) / "out with spaces é"
+
+
+@pytest.fixture(scope="session")
+def model_path(aligned_flight: Path) -> Path:
+    """The model that is learned from `flight`."""
+    (path,) = (aligned_flight / "models").iterdir()
+    return path
+
+
+def seeded(force: str | None = None, **write: Any) -> Settings:
+    """Settings of a run that estimates nothing: bands are mapped by their initial alignment."""
+    return Settings(seed=SeedSettings.model_validate({"only": True, "force": force}), write=WriteSettings(**write))
+
+
+def raising(error: BaseException) -> Callable[..., Any]:
+    """A function that raises this error, whatever its arguments."""
+
+    def function(*_: object, **__: object) -> Any:
+        raise error
+
+    return function
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def save_known_model(path: Path, *, has_rig: bool = True) -> None:
+    """Save a model whose rig is learned from four captures at known heights."""
+    from agalign.flight.learn_rig import learn_rig
+    from agalign.flight.model import FlightModel, save_model
+    from agalign.flight.rig import Observation
+    from agalign.method.descriptor import Descriptor
+
+    captures = []
+    for k, height in enumerate((-2.0, 0.5, 3.0, 6.0)):
+        offsets = {"NIR": (8 + 0.8 * height, 6), "[Red]": (-3, 4 + 0.6 * height)}
+        mappings = {name: geometry.translation(*offset) for name, offset in offsets.items()}
+        captures.append(Observation(float(k), mappings, dict.fromkeys(mappings, 0.05)))
+    rig = learn_rig(captures, (640, 480), {}) if has_rig else None
+    net = Descriptor("pseudo-siamese", (1, 1, 1), half_rectified=True, unit_length=True)
+    save_model(FlightModel(net, "Camera 7", ("NIR", "[Red]"), {}, "", rig), path)
+
+
+def write_band(path: Path, pixels: np.ndarray, **profile: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shape = {"driver": "GTiff", "width": pixels.shape[1], "height": pixels.shape[0], "count": 1, "dtype": pixels.dtype}
+    with rasterio.open(path, "w", **{**shape, **profile}) as dataset:
+        dataset.write(pixels, 1)
+
+
+GAINS = {"green": 900, "red": 500, "nir": 700}
+
+
+def write_capture(
+    folder: Path, *names: str, name: str = "f", size_px: tuple[int, int] = (300, 240), **profile: object
+) -> None:
+    """Bands with one texture and different contrasts, as uint16."""
+    for band in names:
+        pixels = 3000 + GAINS[band] * textured_image(*size_px, 3)
+        write_band(folder / f"{name}_{band}.tif", pixels.clip(1).astype(np.uint16), **profile)
 
 
 def textured_image(width: int, height: int, seed: int = 0) -> np.ndarray:

@@ -3,36 +3,33 @@
 import subprocess
 import sys
 import typing
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
+from pydantic import ValidationError
 
 import agalign
 from agalign import api, config, errors
+from agalign.batch import RunOptions
+from agalign.cameras.discover import DiscoverOptions
+from agalign.cli.main import app
+from agalign.config import JointSettings, Settings
 from agalign.values.issues import BLANK_MOVING, Issue
 from agalign.values.mapping import PixelMapping
 
-FUNCTIONS = {
-    "align", "align_capture", "align_folder", "discover", "open_capture", "open_flight",
-    "read_alignment", "warp_onto",
-}  # fmt: skip
-SETTINGS = {
-    "CheckSettings", "FlightSettings", "JointSettings", "ReliefSettings", "SeedSettings", "Settings", "WriteSettings",
-}  # fmt: skip
-OPTIONS_AND_RESULTS = {
-    "Alignment", "CaptureReport", "DiscoverOptions", "FlightReports", "FolderScan", "Prediction", "Residual",
-    "RunOptions", "Seed",
-}  # fmt: skip
-UNITS = {"FixedFilePx", "FixedImagePx", "MovingFilePx"}
-ERRORS = {
-    "AgalignError", "ConfigurationError", "GeometryError", "InputError", "NoContrastError", "NoSuchBandError",
-    "MemoryLimitError", "NotEnoughTextureError", "OutputError", "SidecarError", "UnreadableFileError", "WorkerError",
-}  # fmt: skip
+FUNCTIONS = "align align_capture align_folder discover open_capture open_flight read_alignment warp_onto"
+SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
+RESULTS = "Alignment CaptureReport FlightReports FolderScan Prediction Residual Seed"
+OPTIONS_AND_UNITS = "DiscoverOptions RunOptions FixedFilePx FixedImagePx MovingFilePx"
+ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError MemoryLimitError
+NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError"""
 
 
 def test_the_public_names() -> None:
-    names = FUNCTIONS | SETTINGS | OPTIONS_AND_RESULTS | UNITS | ERRORS | {"__version__"}
+    names = {*f"{FUNCTIONS} {SETTINGS} {RESULTS} {OPTIONS_AND_UNITS} {ERRORS}".split(), "__version__"}
     assert set(agalign.__all__) == set(dir(agalign)) == names
     assert len(agalign.__all__) == len(names)
     for name in names:
@@ -43,9 +40,9 @@ def test_the_public_names() -> None:
 
 def test_all_errors_and_settings_are_public() -> None:
     raised = {n for n, c in vars(errors).items() if isinstance(c, type) and issubclass(c, Exception)}
-    assert raised == ERRORS
+    assert raised == set(ERRORS.split())
     stages = {type(getattr(config.Settings(), name)).__name__ for name in config.Settings.model_fields}
-    assert stages | {"Settings"} == SETTINGS
+    assert stages | {"Settings"} == set(SETTINGS.split())
 
 
 @pytest.mark.parametrize("name", ["align", "align_folder"])
@@ -80,3 +77,59 @@ def test_an_alignment_prints_one_short_line() -> None:
     failed = agalign.Alignment(mapping, (640, 480), "failed", (Issue(BLANK_MOVING),), seed)
     assert repr(failed).startswith("Alignment(status='failed', residual_median_px=None, corner_std_px=None, reason='")
     assert "array" not in repr(failed)
+
+
+ROOT = Path(__file__).parent.parent
+
+
+WRONG = {"recipe": "slow", "sharing": "none", "model_family": "similarity", "device": 1, "fast": {}, "longest_px": 4096}
+
+
+@pytest.mark.parametrize(("name", "value"), [*WRONG.items(), *(("rng_seed", v) for v in (-1, 2**63, 0.5))])
+def test_one_error_names_the_setting_that_is_wrong(name: str, value: object) -> None:
+    with pytest.raises(ValidationError) as raised:
+        Settings.model_validate({"joint": {name: value}})
+    (error,) = raised.value.errors()
+    assert error["loc"] == ("joint", name)
+
+
+def test_settings_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        JointSettings().rng_seed = 1
+
+
+def documented() -> dict[str, dict[str, str]]:
+    """{title: {Python name: default}} of the tables in docs/options.md."""
+    tables: dict[str, dict[str, str]] = {}
+    for section in (ROOT / "docs" / "options.md").read_text(encoding="utf-8").split("\n## ")[1:]:
+        rows = [[c.strip() for c in line.split("|")] for line in section.splitlines() if line.startswith("| `--")]
+        names = {row[2].partition(" ")[0].strip("`"): row[4].strip("`") for row in rows if row[4]}
+        tables[section.partition("\n")[0]] = names
+    return tables
+
+
+def test_documented_settings_have_the_documented_defaults() -> None:
+    tables = documented()
+    owners = {"Settings": Settings(), "DiscoverOptions": DiscoverOptions(), "RunOptions": RunOptions()}
+    assert len(tables) == len(owners)
+    for title, names in tables.items():
+        (owner,) = (o for name, o in owners.items() if f"`{name}`" in title)
+        assert len(names) > 5
+        for name, default in names.items():
+            assert str(attrgetter(name)(owner)) == default, name
+
+
+def test_every_setting_is_documented() -> None:
+    names = {name for table in documented().values() for name in table}
+    stages = {stage: type(value) for stage, value in vars(Settings()).items()}
+    settings = {f"{stage}.{name}" for stage, fields in stages.items() for name in fields.model_fields}
+    settings.remove("flight.start")  # the fingerprint of a given model: set by the run
+    assert settings == {name for name in names if "." in name}
+    assert 15 < len(settings) <= 30
+
+
+def test_options_are_documented_under_the_names_of_the_command_line() -> None:
+    command = typer.main.get_command(app)
+    text = (ROOT / "docs" / "options.md").read_text(encoding="utf-8")
+    options = {o for p in command.commands["align"].params for o in p.opts if o.startswith("--")}
+    assert {o for o in options if f"`{o}`" not in text} == {"--out"}

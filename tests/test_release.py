@@ -6,9 +6,15 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 import yaml
 
 from agalign import __version__
+from agalign.batch.workers import Task, done_in, own_processes
+from agalign.cameras.discover import discover
+from agalign.values import processes
+
+from .conftest import seeded
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES_ON_CONDA_FORGE = {"opencv-python-headless": "py-opencv", "torch": "pytorch"}
@@ -33,12 +39,36 @@ def test_the_image_has_hashes_of_all_that_the_project_wants() -> None:
     assert f"{pinned}+cpu " in locked
 
 
-def test_the_page_of_licences_is_whole() -> None:
-    script = ROOT / "tools" / "licences.py"
-    done = subprocess.run([sys.executable, script, "--check"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
 def test_the_changes_begin_with_this_version() -> None:
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (\S+?),? ", changes, re.MULTILINE)[0] == __version__
+
+
+ENCODINGS_SAID = """
+import sys, warnings
+warnings.filterwarnings("ignore", category=EncodingWarning)  # of libraries
+warnings.filterwarnings("error", category=EncodingWarning, module="agalign")
+from agalign.__main__ import main
+sys.argv[0] = "agalign"
+main()
+"""
+
+
+@pytest.mark.slow
+def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path, tmp_path: Path) -> None:
+    """Where none is said it is the system's, which on Windows is not UTF-8."""
+    options = ["--only-seed", "--layout", "both", "--error-map", "--stac"]
+    for arguments in (["align", str(flight), "-o", str(tmp_path), *options], ["report", str(tmp_path)]):
+        command = [sys.executable, "-X", "warn_default_encoding", "-c", ENCODINGS_SAID, *arguments]
+        done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
+        assert "EncodingWarning" not in done.stderr
+        assert done.returncode in (0, 3), done.stderr
+
+
+@pytest.mark.slow
+def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As they do on Windows and macOS: nothing of this process is there in them."""
+    monkeypatch.setattr(processes, "get_all_start_methods", lambda: ["spawn"])
+    tasks = [Task(c, tmp_path, seeded(), None) for c in discover(flight).captures]
+    with own_processes(2) as pool:
+        assert [r.state for r in done_in(pool, tasks)] == ["done"] * len(tasks)

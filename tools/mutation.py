@@ -163,7 +163,7 @@ def _run_pytest(tests: tuple[str, ...]) -> None:
             os._exit(99)
         import pytest
 
-        options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "-m", "not real", "--hypothesis-seed=0"]
+        options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "-m", "not real and not full", "--hypothesis-seed=0"]
         code = int(pytest.main([*options, *tests]))
     except BaseException:
         traceback.print_exc()

@@ -30,7 +30,6 @@ from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
-from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
@@ -97,10 +96,14 @@ class _FlightLearner:
             refined = self._refined_by(self.start)
             if refined is not None:
                 return replace(self.start, refined=refined)
-        elif not self._has_rig:
+        if len(self.captures) < MIN_CAPTURES:
             # Learning takes as long as aligning one or two captures, and those that need it are learned from alone.
-            net = initial_network(self._bands, self.settings, None)
-            return FlightModel(net, flight_camera(self.captures), self._bands, {}, "") if net.is_trained else None
+            net = initial_network(self._bands, self.settings, self.start)
+            rig = None if self.start is None else self.start.rig
+            model = FlightModel(
+                net, flight_camera(self.captures), self._bands, {} if rig is None else rig.mean, "", rig
+            )
+            return model if net.is_trained else None
         network = self._network()
         if network is None:
             return None
@@ -133,11 +136,6 @@ class _FlightLearner:
     def _size_px(self) -> tuple[int, int]:
         return self.captures[0].reference.size_px
 
-    @property
-    def _has_rig(self) -> bool:
-        """True if the flight has enough captures for a rig."""
-        return len(self.captures) >= MIN_CAPTURES
-
     def _key(self, capture: Capture) -> str:
         return refinement_key(capture, self.settings)
 
@@ -159,7 +157,7 @@ class _FlightLearner:
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if learning fails."""
-        parts = np.array_split(np.arange(len(self.captures)), min(_NETWORK_CAPTURES, len(self.captures)))
+        parts = np.array_split(np.arange(len(self.captures)), _NETWORK_CAPTURES)
         stretches = [
             tuple(self.captures[part[k]] for k in dict.fromkeys((len(part) // 2, 0, len(part) - 1))) for part in parts
         ]
@@ -167,9 +165,8 @@ class _FlightLearner:
         first = {stretch[0].label for stretch in stretches}
         spread = [c for c in _spread(self.captures, _MIN_RIG_CAPTURES) if c.label not in first]
         others = [(c,) for c in spread[: _MIN_RIG_CAPTURES - len(stretches)]]
-        patches = FLIGHT_PATCHES if len(stretches) >= MIN_CAPTURES else PATCHES
         start = None if self.start is None else portable(self.start)
-        task = partial(choose_and_refine, self._bands, self.settings, patches, start, observe=self._has_rig)
+        task = partial(choose_and_refine, self._bands, self.settings, start)
         refined = []
         for one in self.apply(task, [*stretches, *others]):
             refined.append(one)
@@ -180,10 +177,10 @@ class _FlightLearner:
         net = initial_network(self._bands, self.settings, self.start)
         if all(one.is_good_enough for one in chosen):
             return net, list({one.capture.label: one for one in refined if one is not None}.values())
-        return self._trained(net, chosen, patches)
+        return self._trained(net, chosen)
 
     def _trained(
-        self, net: Descriptor, chosen: Sequence[LearningCapture], patches: int
+        self, net: Descriptor, chosen: Sequence[LearningCapture]
     ) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Train a network on captures, from the mappings that are already refined; None if that fails."""
         settings = self.settings
@@ -195,9 +192,7 @@ class _FlightLearner:
         try:
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
-                return net, list(
-                    pool.map(lambda p: p[1].refined_by(net, settings, patches, observe=self._has_rig), pairs)
-                )
+                return net, list(pool.map(lambda p: p[1].refined_by(net, settings), pairs))
         except Exception as error:
             # One capture may make learning from all of them fail; a network is then learned for each capture alone.
             log_failure("the flight cannot be learned from", error)
@@ -210,8 +205,6 @@ class _FlightLearner:
         """
         count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // _CAPTURES_PER_RIG_CAPTURE))
         result = {one.capture.label: one.observation for one in known if one.observation is not None}
-        if not self._has_rig:
-            return result
         again = [c for c in self.captures if c.label in result and result[c.label].misaligned]
         waiting = [*again, *(c for c in _spread(self.captures, count) if c.label not in result)]
         task = partial(observe_rig, portable(model), self.settings)
@@ -232,8 +225,6 @@ class _FlightLearner:
 
     def _rig(self, observations: Sequence[RigObservation]) -> Rig | None:
         """Return the rig, with the displacement fields of the lenses; None if the captures do not determine it."""
-        if not self._has_rig:
-            return None
         rig = learn_rig([o.observation for o in observations], self._size_px, _layout(self.captures), self.apply)
         if rig is None:
             return None

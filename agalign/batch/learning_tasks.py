@@ -20,6 +20,7 @@ from agalign.method.descriptor import Descriptor, start_from
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import DEFAULT_SCHEDULE
 from agalign.method.joint import Results, refine_with
+from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
@@ -118,22 +119,20 @@ class LoadedCapture:
                     group.mappings[k] = pair.result.fixed_to_moving
         return [group for _, group in self.groups]
 
-    def refined_by(
-        self, net: Descriptor, settings: Settings, patches: int, *, observe: bool, is_final: bool = True
-    ) -> LearningCapture:
+    def refined_by(self, net: Descriptor, settings: Settings, *, is_final: bool = True) -> LearningCapture:
         """Refine the pairs by a network; return the capture without its images.
 
-        With `observe` they are also verified, as observations of the rig, if the network is final or good enough.
+        They are also verified, as observations of the rig, if the network is final or good enough.
         """
         of_pair: dict[int, JointResult[FixedImagePx] | Issue] = {}
         for places, group in self.groups:
-            of_pair |= zip(places, refine_with(net, group, settings.joint, quiet, patches), strict=True)
+            of_pair |= zip(places, refine_with(net, group, settings.joint, quiet, FLIGHT_PATCHES), strict=True)
         results = [of_pair[i] for i in range(len(self.pairs))]
         known = [(p, r) for p, r in zip(self.pairs, results, strict=True) if isinstance(r, JointResult)]
         starts = list(zip(self.pairs, self.seeds, strict=True))
         is_good_enough, refined = _are_good_enough(results), refined_pairs(starts, results)
         observation = None
-        if observe and (is_final or is_good_enough):
+        if is_final or is_good_enough:
             aligned = verify_together(starts, results, None, settings, is_observation=True)
             observation = _observation(self.pairs, aligned, refined, self.capture)
         mappings = {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL}
@@ -181,17 +180,13 @@ def initial_network(bands: Sequence[str], settings: Settings, start: FlightModel
 def choose_and_refine(
     bands: tuple[str, ...],
     settings: Settings,
-    patches: int,
     start: FlightModel | None,
     captures: Sequence[Capture],
-    *,
-    observe: bool,
 ) -> LearningCapture | None:
     """Choose the best of some captures to learn from, and refine it by the initial network.
 
     The chosen one is the first with trusted seeds for all bands, else the one with the highest correlation peaks.
-    Captures without common structure, as of water or fog, are not usable; without any other, the result is None. With
-    `observe`, the flight has enough captures for a rig.
+    Captures without common structure, as of water or fog, are not usable; without any other, the result is None.
     """
     start = None if start is None else _on_device(start, settings)
     best: LoadedCapture | None = None
@@ -207,7 +202,7 @@ def choose_and_refine(
     if not (net.is_trained and best.is_trusted):
         return LearningCapture(best.capture, is_good_enough=False)
     try:
-        return best.refined_by(net, settings, patches, observe=observe, is_final=False)
+        return best.refined_by(net, settings, is_final=False)
     except Exception as error:
         log_failure(f"{best.capture.label} cannot be learned from", error)
         return None

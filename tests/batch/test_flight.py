@@ -1,10 +1,10 @@
-import json
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial, partialmethod
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,79 +16,81 @@ from agalign.batch import CaptureReport, RunOptions, learning_tasks, run_flight
 from agalign.batch import capture as batch_capture
 from agalign.batch import learn as batch_learn
 from agalign.batch.learn import learning_fingerprint
-from agalign.cameras.discover import DiscoverOptions, discover
-from agalign.config import FlightSettings, SeedSettings, Settings
-from agalign.errors import ConfigurationError, GeometryError, InputError, OutputError
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.flight.rig import MIN_CAPTURES
 from agalign.method import joint as method_joint
 from agalign.method.fast import Schedule, learn
 from agalign.method.state import JointState
 from agalign.products import preview
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
-from agalign.synthetic.flight import score_against_truth
+from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Capture
 
-pytestmark = pytest.mark.slow
+from ..conftest import Shared, raising, seeded
 
-SETTINGS = Settings()
-SEED_ONLY = Settings(seed=SeedSettings(only=True))
-"""For tests of what happens to files: it aligns nothing."""
-TWO_PAIRS = DiscoverOptions(bands=("Green", "NIR", "Red edge"))
-"""For tests in which captures must be aligned, and how many bands they have does not matter."""
-Finished = tuple[Path, list[CaptureReport]]
+# The program itself reads files without a georeference quietly.
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error:Dataset has no geotransform")]
+
+SETTINGS = agalign.Settings()
+TWO_PAIRS = agalign.DiscoverOptions(bands=("Green", "NIR", "Red edge"))
+"""For tests that align captures, and for which the number of bands does not matter."""
 
 
 def cpu() -> torch.device:
     return torch.device("cpu")
 
 
-@pytest.fixture(scope="module")
-def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """The output folder of a run with the default settings, which tests must not change, and its reports."""
-    out = tmp_path_factory.mktemp("finished")
-    return out, list(run_flight(discover(flight), out, SETTINGS))
+def run(folder: Path, out: Path, settings: agalign.Settings = SETTINGS, **options: Any) -> list[CaptureReport]:
+    return list(run_flight(agalign.discover(folder), out, settings, **options))
+
+
+def states(reports: list[CaptureReport]) -> list[str]:
+    return [r.state for r in reports]
 
 
 @pytest.fixture
-def finished_copy(finished: Finished, tmp_path: Path) -> Path:
-    """The output folder of a run, which a test may change."""
-    return shutil.copytree(finished[0], tmp_path / "finished")
+def aligned_copy(aligned_flight: Path, tmp_path: Path) -> Path:
+    """The output folder of a run with the default settings, which a test may change."""
+    return shutil.copytree(aligned_flight, tmp_path / "aligned")
 
 
 @pytest.fixture
-def out_with_model(finished: Finished, tmp_path: Path) -> Path:
-    """An output folder in which the flight's model is already learned, and no capture is aligned."""
-    shutil.copytree(finished[0] / "models", tmp_path / "out" / "models")
+def out_with_model(model_path: Path, tmp_path: Path) -> Path:
+    """An output folder with the model of the flight, and without captures."""
+    (tmp_path / "out" / "models").mkdir(parents=True)
+    shutil.copy(model_path, tmp_path / "out" / "models")
     return tmp_path / "out"
 
 
-@pytest.fixture(scope="module")
-def model(finished: Finished) -> FlightModel:
-    (path,) = (finished[0] / "models").iterdir()
-    return load_model(path, cpu)
+@pytest.fixture
+def model(model_path: Path) -> FlightModel:
+    return load_model(model_path, cpu)
 
 
-def test_a_frozen_network_aligns_a_capture_that_it_has_never_seen(flight: Path, finished: Finished) -> None:
-    out, reports = finished
-    bands = [b for r in reports for b in r.sidecar.bands if b.joint]
-    assert {b.joint.recipe for b in bands} == {"flight"}
-    assert {b.joint.iterations for b in bands} == {0}
-    scores = score_against_truth(reports, flight / "truth.json")
-    assert len(scores) == 8
-    assert max(s.median_px for s in scores) < 0.2
-    assert [p.name for p in (out / "models").iterdir()] == ["RedEdge-M_SY01-0000001-AG.safetensors"]
+@pytest.fixture
+def learned_flight(shared: Shared) -> Path:
+    """A flight with enough captures for a rig; those of one or two captures need no learning."""
+    return shared("learned_flight", lambda f: make_flight(f, captures=MIN_CAPTURES, size_px=(480, 360), rng_seed=3))
 
 
-def test_saved_and_loaded_it_is_the_same(model: FlightModel, tmp_path: Path) -> None:
-    path = tmp_path / "models" / "m.safetensors"
-    save_model(model, path)
-    again = load_model(path, cpu)
+def test_a_frozen_network_aligns_all_captures(aligned_flight: Path, model_path: Path) -> None:
+    bands = [b for path in find_sidecars(aligned_flight) for b in read_sidecar(path).bands if b.joint]
+    assert [(b.joint.recipe, b.joint.iterations) for b in bands if b.joint] == [("flight", 0)] * 8
+    assert model_path.name == "RedEdge-M_SY01-0000001-AG.safetensors"
+
+
+def test_a_model_that_is_saved_is_the_same_and_can_be_read_by_everybody(model: FlightModel, tmp_path: Path) -> None:
+    paths = [tmp_path / f"{k}.safetensors" for k in range(2)]
+    for path in paths:
+        save_model(model, path)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    (tmp_path / "plain").touch()
+    assert paths[0].stat().st_mode == (tmp_path / "plain").stat().st_mode
+    again = load_model(paths[0], cpu)
     assert (again.camera, again.bands, again.fingerprint) == (model.camera, model.bands, model.fingerprint)
-    assert len(model.mappings) == 4
-    for name, matrix in model.mappings.items():
-        np.testing.assert_array_equal(again.mappings[name], matrix)
+    np.testing.assert_equal(dict(again.mappings), dict(model.mappings))
     patches = torch.randn(5, 1, 16, 16)
     for side in range(5):
         torch.testing.assert_close(again.net(patches, side), model.net(patches, side))
@@ -96,55 +98,65 @@ def test_saved_and_loaded_it_is_the_same(model: FlightModel, tmp_path: Path) -> 
 
 def test_what_is_no_model_is_named(tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
-    with pytest.raises(InputError, match=r"m\.safetensors"):
+    with pytest.raises(agalign.InputError, match=r"m\.safetensors"):
         load_model(path, cpu)
     path.write_bytes(b"nonsense" * 100)
-    with pytest.raises(InputError, match=r"m\.safetensors"):
+    with pytest.raises(agalign.InputError, match=r"m\.safetensors"):
         load_model(path, cpu)
     from safetensors.torch import save_file
 
     save_file({"x": torch.zeros(1)}, path)
-    with pytest.raises(InputError, match="not a model of agalign"):
+    with pytest.raises(agalign.InputError, match="not a model of agalign"):
         load_model(path, cpu)
 
 
-def test_a_model_is_used_again_and_refused_for_another_camera(
-    flight: Path, model: FlightModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_model_is_used_again(
+    flight: Path, model_path: Path, aligned_copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "m.safetensors"
-    save_model(model, path)
     # From random weights, nothing could be learnt in one step.
     monkeypatch.setattr(JointState, "fast_descriptor", partialmethod(JointState.fast_descriptor, start="random"))
     for module in (batch_learn, method_joint):
         monkeypatch.setattr(module, "learn", partial(learn, schedule=Schedule(max_steps=1)))
-    reports = list(run_flight(discover(flight), tmp_path / "out", SETTINGS, model=path))
-    assert [r.good for r in reports] == [True, True]
+    assert states(run(flight, aligned_copy)) == ["kept", "kept"]
+    reports = run(flight, aligned_copy, model=model_path)
+    assert [(r.state, r.good) for r in reports] == [("done", True)] * 2
+    assert states(run(flight, aligned_copy, model=model_path)) == ["kept", "kept"]
+
+
+def test_a_model_of_another_camera_or_of_no_use_is_refused(flight: Path, model: FlightModel, tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
     save_model(replace(model, camera="Another 1 [Green 10x10]"), path)
-    with pytest.raises(ConfigurationError, match=r"m\.safetensors: was learned for Another 1"):
-        list(run_flight(discover(flight), tmp_path / "out2", SETTINGS, model=path))
+    with pytest.raises(agalign.ConfigurationError, match=r"m\.safetensors: was learned for Another 1"):
+        run(flight, tmp_path / "out", model=path)
+    alone = agalign.Settings(flight=agalign.FlightSettings(together=False))
+    with pytest.raises(agalign.ConfigurationError, match="needs one network per flight"):
+        run(flight, tmp_path / "out", alone, model=path)
 
 
-def test_two_captures_at_a_time_give_the_same_numbers(flight: Path, finished: Finished, tmp_path: Path) -> None:
+def test_two_captures_at_a_time_give_the_same_numbers(flight: Path, aligned_flight: Path, tmp_path: Path) -> None:
     agalign.align_folder(flight, tmp_path, settings=SETTINGS, run=RunOptions(jobs=2))
-    result = []
-    for out in (finished[0], tmp_path):
-        sidecars = [read_sidecar(p) for p in find_sidecars(out)]
-        result.append([(b.grid, b.metrics, b.joint) for s in sidecars for b in s.bands])
-    assert len(result[0]) == 10
-    assert result[0] == result[1]
+    serial, parallel = (
+        [(b.grid, b.metrics, b.joint) for path in find_sidecars(out) for b in read_sidecar(path).bands]
+        for out in (aligned_flight, tmp_path)
+    )
+    assert len(serial) == 10
+    assert serial == parallel
 
 
-def test_a_second_run_learns_nothing_anew(flight: Path, finished_copy: Path) -> None:
-    path = next((finished_copy / "models").iterdir())
+def test_a_second_run_learns_nothing_and_retries_failed_captures_where_asked(flight: Path, aligned_copy: Path) -> None:
+    (path,) = (aligned_copy / "models").iterdir()
     before = path.stat().st_mtime_ns
-    next(iter(find_sidecars(finished_copy))).unlink()
-    states = [r.state for r in run_flight(discover(flight), finished_copy, SETTINGS)]
-    assert sorted(states) == ["done", "kept"]
+    first, second = find_sidecars(aligned_copy)
+    first.unlink()
+    second.write_text(second.read_text().replace('"status": "ok"', '"status": "degraded"', 1))
+    assert sorted(states(run(flight, aligned_copy))) == ["done", "kept"]
+    again = run(flight, aligned_copy, options=RunOptions(retry_failed=True))
+    assert sorted((r.state, r.good) for r in again) == [("done", True), ("kept", True)]
     assert path.stat().st_mtime_ns == before
 
 
-def test_cameras_and_flights_are_kept_apart(flight: Path) -> None:
-    captures = discover(flight).captures
+def test_captures_of_one_camera_and_flight_are_a_group_with_a_model_name_of_its_own(flight: Path) -> None:
+    captures = agalign.discover(flight).captures
     other = replace(captures[1], camera=replace(captures[1].camera, serial="X9"))
     later = replace(captures[1], flight_id="another")
     assert len(flights_of(captures)) == 1
@@ -152,38 +164,29 @@ def test_cameras_and_flights_are_kept_apart(flight: Path) -> None:
     assert [len(g) for g in groups] == [2, 1, 1]
     assert camera_key(captures[0]) == camera_key(later) != camera_key(other)
     stem = "RedEdge-M_SY01-0000001-AG"
-    assert model_names([*groups, [later]]) == [
-        f"{stem}.safetensors", "RedEdge-M_X9.safetensors", f"{stem}-2.safetensors", f"{stem}-3.safetensors",
-    ]  # fmt: skip
+    names = [f"{stem}.safetensors", "RedEdge-M_X9.safetensors", f"{stem}-2.safetensors", f"{stem}-3.safetensors"]
+    assert model_names([*groups, [later]]) == names
+
+    def named(model: str, flight_id: str) -> Capture:
+        return replace(captures[0], camera=replace(captures[0].camera, model=model, serial=""), flight_id=flight_id)
+
+    names = model_names([[named("X", "1")], [named("X", "2")], [named("X-2", "1")], [named("x", "1")]])
+    assert names == ["X.safetensors", "X-2.safetensors", "X-2-2.safetensors", "x-3.safetensors"]
+    smaller = tuple(replace(b, width_px=100) if b.name == "NIR" else b for b in captures[1].bands)
+    assert len(flights_of([captures[0], replace(captures[1], bands=smaller)])) == 2
+    without = tuple(b for b in captures[1].bands if b.name != "NIR")
+    assert len(flights_of([replace(captures[1], bands=without), captures[0]])) == 1
 
 
-def test_a_model_is_learnt_anew_where_what_it_depends_on_has_changed(flight: Path) -> None:
-    captures = discover(flight).captures
+def test_a_model_is_learnt_again_where_what_it_depends_on_has_changed(flight: Path) -> None:
+    captures = agalign.discover(flight).captures
     before = learning_fingerprint(captures, SETTINGS)
-    assert learning_fingerprint(discover(flight).captures, SETTINGS) == before
+    assert learning_fingerprint(agalign.discover(flight).captures, SETTINGS) == before
     no_lens = [replace(c, bands=tuple(replace(b, lens=None) for b in c.bands)) for c in captures]
     other_reference = [replace(c, reference_index=0) for c in captures]
-    elsewhere = Settings(flight=FlightSettings(start="another network"))
+    elsewhere = agalign.Settings(flight=agalign.FlightSettings(start="another network"))
     assert len({learning_fingerprint(c, SETTINGS) for c in (captures, no_lens, other_reference)}) == 3
     assert learning_fingerprint(captures, elsewhere) != before
-
-
-def test_a_capture_is_done_again_with_another_model(
-    flight: Path, model: FlightModel, finished_copy: Path, tmp_path: Path
-) -> None:
-    path = tmp_path / "m.safetensors"
-    save_model(model, path)
-    assert [r.state for r in run_flight(discover(flight), finished_copy, SETTINGS)] == ["kept", "kept"]
-    assert [r.state for r in run_flight(discover(flight), finished_copy, SETTINGS, model=path)] == ["done", "done"]
-    assert [r.state for r in run_flight(discover(flight), finished_copy, SETTINGS, model=path)] == ["kept", "kept"]
-
-
-def test_a_model_of_no_use_is_refused(flight: Path, model: FlightModel, tmp_path: Path) -> None:
-    path = tmp_path / "m.safetensors"
-    save_model(model, path)
-    alone = Settings(flight=FlightSettings(together=False))
-    with pytest.raises(ConfigurationError, match="needs one network per flight"):
-        list(run_flight(discover(flight), tmp_path / "out", alone, model=path))
 
 
 def test_any_executor_will_do(flight: Path, out_with_model: Path) -> None:
@@ -194,112 +197,79 @@ def test_any_executor_will_do(flight: Path, out_with_model: Path) -> None:
 
 
 def test_one_broken_reference_stops_neither_learning_nor_the_others(flight: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "in"
-    shutil.copytree(flight, copy)
+    copy = shutil.copytree(flight, tmp_path / "in")
     for pattern in ("IMG_0001_2.tif", "IMG_0002_4.tif"):
         path = next(copy.rglob(pattern))
         data = path.read_bytes()
         path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
-    reports = {r.label[-8:]: r for r in run_flight(discover(copy), tmp_path / "out", Settings())}
+    reports = {r.label[-8:]: r for r in run(copy, tmp_path / "out")}
     statuses = {b.band: b.status for b in reports["IMG_0002"].sidecar.bands}
     assert statuses["Blue"] == statuses["Red"] == "aligned"
 
 
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (ZeroDivisionError("of nothing"), "please report this"),
+        (RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory"), "out of memory"),
+    ],
+)
 def test_a_fault_in_one_capture_costs_no_other(
-    flight: Path, out_with_model: Path, monkeypatch: pytest.MonkeyPatch
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, message: str
 ) -> None:
     real = batch_capture.process_capture
 
-    def faulty(capture: Capture, *arguments: object) -> object:
+    def faulty(capture: Capture, *arguments: Any) -> object:
         if capture.name == "IMG_0001":
-            raise ZeroDivisionError("of nothing")
-        return real(capture, *arguments)  # type: ignore[arg-type]
+            raise error
+        return real(capture, *arguments)
 
-    monkeypatch.setattr(batch_capture, "process_capture", faulty)
-    reports = {r.label: r for r in agalign.align_folder(flight, out_with_model)}
-    assert reports["0000SET/000/IMG_0002"].good
-    problem = reports["0000SET/000/IMG_0001"].error
-    assert problem is not None
-    assert "please report this" in problem
+    monkeypatch.setattr(workers, "process_capture", faulty)
+    lost, other = run(flight, tmp_path, seeded())
+    assert (lost.state, other.state) == ("error", "done")
+    assert message in (lost.error or "")
 
 
-def test_a_want_of_memory_is_said_so(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def greedy(*_: object) -> object:
-        raise RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory")
-
-    monkeypatch.setattr(batch_capture, "process_capture", greedy)
-    reports = agalign.align_folder(flight, tmp_path, settings=Settings(flight=FlightSettings(together=False)))
-    assert [r.state for r in reports] == ["error", "error"]
-    assert all("out of memory" in (r.error or "") for r in reports)
-
-
-@pytest.mark.parametrize("fault", [cv2.error("of OpenCV"), GeometryError("no homography")])
+@pytest.mark.parametrize("fault", [cv2.error("of OpenCV"), agalign.GeometryError("no homography")])
 def test_a_fault_while_learning_costs_the_flights_network_and_nothing_else(
-    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Exception
+    learned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Exception
 ) -> None:
-    def faulty(*_: object) -> object:
-        raise fault
-
-    monkeypatch.setattr(learning_tasks, "refine_with", faulty)
-    reports = list(run_flight(discover(flight, TWO_PAIRS), tmp_path, SETTINGS))
-    assert [r.good for r in reports] == [True, True]
+    monkeypatch.setattr(learning_tasks, "refine_with", raising(fault))
+    reports = list(run_flight(agalign.discover(learned_flight, TWO_PAIRS), tmp_path, SETTINGS))
+    assert [r.good for r in reports] == [True] * MIN_CAPTURES
     assert {b.joint.recipe for r in reports for b in r.sidecar.bands if b.joint} == {"fast"}
 
 
-def test_a_name_that_another_cameras_number_takes_is_not_taken_twice(flight: Path) -> None:
-    def named(model: str, flight_id: str) -> Capture:
-        capture = discover(flight).captures[0]
-        return replace(capture, camera=replace(capture.camera, model=model, serial=""), flight_id=flight_id)
-
-    names = model_names([[named("X", "1")], [named("X", "2")], [named("X-2", "1")], [named("x", "1")]])
-    assert names == ["X.safetensors", "X-2.safetensors", "X-2-2.safetensors", "x-3.safetensors"]
-    assert len({n.lower() for n in names}) == 4
-
-
-def test_an_old_sidecar_deletes_nothing_beyond_its_folder(flight: Path, finished_copy: Path) -> None:
-    precious = finished_copy.parent / "precious.tif"
+def test_an_old_sidecar_deletes_nothing_beyond_its_folder(flight: Path, aligned_copy: Path) -> None:
+    precious = aligned_copy.parent / "precious.tif"
     precious.write_text("not ours")
-    sidecar = finished_copy / "0000SET" / "000" / "IMG_0001.json"
-    data = json.loads(sidecar.read_text())
-    data["output"]["band_files"] = [{"file": "../../../precious.tif", "bytes": 1}, {"file": str(precious), "bytes": 1}]
-    sidecar.write_text(json.dumps(data))
-    assert [r.state for r in run_flight(discover(flight), finished_copy, SEED_ONLY)] == ["done", "done"]
+    sidecar = aligned_copy / "0000SET" / "000" / "IMG_0001.json"
+    files = '[{"file": "../../../precious.tif", "bytes": 1}, {"file": "%s", "bytes": 1}]' % precious  # noqa: UP031
+    sidecar.write_text(sidecar.read_text().replace('"band_files": []', f'"band_files": {files}'))
+    assert states(run(flight, aligned_copy, seeded())) == ["done", "done"]
     assert precious.read_text() == "not ours"
 
 
-def test_an_output_that_cannot_be_replaced_costs_its_capture_only(flight: Path, tmp_path: Path) -> None:
+def test_an_output_that_cannot_be_made_or_replaced_is_named(flight: Path, tmp_path: Path) -> None:
     (tmp_path / "0000SET" / "000" / "IMG_0001.tif" / "below").mkdir(parents=True)
-    reports = {r.label: r for r in run_flight(discover(flight), tmp_path, SEED_ONLY)}
-    assert reports["0000SET/000/IMG_0002"].state == "done"
-    lost = reports["0000SET/000/IMG_0001"]
-    assert lost.state == "error"
+    lost, other = run(flight, tmp_path, seeded())
+    assert (lost.state, other.state) == ("error", "done")
     assert "IMG_0001.tif: cannot be written" in (lost.error or "")
+    (tmp_path / "file").touch()
+    with pytest.raises(agalign.OutputError, match=r"out: cannot be made \(.+\); choose another folder with -o$"):
+        run(flight, tmp_path / "file" / "out")
 
 
-def test_the_same_model_is_the_same_bytes_and_is_for_everybody(model: FlightModel, tmp_path: Path) -> None:
-    paths = [tmp_path / f"{k}.safetensors" for k in range(2)]
-    for path in paths:
-        save_model(model, path)
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-    plain = tmp_path / "plain"
-    plain.write_bytes(b"")
-    assert paths[0].stat().st_mode == plain.stat().st_mode
-
-
-def test_a_run_tells_what_it_was(flight: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "in"
-    shutil.copytree(flight, copy)
+def test_a_run_records_what_it_was(flight: Path, tmp_path: Path) -> None:
+    copy, out = shutil.copytree(flight, tmp_path / "in"), tmp_path / "out"
     next(copy.rglob("IMG_0001_5.tif")).write_bytes(b"no image")
-    reports = run_flight(discover(copy, TWO_PAIRS), tmp_path / "out", SETTINGS)
-    record = read_run_record(tmp_path / "out")
-    assert record is None
+    reports = run_flight(agalign.discover(copy, TWO_PAIRS), out, SETTINGS)
+    assert read_run_record(out) is None
     first = next(reports)
-    record = read_run_record(tmp_path / "out")
-    assert record is not None
+    record = read_run_record(out)
     assert record.state == "running"
     rest = list(reports)
-    record = read_run_record(tmp_path / "out")
-    assert record is not None
+    record = read_run_record(out)
     assert (record.state, record.captures) == ("finished", {"found": 2, "done": 2})
     assert record.pairs["aligned"] == 3
     assert set(record.capture_seconds) == {first.label, rest[0].label}
@@ -309,89 +279,58 @@ def test_a_run_tells_what_it_was(flight: Path, tmp_path: Path) -> None:
     assert record.settings["joint"]["recipe"] == "fast"
 
 
-def test_what_fell_short_is_done_again_where_asked(flight: Path, finished_copy: Path) -> None:
-    captures = discover(flight)
-    path = finished_copy / "0000SET" / "000" / "IMG_0001.json"
-    path.write_text(path.read_text().replace('"status": "ok"', '"status": "degraded"', 1))
-    assert {r.state for r in run_flight(captures, finished_copy, SETTINGS)} == {"kept"}
-    again = {r.label: r for r in run_flight(captures, finished_copy, SETTINGS, RunOptions(retry_failed=True))}
-    assert {label[-8:]: r.state for label, r in again.items()} == {"IMG_0001": "done", "IMG_0002": "kept"}
-    assert [r.good for r in again.values()] == [True, True]
-
-
-def test_one_run_at_a_time(flight: Path, out_with_model: Path) -> None:
-    captures = discover(flight)
-    first = run_flight(captures, out_with_model, SETTINGS)
+def test_one_run_at_a_time(flight: Path, tmp_path: Path) -> None:
+    first = run_flight(agalign.discover(flight), tmp_path, seeded())
     next(first)
-    with pytest.raises(OutputError, match=rf"another run writes there \(process {os.getpid()} on "):
-        next(run_flight(captures, out_with_model, SETTINGS))
+    with pytest.raises(agalign.OutputError, match=rf"another run writes there \(process {os.getpid()} on "):
+        run(flight, tmp_path, seeded())
     first.close()
-    record = read_run_record(out_with_model)
-    assert record is not None
+    record = read_run_record(tmp_path)
     assert record.state == "interrupted"
-    assert [r.state for r in run_flight(captures, out_with_model, SETTINGS)].count("kept") >= 1
-    assert not list(out_with_model.rglob(".agalign*"))
+    assert "kept" in states(run(flight, tmp_path, seeded()))
+    assert not list(tmp_path.rglob(".agalign*"))
 
 
-def test_a_picture_that_fails_is_told_and_costs_no_more(
+def test_a_picture_that_fails_is_reported_and_costs_no_more(
     flight: Path, out_with_model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(*_: object) -> None:
-        raise OutputError("a.png: cannot be written")
-
-    monkeypatch.setattr(preview, "write_picture", fails)
-    reports = list(run_flight(discover(flight), out_with_model, SETTINGS))
-    assert [r.shortcomings for r in reports] == [("a.png: cannot be written",)] * 2
-    assert not any(r.good for r in reports)
-    assert all(r.result is not None and r.result.status == "ok" for r in reports)
-    assert [r.result.not_written for r in reports if r.result is not None] == [["picture"]] * 2
+    monkeypatch.setattr(preview, "write_picture", raising(agalign.OutputError("a.png: cannot be written")))
+    for report in run(flight, out_with_model):
+        assert report.shortcomings == ("a.png: cannot be written",)
+        assert not report.good
+        assert (report.result.status, report.result.not_written) == ("ok", ["picture"])
     monkeypatch.undo()
-    again = list(run_flight(discover(flight), out_with_model, SETTINGS))
-    assert [(r.state, r.shortcomings) for r in again] == [("done", ())] * 2
+    assert [(r.state, r.shortcomings) for r in run(flight, out_with_model)] == [("done", ())] * 2
     assert len(list(out_with_model.rglob("*.png"))) == 2
 
 
-def test_a_forced_seed_is_for_the_captures_that_the_flight_is_learned_from(flight: Path, tmp_path: Path) -> None:
-    """The others start from the flight's own mapping: the identity is farther away than a frozen network reaches."""
-    settings = Settings(seed=SeedSettings(force="identity"))
-    reports = list(run_flight(discover(flight, TWO_PAIRS), tmp_path, settings))
+def test_a_forced_seed_is_for_the_captures_that_the_flight_is_learned_from(
+    learned_flight: Path, tmp_path: Path
+) -> None:
+    """All three are; others would start from the flight's mapping: a frozen network does not reach the identity."""
+    settings = agalign.Settings(seed=agalign.SeedSettings(force="identity"))
+    reports = list(run_flight(agalign.discover(learned_flight, TWO_PAIRS), tmp_path, settings))
     bands = [b for r in reports for b in r.sidecar.bands if b.status != "reference"]
-    assert [b.status for b in bands] == ["aligned"] * 4
-    assert {b.seed.kind for b in bands if b.seed} <= {"model", "structure", "match"}
+    assert [b.status for b in bands] == ["aligned"] * 2 * MIN_CAPTURES
+    assert {b.seed.kind for b in bands if b.seed} <= {"identity", "model", "structure", "match"}
     assert {b.joint.recipe for b in bands if b.joint} == {"flight"}
-
-
-def without_band(flight: Path, folder: Path, *files: str) -> Path:
-    """A copy of a flight that lacks some files."""
-    shutil.copytree(flight, folder)
-    for name in files:
-        next(folder.rglob(name)).unlink()
-    return folder
 
 
 def test_a_first_capture_that_lacks_a_band_belongs_to_its_flight(flight: Path, tmp_path: Path) -> None:
-    folder = without_band(flight, tmp_path / "in", "IMG_0001_4.tif")
-    captures = discover(folder).captures
+    folder = shutil.copytree(flight, tmp_path / "in")
+    next(folder.rglob("IMG_0001_4.tif")).unlink()
+    captures = agalign.discover(folder).captures
     assert [len(c.bands) for c in captures] == [4, 5]
-    (group,) = flights_of(captures)
-    assert group == list(captures)
-    reports = list(run_flight(discover(folder), tmp_path / "out", Settings()))
+    assert flights_of(captures) == [list(captures)]
+    reports = run(folder, tmp_path / "out")
     (path,) = (tmp_path / "out" / "models").iterdir()
-    model = load_model(path, cpu)
-    assert set(model.bands) == {b.name for b in captures[1].moving}
+    assert set(load_model(path, cpu).bands) == {b.name for b in captures[1].moving}
     bands = [b for r in reports for b in r.sidecar.bands if b.status != "reference"]
     assert [b.status for b in bands] == ["aligned"] * 7
     assert {b.joint.recipe for b in bands if b.joint} == {"flight"}
-    assert {r.label: r.sidecar.missing_bands for r in reports} == {captures[0].label: ["NIR"], captures[1].label: []}
+    assert [r.sidecar.missing_bands for r in reports] == [["NIR"], []]
     # Such a capture alone is of the model's camera too.
-    alone = without_band(folder, tmp_path / "alone", *(b.path.name for b in captures[1].bands))
-    (report,) = run_flight(discover(alone), tmp_path / "again", Settings(), model=path)
+    for band in captures[1].bands:
+        band.path.unlink()
+    (report,) = run(folder, tmp_path / "again", model=path)
     assert report.useful
-
-
-def test_captures_whose_bands_have_other_sizes_are_of_another_flight(flight: Path) -> None:
-    whole, other = discover(flight).captures
-    smaller = [replace(b, width_px=100) if b.name == "NIR" else b for b in other.bands]
-    assert len(flights_of([whole, replace(other, bands=tuple(smaller))])) == 2
-    without = [b for b in other.bands if b.name != "NIR"]
-    assert len(flights_of([replace(other, bands=tuple(without)), whole])) == 1

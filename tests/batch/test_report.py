@@ -1,31 +1,21 @@
 import logging
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import agalign
 from agalign import CaptureReport, FlightReports
-from agalign.config import SeedSettings, Settings
 
-from ..conftest import textured_image
-from ..products.test_outputs import write_band
-
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+from ..conftest import seeded, write_capture
 
 
 def test_progress_is_reported_and_shown(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    scene = textured_image(200, 160, 3)
-    for capture in "ab":
-        for name, gain in (("green", 900), ("red", 500)):
-            pixels = (3000 + gain * scene).clip(1).astype(np.uint16)
-            write_band(tmp_path / "in" / f"{capture}_{name}.tif", pixels)
+    for name in "ab":
+        write_capture(tmp_path / "in", "green", "red", name=name, size_px=(200, 160))
     seen: list[tuple[str, int, int]] = []
     caplog.set_level(logging.INFO, "agalign")
-    reports = agalign.align_folder(
-        tmp_path / "in", tmp_path / "out", settings=Settings(seed=SeedSettings(only=True, force="identity")),
-        progress=lambda report, done, total: seen.append((report.label, done, total)),
-    )  # fmt: skip
+    options = {"progress": lambda report, done, total: seen.append((report.label, done, total))}
+    reports = agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=seeded("identity"), **options)
     assert sorted(seen, key=lambda s: s[1]) == [(reports[0].label, 1, 2), (reports[1].label, 2, 2)]
     assert [r.message for r in caplog.records if "of 2" in r.message] == [
         f"{n} of 2: {r.label}: done, 1 seed_only" for n, r in enumerate(reports, start=1)

@@ -17,6 +17,8 @@ from peers import UnavailableError, identity, method_named
 
 from agalign.cameras.discover import discover
 
+pytestmark = pytest.mark.full
+
 TRUE = np.array([[1.01, 0.02, 30.0], [-0.015, 0.99, -12.0], [1e-5, 2e-5, 1.0]])
 TIES_PX = np.stack(np.meshgrid(np.arange(40.0, 600, 40), np.arange(40.0, 440, 40)), axis=-1).reshape(-1, 2)
 
@@ -104,12 +106,6 @@ def test_what_is_written_is_read_again(sets: dict[str, Any], tmp_path: Path, suf
     turned, plain = score.summary(score.score_pairs(score.read_results(path), sets))
     assert (turned.variant, turned.pairs, turned.seconds) == ("turn 10", 2, 0.5)
     assert (plain.variant, plain.refused) == (score.AS_IT_IS, 4)
-
-
-def test_a_method_without_a_name_is_called_by_its_file(tmp_path: Path) -> None:
-    path = tmp_path / "theirs.csv"
-    path.write_text("set,capture,file,homography\nfield,1,1_r.png,1 0 0 0 1 0 0 0 1\n")
-    assert score.read_results(path)[0]["method"] == "theirs"
 
 
 def test_the_scorer_needs_nothing_of_agalign() -> None:

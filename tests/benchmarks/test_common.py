@@ -10,6 +10,8 @@ from common import Section, band_errors, parsed, read_ties, watched
 
 from agalign.values import geometry
 
+pytestmark = pytest.mark.full
+
 
 def test_the_error_is_that_of_the_grid_at_the_ties(tmp_path: Path) -> None:
     here = geometry.lattice(100, 80, 17, 13)

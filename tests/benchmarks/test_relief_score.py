@@ -14,6 +14,8 @@ from synthetic_flights.depth import BandTruth, Truth
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
 
+pytestmark = pytest.mark.full
+
 WIDTH, HEIGHT = 96, 64
 HERE = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1).astype(np.float64)
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_6X
 
 from agalign.cameras import rig_seed
@@ -16,7 +15,7 @@ from agalign.synthetic.ground import paint_ground
 from agalign.synthetic.rig import CameraSpec, Pose, true_homography
 from agalign.values import geometry
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.full]
 
 CAMERAS = {
     "RedEdge": REDEDGE,
@@ -50,16 +49,3 @@ def test_rig_tags_are_the_truth_from_far_above(tmp_path: Path, name: str) -> Non
         tolerance = 0.7 if not getattr(camera, "calibrated", True) else 3.0 if spec.sees == "heat" else 0.05
         assert geometry.corner_error_px(seed, truth, *SIZE) < tolerance
     assert set(json.loads(path.read_text())[capture.name]["bands"]) == {b.path.name for b in capture.moving}
-
-
-def test_the_photograph_is_a_whole_one(tmp_path: Path) -> None:
-    pose = Pose(28.0, 0, 0, 0, 0, 0)
-    ground = paint_ground(np.random.default_rng(0), [pose], SIZE, camera=MAVIC_3M)
-    write_shots(tmp_path, [Shot(pose, ground)], SIZE, MAVIC_3M, np.random.default_rng(0))
-    (path,) = tmp_path.rglob("*_D.JPG")
-    with Image.open(path) as photo:
-        assert photo.size == (660, 494)
-        means = np.asarray(photo).mean(axis=(0, 1))
-    assert (means > 30).all()
-    assert not list(tmp_path.rglob("*.npy"))
-    assert {b.name for b in discover(tmp_path).captures[0].bands} == {"Green", "Red", "RedEdge", "NIR"}

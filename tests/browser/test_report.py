@@ -19,7 +19,7 @@ from agalign.products.report import write_pages
 from agalign.synthetic import flight as synthetic
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+pytestmark = [pytest.mark.slow, pytest.mark.full, pytest.mark.filterwarnings("ignore")]
 
 HOSTILE = '<img src=x onerror="window.broken=1">\'</script><script>window.broken=1</script>'
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -34,7 +34,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     synthetic.make_flight(folder / "in", captures=2, size_px=(480, 360), rng_seed=3)
     black = folder / "in" / "0000SET" / "000" / "IMG_0002_4.tif"
     with tifffile.TiffFile(black, mode="r+b") as file:
-        file.filehandle.seek(file.pages[0].dataoffsets[0])  # type: ignore[union-attr]
+        file.filehandle.seek(file.pages[0].dataoffsets[0])
         file.filehandle.write(np.full((360, 480), 9, np.uint16).tobytes())
     out = folder / "out"
     agalign.align_folder(folder / "in", out, settings=Settings(write=WriteSettings(error_map=True, indices=("ndvi",))))

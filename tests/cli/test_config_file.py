@@ -1,6 +1,7 @@
-"""Options from a file, what a run would do, and facts as JSON."""
+"""Options of the command line and of a file become settings; what a run would do; facts as JSON."""
 
 import json
+import sys
 import tomllib
 from pathlib import Path
 
@@ -8,38 +9,35 @@ import pytest
 from synthetic_flights.aligned import make_aligned
 from typer.testing import CliRunner
 
-from agalign.cameras.discover import DiscoverOptions, FolderScan
+import agalign
+from agalign.cli import main
 from agalign.cli import run as cli_run
 from agalign.cli.main import app
-from agalign.config import Settings
 from agalign.synthetic import flight as synthetic
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+Seen = list[tuple[agalign.DiscoverOptions, agalign.Settings]]
 
 
 @pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[DiscoverOptions, Settings]]:
+def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
     """The options and settings that the command makes of its arguments."""
-    found: list[DiscoverOptions] = []
-    result: list[tuple[DiscoverOptions, Settings]] = []
+    result: Seen = []
+    found: list[agalign.DiscoverOptions] = []
 
-    def find(folder: Path, options: DiscoverOptions, *_: object) -> FolderScan:
+    def find(folder: Path, options: agalign.DiscoverOptions, *_: object) -> agalign.FolderScan:
         found.append(options)
-        return FolderScan(folder, (), ())
+        return agalign.FolderScan(folder, (), ())
 
-    def run(_flight: object, _out: Path, settings: Settings, *_: object, **__: object) -> None:
-        result.append((found[0], settings))
+    def run(_flight: object, _out: Path, settings: agalign.Settings, *_: object, **__: object) -> None:
+        result.append((found.pop(), settings))
         raise SystemExit(0)
 
-    monkeypatch.setattr(cli_run, "run", run)
-    monkeypatch.setattr(cli_run, "find_captures", find)
-    monkeypatch.setattr(cli_run, "load_ahead", lambda: None)
+    for name, replacement in (("find_captures", find), ("run", run), ("load_ahead", lambda: None)):
+        monkeypatch.setattr(cli_run, name, replacement)
     return result
 
 
-def test_a_file_sets_options_and_the_command_line_comes_first(
-    tmp_path: Path, seen: list[tuple[DiscoverOptions, Settings]]
-) -> None:
+def test_a_file_sets_options_and_the_command_line_comes_first(tmp_path: Path, seen: Seen) -> None:
     config = tmp_path / "agalign.toml"
     config.write_text(
         'radiometry = "sun"\nerror-map = true\naccept_predicted = 0.5\nindex = "ndvi,NDRE"\nexclude = ["*a*", "*b*"]\n'
@@ -49,41 +47,35 @@ def test_a_file_sets_options_and_the_command_line_comes_first(
     assert done.exit_code == 0, done.output
     ((options, settings),) = seen
     assert (options.include, options.exclude) == (("*c*",), ("*a*", "*b*"))
-    assert (settings.write.radiometry, settings.write.error_map, settings.write.indices) == (
-        "sun",
-        True,
-        ("ndvi", "ndre"),
-    )
+    write = settings.write
+    assert (write.radiometry, write.error_map, write.indices) == ("sun", True, ("ndvi", "ndre"))
     assert (settings.check.accept_predicted_px, settings.joint.rng_seed) == (0.5, 4)
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('radiometri = "sun"', "no option 'radiometri'; did you mean 'radiometry'?"), ("x =", "cannot be read as TOML"),
-        ('crop = "round"', "'round' is unknown; choose from flight"), ("[align]\njobs = 1", "no option 'align'"),
-        ("jobs = [1, 2]", "'jobs' takes one value"), ('jobs = "many"', "--jobs: give a whole number"),
+        ('radiometri = "sun"', "no option 'radiometri'; did you mean 'radiometry'?"),
+        ("x =", "cannot be read as TOML"),
+        ('crop = "round"', "'round' is unknown; choose from flight"),
+        ("[align]\njobs = 1", "no option 'align'"),
+        ("jobs = [1, 2]", "'jobs' takes one value"),
+        ('jobs = "many"', "--jobs: give a whole number"),
         ("dry-run = true", "no option 'dry-run'"),
+        (None, "agalign.toml does not exist"),
     ],
-)  # fmt: skip
-def test_a_wrong_file_is_one_line(tmp_path: Path, text: str, said: str) -> None:
+)
+def test_a_wrong_file_is_one_line(tmp_path: Path, text: str | None, said: str) -> None:
     config = tmp_path / "agalign.toml"
-    config.write_text(text)
+    if text is not None:
+        config.write_text(text)
     done = CliRunner().invoke(app, ["align", "x", "--config", str(config)])
     assert done.exit_code == 2
     (line,) = done.stderr.splitlines()
     assert said in line
 
 
-def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["align", "x", "--config", str(tmp_path / "no.toml")])
-    assert done.exit_code == 2
-    assert f"{tmp_path / 'no.toml'} does not exist" in done.stderr
-
-
-def test_the_printed_file_has_every_option_and_changes_nothing(
-    tmp_path: Path, seen: list[tuple[DiscoverOptions, Settings]]
-) -> None:
+def test_the_printed_file_has_every_option_and_changes_nothing(tmp_path: Path, seen: Seen) -> None:
     text = CliRunner().invoke(app, ["info", "--options"]).stdout
     assert tomllib.loads(text) == {}
     lines = [line.removeprefix("# ") for line in text.splitlines() if " = " in line and '""' not in line]
@@ -95,6 +87,47 @@ def test_the_printed_file_has_every_option_and_changes_nothing(
     done = CliRunner().invoke(app, ["align", "x", "--config", str(config)])
     assert done.exit_code == 0, done.output
     assert seen[1][1] == seen[0][1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "chosen"),
+    [
+        ("", ("auto", False, False)),
+        ("--relief", ("always", False, False)),
+        ("--relief -q", ("always", False, False)),
+        ("--relief never", ("never", False, False)),
+        ("--relief=never", ("never", False, False)),
+        ("--relief --relief-map --fill-occluded", ("always", True, True)),
+        ("--local", ("always", False, False)),
+        ("--local -q", ("always", False, False)),
+        ("--local never", ("never", False, False)),
+        ("--local=never", ("never", False, False)),
+        ("--local=always -q", ("always", False, False)),
+    ],
+)
+def test_relief_alone_is_always_and_local_is_its_old_name(
+    arguments: str,
+    chosen: tuple[str, bool, bool],
+    seen: Seen,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for command in ([], ["align"]):
+        monkeypatch.setattr(sys, "argv", ["agalign", *command, "flight", *arguments.split()])
+        with pytest.raises(SystemExit):
+            main.main()
+        _, settings = seen.pop()
+        assert (settings.relief.use, settings.write.relief_map, settings.write.fill_occluded) == chosen
+        assert ("--local is deprecated; use --relief" in capsys.readouterr().err) == ("--local" in arguments)
+
+
+def test_local_is_the_old_name_of_relief_for_onto_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[str] = []
+    monkeypatch.setattr(main, "app", lambda args, prog_name: given.extend(args))
+    monkeypatch.setattr(sys, "argv", ["agalign", "onto", "a.tif", "b.tif", "--local"])
+    main.main()
+    assert "--local" not in given
+    assert given[given.index("--relief") + 1] == "always"
 
 
 def test_a_dry_run_says_what_would_be_done_and_writes_nothing(tmp_path: Path) -> None:
@@ -113,3 +146,61 @@ def test_the_report_as_json(tmp_path: Path) -> None:
     assert done.exit_code == 0
     facts = json.loads(done.stdout)
     assert [c["label"] for c in facts["captures"]] == ["0000SET/IMG_0001", "0000SET/IMG_0002"]
+
+
+@pytest.mark.parametrize("name", ["indices", "ndvi"])
+def test_indices_are_written_and_summed_up(tmp_path: Path, name: str) -> None:
+    make_aligned(tmp_path, 2)
+    done = CliRunner().invoke(app, [name, str(tmp_path), "--index", "ndvi,NDRE", "--formula", "x=N/R"])
+    assert done.exit_code == 0, done.output
+    assert "6 of 6 written" in done.stdout
+    assert done.stderr == ""
+    assert len(list(tmp_path.rglob("*_x.tif"))) == len(list(tmp_path.rglob("*_ndre.png"))) == 2
+
+
+def test_raw_numbers_are_announced_first(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1, raw=True)
+    done = CliRunner().invoke(app, ["indices", str(tmp_path), "-v"])
+    first, second = done.stderr.splitlines()
+    assert "raw numbers, not reflectance" in first
+    assert "--radiometry auto" in first
+    assert "IMG_0001 ndvi: median" in second
+    assert CliRunner().invoke(app, ["indices", str(tmp_path), "--index", "savi"]).exit_code == 1
+
+
+def test_reports_as_json(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
+    done = CliRunner().invoke(app, ["indices", str(tmp_path), "--index", "ndvi,evi", "--json"])
+    assert done.exit_code == 3, "there is no blue band"
+    ndvi, evi = json.loads(done.stdout)["indices"]
+    assert (ndvi["capture"], ndvi["unit"], ndvi["problem"]) == ("0000SET/IMG_0001", "reflectance", None)
+    assert ndvi["p5"] < ndvi["median"] < ndvi["p95"]
+    assert (evi["path"], evi["median"]) == (None, None)
+    assert "evi needs a blue band" in evi["problem"]
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--index", "xyz"], "unknown index 'xyz'"),
+        (["--formula", "import os"], "is not a formula"),
+        (["--index", "ndvi,ndvi"], "'ndvi' is given twice"),
+        (["--index", ","], "--index is empty"),
+        (["--formula", "N/R", "--formula", "N/G"], "'formula' is given twice"),
+    ],
+)
+def test_wrong_indices_are_usage_errors_of_one_line(tmp_path: Path, options: list[str], problem: str) -> None:
+    make_aligned(tmp_path, 1)
+    done = CliRunner().invoke(app, ["indices", str(tmp_path), *options])
+    assert done.exit_code == 2
+    (line,) = done.stderr.splitlines()
+    assert problem in line
+
+
+def test_a_run_announces_indices_of_raw_numbers_too(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path / "in", captures=1, size_px=(160, 120))
+    said = [
+        CliRunner().invoke(app, ["align", str(tmp_path / "in"), "--index", "ndvi", "--dry-run", *options]).stderr
+        for options in ([], ["--radiometry", "auto"])
+    ]
+    assert ["raw numbers, not reflectance" in text for text in said] == [True, False]

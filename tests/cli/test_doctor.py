@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 
@@ -11,25 +9,19 @@ import pytest
 
 from agalign.cli import doctor
 
-
-def told(*arguments: str) -> tuple[int, str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "agalign", "doctor", *arguments], capture_output=True, text=True, check=False
-    )
-    assert "Traceback" not in done.stderr
-    return done.returncode, done.stdout + done.stderr
+from ..program import agalign_here
 
 
 @pytest.mark.slow
-def test_it_knows_versions_devices_and_the_disk(tmp_path: Path) -> None:
-    code, text = told(str(tmp_path), "--json")
-    facts = json.loads(text)
-    assert code == (1 if facts["problems"] else 0)
+def test_it_finds_versions_devices_and_the_disk(tmp_path: Path) -> None:
+    done = agalign_here("doctor", tmp_path, "--json")
+    facts = json.loads(done.stdout)
+    assert done.returncode == (1 if facts["problems"] else 0)
     assert facts["machine"]["torch"] == metadata.version("torch")
     assert facts["machine"]["cores"] >= 1
     assert next(d for d in facts["devices"] if d["device"] == "cpu")["problem"] == ""
     assert facts["disk"]["folder"] == str(tmp_path)
-    assert "device cpu" in told(str(tmp_path))[1]
+    assert "device cpu" in agalign_here("doctor", tmp_path).stdout
 
 
 def test_it_names_every_extra_that_a_user_may_want() -> None:

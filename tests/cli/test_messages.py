@@ -1,4 +1,4 @@
-"""What is printed of wrong arguments and of folders that cannot be used: one line, in the words of the command line."""
+"""What is printed about arguments and files that cannot be used, and at the end: one line in plain words."""
 
 import json
 import sys
@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.cameras.discover import DiscoverOptions, FolderScan, discover
+from agalign.cameras.scan import Problem
 from agalign.cli import main
 from agalign.cli.main import app
-from agalign.errors import ConfigurationError, InputError
+from agalign.cli.run import print_problems
+from agalign.cli.terminal import Terminal, exits, shown
+from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.flight.overview import camera_overviews
 from agalign.method.device import choose_device
 from agalign.synthetic import flight as synthetic
@@ -35,10 +38,15 @@ def write_bands(folder: Path, suffix: str = ".tif", capture: str = "IMG_0001") -
         (["align", "x", "--accept-predicted", "much"], "--accept-predicted: give a number"),
         (["align", "x", "--seed", "rigg"], "--seed: 'rigg' is unknown; choose from auto, rig, geo, structure"),
         (["align", "x", "--crop", "[red]"], "--crop: '[red]' is unknown; choose from flight, common, none"),
-        (["align", "x", "--nope"], "no such option: --nope"), (["align"], "folder is missing"),
-        (["--nope"], "no such option: --nope"), (["align", "x", "y"], "got unexpected extra argument(s) (y)"),
+        (["align", "x", "--layout", "pile"], "--layout: 'pile' is unknown; choose from"),
+        (["align", "x", "--order", "size"], "--order: 'size' is unknown; choose from"),
+        (["align", "x", "--compression", "lzma"], "--compression: 'lzma' is unknown; choose from"),
+        (["align", "x", "--nope"], "no such option: --nope"),
+        (["align"], "folder is missing"),
+        (["--nope"], "no such option: --nope"),
+        (["align", "x", "y"], "got unexpected extra argument(s) (y)"),
     ],
-)  # fmt: skip
+)
 def test_wrong_arguments_are_one_line_in_plain_words(arguments: list[str], line: str) -> None:
     done = CliRunner().invoke(app, arguments, prog_name="agalign")
     assert done.exit_code == 2
@@ -137,7 +145,6 @@ def test_info_begins_with_the_cameras(tmp_path: Path) -> None:
     assert "2 captures of 5 bands, 160 x 120 px" in first
     assert camera.gsd_per_height is not None
     lens = discover(tmp_path).captures[0].reference.lens
-    assert lens is not None
     assert camera.gsd_per_height * lens.fx_px == pytest.approx(1)
     assert f"GSD {1e4 / lens.fx_px:.1f} cm at a height of 100 m" in " ".join(done.stdout.split())
     assert json.loads(CliRunner().invoke(app, ["info", str(tmp_path), "--json"]).stdout)["cameras"][0]["captures"] == 2
@@ -173,5 +180,52 @@ def test_expert_options_are_a_panel_at_the_end() -> None:
 def test_the_list_of_commands_has_whole_sentences() -> None:
     """Their ends are found by full stops: that of an abbreviation would cut a sentence."""
     listed = " ".join(CliRunner().invoke(app, ["--help"]).output.split())
-    for command in main.COMMANDS.values():
-        assert command.hidden or command.summary in listed
+    for command in typer.main.get_command(app).commands.values():
+        if not command.hidden:
+            first_sentence = " ".join(command.help.split("\n\n")[0].split())
+            assert first_sentence in listed
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (InputError("x: is empty"), 1, "x: is empty"),
+        (ConfigurationError("--x: no"), 2, "--x: no"),
+        (MemoryError(), 1, "out of memory"),
+        (RuntimeError("std::bad_alloc"), 1, "out of memory"),
+        (ImportError("libx.so"), 1, "a library cannot be loaded (libx.so)"),
+        (OSError(28, "No space left on device"), 1, "output: No space left on device"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ZeroDivisionError("of 1"), 1, "please report this"),
+    ],
+)
+def test_every_end_is_a_line_and_a_code(
+    error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(typer.Exit) as ended, exits(Terminal(quiet=False, verbose=False, log_json=False)):
+        raise error
+    assert ended.value.exit_code == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_what_is_shown_does_nothing() -> None:
+    assert shown("\x1b[31mred\a\n[b]") == "\\x1b[31mred\\x07\\n\\[b]"
+    assert shown("Köln, 雨 [1]") == "Köln, 雨 [1]"
+
+
+def test_many_files_with_one_problem_are_counted_and_all_are_in_the_json_log(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    texts = {f"f{n:04d}.tif": f"is empty, {n} bytes" for n in range(4000)} | {"x.tif": "cannot be read"}
+    problems = (Problem(Path(f"in/{n}"), UnreadableFileError(f"in/{n}: {text}")) for n, text in texts.items())
+    scan = FolderScan(Path("in"), (), tuple(problems))
+    print_problems(scan, Terminal(quiet=False, verbose=False, log_json=False))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "agalign: in/f0000.tif: is empty, 0 bytes"
+    assert lines[10:] == [
+        "agalign: in/x.tif: cannot be read",
+        "agalign: in: 3990 more files with the same problem as f0009.tif; 'agalign info --json' lists all",
+    ]
+    print_problems(scan, Terminal(quiet=False, verbose=False, log_json=True))
+    assert len(capsys.readouterr().err.splitlines()) == 4001

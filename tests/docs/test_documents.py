@@ -1,72 +1,158 @@
-"""Nothing in the documents rots: every command and every script in them is run, every link leads somewhere."""
+"""Every command and every script of the documents is run, every example too, and every link leads somewhere."""
 
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
 import sys
 import tomllib
+import warnings
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import rasterio
+from synthetic_flights.cameras import ALTUM
 
 import agalign
+from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 
-from ..conftest import REAL_DATA, textured_image
+from ..cli.test_onto import TRUTH as MOVEMENT
+from ..cli.test_onto import write_mosaic
+from ..conftest import REAL_DATA, Shared, textured_image, textured_pair
+from ..program import agalign_here
 from ..test_api import TRUTH
-from .blocks import PAGES, ROOT, Block, blocks_of, commands_of, program
+from .blocks import PAGES, ROOT, blocks_of, commands_of, program
 
-RUN_BY = {
-    "docker": "tools/container.sh",
-    "dask": "tools/dask_cluster.sh",
-    "pip": ".ci/run",
-}
+RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip": ".ci/run"}
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
 KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
-PREAMBLE = """
-import tifffile
-green = tifffile.imread("flight/0000SET/000/IMG_0001_2.tif")
-nir = tifffile.imread("flight/0000SET/000/IMG_0001_4.tif")
-"""
 
 
-def run(block: Block, command: list[str], folder: Path) -> None:
-    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    tools = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
-    done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL,
-        env=os.environ | {"PYTHONPATH": paths, "PATH": tools},
-    )  # fmt: skip
-    assert done.returncode == 0, f"{block.where}: {shlex.join(command)}\n{done.stdout[-1500:]}{done.stderr[-3000:]}"
+@pytest.fixture(scope="session")
+def originals(shared: Shared, flight: Path) -> Path:
+    """What a reader has before he begins: a flight, mosaics, pairs of images, and benchmarks and examples."""
+
+    def fill(folder: Path) -> None:
+        shutil.copytree(flight, folder / "flight")
+        synthetic.make_flight(folder / "altum", captures=2, size_px=(640, 480), rng_seed=4, camera=ALTUM)
+        dates = textured_pair(MOVEMENT, 640, 520)
+        for name, image, off_m in zip(("spring", "summer"), dates, ((0, 0), (3, -4)), strict=True):
+            write_mosaic(folder / f"{name}.tif", image, off_m, bands=2)
+        (folder / "mosaics").mkdir()
+        write_mosaic(folder / "mosaics" / "field.tif", dates[0][:320, :400], (0, 0), bands=3)
+        with rasterio.open(folder / "mosaics" / "field.tif", "r+") as field:
+            field.descriptions = ("green", "red", "nir")
+        for number, seed in enumerate((1, 2), start=1):
+            for side, image in zip("ab", textured_pair(MOVEMENT, 240, 200, seed), strict=True):
+                cv2.imwrite(str(folder / f"{number}{side}.png"), (image * 40 + 128).clip(1, 254).astype(np.uint8))
+            np.savetxt(folder / f"{number}.txt", MOVEMENT)
+        (folder / "pairs.csv").write_text("fixed,moving,homography\n1a.png,1b.png,1.txt\n2a.png,2b.png,2.txt\n")
+        for name in ("examples", "benchmarks"):
+            (folder / name).symlink_to(ROOT / name)
+        if REAL_DATA.is_dir():
+            (folder / "DATA").symlink_to(REAL_DATA)
+
+    return shared("desk", fill)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", RUNNABLE, ids=[p.relative_to(ROOT).as_posix() for p in RUNNABLE])
-def test_a_page_does_what_it_says(page: Path, desk: Path, tmp_path: Path) -> None:
-    """Read from top to bottom, in a folder with a flight in it."""
-    folder = tmp_path / "desk"
-    shutil.copytree(desk, folder)
-    for name in ("examples", "benchmarks"):
-        (folder / name).symlink_to(ROOT / name)
-    if REAL_DATA.is_dir():
-        (folder / "DATA").symlink_to(REAL_DATA)
+@pytest.fixture(scope="module")
+def desk(originals: Path, aligned_flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all pages use one after another; the flight is aligned."""
+    folder = shutil.copytree(originals, tmp_path_factory.mktemp("desk") / "desk", symlinks=True)
+    shutil.copytree(aligned_flight, folder / "aligned")
+    return folder
+
+
+def run_command(command: str, where: str) -> None:
+    """Run agalign in this process, which has loaded everything, and other programs in a shell."""
+    first, *arguments = shlex.split(command)
+    if first == "agalign":
+        found = [sorted(map(str, Path().glob(a))) if "*" in a else [a] for a in arguments]
+        done = agalign_here(*(argument for part in found for argument in part))
+    else:
+        tools = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
+        variables = os.environ | {"PYTHONPATH": str(ROOT), "PATH": tools}
+        done = subprocess.run(["bash", "-c", command], env=variables, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{where}: {command}\n{done.stdout[-1500:]}{done.stderr[-3000:]}"
+
+
+def run_python(text: str) -> None:
+    bands = {name: f"flight/0000SET/000/IMG_0001_{number}.tif" for name, number in (("green", 2), ("nir", 4))}
+    names: dict[str, Any] = {name: cv2.imread(path, cv2.IMREAD_UNCHANGED) for name, path in bands.items()}
+    with warnings.catch_warnings(action="ignore"):
+        exec(text, names)
+
+
+def run_page(page: Path) -> None:
+    """Run the blocks of a page from top to bottom, in the current folder."""
     for block in blocks_of(page):
         if named := re.match(r"# (\w+\.py)\n", block.text):
-            (folder / named[1]).write_text(block.text, encoding="utf-8")
+            Path(named[1]).write_text(block.text, encoding="utf-8")
         if block.kind == "python":
-            run(block, [sys.executable, "-c", PREAMBLE + block.text], folder)
+            run_python(block.text)
         commands = commands_of(block) if block.kind == "sh" else []
         if " DATA " in block.text and not REAL_DATA.is_dir():
             pytest.skip(f"{block.where} is about real captures, which are not at {REAL_DATA}")
         if not any(program(command) in RUN_BY for command in commands):
             for command in commands:
-                run(block, ["bash", "-c", command], folder)
+                run_command(command, block.where)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUNNABLE, ids=[p.relative_to(ROOT).as_posix() for p in RUNNABLE])
+def test_a_page_does_what_it_says(page: Path, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(desk)
+    run_page(page)
+
+
+@pytest.mark.full
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUNNABLE, ids=[p.relative_to(ROOT).as_posix() for p in RUNNABLE])
+def test_a_page_needs_no_other_page(
+    page: Path, originals: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(shutil.copytree(originals, tmp_path / "desk", symlinks=True))
+    run_page(page)
+
+
+EXAMPLES = {
+    "two_arrays.py": ("", "aligned: ", 1),
+    "one_capture.py": ("flight one", ": aligned, ", 4),
+    "whole_flight.py": ("flight whole", " aligned ", 8),
+    "ndvi_over_a_flight.py": ("aligned", " at 52.", 2),
+    "next_flight.py": ("flight flight next", "4 of 4 aligned", 2),
+    "on_dask.py": ("flight dask", " done ", 2),
+    "two_dates.py": ("spring.tif summer.tif change.tif", "offset before alignment: ", 1),
+}
+"""{name: (arguments, a part of what it prints, how many times)}."""
+
+
+def test_every_example_is_run() -> None:
+    assert {path.name for path in (ROOT / "examples").glob("*.py")} == set(EXAMPLES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.full] if name == "on_dask.py" else []) for name in EXAMPLES]
+)
+def test_an_example(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments, text, times = EXAMPLES[name]
+    monkeypatch.chdir(desk)
+    monkeypatch.setattr(sys, "argv", [name, *arguments.split()])
+    with warnings.catch_warnings(action="ignore"):
+        runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+    assert capsys.readouterr().out.count(text) == times
+    if name == "two_dates.py":
+        with rasterio.open("change.tif") as change, rasterio.open("spring.tif") as first:
+            assert (change.shape, change.transform) == (first.shape, first.transform)
+            assert np.isfinite(change.read(1)).mean() > 0.8
 
 
 def test_the_python_of_the_readme_aligns_pixels() -> None:
@@ -161,38 +247,32 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert anchor in {re.sub(r"[^\w -]", "", h).strip().lower().replace(" ", "-") for h in heads}, target
 
 
-def test_options_in_the_documents_exist() -> None:
-    known = set()
-    for command in (["--help"], ["align", "--help"]):
-        done = subprocess.run(
-            [sys.executable, "-m", "agalign", *command], capture_output=True, text=True, check=True,
-            env=os.environ | {"COLUMNS": "300"},
-        )  # fmt: skip
-        known |= set(re.findall(r"--[a-z][\w-]+", done.stdout))
-    names = "README.md", "docs/options.md", "docs/quickstart.md", "docs/troubleshooting.md"
-    for page in (ROOT / name for name in names):
-        named = set(re.findall(r"[` ](--[a-z][\w-]+)", page.read_text(encoding="utf-8")))
-        assert named, page
-        assert named <= known, page
+@pytest.mark.parametrize("name", ["README.md", "docs/options.md", "docs/quickstart.md", "docs/troubleshooting.md"])
+def test_options_in_the_documents_exist(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    helps = agalign_here("--help").stdout + agalign_here("align", "--help").stdout
+    named = set(re.findall(r"[` ](--[a-z][\w-]+)", (ROOT / name).read_text(encoding="utf-8")))
+    assert named
+    assert named <= set(re.findall(r"--[a-z][\w-]+", helps))
 
 
-def test_generated_tables_are_current() -> None:
-    done = subprocess.run(
-        [sys.executable, "tools/pages.py", "--check"], cwd=ROOT, capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+def python(*arguments: str | Path) -> None:
+    """Run a program of Python in a process of its own; it must succeed."""
+    variables = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, check=False, env=variables)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+@pytest.mark.parametrize("tool", ["pages.py", "licences.py"])
+def test_generated_tables_are_current(tool: str) -> None:
+    python(ROOT / "tools" / tool, "--check")
 
 
 @pytest.mark.slow
 def test_the_site_is_built(tmp_path: Path) -> None:
     """Every page, and what the docstrings say, without a warning."""
     pytest.importorskip("sphinx")
-    done = subprocess.run(
-        [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(ROOT / "docs"), str(tmp_path / "site")],
-        capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    python("-m", "sphinx", "-q", "-W", "--keep-going", ROOT / "docs", tmp_path / "site")
     page = (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
     described = set(re.findall(r'descname"><span class="pre">(\w+)<', page))
     assert set(agalign.__all__) - {"__version__"} <= described

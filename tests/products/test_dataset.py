@@ -6,34 +6,26 @@ import rasterio
 import rioxarray  # noqa: F401
 
 import agalign
-from agalign.config import SeedSettings, Settings, WriteSettings
-from agalign.errors import AgalignError, InputError
-from agalign.synthetic.flight import make_flight
 
-from ..conftest import textured_image
-from .test_outputs import write_band
+from ..conftest import Shared, seeded, write_capture
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
-SEEDED = Settings(seed=SeedSettings(only=True))
+pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module", params=["stack", "bands"])
-def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, out = tmp_path_factory.mktemp("in"), tmp_path_factory.mktemp("out")
-    make_flight(folder, 2, (480, 360), rng_seed=3)
-    write = WriteSettings(layout=request.param, crop="none", radiometry="sun")
-    agalign.align_folder(folder, out, settings=SEEDED.model_copy(update={"write": write}))
-    return out
+@pytest.fixture(params=["stack", "bands"])
+def run(request: pytest.FixtureRequest, flight: Path, shared: Shared) -> Path:
+    settings = seeded(layout=request.param, crop="none", radiometry="sun")
+    return shared(f"dataset_{request.param}", lambda out: agalign.align_folder(flight, out, settings=settings))
 
 
 def test_a_capture_is_its_files(run: Path) -> None:
-    dataset = agalign.open_capture(run / "0000SET" / "000" / "IMG_0001.tif")
-    assert dataset.equals(agalign.open_capture(str(run / "0000SET" / "000" / "IMG_0001.stac.json")))
+    path = run / "0000SET" / "000" / "IMG_0001.tif"
+    dataset = agalign.open_capture(path)
+    assert dataset.equals(agalign.open_capture(str(path.with_suffix(".stac.json"))))
     assert set(dataset.data_vars) == {"Blue", "Green", "Red", "NIR", "Red edge"}
     assert (dataset.NIR.attrs["wavelength_nm"], dataset.NIR.attrs["units"]) == (840, "1")
     assert dataset.NIR.dims == ("y", "x")
     assert dataset.attrs["reference_band"] == "Green"
-    path = run / "0000SET" / "000" / "IMG_0001.tif"
     file, index = (path, 4) if path.exists() else (path.with_name("IMG_0001_4.tif"), 1)
     with rasterio.open(file) as source:
         np.testing.assert_array_equal(dataset.NIR.values, source.read(index))
@@ -48,8 +40,7 @@ def test_a_flight_is_read_when_it_is_asked_for(run: Path) -> None:
     assert flight.latitude.values[0] == pytest.approx(52.0)
     one = agalign.open_capture(run / "0000SET" / "000" / "IMG_0002.json")
     np.testing.assert_array_equal(flight.Red.isel(capture=1).values, one.Red.values)
-    ndvi = (flight.NIR - flight.Red) / (flight.NIR + flight.Red)
-    assert 0 < float(ndvi.mean()) < 1
+    assert 0 < float(((flight.NIR - flight.Red) / (flight.NIR + flight.Red)).mean()) < 1
     assert flight.NIR.dtype == np.float32
     assert flight.status.dims == ("capture", "band")
     assert set(flight.status.sel(band=["Red", "NIR"]).values.ravel()) <= {"seed_only", "aligned"}
@@ -60,11 +51,11 @@ def test_a_flight_is_read_when_it_is_asked_for(run: Path) -> None:
 
 def test_a_place_on_the_map_and_masked_pixels_follow(tmp_path: Path) -> None:
     place = {"crs": rasterio.CRS.from_epsg(32631), "transform": rasterio.Affine(0.1, 0, 5e5, 0, -0.1, 5.8e6)}
-    for name, gain in (("green", 900), ("red", 500)):
-        pixels = (3000 + gain * textured_image(300, 240, 3)).clip(1).astype(np.uint16)
-        pixels[:40, :40] = 0
-        write_band(tmp_path / "in" / f"f_{name}.tif", pixels, nodata=0, **place)
-    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=SEEDED)
+    write_capture(tmp_path / "in", "green", "red", nodata=0, **place)
+    for path in (tmp_path / "in").iterdir():
+        with rasterio.open(path, "r+") as dataset:
+            dataset.write(np.zeros((40, 40), np.uint16), 1, window=rasterio.windows.Window(0, 0, 40, 40))
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=seeded())
     raw = agalign.open_capture(tmp_path / "out" / "f.json", masked=False)
     assert raw.red.rio.crs.to_epsg() == 32631
     assert raw.red.dtype == np.uint16
@@ -76,31 +67,24 @@ def test_a_place_on_the_map_and_masked_pixels_follow(tmp_path: Path) -> None:
     assert np.isnan(masked.red.values[:40, :40]).all()
 
 
-def test_captures_on_rotated_grids_are_stacked(tmp_path: Path) -> None:
-    make_flight(tmp_path / "in", 2, (480, 360), rng_seed=3)
-    write = WriteSettings(georeference=True, ground_elevation_m=0.0)
-    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=SEEDED.model_copy(update={"write": write}))
-    one = agalign.open_capture(tmp_path / "out" / "0000SET" / "000" / "IMG_0001.json")
+def test_captures_on_rotated_grids_are_stacked(flight: Path, tmp_path: Path) -> None:
+    agalign.align_folder(flight, tmp_path, settings=seeded(georeference=True, ground_elevation_m=0.0))
+    one = agalign.open_capture(tmp_path / "0000SET" / "000" / "IMG_0001.json")
     assert one.xc.shape == (one.sizes["y"], one.sizes["x"])
-    flight = agalign.open_flight(tmp_path / "out")
-    assert (flight.sizes["capture"], float(flight.x[0]), float(flight.y[0])) == (2, 0.0, 0.0)
-    assert "xc" not in flight.coords
+    stacked = agalign.open_flight(tmp_path)
+    assert (stacked.sizes["capture"], float(stacked.x[0]), float(stacked.y[0])) == (2, 0.0, 0.0)
+    assert "xc" not in stacked.coords
 
 
 def test_what_cannot_be_opened_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no aligned captures"):
+    with pytest.raises(agalign.InputError, match="no aligned captures"):
         agalign.open_flight(tmp_path)
-    with pytest.raises(AgalignError, match=r"missing\.json"):
+    with pytest.raises(agalign.AgalignError, match=r"missing\.json"):
         agalign.open_capture(tmp_path / "missing.tif")
-    with pytest.raises(InputError, match="is a folder; give the sidecar of a capture, or use open_flight"):
+    with pytest.raises(agalign.InputError, match="is a folder; give the sidecar of a capture, or use open_flight"):
         agalign.open_capture(tmp_path)
-
-
-def test_captures_of_different_sizes_make_no_stack(tmp_path: Path) -> None:
-    for number, size in enumerate(((300, 240), (320, 240))):
-        for name, gain in (("green", 900), ("red", 500)):
-            pixels = (3000 + gain * textured_image(*size, 3)).clip(1).astype(np.uint16)
-            write_band(tmp_path / "in" / f"{number}_{name}.tif", pixels)
-    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=SEEDED)
-    with pytest.raises(InputError, match="differ in size"):
+    for name, width in (("a", 300), ("b", 320)):
+        write_capture(tmp_path / "in", "green", "red", name=name, size_px=(width, 240))
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=seeded())
+    with pytest.raises(agalign.InputError, match="differ in size"):
         agalign.open_flight(tmp_path / "out")

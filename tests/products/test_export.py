@@ -12,50 +12,49 @@ import pytest
 import agalign
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.pix4d import perspective_lens
-from agalign.config import SeedSettings, Settings, WriteSettings
-from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.products.export import export
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.choices import ExportProgram
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-SETTINGS = Settings(seed=SeedSettings(only=True, force="rig"), write=WriteSettings(layout="both"))
+from ..conftest import Shared, read_json, seeded
+
+pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def seeded(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def run(flight: Path, shared: Shared) -> Path:
     """The output of a run, by the tags alone to save time: its first capture counts as `ok`."""
-    out = tmp_path_factory.mktemp("out")
-    agalign.align_folder(flight, out, settings=SETTINGS)
-    first = find_sidecars(out)[0]
-    first.write_text(first.read_text().replace('"status": "degraded"', '"status": "ok"', 1))
-    return out
+
+    def fill(out: Path) -> None:
+        agalign.align_folder(flight, out, settings=seeded("rig", layout="both"))
+        first = find_sidecars(out)[0]
+        first.write_text(first.read_text().replace('"status": "degraded"', '"status": "ok"', 1))
+
+    return shared("export", fill)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("program", ["odm", "metashape", "pix4d"])
-def test_band_files_are_linked_under_names_of_their_own(seeded: Path, tmp_path: Path, program: ExportProgram) -> None:
-    report = export(seeded, tmp_path / "to", program)
+def test_band_files_are_linked_under_names_of_their_own(run: Path, tmp_path: Path, program: ExportProgram) -> None:
+    report = export(run, tmp_path / "to", program)
     names = sorted(p.name for p in (tmp_path / "to" / "images").iterdir())
     assert names == [f"0000SET_000_IMG_0001_{k}.tif" for k in range(1, 6)]
-    source = seeded / "0000SET" / "000" / "IMG_0001_4.tif"
+    source = run / "0000SET" / "000" / "IMG_0001_4.tif"
     assert source.samefile(report.files[3])
     assert (report.captures, report.left_out) == (1, [("0000SET/000/IMG_0002", "its status is degraded")])
     assert (tmp_path / "to" / "README.txt").read_text().splitlines() == report.notes
     if program == "odm":
         assert "--skip-band-alignment --primary-band 'Green'" in report.notes[1]
         assert report.notes[1].endswith(" --texturing-skip-global-seam-leveling")
-    copied = export(seeded, tmp_path / "copies", program, copy=True).files[3]
+    copied = export(run, tmp_path / "copies", program, copy=True).files[3]
     assert not source.samefile(copied)
     assert copied.read_bytes() == source.read_bytes()
 
 
-@pytest.mark.slow
 def test_matrices_for_micasense_s_notebooks_warp_their_undistorted_images(
-    flight: Path, seeded: Path, tmp_path: Path
+    flight: Path, run: Path, tmp_path: Path
 ) -> None:
     """Points of the mapping, undistorted by OpenCV as the notebooks undistort images."""
-    export(seeded, tmp_path, "micasense")
+    export(run, tmp_path, "micasense")
     matrices = np.load(tmp_path / "0000SET_000_IMG_0001_warp_matrices.npy", allow_pickle=True)
     assert matrices.shape == (5, 3, 3)
     serial = read_tags(next(flight.rglob("IMG_0001_1.tif"))).serial
@@ -63,13 +62,12 @@ def test_matrices_for_micasense_s_notebooks_warp_their_undistorted_images(
 
     def straight(points: list[tuple[float, float]], file: str) -> np.ndarray:
         lens = perspective_lens(read_tags(next(flight.rglob(file))))
-        assert lens is not None
         coefficients = np.array(lens.distortion[:5])
         new, _ = cv2.getOptimalNewCameraMatrix(lens.matrix, coefficients, (480, 360), 1)
         raw = np.array(points, np.float64)[:, None]
         return cv2.undistortPoints(raw, lens.matrix, coefficients, P=new)[:, 0]
 
-    sidecar = read_sidecar(find_sidecars(seeded)[0])
+    sidecar = read_sidecar(find_sidecars(run)[0])
     for matrix, band in zip(matrices, sidecar.bands, strict=True):
         if band.grid is None:
             np.testing.assert_allclose(matrix, np.eye(3), atol=1e-9)
@@ -80,9 +78,8 @@ def test_matrices_for_micasense_s_notebooks_warp_their_undistorted_images(
         assert np.abs(mapped - reference).max() > 1.0
 
 
-@pytest.mark.slow
-def test_matrices_for_opencv_are_between_raw_pixels(seeded: Path, tmp_path: Path) -> None:
-    report = export(seeded, tmp_path, "opencv")
+def test_matrices_for_opencv_are_between_raw_pixels(run: Path, tmp_path: Path) -> None:
+    report = export(run, tmp_path, "opencv")
     arrays = np.load(tmp_path / "0000SET_000_IMG_0001.npz")
     assert arrays["bands"].tolist() == ["Blue", "Green", "Red", "NIR", "Red edge"]
     for k in (0, 2, 3, 4):
@@ -97,25 +94,22 @@ def test_matrices_for_opencv_are_between_raw_pixels(seeded: Path, tmp_path: Path
     assert "Largest distance" in report.notes[-1]
 
 
-@pytest.mark.slow
-def test_what_cannot_be_exported_is_one_line(seeded: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="give the output folder of a run"):
+def test_what_cannot_be_exported_is_one_line(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(agalign.InputError, match="give the output folder of a run"):
         export(tmp_path, tmp_path / "to", "odm")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").touch()
-    with pytest.raises(OutputError, match="is not empty"):
-        export(seeded, tmp_path / "full", "odm")
-    with pytest.raises(InputError, match=r"IMG_0001_1\.tif: the image is not there; .* --source"):
-        export(seeded, tmp_path / "to", "micasense", source=tmp_path)
-    changed = tmp_path / "changed"
-    shutil.copytree(seeded, changed)
-    path = find_sidecars(changed)[0]
-    content = json.loads(path.read_text())
+    with pytest.raises(agalign.OutputError, match="is not empty"):
+        export(run, tmp_path / "full", "odm")
+    with pytest.raises(agalign.InputError, match=r"IMG_0001_1\.tif: the image is not there; .* --source"):
+        export(run, tmp_path / "to", "micasense", source=tmp_path)
+    path = find_sidecars(shutil.copytree(run, tmp_path / "changed"))[0]
+    content = read_json(path)
     content["output"]["band_files"] = []
-    path.write_text(json.dumps(content))
-    with pytest.raises(ConfigurationError, match="--layout bands or both"):
-        export(changed, tmp_path / "to", "pix4d")
-    content["status"] = "degraded"
-    path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match="no capture with status ok"):
-        export(changed, tmp_path / "to", "pix4d")
+    for status, error, message in (
+        ("ok", agalign.ConfigurationError, "--layout bands or both"),
+        ("degraded", agalign.InputError, "no capture with status ok"),
+    ):
+        path.write_text(json.dumps(content | {"status": status}))
+        with pytest.raises(error, match=message):
+            export(tmp_path / "changed", tmp_path / "to", "pix4d")

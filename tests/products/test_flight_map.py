@@ -4,17 +4,15 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
 from synthetic_flights.aligned import make_aligned
-from synthetic_flights.panel import make_flight_between_panels
 
 import agalign
 from agalign.batch.index_run import index_tasks, run_indices
-from agalign.config import SeedSettings, Settings, WriteSettings
-from agalign.errors import ConfigurationError
 from agalign.products.flight_map import FlightMap
 from agalign.products.footprint import (
     above_elevation,
@@ -24,12 +22,13 @@ from agalign.products.footprint import (
     with_assumed_height,
 )
 from agalign.products.indices import INDICES
+from agalign.products.sidecar import CaptureResult
 from agalign.products.sidecar_file import read_result
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Pose, Position
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-SEEDED = Settings(seed=SeedSettings(only=True))
+from ..conftest import read_json, seeded
+
 M_PER_DEGREE = 111_250.0  # of latitude, at 52 degrees
 
 
@@ -39,63 +38,52 @@ def capture(pose: Pose | None, altitude_m: float | None = 130.0) -> Capture:
     return Capture("a", Path("one"), (band,), 0, position=position, pose=pose)
 
 
+def features_of(out: Path) -> list[dict[str, Any]]:
+    return read_json(out / "flight.geojson")["features"]
+
+
+def mapped(out: Path, known: Capture, status: str = "ok", result: CaptureResult | None = None) -> list[dict[str, Any]]:
+    """The features after a run of one capture."""
+    on_map = FlightMap(out)
+    on_map.add(known, status, result)
+    on_map.write()
+    return features_of(out)
+
+
 def test_the_footprint_of_a_camera_that_looks_down_has_the_size_of_its_field_of_view(tmp_path: Path) -> None:
-    known = capture(Pose(-360.0, height_m=50.0, focal_length_px=1000.0))
-    on_map = FlightMap(tmp_path)
-    on_map.add(known, "failed")
-    path = on_map.write()
-    assert path is not None
-    (feature,) = json.loads(path.read_text())["features"]
+    (feature,) = mapped(tmp_path, capture(Pose(-360.0, height_m=50.0, focal_length_px=1000.0)), "failed")
     ring = np.array(feature["geometry"]["coordinates"][0])
     north_m, east_m = np.ptp(ring[:, 1]) * M_PER_DEGREE, np.ptp(ring[:, 0]) * M_PER_DEGREE * math.cos(math.radians(52))
     assert (east_m, north_m) == pytest.approx((60.0, 40.0), rel=0.01)
     area = np.sum(ring[:-1, 0] * ring[1:, 1] - ring[1:, 0] * ring[:-1, 1])
     assert area > 0  # counter-clockwise, as RFC 7946 has outer rings
-    facts = feature["properties"]
-    assert (facts["status"], facts["height_m"], facts["height_from"]) == ("failed", 50.0, "tags")
-    assert facts["stack"] is None
-    assert facts["heading_deg"] == 0.0
+    facts = {"status": "failed", "height_m": 50.0, "height_from": "tags", "stack": None, "heading_deg": 0.0}
+    assert facts.items() <= feature["properties"].items()
 
 
 def test_an_unknown_height_is_assumed_and_marked(tmp_path: Path) -> None:
     unknown = capture(Pose(0.0, focal_length_px=1000.0))
-    on_map = FlightMap(tmp_path)
-    on_map.add(unknown, "ok")
-    path = on_map.write()
-    assert path is not None
-    (feature,) = json.loads(path.read_text())["features"]
+    (feature,) = mapped(tmp_path, unknown)
     assert feature["geometry"]["type"] == "Polygon"
     assert (feature["properties"]["height_m"], feature["properties"]["height_from"]) == (120.0, "assumed")
     by_tags = replace(unknown, pose=Pose(0.0, focal_length_px=1000.0, height_m=120.0))
-    accuracy_m = accuracy_of_footprint_m(by_tags)
-    assert accuracy_m is not None
-    assert feature["properties"]["accuracy_m"] > 2 * accuracy_m
-    assert with_assumed_height(capture(Pose(0.0, focal_length_px=1000.0), 40.0)).pose.height_m == 40.0  # type: ignore[union-attr]
+    assert feature["properties"]["accuracy_m"] > 2 * accuracy_of_footprint_m(by_tags)
+    assert with_assumed_height(capture(Pose(0.0, focal_length_px=1000.0), 40.0)).pose.height_m == 40.0
 
 
 def test_index_rasters_of_a_later_command_are_linked_and_stay_linked(tmp_path: Path) -> None:
     make_aligned(tmp_path, 1)
     known = replace(capture(Pose(0.0, height_m=50.0)), name="IMG_0001", folder=Path("0000SET"))
 
-    def links() -> list[str]:
-        (feature,) = json.loads((tmp_path / "flight.geojson").read_text())["features"]
-        return list(feature["properties"]["indices"])
+    def links(features: list[dict[str, Any]]) -> list[str]:
+        return sorted(features[0]["properties"]["indices"])
 
-    def end_of_a_run() -> None:
-        on_map = FlightMap(tmp_path)
-        on_map.add(known, "ok")
-        on_map.write()
-
-    end_of_a_run()
-    assert links() == []
+    assert links(mapped(tmp_path, known)) == []
     list(run_indices(index_tasks(tmp_path, [INDICES["ndvi"], INDICES["ndre"]], tmp_path)))
     linked = ["0000SET/IMG_0001_ndre.tif", "0000SET/IMG_0001_ndvi.tif"]
-    assert sorted(links()) == linked
-    end_of_a_run()
-    assert sorted(links()) == linked
+    assert links(features_of(tmp_path)) == links(mapped(tmp_path, known)) == linked
     (tmp_path / linked[0]).unlink()
-    end_of_a_run()
-    assert links() == linked[1:]
+    assert links(mapped(tmp_path, known)) == linked[1:]
 
 
 def test_captures_of_an_earlier_run_stay_as_long_as_their_sidecars(tmp_path: Path) -> None:
@@ -104,10 +92,7 @@ def test_captures_of_an_earlier_run_stay_as_long_as_their_sidecars(tmp_path: Pat
     first, second = (replace(capture(None), name=f"IMG_000{n}", folder=Path("0000SET")) for n in (1, 2))
 
     def labels_after(known: Capture) -> list[str]:
-        on_map = FlightMap(tmp_path)
-        on_map.add(known, "ok", read_result(tmp_path / f"{known.label}.json"))
-        on_map.write()
-        return [f["id"] for f in json.loads((tmp_path / "flight.geojson").read_text())["features"]]
+        return [f["id"] for f in mapped(tmp_path, known, "ok", read_result(tmp_path / f"{known.label}.json"))]
 
     assert labels_after(first) == ["0000SET/IMG_0001"]
     assert labels_after(second) == ["0000SET/IMG_0001", "0000SET/IMG_0002"]
@@ -129,7 +114,6 @@ def test_captures_without_a_footprint_are_points_or_left_without_a_place(tmp_pat
     assert on_map.write() is None
     on_map.add(replace(capture(None), name="b"), "sky")
     path = on_map.write()
-    assert path is not None
     first, second = json.loads(path.read_text())["features"]
     assert first["geometry"] is None
     assert second["geometry"] == {"type": "Point", "coordinates": [5.0, 52.0]}
@@ -138,7 +122,6 @@ def test_captures_without_a_footprint_are_points_or_left_without_a_place(tmp_pat
 def test_the_elevation_of_the_ground_gives_the_height_that_tags_lack() -> None:
     pose = Pose(10.0, focal_length_px=1000.0)
     result = above_elevation(capture(pose), 100.0).pose
-    assert result is not None
     assert (result.height_m, result.height_from) == (30.0, "ground elevation")
     assert above_elevation(capture(replace(pose, height_m=7.0)), 100.0).pose == replace(pose, height_m=7.0)
     assert above_elevation(capture(pose), 131.0).pose == pose  # below the ground
@@ -148,12 +131,10 @@ def test_the_elevation_of_the_ground_gives_the_height_that_tags_lack() -> None:
 def test_the_approximate_georeference_maps_pixels_to_where_the_camera_sees_them(heading_deg: float) -> None:
     known = capture(Pose(heading_deg, height_m=50.0, focal_length_px=1000.0))
     georeference = with_approximate_georeference(known).reference.georeference
-    assert georeference is not None
     assert "32631" in georeference.crs_wkt
     assert georeference.accuracy_m is not None
     points_px = np.array([[0.0, 0.0], [1199.0, 0.0], [300.0, 700.0]])
     expected = ground_m(known, points_px)
-    assert expected is not None
     on_map = geometry.apply(georeference.transform, points_px + 0.5)
     # UTM north differs from true north by the meridian convergence, at 5 degrees east of zone 31 1.6 degrees.
     turn = math.radians(2.0 * math.sin(math.radians(52.0)))
@@ -166,17 +147,15 @@ def test_without_a_height_there_is_no_approximate_georeference() -> None:
 
 
 @pytest.mark.slow
-def test_a_run_writes_the_map_and_georeferenced_rasters_that_agree(tmp_path: Path) -> None:
-    make_flight_between_panels(tmp_path / "in", 2, (640, 480))
-    write = WriteSettings(georeference=True)
-    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=SEEDED.model_copy(update={"write": write}))
-    features = json.loads((tmp_path / "out" / "flight.geojson").read_text())["features"]
+def test_a_run_writes_the_map_and_georeferenced_rasters_that_agree(between_panels: Path, tmp_path: Path) -> None:
+    agalign.align_folder(between_panels, tmp_path, settings=seeded(georeference=True))
+    features = features_of(tmp_path)
     by_status = {f["properties"]["status"] for f in features}
     assert "panel" in by_status
     assert {f["geometry"]["type"] for f in features if f["properties"]["status"] == "panel"} == {"Point"}
     (feature, *_) = [f for f in features if f["properties"]["stack"]]
     assert feature["properties"]["height_from"] == "panel"
-    with rasterio.open(tmp_path / "out" / feature["properties"]["stack"]) as stack:
+    with rasterio.open(tmp_path / feature["properties"]["stack"]) as stack:
         assert stack.crs.to_epsg() == 32631
         assert float(stack.tags()["GEOREFERENCE_ACCURACY_M"]) == feature["properties"]["accuracy_m"]
         lon, lat = np.array(feature["geometry"]["coordinates"][0]).T
@@ -191,11 +170,8 @@ def test_a_run_writes_the_map_and_georeferenced_rasters_that_agree(tmp_path: Pat
 def test_a_georeference_that_no_capture_can_have_is_refused_before_anything_is_done(
     flight: Path, tmp_path: Path
 ) -> None:
-    settings = SEEDED.model_copy(update={"write": WriteSettings(georeference=True)})
-    with pytest.raises(ConfigurationError, match="--ground-elevation"):
-        agalign.align_folder(flight, tmp_path, settings=settings)
-    known = SEEDED.model_copy(update={"write": WriteSettings(georeference=True, ground_elevation_m=0.0)})
-    (report, *_) = agalign.align_folder(flight, tmp_path, settings=known)
-    assert report.good or report.useful or report.result is not None
-    features = json.loads((tmp_path / "flight.geojson").read_text())["features"]
+    with pytest.raises(agalign.ConfigurationError, match="--ground-elevation"):
+        agalign.align_folder(flight, tmp_path, settings=seeded(georeference=True))
+    agalign.align_folder(flight, tmp_path, settings=seeded(georeference=True, ground_elevation_m=0.0))
+    features = features_of(tmp_path)
     assert {f["properties"]["height_from"] for f in features} == {"ground elevation"}

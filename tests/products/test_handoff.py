@@ -14,29 +14,43 @@ from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.troubles import make_two_headings
 
 import agalign
-from agalign.cameras.discover import DiscoverOptions
-from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.rig import CameraSpec
+
+from ..conftest import Shared, read_json, seeded
 
 pytestmark = pytest.mark.slow
 
 CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
 CAPTURE_TAGS = ("@drone-dji:CaptureUUID", "MicaSense:CaptureId", "@Camera:CaptureUUID", "Camera:CaptureUUID")
+TAGS = [
+    *(f"Image {name}" for name in ("Make", "Model")),
+    *(f"GPS GPS{name}" for name in ("Latitude", "LatitudeRef", "Longitude", "Altitude")),
+    *(f"EXIF {name}" for name in ("DateTimeOriginal", "FocalLength", "ExposureTime", "ISOSpeedRatings")),
+]
+DJI = "CalibratedHMatrix DewarpData RelativeOpticalCenterX RelativeOpticalCenterY CalibratedOpticalCenterX DewarpFlag"
+PIX4D = "PrincipalPoint", "PerspectiveDistortion", "PerspectiveFocalLength"
+SHARED_TAGS = [*(f"Camera:{name}" for name in PIX4D), *(f"@drone-dji:{name}" for name in DJI.split())]
 SIZE = 480, 360
 
 
-@pytest.fixture(scope="module", params=list(CAMERAS))
-def aligned(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[CameraSpec, Path, Path]:
-    """(camera, its files, the aligned ones)."""
-    camera, folder, out = CAMERAS[request.param], tmp_path_factory.mktemp("in"), tmp_path_factory.mktemp("out")
-    make_two_headings(folder, 1, SIZE, camera=camera, line=1, lakes=False)
-    settings = Settings(seed=SeedSettings(only=True), write=WriteSettings(layout="bands"))
-    options = DiscoverOptions(with_rgb=True)
-    (report,) = agalign.align_folder(folder, out, settings=settings, options=options)
+Aligned = tuple[CameraSpec, Path, Path]
+
+
+def make_aligned(folder: Path, camera: CameraSpec, **write: object) -> None:
+    make_two_headings(folder / "in", 1, SIZE, camera=camera, line=1, lakes=False)
+    settings, options = seeded(layout="bands", **write), agalign.DiscoverOptions(with_rgb=True)
+    (report,) = agalign.align_folder(folder / "in", folder / "out", settings=settings, options=options)
     assert report.error is None
-    return camera, folder, out
+
+
+@pytest.fixture(params=list(CAMERAS))
+def aligned(request: pytest.FixtureRequest, shared: Shared) -> Aligned:
+    """(camera, its files, the aligned ones)."""
+    camera = CAMERAS[request.param]
+    folder = shared(f"handoff {request.param}", lambda folder: make_aligned(folder, camera))
+    return camera, folder / "in", folder / "out"
 
 
 def bands_of(folder: Path) -> list[Path]:
@@ -67,7 +81,7 @@ def numbers(value: Any) -> list[float]:
     return [float(v) for v in str(value).split(",")]
 
 
-def test_bands_are_grouped_and_named_as_before(aligned: tuple[CameraSpec, Path, Path]) -> None:
+def test_bands_are_grouped_and_named_as_before(aligned: Aligned) -> None:
     camera, folder, out = aligned
     before, after = ({p.name: xmp_of(p) for p in bands_of(f)} for f in (folder, out))
     assert set(before) == set(after)
@@ -81,24 +95,21 @@ def test_bands_are_grouped_and_named_as_before(aligned: tuple[CameraSpec, Path, 
     assert len({xmp["Camera:BandName"] for xmp in after.values()}) == len(after)
 
 
-def test_place_time_and_camera_are_as_before(aligned: tuple[CameraSpec, Path, Path]) -> None:
+def test_place_time_and_camera_are_as_before(aligned: Aligned) -> None:
     _, folder, out = aligned
     sources = {p.name: p for p in bands_of(folder)}
     paths = bands_of(out)
     assert {p.name for p in paths} == set(sources)
     for path in paths:
         before, after = exif_of(sources[path.name]), exif_of(path)
-        for tag in (
-            "Image Make", "Image Model", "GPS GPSLatitude", "GPS GPSLatitudeRef", "GPS GPSLongitude", "GPS GPSAltitude",
-            "EXIF DateTimeOriginal", "EXIF FocalLength", "EXIF ExposureTime", "EXIF ISOSpeedRatings",
-        ):  # fmt: skip
+        for tag in TAGS:
             assert str(after.get(tag)) == str(before.get(tag)), tag
         with Image.open(path) as image:
             assert image.getexif()[271] == str(before["Image Make"])
             assert image.getexif().get_ifd(0x8825)[1] == "N"
 
 
-def test_nobody_aligns_them_once_more(aligned: tuple[CameraSpec, Path, Path]) -> None:
+def test_nobody_aligns_them_once_more(aligned: Aligned) -> None:
     """All bands are one camera's now: no angles between them, one principal point, one lens, one homography."""
     camera, _, out = aligned
     packets = [xmp_of(p) for p in bands_of(out)]
@@ -107,19 +118,14 @@ def test_nobody_aligns_them_once_more(aligned: tuple[CameraSpec, Path, Path]) ->
         for xmp in packets:
             assert numbers(xmp["Camera:RigRelatives"]) == [0, 0, 0]
             assert numbers(xmp["Camera:RigTranslations"]) == [0, 0, 0]
-    shared = (
-        "Camera:PrincipalPoint", "Camera:PerspectiveDistortion", "Camera:PerspectiveFocalLength",
-        "@drone-dji:CalibratedHMatrix", "@drone-dji:DewarpData", "@drone-dji:RelativeOpticalCenterX",
-        "@drone-dji:RelativeOpticalCenterY", "@drone-dji:CalibratedOpticalCenterX", "@drone-dji:DewarpFlag",
-    )  # fmt: skip
-    for tag in shared:
+    for tag in SHARED_TAGS:
         assert len({str(xmp.get(tag)) for xmp in packets}) == 1, tag
 
 
-def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: tuple[CameraSpec, Path, Path]) -> None:
+def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: Aligned) -> None:
     camera, folder, out = aligned
     (sidecar,) = find_sidecars(out)
-    data = json.loads(sidecar.read_text())
+    data = read_json(sidecar)
     x0, y0, *_ = data["output"]["crop"]
     reference = data["reference"]["file"]
     before, after = (next(xmp_of(p) for p in bands_of(f) if p.name == reference) for f in (folder, out))
@@ -137,9 +143,7 @@ def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: tuple[Camer
 
 
 def test_undistorted_pixels_say_so(tmp_path: Path) -> None:
-    make_two_headings(tmp_path / "in", 1, SIZE, camera=MAVIC, line=1, lakes=False)
-    settings = Settings(seed=SeedSettings(only=True), write=WriteSettings(layout="bands", undistort=True))
-    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
+    make_aligned(tmp_path, MAVIC, undistort=True)
     paths = bands_of(tmp_path / "out")
     assert len(paths) == 4
     for path in paths:
@@ -148,7 +152,7 @@ def test_undistorted_pixels_say_so(tmp_path: Path) -> None:
         assert numbers(xmp["@drone-dji:DewarpData"].partition(";")[2])[4:] == [0] * 5
 
 
-def test_gdalinfo_opens_them(aligned: tuple[CameraSpec, Path, Path]) -> None:
+def test_gdalinfo_opens_them(aligned: Aligned) -> None:
     gdalinfo = shutil.which("gdalinfo")
     if gdalinfo is None:
         pytest.skip("gdalinfo is not installed")

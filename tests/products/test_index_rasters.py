@@ -8,32 +8,29 @@ import pytest
 import rasterio
 from synthetic_flights.aligned import make_aligned
 
-from agalign.batch.index_run import index_tasks, run_indices, unit_of_run
-from agalign.errors import ConfigurationError
+from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run
+from agalign.errors import ConfigurationError, InputError
 from agalign.products.index_bands import RAW
-from agalign.products.index_table import IndexReport, read_table
-from agalign.products.indices import INDICES, Index, evaluate, index_named, index_of_formula, symbols_of
+from agalign.products.index_table import IndexReport
+from agalign.products.index_table import read_table
+from agalign.products.indices import INDICES, Index, bands_for, compute, index_named, index_of_formula
 from agalign.products.report import write_pages
 from agalign.products.sidecar import ProductPart
 from agalign.products.sidecar_file import read_sidecar, verify_outputs, write_sidecar
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 NDVI, NDRE = INDICES["ndvi"], INDICES["ndre"]
 
 
-def run(out: Path, *indices: Index, target: Path | None = None, overwrite: bool = False) -> list[IndexReport]:
-    tasks = index_tasks(out, indices or (NDVI,), target or out, overwrite=overwrite)
-    return [r for done in run_indices(tasks, jobs=1) for r in done.reports]
+def run(out: Path, *indices: Index, target: Path | None = None, **options: object) -> list[IndexReport]:
+    tasks = index_tasks(out, indices or (NDVI,), target or out, overwrite=bool(options.pop("overwrite", False)))
+    return [r for done in run_indices(tasks, IndexOptions(jobs=1, **options)) for r in done.reports]
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "__import__('os').system('true')", "N.real", "(lambda: N)()", "N if R else B", "[N][0]", "N; R", "N @ R",
-        "'a'*N", "sqrt(N, R)", "open(N)", "N < R", "f'{N}'", "1e40*N", "N and R", "", "(" * 200, "N" * 400,
-        "-" * 290 + "(",
-    ],
-)  # fmt: skip
+NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
+sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R"""
+
+
+@pytest.mark.parametrize("text", [*NO_FORMULAS.splitlines(), "", "(" * 200, "N" * 400, "-" * 290 + "("])
 def test_a_formula_is_arithmetic_and_nothing_else(text: str) -> None:
     with pytest.raises(ConfigurationError):
         symbols_of(text)
@@ -51,10 +48,13 @@ def test_a_formula_has_the_value_of_its_arithmetic() -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("Q+N", "uses Q; the bands are B, G, R, RE and N"), ("1+1", "uses no band"), ("ndvi=N/R", "'ndvi' cannot name"),
-        ("../x=N/R", "'../x' cannot name"), ("N+", "is not a formula"),
+        ("Q+N", "uses Q; the bands are B, G, R, RE and N"),
+        ("1+1", "uses no band"),
+        ("ndvi=N/R", "'ndvi' cannot name"),
+        ("../x=N/R", "'../x' cannot name"),
+        ("N+", "is not a formula"),
     ],
-)  # fmt: skip
+)
 def test_a_formula_that_is_none_is_a_usage_error(text: str, problem: str) -> None:
     with pytest.raises(ConfigurationError, match=problem):
         index_of_formula(text)
@@ -76,7 +76,6 @@ def test_values_statistics_and_tags_of_a_raster(tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif") as stack:
         _, red, nir, _ = stack.read().astype(float)
     truth = (nir - red) / (nir + red)
-    assert ndvi.path is not None
     with rasterio.open(ndvi.path) as dataset:
         np.testing.assert_allclose(dataset.read(1), truth, rtol=1e-5)
         tags = dataset.tags()
@@ -95,10 +94,10 @@ def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> Non
     for name, raw in (("raw", True), ("reflectance", False)):
         make_aligned(tmp_path / name, 1, raw=raw)
     assert [unit_of_run(index_tasks(tmp_path / n, [NDVI], tmp_path / n)) for n in ("raw", "reflectance")] == [
-        RAW, "reflectance",
-    ]  # fmt: skip
+        RAW,
+        "reflectance",
+    ]
     (of_raw,), (of_reflectance,) = (run(tmp_path / n) for n in ("raw", "reflectance"))
-    assert of_raw.path is not None
     assert of_reflectance.path is not None
     with rasterio.open(of_raw.path) as dataset:
         assert dataset.tags()["INPUT"] == "raw numbers, not reflectance"
@@ -137,8 +136,11 @@ def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
     run(tmp_path / "out", NDRE, target=target)
     rows = list(csv.DictReader((target / "indices.csv").read_text().splitlines()))
     assert [(r["capture"], r["index"]) for r in rows] == [
-        ("IMG_0001", "ndre"), ("IMG_0001", "ndvi"), ("IMG_0002", "ndre"), ("IMG_0002", "ndvi"),
-    ]  # fmt: skip
+        ("IMG_0001", "ndre"),
+        ("IMG_0001", "ndvi"),
+        ("IMG_0002", "ndre"),
+        ("IMG_0002", "ndvi"),
+    ]
     assert [(r["latitude"], r["valid_share"], r["input"]) for r in rows] == [("52.0", "1.0", "reflectance")] * 4
     assert float(rows[1]["p5"]) < float(rows[1]["median"]) < float(rows[1]["p95"])
     assert not list((tmp_path / "out").rglob("*ndvi*"))
@@ -189,3 +191,46 @@ def test_the_report_knows_the_indices(tmp_path: Path) -> None:
     ndvi = facts["captures"][0]["indices"][1]
     assert ndvi["span"] == [-0.2, 1.0]
     assert ndvi["picture"] == "0000SET/IMG_0001_ndvi.png"
+
+
+NAMES = ("Blue-444", "Blue", "Green", "Red-650", "Red", "Red edge-705", "Red edge", "NIR")
+NM = (444.0, 475.0, 560.0, 650.0, 668.0, 705.0, 717.0, 842.0)
+
+
+@pytest.mark.parametrize(
+    ("index", "expected"), [("ndvi", "NIR, Red"), ("ndre", "NIR, Red edge"), ("evi", "NIR, Red, Blue")]
+)
+def test_bands_are_those_nearest_to_the_nominal_wavelength(index: str, expected: str) -> None:
+    assert ", ".join(NAMES[i] for i in bands_for(INDICES[index], NAMES, NM)) == expected
+
+
+def test_without_wavelengths_the_names_count() -> None:
+    assert bands_for(INDICES["ndre"], ("red", "NIR", "RedEdge"), (None,) * 3) == [1, 2]
+
+
+def test_a_missing_band_and_an_unknown_index_are_named() -> None:
+    with pytest.raises(InputError, match="ndre needs a red edge band; there are Red, NIR"):
+        bands_for(INDICES["ndre"], ("Red", "NIR"), (668.0, 840.0))
+    with pytest.raises(InputError, match="needs a red band"):
+        bands_for(INDICES["ndvi"], ("Blue", "Panchro", "NIR"), (475.0, 634.5, 842.0))
+    assert index_named(" NDVI ").name == "ndvi"
+    with pytest.raises(ConfigurationError, match="unknown index 'abc'; choose from ndvi"):
+        index_named("abc")
+
+
+def test_values_and_nodata() -> None:
+    nir, red = np.float32([[0.5, 0.0, np.nan, 0.3]]), np.float32([[0.1, 0.0, 0.2, -0.3]])
+    assert compute(INDICES["ndvi"], [nir, red]).dtype == np.float32
+    np.testing.assert_allclose(compute(INDICES["ndvi"], [nir, red]), [[0.4 / 0.6, *[np.nan] * 3]], rtol=1e-6)
+    expected = {"evi": 2.5 * 0.4 / (0.5 + 0.6 - 0.375 + 1), "savi": 1.5 * 0.4 / 1.1, "cire": 4.0}
+    for name, value in expected.items():
+        bands = [nir, red, np.float32([[0.05] * 4])][: len(INDICES[name].roles)]
+        np.testing.assert_allclose(compute(INDICES[name], bands)[0, 0], value, rtol=1e-6)
+
+
+@pytest.mark.parametrize("index", INDICES.values(), ids=lambda i: i.name)
+def test_vegetation_is_above_bare_soil(index: object) -> None:
+    crop = {"blue": 0.04, "green": 0.1, "red": 0.05, "red edge": 0.28, "nir": 0.5}
+    soil = {"blue": 0.08, "green": 0.12, "red": 0.18, "red edge": 0.22, "nir": 0.26}
+    values = [compute(index, [np.float32([[of[r]]]) for r in index.roles])[0, 0] for of in (crop, soil)]
+    assert (values[0] > values[1]) != (index.name == "ndwi")

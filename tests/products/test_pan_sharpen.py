@@ -9,8 +9,6 @@ from synthetic_flights.cameras import ALTUM_PT, MAVIC_3M
 from synthetic_flights.troubles import make_two_headings
 
 import agalign
-from agalign.cameras.discover import DiscoverOptions
-from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.pixels.raster import open_raster
 from agalign.products.layout import Layer
 from agalign.products.pan_sharpen import (
@@ -27,9 +25,9 @@ from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
 
-from ..conftest import textured_image
+from ..conftest import seeded, textured_image, write_band
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
+pytestmark = pytest.mark.slow
 
 
 def scene() -> tuple[list[np.ndarray], np.ndarray]:
@@ -50,23 +48,16 @@ def test_weights_are_those_that_the_panchromatic_is_made_with() -> None:
 
 def test_it_is_what_gdal_computes(tmp_path: Path) -> None:
     bands, pan = scene()
-    profile = {"driver": "GTiff", "width": 320, "height": 240, "dtype": "float32"}
-    profile |= {"crs": "EPSG:32631", "transform": rasterio.Affine(0.1, 0, 5e5, 0, -0.1, 5.8e6)}
-    with rasterio.open(tmp_path / "bands.tif", "w", count=2, **profile) as file:
-        file.write(np.stack(bands))
-    with rasterio.open(tmp_path / "pan.tif", "w", count=1, **profile) as file:
-        file.write(pan, 1)
-    spectral = "".join(
-        f'<SpectralBand dstBand="{k}"><SourceFilename>{tmp_path / "bands.tif"}</SourceFilename>'
-        f"<SourceBand>{k}</SourceBand></SpectralBand>"
-        for k in (1, 2)
-    )
+    place = {"crs": "EPSG:32631", "transform": rasterio.Affine(0.1, 0, 5e5, 0, -0.1, 5.8e6)}
+    names = {tmp_path / "a.tif": bands[0], tmp_path / "b.tif": bands[1], tmp_path / "pan.tif": pan}
+    for path, pixels in names.items():
+        write_band(path, pixels, **place)
+    sources = [f"<SourceFilename>{path}</SourceFilename><SourceBand>1</SourceBand>" for path in names]
     vrt = (
-        '<VRTDataset subClass="VRTPansharpenedDataset"><PansharpeningOptions>'
-        "<Algorithm>WeightedBrovey</Algorithm>"
+        '<VRTDataset subClass="VRTPansharpenedDataset"><PansharpeningOptions><Algorithm>WeightedBrovey</Algorithm>'
         "<AlgorithmOptions><Weights>0.7,0.2</Weights></AlgorithmOptions>"
-        f"<PanchroBand><SourceFilename>{tmp_path / 'pan.tif'}</SourceFilename><SourceBand>1</SourceBand></PanchroBand>"
-        f"{spectral}</PansharpeningOptions></VRTDataset>"
+        f'<PanchroBand>{sources[2]}</PanchroBand><SpectralBand dstBand="1">{sources[0]}</SpectralBand>'
+        f'<SpectralBand dstBand="2">{sources[1]}</SpectralBand></PansharpeningOptions></VRTDataset>'
     )
     with rasterio.open(vrt) as file:
         expected = file.read()
@@ -76,7 +67,7 @@ def test_it_is_what_gdal_computes(tmp_path: Path) -> None:
 
 def test_what_is_sharpened_keeps_its_brightness_and_gains_detail(tmp_path: Path) -> None:
     make_two_headings(tmp_path / "in", 1, (640, 480), camera=ALTUM_PT, line=1, lakes=False)
-    settings = Settings(write=WriteSettings(pan_sharpen=True, crop="none"))
+    settings = agalign.Settings(write=agalign.WriteSettings(pan_sharpen=True, crop="none"))
     (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
     assert report.error is None
     folder = tmp_path / "out" / "0000SET" / "000"
@@ -95,14 +86,13 @@ def test_what_is_sharpened_keeps_its_brightness_and_gains_detail(tmp_path: Path)
 
 
 def test_without_a_panchromatic_band_it_is_refused(flight: Path, tmp_path: Path) -> None:
-    settings = Settings(write=WriteSettings(pan_sharpen=True))
-    reports = agalign.align_folder(flight, tmp_path, settings=settings)
+    reports = agalign.align_folder(flight, tmp_path, settings=seeded(pan_sharpen=True))
     assert ["--with-rgb" in (r.error or "") for r in reports] == [True, True]
 
 
 def test_what_sees_the_others_light_together() -> None:
     def band(name: str, width_nm: float | None = None, **more: object) -> Band:
-        return Band(name, Path("x.tif"), 1, 64, 48, "uint16", bandwidth_nm=width_nm, **more)  # type: ignore[arg-type]
+        return Band(name, Path("x.tif"), 1, 64, 48, "uint16", bandwidth_nm=width_nm, **more)
 
     def pan(*bands: Band) -> list[str]:
         return [b.name for b in panchromatic(Capture("a", Path(), bands, 0))]
@@ -136,9 +126,10 @@ def test_gaps_keep_the_nodata_value_and_what_is_not_seen_is_not_sharpened(
     assert (result[1, 20:] == 2000).all()
 
 
-@pytest.mark.parametrize(("status", "std_px", "sharpens"), [
-    ("aligned", None, True), ("predicted", 0.9, True), ("predicted", 1.9, False), ("seed_only", None, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("status", "std_px", "sharpens"),
+    [("aligned", None, True), ("predicted", 0.9, True), ("predicted", 1.9, False), ("seed_only", None, False)],
+)
 def test_a_panchromatic_band_that_is_not_delivered_sharpens_nothing(
     monkeypatch: pytest.MonkeyPatch, status: str, std_px: float | None, sharpens: bool
 ) -> None:
@@ -151,15 +142,15 @@ def test_a_panchromatic_band_that_is_not_delivered_sharpens_nothing(
     prediction = None if std_px is None else SimpleNamespace(std_px=std_px)
     usable = {"Panchro": SimpleNamespace(status=status, prediction=prediction)}
     capture = Capture("a", Path("in"), tuple(bands), 0)
-    context = SimpleNamespace(capture=capture, usable=usable, settings=Settings(), rig=None)
-    assert (_sources(context, WriteSettings()) is not None) == sharpens  # type: ignore[arg-type]
+    context = SimpleNamespace(capture=capture, usable=usable, settings=agalign.Settings(), rig=None)
+    assert (_sources(context, agalign.WriteSettings()) is not None) == sharpens
 
 
 def test_a_photograph_sharpens_no_infra_red_alone(tmp_path: Path) -> None:
     make_two_headings(tmp_path / "in", 1, (480, 360), camera=MAVIC_3M, line=1, lakes=False)
     colours = ("RGB Red", "RGB Green", "RGB Blue")
-    options = DiscoverOptions(with_rgb=True, reference="NIR", bands=("NIR", "RedEdge", *colours))
-    settings = Settings(seed=SeedSettings(only=True), write=WriteSettings(pan_sharpen=True))
+    options = agalign.DiscoverOptions(with_rgb=True, reference="NIR", bands=("NIR", "RedEdge", *colours))
+    settings = seeded(pan_sharpen=True)
     (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings, options=options)
     assert report.error is None
     assert not list((tmp_path / "out").rglob("*.pan.tif"))

@@ -5,44 +5,42 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 import agalign
-from agalign.errors import InputError, SidecarError
 from agalign.flight.rig_file import read_rig
+from agalign.products.preview import ReliefView, preview_bytes, write_preview
+from agalign.products.drawing import ReducedBands
 from agalign.products.report import pages, pages_exist, write_pages
 from agalign.products.report.rigs import CHART_HEIGHT, drifts_of, rig_views
-from agalign.synthetic import flight as synthetic
 
-pytestmark = pytest.mark.slow
+from ..conftest import raising, read_json, save_known_model, textured_image
 
 PAGE = Path(agalign.__file__).parent / "products" / "report"
 
 
-@pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("report")
-    synthetic.make_flight(folder / "in", captures=4, size_px=(480, 360), rng_seed=5)
-    agalign.align_folder(folder / "in", folder / "out")
-    return folder / "out"
+@pytest.fixture
+def out(aligned_flight: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(aligned_flight, tmp_path / "out")
 
 
-def facts_of(page: str) -> dict[str, object]:
-    result = re.search(r'<script type="application/json" id="facts">(.*?)</script>', page, re.DOTALL)
-    assert result is not None
-    return json.loads(result.group(1))  # type: ignore[no-any-return]
+def facts_of(folder: Path) -> dict[str, Any]:
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    return json.loads(page.partition('<script type="application/json" id="facts">')[2].partition("</script>")[0])
 
 
-def test_the_page_has_the_facts_of_every_capture(out: Path) -> None:
-    facts = facts_of((out / "index.html").read_text(encoding="utf-8"))
+@pytest.mark.slow
+def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: Path) -> None:
+    facts = facts_of(aligned_flight)
     assert facts["schema"] == "agalign-report/1"
-    captures = facts["captures"]
-    assert [c["label"] for c in captures] == [f"0000SET/000/IMG_000{i}" for i in (1, 2, 3, 4)]  # type: ignore[attr-defined]
-    truth = json.loads((out.parent / "in" / "truth.json").read_text())
-    for capture in captures:  # type: ignore[attr-defined]
-        sidecar = json.loads((out / f"{capture['label']}.json").read_text())
+    assert [c["label"] for c in facts["captures"]] == [f"0000SET/000/IMG_000{i}" for i in (1, 2)]
+    truth = read_json(flight / "truth.json")
+    for capture in facts["captures"]:
+        sidecar = read_json(aligned_flight / f"{capture['label']}.json")
         assert capture["preview"]["file"] == f"{capture['label']}.preview.jpg"
         assert capture["crop"] == sidecar["output"]["crop"]
         assert capture["relief"] is None
@@ -51,89 +49,78 @@ def test_the_page_has_the_facts_of_every_capture(out: Path) -> None:
             assert (pair["band"], pair["status"]) == (part["band"], part["status"])
             if pair["status"] == "reference":
                 continue
-            # How far the files lie apart is known exactly here.
+            # The initial offset of the files is known exactly here.
             known = np.asarray(ties[part["file"]]["ties"])
             apart_px = np.median(np.linalg.norm(known[:, 2:] - known[:, :2], axis=1))
             assert pair["apart_px"] == pytest.approx(apart_px, abs=0.3)
-            shifts = [v for t in part["metrics"]["tiles"] for v in t["shift_px"]]
-            step = facts["shift_step_px"]
-            back = [None if v is None else v * step for v in pair["shifts"]]  # type: ignore[operator]
-            assert back == [None if v is None else pytest.approx(v, abs=0.006) for v in shifts]
-            lattice = facts["lattices"][pair["lattice"]]  # type: ignore[index]
-            assert lattice == [v for t in part["metrics"]["tiles"] for v in t["centre_px"]]
+            tiles = part["metrics"]["tiles"]
+            shifts = [None if v is None else v * facts["shift_step_px"] for v in pair["shifts"]]
+            assert shifts == [v if v is None else pytest.approx(v, abs=0.006) for t in tiles for v in t["shift_px"]]
+            assert facts["lattices"][pair["lattice"]] == [v for t in tiles for v in t["centre_px"]]
 
 
-def test_the_page_has_the_relief(out: Path, tmp_path: Path) -> None:
-    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
-    nodes = {name: [[0.0, 0.0]] for name in ("reference_px", "plane_px", "slope")}
+@pytest.mark.slow
+def test_the_page_has_the_relief(aligned_flight: Path, tmp_path: Path) -> None:
+    sidecar = read_json(aligned_flight / "0000SET" / "000" / "IMG_0001.json")
+    part = {"file": "IMG_0001.relief.tif", "baseline": [0.5, 0.5], "occluded": 0.0125}
+    part |= {name: [[0.0, 0.0]] for name in ("reference_px", "plane_px", "slope")}
     for band in sidecar["bands"]:
         if band["band"] in ("NIR", "Red"):
-            part = {"file": "IMG_0001.relief.tif", "baseline": [0.5, 0.5], "occluded": 0.0125}
-            band["relief"] = part | nodes
+            band["relief"] = part
     sidecar["preview"]["relief"] = {"parallax_px": [-3.0, 7.0], "range_m": None}
     (tmp_path / "a b").mkdir()
     (tmp_path / "a b" / "IMG_0001.json").write_text(json.dumps(sidecar))
     write_pages(tmp_path, pytest.fail)
-    (capture,) = facts_of((tmp_path / "index.html").read_text(encoding="utf-8"))["captures"]  # type: ignore[misc,attr-defined]
+    (capture,) = facts_of(tmp_path)["captures"]
     assert capture["relief"] == "a%20b/IMG_0001.relief.tif"
     assert capture["preview"]["relief"] == sidecar["preview"]["relief"]
     occluded = {pair["band"]: pair["occluded"] for pair in capture["bands"]}
     assert occluded == {"Blue": None, "Green": None, "Red": 0.0125, "NIR": 0.0125, "Red edge": None}
 
 
-def test_a_thousand_captures_make_a_small_page(out: Path, tmp_path: Path) -> None:
-    """Of captures like these: 4 kB each, page and table and all."""
-    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+@pytest.mark.slow
+def test_a_page_is_small_and_loads_nothing(aligned_flight: Path, tmp_path: Path) -> None:
+    """A capture adds 4 kB."""
+    page = (aligned_flight / "index.html").read_text(encoding="utf-8")
+    assert not re.findall(r"(?:src|href)=\"(?:https?:)?//", page)
+    assert "default-src 'none'" in page
+    sidecar = read_json(aligned_flight / "0000SET" / "000" / "IMG_0001.json")
     for number in range(50):
         (tmp_path / f"IMG_{number:04d}.json").write_text(json.dumps(sidecar | {"capture": f"IMG_{number:04d}"}))
-    few = (out / "index.html").stat().st_size
     write_pages(tmp_path, pytest.fail)
     many = (tmp_path / "index.html").stat().st_size
     # Bands that the usual windows do not show everywhere have up to 168 small ones, 1 kB more for a capture.
-    assert (many - few) / (50 - 4) < 6500
+    assert (many - len(page.encode())) / (50 - 2) < 6500
 
 
-def test_the_page_asks_nobody_for_anything(out: Path) -> None:
-    page = (out / "index.html").read_text(encoding="utf-8")
-    assert not re.findall(r"(?:src|href)=\"(?:https?:)?//", page)
-    assert "default-src 'none'" in page
-
-
-def test_pages_stand_until_a_sidecar_is_newer(out: Path) -> None:
+@pytest.mark.slow
+def test_pages_stand_until_a_sidecar_is_newer_or_was_unreadable(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert pages_exist(out)
     path = out / "0000SET" / "000" / "IMG_0001.json"
     path.write_bytes(path.read_bytes())
     assert not pages_exist(out)
     write_pages(out, pytest.fail)
     assert pages_exist(out)
-
-
-def test_pages_without_an_unreadable_sidecar_are_written_again(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(path: Path) -> None:
-        raise SidecarError(f"{path.name}: cannot be read (Input/output error)")
-
     problems: list[str] = []
     with monkeypatch.context() as patched:
-        patched.setattr(pages, "read_sidecar", fails)
+        patched.setattr(pages, "read_sidecar", raising(agalign.SidecarError("IMG_0001.json: cannot be read")))
         write_pages(out, problems.append)
-    assert "IMG_0001.json: cannot be read (Input/output error)" in problems
+    assert "IMG_0001.json: cannot be read" in problems
     assert not pages_exist(out)
     write_pages(out, pytest.fail)
     assert pages_exist(out)
 
 
-def test_the_rig_is_read_without_its_network(out: Path, tmp_path: Path) -> None:
-    (path,) = (out / "models").glob("*.safetensors")
+def test_the_rig_is_read_without_its_network(tmp_path: Path) -> None:
+    path = tmp_path / "models" / "a.safetensors"
+    save_known_model(path)
     camera, rig = read_rig(path)
-    assert "RedEdge" in camera
-    assert rig is not None
-    assert set(rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
-    (view,) = rig_views(out, pytest.fail)
-    assert [b["band"] for b in view.bands] == list(rig.mean)
-    (tmp_path / "models").mkdir()
-    (tmp_path / "models" / "a.safetensors").write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(InputError, match=r"a\.safetensors: its rig cannot be read"):
-        read_rig(tmp_path / "models" / "a.safetensors")
+    assert camera == "Camera 7"
+    (view,) = rig_views(tmp_path, pytest.fail)
+    assert [b.name for b in view.bands] == list(rig.mean) == ["NIR", "[Red]"]
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(agalign.InputError, match=r"a\.safetensors: its rig cannot be read"):
+        read_rig(path)
     said: list[str] = []
     assert rig_views(tmp_path, said.append) == []
     assert len(said) == 1
@@ -144,6 +131,7 @@ def told(label: str, offsets: dict[str, tuple[float, float]]) -> dict[str, objec
     return {"label": label, "captured_at": f"2026-06-21T10:00:{label}", "camera": "camera", "bands": bands}
 
 
+@pytest.mark.slow
 def test_drift_is_drawn_along_the_direction_of_change_and_breaks_where_nothing_is_known() -> None:
     captures = [
         told(f"{i:02d}", {"NIR": (10 + 3 * i, 4 * i), "Blue": (-i, 0)} if i != 3 else {"Blue": (-3, 0)})
@@ -160,12 +148,81 @@ def test_drift_is_drawn_along_the_direction_of_change_and_breaks_where_nothing_i
     assert drifts_of(captures[:2]) == []
 
 
+@pytest.mark.slow
 def test_the_scripts_types_are_right() -> None:
     tsc = shutil.which("tsc")
     if tsc is None:
         pytest.skip("TypeScript is not installed")
     options = "--allowJs --checkJs --noEmit --strict --skipLibCheck --target es2022 --lib es2022,dom,dom.iterable"
-    done = subprocess.run(
-        [tsc, *options.split(), str(PAGE / "page.js")], capture_output=True, text=True, check=False
-    )  # fmt: skip
+    done = subprocess.run([tsc, *options.split(), str(PAGE / "page.js")], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
+
+
+def grey(seed: int, width: int = 640, height: int = 480) -> np.ndarray:
+    return (128 + 40 * textured_image(width, height, seed)).clip(0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def views() -> ReducedBands:
+    """Green and NIR, of which only Green was written."""
+    return ReducedBands({"Green": grey(1), "NIR": grey(2)}, {"Green": grey(3)}, (640, 480))
+
+
+def test_every_picture_lies_where_the_sidecar_says(views: ReducedBands, tmp_path: Path) -> None:
+    errors = {"NIR": np.full((4, 5), 0.25, np.float32)}
+    part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1))
+    sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)
+    (w, h), (dw, dh) = part.tile_px, part.detail_px
+    assert sheet.shape == (3 * h + 2 * dh, 2 * w)
+
+    def like(result: np.ndarray, image: np.ndarray) -> float:
+        there = cv2.resize(image, result.shape[::-1], interpolation=cv2.INTER_AREA)
+        return float(np.corrcoef(result.ravel(), there.ravel())[0, 1])
+
+    assert like(sheet[:h, :w], views.before["Green"]) > 0.98
+    assert like(sheet[:h, w:], views.before["NIR"]) > 0.98
+    assert like(sheet[h : 2 * h, :w], views.after["Green"]) > 0.98
+    assert sheet[h : 2 * h, w:].max() < 4, "what was not written is black"
+    x, y = round(part.detail[0] * 640), round(part.detail[1] * 480)
+    assert like(sheet[2 * h : 2 * h + dh, dw : 2 * dw], views.before["NIR"][y : y + dh, x : x + dw]) > 0.98
+    assert like(sheet[2 * h + dh : 2 * h + 2 * dh, :dw], views.after["Green"][y : y + dh, x : x + dw]) > 0.98
+    assert np.median(sheet[2 * h + 2 * dh :, w:]) == pytest.approx(255 * 0.25 / part.error_full_px, abs=3)
+
+
+@pytest.mark.parametrize("has_errors", [False, True])
+def test_the_relief_is_the_last_row(views: ReducedBands, tmp_path: Path, has_errors: bool) -> None:
+    parallax_px = np.linspace(-3, 7, 320, dtype=np.float32)[None].repeat(240, axis=0)
+    parallax_px[:2, :2] = 1000.0  # wrong pixels take no contrast
+    errors = {"NIR": np.full((4, 5), 0.25, np.float32)} if has_errors else {}
+    relief = ReliefView(parallax_px, (1.23456, 2.5))
+    part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1), relief)
+    low, high = part.relief.parallax_px
+    assert (low, high) == pytest.approx((-2.9, 6.9), abs=0.1)
+    assert part.relief.range_m == (1.235, 2.5)
+    sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)
+    (w, h), (_, dh) = part.tile_px, part.detail_px
+    row = sheet[(3 if has_errors else 2) * h + 2 * dh :]
+    assert row.shape == (h, 2 * w)
+    assert row[:, w:].max() < 4
+    shown = low + row[h // 2, :w].astype(float) / 255 * (high - low)
+    np.testing.assert_allclose(shown, np.linspace(-3, 7, w).clip(low, high), atol=0.25)
+
+
+def test_a_level_relief_can_be_shown() -> None:
+    assert ReliefView(np.full((4, 5), 2.0, np.float32), None).grey.max() == 0
+
+
+@pytest.mark.parametrize("captures", [1, 200, 1000])
+def test_all_previews_of_a_flight_have_a_limit(views: ReducedBands, tmp_path: Path, captures: int) -> None:
+    path = tmp_path / "a.preview.jpg"
+    write_preview(views, ["Green", "NIR"], {}, path, preview_bytes(captures))
+    assert path.stat().st_size <= preview_bytes(captures)
+    assert captures * preview_bytes(captures) <= 44_000_000
+
+
+def test_images_smaller_than_a_tile_are_shown_as_they_are(tmp_path: Path) -> None:
+    tiny = {"Green": grey(1, 60, 41), "NIR": grey(2, 60, 41)}
+    part = write_preview(ReducedBands(tiny, tiny, (60, 41)), ["Green", "NIR"], {}, tmp_path / "a.preview.jpg", 10_000)
+    assert part.tile_px == (56, 40)
+    assert part.detail[2] <= 1
+    assert part.detail[3] <= 1

@@ -1,6 +1,11 @@
+"""Damage to the files of a run is found by their checksums, and named."""
+
+import hashlib
 import json
 import math
+import os
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -9,19 +14,16 @@ from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
 
 import agalign
 from agalign.config import Settings
-from agalign.errors import OutputError, SidecarError
+from agalign.errors import InputError, OutputError, SidecarError
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.sidecar import (
-    BandPart,
-    CameraPart,
     GridPart,
-    IssuePart,
-    OutputPart,
-    ReferencePart,
+    ProductPart,
     Sidecar,
 )
-from agalign.products.sidecar_file import find_sidecars, read_result, read_sidecar, write_sidecar
+from agalign.products.sidecar_file import content_checksum, find_sidecars, read_result, read_sidecar, write_sidecar
+from agalign.products.sidecar_file import verify_outputs
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
@@ -33,16 +35,21 @@ from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 from agalign.verify.window_check import COVERAGE
 
+from ..conftest import read_json
+
 SHIPPED = Path(agalign.__file__).with_name("sidecar.schema.json")
 
 
-def example() -> Sidecar:
-    return Sidecar(
-        agalign="0", capture="IMG_1", capture_id="x", flight_id="", captured_at="",
-        camera=CameraPart(make="", model="", serial=""), status="ok", missing_bands=[],
-        reference=ReferencePart(band="Green", file="g.tif", band_index=1, width=10, height=8),
-        bands=[], output=OutputPart(file="IMG_1.tif", bytes=1, crop=(0, 0, 10, 8), nodata=None), settings="0",
-    )  # fmt: skip
+NIR = {"band": "NIR", "file": "n.tif", "band_index": 1, "status": "failed", "seconds": 0, "wavelength_nm": None}
+
+
+def example(**changes: Any) -> Sidecar:
+    reference = {"band": "Green", "file": "g.tif", "band_index": 1, "width": 10, "height": 8}
+    camera = {"make": "", "model": "", "serial": ""}
+    output = {"file": "IMG_1.tif", "bytes": 1, "crop": (0, 0, 10, 8), "nodata": None}
+    names = {"agalign": "0", "capture": "IMG_1", "capture_id": "x", "flight_id": "", "captured_at": "", "settings": "0"}
+    bands = {"camera": camera, "status": "ok", "missing_bands": [], "reference": reference, "bands": []}
+    return Sidecar.model_validate(names | bands | {"output": output} | changes)
 
 
 def context_of(capture: Capture, alignments: dict[str, Alignment]) -> ProductContext:
@@ -55,16 +62,15 @@ def test_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "sub" / "IMG_1.json"
     write_sidecar(path, example())
     assert read_sidecar(path).model_copy(update={"checksum": None}) == example()
-    assert json.loads(path.read_text())["schema"] == "agalign/1"
+    assert read_json(path)["schema"] == "agalign/1"
     assert not list(path.parent.glob(".*"))
+    with pytest.raises(OutputError, match=r"IMG_1\.json"):
+        write_sidecar(path / "IMG_1.json", example())
 
 
-def test_the_shipped_schema_is_the_models() -> None:
-    assert json.loads(SHIPPED.read_text()) == Sidecar.model_json_schema(mode="serialization")
-
-
-def test_the_schema_accepts_and_refuses() -> None:
-    schema = json.loads(SHIPPED.read_text())
+def test_the_shipped_schema_is_the_models_and_accepts_and_refuses() -> None:
+    schema = read_json(SHIPPED)
+    assert schema == Sidecar.model_json_schema(mode="serialization")
     data = example().model_dump(by_alias=True, mode="json")
     jsonschema.validate(data, schema)
     for change in ({"status": "fine"}, {"schema": "agalign/2"}, {"bands": [{"band": "x"}]}):
@@ -98,12 +104,6 @@ def test_other_json_files_are_passed_over(tmp_path: Path) -> None:
     assert find_sidecars(tmp_path) == [tmp_path / "a" / "IMG_1.json"]
 
 
-def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="file"):
-        write_sidecar(tmp_path / "file" / "IMG_1.json", example())
-
-
 def test_a_rejected_solution_says_so() -> None:
     """The homography of a `seed_only` band is the seed's; `joint` describes what was doubted."""
     joint = JointResult(np.eye(3), 0.1, 0.1, 0.004, 75, (1.0,), "fast", "homography", 0.05, ((0.07, 0.07),) * 4)
@@ -115,15 +115,10 @@ def test_a_rejected_solution_says_so() -> None:
     for status, issue in (("seed_only", issues), ("aligned", ())):
         alignment = Alignment(PixelMapping(seed.fixed_to_moving), (64, 48), status, issue, seed, joint, residual)
         part = sidecar_of(context_of(capture, {"nir": alignment})).bands[1]
-        assert part.joint is not None
         assert part.joint.accepted == (status == "aligned")
         assert [d.kind for d in part.issues] == [d.code for d in issue]
+        assert [json.loads(d.model_dump_json())["value"] for d in part.issues] == [0.1, None][: len(issue)]
     assert "retrieval" in (alignment.reason or "retrieval")
-
-
-def test_a_doubt_that_could_not_be_measured_is_null_in_json() -> None:
-    part = IssuePart(kind="retrieval", value=None, limit=0.2)
-    assert json.loads(part.model_dump_json()) == {"kind": "retrieval", "value": None, "limit": 0.2}
 
 
 def interpolated(grid: GridPart, at_px: np.ndarray) -> dict[str, np.ndarray]:
@@ -145,7 +140,6 @@ def test_the_grid_reproduces_a_displacement_field() -> None:
     bands = tuple(Band(name, Path(f"{name}.tif"), 1, 1280, 960, "uint16") for name in ("green", "nir"))
     alignment = Alignment(mapping, (1280, 960), "aligned", (), Seed("rig", np.eye(3), 30.0))
     part = sidecar_of(context_of(Capture("c", Path(), bands, 0), {"nir": alignment})).bands[1]
-    assert part.grid is not None
     at = np.random.default_rng(1).uniform((0, 0), (1279, 959), (2000, 2))
     for there in interpolated(part.grid, at).values():
         assert np.nanpercentile(np.abs(there - mapping(at)), 99) < 0.02
@@ -161,18 +155,16 @@ def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
         Band("red", Path("r.tif"), 1, 1037, 777, "uint16", lens=plain),
     )
     result = {
-        "rgb": geometry.compose(wide.matrix, geometry.invert(plain.matrix)), "red": geometry.translation(5.0, 2.0),
-    }  # fmt: skip
+        "rgb": geometry.compose(wide.matrix, geometry.invert(plain.matrix)),
+        "red": geometry.translation(5.0, 2.0),
+    }
     seed = Seed("rig", np.eye(3), 30.0)
     mappings = {b: PixelMapping(m, plain, wide if b == "rgb" else plain) for b, m in result.items()}
     alignments = {b: Alignment(m, (1037, 777), "aligned", (), seed) for b, m in mappings.items()}
     _, colour, red = sidecar_of(context_of(Capture("c", Path(), bands, 0), alignments)).bands
-    assert colour.grid is not None
-    assert red.grid is not None
     assert (len(colour.grid.reference_px), len(red.grid.reference_px)) == (65 * 49, 17 * 13)
     at = np.random.default_rng(0).uniform((0, 0), (1036, 776), (500, 2))
     for name, part in (("rgb", colour), ("red", red)):
-        assert part.grid is not None
         for there in interpolated(part.grid, at).values():
             assert np.abs(there - mappings[name](at)).max() < 0.02
 
@@ -180,18 +172,16 @@ def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
 @pytest.mark.parametrize("name", ["../a.tif", "/vsicurl/http://example.org/a.tif", "C:/a.tif"])
 def test_a_sidecar_names_no_file_elsewhere(tmp_path: Path, name: str) -> None:
     path = tmp_path / "a.json"
-    data = json.loads(example().model_dump_json(by_alias=True))
-    band = {"band": "NIR", "file": "n.tif", "band_index": 1, "status": "failed", "seconds": 0, "wavelength_nm": None}
-    data["bands"] = [band | {"reason": None}]
-    data["output"] = {"file": "a.tif", "bytes": 1, "band_files": [], "crop": [0, 0, 1, 1], "nodata": None}
+    data = json.loads(example(bands=[NIR | {"reason": None}]).model_dump_json(by_alias=True))
     path.write_text(json.dumps(data))
     read_sidecar(path)
     for change in (
-        lambda d: d["output"].update(file=name), lambda d: d.update(capture=name),
+        lambda d: d["output"].update(file=name),
+        lambda d: d.update(capture=name),
         lambda d: d["output"]["band_files"].append({"file": name, "bytes": 1, "nodata": None}),
         lambda d: d["bands"][0].update(place={"file": name, "band_index": 1}),
         lambda d: d.update(products=[{"kind": "stack", "file": name, "bytes": 1, "sha256": ""}]),
-    ):  # fmt: skip
+    ):
         changed = json.loads(json.dumps(data))
         change(changed)
         path.write_text(json.dumps(changed))
@@ -201,12 +191,53 @@ def test_a_sidecar_names_no_file_elsewhere(tmp_path: Path, name: str) -> None:
 
 def test_a_result_is_the_sidecar_without_its_tables(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
-    band = BandPart(
-        band="NIR", wavelength_nm=None, file="n.tif", band_index=1, status="aligned", reason=None, seconds=1.5,
-        grid=GridPart(reference_px=[(0, 0)], moving_px=[(1, 1)]),
-    )  # fmt: skip
-    whole = example().model_copy(update={"bands": [band]})
+    grid = {"reference_px": [(0, 0)], "moving_px": [(1, 1)]}
+    whole = example(bands=[NIR | {"reason": None, "status": "aligned", "seconds": 1.5, "grid": grid}])
     write_sidecar(path, whole)
     result = read_result(path)
     assert result.model_copy(update={"checksum": None}) == whole.result()
     assert (result.bands[0].seconds, hasattr(result.bands[0], "grid")) == (1.5, False)
+
+
+DATA = b"pixels of a stack"
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """A run of one capture with one file."""
+    (tmp_path / "IMG_1.tif").write_bytes(DATA)
+    part = ProductPart(kind="stack", file="IMG_1.tif", bytes=len(DATA), sha256=hashlib.sha256(DATA).hexdigest())
+    write_sidecar(tmp_path / "IMG_1.json", example(products=[part]))
+    return tmp_path
+
+
+def problems(out: Path) -> list[str]:
+    return [text.replace(f"{out}{os.sep}", "") for _, texts in verify_outputs(out) for text in texts]
+
+
+def test_damage_is_found_by_checksums_and_named(out: Path) -> None:
+    image, sidecar = out / "IMG_1.tif", out / "IMG_1.json"
+    assert problems(out) == []
+    image.write_bytes(DATA.replace(b"p", b"q", 1))
+    assert problems(out) == ["IMG_1.tif: is not what was written; delete it and run again"]
+    image.unlink()
+    assert problems(out) == ["IMG_1.tif: cannot be read (No such file or directory); run again"]
+    (out / "IMG_0.json").write_text('{"schema": "agalign/1"')
+    assert len(problems(out)) == 2, "a sidecar that cannot be read stops no other"
+    (out / "IMG_0.json").unlink()
+    os.mkfifo(image)
+    assert problems(out) == ["IMG_1.tif: cannot be read (it is not a regular file); run again"]
+    write_sidecar(sidecar, example(not_written=["picture"]))
+    assert problems(out) == ["IMG_1.json: its picture could not be written; run again"]
+    sidecar.write_text(sidecar.read_text().replace('"width": 10', '"width": 11'))
+    assert "IMG_1.json: was changed after it was written; run again with --overwrite" in problems(out)
+    sidecar.unlink()
+    with pytest.raises(InputError, match="no sidecars there"):
+        problems(out)
+
+
+def test_seconds_do_not_change_the_checksum() -> None:
+    one = {"bands": [{"band": "NIR", "seconds": 1.0}], "seconds": 2.0, "checksum": "x"}
+    other = {"seconds": 3.0, "bands": [{"seconds": 4.0, "band": "NIR"}]}
+    assert content_checksum(json.dumps(one)) == content_checksum(json.dumps(other))
+    assert content_checksum(json.dumps(one)) != content_checksum(json.dumps(other | {"bands": []}))

@@ -14,22 +14,18 @@ from pystac.extensions.projection import ProjectionExtension
 from pystac.extensions.raster import RasterExtension
 from pystac.validation import RegisteredValidator
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
-from synthetic_flights.panel import make_flight_between_panels
 
 import agalign
-from agalign.config import SeedSettings, Settings, WriteSettings
-from agalign.errors import OutputError
 from agalign.flight.groups import flights_of
 from agalign.products.footprint import ground_m
 from agalign.products.stac import write_collections
 from agalign.values.capture import Band, CameraIdentity, Capture, Pose
 from agalign.values.files import write_text
 
-from ..conftest import textured_image
-from .test_outputs import write_band
+from ..conftest import Shared, read_json, seeded, write_capture
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
-SEEDED = Settings(seed=SeedSettings(only=True))
+pytestmark = pytest.mark.slow
+GREEN = Band("Green", Path("x.tif"), 1, 640, 480, "uint16")
 EXTENSIONS = "https://stac-extensions.github.io/{}/schema.json"
 
 
@@ -39,21 +35,18 @@ def offline() -> Iterator[None]:
     validator = JsonSchemaSTACValidator()
     for path in Path(__file__).with_name("schemas").glob("*.json"):
         uri = EXTENSIONS.format(path.stem.replace("-v", "/v"))
-        validator.schema_cache[uri] = json.loads(path.read_text())
+        validator.schema_cache[uri] = read_json(path)
     before = RegisteredValidator.get_validator()
     RegisteredValidator.set_validator(validator)
     yield
     RegisteredValidator.set_validator(before)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def run(between_panels: Path, shared: Shared) -> Path:
     """A flight after a panel, whose captures' height is known by it."""
-    folder, out = tmp_path_factory.mktemp("flight"), tmp_path_factory.mktemp("out")
-    make_flight_between_panels(folder, 2, (640, 480))
-    write = WriteSettings(stac=True, format="cog", radiometry="auto")
-    agalign.align_folder(folder, out, settings=SEEDED.model_copy(update={"write": write}))
-    return out
+    settings = seeded(stac=True, format="cog", radiometry="auto")
+    return shared("stac", lambda out: agalign.align_folder(between_panels, out, settings=settings))
 
 
 def test_items_and_collection_are_valid_and_find_each_other(run: Path) -> None:
@@ -67,7 +60,6 @@ def test_items_and_collection_are_valid_and_find_each_other(run: Path) -> None:
         assert item.collection_id == collection.id
         assert collection.id.startswith("syntheticflight00001-")
         result = item.get_collection()
-        assert result is not None
         assert result.id == collection.id
         assert item.assets
         for asset in item.assets.values():
@@ -92,11 +84,11 @@ def test_a_wrong_field_is_seen_by_the_schemas(run: Path) -> None:
 
 def test_assets_say_what_their_bands_are(run: Path) -> None:
     item = pystac.Item.from_file(str(run / "0000SET" / "000" / "IMG_0002.stac.json"))
+    assert item.datetime.isoformat().startswith("2026-06-21T10:00:02")
     stack = item.assets["stack"]
     assert stack.media_type == pystac.MediaType.COG
     raster, eo = RasterExtension.ext(stack).bands, EOExtension.ext(stack).bands
     assert raster is not None
-    assert eo is not None
     assert [(b.data_type, b.nodata, b.unit, b.scale) for b in raster] == [("float32", "nan", "1", 1.0)] * 5
     assert [b.common_name for b in eo] == ["blue", "green", "red", "nir", "rededge"]
     assert eo[3].center_wavelength == 0.84
@@ -109,12 +101,12 @@ def test_assets_say_what_their_bands_are(run: Path) -> None:
 
 def test_the_footprint_is_where_the_camera_looked(run: Path) -> None:
     """28 m up, 640 px are 4.8 mm behind 5.45 mm: 24.7 m wide, less the crop; all look north within a few degrees."""
-    item = json.loads((run / "0000SET" / "000" / "IMG_0002.stac.json").read_text())
+    item = read_json(run / "0000SET" / "000" / "IMG_0002.stac.json")
     ring = np.array(item["geometry"]["coordinates"][0])
     assert ring.shape == (5, 2)
     metres = (ring - [5.0, 52.0]) * [68_680, 111_270]
     width, height = np.linalg.norm(metres[1] - metres[0]), np.linalg.norm(metres[2] - metres[1])
-    crop = json.loads((run / "0000SET" / "000" / "IMG_0002.json").read_text())["output"]["crop"]
+    crop = read_json(run / "0000SET" / "000" / "IMG_0002.json")["output"]["crop"]
     expected = [28 / 5.45 * 4.8 * n / 640 for n in crop[2:]]
     np.testing.assert_allclose([width, height], expected, rtol=0.08)  # 0.7 m up or down
     assert metres[0][1] > metres[3][1]  # the first row is north
@@ -130,33 +122,34 @@ def test_the_footprint_is_where_the_camera_looked(run: Path) -> None:
         (Pose(0.0, 10.0, 0.0, 100.0, 1000.0), (319.5, 239.5), (0.0, 17.633)),
         (Pose(0.0, 10.0, 0.0, 100.0, 1000.0), (319.5, 0.0), (0.0, 43.414)),
         (Pose(0.0, 0.0, 10.0, 100.0, 1000.0), (319.5, 239.5), (-17.633, 0.0)),
+        (None, (0.0, 0.0), None),
+        (Pose(0.0), (0.0, 0.0), None),
+        (Pose(0.0, 60.0, 0.0, 100.0, 1000.0), (0.0, 0.0), None),
+        (Pose(0.0, height_m=10.0), (0.0, 0.0), None),
     ],
 )
 def test_where_a_pixel_lies_on_the_ground(
-    pose: Pose, point_px: tuple[float, float], expected_m: tuple[float, float]
+    pose: Pose | None, point_px: tuple[float, float], expected_m: tuple[float, float] | None
 ) -> None:
-    band = Band("Green", Path("x.tif"), 1, 640, 480, "uint16")
-    result = ground_m(Capture("a", Path(), (band,), 0, pose=pose), np.array([point_px]))
-    assert result is not None
-    np.testing.assert_allclose(result[0], expected_m, atol=0.01)
-
-
-@pytest.mark.parametrize("pose", [None, Pose(0.0), Pose(0.0, 60.0, 0.0, 100.0, 1000.0), Pose(0.0, height_m=10.0)])
-def test_where_the_camera_was_is_not_where_it_looked(pose: Pose | None) -> None:
-    band = Band("Green", Path("x.tif"), 1, 640, 480, "uint16")
-    assert ground_m(Capture("a", Path(), (band,), 0, pose=pose), np.zeros((1, 2))) is None
+    result = ground_m(Capture("a", Path(), (GREEN,), 0, pose=pose), np.array([point_px]))
+    if expected_m is None:
+        assert result is None
+    else:
+        np.testing.assert_allclose(result[0], expected_m, atol=0.01)
 
 
 def test_odc_stac_opens_a_capture_by_its_common_names(tmp_path: Path) -> None:
     odc_stac = pytest.importorskip("odc.stac")
     place = {"crs": rasterio.CRS.from_epsg(32631), "transform": rasterio.Affine(0.1, 0, 5e5, 0, -0.1, 5.8e6)}
-    for name, gain in (("green", 900), ("red", 500)):
-        pixels = (3000 + gain * textured_image(300, 240, 3)).clip(1).astype(np.uint16)
-        write_band(tmp_path / "in" / f"f_{name}.tif", pixels, **place)
-    settings = SEEDED.model_copy(update={"write": WriteSettings(stac=True)})
-    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
+    write_capture(tmp_path / "in", "green", "red", **place)
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=seeded(stac=True))
     item = pystac.Item.from_file(str(tmp_path / "out" / "f.stac.json"))
     item.validate()
+    assert "change of" in item.properties["agalign:datetime_source"]
+    ring = np.array(item.geometry["coordinates"][0])
+    assert ring.shape == (5, 2)
+    assert abs(ring[0] - ring[2]).max() < 0.001
+    assert ring[0] == pytest.approx([3.0, 52.35], abs=0.05)
     assert ProjectionExtension.ext(item).code == "EPSG:32631"
     assert ProjectionExtension.ext(item).transform == [0.1, 0, 5e5, 0, -0.1, 5.8e6, 0, 0, 1]
     loaded = odc_stac.load([item], bands=["red", "green"])
@@ -167,21 +160,30 @@ def test_odc_stac_opens_a_capture_by_its_common_names(tmp_path: Path) -> None:
             np.testing.assert_array_equal(loaded[name].values[0], dataset.read(index))
 
 
+def test_an_item_of_a_capture_without_a_known_height_is_a_point(flight: Path, tmp_path: Path) -> None:
+    agalign.align_folder(flight, tmp_path, settings=seeded(stac=True))
+    item = pystac.Item.from_file(str(tmp_path / "0000SET" / "000" / "IMG_0001.stac.json"))
+    assert item.geometry == {"type": "Point", "coordinates": pytest.approx([5.0, 52.0])}
+
+
 def test_collections_are_the_flights_that_share_a_network(tmp_path: Path) -> None:
     """Two units of one model on one day are two flights, with or without a flight id."""
-    band = Band("Green", Path("x.tif"), 1, 640, 480, "uint16")
 
     def capture(name: str, serial: str, day: str, flight_id: str = "") -> Capture:
         item = pystac.Item(name, None, None, datetime.fromisoformat(f"{day}T10:00:00+00:00"), {})
         write_text(tmp_path / f"{name}.stac.json", json.dumps(item.to_dict(include_self_link=False)))
         camera = CameraIdentity("Make", "Model", serial)
-        return Capture(name, Path(), (band,), 0, camera, captured_at=f"{day}T10:00:00", flight_id=flight_id)
+        return Capture(name, Path(), (GREEN,), 0, camera, captured_at=f"{day}T10:00:00", flight_id=flight_id)
 
-    captures = [
-        capture("a", "1", "2026-06-21"), capture("b", "2", "2026-06-21"), capture("c", "1", "2026-06-22"),
-        capture("d", "1", "2026-06-22", "F"), capture("e", "2", "2026-06-22", "F"),
-        capture("f", "1", "2026-06-22", "F"),
-    ]  # fmt: skip
+    flown = (
+        "a 1 2026-06-21",
+        "b 2 2026-06-21",
+        "c 1 2026-06-22",
+        "d 1 2026-06-22 F",
+        "e 2 2026-06-22 F",
+        "f 1 2026-06-22 F",
+    )
+    captures = [capture(*words.split()) for words in flown]
     members = []
     for path in write_collections(captures, tmp_path):
         collection = pystac.Collection.from_file(str(path))
@@ -193,6 +195,5 @@ def test_collections_are_the_flights_that_share_a_network(tmp_path: Path) -> Non
 
 def test_a_damaged_item_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.stac.json").write_bytes(b"\0\0")
-    band = Band("Green", Path("x.tif"), 1, 640, 480, "uint16")
-    with pytest.raises(OutputError, match=r"a\.stac\.json: cannot be read as a STAC item .* --overwrite"):
-        write_collections([Capture("a", Path(), (band,), 0)], tmp_path)
+    with pytest.raises(agalign.OutputError, match=r"a\.stac\.json: cannot be read as a STAC item .* --overwrite"):
+        write_collections([Capture("a", Path(), (GREEN,), 0)], tmp_path)

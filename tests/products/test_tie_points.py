@@ -9,21 +9,16 @@ import pytest
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
-from agalign.cameras.discover import DiscoverOptions
-from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.products.tie_points import TiePoint, _geojson
 from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Georeference
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-BY_TAGS = Settings(seed=SeedSettings(only=True, force="rig"), write=WriteSettings(tie_points=True))
+from ..conftest import read_json, seeded
 
 
 def tie_errors(report: agalign.CaptureReport, flight: Path) -> dict[str, np.ndarray]:
     """{band: distance (n,) of its tie points from the truth, px; nan outside of the known points}."""
-    assert report.path is not None
-    assert report.sidecar is not None
-    truth = json.loads((flight / "truth.json").read_text())[report.path.stem]["bands"]
+    truth = read_json(flight / "truth.json")[report.path.stem]["bands"]
     rows = list(csv.DictReader(report.path.with_suffix(".ties.csv").read_text().splitlines()))
     result = {}
     for band in report.sidecar.bands:
@@ -42,11 +37,11 @@ def tie_errors(report: agalign.CaptureReport, flight: Path) -> dict[str, np.ndar
 @pytest.mark.slow
 def test_tie_points_match_the_truth_where_the_alignment_is_off(flight: Path, tmp_path: Path) -> None:
     bands = ("Green", "Red", "NIR")
-    (report, *_) = agalign.align_folder(flight, tmp_path, settings=BY_TAGS, options=DiscoverOptions(bands=bands))
-    assert report.path is not None
+    (report, *_) = agalign.align_folder(
+        flight, tmp_path, settings=seeded("rig", tie_points=True), options=agalign.DiscoverOptions(bands=bands)
+    )
     rows = list(csv.DictReader(report.path.with_suffix(".ties.csv").read_text().splitlines()))
     errors_px = tie_errors(report, flight)
-    assert report.sidecar is not None
     for band in report.sidecar.bands:
         own = [r for r in rows if r["band"] == band.band]
         if band.status == "reference":
@@ -57,19 +52,19 @@ def test_tie_points_match_the_truth_where_the_alignment_is_off(flight: Path, tmp
         # By its tags alone the band is off by more than that.
         assert np.median([float(r["residual_px"]) for r in own]) > 0.6
         assert np.median([float(r["weight"]) for r in own]) == pytest.approx(1.0, abs=1e-3)
-    features = json.loads(report.path.with_suffix(".ties.geojson").read_text())["features"]
+    features = read_json(report.path.with_suffix(".ties.geojson"))["features"]
     assert [f["properties"]["band"] for f in features] == [r["band"] for r in rows]
     x, y = features[0]["geometry"]["coordinates"]
     assert (x, y) == (float(rows[0]["reference_x_px"]) + 0.5, -float(rows[0]["reference_y_px"]) - 0.5)
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_tie_points_of_aligned_bands_are_accurate(tmp_path: Path) -> None:
     make_flight(tmp_path / "in", captures=2, size_px=(1280, 960), rng_seed=3)
-    settings = Settings(write=WriteSettings(tie_points=True))
+    settings = agalign.Settings(write=agalign.WriteSettings(tie_points=True))
     errors_px: list[np.ndarray] = []
     for report in agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings):
-        assert report.sidecar is not None
         assert {b.status for b in report.sidecar.bands} == {"reference", "aligned"}
         errors_px += tie_errors(report, tmp_path / "in").values()
     assert len(errors_px) == 8

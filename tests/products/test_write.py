@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,70 +8,61 @@ import rasterio
 
 from agalign.config import Settings, WriteSettings
 from agalign.errors import OutputError
+from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.aligned_files import BandFiles
 from agalign.products.checked_raster import CheckedRaster
-from agalign.products.layout import Layer
+from agalign.products.layout import Layer, output_layers
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.raster_file import write_raster
 from agalign.values import geometry
+from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference
 from agalign.values.image import OutputGrid
+from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 
-from ..conftest import textured_image
+from ..conftest import textured_image, write_band
 
 TRANSFORM = np.array([[0.1, 0, 500000], [0, -0.1, 5800000], [0, 0, 1.0]])
-
-
-def make_capture(
-    folder: Path, dtype: str = "uint16", nodata: float | None = None, georeferenced: bool = False, count: int = 3
-) -> Capture:
-    bands = []
-    crs = rasterio.CRS.from_epsg(32631)
-    for k in range(count):
-        scale = 20 if dtype == "uint8" else 100
-        pixels = ((textured_image(200, 150, k) + 5) * scale).clip(1).astype(dtype)
-        path = folder / f"f_{k}.tif"
-        profile = {"driver": "GTiff", "width": 200, "height": 150, "count": 1, "dtype": dtype, "nodata": nodata}
-        if georeferenced:
-            profile |= {"transform": rasterio.Affine(*TRANSFORM[:2].ravel()), "crs": crs}
-        with rasterio.open(path, "w", **profile) as dataset:
-            dataset.write(pixels, 1)
-        georeference = Georeference(TRANSFORM, crs.to_wkt()) if georeferenced else None
-        bands.append(
-            Band(
-                f"B{k}",
-                path,
-                1,
-                200,
-                150,
-                dtype,
-                nodata=nodata,
-                wavelength_nm=500 + 100 * k,
-                bandwidth_nm=20,
-                georeference=georeference,
-            )
-        )
-    return Capture("f", Path(), tuple(bands), 1, CameraIdentity("Make", "Model"), captured_at="2026-06-21T10:00:00.5")
-
-
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 SHIFT = PixelMapping(geometry.translation(3.25, -2.5))
+FRAME = OutputGrid(0, 0, 200, 150)
 CROP = OutputGrid(4, 6, 180, 130, has_gaps=False)
 
 
-def layers_of(capture: Capture) -> list[Layer]:
-    return [
-        Layer(b, None if b is capture.reference else SHIFT, is_reference=b is capture.reference) for b in capture.bands
-    ]
+def make_capture(folder: Path, dtype: str = "uint16", nodata: float | None = None, is_on_map: bool = False) -> Capture:
+    """Three bands, B1 the reference."""
+    crs = rasterio.CRS.from_epsg(32631)
+    place = {"transform": rasterio.Affine(*TRANSFORM[:2].ravel()), "crs": crs} if is_on_map else {}
+    georeference = Georeference(TRANSFORM, crs.to_wkt()) if is_on_map else None
+    bands = []
+    for k in range(3):
+        pixels = (textured_image(200, 150, k) + 5) * (20 if dtype == "uint8" else 100)
+        path = folder / f"f_{k}.tif"
+        write_band(path, pixels.clip(1).astype(dtype), nodata=nodata, **place)
+        band = Band(f"B{k}", path, 1, 200, 150, dtype, nodata, wavelength_nm=500 + 100 * k, bandwidth_nm=20)
+        bands.append(replace(band, georeference=georeference))
+    return Capture("f", Path(), tuple(bands), 1, CameraIdentity("Make", "Model"), captured_at="2026-06-21T10:00:00.5")
+
+
+def layers_of(capture: Capture, mapping: PixelMapping = SHIFT) -> list[Layer]:
+    is_reference = [band is capture.reference for band in capture.bands]
+    return [Layer(b, None if r else mapping, is_reference=r) for b, r in zip(capture.bands, is_reference, strict=True)]
+
+
+def change(band: Band, change: Any) -> np.ndarray:
+    """Change the pixels of a band's file in place."""
+    with rasterio.open(band.path, "r+") as dataset:
+        pixels = dataset.read(1)
+        change(pixels)
+        dataset.write(pixels, 1)
+    return pixels
 
 
 @pytest.mark.parametrize("compression", ["zstd", "deflate", "none"])
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_the_reference_is_bit_identical_and_the_type_kept(tmp_path: Path, dtype: str, compression: str) -> None:
-    capture = make_capture(tmp_path, dtype)
-    out = tmp_path / "out.tif"
-    write_raster(capture, layers_of(capture), CROP, out, WriteSettings(compression=compression))
+    capture, out = make_capture(tmp_path, dtype), tmp_path / "out.tif"
+    nodata = write_raster(capture, layers_of(capture), CROP, out, WriteSettings(compression=compression))
     with rasterio.open(out) as written, rasterio.open(capture.reference.path) as source:
         assert set(written.dtypes) == {dtype}
         np.testing.assert_array_equal(written.read(2), source.read(1)[6:136, 4:184])
@@ -79,195 +71,135 @@ def test_the_reference_is_bit_identical_and_the_type_kept(tmp_path: Path, dtype:
         assert written.tags(3, ns="IMAGERY")["CENTRAL_WAVELENGTH_UM"] == "0.7"
         assert written.tags()["TIFFTAG_DATETIME"] == "2026:06:21 10:00:00"
         assert written.profile["tiled"]
+        # No georeference and no nodata value are invented; floats have NaN.
+        assert (written.crs, written.transform.is_identity) == (None, True)
+        np.testing.assert_equal([nodata, written.nodata], [np.nan if dtype == "float32" else None] * 2)
+    assert not list(tmp_path.glob("*.aux.xml"))
 
 
 def test_red_green_and_blue_are_shown_as_such(tmp_path: Path) -> None:
     """A viewer that goes by the bands' order would show near infra-red as red."""
     capture = make_capture(tmp_path)
-    names = (("NIR", 840.0), ("Green", 560.0), ("Red", 668.0), ("Blue", 475.0))
-    some = [capture.bands[k % len(capture.bands)] for k in range(4)]
-    bands = [replace(b, name=n, wavelength_nm=w) for b, (n, w) in zip(some, names, strict=True)]
+    names = {"NIR": 840.0, "Green": 560.0, "Red": 668.0, "Blue": 475.0}
+    bands = [replace(capture.bands[0], name=name, wavelength_nm=nm) for name, nm in names.items()]
     layers = [Layer(b, None, is_reference=True) for b in bands]
-    for chosen, colours in (
-        (layers, ["undefined", "green", "red", "blue"]), (layers[:2], ["gray", "undefined"]), (layers[:1], ["gray"]),
-    ):  # fmt: skip
-        write_raster(capture, chosen, CROP, tmp_path / "out.tif", WriteSettings())
+    for count, colours in ((4, "undefined green red blue"), (2, "gray undefined"), (1, "gray")):
+        write_raster(capture, layers[:count], CROP, tmp_path / "out.tif", WriteSettings())
         with rasterio.open(tmp_path / "out.tif") as written:
-            assert [c.name for c in written.colorinterp] == colours
-
-
-def test_no_georeference_and_no_nodata_are_invented(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path)
-    out = tmp_path / "out.tif"
-    nodata_written = write_raster(capture, layers_of(capture), CROP, out, WriteSettings())
-    assert nodata_written is None
-    with rasterio.open(out) as written:
-        assert written.crs is None
-        assert written.transform.is_identity
-        assert written.nodata is None
-    assert not list(tmp_path.glob("*.aux.xml"))
+            assert [c.name for c in written.colorinterp] == colours.split()
 
 
 @pytest.mark.parametrize("file_format", ["gtiff", "cog"])
-def test_the_georeference_follows_the_crop(tmp_path: Path, file_format: str) -> None:
-    capture = make_capture(tmp_path, georeferenced=True)
-    out = tmp_path / "out.tif"
-    write_raster(capture, layers_of(capture), CROP, out, WriteSettings(format=file_format))
-    with rasterio.open(out) as written:
-        assert written.crs.to_epsg() == 32631
-        assert tuple(written.transform)[:6] == pytest.approx((0.1, 0, 500000.4, 0, -0.1, 5799999.4))
-        if file_format == "cog":
-            assert written.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
-        assert written.descriptions == ("B0", "B1", "B2")
-
-
-@pytest.mark.parametrize("file_format", ["gtiff", "cog"])
-def test_statistics_are_those_of_the_valid_pixels(tmp_path: Path, file_format: str) -> None:
-    capture, grid = make_capture(tmp_path), replace(CROP, has_gaps=True)
-    moved = Layer(capture.bands[0], PixelMapping(geometry.translation(40.0, 0.0)))
-    layers = [Layer(capture.bands[1], None, is_reference=True), moved]
-    path = tmp_path / "out.tif"
-    write_raster(capture, layers, grid, path, WriteSettings(statistics=True, format=file_format))
+def test_georeference_and_statistics_in_either_format(tmp_path: Path, file_format: str) -> None:
+    capture, path = make_capture(tmp_path, is_on_map=True), tmp_path / "out.tif"
+    moved, nowhere = (
+        Layer(capture.bands[0], PixelMapping(geometry.translation(40.0, 0.0))),
+        Layer(capture.bands[2], None),
+    )
+    layers = [Layer(capture.bands[1], None, is_reference=True), moved, nowhere]
+    write_raster(
+        capture, layers, replace(CROP, has_gaps=True), path, WriteSettings(statistics=True, format=file_format)
+    )
     with rasterio.open(path) as dataset:
-        for index in dataset.indexes:
+        assert dataset.crs.to_epsg() == 32631
+        assert tuple(dataset.transform)[:6] == pytest.approx((0.1, 0, 500000.4, 0, -0.1, 5799999.4))
+        assert dataset.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == ("COG" if file_format == "cog" else None)
+        assert dataset.descriptions == ("B1", "B0", "B2")
+        for index in (1, 2):
             stored, pixels = dataset.tags(index), dataset.read(index, masked=True).compressed()
-            assert float(stored["STATISTICS_MINIMUM"]) == pixels.min()
-            assert float(stored["STATISTICS_MAXIMUM"]) == pixels.max()
-            assert float(stored["STATISTICS_MEAN"]) == pytest.approx(pixels.mean())
-            assert float(stored["STATISTICS_STDDEV"]) == pytest.approx(pixels.std())
-
-
-def test_a_band_without_valid_pixels_has_no_statistics(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path)
-    layers = [Layer(capture.bands[1], None, is_reference=True), Layer(capture.bands[0], None)]
-    path = tmp_path / "out.tif"
-    write_raster(capture, layers, replace(CROP, has_gaps=True), path, WriteSettings(statistics=True))
-    with rasterio.open(path) as dataset:
+            for name in ("MINIMUM", "MAXIMUM", "MEAN", "STDDEV"):
+                value = {"MINIMUM": pixels.min, "MAXIMUM": pixels.max, "MEAN": pixels.mean, "STDDEV": pixels.std}[
+                    name
+                ]()
+                assert float(stored[f"STATISTICS_{name}"]) == pytest.approx(value)
         assert dataset.tags(1)["STATISTICS_VALID_PERCENT"] == "100"
-        assert dataset.tags(2)["STATISTICS_VALID_PERCENT"] == "0"
-        assert "STATISTICS_MEAN" not in dataset.tags(2)
+        assert dataset.tags(3)["STATISTICS_VALID_PERCENT"] == "0"
+        assert "STATISTICS_MEAN" not in dataset.tags(3)
 
 
 def test_moving_bands_are_resampled_where_the_mapping_says(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path, "float32")
-    whole = PixelMapping(geometry.translation(3, -2))
-    layers = [
-        Layer(b, None if b is capture.reference else whole, is_reference=b is capture.reference) for b in capture.bands
-    ]
-    out = tmp_path / "out.tif"
-    write_raster(capture, layers, CROP, out, WriteSettings())
+    capture, out = make_capture(tmp_path, "float32"), tmp_path / "out.tif"
+    write_raster(capture, layers_of(capture, PixelMapping(geometry.translation(3, -2))), CROP, out, WriteSettings())
     with rasterio.open(out) as written, rasterio.open(capture.bands[0].path) as source:
         np.testing.assert_allclose(written.read(1), source.read(1)[4:134, 7:187], rtol=1e-6)
 
 
-@pytest.mark.parametrize(("dtype", "nodata"), [("uint16", None), ("float32", None), ("int16", -9999), ("uint8", 255)])
-def test_outside_the_moving_image_is_nodata(tmp_path: Path, dtype: str, nodata: float | None) -> None:
-    capture = make_capture(tmp_path, dtype, nodata)
-    frame = OutputGrid(0, 0, 200, 150)
-    out = tmp_path / "out.tif"
-    write_raster(capture, layers_of(capture), frame, out, WriteSettings(crop="none"))
-    expected = nodata if nodata is not None else (np.nan if dtype == "float32" else 0)
+@pytest.mark.parametrize(
+    ("dtype", "nodata", "expected"),
+    [("uint16", None, 0), ("float32", None, np.nan), ("int16", -9999, -9999), ("uint8", 255, 255)],
+)
+def test_outside_the_moving_image_is_nodata(tmp_path: Path, dtype: str, nodata: float | None, expected: float) -> None:
+    capture, out = make_capture(tmp_path, dtype, nodata), tmp_path / "out.tif"
+    write_raster(capture, layers_of(capture), FRAME, out, WriteSettings(crop="none"))
     with rasterio.open(out) as written:
         np.testing.assert_equal(written.nodata, expected)
         mask = written.read_masks(1) > 0
-        assert not mask[:2].any()  # rows -2.5 and -1.5 of the moving image
-        assert not mask[:, 197:].any()
-        assert mask[4:, :195].all()
+    assert not mask[:2].any()  # rows -2.5 and -1.5 of the moving image
+    assert not mask[:, 197:].any()
+    assert mask[4:, :195].all()
 
 
-def test_valid_pixels_that_equal_nodata_are_moved_beside_it(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path, "uint8")
-    with rasterio.open(capture.bands[0].path, "r+") as dataset:
-        dataset.write(np.zeros((150, 200), np.uint8), 1)
-    out = tmp_path / "out.tif"
-    write_raster(capture, layers_of(capture), OutputGrid(0, 0, 200, 150), out, WriteSettings(crop="none"))
+def test_valid_pixels_that_equal_nodata_are_changed_by_one(tmp_path: Path) -> None:
+    capture, out = make_capture(tmp_path, "uint8"), tmp_path / "out.tif"
+    change(capture.bands[0], lambda pixels: pixels.fill(0))
+    write_raster(capture, layers_of(capture), FRAME, out, WriteSettings(crop="none"))
     with rasterio.open(out) as written:
         assert set(np.unique(written.read(1))) == {0, 1}
 
 
-def test_a_gap_is_all_nodata(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path)
-    layers = [Layer(capture.bands[0], None), *layers_of(capture)[1:]]
-    out = tmp_path / "out.tif"
-    write_raster(capture, layers, CROP, out, WriteSettings())
-    with rasterio.open(out) as written:
-        assert not written.read_masks(1).any()
-        assert written.read_masks(3).all()
-
-
-def test_undeclared_nan_stays_nan(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path, "float32")
-    with rasterio.open(capture.bands[0].path, "r+") as dataset:
-        pixels = dataset.read(1)
-        pixels[50:70, 60:90] = np.nan
-        dataset.write(pixels, 1)
-    out = tmp_path / "out.tif"
+def test_undeclared_nan_and_fill_are_nodata_in_the_stack(tmp_path: Path) -> None:
+    capture, out = make_capture(tmp_path, "float32"), tmp_path / "out.tif"
+    change(capture.bands[0], lambda pixels: pixels[50:70, 60:90].fill(np.nan))
+    reference = change(capture.reference, lambda pixels: pixels[:, :20].fill(-9999))
     write_raster(capture, layers_of(capture), CROP, out, WriteSettings())
     with rasterio.open(out) as written:
         assert np.isnan(written.nodata)
-        hole = np.isnan(written.read(1))
-        assert hole[50:60, 60:80].all()
-        assert hole.sum() < 23 * 33
-        assert not np.isnan(written.read(3)).any()
+        moved, copied, other = written.read()
+    assert np.isnan(moved)[50:60, 60:80].all()
+    assert np.isnan(moved).sum() < 23 * 33
+    assert np.isnan(copied[:, :16]).all()
+    np.testing.assert_array_equal(copied[:, 16:], reference[6:136, 20:184])
+    assert not np.isnan(other).any()
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path)
-    (tmp_path / "out.tif").write_bytes(b"the earlier result")
+    capture, out = make_capture(tmp_path), tmp_path / "out.tif"
+    out.write_bytes(b"the earlier result")
     capture.bands[2].path.unlink()
     with pytest.raises(Exception, match=r"f_2\.tif"):
-        write_raster(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())
-    assert (tmp_path / "out.tif").read_bytes() == b"the earlier result"
+        write_raster(capture, layers_of(capture), CROP, out, WriteSettings())
+    assert out.read_bytes() == b"the earlier result"
     assert not list(tmp_path.glob(".*"))
-
-
-def test_a_folder_where_the_file_should_be(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path)
-    (tmp_path / "out.tif").mkdir()
+    out.unlink()
+    out.mkdir()
     with pytest.raises(OutputError, match=r"out\.tif"):
-        write_raster(capture, layers_of(capture), CROP, tmp_path / "out.tif", WriteSettings())
+        write_raster(capture, layers_of(capture)[:2], CROP, out, WriteSettings())
 
 
 def test_nodata_is_a_value_that_copied_pixels_do_not_have(tmp_path: Path) -> None:
-    """The reference's zeros are measurements, and it is copied as it is."""
-    capture = make_capture(tmp_path)
-    reference = np.zeros((150, 200), np.uint16)
-    reference[:, ::3], reference[0, 0] = 7, 65535
-    with rasterio.open(capture.reference.path, "r+") as dataset:
-        dataset.write(reference, 1)
-    layers = [Layer(capture.bands[0], None), *layers_of(capture)[1:]]
-    out = tmp_path / "out.tif"
-    nodata = write_raster(capture, layers, OutputGrid(0, 0, 200, 150), out, WriteSettings())
+    """The reference's zeros are measurements, and it is copied without a change; a band without a mapping is nodata."""
+    capture, out = make_capture(tmp_path), tmp_path / "out.tif"
+    zeros = np.zeros((150, 200), np.uint16)
+    zeros[:, ::3], zeros[0, 0] = 7, 65535
+    change(capture.reference, lambda pixels: np.copyto(pixels, zeros))
+    nodata = write_raster(
+        capture, [Layer(capture.bands[0], None), *layers_of(capture)[1:]], FRAME, out, WriteSettings()
+    )
     with rasterio.open(out) as written:
         assert written.nodata == nodata
         assert nodata not in (None, 0, 7, 65535)
-        np.testing.assert_array_equal(written.read(2), reference)
+        np.testing.assert_array_equal(written.read(2), zeros)
         assert written.read_masks(2).all()
         assert not written.read_masks(1).any()
         assert not written.read_masks(3)[-1, -1]
-
-
-def test_undeclared_fill_of_the_reference_is_nodata_in_the_stack(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path, "float32")
-    with rasterio.open(capture.reference.path, "r+") as dataset:
-        pixels = dataset.read(1)
-        pixels[:, :20] = -9999
-        dataset.write(pixels, 1)
-    out = tmp_path / "out.tif"
-    write_raster(capture, layers_of(capture), CROP, out, WriteSettings())
-    with rasterio.open(out) as written:
-        assert np.isnan(written.nodata)
-        assert np.isnan(written.read(2)[:, :16]).all()
-        np.testing.assert_array_equal(written.read(2)[:, 16:], pixels[6:136, 20:184])
+        assert written.read_masks(3)[10:, :190].all()
 
 
 def test_files_of_bands_have_each_their_own_nodata(tmp_path: Path) -> None:
-    capture = make_capture(tmp_path)
-    (tmp_path / "floats").mkdir()
-    floats = make_capture(tmp_path / "floats", "float32").bands[2]
+    capture, floats = make_capture(tmp_path), make_capture(tmp_path / "floats", "float32").bands[2]
     capture = replace(capture, bands=(*capture.bands[:2], floats))
     paths, settings = CapturePaths(tmp_path / "out", "c"), Settings(write=WriteSettings(layout="bands"))
-    context = ProductContext(capture, paths, settings, {}, layers_of(capture), OutputGrid(0, 0, 200, 150), None, 0)
+    context = ProductContext(capture, paths, settings, {}, layers_of(capture), FRAME, None, 0)
     by_name = {file.path.name: file.nodata for file in BandFiles().write(context)}
     assert by_name["f_0.tif"] == 0
     assert np.isnan(by_name["f_2.tif"])
@@ -285,3 +217,89 @@ def test_a_tile_that_gdal_lost_is_noticed(tmp_path: Path) -> None:
         dataset.write(np.zeros_like(pixels), 1)
     with pytest.raises(OSError, match="the file came out incomplete"):
         raster.verify(path)
+
+
+LENS = Lens(150.0, 150.0, 59.5, 44.5, (-0.1, 0.05))
+
+
+def capture_of(folder: Path) -> Capture:
+    bands = []
+    for name in ("green", "nir"):
+        path = folder / f"{name}.tif"
+        with rasterio.open(path, "w", driver="GTiff", width=120, height=90, count=1, dtype="uint16") as dataset:
+            dataset.write(np.full((1, 90, 120), 500, np.uint16))
+        bands.append(Band(name, path, 1, 120, 90, "uint16", lens=LENS))
+    return Capture("c", Path(), tuple(bands), 0)
+
+
+def aligned_by(shift_px: float) -> Alignment:
+    seed = Seed("identity", geometry.translation(shift_px, 0), 0.0)
+    return Alignment(PixelMapping(seed.fixed_to_moving, LENS, LENS), (120, 90), "aligned", (), seed)
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+@pytest.mark.parametrize("undistort", [False, True])
+def test_without_a_common_area_what_no_band_shows_is_nodata(tmp_path: Path, undistort: bool) -> None:
+    capture, settings = capture_of(tmp_path), WriteSettings(undistort=undistort)
+    layers, grid = output_layers(capture, {"nir": aligned_by(200.0)}, settings)
+    assert (grid.width, grid.height, grid.has_gaps) == (120, 90, True)
+    write_raster(capture, layers, grid, tmp_path / "out.tif", settings)
+    with rasterio.open(tmp_path / "out.tif") as written:
+        assert not written.read_masks(2).any()
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_where_all_bands_show_everything_no_nodata_is_declared(tmp_path: Path) -> None:
+    capture = capture_of(tmp_path)
+    for crop in ("common", "none"):
+        _, grid = output_layers(capture, {"nir": aligned_by(0.0)}, WriteSettings(crop=crop))
+        assert not grid.has_gaps
+    moved, cut = output_layers(capture, {"nir": aligned_by(9.0)}, WriteSettings())
+    assert not cut.has_gaps
+    assert cut.width < 120
+    _, whole = output_layers(capture, {"nir": aligned_by(9.0)}, WriteSettings(crop="none"))
+    assert whole.has_gaps
+    assert write_raster(capture, moved, cut, tmp_path / "out.tif", WriteSettings()) is None
+
+
+def rig_between(low_px: float, high_px: float) -> Rig:
+    """One band that moves to the right as the ground comes nearer."""
+    middle = (low_px + high_px) / 2
+    factors = [(v - middle, 0.0, 0.0, 0.0, 0.0) for v in (low_px, middle, high_px)]
+    seen = tuple(CaptureFactors(float(k), None, None, f) for k, f in enumerate(factors))
+    bars = {"nir": 0.1}
+    return Rig(
+        (120, 90),
+        {"nir": geometry.translation(middle, 0)},
+        {"nir": (1.0, 0.0)},
+        {"nir": 0.0},
+        bars,
+        ("distance",),
+        seen,
+        bars,
+    )
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
+    capture, rig = capture_of(tmp_path), rig_between(2.0, 12.0)
+    grids = [output_layers(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig)[1] for shift in (2.0, 7.0, 12.0)]
+    assert len(set(grids)) == 1
+    assert not grids[0].has_gaps
+    # The farthest band leaves 12 px at the right; two more are left for captures that the rig has not seen.
+    assert 120 - (grids[0].x0 + grids[0].width) in range(13, 17)
+    alone = [
+        output_layers(capture, {"nir": aligned_by(shift)}, WriteSettings(crop="common"), rig)[1]
+        for shift in (2.0, 12.0)
+    ]
+    assert alone[0].width > alone[1].width
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_a_capture_beyond_its_flight_keeps_the_geometry_and_declares_nodata(tmp_path: Path) -> None:
+    capture, rig = capture_of(tmp_path), rig_between(2.0, 12.0)
+    (_, within), (_, beyond) = (
+        output_layers(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig) for shift in (5.0, 30.0)
+    )
+    assert replace(beyond, has_gaps=False) == within
+    assert beyond.has_gaps

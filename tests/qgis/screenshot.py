@@ -26,10 +26,19 @@ def save():
 def start():
     """Align and load as the toolbox does."""
     try:
-        processing.runAndLoadResults("agalign:alignflight", {
-            "INPUT": os.environ["AGALIGN_FLIGHT"], "OUTPUT": os.environ["AGALIGN_OUT"], "RADIOMETRY": 1,
-            "INDICES": "ndvi", "GEOREFERENCE": True, "GROUND": 0, "QA": True, "LOAD": 3,
-        })  # fmt: skip
+        processing.runAndLoadResults(
+            "agalign:alignflight",
+            {
+                "INPUT": os.environ["AGALIGN_FLIGHT"],
+                "OUTPUT": os.environ["AGALIGN_OUT"],
+                "RADIOMETRY": 1,
+                "INDICES": "ndvi",
+                "GEOREFERENCE": True,
+                "GROUND": 0,
+                "QA": True,
+                "LOAD": 3,
+            },
+        )
     except Exception as error:
         print(error, file=sys.stderr, flush=True)
         os._exit(1)

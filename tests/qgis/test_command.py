@@ -20,8 +20,6 @@ HAS_QGIS = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
 
 def _load() -> ModuleType:
     spec = importlib.util.spec_from_file_location("agalign_provider_command", PLUGIN / "command.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -119,7 +117,9 @@ def test_every_algorithm_runs_in_qgis(tmp_path: Path) -> None:
         f"import sys; sys.path.insert(0, {str(ROOT)!r}); from agalign.__main__ import main; sys.exit(main())",
     )
     done = subprocess.run(
-        [ROOT / "tests" / "qgis" / "run_algorithms.sh", agalign, tmp_path / "run"], capture_output=True, text=True,
+        [ROOT / "tests" / "qgis" / "run_algorithms.sh", agalign, tmp_path / "run"],
+        capture_output=True,
+        text=True,
         check=False,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stdout + done.stderr

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -40,7 +40,7 @@ SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])
 SIZE_PX = 320, 240
 MANY = 12
 """Captures of a run that something happens to."""
-ALL = tuple("abcdefghijkl")
+ALL = "abcdefghijkl"
 """Their names."""
 XMP = 700
 STRANGE_NAMES = "with space é 雨", "-rf", "quote'\"`$(x)", "new\nline", "\x1b[31mred\a", "_", "x" * 200
@@ -66,6 +66,8 @@ class Scene:
     """Done beside the program, which then has a process of its own."""
     process: dict[str, Any] = field(default_factory=dict)
     """How that process is started, where it must have one."""
+    options: tuple[str, ...] = ()
+    """Options that save time in what the fault does not concern."""
     undo: Callable[[], None] = lambda: None
     children: list[psutil.Process] = field(default_factory=list)
     """Processes that must not outlive the program."""
@@ -73,20 +75,35 @@ class Scene:
     def file(self, name: str = "b_nir.tif") -> Path:
         return self.folder / name
 
+    def run_of(self, out: Path) -> list[str]:
+        """Arguments of a usual run into this folder."""
+        return [str(self.folder), "-o", str(out), "-j", "1", *self.options]
+
+
+Spoil = Callable[[Scene], object]
+"""Does a fault to a flight or to a run."""
+
+
+@dataclass(frozen=True)
+class Ends:
+    """How a run must end."""
+
+    code: int
+    says: str = ""
+    """A pattern of one of the complaints; nothing is to be complained of where it is empty."""
+    finished: Sequence[str] = "a"
+    """Captures that must be aligned all the same."""
+    all_but: int | None = None
+    """This many of the twelve captures of a longer run are lost, whichever."""
+
 
 @dataclass(frozen=True)
 class Fault:
     """Something that is wrong."""
 
     name: str
-    spoil: Callable[[Scene], None]
-    code: int
-    says: str = ""
-    """A pattern of one of the complaints; nothing is to be complained of where it is empty."""
-    finished: tuple[str, ...] = ("a",)
-    """Captures that must be aligned all the same."""
-    all_but: int | None = None
-    """So many of the twelve captures of a longer run are lost, whichever."""
+    spoil: Spoil
+    ends: Ends
 
 
 @dataclass(frozen=True)
@@ -125,12 +142,14 @@ def as_numbers(image: np.ndarray) -> np.ndarray:
     return ((image - image.min()) / np.ptp(image) * 60000 + 1000).astype(np.uint16)
 
 
-def run_fault(fault: Fault, folder: Path) -> Seen:
-    """Make a flight, do the fault to it, run the program."""
+def run_fault(fault: Fault, folder: Path, model: Path | None = None) -> Seen:
+    """Make a flight, do the fault to it, run the program; `model` is that of a flight without faults."""
     scene = Scene(folder / "flight", folder / "out")
+    if model is not None:
+        scene.options = ("--relief", "never", "--model", str(model))
     make_flight(scene.folder)
     fault.spoil(scene)
-    command = scene.command or [str(scene.folder), "-o", str(scene.out), "-j", "1"]
+    command = scene.command or scene.run_of(scene.out)
     began = time.monotonic()
     try:
         run = run_outside if scene.watch or scene.process else run_inside
@@ -140,6 +159,13 @@ def run_fault(fault: Fault, folder: Path) -> Seen:
         scene.undo()
     complaints = [line.removeprefix("agalign: ") for line in output.splitlines() if line.startswith("agalign: ")]
     return Seen(code, complaints, whole, output, time.monotonic() - began)
+
+
+def make_model(folder: Path) -> None:
+    """Learn the model of a flight without faults."""
+    make_flight(folder / "flight")
+    done = agalign_here(folder / "flight", "-o", folder / "out", "-j", "1", "--relief", "never")
+    assert done.returncode == 0, done.stderr
 
 
 def aligned(out: Path) -> list[str]:
@@ -164,12 +190,12 @@ def run_inside(arguments: list[str], scene: Scene) -> tuple[int, str]:
 
     homes = [module for module in list(sys.modules.values()) if getattr(module, "find_captures", None) is real]
     for home in homes:
-        home.find_captures = result  # type: ignore[attr-defined]
+        home.find_captures = result
     try:
         done = agalign_here(*arguments)
     finally:
         for home in homes:
-            home.find_captures = real  # type: ignore[attr-defined]
+            home.find_captures = real
     return done.returncode, done.stderr
 
 
@@ -188,7 +214,7 @@ def run_outside(arguments: list[str], scene: Scene) -> tuple[int, str]:
 # ---- what is done to files
 
 
-def edited(change: Callable[[bytes], bytes]) -> Callable[[Scene], None]:
+def edited(change: Callable[[bytes], bytes]) -> Spoil:
     def spoil(scene: Scene) -> None:
         path = scene.file()
         path.write_bytes(change(path.read_bytes()))
@@ -196,25 +222,23 @@ def edited(change: Callable[[bytes], bytes]) -> Callable[[Scene], None]:
     return spoil
 
 
-def extra(name: str, data: bytes) -> Callable[[Scene], None]:
-    return lambda scene: (scene.folder / name).write_bytes(data) and None
+def extra(name: str, data: bytes) -> Spoil:
+    return lambda scene: (scene.folder / name).write_bytes(data)
 
 
-def tagged(packet: str | None = None, **tags: Any) -> Callable[[Scene], None]:
-    """Both files of b with tags; a packet's values stand in `_PACKET`."""
+def tagged(packet: str | None = None, *tags: tuple[int, int, int, str, bool]) -> Spoil:
+    """Both files of b with an XMP packet and other tags."""
 
     def spoil(scene: Scene) -> None:
-        for name in ("b_green.tif", "b_nir.tif"):
-            path = scene.file(name)
-            image = tifffile.imread(path)
-            data = None if packet is None else packet.encode()
-            more = [] if data is None else [(XMP, 1, len(data), data, True)]
-            tifffile.imwrite(path, image, extratags=[*more, *tags.get("extratags", [])])
+        data = (packet or "").encode()
+        extratags = [(XMP, 1, len(data), data, True), *tags] if data else tags
+        for path in (scene.file("b_green.tif"), scene.file()):
+            tifffile.imwrite(path, tifffile.imread(path), extratags=extratags)
 
     return spoil
 
 
-def xmp(values: str) -> Callable[[Scene], None]:
+def xmp(values: str) -> Spoil:
     return tagged(_PACKET.format(values))
 
 
@@ -230,11 +254,10 @@ def number(value: int) -> bytes:
 
 def image_of(width: int, height: int, bands: int = 1) -> list[tuple[int, int, int, bytes]]:
     """The tags of an image that has no pixels."""
-    return [
-        (256, 4, 1, number(width)), (257, 4, 1, number(height)), (258, 3, 1, number(8)), (259, 3, 1, number(1)),
-        (262, 3, 1, number(1)), (273, 4, 1, number(8)), (277, 3, 1, number(bands)), (278, 4, 1, number(height)),
-        (279, 4, 1, number(1)), (284, 3, 1, number(2 if bands > 1 else 1)),
-    ]  # fmt: skip
+    sizes = {256: width, 257: height, 273: 8, 278: height, 279: 1}
+    kinds = {258: 8, 259: 1, 262: 1, 277: bands, 284: 2 if bands > 1 else 1}
+    longs, shorts = ([(tag, type_, 1, number(v)) for tag, v in of.items()] for of, type_ in ((sizes, 4), (kinds, 3)))
+    return sorted(longs + shorts)
 
 
 def declared(width: int, height: int, bands: int = 1) -> bytes:
@@ -288,68 +311,60 @@ def strange_names(scene: Scene) -> None:
         write_capture(scene.folder, name, place)
 
 
-def formulas(scene: Scene) -> None:
-    write_capture(scene.folder, '=HYPERLINK("a")', 3)
-
-
 def loops(scene: Scene) -> None:
     (scene.folder / "loop").symlink_to(scene.folder)
     (scene.folder / "b_nir2.tif").symlink_to(scene.folder / "b_nir2.tif")
 
 
-def forbidden(path: Callable[[Scene], Path], name: str = "") -> Callable[[Scene], None]:
+def without_permission(scene: Scene, target: Path, mode: int) -> None:
+    """Root passes over permissions by two capabilities, which the program is started without."""
+
+    def drop_capabilities() -> None:
+        libc = ctypes.CDLL(None)
+        for capability in (1, 2):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
+            libc.prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
+
+    target.chmod(mode)
+    scene.process = {"preexec_fn": drop_capabilities}
+    scene.undo = lambda: target.chmod(0o755)
+
+
+def forbidden(path: Callable[[Scene], Path], name: str = "", mode: int = 0) -> Spoil:
     """A file or folder that whoever runs the program may not read."""
 
     def spoil(scene: Scene) -> None:
-        target = path(scene)
         if name:
-            target.mkdir()
-        target.chmod(0)
-        scene.process = {"preexec_fn": obey_permissions}
-        scene.undo = lambda: target.chmod(0o755)
+            path(scene).mkdir()
+        without_permission(scene, path(scene), mode)
 
     return spoil
 
 
-def obey_permissions() -> None:
-    """Root passes over permissions by two capabilities, which the program is started without."""
-    libc = ctypes.CDLL(None)
-    for capability in (1, 2):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
-        libc.prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
-
-
 def read_only(scene: Scene) -> None:
-    for one in (*scene.folder.iterdir(), scene.folder):
-        one.chmod(0o555 if one.is_dir() else 0o444)
-    scene.process = {"preexec_fn": obey_permissions}
-    scene.undo = lambda: scene.folder.chmod(0o755)
-
-
-def out_is_read_only(scene: Scene) -> None:
-    scene.out.mkdir()
-    scene.out.chmod(0o555)
-    scene.process = {"preexec_fn": obey_permissions}
+    for path in scene.folder.iterdir():
+        path.chmod(0o444)
+    without_permission(scene, scene.folder, 0o555)
 
 
 # ---- what is done to runs
 
 
 def first_run(scene: Scene) -> None:
-    code, output = run_inside([str(scene.folder), "-o", str(scene.out), "-j", "1"], scene)
+    code, output = run_inside(scene.run_of(scene.out), scene)
     assert code == 0, output
 
 
 def killed_inside_the_input(scene: Scene) -> None:
     """An earlier run wrote below its input, and was killed before its report."""
     earlier = scene.folder / "earlier"
-    code, _ = run_inside([str(scene.folder), "-o", str(earlier), "-j", "1"], scene)
+    code, _ = run_inside(scene.run_of(earlier), scene)
     assert code == 0
     for name in ("summary.csv", "index.html"):
         (earlier / name).unlink()
     assert (earlier / RUN_FILE).is_file()
 
 
-def with_sidecar(change: Callable[[Scene, str], str]) -> Callable[[Scene], None]:
+def with_sidecar(change: Callable[[Scene, str], str]) -> Spoil:
     def spoil(scene: Scene) -> None:
         first_run(scene)
         path = scene.out / "b.json"
@@ -358,7 +373,13 @@ def with_sidecar(change: Callable[[Scene, str], str]) -> Callable[[Scene], None]
     return spoil
 
 
+def learning(scene: Scene) -> None:
+    """The run learns its own model, although one that fits is there."""
+    scene.options = ()
+
+
 def damaged_model(scene: Scene) -> None:
+    learning(scene)
     first_run(scene)
     (path,) = (scene.out / "models").iterdir()
     data = bytearray(path.read_bytes())
@@ -367,22 +388,17 @@ def damaged_model(scene: Scene) -> None:
     scene.arguments = ["--overwrite"]
 
 
-def given_model(data: bytes) -> Callable[[Scene], None]:
+def given_model(make: Callable[[Path], object]) -> Spoil:
     def spoil(scene: Scene) -> None:
         path = scene.folder.parent / "m.safetensors"
-        path.write_bytes(data)
+        make(path)
         scene.arguments = ["--model", str(path)]
 
     return spoil
 
 
-def stack_is_a_folder(scene: Scene) -> None:
-    (scene.out / "b.tif" / "below").mkdir(parents=True)
-
-
-def band_file_is_a_folder(scene: Scene) -> None:
-    scene.arguments = ["--layout", "bands"]
-    (scene.out / "b_nir.tif" / "below").mkdir(parents=True)
+def output_is_a_folder(name: str) -> Spoil:
+    return lambda scene: (scene.out / name / "below").mkdir(parents=True)
 
 
 def held_by_another(scene: Scene) -> None:
@@ -392,7 +408,6 @@ def held_by_another(scene: Scene) -> None:
         "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     other = subprocess.Popen([sys.executable, "-c", code, str(scene.out)], stdout=subprocess.PIPE, text=True)
-    assert other.stdout is not None
     other.stdout.readline()
 
     def undo() -> None:
@@ -409,16 +424,16 @@ def held_by_a_killed_one(scene: Scene) -> None:
     assert (scene.out / ".agalign.lock").is_file()
 
 
-def vanishing(scene: Scene) -> None:
-    scene.during = scene.file().unlink
-
-
 def full_disk(scene: Scene) -> None:
     """A file system that holds a capture; without the right to mount one, files of at most 60 kB."""
     scene.out.mkdir()
-    mounted = os.getuid() == 0 and subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1600k", "tmpfs", str(scene.out)], capture_output=True
-    ).returncode == 0  # fmt: skip
+    mounted = (
+        os.getuid() == 0
+        and subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=1600k", "tmpfs", str(scene.out)], capture_output=True
+        ).returncode
+        == 0
+    )
     if mounted:
         scene.undo = lambda: subprocess.run(["umount", "-l", str(scene.out)], check=True) and None
         return
@@ -430,7 +445,7 @@ def full_disk(scene: Scene) -> None:
     scene.process = {"preexec_fn": limit}
 
 
-def when_begun(act: Callable[["subprocess.Popen[str]", Scene], None], *arguments: str) -> Callable[[Scene], None]:
+def when_begun(act: Callable[["subprocess.Popen[str]", Scene], None], *arguments: str) -> Spoil:
     """Something happens to a run of twelve captures once the first of them is done."""
 
     def spoil(scene: Scene) -> None:
@@ -517,7 +532,11 @@ def some_are_reported(scene: Scene) -> bool:
 
 
 def larger(scene: Scene) -> None:
-    """Images that become larger and larger: a process must ask for more memory than it keeps from those before."""
+    """Images that become larger and larger: a process must ask for more memory than it keeps from those before.
+
+    No model fits them.
+    """
+    learning(scene)
     for path in scene.folder.iterdir():
         times = 2 + ALL.index(path.name[0]) // 3
         tifffile.imwrite(path, np.kron(tifffile.imread(path), np.ones((times, times), np.uint16)))
@@ -560,13 +579,8 @@ def terminated_while_files_are_read(scene: Scene) -> None:
     scene.watch = watch
 
 
-def in_ascii(scene: Scene) -> None:
-    scene.process = {"env": {**os.environ, "PYTHONIOENCODING": "ascii"}}
-
-
-def in_c(scene: Scene) -> None:
-    settings = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    scene.process = {"env": {**os.environ, **settings}}
+def with_environment(**variables: str) -> Spoil:
+    return lambda scene: scene.process.update(env={**os.environ, **variables})
 
 
 def standard_output_full(scene: Scene) -> None:
@@ -574,11 +588,8 @@ def standard_output_full(scene: Scene) -> None:
         scene.process = {"stdout": os.dup(full.fileno())}
 
 
-def asking(*arguments: str) -> Callable[[Scene], None]:
-    def spoil(scene: Scene) -> None:
-        scene.arguments = list(arguments)
-
-    return spoil
+def asking(*options: str) -> Spoil:
+    return lambda scene: scene.arguments.extend(options)
 
 
 def lines(scene: Scene) -> None:
@@ -591,21 +602,12 @@ def sidecar_is_a_pipe(scene: Scene) -> None:
     os.mkfifo(scene.out / "b.json")
 
 
-def model_is_a_pipe(scene: Scene) -> None:
-    path = scene.folder.parent / "m.safetensors"
-    os.mkfifo(path)
-    scene.arguments = ["--model", str(path)]
-
-
 def endless_number(scene: Scene) -> None:
-    """In the sidecar of b, of which the report is to be made."""
-    run_inside([str(scene.folder), "-o", str(scene.out), "-j", "1"], Scene(scene.folder, scene.out))
-    path = scene.out / "b.json"
-    path.write_text(re.sub(r'"seconds": [0-9.]+', '"seconds": 1e309', path.read_text()))
-    scene.command = ["report", str(scene.out)]
+    with_sidecar(lambda _, text: re.sub(r'"seconds": [0-9.]+', '"seconds": 1e309', text))(scene)
+    commanding("report {out}")(scene)
 
 
-def without_streams(*numbers: int) -> Callable[[Scene], None]:
+def without_streams(*numbers: int) -> Spoil:
     def spoil(scene: Scene) -> None:
         scene.process = {"preexec_fn": lambda: [os.close(n) for n in numbers] and None}
 
@@ -624,14 +626,10 @@ def unread_errors(scene: Scene) -> None:
     scene.watch = lambda _: None
 
 
-def asking_too(*options: str) -> Callable[[Scene], None]:
-    return lambda scene: scene.arguments.extend(options)
-
-
 def long_temporary_folder(scene: Scene) -> None:
     folder = scene.folder.parent / ("t" * 150)
     folder.mkdir()
-    scene.process = {"env": {**os.environ, "TMPDIR": str(folder)}}
+    with_environment(TMPDIR=str(folder))(scene)
     scene.arguments = ["-j", "2"]
 
 
@@ -649,23 +647,12 @@ def no_locks(scene: Scene) -> None:
     scene.undo = undo
 
 
-def commanding(*command: str) -> Callable[[Scene], None]:
-    def spoil(scene: Scene) -> None:
-        scene.command = [part.format(folder=scene.folder, out=scene.out) for part in command]
-
-    return spoil
+def commanding(command: str) -> Spoil:
+    return lambda scene: setattr(scene, "command", command.format(folder=scene.folder, out=scene.out).split(" "))
 
 
-def both(*spoils: Callable[[Scene], None]) -> Callable[[Scene], None]:
-    def spoil(scene: Scene) -> None:
-        for one in spoils:
-            one(scene)
-
-    return spoil
-
-
-def long_model(scene: Scene) -> None:
-    tagged(extratags=[(271, 2, 0, "Maker", True), (272, 2, 0, "M" * 300, True)])(scene)
+def both(*spoils: Spoil) -> Spoil:
+    return lambda scene: [spoil(scene) for spoil in spoils]
 
 
 def colliding(scene: Scene) -> None:
@@ -674,10 +661,6 @@ def colliding(scene: Scene) -> None:
     image = tifffile.imread(scene.file("a_nir.tif"))
     bands = np.stack([tifffile.imread(scene.file("a_green.tif")), image])
     tifffile.imwrite(scene.file("a_nir.tiff"), bands, photometric="minisblack", planarconfig="separate")
-
-
-def fifo(scene: Scene) -> None:
-    os.mkfifo(scene.folder / "c_nir.tif")
 
 
 def counting_beyond(scene: Scene) -> None:
@@ -689,119 +672,185 @@ def counting_beyond(scene: Scene) -> None:
 _SECOND = '"file": "b.tif",\n    "band_index": 2'
 _NESTED = "<a>" * 1200 + "</a>" * 1200
 _BOMB = (
-    '<!DOCTYPE l [<!ENTITY a "aaaaaaaaaa">' + "".join(
-        f'<!ENTITY {chr(98 + k)} "{("&" + chr(97 + k) + ";") * 10}">' for k in range(8)
-    ) + ']>' + _PACKET.format("<Camera:BandName>&i;</Camera:BandName>")
-)  # fmt: skip
+    '<!DOCTYPE l [<!ENTITY a "aaaaaaaaaa">'
+    + "".join(f'<!ENTITY {chr(98 + k)} "{("&" + chr(97 + k) + ";") * 10}">' for k in range(8))
+    + "]>"
+    + _PACKET.format("<Camera:BandName>&i;</Camera:BandName>")
+)
 _OUTSIDE = '<!DOCTYPE l [<!ENTITY a SYSTEM "file:///etc/passwd">]>' + _PACKET.format(
     "<Camera:BandName>&a;</Camera:BandName>"
 )
 
-FAULTS = (
-    Fault("a TIFF cut short", edited(lambda data: data[: len(data) // 2]), 3, r"b_nir\.tif: .*copy it from the card"),
-    Fault("half of a TIFF zeros", edited(lambda data: data[:2000] + bytes(len(data) - 2000)), 3, r"^b nir: "),
-    Fault("wrong magic", edited(lambda data: b"XX" + data[2:]), 3, "b_nir.tif: is not a TIFF, JPEG or PNG"),
-    Fault("no bytes at all", edited(lambda _: b""), 3, "b_nir.tif: is empty"),
-    Fault("a text named .tif", extra("c_nir.tif", b"hello"), 3, "c_nir.tif: is not a TIFF", ("a", "b")),
-    Fault("a folder named .tif", lambda s: (s.folder / "c_nir.tif").mkdir(), 0, "", ("a", "b")),
-    Fault("a pipe named .tif", fifo, 3, "c_nir.tif: is not a regular file", ("a", "b")),
-    Fault("symlinks that lead in a circle", loops, 3, "b_nir2.tif: cannot be read", ("a",)),
-    Fault("a file without permission", forbidden(lambda s: s.file()), 3, r"b_nir.tif: cannot be read \(Permission"),
-    Fault("a folder without permission", forbidden(lambda s: s.folder / "sub", "new"), 3,
-          r"sub: cannot be looked into \(Permission denied\)", ("a", "b")),
-    Fault("the system's folder on a card", forbidden(lambda s: s.folder / "lost+found", "new"), 0, "", ("a", "b")),
-    Fault("an input that may only be read", read_only, 0, "", ("a", "b")),
-    Fault("an output that may not be written", out_is_read_only, 1, "out: no permission to write there", ()),
-    Fault("an output that is a file", lambda s: s.out.write_text("x") and None, 1, "out: is a file", ()),
-    Fault("a file that vanishes during the run", vanishing, 3, r"b_nir\.tif: does not exist"),
-    Fault("the disk full", full_disk, 3, "the disk is full|cannot be written", ("a",)),
-    Fault("a worker killed by SIGKILL", when_begun(kill_worker, "-j", "2", "--timeout", "100"), 0, "", ALL),
-    Fault("both workers killed by SIGKILL", when_begun(kill_all_workers, "-j", "2"), 0, "", ALL),
-    Fault("a capture whose worker is killed twice",
-          both(when_begun(kill_capture, "-j", "1", "--timeout", "100"), larger), 3,
-          r"its worker process was killed \(signal 9; ", (), 1),
-    Fault("each worker killed as it appears", when_begun(kill_workers_as_they_appear, "-j", "2"), 3,
-          r"^3 worker processes one after another ended before they finished anything \(the last by signal 9", ()),
-    Fault("the process that starts workers killed", when_begun(kill_server, "-j", "2"), 0, "", ALL),
-    Fault("memory short in the workers", both(when_begun(starve_workers, "-j", "2", "--timeout", "100"), larger), 3,
-          "out of memory|killed", ()),
-    Fault("a capture that never ends", when_begun(stop_worker, "-j", "2", "--timeout", "4"), 3,
-          "stopped after 4 s", (), 1),
-    Fault("the interrupt key", when_begun(signalled(signal.SIGINT), "-j", "2"), 130, "interrupted; finished", ()),
-    Fault("the interrupt key while workers start", interrupted_while_workers_start, 130, "interrupted; finished", ()),
-    Fault("SIGTERM", when_begun(signalled(signal.SIGTERM), "-j", "2"), 143, "interrupted; finished", ()),
-    Fault("SIGTERM while files are read", terminated_while_files_are_read, 143, "interrupted; finished", ()),
-    Fault("XML entities that multiply", tagged(_BOMB), 0, "", ("a", "b")),
-    Fault("an XML entity that names a file", tagged(_OUTSIDE), 0, "", ("a", "b")),
-    Fault("XMP nested 1200 deep", tagged(_PACKET.format(_NESTED)), 0, "", ("a", "b")),
-    Fault("XMP of five megabytes", xmp(f"<Camera:BandName>{'x' * 5_000_000}</Camera:BandName>"), 0, "", ("a", "b")),
-    Fault("a thousand tags of one value of 2 MB", long_tags, 3, "b_nir.tif: .*declare 2000 MB"),
-    Fault("a tag that counts beyond the file", counting_beyond, 3, "b_nir.tif: not a readable TIFF"),
-    Fault("numbers in the tags that cannot be", both(
-        xmp("<Camera:PerspectiveFocalLength>nan</Camera:PerspectiveFocalLength><Camera:PrincipalPoint>1e300,inf"
+ALL_FINISHED: dict[str, Spoil] = {
+    "a folder named .tif": lambda s: (s.folder / "c_nir.tif").mkdir(),
+    "the system's folder on a card": forbidden(lambda s: s.folder / "lost+found", "new"),
+    "an input that may only be read": read_only,
+    "XML entities that multiply": tagged(_BOMB),
+    "an XML entity that names a file": tagged(_OUTSIDE),
+    "XMP nested 1200 deep": tagged(_PACKET.format(_NESTED)),
+    "XMP of five megabytes": xmp(f"<Camera:BandName>{'x' * 5_000_000}</Camera:BandName>"),
+    "numbers in the tags that cannot be": both(
+        xmp(
+            "<Camera:PerspectiveFocalLength>nan</Camera:PerspectiveFocalLength><Camera:PrincipalPoint>1e300,inf"
             "</Camera:PrincipalPoint><DLS:HorizontalIrradiance>-5</DLS:HorizontalIrradiance>"
-            "<MicaSense:RadiometricCalibration>1e300,0,0</MicaSense:RadiometricCalibration>"),
-        asking("--radiometry", "off")), 0, "", ("a", "b")),
-    Fault("a sparse image of 100,000 x 100,000", enormous, 3, r"declares 100000 x 100000 pixels.*--max-pixels",
-          ("a", "b")),
-    Fault("an image of 65,535 bands", extra("c.tif", declared(64, 64, 65535)), 3, "c.tif: ", ("a", "b")),
-    Fault("a band of another size", of_other_size, 0, "", ("a", "b")),
-    Fault("images of one pixel", of_one_pixel, 3, "^b nir: "),
-    Fault("a band that is all nodata", all_nodata, 3, "^b nir: "),
-    Fault("names of every kind", strange_names, 0, "", ("a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200)),
-    Fault("a formula for a name", formulas, 0, "", ("a", "b")),
-    Fault("a camera model of 300 characters", long_model, 0, "", ("a", "b")),
-    Fault("an output inside the input", lambda s: setattr(s, "out", s.folder / "out"), 0, "", ("a", "b")),
-    Fault("an earlier run inside the input, killed", killed_inside_the_input, 0, "", ("a", "b")),
-    Fault("two captures that would write one file", colliding, 0, "", ("a", "b")),
-    Fault("a TIFF that describes other files (VRT)", lambda s: s.file().write_text(vrt(s)) and None, 3,
-          "b_nir.tif: is not a TIFF"),
-    Fault("overviews that describe other files", overviews_elsewhere, 0, "", ("a", "b")),
-    Fault("a sidecar that names files elsewhere",
-          with_sidecar(lambda s, t: t.replace('"band_files": []', '"band_files": [{"file": "../a", "bytes": 1}]')),
-          0, "", ("a", "b")),
-    Fault("a sidecar nested 200,000 deep", with_sidecar(lambda *_: '{"schema": "agalign/1", "bands": ' + "[" * 200_000),
-          0, "", ("a", "b")),
-    Fault("a sidecar of width 0, for the report", both(
-        with_sidecar(lambda _, t: re.sub(r'"width": \d+', '"width": 0', t)), commanding("report", "{out}")), 3,
-        "b.json: reference.width"),
-    Fault("a sidecar without permission, for the report", both(
-        first_run, forbidden(lambda s: s.out / "b.json"), commanding("report", "{out}")), 3,
-        r"b.json: cannot be read \(Permission"),
-    Fault("a band index of 99 in a sidecar, for indices", both(
-        with_sidecar(lambda _, t: t.replace(_SECOND, _SECOND.replace("2", "99"))),
-        commanding("ndvi", "{out}", "--index", "gndvi")), 3, "b.tif: has no band 99", ("a", "b")),
-    Fault("a model of an earlier run, damaged", damaged_model, 0, "", ("a", "b")),
-    Fault("a malformed model file", given_model(b"\x40" + bytes(7) + b"{" + b"[" * 63), 1,
-          "m.safetensors: cannot be read", ()),
-    Fault("a folder where a stack belongs", stack_is_a_folder, 3, "b.tif: cannot be written"),
-    Fault("a folder where a band's file belongs", band_file_is_a_folder, 3, "b_nir.tif: cannot be written"),
-    Fault("another run in the same output", held_by_another, 1, r"out: another run writes there \(process \d+ on ", ()),
-    Fault("the lock of a killed run", held_by_a_killed_one, 0, "", ("a", "b")),
-    Fault("a terminal of ASCII", both(strange_names, in_ascii), 0, "", ("a", "b")),
-    Fault("a system without letters beyond ASCII", both(strange_names, in_c), 3,
-          "the system encoding cannot represent its name", ("a", "b")),
-    Fault("standard output full", standard_output_full, 1, "standard output|output: No space left", ("a", "b")),
-    Fault("a random seed beyond 64 bits", asking("--rng-seed", "9" * 30), 2, "--rng-seed: give", ()),
-    Fault("a torch device without data", asking("--device", "meta"), 2, "device 'meta' cannot be used", ()),
-    Fault("images of a line of 100,000 pixels", lines, 3, "^b nir: "),
-    Fault("a pipe where a sidecar belongs", sidecar_is_a_pipe, 0, "", ("a", "b")),
-    Fault("a pipe for a model", model_is_a_pipe, 1, r"m\.safetensors: .*not a regular file", ()),
-    Fault("an infinite number in a sidecar, for the report", endless_number, 3, r"b\.json: .*finite", ("a",)),
-    Fault("an infinite number in an earlier sidecar", both(
-        endless_number, commanding("{folder}", "-o", "{out}", "-j", "1")), 0, "", ("a", "b")),
-    Fault("standard output closed", without_streams(1), 0, "", ("a", "b")),
-    Fault("all standard streams closed", without_streams(0, 1, 2), 0, "", ("a", "b")),
-    Fault("standard error that is not read", unread_errors, 0, "", tuple("abcde")),
-    Fault("JSON lines that are not read", both(unread_errors, asking_too("--log-json")), 0, "", tuple("abcde")),
-    Fault("a temporary folder with a name of 150 letters", long_temporary_folder, 0, "", ("a", "b")),
-    Fault("a file system without locks", no_locks, 0, "", ("a", "b")),
-    Fault("an empty name for the folder", commanding("", "-o", "{out}"), 2, "the name of the folder is empty", ()),
-    Fault("a focal length of 1e308 mm in the tags", xmp(
+            "<MicaSense:RadiometricCalibration>1e300,0,0</MicaSense:RadiometricCalibration>"
+        ),
+        asking("--radiometry", "off"),
+    ),
+    "a band of another size": of_other_size,
+    "a formula for a name": lambda s: write_capture(s.folder, '=HYPERLINK("a")', 3),
+    "a camera model of 300 characters": both(
+        learning, tagged(None, (271, 2, 0, "Maker", True), (272, 2, 0, "M" * 300, True))
+    ),
+    "an output inside the input": lambda s: setattr(s, "out", s.folder / "out"),
+    "an earlier run inside the input, killed": killed_inside_the_input,
+    "two captures that would write one file": colliding,
+    "overviews that describe other files": overviews_elsewhere,
+    "a sidecar that names files elsewhere": with_sidecar(
+        lambda s, t: t.replace('"band_files": []', '"band_files": [{"file": "../a", "bytes": 1}]')
+    ),
+    "a sidecar nested 200,000 deep": with_sidecar(lambda *_: '{"schema": "agalign/1", "bands": ' + "[" * 200_000),
+    "a model of an earlier run, damaged": damaged_model,
+    "the lock of a killed run": held_by_a_killed_one,
+    "a terminal of ASCII": both(strange_names, with_environment(PYTHONIOENCODING="ascii")),
+    "a pipe where a sidecar belongs": sidecar_is_a_pipe,
+    "an infinite number in an earlier sidecar": both(endless_number, commanding("{folder} -o {out} -j 1")),
+    "standard output closed": without_streams(1),
+    "all standard streams closed": without_streams(0, 1, 2),
+    "a temporary folder with a name of 150 letters": long_temporary_folder,
+    "a file system without locks": no_locks,
+    "a focal length of 1e308 mm in the tags": xmp(
         "<Camera:PerspectiveFocalLength>1e308</Camera:PerspectiveFocalLength>"
-        "<Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>"), 0, "", ("a", "b")),
-    Fault("one of GDAL's virtual paths", commanding("/vsizip/flight.zip", "-o", "{out}"), 1, "virtual paths", ()),
-)  # fmt: skip
+        "<Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>"
+    ),
+}
+"""After these, both captures are aligned, without a complaint."""
+B_IS_LOST: dict[str, tuple[Spoil, str]] = {
+    "a TIFF cut short": (edited(lambda data: data[: len(data) // 2]), r"b_nir\.tif: .*copy it from the card"),
+    "half of a TIFF zeros": (edited(lambda data: data[:2000] + bytes(len(data) - 2000)), r"^b nir: "),
+    "wrong magic": (edited(lambda data: b"XX" + data[2:]), "b_nir.tif: is not a TIFF, JPEG or PNG"),
+    "no bytes at all": (edited(lambda _: b""), "b_nir.tif: is empty"),
+    "a file without permission": (forbidden(lambda s: s.file()), r"b_nir.tif: cannot be read \(Permission"),
+    "a file that vanishes during the run": (
+        lambda s: setattr(s, "during", s.file().unlink),
+        r"b_nir\.tif: does not exist",
+    ),
+    "a thousand tags of one value of 2 MB": (long_tags, "b_nir.tif: .*declare 2000 MB"),
+    "a tag that counts beyond the file": (counting_beyond, "b_nir.tif: not a readable TIFF"),
+    "images of one pixel": (of_one_pixel, "^b nir: "),
+    "a band that is all nodata": (all_nodata, "^b nir: "),
+    "a TIFF that describes other files (VRT)": (lambda s: s.file().write_text(vrt(s)), "b_nir.tif: is not a TIFF"),
+    "a sidecar of width 0, for the report": (
+        both(with_sidecar(lambda _, t: re.sub(r'"width": \d+', '"width": 0', t)), commanding("report {out}")),
+        "b.json: reference.width",
+    ),
+    "a sidecar without permission, for the report": (
+        both(first_run, forbidden(lambda s: s.out / "b.json"), commanding("report {out}")),
+        r"b.json: cannot be read \(Permission",
+    ),
+    "a folder where a stack belongs": (output_is_a_folder("b.tif"), "b.tif: cannot be written"),
+    "a folder where a band's file belongs": (
+        both(output_is_a_folder("b_nir.tif"), asking("--layout", "bands")),
+        "b_nir.tif: cannot be written",
+    ),
+    "images of a line of 100,000 pixels": (lines, "^b nir: "),
+}
+"""After these, the other capture is aligned; with a pattern of the complaint."""
+FILE_IS_NAMED: dict[str, tuple[Spoil, str]] = {
+    "a text named .tif": (extra("c_nir.tif", b"hello"), "c_nir.tif: is not a TIFF"),
+    "a pipe named .tif": (lambda s: os.mkfifo(s.folder / "c_nir.tif"), "c_nir.tif: is not a regular file"),
+    "a folder without permission": (
+        forbidden(lambda s: s.folder / "sub", "new"),
+        r"sub: cannot be looked into \(Permission denied\)",
+    ),
+    "a sparse image of 100,000 x 100,000": (enormous, r"declares 100000 x 100000 pixels.*--max-pixels"),
+    "an image of 65,535 bands": (extra("c.tif", declared(64, 64, 65535)), "c.tif: "),
+    "a band index of 99 in a sidecar, for indices": (
+        both(
+            with_sidecar(lambda _, t: t.replace(_SECOND, _SECOND.replace("2", "99"))),
+            commanding("ndvi {out} --index gndvi"),
+        ),
+        "b.tif: has no band 99",
+    ),
+    "a system without letters beyond ASCII": (
+        both(strange_names, with_environment(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")),
+        "the system encoding cannot represent its name",
+    ),
+}
+"""After these, both captures are aligned, and another file is complained of."""
+REFUSED: dict[str, tuple[Spoil, int, str]] = {
+    "an output that may not be written": (
+        forbidden(lambda s: s.out, "new", 0o555),
+        1,
+        "out: no permission to write there",
+    ),
+    "an output that is a file": (lambda s: s.out.write_text("x"), 1, "out: is a file"),
+    "a malformed model file": (
+        given_model(lambda path: path.write_bytes(b"\x40" + bytes(7) + b"{" + b"[" * 63)),
+        1,
+        "m.safetensors: cannot be read",
+    ),
+    "another run in the same output": (held_by_another, 1, r"out: another run writes there \(process \d+ on "),
+    "a random seed beyond 64 bits": (asking("--rng-seed", "9" * 30), 2, "--rng-seed: give"),
+    "a torch device without data": (asking("--device", "meta"), 2, "device 'meta' cannot be used"),
+    "a pipe for a model": (given_model(os.mkfifo), 1, r"m\.safetensors: .*not a regular file"),
+    "an empty name for the folder": (commanding(" -o {out}"), 2, "the name of the folder is empty"),
+    "one of GDAL's virtual paths": (commanding("/vsizip/flight.zip -o {out}"), 1, "virtual paths"),
+}
+"""These end the run: with the exit code and a pattern of the complaint."""
+OTHERS = {
+    "symlinks that lead in a circle": (loops, Ends(3, "b_nir2.tif: cannot be read", "a")),
+    "the disk full": (full_disk, Ends(3, "the disk is full|cannot be written", "a")),
+    "a worker killed by SIGKILL": (when_begun(kill_worker, "-j", "2", "--timeout", "100"), Ends(0, "", ALL)),
+    "both workers killed by SIGKILL": (when_begun(kill_all_workers, "-j", "2"), Ends(0, "", ALL)),
+    "a capture whose worker is killed twice": (
+        both(when_begun(kill_capture, "-j", "1", "--timeout", "100"), larger),
+        Ends(3, r"its worker process was killed \(signal 9; ", "", 1),
+    ),
+    "each worker killed as it appears": (
+        when_begun(kill_workers_as_they_appear, "-j", "2"),
+        Ends(
+            3, r"^3 worker processes one after another ended before they finished anything \(the last by signal 9", ""
+        ),
+    ),
+    "the process that starts workers killed": (when_begun(kill_server, "-j", "2"), Ends(0, "", ALL)),
+    "memory short in the workers": (
+        both(when_begun(starve_workers, "-j", "2", "--timeout", "100"), larger),
+        Ends(3, "out of memory|killed", ""),
+    ),
+    "a capture that never ends": (
+        when_begun(stop_worker, "-j", "2", "--timeout", "4"),
+        Ends(3, "stopped after 4 s", "", 1),
+    ),
+    "the interrupt key": (when_begun(signalled(signal.SIGINT), "-j", "2"), Ends(130, "interrupted; finished", "")),
+    "the interrupt key while workers start": (interrupted_while_workers_start, Ends(130, "interrupted; finished", "")),
+    "SIGTERM": (when_begun(signalled(signal.SIGTERM), "-j", "2"), Ends(143, "interrupted; finished", "")),
+    "SIGTERM while files are read": (terminated_while_files_are_read, Ends(143, "interrupted; finished", "")),
+    "names of every kind": (strange_names, Ends(0, "", ("a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200))),
+    "standard output full": (standard_output_full, Ends(1, "standard output|output: No space left", "ab")),
+    "an infinite number in a sidecar, for the report": (endless_number, Ends(3, r"b\.json: .*finite", "a")),
+    "standard error that is not read": (unread_errors, Ends(0, "", "abcde")),
+    "JSON lines that are not read": (both(unread_errors, asking("--log-json")), Ends(0, "", "abcde")),
+}
+FULL = {
+    "both workers killed by SIGKILL",
+    "a capture whose worker is killed twice",
+    "the process that starts workers killed",
+    "memory short in the workers",
+    "the interrupt key while workers start",
+    "SIGTERM while files are read",
+    "a thousand tags of one value of 2 MB",
+    "a terminal of ASCII",
+    "JSON lines that are not read",
+}
+"""Only in the full tests: these take long, and others are like them."""
+FAULTS = (
+    *(Fault(name, spoil, Ends(0, "", "ab")) for name, spoil in ALL_FINISHED.items()),
+    *(Fault(name, spoil, Ends(3, says)) for name, (spoil, says) in B_IS_LOST.items()),
+    *(Fault(name, spoil, Ends(3, says, "ab")) for name, (spoil, says) in FILE_IS_NAMED.items()),
+    *(Fault(name, spoil, Ends(code, says, "")) for name, (spoil, code, says) in REFUSED.items()),
+    *(Fault(name, spoil, ends) for name, (spoil, ends) in OTHERS.items()),
+)
 
 
 def main() -> None:
@@ -837,22 +886,22 @@ def told(seen: Seen, folder: Path) -> str:
 def what_is_wrong(fault: Fault, seen: Seen) -> str:
     """Nothing where a fault came to what it must come to."""
     wrong = []
-    if seen.code != fault.code:
-        wrong.append(f"exit code {seen.code}, not {fault.code}")
+    if seen.code != fault.ends.code:
+        wrong.append(f"exit code {seen.code}, not {fault.ends.code}")
     if "Traceback" in seen.output or "please report" in seen.output:
         wrong.append(f"a traceback: {seen.output[-1500:]}")
     if "\x1b[31mred" in seen.output or "\a" in seen.output:
         wrong.append("an escape sequence reached the terminal")
-    if fault.says and not any(re.search(fault.says, line) for line in seen.complaints):
+    if fault.ends.says and not any(re.search(fault.ends.says, line) for line in seen.complaints):
         wrong.append(f"complaints {seen.complaints}")
-    if not fault.says and seen.complaints:
+    if not fault.ends.says and seen.complaints:
         wrong.append(f"complaints {seen.complaints}")
     # What was stopped may have been written before.
-    if fault.all_but is not None and len(seen.finished) < MANY - fault.all_but:
+    if fault.ends.all_but is not None and len(seen.finished) < MANY - fault.ends.all_but:
         wrong.append(f"{len(seen.finished)} captures finished")
     if "left behind" in seen.output:
         wrong.append("processes are left")
-    if missing := set(fault.finished) - set(seen.finished):
+    if missing := set(fault.ends.finished) - set(seen.finished):
         wrong.append(f"not finished: {sorted(missing)}")
     return "; ".join(wrong)
 

@@ -32,18 +32,16 @@ from agalign.values.capture import Band
 from agalign.values.files import RUN_FILE
 from agalign.values.image import OutputGrid
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning", "ignore::UserWarning"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::UserWarning")]
 
-ANY_FILE = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+ANY_FILE = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=12)
 INFO = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=20,
-)  # fmt: skip
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
 
 
 def edited(data: bytes, edits: list[tuple[float, int]]) -> bytes:
@@ -66,7 +64,7 @@ def refusal(read: Callable[[Any], object], given: object) -> str | None:
 def images(flight: Path) -> list[bytes]:
     """A band's file of a camera, without most of its pixels, and a plain one."""
     camera = next(flight.rglob("IMG_0001_1.tif"))
-    tags = {t.code: t for t in tifffile.TiffFile(camera).pages[0].tags.values()}  # type: ignore[union-attr]
+    tags = {t.code: t for t in tifffile.TiffFile(camera).pages[0].tags.values()}
     plain, tagged = io.BytesIO(), io.BytesIO()
     tifffile.imwrite(plain, np.arange(48, dtype=np.uint16).reshape(6, 8))
     extra = [(700, 1, len(tags[700].value), tags[700].value, True), (271, 2, 0, "MicaSense", True)]
@@ -87,13 +85,14 @@ def test_any_tiff(images: list[bytes], tmp_path: Path, edits: list[tuple[float, 
     capture_tags(band, OutputGrid(0, 0, 8, 6))
 
 
-NAMED = (
-    "Camera:BandName", "Camera:RigRelatives", "Camera:PerspectiveFocalLength", "Camera:PrincipalPoint",
-    "Camera:CentralWavelength", "Camera:VignettingPolynomial", "Camera:FlyingHeight", "DLS:Yaw",
-    "DLS:HorizontalIrradiance", "MicaSense:RadiometricCalibration", "drone-dji:DewarpData",
-    "drone-dji:CalibratedHMatrix", "drone-dji:VignettingData", "drone-dji:SensorGain", "drone-dji:Irradiance",
-    "drone-dji:GimbalYawDegree",
-)  # fmt: skip
+TAGS = {
+    "Camera": "BandName RigRelatives PerspectiveFocalLength PrincipalPoint CentralWavelength VignettingPolynomial"
+    " FlyingHeight",
+    "DLS": "Yaw HorizontalIrradiance",
+    "MicaSense": "RadiometricCalibration",
+    "drone-dji": "DewarpData CalibratedHMatrix VignettingData SensorGain Irradiance GimbalYawDegree",
+}
+NAMED = [f"{prefix}:{name}" for prefix, names in TAGS.items() for name in names.split()]
 LISTS = st.lists(st.floats(), max_size=12).map(lambda numbers: ",".join(map(str, numbers)))
 
 
@@ -122,7 +121,7 @@ def test_any_packet(values: dict[str, str], make: str) -> None:
 NAMES = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1, max_size=40)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@ANY_FILE
 @given(names=st.lists(NAMES.map(lambda n: n + ".tif"), max_size=6, unique_by=str.lower))
 def test_any_names(tmp_path_factory: pytest.TempPathFactory, images: list[bytes], names: list[str]) -> None:
     folder = tmp_path_factory.mktemp("names")
@@ -163,7 +162,7 @@ def model_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@ANY_FILE
 @given(edits=EDITS, cut=st.floats(0.0, 1.0))
 def test_any_damage_to_a_model_is_seen(
     model_bytes: bytes, tmp_path: Path, edits: list[tuple[float, int]], cut: float
