@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from pydantic import ValidationError
 
 import agalign
 from agalign import api, config, errors
 from agalign.batch import RunOptions
 from agalign.cameras.discover import DiscoverOptions
-from agalign.cli.main import app
+from agalign.cli.main import COMMANDS
 from agalign.config import JointSettings, Settings
 from agalign.values.issues import BLANK_MOVING, Issue
 from agalign.values.mapping import PixelMapping
@@ -129,7 +128,6 @@ def test_every_setting_is_documented() -> None:
 
 
 def test_options_are_documented_under_the_names_of_the_command_line() -> None:
-    command = typer.main.get_command(app)
     text = (ROOT / "docs" / "options.md").read_text(encoding="utf-8")
-    options = {o for p in command.commands["align"].params for o in p.opts if o.startswith("--")}
+    options = {o for p in COMMANDS["align"].built("align").params for o in p.opts if o.startswith("--")}
     assert {o for o in options if f"`{o}`" not in text} == {"--out"}

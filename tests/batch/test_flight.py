@@ -224,7 +224,7 @@ def test_a_fault_in_one_capture_costs_no_other(
             raise error
         return real(capture, *arguments)
 
-    monkeypatch.setattr(workers, "process_capture", faulty)
+    monkeypatch.setattr(batch_capture, "process_capture", faulty)
     lost, other = run(flight, tmp_path, seeded())
     assert (lost.state, other.state) == ("error", "done")
     assert message in (lost.error or "")

@@ -74,6 +74,10 @@ def seeds_only(flight: Path, out: Path) -> list[Task]:
     return [Task(c, out, seeded(), None) for c in discover(flight).captures]
 
 
+def reports_of(run: Run, tasks: list[Task]) -> Iterator[CaptureReport]:
+    return capture_reports(run, tasks, Listener(), timeout_s=10)
+
+
 class KillsWhenRead(Settings):
     """Settings that send a signal to the process that unpickles them, this many times in all."""
 
@@ -93,8 +97,8 @@ def kill_and_read(mark: Path, times: int, number: int) -> Settings:
 @pytest.mark.full
 def test_a_process_killed_once_costs_no_capture(flight: Path, tmp_path: Path) -> None:
     tasks = seeds_only(flight, tmp_path)
-    with own_processes(1) as pool:
-        reports = done_in(pool, tasks * 2)
+    with own_processes(1, start_worker) as run:
+        reports = reports_of(run, tasks * 2)
         states = [next(reports).state]
         (worker,) = (c for c in psutil.Process().children(recursive=True) if c.ppid() != os.getpid())
         worker.kill()
@@ -114,8 +118,8 @@ def test_a_process_that_is_killed_twice_or_stopped_costs_its_capture(
 ) -> None:
     capture, *others = seeds_only(flight, tmp_path)
     deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", times, number))
-    with own_processes(1) as pool:
-        reports = {r.label: r for r in done_in(pool, [deadly, *others], timeout_s=timeout_s)}
+    with own_processes(1, start_worker, timeout_s=timeout_s) as run:
+        reports = {r.label: r for r in reports_of(run, [deadly, *others])}
     lost = reports.pop(capture.capture.label)
     assert (lost.state, lost.error) == ("error", error)
     assert [r.state for r in reports.values()] == ["done"] * len(others)
@@ -136,7 +140,9 @@ def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(
         list(in_order(run, without_memory, [0]))
 
 
-def test_an_executor_that_loses_its_processes_costs_the_captures(flight: Path, tmp_path: Path) -> None:
+def test_an_executor_that_loses_its_processes_costs_the_captures(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also those that it refuses to take afterwards."""
     monkeypatch.setattr(workers, "_MAX_WAITING_TASKS", 1)
     capture, *_ = seeds_only(flight, tmp_path)

@@ -121,13 +121,9 @@ def test_relief_alone_is_always_and_local_is_its_old_name(
         assert ("--local is deprecated; use --relief" in capsys.readouterr().err) == ("--local" in arguments)
 
 
-def test_local_is_the_old_name_of_relief_for_onto_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[str] = []
-    monkeypatch.setattr(main, "app", lambda args, prog_name: given.extend(args))
-    monkeypatch.setattr(sys, "argv", ["agalign", "onto", "a.tif", "b.tif", "--local"])
-    main.main()
-    assert "--local" not in given
-    assert given[given.index("--relief") + 1] == "always"
+def test_local_is_the_old_name_of_relief_for_onto_too() -> None:
+    context = main.COMMANDS["onto"].built("onto").make_context("onto", ["a.tif", "b.tif", "--local"])
+    assert context.params["relief"] == "always"
 
 
 def test_a_dry_run_says_what_would_be_done_and_writes_nothing(tmp_path: Path) -> None:

@@ -8,12 +8,20 @@ import pytest
 import rasterio
 from synthetic_flights.aligned import make_aligned
 
-from agalign.batch.index_run import IndexOptions, index_tasks, run_indices, unit_of_run
+from agalign.batch.index_run import index_tasks, run_indices, unit_of_run
 from agalign.errors import ConfigurationError, InputError
 from agalign.products.index_bands import RAW
-from agalign.products.index_table import IndexReport
-from agalign.products.index_table import read_table
-from agalign.products.indices import INDICES, Index, bands_for, compute, index_named, index_of_formula
+from agalign.products.index_table import IndexReport, read_table
+from agalign.products.indices import (
+    INDICES,
+    Index,
+    bands_for,
+    compute,
+    evaluate,
+    index_named,
+    index_of_formula,
+    symbols_of,
+)
 from agalign.products.report import write_pages
 from agalign.products.sidecar import ProductPart
 from agalign.products.sidecar_file import read_sidecar, verify_outputs, write_sidecar
@@ -21,9 +29,9 @@ from agalign.products.sidecar_file import read_sidecar, verify_outputs, write_si
 NDVI, NDRE = INDICES["ndvi"], INDICES["ndre"]
 
 
-def run(out: Path, *indices: Index, target: Path | None = None, **options: object) -> list[IndexReport]:
-    tasks = index_tasks(out, indices or (NDVI,), target or out, overwrite=bool(options.pop("overwrite", False)))
-    return [r for done in run_indices(tasks, IndexOptions(jobs=1, **options)) for r in done.reports]
+def run(out: Path, *indices: Index, target: Path | None = None, overwrite: bool = False) -> list[IndexReport]:
+    tasks = index_tasks(out, indices or (NDVI,), target or out, overwrite=overwrite)
+    return [r for done in run_indices(tasks, jobs=1) for r in done.reports]
 
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N

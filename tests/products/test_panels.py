@@ -16,9 +16,8 @@ import agalign
 from agalign.batch import RunOptions
 from agalign.config import Settings, WriteSettings
 from agalign.errors import SidecarError
-from agalign.products.panels import PANELS_FILE, read_panels
+from agalign.products.panels import PANELS_FILE, SKY_FILE, read_panels, read_sky
 from agalign.products.report import write_pages
-from agalign.products.panels import SKY_FILE, read_sky
 
 from ..conftest import Shared, read_json, seeded
 from ..program import agalign_here

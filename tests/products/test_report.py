@@ -13,8 +13,8 @@ import pytest
 
 import agalign
 from agalign.flight.rig_file import read_rig
-from agalign.products.preview import ReliefView, preview_bytes, write_preview
 from agalign.products.drawing import ReducedBands
+from agalign.products.preview import ReliefView, preview_bytes, write_preview
 from agalign.products.report import pages, pages_exist, write_pages
 from agalign.products.report.rigs import CHART_HEIGHT, drifts_of, rig_views
 
@@ -117,7 +117,7 @@ def test_the_rig_is_read_without_its_network(tmp_path: Path) -> None:
     camera, rig = read_rig(path)
     assert camera == "Camera 7"
     (view,) = rig_views(tmp_path, pytest.fail)
-    assert [b.name for b in view.bands] == list(rig.mean) == ["NIR", "[Red]"]
+    assert [b["band"] for b in view.bands] == list(rig.mean) == ["NIR", "[Red]"]
     path.write_bytes(path.read_bytes()[:-500])
     with pytest.raises(agalign.InputError, match=r"a\.safetensors: its rig cannot be read"):
         read_rig(path)

@@ -22,8 +22,14 @@ from agalign.products.sidecar import (
     ProductPart,
     Sidecar,
 )
-from agalign.products.sidecar_file import content_checksum, find_sidecars, read_result, read_sidecar, write_sidecar
-from agalign.products.sidecar_file import verify_outputs
+from agalign.products.sidecar_file import (
+    content_checksum,
+    find_sidecars,
+    read_result,
+    read_sidecar,
+    verify_outputs,
+    write_sidecar,
+)
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
