@@ -39,8 +39,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.values.process_pool import A, Apply, R
 from agalign.verify.displacement_field import common_field
-from agalign.verify.extrapolation_check import unobserved_quarters
-from agalign.verify.lens_shapes import unmodelled_std_px
+from agalign.verify.extrapolation import unmodelled_std_px, unobserved_quarters
 
 _NETWORK_CAPTURES = 3
 """Number of captures that the network is learned from; each takes seconds. A third capture mostly shows the structure

@@ -20,12 +20,9 @@ from agalign.values.alignment import Alignment, JointResult, Prediction, Residua
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.acceptance import seed_fits
-from agalign.verify.descriptor_check import BY_WINDOWS
-from agalign.verify.extrapolation_check import issues_of_extrapolation, points_in_frame
-from agalign.verify.lens_shapes import lens_std_px
-from agalign.verify.repetition import MAX_ALIAS_PEAK, alias_peak
-from agalign.verify.window_fit import WindowFit, fit_in_rounds
+from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, alias_peak, seed_fits
+from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
+from agalign.verify.window_fit import WindowFit, fit_in_rounds, lens_std_px
 
 _DESCRIPTORS_FAILED = frozenset({RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN})
 """Issues for which windows are tried. With other issues, the descriptors of sharp images have a result that may

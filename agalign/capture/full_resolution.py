@@ -23,8 +23,7 @@ from agalign.values.image import Raster, Tile
 from agalign.values.issues import UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx
-from agalign.verify.check import Evidence
-from agalign.verify.checks import issues_of
+from agalign.verify.checks import Evidence, issues_of
 from agalign.verify.residuals import FixedWindows
 from agalign.verify.window_fit import fit_in_rounds
 

@@ -13,9 +13,7 @@ from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment
 from agalign.values.capture import Capture
 from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
-from agalign.verify.check import Evidence
-from agalign.verify.checks import issues_of
-from agalign.verify.rig_check import MAX_UNEXPECTED_PX, UNEXPECTED_PX
+from agalign.verify.checks import MAX_UNEXPECTED_PX, UNEXPECTED_PX, Evidence, issues_of
 
 
 def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], capture: Capture) -> Observation:

@@ -21,7 +21,7 @@ from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.acceptance import seed_fits
+from agalign.verify.checks import seed_fits
 from agalign.verify.window_fit import fit_in_rounds
 
 _CERTAIN_SIGMA = 120.0

@@ -15,13 +15,19 @@ from agalign.values.image import Raster
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, IssueKind
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, PixelScale
-from agalign.verify.acceptance import is_unchanged, seed_fits, status_of
-from agalign.verify.check import Evidence
-from agalign.verify.checks import issues_of
+from agalign.verify.checks import (
+    CLOSE_WINDOWS,
+    CLUSTER,
+    RESIDUAL_PX,
+    Evidence,
+    is_unchanged,
+    issues_of,
+    seed_fits,
+    status_of,
+)
 from agalign.verify.displacement_field import DisplacementResult
-from agalign.verify.extrapolation_check import points_in_frame, unobserved_quarters
+from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
 from agalign.verify.residuals import residual_under
-from agalign.verify.window_check import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX
 
 _SEEDS_OF_ALIGNED_INPUT: tuple[SeedKind, ...] = ("geo", "identity")
 """Seeds of input that may be aligned already; it is then returned unchanged instead of resampled by a small shift."""

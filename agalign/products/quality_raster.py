@@ -22,7 +22,7 @@ from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.quality import MEANINGS, Quality
 from agalign.values.resample import tiles
-from agalign.verify.expected_error import expected_error_px
+from agalign.verify.extrapolation import expected_error_px
 
 _LATTICE_PX = 16
 """Distance of the nodes at which the error, which is smooth, is calculated."""

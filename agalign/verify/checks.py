@@ -1,26 +1,243 @@
-"""All checks of an alignment, and all kinds of issues by code. A new check is one module and one line here."""
+"""Status of a band pair from the issues of its alignment, and all kinds of issues by code.
 
-from collections.abc import Mapping
+A new check is one function, which yields issues, and one line in `CHECKS`. The worst error is a wrong alignment called
+`aligned`. Negated comparisons also reject NaN.
+"""
 
-from agalign.values import issues
-from agalign.values.issues import Issue, IssueKind
-from agalign.values.pixel_units import FixedPx
-from agalign.verify import descriptor_check, extrapolation_check, mapping_check, repetition, rig_check, window_check
-from agalign.verify.check import Check, Evidence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, Protocol
 
-CHECKS: tuple[Check, ...] = (
-    mapping_check.CHECK, descriptor_check.CHECK, window_check.CHECK, rig_check.CHECK, repetition.CHECK,
-)  # fmt: skip
+import numpy as np
+from scipy.sparse import identity
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from agalign.pixels.structure import Field, correlation_surfaces
+from agalign.values import geometry, issues
+from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction, Residual
+from agalign.values.choices import PairStatus
+from agalign.values.geometry import Matrix, Points
+from agalign.values.issues import RETRIEVAL, TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
+from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
+from agalign.verify.extrapolation import EXTRAPOLATED
+from agalign.verify.residuals import window_spacing_px
+
+BY_WINDOWS = "windows"
+"""Recipe of a result that is fitted to windows; its residual contains the windows that were left out of the fit."""
+MAX_UNEXPECTED_PX = 3.0
+"""Distance from the prediction by the rig, px of the moving file, that is always accepted, as relief may cause it."""
+MAX_ALIAS_PEAK = 0.75
+"""Ratio of the heights of the next correlation peak and that of the result, above which the scene is repetitive."""
+
+_MAX_STRETCH = 4.0
+"""Maximum ratio of the largest and the smallest magnification: beyond it, a homography is degenerate."""
+_MAX_CORNER_STD_PX = 2.0
+"""Maximum standard error of the least certain mapped corner: windows near the centre do not verify the corners."""
+_MIN_HELD_OUT_WINDOWS, _MIN_HELD_OUT_COVERAGE = 12, 0.8
+"""Minimum number and share of held-out windows with a measured shift, if they are the only evidence. In unrelated
+images one in a thousand is within 1 px."""
+_MIN_WINDOWS, _MIN_COVERAGE = 4, 0.6
+"""Minimum number of windows with structure, as fewer cannot cover all corners of the image, and minimum share of them
+with a measured shift, which is small for unrelated images."""
+_MAX_SHIFT_PX = 1.0
+"""Maximum residual shift of an aligned window, and of the median: beyond it, a spectral index mixes neighbours."""
+_MIN_CLOSE_SHARE = 0.9
+"""Minimum share of aligned windows among the measured ones: a few wrong peaks are normal."""
+_MIN_CLUSTER, _MAX_CLUSTER_SHARE, _MAX_NEIGHBOUR_SPACINGS = 5, 0.04, 1.6
+"""Size of a cluster of adjacent misaligned windows, as a count and as a share of the measured windows, from which it is
+an issue; both must be reached. Wrong peaks are scattered, windows with parallax are adjacent. Maximum distance of
+adjacent windows in units of their spacing, which includes diagonal neighbours (1.41)."""
+_MAX_UNEXPECTED_STD = 5.0
+"""Distances from the prediction above MAX_UNEXPECTED_PX are accepted up to this multiple of its standard error."""
+_PEAK_RADIUS_PX = 3
+"""Radius of a correlation peak, px of the reduced images."""
+_MIN_SEED_COVERAGE, _MAX_SEED_MEDIAN_PX = 0.3, 8.0
+"""Minimum share of windows with a measured shift and their maximum median for a seed with status `seed_only`: rig tags
+have errors of a few px (docs/cameras.md)."""
+_MAX_UNCHANGED_PX, _MAX_UNCHANGED_STD = 0.25, 3.0
+"""Maximum displacement of a corner, in px of the file and in standard errors of the least certain corner, for aligned
+input to be returned unchanged: resampling would cost more sharpness than the correction gains."""
+
+_PARALLAX = Remedy(
+    "parallax (trees, buildings or terraces near the camera), or motion between the exposures",
+    "fly higher or slower, and do not use --relief never; --bands omits a band",
+)
+FOLDS = IssueKind("folds", "the mapping folds or stretches the image", UNLIKE)
+CORNER_STD_PX = IssueKind(
+    "corner_std_px", "the standard error at the corners of the image is {value:.1f} px", TEXTURELESS
+)
+FEW_WINDOWS = IssueKind("few_windows", "too little common structure to verify the result", TEXTURELESS)
+COVERAGE = IssueKind("coverage", "a shift can be measured in only {value:.0%} of the windows", UNLIKE)
+CLOSE_WINDOWS = IssueKind("close_windows", "only {value:.0%} of the windows are aligned within {detail}", _PARALLAX)
+CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", _PARALLAX)
+RESIDUAL_PX = IssueKind("residual_px", "the median residual shift is {value:.1f} px", UNLIKE)
+UNEXPECTED_PX = IssueKind(
+    "unexpected_px",
+    "the result is {value:.1f} px from the position that the rig of the flight predicts",
+    Remedy(
+        "the result contradicts the rig of the flight",
+        "if a lens was replaced or moved, align without --model; otherwise look at the picture",
+    ),
+)
+REPEATS = IssueKind(
+    "repeats",
+    "the scene repeats: a shift of {value:.0f} px fits nearly as well, and no prior information decides",
+    Remedy(
+        "the scene repeats, and no prior information decides which shift is right",
+        "keep the camera's metadata in the files (no --ignore-metadata), or give --model OUT/models/… of an earlier "
+        "flight",
+    ),
+)
+
+
+class AlignedImages(Protocol):
+    """The two images of a result on one grid, for checks that use pixels."""
+
+    @property
+    def reduced_scale(self) -> PixelScale:
+        """Scale of the reduced images relative to the fixed image."""
+
+    def reduced_spectra(self) -> tuple[Field, Field]:
+        """Windowed spectra (height, width) of the structures of the reduced fixed and moving images."""
+
+    def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
+        """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or user."""
+
+
+@dataclass(frozen=True)
+class Evidence(Generic[FixedPx]):
+    """The input of the checks, on the grid of the images or of the files (`FixedPx`)."""
+
+    joint: JointResult[FixedPx]
+    residual: Residual[FixedPx]
+    """Residual shifts of windows after alignment."""
+    size_px: tuple[int, int]
+    """(width, height) of the fixed image."""
+    images: AlignedImages | None = None
+    """None omits the checks that use pixels."""
+    prediction: Prediction | None = None
+    """Prediction by the rig, with the distance `off_px` of the result; None without a rig."""
+    file_px: float = 1.0
+    """Size of a pixel of the reference's file on this grid; the limits of residual shifts are in px of the file."""
+
+
+def _mapping_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+    scale = geometry.local_scale(evidence.joint.fixed_to_moving, *evidence.size_px)
+    if not (scale.min() > 0 and scale.max() <= _MAX_STRETCH * scale.min()):
+        yield Issue(FOLDS, float(scale.max() / scale.min()), _MAX_STRETCH)
+
+
+def _descriptor_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+    """Retrieval of held-out patches, or held-out windows of a result that is fitted to windows; corner errors."""
+    joint, residual = evidence.joint, evidence.residual
+    is_confirmed = (
+        joint.recipe == BY_WINDOWS
+        and len(residual.measured_px) >= _MIN_HELD_OUT_WINDOWS
+        and residual.coverage >= _MIN_HELD_OUT_COVERAGE
+    )
+    minimum = max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * joint.chance)
+    if not (joint.retrieval >= minimum or is_confirmed):
+        yield Issue(RETRIEVAL, joint.retrieval, minimum)
+    if not joint.corner_std_px <= _MAX_CORNER_STD_PX:
+        yield Issue(CORNER_STD_PX, joint.corner_std_px, _MAX_CORNER_STD_PX)
+
+
+def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+    """Residual shifts of windows, which are independent of the estimation."""
+    residual = evidence.residual
+    if len(residual.centres_px) < _MIN_WINDOWS:
+        yield Issue(FEW_WINDOWS, len(residual.centres_px), _MIN_WINDOWS)
+        return
+    if not residual.coverage >= _MIN_COVERAGE:
+        yield Issue(COVERAGE, residual.coverage, _MIN_COVERAGE)
+    measured = len(residual.measured_px)
+    count = max(measured, 1)
+    is_far = np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _MAX_SHIFT_PX * evidence.file_px
+    close = 1 - float(is_far.sum()) / count
+    if not close >= _MIN_CLOSE_SHARE:
+        yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE_SHARE, f"{_MAX_SHIFT_PX:g} px")
+    cluster = _largest_cluster(residual.centres_px[is_far], residual.centres_px)
+    limit = max(_MIN_CLUSTER, round(_MAX_CLUSTER_SHARE * measured))
+    if not cluster < limit:
+        yield Issue(CLUSTER, cluster / count, limit / count)
+    median_px = residual.median_px / evidence.file_px
+    if not median_px <= _MAX_SHIFT_PX:
+        yield Issue(RESIDUAL_PX, median_px, _MAX_SHIFT_PX)
+
+
+def _largest_cluster(centres_px: Points, all_px: Points) -> int:
+    """Return the size of the largest group of adjacent centres (n, 2) on the grid `all_px` (m, 2)."""
+    if len(centres_px) == 0:
+        return 0
+    radius_px = _MAX_NEIGHBOUR_SPACINGS * window_spacing_px(all_px)
+    adjacent = cKDTree(centres_px).sparse_distance_matrix(cKDTree(centres_px), radius_px)
+    _, labels = connected_components(adjacent.tocsr() + identity(len(centres_px)), directed=False)
+    return int(np.bincount(labels).max())
+
+
+def _rig_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+    """Distance from the prediction by the rig, which detects aliasing in repetitive scenes."""
+    prediction = evidence.prediction
+    if prediction is not None and prediction.off_px is not None:
+        limit_px = max(MAX_UNEXPECTED_PX, _MAX_UNEXPECTED_STD * prediction.std_px)
+        if not prediction.off_px <= limit_px:
+            yield Issue(UNEXPECTED_PX, prediction.off_px, limit_px)
+
+
+def _repetition_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+    """Another shift fits nearly as well in an orchard or on solar panels, and no prior information excludes it."""
+    images = evidence.images
+    if images is None:
+        return
+    alias = alias_peak(*images.reduced_spectra())
+    x_px, y_px = (shift / scale for shift, scale in zip(alias.shift_px, images.reduced_scale, strict=True))
+    if alias.ratio > MAX_ALIAS_PEAK and (not images.is_expected() or images.is_expected((x_px, y_px))):
+        yield Issue(REPEATS, math.hypot(x_px, y_px))
+
+
+class AliasPeak(NamedTuple):
+    """The highest correlation peak after that of the result: (x, y), px of the reduced images, and relative height."""
+
+    shift_px: tuple[float, float]
+    ratio: float
+
+
+def alias_peak(fixed: Field, moving: Field) -> AliasPeak:
+    """Return the highest peak except that at zero shift; `fixed` and `moving` are windowed spectra (height, width)."""
+    surface = np.fft.fftshift(correlation_surfaces(fixed, moving))
+    height, width = surface.shape
+    row, column, radius = height // 2, width // 2, _PEAK_RADIUS_PX
+    centre = np.s_[row - radius : row + radius + 1, column - radius : column + radius + 1]
+    centre_peak = float(surface[centre].max())
+    surface[centre] = -np.inf
+    index = int(surface.argmax())
+    ratio = float(surface.flat[index]) / centre_peak if centre_peak > 0 else math.inf
+    return AliasPeak((float(index % width - column), float(index // width - row)), ratio)
+
+
+class Check(NamedTuple):
+    """One check: the function that returns its issues, and the kinds of issues that it defines."""
+
+    issues: Callable[[Evidence[Any]], Iterable[Issue]]
+    kinds: tuple[IssueKind, ...]
+    is_costly: bool = False
+    """Run only if no other check returns an issue."""
+
+
+CHECKS = (
+    Check(_mapping_issues, (FOLDS,)),
+    Check(_descriptor_issues, (CORNER_STD_PX,)),
+    Check(_window_issues, (FEW_WINDOWS, COVERAGE, CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX)),
+    Check(_rig_issues, (UNEXPECTED_PX,)),
+    Check(_repetition_issues, (REPEATS,), is_costly=True),
+)
 """In the order in which their issues are listed; the first issue is the reason in the sidecar."""
 
+_OF_CHECKS = tuple(kind for check in CHECKS for kind in check.kinds)
 KINDS: Mapping[str, IssueKind] = {
-    kind.code: kind
-    for kind in (
-        *issues.KINDS,
-        *(kind for check in CHECKS for kind in check.kinds),
-        extrapolation_check.EXTRAPOLATED,
-        issues.SEED_DOES_NOT_FIT,
-    )
+    kind.code: kind for kind in (*issues.KINDS, *_OF_CHECKS, EXTRAPOLATED, issues.SEED_DOES_NOT_FIT)
 }
 """Every kind of issue that a sidecar may contain, by code."""
 
@@ -29,3 +246,25 @@ def issues_of(evidence: Evidence[FixedPx]) -> tuple[Issue, ...]:
     """Return every reason for not accepting a result; empty if it passes verification."""
     result = tuple(i for check in CHECKS if not check.is_costly for i in check.issues(evidence))
     return result or tuple(i for check in CHECKS if check.is_costly for i in check.issues(evidence))
+
+
+def status_of(issues: Sequence[Issue], residual: Residual[FixedImagePx], *, seed: bool) -> PairStatus:
+    """Return `aligned` without issues, else `seed_only` for a usable `seed` with a small `residual`, else `failed`."""
+    if not issues:
+        return "aligned"
+    return "seed_only" if seed and seed_fits(residual) else "failed"
+
+
+def seed_fits(residual: Residual[FixedImagePx]) -> bool:
+    """Return True if the residual of a seed is small enough for the status `seed_only`."""
+    return residual.coverage >= _MIN_SEED_COVERAGE and residual.median_px <= _MAX_SEED_MEDIAN_PX
+
+
+def is_unchanged(joint: JointResult[FixedImagePx], given: Matrix, size_px: tuple[int, int], scale: float = 1.0) -> bool:
+    """Return True if a result on an image (width, height) does not differ from the mapping `given` by the files.
+
+    `scale` is the size of the image relative to its file.
+    """
+    change = geometry.compose(geometry.invert(given), joint.fixed_to_moving)
+    change_px = FixedImagePx(geometry.corner_error_px(change, geometry.identity(), *size_px))
+    return change_px <= min(FixedImagePx(_MAX_UNCHANGED_PX * scale), joint.corner_std_px * _MAX_UNCHANGED_STD)

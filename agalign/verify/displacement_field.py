@@ -6,12 +6,13 @@ A field is accepted if it reduces the residuals of windows that were left out of
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
-from scipy.sparse import dia_matrix, diags, identity, kron, vstack
+from scipy.sparse import diags, identity, kron, vstack
 from scipy.spatial import cKDTree
 
 from agalign.pixels.resample import warped
@@ -22,58 +23,48 @@ from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
-from agalign.values.robust import cauchy_weights, shift_scale_px
-from agalign.verify.residuals import FixedWindows
+from agalign.verify.residuals import FixedWindows, Shifts, in_standard_errors
 
 _WINDOW_PX, _STEP_PX = 40, 20
 """Side and spacing of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones
 are as accurate, and larger ones less."""
-_LATTICE_PX = 24
-"""Spacing of the field's nodes: leaves and branches near the camera have parallax at this scale."""
 _VERIFICATION_PX = 48
-"""Side of the windows in which a field is verified; larger ones are farther from the windows of the fit."""
+"""Side of the windows in which a field is verified, without overlap; larger ones are farther from those of the fit."""
 _MAX_WINDOWS = 5500
 """The spacing of the windows grows in images above 2 megapixels, which limits the time."""
-_MIN_NODE_SPACING = 0.75
-"""Minimum spacing of the nodes relative to that of the windows: the windows do not determine more nodes."""
-_SMOOTHNESS = (0.2, 1.0, 5.0, 25.0, 200.0)
-"""Weights of the field's second differences relative to one window; selected by cross-validation."""
-_DAMPING = 0.003
-"""Weight of the field's length, relative to one window; it matters only far from all windows."""
-
-_CAUCHY_SCALES = 4.0
-"""Residual at which the robust weight is one half, in residual scales; only wrong peaks have larger ones."""
-_REWEIGHTINGS = 4
-"""Iterations after which the robust weights have converged."""
+_LATTICE_PX, _MIN_NODE_SPACING = 24, 0.75
+"""Spacing of the field's nodes, px, as leaves and branches near the camera have parallax at this scale, and relative to
+that of the windows, which do not determine more nodes."""
+_SMOOTHNESS, _DAMPING = (0.2, 1.0, 5.0, 25.0, 200.0), 0.003
+"""Weights relative to one window: of the field's second differences, selected by cross-validation, and of its length,
+which matters only far from all windows."""
+_CAUCHY_SCALES, _REWEIGHTINGS = 4.0, 4
+"""Residual at which the robust weight is one half, in residual scales: only wrong peaks have larger ones. The weights
+converge in this number of iterations."""
 _MIN_ROUNDS, _MAX_ROUNDS, _CONVERGED_PX = 2, 4, 0.2
 """Shifts are measured again with the field of the previous round until their median is at most 0.2 px, because large
 shifts are measured in steps."""
 _MIN_WINDOWS = 24
 """Minimum number of windows with a shift; a fit without one fold may have half as many."""
-_MIN_GAIN_SIGMA = 4.0
+_MIN_GAIN_SIGMA, _MAX_P95_GROWTH = 4.0, 1.05
 """Minimum decrease of the loss of held-out windows, in standard errors of the decrease: 4 to 8 for lenses and canopies,
-up to 3 for edges of shadows in blurred bands."""
+up to 3 for edges of shadows in blurred bands. Maximum ratio of their p95 with and without a field, which is noisy."""
 _LOSS_SCALE_PX = 0.1
 """Scale of the robust loss by which fields are compared: several times the noise of a shift."""
-_MIN_CAPTURES, _COMMON_FOLDS = 3, 4
-"""Minimum number of captures for a common field, and number of folds of its cross-validation."""
-_COMMON_LATTICE_PX = 48
-"""Spacing of the nodes of a common field: the distortion of lenses varies over hundreds of pixels."""
-_COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
-"""As `_SMOOTHNESS`, relative to one window of each capture."""
-_MIN_COMMON_GAIN_SIGMA = 2.5
-"""Less strict than within one capture: captures that are left out have only their lenses in common with the others."""
-_MAX_P95_GROWTH = 1.05
-"""Maximum ratio of the p95 of held-out windows with and without a field; the p95 of wrong peaks is noisy."""
-_FOLDS = 4
-"""Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain."""
-_GAIN_FOLDS = (0, 2, 8, 10)
-"""Folds with which fields are compared, a quarter of the windows."""
+_FOLDS, _GAIN_FOLDS = 4, (0, 2, 8, 10)
+"""Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain. Fields are
+compared in four of the sixteen folds."""
 _SAME_WINDOW_PX = 1.0
 """Windows of one grid at a smaller distance are identical."""
 _MIN_WEIGHT = 0.1
 """Windows with a lower relative weight are excluded from the comparison of fields: parallax within a window lowers its
 peak."""
+_COMMON_LATTICE_PX, _COMMON_SMOOTHNESS = 48, (1.0, 4.0, 16.0, 64.0)
+"""Spacing of the nodes of a field that captures have in common, as the distortion of lenses varies over hundreds of
+pixels, and its smoothness, relative to one window of each capture."""
+_MIN_CAPTURES, _COMMON_FOLDS, _MIN_COMMON_GAIN_SIGMA = 3, 4, 2.5
+"""Minimum number of captures for a common field, folds of its cross-validation, and minimum decrease of the loss: less
+than within one capture, as captures that are left out have only their lenses in common with the others."""
 
 
 @dataclass(frozen=True)
@@ -92,16 +83,11 @@ class DisplacementEstimator:
 
     def __init__(self, valid: Mask, structure: Field) -> None:
         """Cut windows from the structure field (height, width) of the reference with the mask `valid`."""
-        self._valid, self._structure = valid, structure
         step_px = max(_STEP_PX, round((valid.size / _MAX_WINDOWS) ** 0.5))
         self.size_px = valid.shape[1], valid.shape[0]
         self.lattice_px = max(_LATTICE_PX, round(_MIN_NODE_SPACING * step_px))
         self.windows = FixedWindows(valid, structure, _WINDOW_PX, step_px)
-
-    @cached_property
-    def verification(self) -> FixedWindows:
-        """The windows in which a field is verified; they do not overlap."""
-        return FixedWindows(self._valid, self._structure, _VERIFICATION_PX)
+        self.verification = FixedWindows(valid, structure, _VERIFICATION_PX)
 
     def refine(self, moving: Raster, mapping: PixelMapping, verified: PixelMapping | None = None) -> DisplacementResult:
         """Fit the displacement field of a mapping, including the field that the mapping already has.
@@ -115,26 +101,29 @@ class DisplacementEstimator:
         without = DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
         if not gain.is_significant(_MIN_GAIN_SIGMA):
             return without
-        field, total = (
-            None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px),
-            shifts,
-        )
+        field = None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px)
         for number in range(_MAX_ROUNDS):
             if number > 0:
                 shifts = self._measure(moving, replace(mapping, local=field))
-            total = shifts if field is None else shifts.plus(field(shifts.centres_px))
-            next_field = self._field(total, gain.smoothness)
-            if not _is_one_to_one(next_field, self.size_px):
+            before_px = 0.0 if field is None else field(shifts.centres_px)
+            total = shifts._replace(shifts_px=shifts.shifts_px + before_px)
+            field = self._field(total, gain.smoothness)
+            if not _is_one_to_one(field, self.size_px):
                 return without
-            field = next_field
-            if number + 1 >= _MIN_ROUNDS and shifts.median_px <= _CONVERGED_PX:
+            if number + 1 >= _MIN_ROUNDS and len(shifts.weights) and np.median(shifts.distances_px()) <= _CONVERGED_PX:
                 break
         assert field is not None
         held_out = self._held_out(moving, replace(verified or mapping, local=field), total, gain.smoothness)
-        return DisplacementResult(field, gain.before_p95_px, gain.after_p95_px, held_out)
+        return replace(without, field=field, held_out=held_out)
+
+    def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:
+        return Shifts.of(self.windows.residuals(warped(moving, mapping, self.size_px), min_valid=1.0))
+
+    def _field(self, shifts: Shifts, smoothness: float, reweightings: int = _REWEIGHTINGS) -> DisplacementField:
+        return fitted_field(shifts, smoothness, self.lattice_px, self.size_px, reweightings)
 
     def _held_out(
-        self, moving: Raster, mapping: PixelMapping, total: "Shifts", smoothness: float
+        self, moving: Raster, mapping: PixelMapping, total: Shifts, smoothness: float
     ) -> Residual[FixedImagePx]:
         """Return the cross-validated residual of the verification windows.
 
@@ -148,26 +137,26 @@ class DisplacementEstimator:
         remaining_px = residual.shifts_px + mapping.local(residual.centres_px) - predicted_px
         return Residual.of(residual.centres_px, remaining_px, residual.peaks_sigma)
 
-    def _best_gain(self, shifts: "Shifts") -> "_Gain":
+    def _best_gain(self, shifts: Shifts) -> "_Gain":
         """Return the gain of the least smooth field with a significant gain, else that of the smoothest field."""
-        if len(shifts) < _MIN_WINDOWS:
+        if len(shifts.weights) < _MIN_WINDOWS:
             return _Gain(_SMOOTHNESS[-1])
-        best = min(_SMOOTHNESS, key=lambda s: self._held_out_gain(shifts, s, min_distance_px=_SAME_WINDOW_PX).loss)
+        best = min(_SMOOTHNESS, key=lambda s: self._gain(shifts, s, _SAME_WINDOW_PX).loss)
         # Held-out windows at a larger distance from those of the fit may require a smoother field.
         for smoothness in (s for s in _SMOOTHNESS if s >= best):
-            gain = self._held_out_gain(shifts, smoothness, min_distance_px=self.windows.side)
+            gain = self._gain(shifts, smoothness, self.windows.side)
             if gain.is_significant(_MIN_GAIN_SIGMA):
                 break
         return gain
 
-    def _held_out_gain(self, shifts: "Shifts", smoothness: float, min_distance_px: float) -> "_Gain":
+    def _gain(self, shifts: Shifts, smoothness: float, min_distance_px: float) -> "_Gain":
         """Return the cross-validated gain of a field, without windows nearer than `min_distance_px` in the fit."""
-        predicted = self._cross_predicted(shifts, shifts.centres_px, min_distance_px, smoothness, _GAIN_FOLDS)
-        return _gain_of(shifts, np.linalg.norm(shifts.shifts_px - predicted, axis=1), smoothness)
+        predicted_px = self._cross_predicted(shifts, shifts.centres_px, min_distance_px, smoothness, _GAIN_FOLDS)
+        return _Gain.of(shifts, predicted_px, smoothness)
 
     def _cross_predicted(
         self,
-        shifts: "Shifts",
+        shifts: Shifts,
         centres_px: Points,
         min_distance_px: float,
         smoothness: float,
@@ -178,9 +167,8 @@ class DisplacementEstimator:
         The distance is the maximum norm. NaN in other folds and where too few windows are left. The robust weights are
         those of a fit to all windows.
         """
-        fold = _folds(centres_px)
-        weighted = shifts.reweighted(self._field(shifts, smoothness)(shifts.centres_px))
-        result = np.full((len(centres_px), 2), np.nan)
+        fold, result = _folds(centres_px), np.full((len(centres_px), 2), np.nan)
+        weighted = shifts.reweighted(self._field(shifts, smoothness)(shifts.centres_px), _CAUCHY_SCALES)
         for k in folds:
             is_held_out = fold == k
             is_fitted = ~_near(shifts.centres_px, centres_px[is_held_out], min_distance_px)
@@ -189,81 +177,31 @@ class DisplacementEstimator:
                 result[is_held_out] = field(centres_px[is_held_out])
         return result
 
-    def _field(self, shifts: "Shifts", smoothness: float, reweightings: int = _REWEIGHTINGS) -> DisplacementField:
-        return fitted_field(shifts, smoothness, self.lattice_px, self.size_px, reweightings)
 
-    def _measure(self, moving: Raster, mapping: PixelMapping) -> "Shifts":
-        return Shifts.of(self.windows.residuals(warped(moving, mapping, self.size_px), min_valid=1.0))
-
-
-@dataclass(frozen=True)
-class Shifts:
-    """The measured shifts of windows."""
-
-    centres_px: Points
-    """(n, 2)"""
-    shifts_px: Points
-    """(n, 2)"""
-    weights: NDArray[np.float64]
-    """(n,) relative inverse variances, median 1: the error of a shift is inversely proportional to the square of the
-    peak height."""
-    peaks_sigma: NDArray[np.float64]
-    """(n,) peak heights, in standard deviations of the correlation surface."""
-
-    @classmethod
-    def of(cls, residual: Residual[FixedImagePx]) -> "Shifts":
-        """Select the measured shifts of a residual."""
-        measured = np.isfinite(residual.shifts_px[:, 0])
-        sigma = residual.peaks_sigma[measured]
-        weights = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
-        return cls(residual.centres_px[measured], residual.shifts_px[measured], weights, sigma)
-
-    @classmethod
-    def joined(cls, several: Sequence["Shifts"]) -> "Shifts":
-        """Concatenate the shifts of several captures."""
-        return cls(
-            np.concatenate([s.centres_px for s in several]), np.concatenate([s.shifts_px for s in several]),
-            np.concatenate([s.weights for s in several]), np.concatenate([s.peaks_sigma for s in several]),
-        )  # fmt: skip
-
-    def subset(self, mask: NDArray[np.bool_]) -> "Shifts":
-        """Return the shifts where `mask` (n,) is True."""
-        return Shifts(self.centres_px[mask], self.shifts_px[mask], self.weights[mask], self.peaks_sigma[mask])
-
-    def plus(self, shifts_px: Points) -> "Shifts":
-        """Return the windows with shifts (n, 2) added."""
-        return replace(self, shifts_px=self.shifts_px + shifts_px)
-
-    def reweighted(self, fitted_px: Points) -> "Shifts":
-        """Return the windows with weights that are robust to shifts far from the fitted ones (n, 2)."""
-        residuals_px = np.linalg.norm(self.shifts_px - fitted_px, axis=1)
-        robust = cauchy_weights(residuals_px, _CAUCHY_SCALES * shift_scale_px(residuals_px))
-        return replace(self, weights=self.weights * robust)
-
-    @property
-    def median_px(self) -> float:
-        """Median length of the shifts."""
-        return float(np.median(np.linalg.norm(self.shifts_px, axis=1))) if len(self) else math.inf
-
-    def __len__(self) -> int:
-        return len(self.centres_px)
-
-
-_UNKNOWN_PX = FixedImagePx(math.nan)
-
-
-@dataclass(frozen=True)
-class _Gain:
+class _Gain(NamedTuple):
     """Decrease of the residuals of held-out windows by a field."""
 
     smoothness: float
-    before_p95_px: FixedImagePx = _UNKNOWN_PX
-    after_p95_px: FixedImagePx = _UNKNOWN_PX
+    before_p95_px: FixedImagePx = FixedImagePx(math.nan)
+    after_p95_px: FixedImagePx = FixedImagePx(math.nan)
     loss: float = math.inf
-    """Weighted mean of log(1 + (shift / 0.1 px)^2) of the remaining shifts, which is robust to wrong peaks and depth
-    edges."""
+    """Mean of `_losses` of the remaining shifts, weighted."""
     sigma: float = 0.0
     """Mean decrease of that loss, without weights, in standard errors."""
+
+    @classmethod
+    def of(cls, shifts: Shifts, predicted_px: Points, smoothness: float) -> "_Gain":
+        """Return the gain from predictions (n, 2) of the shifts, NaN for windows that were not held out."""
+        compared = shifts.weights >= _MIN_WEIGHT
+        compared &= np.isfinite(predicted_px[:, 0])
+        if not compared.any():
+            return cls(smoothness)
+        shifts = shifts.subset(compared)
+        before_px, after_px = shifts.distances_px(), shifts.distances_px(predicted_px[compared])
+        before_p95_px, after_p95_px = (FixedImagePx(np.percentile(v, 95)) for v in (before_px, after_px))
+        losses = _losses(after_px)
+        loss = float(np.average(losses, weights=shifts.weights))
+        return cls(smoothness, before_p95_px, after_p95_px, loss, in_standard_errors(_losses(before_px) - losses))
 
     def is_significant(self, min_sigma: float) -> bool:
         """Return True if a field reduces the shifts significantly without a larger p95."""
@@ -272,9 +210,8 @@ class _Gain:
 
 def robust_loss(residual: Residual[FixedImagePx]) -> float:
     """Return the mean of log(1 + (shift / 0.1 px)^2) of the measured windows, infinite without any."""
-    lengths = np.linalg.norm(residual.shifts_px, axis=1)
-    measured = np.isfinite(lengths)
-    return float(_losses(lengths[measured]).mean()) if measured.any() else math.inf
+    shifts = Shifts.of(residual)
+    return float(_losses(shifts.distances_px()).mean()) if len(shifts.weights) else math.inf
 
 
 def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -282,25 +219,8 @@ def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.log1p((lengths_px / _LOSS_SCALE_PX) ** 2))
 
 
-def _gain_of(shifts: Shifts, remaining_px: NDArray[np.float64], smoothness: float) -> _Gain:
-    """Return the gain from the lengths (n,) of the remaining shifts, NaN for windows that were not held out."""
-    is_compared = np.isfinite(remaining_px) & (shifts.weights >= _MIN_WEIGHT)
-    if not is_compared.any():
-        return _Gain(smoothness)
-    before, after = np.linalg.norm(shifts.shifts_px[is_compared], axis=1), remaining_px[is_compared]
-    losses_before, losses = _losses(before), _losses(after)
-    decrease = losses_before - losses
-    sigma = float(decrease.mean() / max(decrease.std() / math.sqrt(len(decrease)), 1e-12))
-    before_p95, after_p95 = (FixedImagePx(np.percentile(lengths, 95)) for lengths in (before, after))
-    loss = float(np.average(losses, weights=shifts.weights[is_compared]))
-    return _Gain(smoothness, before_p95, after_p95, loss, sigma)
-
-
 def _folds(centres_px: Points) -> NDArray[np.int64]:
-    """Return the fold (n,) of each window.
-
-    A fold contains every fourth window along both axes.
-    """
+    """Return (n,) the fold of each window of a grid."""
     column, row = (np.unique(centres_px[:, axis], return_inverse=True)[1] for axis in (0, 1))
     return np.asarray(column % _FOLDS + _FOLDS * (row % _FOLDS))
 
@@ -321,26 +241,27 @@ def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int
 
     None if it does not reduce the residuals of captures that are left out of the fit.
     """
-    captures = [s for s in map(Shifts.of, residuals) if len(s)]
+    captures = [s for s in map(Shifts.of, residuals) if len(s.weights)]
     if len(captures) < _MIN_CAPTURES:
         return None
     count = min(len(captures), _COMMON_FOLDS)
     folds = [captures[k::count] for k in range(count)]
+    every = [c for fold in folds for c in fold]
 
     def fitted(some: Sequence[Shifts], smoothness: float) -> DisplacementField:
         return fitted_field(Shifts.joined(some), smoothness * len(some), _COMMON_LATTICE_PX, size_px)
 
     def gain(smoothness: float) -> _Gain:
-        remaining_px = []
+        predicted_px = []
         for fold in folds:
             field = fitted([c for other in folds if other is not fold for c in other], smoothness)
-            remaining_px += [np.linalg.norm(c.shifts_px - field(c.centres_px), axis=1) for c in fold]
-        return _gain_of(Shifts.joined([c for fold in folds for c in fold]), np.concatenate(remaining_px), smoothness)
+            predicted_px += [field(c.centres_px) for c in fold]
+        return _Gain.of(Shifts.joined(every), np.concatenate(predicted_px), smoothness)
 
     best = min(map(gain, _COMMON_SMOOTHNESS), key=lambda g: g.loss)
     if not best.is_significant(_MIN_COMMON_GAIN_SIGMA):
         return None
-    field = fitted([c for fold in folds for c in fold], best.smoothness)
+    field = fitted(every, best.smoothness)
     return field if _is_one_to_one(field, size_px) else None
 
 
@@ -372,7 +293,8 @@ def fitted_field(
         right_side = [_sums(nodes, bilinear * weights * s, rows * columns) for s in shifts.shifts_px.T]
         field = solveh_banded(normal, np.stack(right_side, axis=-1), overwrite_ab=True, lower=True, check_finite=False)
         if number + 1 < reweightings:
-            weights = shifts.reweighted((bilinear[..., None] * field[nodes]).sum(axis=0)).weights
+            fitted_px = (bilinear[..., None] * field[nodes]).sum(axis=0)
+            weights = shifts.reweighted(fitted_px, _CAUCHY_SCALES).weights
     lattice = field.reshape(rows, columns, 2)
     return DisplacementField(float(lattice_px), lattice if order[0] == 0 else lattice.transpose(1, 0, 2).copy())
 
@@ -399,16 +321,11 @@ def _second_difference_form(columns: int, rows: int) -> NDArray[np.float64]:
 
     Shape (1 + 2 columns, rows columns), as `scipy.linalg.solveh_banded` expects it.
     """
-    differences = vstack([
-        kron(identity(rows), _second_differences(columns)), kron(_second_differences(rows), identity(columns)),
-    ])  # fmt: skip
+    along_x, along_y = (diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count)) for count in (columns, rows))
+    differences = vstack([kron(identity(rows), along_x), kron(along_y, identity(columns))])
     form = (differences.T @ differences).tocsr()
     diagonals = [form.diagonal(-k) for k in range(2 * columns + 1)]
     return np.stack([np.pad(d, (0, rows * columns - len(d))) for d in diagonals])
-
-
-def _second_differences(count: int) -> dia_matrix:
-    return diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
 
 
 def _is_one_to_one(field: DisplacementField, size_px: tuple[int, int]) -> bool:

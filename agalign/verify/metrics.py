@@ -4,7 +4,7 @@ All are deterministic. Gradients and local moments are computed at full resoluti
 pixels; in large images over those on a regular grid of at least _ENOUGH_PIXELS.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
@@ -15,16 +15,12 @@ from scipy.special import entr
 from agalign.pixels.structure import gradient_magnitude
 from agalign.values.image import FloatImage, Mask, Raster
 
-_BINS = 32
-"""Of each axis of the joint histogram, elastix's default."""
-_RANGE_MARGIN_SHARE = 0.01
-"""Both ranges are widened by this share on both sides, as in elastix."""
+_BINS, _RANGE_MARGIN_SHARE = 32, 0.01
+"""Bins of each axis of the joint histogram, and share by which ranges are widened on both sides, as in elastix."""
 _SUBBINS = 64
 """Moving values are counted in subdivisions of a bin before the spline is applied; the error is at most 1/128 bin."""
-_MIN_PIXELS = 256
-"""Minimum number of common pixels for a metric."""
-_ENOUGH_PIXELS = 250_000
-"""Minimum number of pixels that are sampled from a large image."""
+_MIN_PIXELS, _ENOUGH_PIXELS = 256, 250_000
+"""Minimum number of common pixels for a metric, and of pixels that are sampled from a large image."""
 _MIN_STD = 1e-9
 """Smaller standard deviations are rounding errors of constant images."""
 _SSIM_WINDOW_PX = 11
@@ -42,7 +38,7 @@ class FixedSimilarity:
         self.grid = np.s_[step // 2 :: step, step // 2 :: step]
         self.gradient = _Gradient.of(fixed.pixels, self.grid)
         self.sampled = fixed.pixels[self.grid].ravel()
-        self.bins = fixed_bins(self.sampled, _range(fixed.pixels, fixed.valid))
+        self.bins = fixed_bins(self.sampled, _range(fixed))
 
     def to(self, moving: Raster) -> dict[str, float]:
         """Compute all metrics over the pixels that are valid in both rasters.
@@ -59,7 +55,7 @@ class FixedSimilarity:
         if len(valid) < _MIN_PIXELS:
             return {"overlap": overlap}
         fixed_values, moving_values = self.sampled[valid], moving.pixels[self.grid].ravel()[valid]
-        joint = joint_histogram(self.bins[valid], moving_values, _range(moving.pixels, both))
+        joint = joint_histogram(self.bins[valid], moving_values, _range(replace(moving, valid=both)))
         gradient = _Gradient.of(moving.pixels, self.grid)
         inside = np.flatnonzero(_eroded(both, 3)[self.grid])
         gradients = self.gradient.sampled[inside], gradient.sampled[inside]
@@ -71,7 +67,7 @@ class FixedSimilarity:
             "gradient_correlation": correlation(*gradients) if len(inside) else 0.0,
             "structure_ssim": _ssim(self.gradient, gradient, valid, complete_windows),
             "overlap": overlap,
-        }  # fmt: skip
+        }
 
 
 def _eroded(valid: Mask, side_px: int) -> Mask:
@@ -109,12 +105,10 @@ def _kernel() -> NDArray[np.float64]:
     return cubic_spline(centres[:, None] - np.arange(_BINS)[None, :])
 
 
-def _range(image: FloatImage, valid: Mask) -> tuple[float, float]:
+def _range(image: Raster) -> tuple[float, float]:
     """Return the minimum and maximum of the valid values; (0, 1) without any."""
-    if not valid.any():
-        return 0.0, 1.0
-    low, high, _, _ = cv2.minMaxLoc(image, mask=valid.view(np.uint8))
-    return low, high
+    low, high, _, _ = cv2.minMaxLoc(image.pixels, mask=image.valid.view(np.uint8))
+    return (low, high) if image.valid.any() else (0.0, 1.0)
 
 
 def _bin_position(values: NDArray[np.float32], limits: tuple[float, float], padding: int) -> NDArray[np.float32]:
@@ -134,45 +128,41 @@ def cubic_spline(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def mutual_information(joint: NDArray[np.float64]) -> float:
     """Return the sum of p log(p / (p_fixed p_moving)), in nats."""
-    return _entropy(joint.sum(axis=1)) + _entropy(joint.sum(axis=0)) - _entropy(joint)
+    of_each, of_both = _entropies(joint)
+    return of_each - of_both
 
 
 def normalised_mutual_information(joint: NDArray[np.float64]) -> float:
     """Return (H(fixed) + H(moving)) / H(fixed, moving), 1 if independent to 2 if identical (Studholme 1999)."""
-    joint_entropy = _entropy(joint)
-    return (_entropy(joint.sum(axis=1)) + _entropy(joint.sum(axis=0))) / joint_entropy if joint_entropy > 0 else 1.0
+    of_each, of_both = _entropies(joint)
+    return of_each / of_both if of_both > 0 else 1.0
 
 
-def _entropy(p: NDArray[np.float64]) -> float:
-    return float(entr(p).sum())
+def _entropies(joint: NDArray[np.float64]) -> tuple[float, float]:
+    """Return H(fixed) + H(moving) and H(fixed, moving), in nats."""
+    fixed, moving, both = (float(entr(p).sum()) for p in (joint.sum(axis=1), joint.sum(axis=0), joint))
+    return fixed + moving, both
 
 
 def correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     """Return Pearson's coefficient of two samples (n,); 0 if either is constant."""
-    centred = [x - np.float32(x.mean(dtype=np.float64)) for x in (a, b)]
-    aa, bb, ab = (float(centred[i] @ centred[j]) for i, j in ((0, 0), (1, 1), (0, 1)))
-    norm = float(np.sqrt(aa * bb))
-    return float(ab / norm) if norm > 0 else 0.0
+    a, b = (x - np.float32(x.mean(dtype=np.float64)) for x in (a, b))
+    norm = float(np.sqrt(float(a @ a) * float(b @ b)))
+    return float(a @ b) / norm if norm > 0 else 0.0
 
 
 @dataclass(frozen=True)
 class _Gradient:
-    """Gradient magnitude of an image."""
+    """Gradient magnitude (height, width) of an image; on a grid of n pixels also its moments in the SSIM window."""
 
     grid: tuple[slice, slice]
-    """Selects the n pixels of the following samples."""
     magnitude: FloatImage
-    """(height, width)"""
     sampled: NDArray[np.float32]
-    """(n,)"""
     local_mean: NDArray[np.float32]
-    """(n,) in the SSIM window."""
     local_variance: NDArray[np.float32]
-    """(n,) in the SSIM window."""
 
     @classmethod
     def of(cls, image: FloatImage, grid: tuple[slice, slice]) -> "_Gradient":
-        """Compute the gradient of an image and its samples."""
         gx, gy = (cv2.Sobel(image, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
         magnitude = gradient_magnitude(gx, gy)
         mean, square = (_blur(x)[grid].ravel() for x in (magnitude, magnitude * magnitude))

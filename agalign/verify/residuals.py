@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from agalign.pixels.structure import (
     Field,
@@ -16,11 +18,13 @@ from agalign.pixels.structure import (
     windowed_spectra,
 )
 from agalign.values.alignment import Residual
+from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, FixedPx
+from agalign.values.robust import cauchy_weights, shift_scale_px
 
-_Origin = tuple[int, int]
+_Element = TypeVar("_Element", bound=np.generic)
 
 _WINDOW_PX = 112
 """Side of the windows: large enough for a clear peak over crops, small enough to localise misalignment."""
@@ -40,22 +44,27 @@ class FixedWindows:
     """Windows of the reference with structure, at `centres_px` (n, 2); shifts are measured in any number of bands."""
 
     def __init__(
-        self, valid: Mask, structure: Field, side_px: int = _WINDOW_PX, step_px: int | None = None,
-        origins: Sequence[_Origin] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        valid: Mask,
+        structure: Field,
+        side_px: int = _WINDOW_PX,
+        step_px: int | None = None,
+        origins: NDArray[np.int64] | None = None,
+    ) -> None:
         """Cut the structure field (height, width) of the reference into windows.
 
         `valid` (height, width) is its mask. Windows have a side of `side_px`, less on images smaller than four windows,
-        and a spacing of `step_px`, by default without overlap; or their top left pixels are `origins` (x, y).
+        and a spacing of `step_px`, by default without overlap; or their top left pixels are `origins` (n, 2), (x, y).
         """
         self.valid = valid
         height, width = valid.shape
         self.side = max(_MIN_WINDOW_PX, min(side_px, width // 4, height // 4))
         if origins is None:
-            origins = [(x, y) for y in _starts(height, self.side, step_px) for x in _starts(width, self.side, step_px)]
-        inside = [(x, y) for x, y in origins if x + self.side <= width and y + self.side <= height]
-        self.origins, windows = self._strong(structure, inside)
-        self.centres_px = self._centres_px(self.origins)
+            origins = _grid(*(_starts(length, self.side, step_px) for length in (width, height)))
+        inside = origins[(origins + self.side <= (width, height)).all(axis=1)]
+        is_strong, windows = self._strong(structure, inside)
+        self.origins = inside[is_strong]
+        self.centres_px = self.origins + (self.side - 1) / 2
         self.spectra = windowed_spectra(windows)
 
     @classmethod
@@ -65,15 +74,10 @@ class FixedWindows:
         Windows of different colours share no pixels, so those of one colour can verify a fit to the other.
         """
         height, width = valid.shape
+        corners = _grid(range(0, width, _FIELD_PX), range(0, height, _FIELD_PX))
+        corners = corners[corners.sum(axis=1) // _FIELD_PX % 2 == int(white)]
         starts = range(0, _FIELD_PX - side_px + 1, (_FIELD_PX - side_px) // 2)
-        origins = [
-            (x + dx, y + dy)
-            for y in range(0, height, _FIELD_PX)
-            for x in range(0, width, _FIELD_PX)
-            if ((x + y) // _FIELD_PX) % 2 == int(white)
-            for dy in starts
-            for dx in starts
-        ]
+        origins = (corners[:, None] + _grid(starts, starts)).reshape(-1, 2)
         return cls(valid, structure, side_px, origins=origins)
 
     def residuals(self, moving: Raster, min_valid: float = _MIN_VALID_SHARE) -> Residual[FixedImagePx]:
@@ -82,36 +86,76 @@ class FixedWindows:
         Windows with a smaller share of valid pixels than `min_valid` are omitted: the outline of an invalid area biases
         the shift, by some tenths of a px in windows of 64 px with a twentieth of invalid pixels.
         """
-        valid = self.valid & moving.valid
-        field = structure_field(moving)
-        min_count = min_valid * self.side**2
-        usable = [o for o in self.origins if np.count_nonzero(self._cut(valid, o)) >= min_count]
-        origins, windows = self._strong(field, usable)
-        rows = {o: i for i, o in enumerate(self.origins)}
-        fixed = self.spectra if len(origins) == len(rows) else self.spectra[[rows[o] for o in origins]]
+        valid = self._cut(self.valid & moving.valid, self.origins)
+        usable = np.flatnonzero(np.count_nonzero(valid, axis=(1, 2)) >= min_valid * self.side**2)
+        is_strong, windows = self._strong(structure_field(moving), self.origins[usable])
+        rows = usable[is_strong]
+        fixed = self.spectra if len(rows) == len(self.origins) else self.spectra[rows]
         shifts_px, sigma = _peaks(whitened_cross_spectra(fixed, windowed_spectra(windows)))
-        return Residual.of(self._centres_px(origins), shifts_px, sigma)
+        return Residual.of(self.centres_px[rows], shifts_px, sigma)
 
-    def _centres_px(self, origins: Sequence[_Origin]) -> NDArray[np.float64]:
-        return np.asarray(np.array(origins, dtype=np.float64).reshape(-1, 2) + (self.side - 1) / 2)
+    def _cut(self, image: NDArray[_Element], origins: NDArray[np.int64]) -> NDArray[_Element]:
+        """Return (n, side, side) the windows with these origins, a copy."""
+        if not len(origins):  # the image may be smaller than a window
+            return np.empty((0, self.side, self.side), image.dtype)
+        x, y = origins.T
+        return np.asarray(sliding_window_view(image, (self.side, self.side))[y, x])
 
-    def _cut(self, image: NDArray[Any], origin: _Origin) -> NDArray[Any]:
-        x, y = origin
-        return image[y : y + self.side, x : x + self.side]
-
-    def _strong(self, field: Field, origins: list[_Origin]) -> tuple[list[_Origin], Field]:
-        """Return the origins of the windows with structure, and the windows (n, side, side) minus their means.
+    def _strong(self, field: Field, origins: NDArray[np.int64]) -> tuple[NDArray[np.bool_], Field]:
+        """Return True (n,) for windows with structure, and these windows (m, side, side) minus their means.
 
         The mean orientation of a row crop is the same everywhere and contains no information on the position.
         """
-        windows = np.empty((len(origins), self.side, self.side), np.complex64)
-        for window, origin in zip(windows, origins, strict=True):
-            window[:] = self._cut(field, origin)
+        windows = self._cut(field, origins)
         is_strong = np.abs(windows[:, ::2, ::2]).mean(axis=(1, 2)) >= _MIN_STRENGTH
         if not is_strong.all():
             windows = windows[is_strong]
         windows -= windows.mean(axis=(1, 2), keepdims=True)
-        return [o for o, strong in zip(origins, is_strong, strict=True) if strong], windows
+        return is_strong, windows
+
+
+def window_spacing_px(centres_px: Points) -> float:
+    """Return the median distance of window centres (n, 2) from the nearest other one, 0 for a single window."""
+    nearest, _ = cKDTree(centres_px).query(centres_px, k=min(2, len(centres_px)))
+    return float(np.median(nearest.reshape(len(centres_px), -1)[:, -1]))
+
+
+class Shifts(NamedTuple):
+    """The measured shifts of windows, (n, 2), and their relative weights (n,), by peak heights with median 1."""
+
+    centres_px: Points
+    shifts_px: Points
+    weights: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, residual: Residual[FixedPx]) -> "Shifts":
+        """Select the measured shifts of a residual. Their errors are inversely proportional to the squared peaks."""
+        measured = np.isfinite(residual.shifts_px[:, 0])
+        peaks_sigma = residual.peaks_sigma[measured]
+        weights = (peaks_sigma / np.median(peaks_sigma)) ** 4 if len(peaks_sigma) else peaks_sigma
+        return cls(residual.centres_px[measured], residual.shifts_px[measured], weights)
+
+    @classmethod
+    def joined(cls, several: Sequence["Shifts"]) -> "Shifts":
+        return cls(*map(np.concatenate, zip(*several, strict=True)))
+
+    def subset(self, mask: NDArray[np.bool_]) -> "Shifts":
+        return Shifts(*(values[mask] for values in self))
+
+    def distances_px(self, predicted_px: Points | float = 0.0) -> NDArray[np.float64]:
+        """Return (n,) the lengths of the shifts, minus predicted ones (n, 2)."""
+        return np.asarray(np.linalg.norm(self.shifts_px - predicted_px, axis=1))
+
+    def reweighted(self, fitted_px: Points, scales: float) -> "Shifts":
+        """Return the windows with half the weight at `scales` standard deviations from the fitted shifts (n, 2)."""
+        residuals_px = self.distances_px(fitted_px)
+        robust = cauchy_weights(residuals_px, scales * shift_scale_px(residuals_px))
+        return self._replace(weights=self.weights * robust)
+
+
+def in_standard_errors(decreases: NDArray[np.float64]) -> float:
+    """Return the mean of n decreases relative to its standard error."""
+    return float(decreases.mean() / max(decreases.std() / math.sqrt(len(decreases)), 1e-12))
 
 
 def residual_under(residual: Residual[FixedPx], before: PixelMapping, after: PixelMapping) -> Residual[FixedPx]:
@@ -133,8 +177,12 @@ def decrease_sigma(before_px: NDArray[np.float64], after_px: NDArray[np.float64]
     Lengths are clipped at twice the p95 of `before_px`, which limits the influence of wrong peaks.
     """
     limit_px = 2 * np.percentile(before_px, 95)
-    decrease = np.minimum(before_px, limit_px) ** 2 - np.minimum(after_px, limit_px) ** 2
-    return float(decrease.mean() / max(decrease.std() / math.sqrt(len(decrease)), 1e-12))
+    return in_standard_errors(np.minimum(before_px, limit_px) ** 2 - np.minimum(after_px, limit_px) ** 2)
+
+
+def _grid(x: Sequence[int], y: Sequence[int]) -> NDArray[np.int64]:
+    """Return (n, 2) all (x, y), row by row."""
+    return np.stack(np.meshgrid(np.array(x, np.int64), np.array(y, np.int64)), axis=-1).reshape(-1, 2)
 
 
 def _starts(length: int, side: int, step: int | None) -> list[int]:

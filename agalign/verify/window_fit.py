@@ -4,6 +4,9 @@
 
 s_i is the shift of the window at x_i, m are the displacements of the image's corners and the coefficients of the lens
 shapes, D is their Jacobian. The maximum a posteriori estimate is computed by iteratively reweighted least squares.
+
+The lens shapes model the smooth displacement by which the distortions of two lenses differ: the Brown-Conrady model to
+first order. A homography approximates it in the part of the image to which it is fitted.
 """
 
 from collections.abc import Callable
@@ -19,21 +22,25 @@ from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedPx
-from agalign.values.robust import MIN_SHIFT_SCALE_PX, cauchy_weights, shift_scale_px
-from agalign.verify.lens_shapes import lens_shapes, over_corners_and_lens, variance_px2
+from agalign.values.robust import MIN_SHIFT_SCALE_PX, shift_scale_px
+from agalign.verify.residuals import Shifts
 
 Array = NDArray[np.float64]
 
+LENS_STD = (1.3e-3, 0.7e-3, 1.2e-3, 1.2e-3)
+"""Standard deviation of each shape at the corners, as a share of half the diagonal. The lenses of 28 band pairs of six
+cameras (RedEdge-3, RedEdge-M, RedEdge-MX dual, Sequoia; calibrations in the tags) differ by 1.0, 0.6, 1.0 and 1.0 px
+at 800 px from the centre."""
+CALIBRATED = 0.4
+"""Factor on LENS_STD if both lenses are calibrated; measured on reference tie points of 45 RedEdge pairs."""
 _MIN_WINDOWS = 12
 """Minimum number of windows for parameters without a prior: 1.5 times the eight of a homography."""
 _CORNER_STD_PX = 5.0
 """Standard deviation of the prior of a corner, with lens shapes only: the error of an extrapolated affine mapping."""
 _MIN_INFORMATION_SHARE = 1e-12
 """Share of the total information that is added to directions that no window determines, as with windows on a line."""
-_CAUCHY_SCALES = 2.0
-"""Residual at which the robust weight is one half, in residual scales."""
-_REWEIGHTINGS = 6
-"""Iterations after which the robust weights have converged."""
+_CAUCHY_SCALES, _REWEIGHTINGS = 2.0, 6
+"""Residual at which the robust weight is one half, in residual scales, and iterations after which it has converged."""
 _AXIS_SHARE = 1 / 3
 """Variance along one axis over the square of the scale of lengths: normally distributed vectors have 1 / 3.05."""
 _EXTRAPOLATION_FACTOR = 12.0
@@ -76,9 +83,42 @@ class WindowFit:
         corrected = replace(mapping, fixed_to_moving=geometry.compose(mapping.fixed_to_moving, corners))
         if len(self.mean_px) == 8:
             return corrected
-        return replace(corrected, local=DisplacementField.sampled(
-            lambda nodes: lens_shapes(nodes, self.size_px) @ self.mean_px[8:], _NODE_STEP_PX, self.size_px
-        ))  # fmt: skip
+
+        def lens_px(points_px: Points) -> Points:
+            return np.asarray(lens_shapes(points_px, self.size_px) @ self.mean_px[8:])
+
+        return replace(corrected, local=DisplacementField.sampled(lens_px, _NODE_STEP_PX, self.size_px))
+
+
+def lens_shapes(points_px: Points, size_px: tuple[int, int]) -> Array:
+    """Return (n, 2, 4) the displacements by each shape at points (n, 2) of an image (width, height).
+
+    The shapes are radial of third and fifth order, and the two of decentring. Their length is 1 at the corners.
+    """
+    centre = (np.array(size_px, dtype=np.float64) - 1) / 2
+    u, v = ((points_px - centre) / np.linalg.norm(centre)).T
+    square = u * u + v * v
+    dx = np.stack([u * square, u * square**2, square + 2 * u * u, 2 * u * v], axis=-1)
+    dy = np.stack([v * square, v * square**2, 2 * u * v, square + 2 * v * v], axis=-1)
+    # The length of the decentring shapes is up to 3 along their axis.
+    return np.asarray(np.stack([dx, dy], axis=1) * np.array([1.0, 1.0, 1 / 3, 1 / 3]))
+
+
+def lens_std_px(size_px: tuple[int, int], *, calibrated: bool) -> Array:
+    """Return (4,) the standard deviation of each shape on an image (width, height), px."""
+    return np.array(LENS_STD) * float(np.hypot(*size_px)) / 2 * (CALIBRATED if calibrated else 1.0)
+
+
+def jacobian(points_px: Points, size_px: tuple[int, int], parameters: int = 12) -> Array:
+    """Return (n, 2, 8 or 12) the derivative of displacements of points by those of the corners, and by lens shapes."""
+    of_corners = geometry.over_corners(points_px, *size_px)
+    return of_corners if parameters == 8 else np.concatenate([of_corners, lens_shapes(points_px, size_px)], axis=2)
+
+
+def variance_px2(points_px: Points, covariance_px2: Array, size_px: tuple[int, int]) -> Array:
+    """Return (n,) the variance at points (n, 2) by the covariance of the corners (8, 8), or with shapes (12, 12)."""
+    design = jacobian(points_px, size_px, len(covariance_px2))
+    return np.asarray(np.einsum("nki,ij,nkj->n", design, covariance_px2, design))
 
 
 def fit_windows(
@@ -87,31 +127,27 @@ def fit_windows(
     """Fit the correction of a mapping of a reference (width, height) to the residual measured with this mapping.
 
     With the standard deviations `lens_std_px` (4,) of the lens shapes, these are fitted too. Without, the result is
-    None if fewer than 12 windows are measured. A window's weight is the fourth power of its correlation peak times a
-    Cauchy weight.
+    None if fewer than 12 windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
     """
-    measured = np.isfinite(residual.shifts_px[:, 0])
-    if lens_std_px is None and measured.sum() < _MIN_WINDOWS:
+    centres_px, raw_shifts_px, by_peak = Shifts.of(residual)
+    if lens_std_px is None and len(centres_px) < _MIN_WINDOWS:
         return None
-    centres_px, peaks_sigma = residual.centres_px[measured], residual.peaks_sigma[measured]
-    points_px, shifted_px = (mapping.undistorted(p) for p in (centres_px, centres_px + residual.shifts_px[measured]))
-    shifts_px = shifted_px - points_px
-    if lens_std_px is None:
-        design, std_px, factor = geometry.over_corners(points_px, *size_px), np.full(8, np.inf), 1.0
-    else:
-        design, factor = over_corners_and_lens(points_px, size_px), _EXTRAPOLATION_FACTOR
-        std_px = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px]
-    by_peak = (peaks_sigma / np.median(peaks_sigma)) ** 4 if len(peaks_sigma) else peaks_sigma
-    weights, residuals_px, scale_px = by_peak, np.zeros(len(shifts_px)), MIN_SHIFT_SCALE_PX
+    points_px, shifted_px = (mapping.undistorted(p) for p in (centres_px, centres_px + raw_shifts_px))
+    shifts = Shifts(points_px, shifted_px - points_px, by_peak)
+    std_px, factor = np.full(8, np.inf), 1.0
+    if lens_std_px is not None:
+        std_px, factor = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px], _EXTRAPOLATION_FACTOR
+    design = jacobian(points_px, size_px, len(std_px))
+    weighted, scale_px = shifts, MIN_SHIFT_SCALE_PX
     for _ in range(_REWEIGHTINGS):
-        information = weights / (factor * _AXIS_SHARE * scale_px**2 + MIN_SHIFT_SCALE_PX**2)
+        information = weighted.weights / (factor * _AXIS_SHARE * scale_px**2 + MIN_SHIFT_SCALE_PX**2)
         normal = np.einsum("n,nki,nkj->ij", information, design, design) + np.diag(std_px**-2.0)
         covariance = np.linalg.inv(normal + _MIN_INFORMATION_SHARE * np.trace(normal) * np.eye(len(normal)))
-        mean = covariance @ np.einsum("n,nki,nk->i", information, design, shifts_px)
-        residuals_px = np.linalg.norm(shifts_px - design @ mean, axis=1)
-        scale_px = shift_scale_px(residuals_px)
-        weights = by_peak * cauchy_weights(residuals_px, _CAUCHY_SCALES * scale_px)
-    return WindowFit(mean, covariance + _COMMON_STD_PX**2 * np.eye(len(mean)), residuals_px, size_px)
+        mean = covariance @ np.einsum("n,nki,nk->i", information, design, shifts.shifts_px)
+        scale_px = shift_scale_px(shifts.distances_px(design @ mean))
+        weighted = shifts.reweighted(design @ mean, _CAUCHY_SCALES)
+    covariance += _COMMON_STD_PX**2 * np.eye(len(mean))
+    return WindowFit(mean, covariance, shifts.distances_px(design @ mean), size_px)
 
 
 def fit_in_rounds(

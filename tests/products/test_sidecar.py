@@ -39,7 +39,7 @@ from agalign.values.image import OutputGrid
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
-from agalign.verify.window_check import COVERAGE
+from agalign.verify.checks import COVERAGE
 
 from ..conftest import read_json
 

@@ -11,9 +11,7 @@ from agalign.values.alignment import Alignment, Prediction, Residual, Seed
 from agalign.values.issues import RETRIEVAL, SEED_DOES_NOT_FIT, Issue, IssueKind, Remedy, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.verify import checks
-from agalign.verify.acceptance import is_unchanged, status_of
-from agalign.verify.check import Check, Evidence
-from agalign.verify.checks import CHECKS, KINDS, issues_of
+from agalign.verify.checks import CHECKS, KINDS, Check, Evidence, is_unchanged, issues_of, status_of
 
 from ..builders import joint_result
 
@@ -188,7 +186,7 @@ def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded() -> None:
 
 def test_a_new_check_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
     kind = IssueKind("too_late", "taken at night", Remedy("the sun is down", "fly at noon"))
-    monkeypatch.setattr(checks, "CHECKS", (*CHECKS, Check((kind,), lambda _: [Issue(kind)])))
+    monkeypatch.setattr(checks, "CHECKS", (*CHECKS, Check(lambda _: [Issue(kind)], (kind,))))
     assert codes() == ["too_late"]
 
 

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -13,12 +11,12 @@ from agalign.verify import displacement_field
 from agalign.verify.displacement_field import (
     DisplacementEstimator,
     DisplacementResult,
-    Shifts,
     _Gain,
     _is_one_to_one,
     common_field,
     fitted_field,
 )
+from agalign.verify.residuals import Shifts
 
 from ..builders import displaced_views, residual_of, texture
 
@@ -37,7 +35,7 @@ def centres() -> np.ndarray:
 
 def shifts_at(at: np.ndarray, shifts_px: np.ndarray) -> Shifts:
     """Shifts with equal weights and peak heights."""
-    return Shifts(at, shifts_px, np.ones(len(at)), np.full(len(at), 20.0))
+    return Shifts(at, shifts_px, np.ones(len(at)))
 
 
 def estimator() -> DisplacementEstimator:
@@ -168,7 +166,7 @@ def test_predictions_exclude_windows_that_share_pixels() -> None:
     one = int(np.argmin(np.linalg.norm(at - (320, 256), axis=1)))
     moved = quiet.shifts_px.copy()
     moved[np.abs(at - at[one]).max(axis=1) < 64] += 3.0
-    loud = replace(quiet, shifts_px=moved)
+    loud = quiet._replace(shifts_px=moved)
     before, after = (estimator()._cross_predicted(s, at, 64, 1.0) for s in (quiet, loud))
     np.testing.assert_allclose(before[one], after[one], atol=0.05 * 3.0)
     neighbour = int(np.argmin(np.linalg.norm(at - at[one] - (96, 0), axis=1)))

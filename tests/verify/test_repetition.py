@@ -5,7 +5,7 @@ import pytest
 import agalign
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.verify.repetition import alias_peak
+from agalign.verify.checks import alias_peak
 
 from ..builders import whole
 from ..conftest import textured_image

@@ -12,22 +12,15 @@ from agalign.values.displacement import DisplacementField
 from agalign.values.issues import sentence
 from agalign.values.mapping import PixelMapping
 from agalign.verify.checks import KINDS
-from agalign.verify.expected_error import expected_error_px
-from agalign.verify.extrapolation_check import (
+from agalign.verify.extrapolation import (
     EXTRAPOLATED,
+    expected_error_px,
     issues_of_extrapolation,
     points_in_frame,
+    unmodelled_std_px,
     unobserved_quarters,
 )
-from agalign.verify.lens_shapes import (
-    CALIBRATED,
-    LENS_STD,
-    lens_shapes,
-    lens_std_px,
-    over_corners_and_lens,
-    unmodelled_std_px,
-)
-from agalign.verify.window_fit import WindowFit, fit_windows
+from agalign.verify.window_fit import CALIBRATED, LENS_STD, WindowFit, fit_windows, jacobian, lens_shapes, lens_std_px
 
 from ..builders import joint_result, residual_of, rms
 
@@ -42,7 +35,7 @@ IDENTITY = PixelMapping(np.eye(3))
 
 
 def windows(truth_px: np.ndarray, centres_px: np.ndarray = CENTRES, noise_px: float = 0.05, seed: int = 0) -> Residual:
-    exact = over_corners_and_lens(centres_px, SIZE)[:, :, : len(truth_px)] @ truth_px
+    exact = jacobian(centres_px, SIZE, len(truth_px)) @ truth_px
     return residual_of(centres_px, exact + np.random.default_rng(seed).normal(0, noise_px, exact.shape))
 
 
@@ -85,8 +78,8 @@ def test_wrong_peaks_do_not_bias_the_fit(lens: bool) -> None:
     shifts = clean.shifts_px.copy()
     shifts[np.random.default_rng(1).permutation(len(shifts))[:20]] += (6.0, -3.0)
     fit = fitted(residual_of(CENTRES, shifts), lens)
-    jacobian = over_corners_and_lens(EVERYWHERE, SIZE)[:, :, : len(fit.mean_px)]
-    assert rms(jacobian @ (fit.mean_px - TRUTH_PX[: len(fit.mean_px)])) < 0.05
+    design = jacobian(EVERYWHERE, SIZE, len(fit.mean_px))
+    assert rms(design @ (fit.mean_px - TRUTH_PX[: len(fit.mean_px)])) < 0.05
     # With a fifth fewer windows the standard errors are larger.
     assert np.trace(fit.covariance_px2) > np.trace(fitted(clean, lens).covariance_px2)
 
@@ -135,7 +128,7 @@ def test_windows_in_one_half_determine_the_lens_in_the_other_half_to_the_stated_
     ratios = []
     for seed in range(30):
         fit = fitted(windows(TRUTH_PX, LEFT, seed=seed), lens=True)
-        ratios.append(rms(over_corners_and_lens(RIGHT, SIZE) @ (fit.mean_px - TRUTH_PX)) / fit.std_px(RIGHT))
+        ratios.append(rms(jacobian(RIGHT, SIZE) @ (fit.mean_px - TRUTH_PX)) / fit.std_px(RIGHT))
     # Errors of windows are assumed to be correlated; independent ones have smaller errors.
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.0
     assert fit.std_px(LEFT) < 0.15 < fit.std_px(RIGHT)
