@@ -21,12 +21,11 @@ from agalign.batch.learning_tasks import (
     try_model,
 )
 from agalign.config import Settings
-from agalign.flight.factors import median_mapping
 from agalign.flight.fingerprint import hashed, refinement_key
 from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
-from agalign.flight.rig import MIN_CAPTURES, Rig
+from agalign.flight.rig import MIN_CAPTURES, Rig, median_mapping
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn

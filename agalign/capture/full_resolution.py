@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.errors import UnreadableFileError
-from agalign.flight.factors import distance_px
+from agalign.flight.rig import distance_px
 from agalign.pixels.masks import learnable
 from agalign.pixels.raster import OpenRaster, open_raster, read_window
 from agalign.pixels.resample import resample_tile_of

@@ -20,9 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
-from agalign.flight.factors import FACTOR_STD_PX, MIN_STD_PX, coordinates, lattice_points
-from agalign.flight.rig import Rig
-from agalign.flight.rig_prediction import band_design
+from agalign.flight.rig import FACTOR_STD_PX, MIN_STD_PX, Rig, lattice
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.geometry import Matrix
@@ -32,7 +30,7 @@ from agalign.verify.window_fit import fit_windows
 Array = NDArray[np.float64]
 
 _CORNERS = [0, 6, 34, 28]
-"""Indices of the image's corners in `lattice_points`, clockwise from the top left."""
+"""Indices of the image's corners in `flight.rig.lattice`, clockwise from the top left."""
 _MAX_CORRECTION_PX = 1.0
 """Maximum displacement of a corner by windows; larger ones contradict the mapping and are ignored."""
 _REWEIGHTINGS = 6
@@ -139,10 +137,10 @@ def expected_corners(rig: Rig, band: str, fixed_to_moving: Matrix, scale: Sequen
     They are in px of an image that is larger than the reference's file by `scale` (x, y). The covariance distributes
     the cross-validated error over all homographies: those with equal mean square are equally likely.
     """
-    points, up = lattice_points(rig.size_px), np.tile(scale, 4)
+    (points, g), up = lattice(rig.size_px), np.tile(scale, 4)
     corners, to_fixed = points[_CORNERS], geometry.invert(fixed_to_moving)
     # (5, 4, 2) changes of the corners in the moving image by 1 px of each factor.
-    changes_px = np.einsum("nk,akf->fna", coordinates(rig.size_px)[_CORNERS], band_design(rig, band))
+    changes_px = np.einsum("nk,akf->fna", g[_CORNERS], rig.design(band))
     moving = geometry.apply(rig.mean[band], corners) + np.concatenate([np.zeros((1, 4, 2)), changes_px])
     moved = up[:, None] * (geometry.apply(to_fixed, moving) - corners).reshape(-1, 8).T
     over = geometry.over_corners(points, *rig.size_px)

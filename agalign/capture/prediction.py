@@ -6,8 +6,7 @@ from dataclasses import replace
 from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import find_rotated
 from agalign.capture.verification import as_predicted
-from agalign.flight.factors import distance_px
-from agalign.flight.rig import Observation, Rig
+from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment
 from agalign.values.capture import Capture

@@ -50,7 +50,7 @@ def _info(
         return EXIT_OK
     from agalign.cli.run import find_captures
     from agalign.config import DiscoverOptions
-    from agalign.flight.overview import camera_overviews
+    from agalign.flight.groups import camera_overviews
     from agalign.flight.panels import with_panels
     from agalign.flight.sky import sky_captures
 

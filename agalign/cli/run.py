@@ -89,7 +89,7 @@ def print_problems(flight: "FolderScan", terminal: Terminal) -> None:
 def print_plan(flight: "FolderScan", out: Path, settings: "Settings", options: "RunOptions", terminal: Terminal) -> int:
     """Print what a run would do with each capture; return the exit code."""
     from agalign.batch.run import plan_run
-    from agalign.flight.overview import camera_overviews
+    from agalign.flight.groups import camera_overviews
 
     states = plan_run(flight, out, settings, options)
     for camera in camera_overviews(flight.captures):

@@ -3,6 +3,7 @@
 import hashlib
 import struct
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +21,10 @@ def fingerprint(capture: Capture, *stages: Stage) -> str:
 
     It does not depend on the other captures of the flight, so results remain valid when captures are added.
     """
-    bands = [
-        (
-            b.name, b.address, b.lens, b.to_rig, b.georeference is not None, _state(b.path),
-            None if b.radiometry is None else (b.radiometry.quantity, b.radiometry.gain),
-        )
-        for b in capture.bands
-    ]  # fmt: skip
+    bands: list[Fact] = []
+    for b in capture.bands:
+        calibration = None if b.radiometry is None else (b.radiometry.quantity, b.radiometry.gain)
+        bands.append((b.name, b.address, b.lens, b.to_rig, b.georeference is not None, _state(b.path), calibration))
     return hashed(__version__, *(s.model_dump_json() for s in stages), capture.reference_index, bands)
 
 
@@ -60,8 +58,7 @@ def _canonical(fact: Fact) -> bytes:
 
 def _state(path: Path) -> tuple[int, int]:
     """Return the size and the modification time of a file, zeros if it cannot be read."""
-    try:
+    with suppress(OSError):
         status = path.stat()
-    except OSError:
-        return 0, 0
-    return status.st_size, status.st_mtime_ns
+        return status.st_size, status.st_mtime_ns
+    return 0, 0

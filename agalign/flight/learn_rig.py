@@ -2,40 +2,36 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.flight.factors import (
-    MIN_STD_PX,
-    affine_difference,
-    design_tensor,
-    displaced,
-    least_squares,
-    mapping_weight,
-    median_mapping,
-)
-from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig
-from agalign.values.geometry import Matrix
+from agalign.flight import rig
+from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig, design_tensor, least_squares
 from agalign.values.process_pool import Apply
 from agalign.values.robust import cauchy_weights
 
 Array = NDArray[np.float64]
+Layout = Mapping[str, tuple[float, float]]
+"""Positions of the lenses by band, in any unit."""
 
 _FACTOR_SETS: tuple[tuple[Factor, ...], ...] = (
-    (), ("distance",), ("distance", "tilt"), ("distance", "reference"), ("distance", "tilt", "reference"),
-    ("motion",), ("distance", "motion"), ("distance", "tilt", "motion"),
-)  # fmt: skip
+    (),
+    ("distance",),
+    ("distance", "tilt"),
+    ("distance", "reference"),
+    ("distance", "tilt", "reference"),
+    ("motion",),
+    ("distance", "motion"),
+    ("distance", "tilt", "motion"),
+)
 """Candidates in the order of preference: on parallel flight lines, motion alone resembles distance with motion."""
 _LAYOUT_STD = 0.015
 """Standard error of the lens positions of a camera model, relative to the norm of all baselines."""
 _UNKNOWN_STD = 1000.0
 """Standard deviation of the prior of parameters that only the captures determine."""
-_MAX_ITERATIONS = 20
-"""Of alternating least squares."""
-_CONVERGED = 1e-4
-"""Maximum change of the means, px, and of the baselines, of norm 1, in the last iteration."""
+_MAX_ITERATIONS, _CONVERGED = 20, 1e-4
+"""Of alternating least squares: the maximum change of the means, px, and of the baselines, of norm 1."""
 _MAX_FOLDS = 12
 """Of the cross-validation: more folds take longer and change the errors little."""
 _MAX_ERROR_RATIO = 0.9
@@ -43,20 +39,18 @@ _MAX_ERROR_RATIO = 0.9
 
 
 def learn_rig(
-    captures: Sequence[Observation], size_px: tuple[int, int], layout: Mapping[str, tuple[float, float]],
-    apply: Apply = map,
-) -> Rig | None:  # fmt: skip
+    captures: Sequence[Observation], size_px: tuple[int, int], layout: Layout, apply: Apply = map
+) -> Rig | None:
     """Estimate the rig from captures; None if no band has a mapping in at least MIN_CAPTURES of them.
 
-    `size_px` is (width, height) of the reference. `layout` has the known positions of the lenses by band, in any unit.
-    `apply` runs the cross-validations.
+    `size_px` is (width, height) of the reference. `apply` runs the cross-validations.
     """
     counts = Counter(b for c in captures for b in c.mappings)
     bands = tuple(b for b, count in counts.items() if count >= MIN_CAPTURES)
     captures = [c for c in captures if any(b in c.mappings for b in bands)]
     if not bands:
         return None
-    table = _Table.of(captures, bands, size_px, layout)
+    table = _Table(captures, bands, size_px, layout)
     candidates = _FACTOR_SETS if len(bands) > 1 else _FACTOR_SETS[:1]
     (factors, errors_px), *others = zip(candidates, apply(table.cross_validated_px, candidates), strict=True)
     for candidate, candidate_px in others:
@@ -66,42 +60,36 @@ def learn_rig(
     offsets, lenses = fitted[:, :6].reshape(-1, 2, 3), dict(zip(bands, fitted[:, 6:].tolist(), strict=True))
     by_capture = zip(captures, nu_w.tolist(), strict=True)
     return Rig(
-        size_px, {b: displaced(m, o, size_px) for b, m, o in zip(bands, table.median, offsets, strict=True)},
-        {b: (x, y) for b, (x, y, _) in lenses.items()}, {b: delay for b, (_, _, delay) in lenses.items()},
-        dict(zip(bands, t_std.tolist(), strict=True)), factors,
-        tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in by_capture),
-        dict(zip(bands, errors_px.tolist(), strict=True)),
-    )  # fmt: skip
+        size_px=size_px,
+        mean={b: rig.displaced(m, o, size_px) for b, m, o in zip(bands, table.median, offsets, strict=True)},
+        baselines={b: (x, y) for b, (x, y, _) in lenses.items()},
+        delays={b: delay for b, (_, _, delay) in lenses.items()},
+        baseline_std=dict(zip(bands, t_std.tolist(), strict=True)),
+        factors=factors,
+        captures=tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in by_capture),
+        from_bands_px=dict(zip(bands, errors_px.tolist(), strict=True)),
+    )
 
 
-@dataclass(frozen=True)
 class _Table:
     """The mappings of all captures as coefficients."""
 
-    median: list[Matrix]
-    """Median mapping of each band."""
-    differences: Array
-    """(captures, bands, 2, 3) coefficients of the mappings minus the median mapping, px."""
-    weights: Array
-    """(captures, bands) of `mapping_weight`, 0 without a mapping."""
-    layout: Array | None
-    """(bands, 2) baselines of the known lens layout, of norm 1 together; None if unknown."""
-
-    @classmethod
-    def of(
-        cls, captures: Sequence[Observation], bands: tuple[str, ...], size_px: tuple[int, int],
-        layout: Mapping[str, tuple[float, float]],
-    ) -> "_Table":  # fmt: skip
-        """Compute the coefficients of the mappings of `bands` in all captures."""
-        median = [median_mapping([c.mappings[b] for c in captures if b in c.mappings], size_px) for b in bands]
-        differences, weights = np.zeros((len(captures), len(bands), 2, 3)), np.zeros((len(captures), len(bands)))
+    def __init__(
+        self, captures: Sequence[Observation], bands: Sequence[str], size_px: tuple[int, int], layout: Layout
+    ) -> None:
+        self.median = [rig.median_mapping([c.mappings[b] for c in captures if b in c.mappings], size_px) for b in bands]
+        self.differences = np.zeros((len(captures), len(bands), 2, 3))
+        """Coefficients of the mappings minus the median mapping of the band, px."""
+        self.weights = np.zeros((len(captures), len(bands)))
+        """Of `mapping_weight`, 0 without a mapping."""
         for i, capture in enumerate(captures):
             for j, band in enumerate(bands):
                 if band in capture.mappings:
-                    differences[i, j] = affine_difference(median[j], capture.mappings[band], size_px)
-                    weights[i, j] = mapping_weight(capture.std_px[band])
+                    self.differences[i, j] = rig.affine_difference(self.median[j], capture.mappings[band], size_px)
+                    self.weights[i, j] = rig.mapping_weight(capture.std_px[band])
         known = np.array([layout.get(b, (np.nan, np.nan)) for b in bands])
-        return cls(median, differences, weights, _unit(known) if np.linalg.norm(known) > 0 else None)
+        self.layout = _unit(known) if np.linalg.norm(known) > 0 else None
+        """(bands, 2) baselines of the known lens layout, of norm 1 together; None if unknown."""
 
     def fit(self, is_used: Array, factors: Sequence[Factor]) -> tuple[Array, Array, Array]:
         """Fit the model by alternating least squares: the factors of captures, then the parameters of bands.
@@ -120,7 +108,7 @@ class _Table:
             # The median is robust to a few captures at another height.
             result -= np.median(result[is_used > 0], axis=0)
             # Errors of the baselines displace captures far from the median factors, which therefore have less weight.
-            robust = cauchy_weights(np.linalg.norm(result[:, :3], axis=1), MIN_STD_PX / _LAYOUT_STD)
+            robust = cauchy_weights(np.linalg.norm(result[:, :3], axis=1), rig.MIN_STD_PX / _LAYOUT_STD)
             design = np.concatenate([of_offset, np.moveaxis(tensor @ result.T, (3, 0), (0, 3))], axis=3)
             # Parameters that neither the layout nor the factors determine keep their values.
             known = lens if self.layout is None else np.column_stack([self.layout, lens[:, 2]])
@@ -135,8 +123,13 @@ class _Table:
 
     def cross_validated_px(self, factors: Sequence[Factor]) -> Array:
         """Return (bands,) the RMS error of predictions from the other bands, in captures left out of the fit."""
-        squares_px2 = np.zeros(self.weights.shape)
-        for is_left_out in self._folds():
+        squares_px2, count = np.zeros(self.weights.shape), len(self.weights)
+        for folds in (min(count, _MAX_FOLDS), count):
+            left_out = np.arange(count) % folds == np.arange(folds)[:, None]
+            # If a fold would contain all captures of a band, each capture is its own fold.
+            if (~left_out @ self.weights > 0).all():
+                break
+        for is_left_out in left_out:
             bands, *_ = self.fit(~is_left_out * 1.0, factors or ("distance",))
             design = np.tensordot(bands[:, 6:], design_tensor(factors), 1)
             differences = self.differences[is_left_out] - bands[:, :6].reshape(-1, 2, 3)
@@ -145,28 +138,13 @@ class _Table:
                 result, _ = least_squares(design, differences, other_weights)
                 error_px = differences[:, j] - (design[j] @ result.T).transpose(2, 0, 1)
                 squares_px2[is_left_out, j] = (error_px**2).sum(axis=(1, 2))
-        count = (self.weights > 0).sum(axis=0)
-        mean_px2 = (squares_px2 * (self.weights > 0)).sum(axis=0) / count
+        counts = (self.weights > 0).sum(axis=0)
+        mean_px2 = (squares_px2 * (self.weights > 0)).sum(axis=0) / counts
         # The final rig has one capture more than a fit of a fold: the error variance is proportional to 1 + 1 / n.
-        return np.asarray(np.sqrt(mean_px2 * (1 + 1 / count) / (1 + 1 / np.maximum(count - 1, 1))))
-
-    def _folds(self) -> NDArray[np.bool_]:
-        """Return (folds, captures) True for the captures that each fold leaves out.
-
-        If a fold would contain all captures of a band, each capture is its own fold.
-        """
-        count = len(self.weights)
-        for folds in (min(count, _MAX_FOLDS), count):
-            is_left_out = np.arange(count) % folds == np.arange(folds)[:, None]
-            if (~is_left_out @ self.weights > 0).all():
-                break
-        return np.asarray(is_left_out)
+        return np.asarray(np.sqrt(mean_px2 * (1 + 1 / counts) / (1 + 1 / np.maximum(counts - 1, 1))))
 
     def _initial(self, weights: Array, factors: Sequence[Factor]) -> Array:
-        """Return initial baselines and delays (bands, 3).
-
-        Unknown ones are the first singular vector of the coefficients of all bands over all captures.
-        """
+        """Return initial baselines and delays (bands, 3): by default first singular vectors of the coefficients."""
         scaled = self.differences * np.sqrt(weights)[:, :, None, None]
         delay = np.linalg.svd(scaled[..., 0].swapaxes(0, 1).reshape(len(self.median), -1), full_matrices=False)[0][:, 0]
         coefficients = scaled.transpose(1, 2, 0, 3).reshape(2 * len(self.median), -1)

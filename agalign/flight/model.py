@@ -28,12 +28,9 @@ from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
 
 _FORMAT = "agalign-model/1"
-_MAX_FILE_BYTES = 1 << 28
-"""Far above the size of a model, so that other files are not read into memory."""
-_MAX_SIDES = 512
-"""Maximum number of sides, and of channels of a side, of a network: more than any imager has bands."""
-_MAX_VALUE = 1e6
-"""Weights are below 100 and mappings are in px: larger numbers indicate a damaged file."""
+_MAX_FILE_BYTES, _MAX_SIDES, _MAX_VALUE = 1 << 28, 512, 1e6
+"""Far above the size of a model, the number of sides of a network and of channels of a side, and its values, as weights
+are below 100 and mappings are in px: larger numbers indicate another or a damaged file."""
 
 
 @dataclass(frozen=True)
@@ -70,10 +67,16 @@ def save_model(model: FlightModel, path: Path) -> None:
     if model.rig is not None:
         tensors |= {f"field.{k}": torch.tensor(f.displacements_px).contiguous() for k, f in model.rig.fields.items()}
     facts = {
-        "format": _FORMAT, "agalign": __version__, "camera": model.camera, "bands": json.dumps(model.bands),
-        "sharing": model.net.sharing, "channels": json.dumps(model.net.channels), "fingerprint": model.fingerprint,
-        "rig": "" if model.rig is None else rig_to_json(model.rig), "refined": refined_to_json(model.refined),
-    }  # fmt: skip
+        "format": _FORMAT,
+        "agalign": __version__,
+        "camera": model.camera,
+        "bands": json.dumps(model.bands),
+        "sharing": model.net.sharing,
+        "channels": json.dumps(model.net.channels),
+        "fingerprint": model.fingerprint,
+        "rig": "" if model.rig is None else rig_to_json(model.rig),
+        "refined": refined_to_json(model.refined),
+    }
     contents = _with_sorted_header(save(tensors, facts | {"digest": _digest(tensors, facts)}))
     with complete_file(path) as partial:
         partial.write_bytes(contents)
@@ -102,11 +105,15 @@ def _read_model(path: Path) -> FlightModel:
     net.load_state_dict(_with_prefix("theta.", tensors))
     net.is_trained = True
     fields = {band: values.numpy() for band, values in _with_prefix("field.", tensors).items()}
-    mappings = {band: normalised(matrix.numpy()) for band, matrix in _with_prefix("mapping.", tensors).items()}
-    bands = tuple(map(str, json.loads(facts["bands"])))
-    rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
-    refined = refined_from_json(facts.get("refined", "{}"))
-    return FlightModel(net, facts["camera"], bands, mappings, facts["fingerprint"], rig, refined)
+    return FlightModel(
+        net,
+        camera=facts["camera"],
+        bands=tuple(map(str, json.loads(facts["bands"]))),
+        mappings={band: normalised(matrix.numpy()) for band, matrix in _with_prefix("mapping.", tensors).items()},
+        fingerprint=facts["fingerprint"],
+        rig=rig_from_json(facts["rig"], fields) if facts.get("rig") else None,
+        refined=refined_from_json(facts.get("refined", "{}")),
+    )
 
 
 def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

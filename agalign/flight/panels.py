@@ -1,5 +1,6 @@
 """Detection of captures of calibration panels, and reflectance factors from them."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from agalign.flight.groups import camera_key, flights_of
 from agalign.pixels.panel import DetectedPanel, albedo_of, find_panel, inside
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, read_for_alignment, read_window, without_warnings
-from agalign.values.capture import Band, Capture, Panel
+from agalign.values.capture import Band, Capture, Panel, PanelSource
 from agalign.values.pixel_units import PixelScale
 
 Albedos = Mapping[str, float]
@@ -34,12 +35,11 @@ _MIN_HEIGHT_M = 3.0
 
 @dataclass(frozen=True)
 class BandReading:
-    """Measurement of a panel in one band."""
+    """Measurement of the panel of one band."""
 
     band: Band
-    """With its panel."""
     albedo: float | None
-    radiance: float | None
+    radiance: float | None = None
     """Mean over the panel, in the unit of the camera's calibration."""
     problem: str = ""
     """Why it cannot be used; empty if it can."""
@@ -90,15 +90,12 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
     The illumination is interpolated linearly in time between the panels of the camera and constant outside. Empty if
     the time of the capture or of all panels is unknown.
     """
-    time_s = capture.time_s
-    if time_s is None:
-        return {}
     illumination: dict[str, list[tuple[float, float]]] = {}
-    for panel_time_s, reading in _within_hours(readings, time_s):
+    for later_s, reading in _within_hours(readings, capture):
         for band in reading.bands if camera_key(reading.capture) == camera_key(capture) else ():
             if band.factor is not None:
-                illumination.setdefault(band.band.name, []).append((panel_time_s, 1 / band.factor))
-    return {name: 1 / _interpolated(time_s, samples) for name, samples in illumination.items()}
+                illumination.setdefault(band.band.name, []).append((later_s, 1 / band.factor))
+    return {name: 1 / _interpolated(samples) for name, samples in illumination.items()}
 
 
 def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
@@ -106,38 +103,32 @@ def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
 
     Captures with a height in the tags, without an altitude or without a panel within hours are not changed.
     """
-    pose, position, time_s = capture.pose, capture.position, capture.time_s
-    if pose is None or pose.height_m is not None or position is None or position.altitude_m is None or time_s is None:
+    pose, position = capture.pose, capture.position
+    if pose is None or pose.height_m is not None or position is None or position.altitude_m is None:
         return capture
-    altitudes_m = [
-        r.capture.position.altitude_m for _, r in _within_hours(readings, time_s)
-        if r.capture.is_of_a_panel and r.capture.position is not None and r.capture.position.altitude_m is not None
-    ]  # fmt: skip
+    on_ground = [r.capture for _, r in _within_hours(readings, capture) if r.capture.is_of_a_panel]
+    altitudes_m = [a for c in on_ground if c.position is not None and (a := c.position.altitude_m) is not None]
     height_m = position.altitude_m - min(altitudes_m) + _PANEL_HEIGHT_M if altitudes_m else 0.0
     if height_m <= _MIN_HEIGHT_M:
         return capture
     return replace(capture, pose=replace(pose, height_m=height_m, height_from="panel"))
 
 
-def _within_hours(readings: Iterable[PanelReading], time_s: float) -> list[tuple[float, PanelReading]]:
-    """Return (time, reading) of the panels within _MAX_TIME_DIFFERENCE_S of a time."""
-    return [
-        (panel_time_s, r) for r in readings
-        if (panel_time_s := r.capture.time_s) is not None and abs(panel_time_s - time_s) <= _MAX_TIME_DIFFERENCE_S
-    ]  # fmt: skip
+def _within_hours(readings: Iterable[PanelReading], capture: Capture) -> list[tuple[float, PanelReading]]:
+    """Return (seconds after a capture, reading) of the panels close to it in time; none if its time is unknown."""
+    time_s = math.nan if capture.time_s is None else capture.time_s
+    timed = [(panel_time_s - time_s, r) for r in readings if (panel_time_s := r.capture.time_s) is not None]
+    return [(later_s, r) for later_s, r in timed if abs(later_s) <= _MAX_TIME_DIFFERENCE_S]
 
 
-def _interpolated(time_s: float, samples: list[tuple[float, float]]) -> float:
-    """Interpolate (time, value) samples linearly; values at equal times are averaged."""
+def _interpolated(samples: list[tuple[float, float]]) -> float:
+    """Interpolate (time, value) samples linearly at time 0; values at equal times are averaged."""
     times = sorted({t for t, _ in samples})
-    return float(np.interp(time_s, times, [np.mean([v for t, v in samples if t == time]) for time in times]))
+    return float(np.interp(0.0, times, [np.mean([v for t, v in samples if t == time]) for time in times]))
 
 
 def _from_both_ends(flight: Sequence[Capture]) -> tuple[list[Capture], list[Capture]]:
-    """Return the first half of a flight, and the second half in reverse order.
-
-    The order is by time, or as given if a time is unknown.
-    """
+    """Return the first half of a flight and the reversed second half: by time, or as given if one is unknown."""
     times = [t for c in flight if (t := c.time_s) is not None]
     ordered = [flight[i] for i in np.argsort(times, kind="stable")] if len(times) == len(flight) else list(flight)
     middle = (len(ordered) + 1) // 2
@@ -152,11 +143,8 @@ def _captures_of_panels(half: Sequence[Capture], without_code: bool) -> list[Cap
         # Mosaics contain no panels and take long to read.
         is_known = capture.panel is not None or capture.reference.georeference is not None
         examined = capture if is_known else _with_detected_panel(capture, without_code)
-        if examined.panel is not None:
-            result.append(examined)
-            without_panel = 0
-            continue
-        without_panel += 1
+        without_panel = 0 if examined.panel is not None else without_panel + 1
+        result += [examined] if examined.panel is not None else []
         if without_panel == _MAX_CAPTURES_WITHOUT_PANEL:
             break
     return result
@@ -167,19 +155,16 @@ def _with_detected_panel(capture: Capture, without_code: bool) -> Capture:
     # Without a code, a small square far from the image centre may be a roof or a sheet.
     if detected is None or (detected.in_scene and not detected.code):
         return capture
-    by_band = [_detect(b, without_code=True) for b in capture.bands]
+    areas = [_detect(b, without_code=True) for b in capture.bands]
     # The code may be readable in one band only; it is valid for all.
-    code = next((d.code for d in by_band if d is not None and d.code), "")
-    bands = (
-        replace(b, panel=None if d is None else _panel(d, b, code, in_scene=detected.in_scene))
-        for b, d in zip(capture.bands, by_band, strict=True)
-    )
+    code = next((d.code for d in areas if d is not None and d.code), "")
+    source: PanelSource = "QR code" if code else "look"
+    bands = []
+    for band, area in zip(capture.bands, areas, strict=True):
+        albedo, serial = albedo_of(code, band.wavelength_nm), code.partition("_")[0]
+        panel = None if area is None else Panel(source, serial, albedo, area.area_px, detected.in_scene)
+        bands.append(replace(band, panel=panel))
     return replace(capture, bands=tuple(bands))
-
-
-def _panel(detected: DetectedPanel, band: Band, code: str, *, in_scene: bool) -> Panel:
-    serial, _, _ = code.partition("_")
-    return Panel("QR code" if code else "look", serial, albedo_of(code, band.wavelength_nm), detected.area_px, in_scene)
 
 
 def _detect(band: Band, *, without_code: bool) -> DetectedPanel | None:
@@ -205,30 +190,26 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
         band = replace(band, panel=panel)
     albedo = albedos.get(band.name.lower(), albedos.get("", None if panel is None else panel.albedo))
     if panel is None or not panel.corners_px:
-        return BandReading(band, albedo, None, "it was not found in this band")
+        return BandReading(band, albedo, problem="it was not found in this band")
     try:
         radiance, saturated = _radiance(band, panel)
     except AgalignError as error:
-        return BandReading(band, albedo, None, str(error))
+        return BandReading(band, albedo, problem=str(error))
+    problem = "it is black" if radiance is not None and not radiance > 0 else ""
     if saturated > _MAX_SATURATED_SHARE:
-        return BandReading(band, albedo, radiance, f"{saturated:.0%} of it is saturated")
-    if radiance is not None and not radiance > 0:
-        return BandReading(band, albedo, radiance, "it is black")
-    return BandReading(band, albedo, radiance)
+        problem = f"{saturated:.0%} of it is saturated"
+    return BandReading(band, albedo, radiance, problem)
 
 
 def _radiance(band: Band, panel: Panel) -> tuple[float | None, float]:
     """Return the mean radiance over the panel, None without calibration, and the saturated share of its pixels."""
-    corners = np.asarray(panel.corners_px)
-    x0, y0 = np.floor(corners.min(axis=0)).astype(int).clip(0, np.subtract(band.size_px, 1))
-    x1, y1 = np.ceil(corners.max(axis=0)).astype(int).clip((x0, y0), np.subtract(band.size_px, 1))
     with open_raster(band.path) as source:
-        pixels, valid = read_window(source, band, int(x0), int(y0), int(x1 - x0 + 1), int(y1 - y0 + 1))
-    within = inside(corners - (x0, y0), pixels.shape) & valid
+        pixels, valid = read_window(source, band, 0, 0, band.width_px, band.height_px)
+    within = inside(panel.corners_px, pixels.shape) & valid
     if not within.any():
         return None, 0.0
-    values = pixels[within].astype(np.float64)
-    saturated = 0.0 if band.saturation_value is None else float((values >= band.saturation_value).mean())
+    saturation = np.inf if band.saturation_value is None else band.saturation_value
+    saturated = float((pixels[within].astype(np.float64) >= saturation).mean())
     if band.radiometry is None or not band.radiometry.is_of_light:
         return None, saturated
-    return float(calibrated(pixels, band.radiometry, int(x0), int(y0))[within].mean(dtype=np.float64)), saturated
+    return float(calibrated(pixels, band.radiometry, 0, 0)[within].mean(dtype=np.float64)), saturated

@@ -9,15 +9,17 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.flight.factors import (
+from agalign.flight.rig import (
+    FACTORS,
+    MIN_CAPTURES,
     MIN_STD_PX,
+    CaptureFactors,
+    Observation,
+    Rig,
     affine_difference,
-    design_tensor,
-    displaced,
     least_squares,
     mapping_weight,
 )
-from agalign.flight.rig import FACTORS, MIN_CAPTURES, CaptureFactors, Observation, Rig
 from agalign.values import geometry
 from agalign.values.alignment import Prediction
 from agalign.values.geometry import Matrix
@@ -70,42 +72,39 @@ def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
     # If every capture is an outlier in some factor, keep the least outlying one.
     factors = factors[outlyingness <= max(1.0, float(outlyingness.min()))]
     extremes = {int(i) for column in factors.T for i in (column.argmin(), column.argmax())}
-    return [displaced(rig.mean[band], band_design(rig, band) @ factors[i], rig.size_px) for i in sorted(extremes)]
-
-
-def band_design(rig: Rig, band: str) -> Array:
-    """Return (2, 3, 5) the derivative of a band's coefficients with respect to the factors; 0 for unused factors."""
-    return np.tensordot([*rig.baselines[band], rig.delays[band]], design_tensor(rig.factors), 1)
+    return [rig.mapping(band, factors[i]) for i in sorted(extremes)]
 
 
 def band_summaries(rig: Rig) -> list[dict[str, Any]]:
     """Return for each band the offset of the image centre, the baseline and the errors of predictions, px."""
     centre = (np.array(rig.size_px, float) - 1) / 2
+    field_px = {b: float(np.linalg.norm(f.displacements_px, axis=-1).max()) for b, f in rig.fields.items()}
     return [
         {
-            "band": band, "offset_px": (geometry.apply(mean, centre[None])[0] - centre).tolist(),
-            "baseline": rig.baselines[band], "from_bands_px": rig.from_bands_px[band],
+            "band": band,
+            "offset_px": (geometry.apply(mean, centre[None])[0] - centre).tolist(),
+            "baseline": rig.baselines[band],
+            "from_bands_px": rig.from_bands_px[band],
             "from_neighbours_px": unobserved_error_px(rig, band, by_neighbours=True),
             "from_flight_px": unobserved_error_px(rig, band, by_neighbours=False),
-            "field_px": float(np.hypot(*np.moveaxis(rig.fields[band].displacements_px, -1, 0)).max())
-            if band in rig.fields else None,
+            "field_px": field_px.get(band),
         }
         for band, mean in rig.mean.items()
-    ]  # fmt: skip
+    ]
 
 
 def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     """Predict a band from the mappings of the other bands of the capture.
 
-    The variance is the sum of the cross-validated variance, the additional variance of the factors compared with
-    captures in which all other bands are known accurately, the variance by the baseline's error when the factors are
-    outside the learned range, and the excess residual of the other bands: the median square minus the cross-validated
-    variance, which is large for a capture that the rig does not describe.
+    The variance is the sum of the cross-validated one, the additional variance of the factors compared with captures in
+    which all other bands are known accurately, that by the baseline's error for factors outside the learned range, and
+    the excess residual of the other bands (the median square minus the cross-validated variance), which is large for a
+    capture that the rig does not describe.
     """
     others = [b for b in rig.mean if b != band]
     mean_and_mapping = [(rig.mean[b], known.mappings.get(b, rig.mean[b])) for b in others]
     std_px = [known.std_px[b] if b in known.mappings else math.inf for b in others]
-    design, designs = band_design(rig, band), np.stack([band_design(rig, b) for b in others])
+    design, designs = rig.design(band), np.stack([rig.design(b) for b in others])
     expected_px = np.array([rig.from_bands_px[b] for b in others])
     differences = np.stack([affine_difference(*pair, rig.size_px) for pair in mean_and_mapping])
     weights = mapping_weight(np.stack([std_px, np.full(len(others), MIN_STD_PX)]), expected_px)
@@ -113,12 +112,11 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     excess_px2 = ((differences - designs @ solutions[0]) ** 2).sum(axis=(1, 2)) - expected_px**2
     learned_px2 = [np.square(c.factors[:3]).sum() for c in rig.captures]
     outside_px2 = np.square(solutions[0, :3]).sum() - np.mean(learned_px2 or [0.0])
-    variances_px2 = (
-        np.median(excess_px2[weights[0] > 0]), np.einsum("akf,fg,akg->", design, covariance - complete, design),
-        2 * rig.baseline_std[band] ** 2 * outside_px2,
-    )  # fmt: skip
+    of_factors_px2 = np.einsum("akf,fg,akg->", design, covariance - complete, design)
+    baseline_px2 = 2 * rig.baseline_std[band] ** 2 * outside_px2
+    variances_px2 = (np.median(excess_px2[weights[0] > 0]), of_factors_px2, baseline_px2)
     error_px = np.sqrt(rig.from_bands_px[band] ** 2 + sum(max(0.0, v) for v in variances_px2))
-    mapping = displaced(rig.mean[band], design @ solutions[0], rig.size_px)
+    mapping = rig.mapping(band, solutions[0])
     return Prediction(mapping, "bands" if rig.factors else "flight", MovingFilePx(error_px))
 
 
@@ -169,7 +167,7 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
     That is the leave-one-out error of the estimator for learned captures with similar gaps, or the difference between
     the captures used if that is larger.
     """
-    design, results = band_design(rig, band), []
+    design, results = rig.design(band), []
     for estimator in get_args(Estimator)[: 3 if len(rig.captures) >= _MIN_CAPTURES_FOR_ALTITUDE else 2]:
         estimate, tests = estimated_factors(known, rig.captures, estimator), _leave_one_out(rig, band, estimator)
         if estimate is not None and tests:
@@ -182,13 +180,12 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
     variance_px2, factors = min(results, key=itemgetter(0), default=(0.0, np.zeros(FACTORS)))
     altitude_px = _altitude_error_px(rig, known.altitude_m) * float(np.linalg.norm(rig.baselines[band]))
     error_px = MovingFilePx(np.sqrt(variance_px2 + rig.from_bands_px[band] ** 2 + altitude_px**2))
-    mapping = displaced(rig.mean[band], design @ factors, rig.size_px)
-    return Prediction(mapping, "neighbours" if (design @ factors).any() else "flight", error_px)
+    return Prediction(rig.mapping(band, factors), "neighbours" if (design @ factors).any() else "flight", error_px)
 
 
 def _leave_one_out(rig: Rig, band: str, estimator: Estimator) -> list[tuple[float, float]]:
     """Return (gap, squared error of the band, px^2) of estimates of each learned capture from the others, sorted."""
-    design, result = band_design(rig, band), []
+    design, result = rig.design(band), []
     for i, capture in enumerate(rig.captures):
         estimate = estimated_factors(capture, [*rig.captures[:i], *rig.captures[i + 1 :]], estimator)
         if estimate is not None:

@@ -57,11 +57,10 @@ _SKY_NAME = re.compile(r"(?:^|[-_. ])sky(?:$|[-_. ])", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class SkyCapture:
-    """A capture of the sky."""
+    """A capture of the sky, and the reasons to classify it so, in words."""
 
     capture: Capture
     cues: tuple[str, ...]
-    """The reasons to classify it so, in words."""
 
 
 def sky_cues(capture: Capture) -> tuple[str, ...]:
@@ -75,23 +74,18 @@ def sky_cues(capture: Capture) -> tuple[str, ...]:
         cues.append(f"its tags point the camera {capture.elevation_deg:.0f} degrees above the horizon")
     if any(_SKY_NAME.search(part) for part in (*capture.folder.parts, capture.name)):
         cues.append("its folder or name contains 'sky'")
-    if cues and _is_without_texture(capture):
+    # The sky has little signal in thermal bands.
+    bands = [b for b in capture.bands if not is_thermal(b) and not b.companion]
+    if cues and bands and all(map(_is_smooth, bands)):
         cues.append("no band has texture")
     return tuple(cues) if len(cues) >= _MIN_CUES else ()
 
 
 def sky_captures(captures: Iterable[Capture]) -> tuple[list[SkyCapture], list[Capture]]:
     """Separate captures into (captures of the sky, other captures), both in their order."""
-    sky: list[SkyCapture] = []
-    others: list[Capture] = []
     with without_warnings():
-        for capture in captures:
-            cues = sky_cues(capture)
-            if cues:
-                sky.append(SkyCapture(capture, cues))
-            else:
-                others.append(capture)
-    return sky, others
+        classified = [SkyCapture(capture, sky_cues(capture)) for capture in captures]
+    return [c for c in classified if c.cues], [c.capture for c in classified if not c.cues]
 
 
 def sky_radiance(band: Band) -> float | None:
@@ -108,12 +102,6 @@ def sky_radiance(band: Band) -> float | None:
     if valid.mean() < _MIN_UNSATURATED_SHARE:
         return None
     return float(np.median(calibrated(pixels, band.radiometry, 0, 0)[valid]))
-
-
-def _is_without_texture(capture: Capture) -> bool:
-    """Return True if all bands except thermal ones, in which the sky has little signal, have no texture."""
-    bands = [b for b in capture.bands if not is_thermal(b) and not b.companion]
-    return bool(bands) and all(_is_smooth(b) for b in bands)
 
 
 def _is_smooth(band: Band) -> bool:

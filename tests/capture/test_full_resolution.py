@@ -15,7 +15,7 @@ from agalign.capture.align import align_capture_bands
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.config import JointSettings, Settings
 from agalign.errors import UnreadableFileError
-from agalign.flight.factors import distance_px
+from agalign.flight.rig import distance_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Residual, Seed
 from agalign.values.capture import Capture

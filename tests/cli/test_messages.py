@@ -16,7 +16,7 @@ from agalign.cli.main import app
 from agalign.cli.run import print_problems
 from agalign.cli.terminal import Terminal, exits, shown
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
-from agalign.flight.overview import camera_overviews
+from agalign.flight.groups import camera_overviews
 from agalign.method.device import choose_device
 from agalign.synthetic import flight as synthetic
 

@@ -4,9 +4,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from agalign.flight.factors import distance_px
 from agalign.flight.learn_rig import learn_rig
-from agalign.flight.rig import Observation, Rig
+from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_file import rig_from_json, rig_to_json
 from agalign.flight.rig_prediction import extreme_mappings, predict_band, unobserved_error_px
 from agalign.products.sidecar import PredictionPart

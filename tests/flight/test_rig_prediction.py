@@ -6,8 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agalign.flight.factors import (
+from agalign.flight.rig import (
     FACTOR_STD_PX,
+    CaptureFactors,
+    Observation,
+    Rig,
     affine_difference,
     design_tensor,
     displaced,
@@ -16,9 +19,7 @@ from agalign.flight.factors import (
     mapping_weight,
     median_mapping,
 )
-from agalign.flight.rig import CaptureFactors, Observation, Rig
 from agalign.flight.rig_prediction import (
-    band_design,
     band_summaries,
     estimated_factors,
     extreme_mappings,
@@ -52,7 +53,7 @@ def some() -> Rig:
 
 def showing(rig: Rig, band: str, distance_px: float, std_px: float = 0.01) -> Observation:
     factors = np.array([distance_px, 0, 0, 0, 0])
-    mapping = displaced(rig.mean[band], band_design(rig, band) @ factors, SIZE)
+    mapping = displaced(rig.mean[band], rig.design(band) @ factors, SIZE)
     return Observation(None, {band: mapping}, {band: MovingFilePx(std_px)})
 
 
