@@ -34,7 +34,7 @@ def centres() -> np.ndarray:
 
 
 def shifts_at(at: np.ndarray, shifts_px: np.ndarray) -> Shifts:
-    """Shifts with equal weights and peak heights."""
+    """Shifts with equal weights."""
     return Shifts(at, shifts_px, np.ones(len(at)))
 
 
@@ -116,7 +116,7 @@ def test_smoothness_is_relative_to_the_number_of_captures(monkeypatch: pytest.Mo
     fits: list[tuple[int, float]] = []
 
     def recorded(shifts: Shifts, smoothness: float, *rest: object) -> DisplacementField:
-        fits.append((len(shifts) // len(centres()), smoothness))
+        fits.append((len(shifts.weights) // len(centres()), smoothness))
         return fitted_field(shifts, smoothness, *rest)
 
     monkeypatch.setattr(displacement_field, "fitted_field", recorded)
