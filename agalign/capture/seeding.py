@@ -80,12 +80,20 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
 
 
 def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual: Residual[FixedImagePx]) -> Seed:
-    """Return a match with a smaller residual than the best seed, or that seed."""
+    """Return a match with a smaller residual than the best seed, or that seed.
+
+    If the tags and the windows confirm the seed, a match also needs a higher correlation peak: equal plants in a square
+    grid match after a quarter turn too, with a smaller residual where there is parallax.
+    """
+    is_confirmed = pair.is_expected(best.fixed_to_moving) and seed_fits(residual)
     for mapping in _matches(pair, model, by_learned_descriptors=not best.trusted):
         for match, match_residual in _with_corrected(pair, mapping):
-            if seed_fits(match_residual) and match_residual.is_better_than(residual):
-                # The match has its own score: it is not shifted to the correlation peak.
-                best, residual = replace(_scored(pair, "match", match)[0], trusted=True), match_residual
+            if not seed_fits(match_residual) or not match_residual.is_better_than(residual):
+                continue
+            # The match has its own score: it is not shifted to the correlation peak.
+            scored = replace(_scored(pair, "match", match)[0], trusted=True)
+            if not is_confirmed or scored.score > best.score:
+                best, residual = scored, match_residual
         if best.kind == "match" and residual.p95_px <= _CLOSE_PX:
             break
     return best

@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
+from agalign.capture import seeding
 from agalign.capture.band_pair import Candidates
 from agalign.capture.seeding import best_seed, find_rotated, find_seed
 from agalign.capture.tag_seeds import geo_seed
@@ -18,7 +19,7 @@ from agalign.values.capture import Band, Georeference
 from agalign.values.choices import SeedKind
 from agalign.values.image import Raster
 
-from ..builders import pair_of, texture, two_views
+from ..builders import pair_of, residual_of, texture, two_views
 from ..conftest import mean_error_px
 
 SHIFTED = np.array([[1.01, 0.01, 31.0], [-0.01, 1.0, -18.0], [0, 0, 1.0]])
@@ -150,6 +151,23 @@ def test_the_user_s_seed_is_not_replaced_by_landmarks() -> None:
     seed = find_seed(pair_of(fixed, image, {"user": geometry.translation(5, 5)}, user=3.0), SeedSettings())
     assert seed.kind in ("user", "structure")
     assert mean_error_px(seed.fixed_to_moving, to_rotated, 400, 320) > 5
+
+
+@pytest.mark.parametrize("is_confirmed", [True, False])
+def test_a_match_with_a_lower_peak_does_not_replace_a_seed_that_the_tags_and_windows_confirm(
+    is_confirmed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a quarter turn of a square grid of equal plants."""
+    image = texture()
+    pair = pair_of(image, image, {"rig": np.eye(3)}, **({"rig": 5.0} if is_confirmed else {}))
+    turned = geometry.compose(geometry.translation(40.0, 310.0), np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
+    centres_px = np.argwhere(np.ones((6, 6))) * 60.0
+    small, large = (residual_of(centres_px, np.array([shift_px, 0.0])) for shift_px in (0.2, 0.4))
+    monkeypatch.setattr(seeding, "_matches", lambda *_, **__: iter([turned]))
+    monkeypatch.setattr(seeding, "_residual_of", lambda *_: small)
+    seed = Seed("structure", np.eye(3), 33.0, 33.0, 25.0)
+    chosen = seeding._best_match(pair, None, seed, large)
+    assert (chosen is seed) == is_confirmed
 
 
 def test_an_inaccurate_match_is_corrected_by_windows(monkeypatch: pytest.MonkeyPatch) -> None:
