@@ -178,10 +178,7 @@ def initial_network(bands: Sequence[str], settings: Settings, start: FlightModel
 
 
 def choose_and_refine(
-    bands: tuple[str, ...],
-    settings: Settings,
-    start: FlightModel | None,
-    captures: Sequence[Capture],
+    bands: tuple[str, ...], settings: Settings, start: FlightModel | None, captures: Sequence[Capture]
 ) -> LearningCapture | None:
     """Choose the best of some captures to learn from, and refine it by the initial network.
 

@@ -109,9 +109,12 @@ def _with_metrics(
 
 @one_thread()
 def align_pairs(
-    pairs: Sequence[BandPair], settings: Settings, progress: PairProgress, model: FlightModel | None = None,
+    pairs: Sequence[BandPair],
+    settings: Settings,
+    progress: PairProgress,
+    model: FlightModel | None = None,
     capture: Capture | None = None,
-) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
+) -> dict[str, Alignment[FixedImagePx]]:
     """Align the pairs of one `capture`; return the alignments by name, px of the images.
 
     Pairs that the flight's network cannot align are learned from scratch, with a rig only those without an accurate
@@ -242,13 +245,7 @@ class PairAligner:
     def _verify(self, starts: Sequence[Start], results: Results) -> None:
         self.refined |= refined_pairs(starts, results)
         self.result |= verify_together(
-            starts,
-            results,
-            self.model,
-            self.settings,
-            self.progress,
-            self.timer,
-            is_observation=self.is_observation,
+            starts, results, self.model, self.settings, self.progress, self.timer, is_observation=self.is_observation
         )
 
 
@@ -271,9 +268,15 @@ def _quiet(band: str, stage: str, share: float) -> None:
 
 
 def verify_together(
-    starts: Sequence[Start], results: Results, model: FlightModel | None, settings: Settings,
-    progress: PairProgress = _quiet, timer: _Timer | None = None, *, is_observation: bool = False,
-) -> dict[str, Alignment[FixedImagePx]]:  # fmt: skip
+    starts: Sequence[Start],
+    results: Results,
+    model: FlightModel | None,
+    settings: Settings,
+    progress: PairProgress = _quiet,
+    timer: _Timer | None = None,
+    *,
+    is_observation: bool = False,
+) -> dict[str, Alignment[FixedImagePx]]:
     """Combine the results of a capture by MAP estimation and verify each one; return the alignments by name.
 
     For an observation of the rig, no displacement fields are fitted. A model family that the user chose is not replaced
@@ -338,9 +341,12 @@ def _results(
 
 
 def _map_estimates(
-    starts: Sequence[Start], results: Results, residuals: Mapping[str, Residual[FixedImagePx]],
-    model: FlightModel | None, settings: Settings,
-) -> list[JointResult[FixedImagePx] | Issue]:  # fmt: skip
+    starts: Sequence[Start],
+    results: Results,
+    residuals: Mapping[str, Residual[FixedImagePx]],
+    model: FlightModel | None,
+    settings: Settings,
+) -> list[JointResult[FixedImagePx] | Issue]:
     """Return the results after the MAP estimation of all bands of the capture."""
     if not _may_be_homography(settings):
         return list(results)  # the estimate is a homography, not of the family that the user chose

@@ -87,9 +87,13 @@ class BandPair:
 
     @classmethod
     def of_images(
-        cls, name: str, fixed: Raster, moving: Raster, candidates: Candidates,
+        cls,
+        name: str,
+        fixed: Raster,
+        moving: Raster,
+        candidates: Candidates,
         candidate_std_px: Mapping[SeedKind, FixedImagePx] | None = None,
-    ) -> "BandPair":  # fmt: skip
+    ) -> "BandPair":
         """Create a pair of two images that are not reduced."""
         return cls(name, Reference(fixed), moving, candidates, candidate_std_px=candidate_std_px or {})
 
@@ -249,9 +253,14 @@ def _candidates(reference: Band, moving: Band, settings: SeedSettings, model: Fl
 
 
 def _pair(
-    band: Band, reference: Reference, longest: int, bands: Sequence[Band], moving: Raster, candidates: Candidates,
+    band: Band,
+    reference: Reference,
+    longest: int,
+    bands: Sequence[Band],
+    moving: Raster,
+    candidates: Candidates,
     model: FlightModel | None,
-) -> BandPair:  # fmt: skip
+) -> BandPair:
     """Create the pair of `reference`, the image of `band` reduced to `longest` px, and the image of `bands`."""
     name = bands[0].name
     is_coarse = longest < min(_LONGEST_SIDE_PX, max(band.size_px))

@@ -60,9 +60,11 @@ def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[Fi
         return None
     max_step_px = min(_MAX_STEP_PX, pair.max_shift_px)
     fitted = fit_in_rounds(
-        pair.mapping(alignment.fixed_to_moving), lambda mapping: _half(WarpedPair.of(pair, mapping), is_black=True),
-        pair.fixed.size_px, lambda fit: fit.max_px <= max_step_px,
-    )  # fmt: skip
+        pair.mapping(alignment.fixed_to_moving),
+        lambda mapping: _half(WarpedPair.of(pair, mapping), is_black=True),
+        pair.fixed.size_px,
+        lambda fit: fit.max_px <= max_step_px,
+    )
     if fitted is None:
         return None
     mapping, fit = fitted
@@ -109,24 +111,31 @@ def without_extrapolated(
 
 
 def _predicted(
-    pair: BandPair, alignment: Alignment[FixedImagePx], start: PixelMapping,
+    pair: BandPair,
+    alignment: Alignment[FixedImagePx],
+    start: PixelMapping,
     is_accepted: Callable[[WindowFit], bool] = lambda _: True,
-) -> Alignment[FixedImagePx] | None:  # fmt: skip
+) -> Alignment[FixedImagePx] | None:
     """Return the alignment as `predicted` by a homography and lens shapes, which replace the field of `start`."""
     size_px, to_file = pair.fixed.size_px, pair.scales.fixed.inverse
     fitted = fit_in_rounds(
-        replace(start, local=None), lambda mapping: _measured(pair, mapping), size_px, is_accepted,
+        replace(start, local=None),
+        lambda mapping: _measured(pair, mapping),
+        size_px,
+        is_accepted,
         lens_std_px(size_px, calibrated=pair.space == "undistorted"),
-    )  # fmt: skip
+    )
     if fitted is None:
         return None
     mapping, fit = fitted
     matrix, to_file_px = mapping.fixed_to_moving, np.r_[np.tile(to_file, 4), np.full(4, to_file.mean)]
     std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, size_px, pair.moving.size_px)))
     prediction = Prediction(
-        pair.scales.between_files(matrix), "windows", pair.in_moving_file_px(std_px, matrix),
+        pair.scales.between_files(matrix),
+        "windows",
+        pair.in_moving_file_px(std_px, matrix),
         covariance_px2=fit.covariance_px2 * np.outer(to_file_px, to_file_px),
-    )  # fmt: skip
+    )
     residual = WarpedPair.of(pair, mapping).residual
     return replace(alignment, mapping=mapping, status="predicted", residual=residual, prediction=prediction)
 

@@ -75,9 +75,11 @@ def _refined(
     None if the median shift of that half does not decrease or a check finds an issue. Raises UnreadableFileError.
     """
     fitted = fit_in_rounds(
-        alignment.mapping, lambda mapping: _residual(moving, mapping, for_fit), size_px,
+        alignment.mapping,
+        lambda mapping: _residual(moving, mapping, for_fit),
+        size_px,
         lambda fit: fit.max_px <= _MAX_STEP_PX,
-    )  # fmt: skip
+    )
     if fitted is None or alignment.joint is None:
         return None
     mapping, fit = fitted

@@ -170,20 +170,28 @@ def image_groups(
     return [
         (
             indices,
-            _image_group([pairs[i] for i in indices], [seeds[i] for i in indices],
-                         [sides[i] for i in indices] if sides else range(1, len(indices) + 1)),
+            _image_group(
+                [pairs[i] for i in indices],
+                [seeds[i] for i in indices],
+                [sides[i] for i in indices] if sides else range(1, len(indices) + 1),
+            ),
         )
         for indices in groups.values()
-    ]  # fmt: skip
+    ]
 
 
 def _image_group(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> ImageGroup:
     mappings = [s.fixed_to_moving for s in seeds]
     fields = [p.field for p in pairs]
     return ImageGroup(
-        pairs[0].fixed, [p.moving for p in pairs], mappings, sides, [s.trusted for s in seeds],
-        [p.max_shift_px for p in pairs], fields=fields if any(f is not None for f in fields) else (),
-    )  # fmt: skip
+        pairs[0].fixed,
+        [p.moving for p in pairs],
+        mappings,
+        sides,
+        [s.trusted for s in seeds],
+        [p.max_shift_px for p in pairs],
+        fields=fields if any(f is not None for f in fields) else (),
+    )
 
 
 def best_seed(pair: BandPair, candidates: Candidates, force: SeedKind | None = None) -> Seed:

@@ -22,8 +22,10 @@ def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> di
     If the settings force a kind that tags provide, only this kind is returned, or nothing if the tags lack it.
     """
     sources: tuple[tuple[SeedKind, Callable[[Band, Band], Matrix | None]], ...] = (
-        ("rig", rig_seed), ("centre", other_rig_seed), ("geo", geo_seed),
-    )  # fmt: skip
+        ("rig", rig_seed),
+        ("centre", other_rig_seed),
+        ("geo", geo_seed),
+    )
     candidates: dict[SeedKind, Matrix] = {}
     for kind, source in sources:
         with suppress(GeometryError):  # invalid values in the tags

@@ -154,9 +154,15 @@ def verified(
     if local is not None:
         candidates = {"homography": local.before_p95_px, "field": local.after_p95_px}
     alignment = Alignment(
-        warped_pair.mapping, pair.fixed.size_px, status, issues, seed, joint, warped_pair.residual,
+        warped_pair.mapping,
+        pair.fixed.size_px,
+        status,
+        issues,
+        seed,
+        joint,
+        warped_pair.residual,
         candidates=candidates,
-    )  # fmt: skip
+    )
     return predicted_by_windows(alignment, pair) if issues and is_displaced else alignment
 
 

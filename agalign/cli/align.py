@@ -117,10 +117,7 @@ def _demo(
 
 _DEVICE = {"help": "auto, cpu, cuda, cuda:1 …"}
 demo = Command(
-    _demo,
-    {"Running": "jobs device rng_seed quiet verbose log_json"},
-    {"device": _DEVICE},
-    on_interrupt=INTERRUPTED,
+    _demo, {"Running": "jobs device rng_seed quiet verbose log_json"}, {"device": _DEVICE}, on_interrupt=INTERRUPTED
 )
 
 

@@ -177,10 +177,7 @@ def _indices(
 
 indices = Command(
     _indices,
-    {
-        "Output": "index formula target mask_qa",
-        "Running": "jobs dask overwrite as_json quiet verbose log_json",
-    },
+    {"Output": "index formula target mask_qa", "Running": "jobs dask overwrite as_json quiet verbose log_json"},
     {"overwrite": {"help": "Compute again what an earlier command wrote."}},
     on_interrupt="interrupted; written indices are kept, and the same command resumes the run",
     epilog=examples(

@@ -128,12 +128,7 @@ def design_tensor(factors: Sequence[Factor]) -> Array:
 
 
 def least_squares(
-    design: Array,
-    target: Array,
-    weights: Array,
-    prior: tuple[Array, Array] = _FACTOR_PRIOR,
-    *,
-    robust: bool = True,
+    design: Array, target: Array, weights: Array, prior: tuple[Array, Array] = _FACTOR_PRIOR, *, robust: bool = True
 ) -> tuple[Array, Array]:
     """Solve n linear problems with Gaussian priors; return the parameters (n, p) and their covariances (n, p, p).
 

@@ -28,9 +28,13 @@ _NODES = 33
 
 
 def inverse_range(
-    mappings: Sequence[PixelMapping], at_infinity: Sequence[Matrix], directions_m: Array, reference_lens: Lens,
-    points_px: Points, parallax_px: Array,
-) -> Array:  # fmt: skip
+    mappings: Sequence[PixelMapping],
+    at_infinity: Sequence[Matrix],
+    directions_m: Array,
+    reference_lens: Lens,
+    points_px: Points,
+    parallax_px: Array,
+) -> Array:
     """Return 1 / Z (height, width), per metre, at raw pixels (height, width, 2) of the reference with a parallax.
 
     `mappings` are the complete mappings of the bands and `at_infinity` their fixed_to_moving at infinite range,

@@ -129,13 +129,7 @@ def write_tiff(
     moment, density = exposure.moment, rational(_pixels_per_mm(pixels))
     add_directories(
         path,
-        {
-            271: text(camera.maker),
-            272: text(camera.model),
-            306: text(moment),
-            700: byte_string(xmp.encode()),
-            **first,
-        },
+        {271: text(camera.maker), 272: text(camera.model), 306: text(moment), 700: byte_string(xmp.encode()), **first},
         {
             0x9003: text(moment),
             0x920A: rational(band.focal_length_mm),

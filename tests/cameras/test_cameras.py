@@ -182,9 +182,13 @@ def test_panels_as_firmware_writes_them(values: dict[str, str], albedo: float | 
 @pytest.mark.parametrize(
     "values",
     [
-        {}, {"CalibrationPicture": "0"}, {"CalibrationPicture": "0", "ReflectArea": "40,10,20,10,20,30,40,30"},
-        {"ReflectArea": "0,0,0,0,0,0,0,0"}, {"ReflectArea": "40,10,20,10,20,30,4000,30"}, {"Albedo": "0.5"},
+        {},
+        {"CalibrationPicture": "0"},
+        {"CalibrationPicture": "0", "ReflectArea": "40,10,20,10,20,30,40,30"},
+        {"ReflectArea": "0,0,0,0,0,0,0,0"},
+        {"ReflectArea": "40,10,20,10,20,30,4000,30"},
+        {"Albedo": "0.5"},
     ],
-)  # fmt: skip
+)
 def test_other_captures_are_no_panels(values: dict[str, str]) -> None:
     assert panel_in(Tags(xmp={(NAMESPACE, k): (v,) for k, v in values.items()}), (64, 48)) is None

@@ -23,10 +23,14 @@ DJI = "dji.com/drone-dji"
 def mavic_tags(matrix: str | None = None, **more: str) -> Tags:
     """A band's file of a Mavic 3, with the values of one real unit's red band and no distortion."""
     xmp = {
-        "RelativeOpticalCenterX": "11.32", "RelativeOpticalCenterY": "3.06", "CalibratedOpticalCenterX": "1296",
-        "CalibratedOpticalCenterY": "972", "DewarpData": "2022-09-08;2170,2170,0,0,0,0,0,0,0",
-        "DewarpHMatrix": "1.7162,0,415.7048,0,1.7162,309.8536,0,0,1", **more,
-    }  # fmt: skip
+        "RelativeOpticalCenterX": "11.32",
+        "RelativeOpticalCenterY": "3.06",
+        "CalibratedOpticalCenterX": "1296",
+        "CalibratedOpticalCenterY": "972",
+        "DewarpData": "2022-09-08;2170,2170,0,0,0,0,0,0,0",
+        "DewarpHMatrix": "1.7162,0,415.7048,0,1.7162,309.8536,0,0,1",
+        **more,
+    }
     if matrix is not None:
         xmp["CalibratedHMatrix"] = matrix
     return Tags(make="DJI", model="M3M", xmp={(DJI, k): (v,) for k, v in xmp.items()})
@@ -77,9 +81,14 @@ def test_the_mavic_s_colour_photograph_goes_through_the_designed_frame(tmp_path:
 @pytest.mark.parametrize(("roll", "yaw"), [("0.00", "30"), ("+180.00", "-150")])
 def test_a_mavic_s_gimbal_is_turned_either_way(roll: str, yaw: str) -> None:
     tags = mavic_tags(
-        GimbalRollDegree=roll, GimbalYawDegree=yaw, GimbalPitchDegree="-90", FlightXSpeed="8.66", FlightYSpeed="5",
-        RelativeAltitude="20", CalibratedFocalLength="2170",
-    )  # fmt: skip
+        GimbalRollDegree=roll,
+        GimbalYawDegree=yaw,
+        GimbalPitchDegree="-90",
+        FlightXSpeed="8.66",
+        FlightYSpeed="5",
+        RelativeAltitude="20",
+        CalibratedFocalLength="2170",
+    )
     assert Dji().motion(tags) == pytest.approx((0.0, 0.5), abs=1e-3)
     pose = Dji().pose(tags)
     assert (pose.heading_deg % 360, pose.pitch_deg, pose.height_m) == (pytest.approx(30), 0, 20)

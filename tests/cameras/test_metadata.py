@@ -53,10 +53,15 @@ def test_the_same_name_in_another_namespace_is_another_tag() -> None:
 @pytest.mark.parametrize(
     "bad",
     [
-        b"", b"\0\0\0", b"<x:xmpmeta", enveloped("<rdf:Description>"), b"not xml at all",
-        enveloped('<rdf:Description Camera:BandName=""/>'), "<x:xmpmeta></x:xmpmeta>",
+        b"",
+        b"\0\0\0",
+        b"<x:xmpmeta",
+        enveloped("<rdf:Description>"),
+        b"not xml at all",
+        enveloped('<rdf:Description Camera:BandName=""/>'),
+        "<x:xmpmeta></x:xmpmeta>",
     ],
-)  # fmt: skip
+)
 def test_malformed_or_empty_xmp_is_no_xmp(bad: bytes) -> None:
     assert Packet.parse(bad).values() == {}
 
@@ -67,8 +72,7 @@ def test_an_xml_bomb_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "expected"),
-    [(0.25, 0.25), (3, 3.0), ((1, 4), None), (None, None), ("x", None), (float("inf"), None)],
+    ("value", "expected"), [(0.25, 0.25), (3, 3.0), ((1, 4), None), (None, None), ("x", None), (float("inf"), None)]
 )
 def test_a_finite_number(value: object, expected: float | None) -> None:
     assert finite(value) == expected
@@ -122,8 +126,10 @@ def test_taking_anothers_values(dialect: str, theirs: str) -> None:
     result = Packet.parse(mine.serialised()).values()
     values = {k: ",".join(v).replace(" ", "") for k, v in result.items() if k[0] == NAMESPACE}
     assert values == {
-        (NAMESPACE, "PrincipalPoint"): "9,8", (NAMESPACE, "RigRelatives"): "1,2,3", (NAMESPACE, "BandName"): "Red",
-    }  # fmt: skip
+        (NAMESPACE, "PrincipalPoint"): "9,8",
+        (NAMESPACE, "RigRelatives"): "1,2,3",
+        (NAMESPACE, "BandName"): "Red",
+    }
 
 
 def test_taking_from_one_that_has_none_removes() -> None:

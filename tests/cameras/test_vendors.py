@@ -24,9 +24,11 @@ from agalign.values.capture import Band, Capture
 
 DJI, MICASENSE, SENTERA = "dji.com/drone-dji", "micasense.com/MicaSense", "sentera.com"
 URIS = {
-    "Camera": "http://pix4d.com/camera/1.0/", "MicaSense": "http://micasense.com/MicaSense/1.0/",
-    "drone-dji": "http://www.dji.com/drone-dji/1.0/", "Sentera": "https://www.sentera.com/schemas/",
-}  # fmt: skip
+    "Camera": "http://pix4d.com/camera/1.0/",
+    "MicaSense": "http://micasense.com/MicaSense/1.0/",
+    "drone-dji": "http://www.dji.com/drone-dji/1.0/",
+    "Sentera": "https://www.sentera.com/schemas/",
+}
 PREFIXES = {NAMESPACE: "Camera", MICASENSE: "MicaSense", DJI: "drone-dji", SENTERA: "Sentera"}
 SIZE = 160, 120
 
@@ -47,10 +49,12 @@ class Vendor:
 
 def pinhole(k: int) -> Values:
     return {
-        (NAMESPACE, "PrincipalPoint"): (f"{2.4 + 0.01 * k}", "1.8"), (NAMESPACE, "PerspectiveFocalLength"): ("5.45",),
-        (NAMESPACE, "PerspectiveFocalLengthUnits"): ("mm",), (NAMESPACE, "RigRelatives"): (f"{0.1 * k}", "0", "0.05"),
+        (NAMESPACE, "PrincipalPoint"): (f"{2.4 + 0.01 * k}", "1.8"),
+        (NAMESPACE, "PerspectiveFocalLength"): ("5.45",),
+        (NAMESPACE, "PerspectiveFocalLengthUnits"): ("mm",),
+        (NAMESPACE, "RigRelatives"): (f"{0.1 * k}", "0", "0.05"),
         (NAMESPACE, "PerspectiveDistortion"): ("-0.1", "0.1", "0", "0", "0"),
-    }  # fmt: skip
+    }
 
 
 MICASENSE_BANDS = {"Blue": 475, "Green": 560, "Red": 668, "NIR": 840, "Red edge": 717}
@@ -59,40 +63,89 @@ SEQUOIA_BANDS = {"GRE": ("Green", 550), "RED": ("Red", 660), "REG": ("Red edge",
 MAVIC_BANDS = {"G": ("Green", 560), "R": ("Red", 650), "RE": ("RedEdge", 730), "NIR": ("NIR", 860)}
 
 VENDORS = {
-    "RedEdge": Vendor("MicaSense", "RedEdge-M", {
-        f"IMG_0007_{k}.tif": (band, nm, {(MICASENSE, "CaptureId"): ("abc",), **pinhole(k)})
-        for k, (band, nm) in enumerate(MICASENSE_BANDS.items(), start=1)
-    }, frozenset(f"band_{k}" for k in range(1, 6))),
-    "Phantom 4": Vendor("DJI", "FC6360", {
-        f"DJI_001{k}.TIF": (band, nm, {
-            (DJI, "CaptureUUID"): ("abc",), (DJI, "RelativeOpticalCenterX"): (f"+{k}.5",),
-            (DJI, "RelativeOpticalCenterY"): (f"-{k}.25",),
-        }) for k, (band, nm) in enumerate(DJI_BANDS.items(), start=1)
-    }, frozenset(DJI_BANDS)),
-    "Mavic 3": Vendor("DJI", "M3M", {
-        f"DJI_20230607112233_0001_MS_{k}.TIF": (band, nm, {
-            (DJI, "CaptureUUID"): ("abc",), (DJI, "CalibratedOpticalCenterX"): ("80",),
-            (DJI, "CalibratedOpticalCenterY"): ("60",),
-            (DJI, "CalibratedHMatrix"): (f"1,0,{n}.5,0,1,-2,0,0,1",),
-            (DJI, "DewarpData"): ("2022-09-08;170,170,1.5,-2.5,-0.1,0.05,0,0,0",),
-        }) for n, (k, (band, nm)) in enumerate(MAVIC_BANDS.items())
-    }, frozenset(band for band, _ in MAVIC_BANDS.values())),
-    "Sequoia": Vendor("Parrot", "Sequoia", {
-        f"IMG_180413_080658_0000_{k}.TIF": (band, nm, {
-            (NAMESPACE, "CaptureUUID"): ("abc",), (NAMESPACE, "ModelType"): ("fisheye",),
-            (NAMESPACE, "PrincipalPoint"): ("0.3", "0.22"),
-            (NAMESPACE, "FisheyeAffineMatrix"): ("207", "0", "0", "207"),
-            (NAMESPACE, "FisheyePolynomial"): ("0", "1", "0.0096", "-0.1455"),
-            (NAMESPACE, "RigRelatives"): ("-0.17", f"{0.1 * len(band)}", "0"),
-        }) for k, (band, nm) in SEQUOIA_BANDS.items()
-    }, frozenset(band for band, _ in SEQUOIA_BANDS.values()), orientation=3),
-    "6X": Vendor("Sentera", "6X", {
-        f"{k}-{band}-{nm}-30/IMG_00012_{nm}_30.tif": (band, nm, {
-            (NAMESPACE, "CaptureUUID"): ("abc",),
-            (SENTERA, "AlignMatrix"): ("1", "0.001", f"{k}", "-0.001", "1", "5", "0", "0", "1"),
-        }) for k, (band, nm) in enumerate({"Blue": 475, "Green": 550, "Red": 670, "RedEdge": 715, "NIR": 840}.items())
-    }, frozenset({"Blue", "Green", "Red", "RedEdge", "NIR"})),
-}  # fmt: skip
+    "RedEdge": Vendor(
+        "MicaSense",
+        "RedEdge-M",
+        {
+            f"IMG_0007_{k}.tif": (band, nm, {(MICASENSE, "CaptureId"): ("abc",), **pinhole(k)})
+            for k, (band, nm) in enumerate(MICASENSE_BANDS.items(), start=1)
+        },
+        frozenset(f"band_{k}" for k in range(1, 6)),
+    ),
+    "Phantom 4": Vendor(
+        "DJI",
+        "FC6360",
+        {
+            f"DJI_001{k}.TIF": (
+                band,
+                nm,
+                {
+                    (DJI, "CaptureUUID"): ("abc",),
+                    (DJI, "RelativeOpticalCenterX"): (f"+{k}.5",),
+                    (DJI, "RelativeOpticalCenterY"): (f"-{k}.25",),
+                },
+            )
+            for k, (band, nm) in enumerate(DJI_BANDS.items(), start=1)
+        },
+        frozenset(DJI_BANDS),
+    ),
+    "Mavic 3": Vendor(
+        "DJI",
+        "M3M",
+        {
+            f"DJI_20230607112233_0001_MS_{k}.TIF": (
+                band,
+                nm,
+                {
+                    (DJI, "CaptureUUID"): ("abc",),
+                    (DJI, "CalibratedOpticalCenterX"): ("80",),
+                    (DJI, "CalibratedOpticalCenterY"): ("60",),
+                    (DJI, "CalibratedHMatrix"): (f"1,0,{n}.5,0,1,-2,0,0,1",),
+                    (DJI, "DewarpData"): ("2022-09-08;170,170,1.5,-2.5,-0.1,0.05,0,0,0",),
+                },
+            )
+            for n, (k, (band, nm)) in enumerate(MAVIC_BANDS.items())
+        },
+        frozenset(band for band, _ in MAVIC_BANDS.values()),
+    ),
+    "Sequoia": Vendor(
+        "Parrot",
+        "Sequoia",
+        {
+            f"IMG_180413_080658_0000_{k}.TIF": (
+                band,
+                nm,
+                {
+                    (NAMESPACE, "CaptureUUID"): ("abc",),
+                    (NAMESPACE, "ModelType"): ("fisheye",),
+                    (NAMESPACE, "PrincipalPoint"): ("0.3", "0.22"),
+                    (NAMESPACE, "FisheyeAffineMatrix"): ("207", "0", "0", "207"),
+                    (NAMESPACE, "FisheyePolynomial"): ("0", "1", "0.0096", "-0.1455"),
+                    (NAMESPACE, "RigRelatives"): ("-0.17", f"{0.1 * len(band)}", "0"),
+                },
+            )
+            for k, (band, nm) in SEQUOIA_BANDS.items()
+        },
+        frozenset(band for band, _ in SEQUOIA_BANDS.values()),
+        orientation=3,
+    ),
+    "6X": Vendor(
+        "Sentera",
+        "6X",
+        {
+            f"{k}-{band}-{nm}-30/IMG_00012_{nm}_30.tif": (
+                band,
+                nm,
+                {
+                    (NAMESPACE, "CaptureUUID"): ("abc",),
+                    (SENTERA, "AlignMatrix"): ("1", "0.001", f"{k}", "-0.001", "1", "5", "0", "0", "1"),
+                },
+            )
+            for k, (band, nm) in enumerate({"Blue": 475, "Green": 550, "Red": 670, "RedEdge": 715, "NIR": 840}.items())
+        },
+        frozenset({"Blue", "Green", "Red", "RedEdge", "NIR"}),
+    ),
+}
 
 
 def packet(values: Values, dialect: str) -> bytes:

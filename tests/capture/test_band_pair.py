@@ -56,8 +56,7 @@ def test_without_one_lens_neither_is_corrected(flight: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ratio", "longest"),
-    [(1.0, 2700), (2.0, 2700), (0.5, 2700), (0.25, 640), (0.0775, 198), (0.01, 128), (0.0, 2700)],
+    ("ratio", "longest"), [(1.0, 2700), (2.0, 2700), (0.5, 2700), (0.25, 640), (0.0775, 198), (0.01, 128), (0.0, 2700)]
 )
 def test_the_reference_is_reduced_for_a_coarse_band(ratio: float, longest: int) -> None:
     band = Band("Green", Path("x.tif"), 1, 1280, 960, "uint16")

@@ -166,9 +166,13 @@ def test_range_is_right_to_two_percent(boxes: Rendered, aligned: Mapping[str, Al
     infinite = [geometry.invert(to_plane(REFERENCE, b, boxes.size_px)) for b in MOVING]
     towards_m = np.subtract(REFERENCE.baseline_m, [b.baseline_m for b in MOVING])
     inverse_m = inverse_range(
-        [aligned[b.name].mapping for b in MOVING], infinite, towards_m, REFERENCE.lens(*boxes.size_px),
-        boxes.pixels, parallax.relief(boxes.pixels),
-    )  # fmt: skip
+        [aligned[b.name].mapping for b in MOVING],
+        infinite,
+        towards_m,
+        REFERENCE.lens(*boxes.size_px),
+        boxes.pixels,
+        parallax.relief(boxes.pixels),
+    )
     ratio = 1 / inverse_m / boxes.truth.range_m
     assert np.median(np.abs(ratio - 1)) < 0.02
     # Positive parallax is nearer: the range decreases with the parallax.

@@ -27,8 +27,12 @@ def test_hpatches_layout(tmp_path: Path) -> None:
     result = find_pairs(tmp_path)
     assert len(result) == 10
     assert [p.group for p in result if p.name.startswith("i_sun")] == [
-        "illumination, easy", "illumination, easy", "illumination, hard", "illumination, hard", "illumination, tough",
-    ]  # fmt: skip
+        "illumination, easy",
+        "illumination, easy",
+        "illumination, hard",
+        "illumination, hard",
+        "illumination, tough",
+    ]
     assert result[-1].name == "v_wall 1-6"
     assert result[-1].moving.name == "6.ppm"
     np.testing.assert_allclose(result[0].fixed_to_moving, H)

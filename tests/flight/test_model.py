@@ -26,9 +26,18 @@ FIELD = DisplacementField(48.0, np.arange(24.0).reshape(3, 4, 2) / 100)
 
 SEED = Seed("structure", geometry.translation(1 / 3, 0.1), 20.0, 18.0, 2.5, trusted=True)
 RESULT = JointResult[FixedImagePx](
-    geometry.translation(1 / 7, -0.3), math.nan, 0.9, 0.004, 0, (1.0,), "flight", "homography", 0.01,
-    ((0.1, 0.2), (0.1, 0.2), (0.3, 0.2), (0.1, 1 / 3)), np.eye(8) / 3,
-)  # fmt: skip
+    geometry.translation(1 / 7, -0.3),
+    math.nan,
+    0.9,
+    0.004,
+    0,
+    (1.0,),
+    "flight",
+    "homography",
+    0.01,
+    ((0.1, 0.2), (0.1, 0.2), (0.3, 0.2), (0.1, 1 / 3)),
+    np.eye(8) / 3,
+)
 SIZES_PX = ((640, 480), (320, 240))
 REFINED = {
     "key": {"Red": RefinedPair(SEED, RESULT, SIZES_PX)},

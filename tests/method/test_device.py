@@ -81,8 +81,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> GPU:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("recipe", "has_float64"),
-    [("fast", False), in_full_run("fast", True), in_full_run("paper", False)],
+    ("recipe", "has_float64"), [("fast", False), in_full_run("fast", True), in_full_run("paper", False)]
 )
 def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64: bool) -> None:
     fixed, moving = (view.pixels for view in two_views(geometry.translation(6.0, -4.0), 260, 200))

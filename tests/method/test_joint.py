@@ -91,8 +91,7 @@ def test_one_network_for_two_bands_and_an_unrelated_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sharing", "left"),
-    [("pseudo-siamese", 0.35), in_full_run("siamese", 0.35), in_full_run("unshared", 0.9)],
+    ("sharing", "left"), [("pseudo-siamese", 0.35), in_full_run("siamese", 0.35), in_full_run("unshared", 0.9)]
 )
 def test_paper_recipe_reduces_the_error(sharing: str, left: float) -> None:
     # Unshared networks learn most slowly, as the paper expects; three epochs are few.

@@ -128,11 +128,18 @@ def test_thermal_bands_are_not_converted() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"gain": 1e300}, {"gain": -1.0}, {"gain": math.nan}, {"full_scale": 0.0}, {"black_level": math.inf},
-        {"by_sun": (-5.0, "reflectance")}, {"vignetting": (10.0,)}, {"vignetting": (1e300,)},
-        {"vignetting_centre_px": (math.nan, 0.0)}, {"row_gradient": -0.01},
+        {"gain": 1e300},
+        {"gain": -1.0},
+        {"gain": math.nan},
+        {"full_scale": 0.0},
+        {"black_level": math.inf},
+        {"by_sun": (-5.0, "reflectance")},
+        {"vignetting": (10.0,)},
+        {"vignetting": (1e300,)},
+        {"vignetting_centre_px": (math.nan, 0.0)},
+        {"row_gradient": -0.01},
     ],
-)  # fmt: skip
+)
 def test_implausible_calibrations_are_rejected(change: dict[str, object]) -> None:
     good = Radiometry("radiance", 4800.0, 65536.0, 0.02, (640.0, 480.0), (1e-5, -2e-7))
     assert is_physical(good, (1280, 960))

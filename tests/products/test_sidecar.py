@@ -17,11 +17,7 @@ from agalign.config import Settings
 from agalign.errors import InputError, OutputError, SidecarError
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.sidecar import (
-    GridPart,
-    ProductPart,
-    Sidecar,
-)
+from agalign.products.sidecar import GridPart, ProductPart, Sidecar
 from agalign.products.sidecar_file import (
     content_checksum,
     find_sidecars,
