@@ -101,7 +101,7 @@ class Schedule:
     learning_rate: float = LEARNING_RATE
     max_steps: int = 150
     """Per capture."""
-    enough_retrieval: float = 0.6
+    enough_retrieval: float = 0.5
     """Held-out retrieval above which learning stops once psi has converged."""
 
 
