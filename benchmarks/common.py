@@ -1,19 +1,19 @@
-"""Shared by the benchmarks: options, tables, runs of the command line, and errors at ground truth."""
+"""Shared by the benchmarks: arguments, tables, runs of the command line, and errors at ground truth."""
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
@@ -23,22 +23,21 @@ WRONG_PX = 1.0
 """A band that is called aligned with a larger error is wrong."""
 Ties = dict[str, dict[str, Any]]
 """Entries of ties.json or truth.json by the name of the moving file, each with `ties` (n, 4), raw px."""
+Number = Annotated[int, typer.Argument()]
+"""A positional argument of a script, with a default."""
 
 
-def parser(description: str | None) -> argparse.ArgumentParser:
-    """Return a parser with the docstring of a script as its help."""
-    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+def run(main: Callable[..., None]) -> None:
+    """Call the function of a script with the arguments of its command line; the script's docstring is its help.
 
-
-def parsed(description: str | None, *paths: str, **options: int | float | bool | None) -> argparse.Namespace:
-    """Parse the command line: `paths` are positional, `options` have defaults of their type; None is a path."""
-    result = parser(description)
-    for name in paths:
-        result.add_argument(name, type=Path)
-    for name, default in options.items():
-        kind = {"action": "store_true"} if default is False else {"type": Path if default is None else type(default)}
-        result.add_argument("--" + name.replace("_", "-"), default=default, **kind)
-    return result.parse_args()
+    Unknown options go to a last argument that takes a list.
+    """
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    paragraphs = sys.modules["__main__"].__doc__.split("\n\n")
+    # After \b a paragraph keeps its lines.
+    text = "\n\n".join(f"\b\n{paragraph}" for paragraph in paragraphs)
+    app.command(help=text, context_settings={"ignore_unknown_options": True})(main)
+    app()
 
 
 # ---- tables

@@ -8,12 +8,11 @@ good: a rig's usual offset, blurred, noisy, partly saturated, shifted by 5 % of 
 without a seed, as in lattices.py: aligned is wrong where it is a period away. Truth comes from the generator.
 """
 
-import sys
 import time
 
 import cv2
 import numpy as np
-from common import WRONG_PX, print_head, print_row
+from common import WRONG_PX, Number, print_head, print_row, run
 from lattices import pair as lattice
 
 import agalign
@@ -96,7 +95,7 @@ GRID = "planted grid"
 GOOD = ("as it comes", "blurred", "noisy", "partly saturated", "5 % off")
 
 
-def main(count: int = 200, first: int = 0) -> None:
+def main(count: Number = 200, first: Number = 0) -> None:
     tally: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in (*BAD, *GOOD, GRID)}
     for number in range(first, first + count):
         kind = tuple(tally)[number % len(tally)]
@@ -130,4 +129,4 @@ def lens_free_error(result: np.ndarray, truth: np.ndarray, size: tuple[int, int]
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    run(main)

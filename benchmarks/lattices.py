@@ -7,12 +7,11 @@ contrast that reverses between the two images, each with noise of its own. Seeds
 a period and known to that; and bad, off by one to three periods and not known to anything.
 """
 
-import sys
 import time
 
 import cv2
 import numpy as np
-from common import WRONG_PX, print_head, print_row
+from common import WRONG_PX, Number, print_head, print_row, run
 
 import agalign
 from agalign.values import geometry
@@ -49,7 +48,7 @@ def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     return images[0], images[1], geometry.translation(*shift), period
 
 
-def main(count: int = 60, first: int = 0) -> None:
+def main(count: Number = 60, first: Number = 0) -> None:
     table: dict[str, list[tuple[str, float, float]]] = {"none": [], "good": [], "bad": []}
     for number in range(first, first + count):
         rng = np.random.default_rng(number)
@@ -75,4 +74,4 @@ def main(count: int = 60, first: int = 0) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    run(main)

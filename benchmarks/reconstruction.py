@@ -16,7 +16,7 @@ from statistics import median
 import cv2
 import numpy as np
 import pycolmap
-from common import parsed, print_head, print_row
+from common import print_head, print_row, run
 from numpy.typing import NDArray
 
 from agalign.cameras import known_cameras
@@ -145,13 +145,12 @@ def print_together(title: str, photos: Photos, camera: Pinhole, reference: str) 
         print_row(band, len(own), *(f"{median(v):.2f}, {max(v):.2f}" for v in zip(*own, strict=True)))
 
 
-def main() -> None:
+def main(flight: Path, out: Path) -> None:
     """Print all tables."""
-    asked = parsed(__doc__, "flight", "out")
     pycolmap.logging.minloglevel = 2
     with without_warnings():
-        photos, camera, reference = aligned_photos(asked.out)
-        originals, their_camera = original_photos(asked.flight, {capture for capture, _ in photos})
+        photos, camera, reference = aligned_photos(out)
+        originals, their_camera = original_photos(flight, {capture for capture, _ in photos})
     print()
     print_head("aligned band by itself", "photos with a pose", "points", "reprojection error, px")
     for band in dict.fromkeys(band for _, band in photos):
@@ -162,4 +161,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)
