@@ -17,6 +17,7 @@ import typer
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
+import agalign
 from agalign.products.sidecar_file import find_sidecars
 
 WRONG_PX = 1.0
@@ -87,6 +88,33 @@ def pyplot() -> Any:
     from matplotlib import pyplot as plt
 
     return plt
+
+
+# ---- decisions on pairs of images
+
+
+Pair = tuple[NDArray[Any], NDArray[Any], dict[str, Any], Callable[[NDArray[np.float64]], float]]
+"""Two images, options of `agalign.align`, and the error of a homography in px; nan if they show different scenes."""
+
+
+def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Generator], Pair], numbers: range) -> None:
+    """Align a pair for each number, of the kinds in turn, and print a table of the results."""
+    rows: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in kinds}
+    for number in numbers:
+        kind = kinds[number % len(kinds)]
+        fixed, moving, options, error_px = pair_of(kind, np.random.default_rng(number))
+        began = time.perf_counter()
+        result = agalign.align(fixed, moving, **options)
+        rows[kind].append((result.status, error_px(result.fixed_to_moving), time.perf_counter() - began))
+        print("{:4d} {:28s} {:9s} {:7.2f} px {:5.1f} s".format(number, kind, *rows[kind][-1]), result.reason or "")
+    statuses = "aligned", "seed_only", "failed"
+    print_head("kind", "pairs", *statuses, "wrongly aligned", "worst error, px", "seconds")
+    for kind, some in ((kind, some) for kind, some in rows.items() if some):
+        errors = [error for status, error, _ in some if status == "aligned"]
+        wrong = sum(not error <= WRONG_PX for error in errors)
+        counts = [sum(status == one for status, *_ in some) for one in statuses]
+        seconds = np.median([row[2] for row in some])
+        print_row(kind, len(some), *counts, wrong, f"{max(errors, default=np.nan):.2f}", f"{seconds:.1f}")
 
 
 # ---- runs of the command line
