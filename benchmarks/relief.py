@@ -4,9 +4,9 @@
     python benchmarks/relief.py --fooled N
 
 Each scene is one capture of a synthetic RedEdge in a folder of its own, aligned by the command line with its defaults.
-The other methods start from `--relief never`: elastix's B-splines (`pip install 'agalign[bench]'`) and OpenCV's dense
-flows. Residuals are the distance to the true position of each written pixel that a band shows. `--fooled` counts bands
-that are called `aligned` though more than a tenth of what they show is more than 1 px off, or they show another scene.
+The other methods, OpenCV's dense flows, start from `--relief never`. Residuals are the distance to the true position of
+each written pixel that a band shows. `--fooled` counts bands that are called `aligned` though more than a tenth of what
+they show is more than 1 px off, or they show another scene.
 """
 
 import sys
@@ -21,7 +21,7 @@ import numpy as np
 import tifffile
 import typer
 from common import WRONG_PX, align, flight_and_out, print_head, print_row, run
-from peers import Dense, by_dense, dense_methods
+from peers import DENSE_METHODS, Dense, by_dense
 from relief_score import Map, Score, mapping_of, occlusion_scores, range_errors, read_sidecar, residuals
 from synthetic_flights.depth import Scene, Truth, write_capture
 from synthetic_flights.relief import FOOLING, GEOMETRIES, fooling, make_scene
@@ -75,7 +75,7 @@ def dense_scores(
 
 def of_scene(scene: Scene, blank: Score, size_px: tuple[int, int], methods: Sequence[str]) -> Iterator[Score]:
     """Yield the scores of all methods on one scene."""
-    dense = {name: method for name, method in dense_methods().items() if name in methods}
+    dense = {name: method for name, method in DENSE_METHODS.items() if name in methods}
     with flight_and_out() as (flight, out):
         truth = write_capture(flight, scene, size_px=size_px, rng_seed=blank.scene)
         for method in (m for m in _OPTIONS if m in methods or (m == START and dense)):
@@ -125,7 +125,7 @@ def main(
     first: Annotated[int, typer.Option(help="number of the first scene")] = 0,
 ) -> None:
     width_px, height_px = map(int, size.split("x"))
-    every = (*_OPTIONS, *dense_methods())
+    every = (*_OPTIONS, *DENSE_METHODS)
     chosen = methods.split(";") if methods else every[:1] if fooled else every
     if fooled:
         chosen_scenes = [(*fooling(number), number) for number in range(first, first + fooled)]
