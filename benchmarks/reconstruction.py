@@ -2,8 +2,8 @@
 
 python benchmarks/reconstruction.py FLIGHT OUT
 
-OUT is the output of `agalign FLIGHT -o OUT --layout bands`. In the reconstruction from all bands, the bands of a capture
-have one pose where they are aligned. The original images, which a rig of several cameras took, are the control.
+OUT is the output of `agalign FLIGHT -o OUT --layout bands`. In the reconstruction from all bands, the bands of a
+capture have one pose where they are aligned. The original images, which a rig of several cameras took, are the control.
 `pip install "pycolmap>=4"`; it is no dependency of agalign.
 """
 
