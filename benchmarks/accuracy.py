@@ -6,18 +6,19 @@ A folder takes part where it holds `ties.json`:
 {capture: {"reference": file, "bands": {file: {"ties": [[x_ref, y_ref, x_mov, y_mov], ...]}}}}, raw pixels of the files.
 """
 
-import sys
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from common import align, band_errors, flight_and_out, print_head, print_row, read_ties
+import typer
+from common import align, band_errors, flight_and_out, print_head, print_row, read_ties, run
 
 
-def main() -> None:
+def main(data: Path, options: Annotated[list[str] | None, typer.Argument()] = None) -> None:
     print_head("set", "aligned", "median, px", "worst pair, px", "95 %, px", "seconds a pair, median", "worst")
-    for path in sorted(Path(sys.argv[1]).rglob("ties.json")):
+    for path in sorted(data.rglob("ties.json")):
         with flight_and_out() as (_, out):
-            align(path.parent, out, *sys.argv[2:])
+            align(path.parent, out, *(options or ()))
             bands = band_errors(out, read_ties(path))
         good = [b for b in bands if b.status == "aligned"]
         name, aligned = path.parent.name, f"{len(good)} of {len(bands)}"
@@ -30,4 +31,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

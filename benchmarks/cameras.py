@@ -5,11 +5,12 @@ python benchmarks/cameras.py [CAPTURES] [CAMERA ...]
 Cameras are rendered with half of their pixels along each side, but the Altum, with its small thermal band, with all.
 """
 
-import sys
 import time
+from typing import Annotated
 
 import numpy as np
-from common import band_errors, flight_and_out, print_head, print_row, read_ties
+import typer
+from common import Number, band_errors, flight_and_out, print_head, print_row, read_ties, run
 from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.troubles import make_two_headings
 
@@ -24,9 +25,9 @@ CAMERAS = {
 }
 
 
-def main(captures: int, names: list[str]) -> None:
+def main(captures: Number = 8, names: Annotated[list[str] | None, typer.Argument()] = None) -> None:
     print_head("camera", "band", "aligned", "predicted", "other", "median, px", "worst capture, px", "in its own px")
-    for name in names:
+    for name in names or CAMERAS:
         camera, size_px = CAMERAS[name]
         with flight_and_out() as (flight, out):
             truth = make_two_headings(flight, captures, size_px, camera=camera, line=captures // 2, lakes=False)
@@ -49,4 +50,4 @@ def main(captures: int, names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 8, sys.argv[2:] or list(CAMERAS))
+    run(main)

@@ -1,44 +1,44 @@
-"""Shared by the benchmarks: options, tables, runs of the command line, and errors at ground truth."""
+"""Shared by the benchmarks: arguments, tables, runs of the command line, and errors at ground truth."""
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
+import agalign
 from agalign.products.sidecar_file import find_sidecars
 
 WRONG_PX = 1.0
 """A band that is called aligned with a larger error is wrong."""
 Ties = dict[str, dict[str, Any]]
 """Entries of ties.json or truth.json by the name of the moving file, each with `ties` (n, 4), raw px."""
+Number = Annotated[int, typer.Argument()]
+"""A positional argument of a script, with a default."""
 
 
-def parser(description: str | None) -> argparse.ArgumentParser:
-    """Return a parser with the docstring of a script as its help."""
-    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+def run(main: Callable[..., None]) -> None:
+    """Call the function of a script with the arguments of its command line; the script's docstring is its help.
 
-
-def parsed(description: str | None, *paths: str, **options: int | float | bool | None) -> argparse.Namespace:
-    """Parse the command line: `paths` are positional, `options` have defaults of their type; None is a path."""
-    result = parser(description)
-    for name in paths:
-        result.add_argument(name, type=Path)
-    for name, default in options.items():
-        kind = {"action": "store_true"} if default is False else {"type": Path if default is None else type(default)}
-        result.add_argument("--" + name.replace("_", "-"), default=default, **kind)
-    return result.parse_args()
+    Unknown options go to a last argument that takes a list.
+    """
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    paragraphs = sys.modules["__main__"].__doc__.split("\n\n")
+    # After \b a paragraph keeps its lines.
+    text = "\n\n".join(f"\b\n{paragraph}" for paragraph in paragraphs)
+    app.command(help=text, context_settings={"ignore_unknown_options": True})(main)
+    app()
 
 
 # ---- tables
@@ -88,6 +88,33 @@ def pyplot() -> Any:
     from matplotlib import pyplot as plt
 
     return plt
+
+
+# ---- decisions on pairs of images
+
+
+Pair = tuple[NDArray[Any], NDArray[Any], dict[str, Any], Callable[[NDArray[np.float64]], float]]
+"""Two images, options of `agalign.align`, and the error of a homography in px; nan if they show different scenes."""
+
+
+def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Generator], Pair], numbers: range) -> None:
+    """Align a pair for each number, of the kinds in turn, and print a table of the results."""
+    rows: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in kinds}
+    for number in numbers:
+        kind = kinds[number % len(kinds)]
+        fixed, moving, options, error_px = pair_of(kind, np.random.default_rng(number))
+        began = time.perf_counter()
+        result = agalign.align(fixed, moving, **options)
+        rows[kind].append((result.status, error_px(result.fixed_to_moving), time.perf_counter() - began))
+        print("{:4d} {:28s} {:9s} {:7.2f} px {:5.1f} s".format(number, kind, *rows[kind][-1]), result.reason or "")
+    statuses = "aligned", "seed_only", "failed"
+    print_head("kind", "pairs", *statuses, "wrongly aligned", "worst error, px", "seconds")
+    for kind, some in ((kind, some) for kind, some in rows.items() if some):
+        errors = [error for status, error, _ in some if status == "aligned"]
+        wrong = sum(not error <= WRONG_PX for error in errors)
+        counts = [sum(status == one for status, *_ in some) for one in statuses]
+        seconds = np.median([row[2] for row in some])
+        print_row(kind, len(some), *counts, wrong, f"{max(errors, default=np.nan):.2f}", f"{seconds:.1f}")
 
 
 # ---- runs of the command line

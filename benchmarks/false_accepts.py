@@ -8,15 +8,11 @@ good: a rig's usual offset, blurred, noisy, partly saturated, shifted by 5 % of 
 without a seed, as in lattices.py: aligned is wrong where it is a period away. Truth comes from the generator.
 """
 
-import sys
-import time
-
 import cv2
 import numpy as np
-from common import WRONG_PX, print_head, print_row
+from common import Number, Pair, print_decisions, run
 from lattices import pair as lattice
 
-import agalign
 from agalign.synthetic.cameras import BANDS, REFERENCE
 from agalign.synthetic.flight import render
 from agalign.synthetic.ground import Ground, paint_ground, reflectance
@@ -96,38 +92,24 @@ GRID = "planted grid"
 GOOD = ("as it comes", "blurred", "noisy", "partly saturated", "5 % off")
 
 
-def main(count: int = 200, first: int = 0) -> None:
-    tally: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in (*BAD, *GOOD, GRID)}
-    for number in range(first, first + count):
-        kind = tuple(tally)[number % len(tally)]
-        fixed, moving, seed, truth = pair(kind, np.random.default_rng(number))
-        began = time.perf_counter()
-        result = agalign.align(fixed, moving, seed=seed)
-        seconds = time.perf_counter() - began
-        # Lens distortion changes the truth by a few pixels, which a homography only partly models.
-        error = np.nan if truth is None else lens_free_error(result.fixed_to_moving, truth, fixed.shape[::-1])
-        tally[kind].append((result.status, error, seconds))
-        print(f"{number:4d} {kind:28s} {result.status:9s} {error:7.2f} {seconds:5.1f} s", flush=True)
-    statuses = "aligned", "seed_only", "failed"
-    print_head("kind", "pairs", *statuses, "wrongly aligned", "rejected", "worst error, px", "seconds")
-    for kind in (*GOOD, GRID, *BAD):
-        rows = tally[kind]
-        if not rows:
-            continue
-        counts = [sum(r[0] == s for r in rows) for s in statuses]
-        errors = [r[1] for r in rows if r[0] == "aligned"]
-        wrong = counts[0] if kind in BAD else sum(e > WRONG_PX for e in errors)
-        rejected = len(rows) - counts[0] if kind in GOOD else "-"
-        worst = "-" if kind in BAD or not errors else f"{max(errors):.2f}"
-        print_row(kind, len(rows), *counts, wrong, rejected, worst, f"{np.median([r[2] for r in rows]):.1f}")
-
-
-def lens_free_error(result: np.ndarray, truth: np.ndarray, size: tuple[int, int]) -> float:
-    """Return the mean distance, px, between two homographies in the centre of the image, where distortion is small."""
+def pair_with_error(kind: str, rng: np.random.Generator) -> Pair:
+    fixed, moving, seed, truth = pair(kind, rng)
+    size = fixed.shape[::-1]
     points = geometry.lattice(*size, 20, 20)
+    # In the centre lens distortion is small, which a homography only partly models.
     middle = points[(np.abs(points - np.divide(size, 2)) < np.multiply(size, 0.3)).all(axis=1)]
-    return float(np.linalg.norm(geometry.apply(result, middle) - geometry.apply(truth, middle), axis=1).mean())
+
+    def error_px(matrix: np.ndarray) -> float:
+        if truth is None:
+            return np.nan
+        return float(np.linalg.norm(geometry.apply(matrix, middle) - geometry.apply(truth, middle), axis=1).mean())
+
+    return fixed, moving, {"seed": seed}, error_px
+
+
+def main(count: Number = 200, first: Number = 0) -> None:
+    print_decisions((*BAD, *GOOD, GRID), pair_with_error, range(first, first + count))
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    run(main)

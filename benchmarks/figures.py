@@ -5,14 +5,15 @@
 Writes matches.jpg, aligned.jpg and loss-surface.png to FOLDER, by default docs/figures.
 """
 
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
-from common import read_ties
+import typer
+from common import read_ties, run
 from numpy.typing import NDArray
 
 import agalign
@@ -84,7 +85,7 @@ def before_and_after(folder: Path) -> NDArray[np.uint8]:
     return cv2.imread(str(next((folder / "aligned").rglob("IMG_*.png"))))
 
 
-def main(out: Path) -> None:
+def main(out: Annotated[Path, typer.Argument()] = Path("docs/figures")) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         fixed, moving, truth = straight_pair(folder)
@@ -98,4 +99,4 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/figures"))
+    run(main)

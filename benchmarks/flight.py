@@ -10,13 +10,18 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from common import command, print_head, print_row, watched
+import typer
+from common import command, print_head, print_row, run, watched
+
+Numbers = Annotated[str, typer.Argument()]
+"""Separated by commas."""
 
 
-def main(lengths: list[int], jobs: list[int]) -> None:
-    lengths = sorted(lengths)
+def main(of_captures: Numbers = "10,30,100", of_jobs: Numbers = "1,2") -> None:
+    lengths, jobs = (sorted(map(int, numbers.split(","))) for numbers in (of_captures, of_jobs))
     seconds: dict[int, list[float]] = {count: [] for count in jobs}
     print_head("captures", "jobs", "seconds", "largest process, GB", "all, 2nd and last quarter, GB", "open files")
     with tempfile.TemporaryDirectory() as folder:
@@ -31,12 +36,12 @@ def main(lengths: list[int], jobs: list[int]) -> None:
                 if int(path.stem.split("_")[1]) <= length:
                     (part / path.name).symlink_to(path)
             for count in jobs:
-                run = watched(command(part, Path(folder) / f"out{length}-{count}", "--jobs", str(count)))
-                seconds[count].append(run.seconds)
-                quarters = [np.median(np.array_split(run.samples, 4)[k], axis=0) for k in (1, 3)]
+                process = watched(command(part, Path(folder) / f"out{length}-{count}", "--jobs", str(count)))
+                seconds[count].append(process.seconds)
+                quarters = [np.median(np.array_split(process.samples, 4)[k], axis=0) for k in (1, 3)]
                 memory_gb = " / ".join(f"{q[1] / 1000:.2f}" for q in quarters)
                 files = " / ".join(f"{q[3]:.0f}" for q in quarters)
-                print_row(length, count, f"{run.seconds:.1f}", f"{run.largest_gb:.2f}", memory_gb, files)
+                print_row(length, count, f"{process.seconds:.1f}", f"{process.largest_gb:.2f}", memory_gb, files)
     lines = {count: np.polyfit(lengths, seconds[count], 1) for count in jobs}
     for count, (slope, offset) in lines.items():
         print(f"jobs {count}: {offset:.1f} s + {slope:.2f} s a capture")
@@ -46,6 +51,4 @@ def main(lengths: list[int], jobs: list[int]) -> None:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:] + ["10,30,100", "1,2"][len(sys.argv) - 1 :]
-    lengths_and_jobs = ([int(n) for n in one.split(",")] for one in given)
-    main(*lengths_and_jobs)
+    run(main)

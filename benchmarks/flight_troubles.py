@@ -6,12 +6,23 @@ The synthetic flights are aligned with the defaults. Errors are medians over a b
 standard error in the sidecar; the time per capture is compared with that of a flight of the same length without faults.
 """
 
-import sys
 from collections import Counter
 from functools import partial
 
 import numpy as np
-from common import WRONG_PX, BandError, Ties, align, band_errors, flight_and_out, print_head, print_row, read_ties
+from common import (
+    WRONG_PX,
+    BandError,
+    Number,
+    Ties,
+    align,
+    band_errors,
+    flight_and_out,
+    print_head,
+    print_row,
+    read_ties,
+    run,
+)
 from synthetic_flights.troubles import make_troubled_flight, make_two_headings
 
 from agalign.synthetic import make_flight
@@ -40,7 +51,7 @@ def report(bands: list[BandError], truth: Ties) -> None:
         print(f"  {where}: {b.status}, {b.median_px:.2f} px, standard error {b.std_px:.2f}")
 
 
-def main(captures: int = 60, rng_seed: int = 0) -> None:
+def main(captures: Number = 60, rng_seed: Number = 0) -> None:
     seconds = {}
     for name, make in {
         "untroubled": partial(make_flight, captures=captures),
@@ -57,4 +68,4 @@ def main(captures: int = 60, rng_seed: int = 0) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    run(main)

@@ -7,14 +7,10 @@ contrast that reverses between the two images, each with noise of its own. Seeds
 a period and known to that; and bad, off by one to three periods and not known to anything.
 """
 
-import sys
-import time
-
 import cv2
 import numpy as np
-from common import WRONG_PX, print_head, print_row
+from common import Number, Pair, print_decisions, run
 
-import agalign
 from agalign.values import geometry
 
 SIZE = 480, 360
@@ -49,30 +45,18 @@ def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     return images[0], images[1], geometry.translation(*shift), period
 
 
-def main(count: int = 60, first: int = 0) -> None:
-    table: dict[str, list[tuple[str, float, float]]] = {"none": [], "good": [], "bad": []}
-    for number in range(first, first + count):
-        rng = np.random.default_rng(number)
-        fixed, moving, truth, period = pair(rng)
-        kind = tuple(table)[number % len(table)]
-        angle = rng.uniform(0, 2 * np.pi)
-        off = {"none": 0.0, "good": 0.25 * rng.uniform() * period, "bad": period * rng.integers(1, 4)}[kind]
-        start = geometry.compose(truth, geometry.translation(off * np.cos(angle), off * np.sin(angle)))
-        seed, std_px = None if kind == "none" else start, period / 6 if kind == "good" else None
-        began = time.perf_counter()
-        result = agalign.align(fixed, moving, seed=seed, seed_std_px=std_px)
-        error = geometry.corner_error_px(result.fixed_to_moving, truth, *SIZE)
-        table[kind].append((result.status, error, time.perf_counter() - began))
-        print(f"{number} {kind:5} period {period:5.1f}", end="  ")
-        print(f"{result.status:9} {error:7.2f} px  {result.reason or ''}", flush=True)
-    print()
-    print_head("seed", "pairs", "aligned", "rightly, to 1 px", "wrongly", "seconds")
-    for kind, rows in table.items():
-        aligned = [e for s, e, _ in rows if s == "aligned"]
-        right = sum(e < WRONG_PX for e in aligned)
-        seconds = np.median([t for _, _, t in rows]) if rows else 0.0
-        print_row(kind, len(rows), len(aligned), right, len(aligned) - right, f"{seconds:.1f}")
+def seeded_pair(kind: str, rng: np.random.Generator) -> Pair:
+    fixed, moving, truth, period = pair(rng)
+    angle = rng.uniform(0, 2 * np.pi)
+    off = {"none": 0.0, "good": 0.25 * rng.uniform() * period, "bad": period * rng.integers(1, 4)}[kind]
+    start = geometry.compose(truth, geometry.translation(off * np.cos(angle), off * np.sin(angle)))
+    options = {"seed": None if kind == "none" else start, "seed_std_px": period / 6 if kind == "good" else None}
+    return fixed, moving, options, lambda matrix: geometry.corner_error_px(matrix, truth, *SIZE)
+
+
+def main(count: Number = 60, first: Number = 0) -> None:
+    print_decisions(("none", "good", "bad"), seeded_pair, range(first, first + count))
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    run(main)

@@ -9,13 +9,12 @@ the standard error in the sidecar.
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import rasterio
-from common import BandError, align, band_errors, flight_and_out, print_head, print_row, read_ties
+from common import BandError, align, band_errors, flight_and_out, print_head, print_row, read_ties, run
 
 
 def spoil(path: Path, how: str, rng: np.random.Generator) -> None:
@@ -43,9 +42,9 @@ def run_without(flight: Path, lost: set[str], how: str, rng: np.random.Generator
         return band_errors(out, {name: entry for name, entry in truth.items() if name in lost})
 
 
-def main() -> None:
+def main(flights: list[Path]) -> None:
     rng, result = np.random.default_rng(0), dict[str, list[BandError]]()
-    for flight in map(Path, sys.argv[1:]):
+    for flight in flights:
         captures = list(json.loads((flight / "ties.json").read_text()).values())
         count = len(captures[0]["bands"])
         for turn in range(count):
@@ -67,4 +66,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

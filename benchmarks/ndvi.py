@@ -3,12 +3,11 @@
 python benchmarks/ndvi.py [CAPTURES]
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import rasterio
-from common import flight_and_out, print_head, print_row
+from common import Number, flight_and_out, print_head, print_row, run
 
 import agalign
 from agalign.batch.index_run import index_tasks, run_indices
@@ -27,7 +26,7 @@ SIZE_PX = (1280, 960)
 NDVI = INDICES["ndvi"]
 
 
-def main(captures: int = 3) -> None:
+def main(captures: Number = 3) -> None:
     errors: dict[str, list[np.ndarray]] = {"before": [], "after": []}
     bands = {b.name: b for b in cameras.BANDS}
     infrared_and_red, reference = (bands["NIR"], bands["Red"]), cameras.BANDS[cameras.REFERENCE]
@@ -62,4 +61,4 @@ def raw_reflectance(folder: Path, number: int, spec: rig.BandSpec) -> np.ndarray
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    run(main)

@@ -9,13 +9,14 @@ it. `agalign evaluate` and `agalign learn` do the same on any pairs.
 """
 
 import random
-import sys
 import tempfile
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+import typer
 from cases import image_pairs
-from common import print_head, print_row, pyplot
+from common import print_head, print_row, pyplot, run
 
 from agalign.capture.band_pair import BandPair
 from agalign.config import JointSettings, Settings
@@ -96,6 +97,15 @@ def automatic(pairs: list[PairFiles], _names: list[str]) -> None:
     print_table(precision_table(results))
 
 
+def main(
+    folder: Path,
+    experiment: Literal["precision", "robustness", "automatic"],
+    methods: Annotated[list[str] | None, typer.Argument()] = None,
+) -> None:
+    steps = {"precision": precision, "robustness": robustness, "automatic": automatic}
+    steps[experiment](image_pairs(folder), methods or [])
+
+
 def print_table(rows: list[list[str]]) -> None:
     print_head(*rows[0])
     for row in rows[1:]:
@@ -104,5 +114,4 @@ def print_table(rows: list[list[str]]) -> None:
 
 
 if __name__ == "__main__":
-    steps = {"precision": precision, "robustness": robustness, "automatic": automatic}
-    steps[sys.argv[2]](image_pairs(Path(sys.argv[1])), sys.argv[3:])
+    run(main)

@@ -10,7 +10,6 @@ import contextlib
 import importlib
 import importlib.util
 import io
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -210,9 +209,6 @@ _NEEDS = {"elastix affine": _ITK, "elastix, structure seed": _ITK, "XFeat": ("sc
 
 # ---- dense methods
 
-_GRID_PX = 32
-"""Spacing of elastix's control points."""
-
 _COARSEST_PX = 320
 """Width at which a flow starts. The start is off by some px only, and on smaller images of bands with different
 contrast the flows go astray by 10-40 px: at 80 px, OpenCV's default for 640, on a flat field in near infra-red.
@@ -257,26 +253,4 @@ def _structure_images(reference: Image, moving: Image, inside: Mask) -> list[NDA
     return [np.asarray(np.rint(255 * np.abs(field)), np.uint8) for field in fields]
 
 
-def elastix_b_splines(reference: Image, moving: Image, inside: Mask) -> NDArray[np.float64]:
-    """Elastix's B-spline registration by Mattes mutual information."""
-    itk = importlib.import_module("itk")
-    parameters = itk.ParameterObject.New()
-    chosen = parameters.GetDefaultParameterMap("bspline", 4, float(_GRID_PX))
-    chosen["Registration"], chosen["Metric"] = ["MultiResolutionRegistration"], ["AdvancedMattesMutualInformation"]
-    parameters.AddParameterMap(chosen)
-    images = [itk.GetImageFromArray(np.ascontiguousarray(i)) for i in (reference, moving)]
-    mask = itk.GetImageFromArray(inside.astype(np.uint8))
-    _, result = itk.elastix_registration_method(
-        *images, fixed_mask=mask, parameter_object=parameters, log_to_console=False
-    )
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # it leaves a file where it runs
-        field = itk.transformix_deformation_field(images[1], result)
-    return np.asarray(itk.GetArrayFromImage(field), np.float64)[..., :2]
-
-
-def dense_methods() -> dict[str, Dense]:
-    """Return the dense methods that are installed, by name."""
-    result: dict[str, Dense] = {"DIS flow on structure": dis, "Farneback on structure": farneback}
-    if importlib.util.find_spec("itk") is not None:
-        result["elastix B-spline"] = elastix_b_splines
-    return result
+DENSE_METHODS: dict[str, Dense] = {"DIS flow on structure": dis, "Farneback on structure": farneback}

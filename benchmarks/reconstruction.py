@@ -2,12 +2,11 @@
 
 python benchmarks/reconstruction.py FLIGHT OUT
 
-OUT is the output of `agalign FLIGHT -o OUT --layout bands`. Each band is reconstructed by itself, then all bands
-together: in the common reconstruction the bands of a capture have one pose where they are aligned. The original images,
-which a rig of several cameras took, are the control. `pip install "pycolmap>=4"`; it is no dependency of agalign.
+OUT is the output of `agalign FLIGHT -o OUT --layout bands`. In the reconstruction from all bands, the bands of a
+capture have one pose where they are aligned. The original images, which a rig of several cameras took, are the control.
+`pip install "pycolmap>=4"`; it is no dependency of agalign.
 """
 
-import math
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from statistics import median
 import cv2
 import numpy as np
 import pycolmap
-from common import parsed, print_head, print_row
+from common import print_head, print_row, run
 from numpy.typing import NDArray
 
 from agalign.cameras import known_cameras
@@ -99,37 +98,23 @@ def reconstruct(photos: Photos, camera: Pinhole) -> pycolmap.Reconstruction | No
     return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
 
 
-def poses(model: pycolmap.Reconstruction, camera: Pinhole, reference: str) -> dict[str, list[tuple[float, ...]]]:
+def shifts_px(model: pycolmap.Reconstruction, camera: Pinhole, reference: str) -> dict[str, list[float]]:
     """The poses of each band relative to the reference of its capture, where both are in the model: median distance of
-    the scene's points in the two images, which over flat ground may be 0 though rotation and offset are not; the angle
-    between the two, px at the centre of the image; and the distance of the two centres of projection, px of the ground.
+    the scene's points in the two images.
     """
     images = {tuple(i.name.removesuffix(".png").split("--")): i for i in model.images.values() if i.has_pose}
     focal_px = float(camera.matrix[0, 0])
-    result: dict[str, list[tuple[float, ...]]] = {}
+    result: dict[str, list[float]] = {}
     for (capture, band), image in sorted(images.items()):
         other = images.get((capture, reference))
         if band == reference or other is None:
             continue
-        one, two = image.cam_from_world(), other.cam_from_world()
-        turned = one.rotation.matrix() @ two.rotation.matrix().T
-        angle = math.acos(min(1.0, (float(np.trace(turned)) - 1) / 2))
+        poses = image.cam_from_world(), other.cam_from_world()
         points = np.array([model.points3D[p.point3D_id].xyz for p in other.points2D if p.has_point3D()])
-        seen, seen_by_other = (points @ m.rotation.matrix().T + m.translation for m in (one, two))
+        seen, seen_by_other = (points @ m.rotation.matrix().T + m.translation for m in poses)
         shifts = (seen[:, :2] / seen[:, 2:] - seen_by_other[:, :2] / seen_by_other[:, 2:]) * focal_px
-        distance = float(np.linalg.norm(image.projection_center() - other.projection_center()))
-        offset_px = distance / float(np.median(seen_by_other[:, 2])) * focal_px
-        shift_px = float(np.median(np.linalg.norm(shifts, axis=1)))
-        result.setdefault(band, []).append((shift_px, math.tan(angle) * focal_px, offset_px))
+        result.setdefault(band, []).append(float(np.median(np.linalg.norm(shifts, axis=1))))
     return result
-
-
-def summary(model: pycolmap.Reconstruction | None, photos: Photos) -> tuple[str, ...]:
-    """Photos with a pose, points, and the mean reprojection error."""
-    if model is None:
-        return f"0 of {len(photos)}", "-", "-"
-    error_px = f"{model.compute_mean_reprojection_error():.2f}"
-    return f"{model.num_reg_images()} of {len(photos)}", str(model.num_points3D()), error_px
 
 
 def print_together(title: str, photos: Photos, camera: Pinhole, reference: str) -> None:
@@ -138,28 +123,22 @@ def print_together(title: str, photos: Photos, camera: Pinhole, reference: str) 
     if model is None:
         print(f"\n{title}: no model; do at least three captures overlap?")
         return
-    print(f"\n{title}: {' | '.join(summary(model, photos))}\n")
-    shift = f"shift of the scene against {reference}, px"
-    print_head("band", "captures", shift, "rotation, px", "offset, px of the ground")
-    for band, own in sorted(poses(model, camera, reference).items()):
-        print_row(band, len(own), *(f"{median(v):.2f}, {max(v):.2f}" for v in zip(*own, strict=True)))
+    error_px = model.compute_mean_reprojection_error()
+    print(f"\n{title}: {model.num_reg_images()} of {len(photos)} photos, reprojection error {error_px:.2f} px\n")
+    print_head("band", "captures", f"shift of the scene against {reference}, px: median, maximum")
+    for band, own in sorted(shifts_px(model, camera, reference).items()):
+        print_row(band, len(own), f"{median(own):.2f}, {max(own):.2f}")
 
 
-def main() -> None:
+def main(flight: Path, out: Path) -> None:
     """Print all tables."""
-    asked = parsed(__doc__, "flight", "out")
     pycolmap.logging.minloglevel = 2
     with without_warnings():
-        photos, camera, reference = aligned_photos(asked.out)
-        originals, their_camera = original_photos(asked.flight, {capture for capture, _ in photos})
-    print()
-    print_head("aligned band by itself", "photos with a pose", "points", "reprojection error, px")
-    for band in dict.fromkeys(band for _, band in photos):
-        own = {key: pixels for key, pixels in photos.items() if key[1] == band}
-        print_row(band, *summary(reconstruct(own, camera), own))
+        photos, camera, reference = aligned_photos(out)
+        originals, their_camera = original_photos(flight, {capture for capture, _ in photos})
     print_together("All aligned bands", photos, camera, reference)
     print_together("All original bands", originals, their_camera, reference)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,28 +1,30 @@
 """Alignment of scenes with depth, against their exact geometry: terraces, plants and boxes from 1-2 m and from 20 m.
 
     python benchmarks/relief.py [--scenes N] [--kinds flat,boxes] [--ranges close,far] [--size 640x480] [--methods ...]
-    python benchmarks/relief.py --fooled [N]
+    python benchmarks/relief.py --fooled N
 
 Each scene is one capture of a synthetic RedEdge in a folder of its own, aligned by the command line with its defaults.
-The other methods start from `--relief never`: elastix's B-splines (`pip install 'agalign[bench]'`) and OpenCV's dense
-flows. Residuals are the distance to the true position of each written pixel that a band shows. `--fooled` counts bands
-that are called `aligned` though more than a tenth of what they show is more than 1 px off, or they show another scene.
+The other methods, OpenCV's dense flows, start from `--relief never`. Residuals are the distance to the true position of
+each written pixel that a band shows. `--fooled` counts bands that are called `aligned` though more than a tenth of what
+they show is more than 1 px off, or they show another scene.
 """
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import tifffile
-from common import WRONG_PX, align, flight_and_out, parser, print_head, print_row
-from peers import Dense, by_dense, dense_methods
+import typer
+from common import WRONG_PX, align, flight_and_out, print_head, print_row, run
+from peers import DENSE_METHODS, Dense, by_dense
 from relief_score import Map, Score, mapping_of, occlusion_scores, range_errors, read_sidecar, residuals
 from synthetic_flights.depth import Scene, Truth, write_capture
-from synthetic_flights.relief import FOOLING, GEOMETRIES, SCENES, fooling, fooling_scene, make_scene
+from synthetic_flights.relief import FOOLING, GEOMETRIES, fooling, make_scene
 
 DEFAULT, START = "agalign", "agalign, homography alone"
 _OPTIONS = {DEFAULT: ("--relief-map",), START: ("--relief", "never")}
@@ -73,7 +75,7 @@ def dense_scores(
 
 def of_scene(scene: Scene, blank: Score, size_px: tuple[int, int], methods: Sequence[str]) -> Iterator[Score]:
     """Yield the scores of all methods on one scene."""
-    dense = {name: method for name, method in dense_methods().items() if name in methods}
+    dense = {name: method for name, method in DENSE_METHODS.items() if name in methods}
     with flight_and_out() as (flight, out):
         truth = write_capture(flight, scene, size_px=size_px, rng_seed=blank.scene)
         for method in (m for m in _OPTIONS if m in methods or (m == START and dense)):
@@ -113,45 +115,32 @@ def print_table(scores: Sequence[Score]) -> None:
         print(f"  {s.place}, {s.band}, {s.method}: {off}")
 
 
-def parsed() -> argparse.Namespace:
-    options = parser(__doc__)
-    methods = (*_OPTIONS, *dense_methods())
-    options.add_argument("--scenes", type=int, default=2, help="of each kind and range")
-    options.add_argument("--kinds", default=",".join(GEOMETRIES))
-    options.add_argument("--ranges", default="close,far")
-    options.add_argument("--size", default="640x480")
-    options.add_argument("--methods", help=f"separated by ;: {'; '.join(methods)}; all, and the first for --fooled")
-    options.add_argument("--fooled", type=int, nargs="?", const=SCENES, help="count wrong bands on N fooling scenes")
-    options.add_argument("--first", type=int, default=0, help="number of the first scene")
-    result = options.parse_args()
-    result.size = tuple(int(n) for n in result.size.split("x"))
-    usual = methods if result.fooled is None else (DEFAULT,)
-    result.methods = usual if result.methods is None else tuple(m.strip() for m in result.methods.split(";"))
-    return result
-
-
-def scenes(options: argparse.Namespace) -> Iterator[tuple[Scene, Score]]:
-    """Yield (scene, empty score) of all scenes."""
-    width_px = options.size[0]
-    if options.fooled is not None:
-        for number in range(options.first, options.first + options.fooled):
-            yield fooling_scene(number, width_px), Score("", *fooling(number), number)
-        return
-    for kind in options.kinds.split(","):
-        for close in (place == "close" for place in options.ranges.split(",")):
-            for number in range(_FIRST_SEED + options.first, _FIRST_SEED + options.first + options.scenes):
-                yield make_scene(kind, number, close=close, width_px=width_px), Score("", kind, close, number)
-
-
-def main() -> None:
-    options, scores = parsed(), list[Score]()
-    for scene, blank in scenes(options):
-        result = list(of_scene(scene, blank, options.size, options.methods))
-        statuses = ", ".join(f"{s.band} {s.status} {s.p90_px:.2f}" for s in result if s.method == options.methods[0])
+def main(
+    scenes: int = 2,
+    kinds: str = ",".join(GEOMETRIES),
+    ranges: str = "close,far",
+    size: str = "640x480",
+    methods: Annotated[str, typer.Option(help="separated by ;, by default all, and the first for --fooled")] = "",
+    fooled: Annotated[int, typer.Option(help="count wrong bands on this number of fooling scenes")] = 0,
+    first: Annotated[int, typer.Option(help="number of the first scene")] = 0,
+) -> None:
+    width_px, height_px = map(int, size.split("x"))
+    every = (*_OPTIONS, *DENSE_METHODS)
+    chosen = methods.split(";") if methods else every[:1] if fooled else every
+    if fooled:
+        chosen_scenes = [(*fooling(number), number) for number in range(first, first + fooled)]
+    else:
+        numbers = range(_FIRST_SEED + first, _FIRST_SEED + first + scenes)
+        chosen_scenes = list(product(kinds.split(","), [place == "close" for place in ranges.split(",")], numbers))
+    scores: list[Score] = []
+    for kind, close, number in chosen_scenes:
+        scene, blank = make_scene(kind, number, close=close, width_px=width_px), Score("", kind, close, number)
+        result = list(of_scene(scene, blank, (width_px, height_px), chosen))
+        statuses = ", ".join(f"{s.band} {s.status} {s.p90_px:.2f}" for s in result if s.method == chosen[0])
         print(f"{blank.place}: {statuses}", file=sys.stderr, flush=True)
         scores += result
     print_table(scores)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -5,14 +5,15 @@
 The scene is rendered, and aligned by the command line twice; FOLDER keeps what was made for the next call.
 """
 
-import sys
 import tempfile
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
 import rasterio
-from common import align, pyplot
+import typer
+from common import align, pyplot, run
 from numpy.typing import NDArray
 from PIL import Image
 from relief_score import Sidecar, read_sidecar
@@ -30,17 +31,17 @@ _HIDDEN = 90
 """Grey of pixels that a band does not show."""
 
 
-def main() -> None:
+def main(figure: Path, folder: Annotated[Path | None, typer.Argument()] = None) -> None:
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(sys.argv[2] if len(sys.argv) > 2 else temporary)
+        folder = folder or Path(temporary)
         if not (folder / "flight").is_dir():
             scene = make_scene("boxes", SCENE, close=True, width_px=SIZE_PX[0])
             write_capture(folder / "flight", scene, size_px=SIZE_PX, rng_seed=SCENE)
-        aligned, flat = (run(folder, name, use) for name, use in (("aligned", "auto"), ("flat", "never")))
-        draw(aligned, flat, Path(sys.argv[1]))
+        aligned, flat = (aligned_by(folder, name, use) for name, use in (("aligned", "auto"), ("flat", "never")))
+        draw(aligned, flat, figure)
 
 
-def run(folder: Path, name: str, use: str) -> Sidecar:
+def aligned_by(folder: Path, name: str, use: str) -> Sidecar:
     """The sidecar of an alignment."""
     if not (folder / name).is_dir():
         align(folder / "flight", folder / name, "--relief", use)
@@ -100,4 +101,4 @@ def stretched(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -3,11 +3,10 @@
 python benchmarks/rig_figure.py MODEL.safetensors FIGURE.png
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
-from common import pyplot
+from common import pyplot, run
 
 from agalign.flight.model import load_model
 from agalign.method.device import choose_device
@@ -18,10 +17,10 @@ _TIMES = 800
 """Scale of the arrows of the displacement field."""
 
 
-def main() -> None:
-    model = load_model(Path(sys.argv[1]), lambda: choose_device("cpu"))
+def main(model_path: Path, figure_path: Path) -> None:
+    model = load_model(model_path, lambda: choose_device("cpu"))
     if model.rig is None:
-        sys.exit(f"{sys.argv[1]}: contains no rig")
+        raise SystemExit(f"{model_path}: contains no rig")
     rig, bands = model.rig, list(model.rig.mean)
     figure, axes = pyplot().subplots(1, 1 + len(bands), figsize=(3.1 * (1 + len(bands)), 3.2), layout="constrained")
     plan = axes[0]
@@ -49,8 +48,8 @@ def main() -> None:
         axis.quiver(*points.T, *(_TIMES * apart.T), length, **style)
         axis.set_title(f"{band}: up to {length.max():.2f} px")
     figure.suptitle(f"{len(rig.captures)} captures; arrows of the lens fields {_TIMES} times as long", fontsize=9)
-    figure.savefig(sys.argv[2], dpi=70)
+    figure.savefig(figure_path, dpi=70)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

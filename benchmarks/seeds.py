@@ -6,11 +6,10 @@ DATA holds captures below flights/ and captures/, some with reference ties in ti
 residual in windows of the two bands, where there is one.
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
-from common import Ties, print_head, print_row, read_ties
+from common import Ties, print_head, print_row, read_ties, run
 
 from agalign.cameras.discover import discover
 from agalign.capture.band_pair import BandPair, read_pairs
@@ -58,4 +57,4 @@ def main(data: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    run(main)

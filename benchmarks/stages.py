@@ -1,9 +1,9 @@
 """Time of the stages of a run, in seconds and relative to SIFT + RANSAC on the same images.
 
-    python benchmarks/stages.py FLIGHT [--peers]
+    python benchmarks/stages.py FLIGHT
 
-One process, one thread. The imports, a run, the same with the model that it learned, and the methods that others use
-are timed in turn, three times; the table has medians. "A capture" is one that no model was learned from or tested with,
+One process, one thread. SIFT, the imports, a run, and the same with the model that it learned are timed in turn, three
+times; the table has medians. "A capture" is one that no model was learned from or tested with,
 as most of a long flight; the fixed part is the time of the run minus that of as many such captures.
 """
 
@@ -20,13 +20,12 @@ from statistics import mean, median
 
 import cv2
 from bands.images import read
-from common import command, parsed, print_head, print_row
-from peers import UnavailableError, method_named, sift
+from common import command, print_head, print_row, run
+from peers import sift
 
 from agalign.cameras.discover import discover
 
 ROUNDS = 3
-PEERS = ("ECC on gradients", "elastix affine", "XFeat")
 IMPORTS = "import torch, cv2, rasterio, scipy"
 
 
@@ -63,23 +62,16 @@ def runs(flight: Path) -> list[tuple[float, str]]:
         return [first, timed(command(flight, again, "-j", "1", "--log-json", *with_model[:2]))]
 
 
-def main() -> None:
-    asked = parsed(__doc__, "flight", peers=False)
+def main(flight: Path) -> None:
     cv2.setNumThreads(1)
-    captures = discover(asked.flight).captures
+    captures = discover(flight).captures
     middle = captures[len(captures) // 2]  # the first may show the sky or a panel
     pair = read(middle.reference.path), read(middle.moving[0].path)
-    methods = {"SIFT + RANSAC": partial(sift, features=8000)}
-    for name in PEERS if asked.peers else ():
-        try:
-            methods[name] = method_named(name)
-        except UnavailableError as error:
-            print(f"{name}: {error}", file=sys.stderr)
     seconds: dict[str, list[float]] = {}
     for _ in range(ROUNDS):
-        values = {f"{name}, a pair": seconds_of(partial(align, *pair)) for name, align in methods.items()}
+        values = {"SIFT + RANSAC, a pair": seconds_of(partial(sift, *pair, features=8000))}
         values["imports of the libraries"] = timed([sys.executable, "-c", IMPORTS])[0]
-        (whole_s, _), (again_s, log) = runs(asked.flight)
+        (whole_s, _), (again_s, log) = runs(flight)
         every = captures_of(log)
         refined = [stages for stages in every.values() if "refining" in stages] or list(every.values())
         stages = {name: mean(one.get(name, 0.0) for one in refined) for name in {n for one in refined for n in one}}
@@ -90,7 +82,7 @@ def main() -> None:
         for name, value in values.items():
             seconds.setdefault(name, []).append(value)
     unit, imports = median(seconds["SIFT + RANSAC, a pair"]), median(seconds["imports of the libraries"])
-    print(f"{asked.flight.name}: {len(captures)} captures, {sum(len(c.moving) for c in captures)} pairs")
+    print(f"{flight.name}: {len(captures)} captures, {sum(len(c.moving) for c in captures)} pairs")
     print_head("", "seconds", "x SIFT", "x imports")
     for name, some in seconds.items():
         value = median(some)
@@ -98,4 +90,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

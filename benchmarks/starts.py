@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from cases import Case, cases
-from common import WRONG_PX, parser, print_head, print_row, pyplot
+from common import WRONG_PX, print_head, print_row, pyplot, run
 from peers import elastix, sift
 
 import agalign
@@ -86,19 +86,13 @@ def chosen(folders: Sequence[Path], pairs: int) -> Iterator[Case]:
         yield from (some[i] for i in np.unique(np.linspace(0, len(some) - 1, pairs).round().astype(int)))
 
 
-def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("data", type=Path, nargs="+")
-    options.add_argument("--pairs", type=int, default=3)
-    options.add_argument("--methods", default=";".join(METHODS))
-    options.add_argument("--plot", type=Path)
-    asked = options.parse_args()
-    shares: dict[str, dict[tuple[float, float, float], float]] = {name: {} for name in asked.methods.split(";")}
+def main(data: list[Path], pairs: int = 3, methods: str = ";".join(METHODS), plot: Path | None = None) -> None:
+    shares: dict[str, dict[tuple[float, float, float], float]] = {name: {} for name in methods.split(";")}
     head = "method", "shift", "turn", "scale", "found", "median, px", "worst sure, px", "wrong though sure", "s"
     print_head(*head)
     with tempfile.TemporaryDirectory() as folder:
         synthetic.make_flight(Path(folder), captures=2, rng_seed=11)
-        tried = list(chosen([*asked.data, Path(folder)], asked.pairs))
+        tried = list(chosen([*data, Path(folder)], pairs))
     for start, (name, of_method) in product(STARTS, shares.items()):
         rows = []
         for case in tried:
@@ -115,8 +109,8 @@ def main() -> None:
         errors = f"{np.median(off):.3f}", worst, (sure & (off > WRONG_PX)).sum(), f"{np.median(seconds):.1f}"
         moved_by = f"{start[0]:.0%}", f"{start[1]:g}°", f"{start[2]:g}"
         print_row(name, *moved_by, f"{hit.sum()} of {len(hit)}", *errors)
-    if asked.plot is not None:
-        draw(shares, asked.plot)
+    if plot is not None:
+        draw(shares, plot)
 
 
 def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path) -> None:
@@ -141,4 +135,4 @@ def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -6,17 +6,15 @@ At each corner of the reference and along each axis, the error should lie within
 68 % and within 1.96 of them in 95 % of the cases.
 """
 
-import sys
-
 import numpy as np
-from common import flight_and_out, print_head, print_row, read_ties
+from common import Number, flight_and_out, print_head, print_row, read_ties, run
 
 import agalign
 from agalign.synthetic import make_flight
 from agalign.values import geometry
 
 
-def main(captures: int = 12, rng_seed: int = 1) -> None:
+def main(captures: Number = 12, rng_seed: Number = 1) -> None:
     bands: dict[str, list[np.ndarray]] = {}
     with flight_and_out() as (flight, out):
         truth = read_ties(make_flight(flight, captures, rng_seed=rng_seed))
@@ -39,4 +37,4 @@ def main(captures: int = 12, rng_seed: int = 1) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    run(main)

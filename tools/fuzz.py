@@ -18,9 +18,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import tifffile
+import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
@@ -125,7 +127,7 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
     atheris.Fuzz()
 
 
-def run(target: str, inputs: int, corpus: Path) -> tuple[list[int], str]:
+def fuzz_in_process(target: str, inputs: int, corpus: Path) -> tuple[list[int], str]:
     """([inputs, slowest in seconds, peak MB], error, if any) of a target in a process of its own."""
     command = [sys.executable, __file__, "--target", target, "--inputs", str(inputs), "--corpus", str(corpus)]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
@@ -136,31 +138,33 @@ def run(target: str, inputs: int, corpus: Path) -> tuple[list[int], str]:
     return [stats.get(name, 0) for name in names], error
 
 
-def main() -> None:
-    from common import Section, parser
+def main(
+    inputs: int = 200_000,
+    target: Literal["xmp", "tags", "names"] | None = None,
+    corpus: Path | None = None,
+    markdown: Path | None = None,
+    libfuzzer: Annotated[list[str] | None, typer.Argument(help="options and files for libFuzzer")] = None,
+) -> None:
+    from common import Section
 
-    options = parser(__doc__)
-    options.add_argument("--inputs", type=int, default=200_000)
-    options.add_argument("--target", choices=SHARES)
-    options.add_argument("--corpus", type=Path)
-    options.add_argument("--markdown", type=Path)
-    asked, more = options.parse_known_args()
-    if asked.target and asked.corpus:
-        fuzz(asked.target, asked.corpus, [f"-runs={asked.inputs}", *more])
+    if target and corpus:
+        fuzz(target, corpus, [f"-runs={inputs}", *(libfuzzer or ())])
     with tempfile.TemporaryDirectory() as folder:
         seeds(Path(folder))
         rows = [("what is fuzzed", "inputs", "failures", "slowest, whole seconds", "most memory, MB", "seconds")]
         errors = []
-        for target, share in SHARES.items() if asked.target is None else {asked.target: 1.0}.items():
+        for one, share in SHARES.items() if target is None else {target: 1.0}.items():
             began = time.monotonic()
-            (count, slowest, memory), error = run(target, round(asked.inputs * share), Path(folder, target))
+            (count, slowest, memory), error = fuzz_in_process(one, round(inputs * share), Path(folder, one))
             errors += [error] if error else []
             numbers = count, int(bool(error)), slowest, memory, round(time.monotonic() - began)
-            rows.append((target, *map(str, numbers)))
-        Section("fuzz", asked.markdown).table(rows)
+            rows.append((one, *map(str, numbers)))
+        Section("fuzz", markdown).table(rows)
         if errors:
             raise SystemExit("\n".join(errors))
 
 
 if __name__ == "__main__":
-    main()
+    from common import run
+
+    run(main)

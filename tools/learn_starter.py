@@ -3,8 +3,8 @@
     python tools/learn_starter.py [scenes, by default 40]
 
 One siamese network is learned with in-batch negatives, without labels, on one capture of each of many synthetic fields.
-It takes about a quarter of an hour on one core; equal numbers of scenes give equal networks. benchmarks/starter.py
-compares the network with random weights.
+It takes about a quarter of an hour on one core; equal numbers of scenes give equal networks. Compare the errors of
+benchmarks/accuracy.py before and after.
 """
 
 import sys

@@ -2,41 +2,27 @@
 
     pip install "mutmut>=3.8,<4"
     python tools/mutation.py [--count 300] [--seed 0] [--packages verify capture flight values] [--list]
-                             [--results FILE [--resume] [--retry-survivors]] [--max-test-seconds S] [--mypy]
+                             [--results FILE] [--mypy]
 
 The mutants are a random sample of those that mutmut's operators make (mutants.py). Each one runs the tests of its
-package, first the file named after its module and then the fastest, and stops at the first failure. The work tree is
-not touched: two copies of it in a temporary folder take the mutants in turn. The libraries are imported once, and a
-process is forked for each mutant; this needs Linux or macOS. Results are appended to FILE, one JSON object a line; an
-interrupted run continues with `--resume`, and `--retry-survivors` also runs the survivors again, after tests were
-added. With `--max-test-seconds`, a file of tests that takes longer on unchanged code runs only against the module that
-it is named after: faster, and a survivor may then be one that a slow test would detect. `--mypy` runs mypy on each
-survivor.
+package, first the file named after its module, and stops at the first failure. The work tree is not touched: two copies
+of it in a temporary folder take the mutants in turn. Results are appended to FILE, one JSON object a line; mutants with
+a result there are not run again. `--mypy` runs mypy on each survivor.
 """
 
 import argparse
-import contextlib
-import importlib
-import importlib.util
 import json
-import math
-import multiprocessing
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-import traceback
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from queue import Queue
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch reads it when it is imported
 
 from mutants import Mutant, sample
 
@@ -54,14 +40,10 @@ ELSEWHERE = {
     "agalign/values/text.py": ("tests/products/test_failures.py",),
 }
 """Modules that are also tested outside tests/<package>; those tests run after the package's own."""
-PRELOADED = ("cv2", "numpy", "pydantic", "pytest", "rasterio", "scipy.optimize", "skimage", "torch", "typer", "xarray")
-"""Libraries that take long to import."""
 NOT_COPIED = (".git", ".*_cache", "__pycache__", ".hypothesis", ".venv", "build", "dist", "site", "*.egg-info")
 TIMEOUT_FACTOR, TIMEOUT_S = 3.0, 30.0
 """A mutant times out after this many times the duration of its tests on unchanged code, plus this many seconds."""
-BASELINE_LIMIT_S = 1800.0
-LOG = Path("../tests.log")
-"""Output of the tests, next to a copy."""
+TESTS = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "--hypothesis-seed=0", "-m"]
 
 
 @dataclass(frozen=True)
@@ -76,119 +58,57 @@ class Result:
     seconds: float
 
 
-def files_with_tests(path: str, seconds: dict[str, float], max_seconds: float = math.inf) -> tuple[str, ...]:
-    """The tests of a module, relative to the root: the file named after it, then the others of its package and those
-    elsewhere that take up to `max_seconds`, the fastest first.
-    """
-    folder, own = ROOT / "tests" / Path(path).parts[1], f"test_{Path(path).name}"
-    files = {*(p.relative_to(ROOT).as_posix() for p in folder.glob("test_*.py")), *ELSEWHERE.get(path, ())}
-    files = {f for f in files if Path(f).name == own or seconds.get(f, 0.0) <= max_seconds}
-    return tuple(sorted(files, key=lambda f: (Path(f).name != own, seconds.get(f, 0.0), f)))
+def files_with_tests(path: str) -> list[str]:
+    """The tests of a module, relative to the root: the file named after it first."""
+    own = f"test_{Path(path).name}"
+    files = {p.relative_to(ROOT).as_posix() for p in (ROOT / "tests" / Path(path).parts[1]).glob("test_*.py")}
+    return sorted({*files, *ELSEWHERE.get(path, ())}, key=lambda file: (Path(file).name != own, file))
 
 
-@dataclass(frozen=True)
-class Job:
-    """Tests of a mutant, or of the unchanged code."""
+def status_of(tests: list[str], copy: Path, limit_s: float | None) -> str:
+    """Run tests in a copy of the work tree; returns the status of the mutant that it contains."""
+    command = [sys.executable, "-m", "pytest", *TESTS, "not real and not full", *tests]
+    environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
+    try:
+        done = subprocess.run(
+            command, cwd=copy, env=environment, capture_output=True, text=True, timeout=limit_s, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return "timeout"
+    if done.returncode == 5:  # no tests
+        raise RuntimeError(f"{tests} could not run:\n{done.stdout[-2000:]}")
+    # Any other code or signal is caused by the change, as the unchanged code passes.
+    return "killed" if done.returncode else "survived"
 
-    mutant: Mutant | None
-    tests: tuple[str, ...]
-    limit_s: float
-    mypy: bool = False
-    """Also run mypy if the tests pass."""
 
-
-def work_in(copies: "Queue[Path]") -> None:
-    """Take one of the copies of the work tree for this process."""
-    os.chdir(copies.get())
-
-
-def do(job: Job) -> tuple[Job, str, float]:
-    """Run a job in the copy of this process; returns it with its status and seconds."""
-    began = time.monotonic()
-    with changed(job.mutant):
-        status = run_tests(job)
-        if job.mypy and status == "survived":
-            done = subprocess.run(["mypy"], capture_output=True, check=False)
+def run_mutant(mutant: Mutant, copies: "Queue[Path]", limit_s: float, with_mypy: bool) -> Result:
+    """Put a mutant into one of the copies and run its tests."""
+    began, copy = time.monotonic(), copies.get()
+    target = copy / mutant.path
+    unchanged = target.read_bytes()
+    try:
+        target.write_text(mutant.source, encoding="utf-8")
+        status = status_of(files_with_tests(mutant.path), copy, limit_s)
+        if with_mypy and status == "survived":
+            done = subprocess.run(["mypy"], cwd=copy, capture_output=True, check=False)
             status = "type error" if done.returncode == 1 else status
-    return job, status, time.monotonic() - began
-
-
-@contextlib.contextmanager
-def changed(mutant: Mutant | None) -> Iterator[None]:
-    """The copy with one module replaced; its time is put back too, so that its compiled file is valid again."""
-    if mutant is None:
-        yield
-        return
-    target = Path(mutant.path)
-    before, stat = target.read_bytes(), target.stat()
-    target.write_text(mutant.source, encoding="utf-8")
-    try:
-        yield
     finally:
-        target.write_bytes(before)
-        os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+        target.write_bytes(unchanged)
+        copies.put(copy)
+    seconds = round(time.monotonic() - began, 1)
+    return Result(mutant.key, mutant.path, mutant.line, mutant.operator, mutant.diff, status, seconds)
 
 
-def run_tests(job: Job) -> str:
-    """Run pytest in a fork of this process; returns the status of the mutant."""
-    deadline_s = time.monotonic() + job.limit_s
-    pid = os.fork()
-    if pid == 0:
-        _run_pytest(job.tests)
-    while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
-        if time.monotonic() > deadline_s:
-            os.killpg(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
-            return "timeout"
-        time.sleep(0.05)
-    code = os.waitstatus_to_exitcode(ended[1])
-    if code in (5, 98, 99):  # 5 is pytest's for no tests
-        raise RuntimeError(f"{job.tests} could not run:\n{LOG.read_text()[-2000:]}")
-    # Any other code or signal is caused by the change, as the unchanged code passed.
-    return "killed" if code else "survived"
-
-
-def _run_pytest(tests: tuple[str, ...]) -> None:
-    """End this process with the exit code of pytest, 99 where another agalign is found, 98 without any."""
-    code = 98
-    try:
-        os.setsid()
-        log, here = os.open(LOG, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), Path.cwd()
-        os.dup2(log, 1)
-        os.dup2(log, 2)
-        sys.path[:] = [str(here), *(p for p in sys.path if Path(p).resolve() not in (ROOT, ROOT / "tools"))]
-        os.environ |= {"PYTHONPATH": str(here), "PYTHONDONTWRITEBYTECODE": "1"}
-        spec = importlib.util.find_spec("agalign")
-        if spec is None or not Path(spec.origin or "").is_relative_to(here):
-            os._exit(99)
-        import pytest
-
-        options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "-m", "not real and not full", "--hypothesis-seed=0"]
-        code = int(pytest.main([*options, *tests]))
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-
-
-def done_by(pool: Executor, jobs: list[Job]) -> Iterator[tuple[Job, str, float]]:
-    """Jobs with status and seconds, in the order in which they end."""
-    return (future.result() for future in as_completed([pool.submit(do, job) for job in jobs]))
-
-
-def measured(pool: Executor, files: Iterable[str], cache: Path) -> dict[str, float]:
-    """Seconds that each file of tests takes on the unchanged code, which must pass; those in `cache` are not run."""
-    seconds: dict[str, float] = json.loads(cache.read_text(encoding="utf-8")) if cache.is_file() else {}
-    jobs = [Job(None, (file,), BASELINE_LIMIT_S) for file in sorted(set(files) - set(seconds))]
-    for job, status, took in done_by(pool, jobs):
-        if status != "survived":
-            sys.exit(f"{job.tests[0]} does not pass on the unchanged code")
-        seconds[job.tests[0]] = took
-        cache.write_text(json.dumps(seconds), encoding="utf-8")
-        print(f"unchanged  {took:5.1f} s {job.tests[0]}", flush=True)
-    return seconds
+def limits_s(paths: set[str], copy: Path) -> dict[str, float]:
+    """Longest duration of the tests of each package of these modules, which must pass on the unchanged code."""
+    result = {}
+    for package in sorted({Path(path).parts[1] for path in paths}):
+        tests = {file for path in paths if Path(path).parts[1] == package for file in files_with_tests(path)}
+        began = time.monotonic()
+        if status_of(sorted(tests), copy, None) != "survived":
+            sys.exit(f"the tests of {package} do not pass on the unchanged code")
+        result[package] = TIMEOUT_FACTOR * (time.monotonic() - began) + TIMEOUT_S
+    return result
 
 
 def _print_table(results: list[Result]) -> None:
@@ -203,36 +123,15 @@ def _print_table(results: list[Result]) -> None:
         print(f"\n{r.status}: {r.path}:{r.line}\n{r.diff}")
 
 
-def _arguments() -> argparse.Namespace:
+def main() -> None:
     parser = argparse.ArgumentParser(description="Mutation test of the packages that decide about an alignment.")
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--packages", nargs="+", default=list(PACKAGES), metavar="NAME")
     parser.add_argument("--list", action="store_true", help="print the sample and end")
     parser.add_argument("--results", type=Path, metavar="FILE", default=Path("mutation.jsonl"))
-    parser.add_argument("--resume", action="store_true", help="keep the results in FILE")
-    parser.add_argument("--retry-survivors", action="store_true", help="the same, but run survivors again")
-    parser.add_argument("--max-test-seconds", type=float, default=math.inf, metavar="S")
     parser.add_argument("--mypy", action="store_true", help="run mypy on survivors")
-    return parser.parse_args()
-
-
-def _earlier(asked: argparse.Namespace) -> dict[str, Result]:
-    """Results of an earlier run by the mutant's key; the file is emptied of what is run again."""
-    lines: list[str] = []
-    if (asked.resume or asked.retry_survivors) and asked.results.is_file():
-        lines = asked.results.read_text(encoding="utf-8").splitlines()
-    else:
-        asked.results.with_suffix(".durations.json").unlink(missing_ok=True)
-    kept = {r.key: r for r in (Result(**json.loads(line)) for line in lines)}
-    if asked.retry_survivors:
-        kept = {k: r for k, r in kept.items() if r.status == "killed"}
-    asked.results.write_text("".join(json.dumps(asdict(r)) + "\n" for r in kept.values()), encoding="utf-8")
-    return kept
-
-
-def main() -> None:
-    asked = _arguments()
+    asked = parser.parse_args()
     missing = [name for row in ELSEWHERE.items() for name in (row[0], *row[1]) if not (ROOT / name).is_file()]
     if missing:
         sys.exit(f"ELSEWHERE names files that do not exist: {', '.join(missing)}")
@@ -242,34 +141,23 @@ def main() -> None:
         for m in mutants:
             print(f"\n{m.path}:{m.line}\n{m.diff}")
         return
-    results = _earlier(asked)
+    lines = asked.results.read_text(encoding="utf-8").splitlines() if asked.results.is_file() else []
+    results = {r.key: r for r in (Result(**json.loads(line)) for line in lines)}
     todo = [m for m in mutants if m.key not in results]
-    for name in PRELOADED:
-        with contextlib.suppress(ImportError):
-            importlib.import_module(name)
-    sys.dont_write_bytecode = True
-    fork = multiprocessing.get_context("fork")
-    copies: Queue[Path] = fork.Queue()
-    with tempfile.TemporaryDirectory(prefix="agalign-mutation-") as folder:
+    copies: Queue[Path] = Queue()
+    with tempfile.TemporaryDirectory(prefix="agalign-mutation-") as folder, ThreadPoolExecutor(2) as pool:
         for name in ("0", "1"):
             copy = Path(folder).resolve() / name / "agalign"
             shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*NOT_COPIED))
-            subprocess.run([sys.executable, "-m", "compileall", "-q", str(copy / "agalign")], check=True)
             copies.put(copy)
-        with ProcessPoolExecutor(2, fork, work_in, (copies,)) as pool:
-            files = {file for m in todo for file in files_with_tests(m.path, {})}
-            durations = measured(pool, files, asked.results.with_suffix(".durations.json"))
-            jobs = []
-            for m in todo:
-                tests = files_with_tests(m.path, durations, asked.max_test_seconds)
-                limit_s = TIMEOUT_FACTOR * sum(durations[f] for f in tests) + TIMEOUT_S
-                jobs.append(Job(m, tests, limit_s, asked.mypy))
-            for number, (job, status, seconds) in enumerate(done_by(pool, jobs), start=1):
-                m = job.mutant
-                results[m.key] = Result(m.key, m.path, m.line, m.operator, m.diff, status, round(seconds, 1))
-                with asked.results.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(asdict(results[m.key])) + "\n")
-                print(f"{number}/{len(jobs)} {status:9} {seconds:5.1f} s {m.path}:{m.line}", flush=True)
+        limits = limits_s({m.path for m in todo}, copy)
+        jobs = [pool.submit(run_mutant, m, copies, limits[Path(m.path).parts[1]], asked.mypy) for m in todo]
+        for number, job in enumerate(as_completed(jobs), start=1):
+            r = job.result()
+            results[r.key] = r
+            with asked.results.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(asdict(r)) + "\n")
+            print(f"{number}/{len(jobs)} {r.status:9} {r.seconds:5.1f} s {r.path}:{r.line}", flush=True)
     _print_table([results[m.key] for m in mutants])
 
 

@@ -8,7 +8,6 @@ method runs in a process of its own with as many threads as it takes; one that r
 written to -o, and as tables next to it (.md); the mapping of each pair to --said, in the format that score.py reads.
 """
 
-import argparse
 import csv
 import json
 import shutil
@@ -19,16 +18,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 import rasterio
+import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
 from cases import straightened
-from common import align, parser, watched
+from common import align, run, watched
 from peers import METHODS, Align, UnavailableError, grey_raster, method_named
 
 from agalign.cameras.discover import discover
@@ -168,11 +168,11 @@ def child(name: str, arguments: Sequence[str]) -> tuple[list[Row], float]:
     no rows without a result.
     """
     with tempfile.NamedTemporaryFile("r", suffix=".json") as file:
-        run = watched([sys.executable, __file__, *arguments, "--only", name, "-o", file.name])
-        if run.code:
+        process = watched([sys.executable, __file__, *arguments, "--only", name, "-o", file.name])
+        if process.code:
             print(f"{name}: left out", file=sys.stderr)
             return [], 0.0
-        return json.load(file), run.largest_gb
+        return json.load(file), process.largest_gb
 
 
 def print_missing(missing: Mapping[str, Sequence[str]], sets: dict[str, Any]) -> None:
@@ -192,54 +192,48 @@ def write_said(rows: Iterable[Row], path: Path) -> None:
             writer.writerow({k: json.dumps(v) if k in ("homography", "grid") else v for k, v in row.items()})
 
 
-def parsed() -> argparse.Namespace:
-    options = parser(__doc__)
-    options.add_argument("data", type=Path)
-    options.add_argument("-o", "--output", type=Path, default=Path("results.csv"))
-    options.add_argument("--methods", help=f"separated by ;: FILE.py:FUNCTION, {'; '.join(ALL_METHODS)}")
-    options.add_argument("--sets", help="separated by commas")
-    options.add_argument("--variants", help=f"separated by commas: {', '.join(VARIANTS)}")
-    options.add_argument("--jobs", type=int, default=1, help="methods at a time; above one, seconds mean little")
-    options.add_argument("--said", type=Path)
-    options.add_argument("--plot", type=Path)
-    options.add_argument("--only", help=argparse.SUPPRESS)
-    return options.parse_args()
-
-
-def main() -> None:
-    options = parsed()
-    sets = read_sets()
-    if options.sets:
-        sets = {name: sets[name] for name in options.sets.split(",")}
-    variants = options.variants.split(",") if options.variants else VARIANTS
-    if unknown := set(variants) - set(VARIANTS):
+def main(
+    data: Path,
+    output: Annotated[Path, typer.Option("-o", "--output")] = Path("results.csv"),
+    methods: Annotated[str, typer.Option(help="separated by ;, FILE.py:FUNCTION among them")] = ";".join(ALL_METHODS),
+    sets: Annotated[str, typer.Option(help="separated by commas; by default all")] = "",
+    variants: Annotated[str, typer.Option(help="separated by commas")] = ",".join(VARIANTS),
+    jobs: Annotated[int, typer.Option(help="methods at a time; above one, seconds mean little")] = 1,
+    said: Path | None = None,
+    plot: Path | None = None,
+    only: Annotated[str, typer.Option(hidden=True)] = "",
+) -> None:
+    known = read_sets()
+    if sets:
+        known = {name: known[name] for name in sets.split(",")}
+    if unknown := set(variants.split(",")) - set(VARIANTS):
         sys.exit(f"unknown variant '{unknown.pop()}'; choose from {', '.join(VARIANTS)}")
-    located, missing = locate(options.data, sets)
-    if options.only:
+    located, missing = locate(data, known)
+    if only:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every unknown tag
         try:
-            options.output.write_text(json.dumps(run_method(options.only, located, sets, variants)))
+            output.write_text(json.dumps(run_method(only, located, known, variants.split(","))))
         except UnavailableError as error:
-            sys.exit(f"{options.only}: {error}")
+            sys.exit(f"{only}: {error}")
         return
-    print_missing(missing, sets)
+    print_missing(missing, known)
     if not located:
-        sys.exit(f"{options.data}: contains no complete set")
-    names = options.methods.split(";") if options.methods else ALL_METHODS
-    arguments = [str(options.data), "--sets", ",".join(located), "--variants", ",".join(variants)]
-    with ThreadPoolExecutor(options.jobs) as pool:
+        sys.exit(f"{data}: contains no complete set")
+    names = methods.split(";")
+    arguments = [str(data), "--sets", ",".join(located), "--variants", variants]
+    with ThreadPoolExecutor(jobs) as pool:
         result = dict(zip(names, pool.map(lambda name: child(name, arguments), names), strict=True))
     rows = [row for some, _ in result.values() for row in some]
-    if options.said:
-        write_said(rows, options.said)
-    scored = score_pairs(rows, sets)
-    write_csv(summary(scored), options.output)
+    if said:
+        write_said(rows, said)
+    scored = score_pairs(rows, known)
+    write_csv(summary(scored), output)
     text = tables(scored, {name: gigabytes for name, (some, gigabytes) in result.items() if some})
-    options.output.with_suffix(".md").write_text(text, encoding="utf-8")
+    output.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
-    if options.plot:
-        draw(scored, options.plot)
+    if plot:
+        draw(scored, plot)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

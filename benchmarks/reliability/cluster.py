@@ -15,7 +15,7 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, align, command, parsed
+from common import Section, align, command, run
 from kills import differences, snapshot
 
 from agalign.products.sidecar_file import find_sidecars
@@ -37,13 +37,12 @@ def kill_worker(nanny_pid: int) -> None:
     nanny.kill()
 
 
-def main() -> None:
-    asked = parsed(__doc__, captures=40, markdown=None)
-    section = Section("cluster", asked.markdown)
+def main(captures: int = 40, markdown: Path | None = None) -> None:
+    section = Section("cluster", markdown)
     with tempfile.TemporaryDirectory() as folder:
         flight, alone, out = Path(folder, "flight"), Path(folder, "alone"), Path(folder, "out")
         address_file = Path(folder, "scheduler.json")
-        synthetic.make_flight(flight, asked.captures, SIZE_PX, rng_seed=5)
+        synthetic.make_flight(flight, captures, SIZE_PX, rng_seed=5)
         alone_s = align(flight, alone, "-j", "2")
         worker = "--nthreads", "1", "--local-directory", folder
         processes = [dask("dask_worker", address_file, *worker) for _ in range(2)]
@@ -53,21 +52,21 @@ def main() -> None:
                 time.sleep(0.2)
             address = json.loads(address_file.read_text())["address"]
             began, killed_at = time.monotonic(), 0
-            run = subprocess.Popen(command(flight, out, "--dask", address))
-            while run.poll() is None:
+            process = subprocess.Popen(command(flight, out, "--dask", address))
+            while process.poll() is None:
                 done = len(find_sidecars(out)) if out.is_dir() else 0
-                if not killed_at and done >= asked.captures // 2:
+                if not killed_at and done >= captures // 2:
                     kill_worker(processes[0].pid)
                     killed_at = done
                 time.sleep(0.1)
             seconds = time.monotonic() - began
         finally:
-            for process in processes:
-                process.terminate()
+            for one in processes:
+                one.terminate()
         result = differences(out, snapshot(alone))
         section.say(
-            f"{asked.captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} on a scheduler and two worker processes; one, "
-            f"with its nanny, killed by SIGKILL when {killed_at} captures were done: exit code {run.returncode}, "
+            f"{captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} on a scheduler and two worker processes; one, "
+            f"with its nanny, killed by SIGKILL when {killed_at} captures were done: exit code {process.returncode}, "
             f"{len(find_sidecars(out))} captures done in {seconds:.0f} s (a run on this machine's two cores without "
             f"a cluster: {alone_s:.0f} s)."
         )
@@ -76,4 +75,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -25,7 +25,7 @@ import rasterio
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, align, command, parsed
+from common import Section, align, command, run
 
 from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic import flight as synthetic
@@ -110,9 +110,8 @@ def kill_after(seconds: float, argv: list[str], *, workers_too: bool) -> bool:
     return running
 
 
-def main() -> None:
-    asked = parsed(__doc__, kills=50, rng_seed=0, markdown=None)
-    section, rng = Section("kills", asked.markdown), random.Random(asked.rng_seed)
+def main(kills: int = 50, rng_seed: int = 0, markdown: Path | None = None) -> None:
+    section, rng = Section("kills", markdown), random.Random(rng_seed)
     np.seterr(all="ignore")
     with tempfile.TemporaryDirectory() as folder:
         flight, whole, out = Path(folder, "flight"), Path(folder, "whole"), Path(folder, "out")
@@ -121,7 +120,7 @@ def main() -> None:
         expected = snapshot(whole)
         result: Counter[str] = Counter()
         hit, kept = 0, []
-        for number in range(asked.kills):
+        for number in range(kills):
             shutil.rmtree(out, ignore_errors=True)
             at = rng.uniform(0.02, 1.0) * seconds
             hit += kill_after(at, command(flight, out, *OPTIONS), workers_too=bool(number % 2))
@@ -135,13 +134,13 @@ def main() -> None:
             )
             result += here
         section.say(
-            f"{asked.kills} kills of a run of {seconds:.0f} s over {CAPTURES} captures ({hit} while it was running; "
+            f"{kills} kills of a run of {seconds:.0f} s over {CAPTURES} captures ({hit} while it was running; "
             f"between {min(kept)} and {max(kept)} captures were finished by then), each followed by the same command: "
-            f"{asked.kills - result['bad exit codes']} exit codes 0."
+            f"{kills - result['bad exit codes']} exit codes 0."
         )
         kinds = ("torn sidecars", "torn captures", "missing", "left over", "corrupt", "different")
         section.table([("after the kill, and after resuming", "files"), *((k, str(result[k])) for k in kinds)])
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

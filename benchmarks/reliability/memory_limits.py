@@ -14,10 +14,13 @@ import tempfile
 import time
 from collections import defaultdict
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, parser
+from common import Section, command, run
 
 from agalign.synthetic import flight as synthetic
 
@@ -54,22 +57,20 @@ def run_within(limit_gb: float, flight: Path, out: Path, *options: str) -> tuple
     return how, line.removeprefix("agalign: "), time.monotonic() - began
 
 
-def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("--from", dest="first_gb", type=float, default=1.0)
-    options.add_argument("--to", dest="last_gb", type=float, default=2.0)
-    options.add_argument("--step", dest="step_gb", type=float, default=0.05)
-    options.add_argument("--jobs", type=int, nargs="+", default=[1, 2])
-    options.add_argument("--markdown", type=Path)
-    asked = options.parse_args()
-    section = Section("memory limits", asked.markdown)
+def main(
+    first_gb: Annotated[float, typer.Option("--from")] = 1.0,
+    last_gb: Annotated[float, typer.Option("--to")] = 2.0,
+    step_gb: Annotated[float, typer.Option("--step")] = 0.05,
+    markdown: Path | None = None,
+) -> None:
+    section = Section("memory limits", markdown)
     rows: dict[tuple[int, str, str], list[tuple[float, float]]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as name:
         flight = Path(name, "flight")
         synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
-        for jobs in asked.jobs:
-            for step in range(round((asked.last_gb - asked.first_gb) / asked.step_gb) + 1):
-                limit_gb = asked.first_gb + step * asked.step_gb
+        for jobs in (1, 2):
+            for step in range(round((last_gb - first_gb) / step_gb) + 1):
+                limit_gb = first_gb + step * step_gb
                 # A time limit asks for worker processes; a flight of four captures is done in threads otherwise.
                 workers = ("-j", str(jobs)) if jobs == 1 else ("-j", str(jobs), "--timeout", "100")
                 how, line, seconds = run_within(limit_gb, flight, Path(name, f"out{jobs}-{step}"), *workers)
@@ -86,4 +87,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

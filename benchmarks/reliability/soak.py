@@ -14,7 +14,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, flight_and_out, parsed, watched
+from common import Section, command, flight_and_out, run, watched
 
 from agalign.synthetic import flight as synthetic
 
@@ -23,18 +23,17 @@ QUANTITIES = {"memory of all processes, MB": 2, "open files of all processes": 3
 """Columns of the samples."""
 
 
-def main() -> None:
-    asked = parsed(__doc__, captures=1000, jobs=2, markdown=None)
-    section = Section("soak", asked.markdown)
+def main(captures: int = 1000, jobs: int = 2, markdown: Path | None = None) -> None:
+    section = Section("soak", markdown)
     with flight_and_out() as (flight, out):
-        synthetic.make_flight(flight, asked.captures, SIZE_PX, rng_seed=1)
-        run = watched(command(flight, out, "-j", str(asked.jobs)))
+        synthetic.make_flight(flight, captures, SIZE_PX, rng_seed=1)
+        process = watched(command(flight, out, "-j", str(jobs)))
         section.say(
-            f"{asked.captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} and five bands, {asked.jobs} worker processes: "
-            f"exit code {run.code}, {run.seconds:.0f} s, {len(run.left)} processes left behind."
+            f"{captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} and five bands, {jobs} worker processes: "
+            f"exit code {process.code}, {process.seconds:.0f} s, {len(process.left)} processes left behind."
         )
-        count = run.samples[:, 4]
-        working = run.samples[count == np.median(count)]  # neither while processes start nor while they end
+        count = process.samples[:, 4]
+        working = process.samples[count == np.median(count)]  # neither while processes start nor while they end
         half = working[working[:, 0] > working[-1, 0] / 2]
         table = [("while all processes work, second half of the run", "mean", "growth", "scatter")]
         for name, column in QUANTITIES.items():
@@ -43,10 +42,12 @@ def main() -> None:
             growth, scatter = line[0] * (t_s[-1] - t_s[0]), (y - np.polyval(line, t_s)).std()
             table.append((name, f"{y.mean():.0f}", f"{growth:+.1f}", f"{scatter:.1f}"))
         section.table(table)
-        run = watched(command(flight, out, "-j", str(asked.jobs)))
-        mb = run.samples[:, 2].max()
-        section.say(f"The same command again, all kept: exit code {run.code}, {run.seconds:.1f} s, {mb:.0f} MB.")
+        process = watched(command(flight, out, "-j", str(jobs)))
+        mb = process.samples[:, 2].max()
+        section.say(
+            f"The same command again, all kept: exit code {process.code}, {process.seconds:.1f} s, {mb:.0f} MB."
+        )
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -3,45 +3,37 @@
     python benchmarks/reliability/syscall_faults.py [--faults 200] [--markdown FILE]
 
 `strace` lists the calls of an undisturbed run that have a file or folder below the output folder as their argument.
-In each further run it makes one of them fail, drawn at random: `-P FILE -e inject=write:error=EIO:when=3`. A run is a
-fork of this process, which has already loaded the program and gives temporary files the same names in every run. Linux
-only. Without strace, or where the system does not allow tracing, nothing is measured.
+In each further run it makes one of them fail, drawn at random: `-P FILE -e inject=write:error=EIO:when=3`. Temporary
+files have the same names in every run. Linux only. Without strace, or where the system does not allow tracing, nothing
+is measured.
 """
 
 import os
 import random
 import re
-import secrets
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-import traceback
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
-from importlib import import_module
-from itertools import count, cycle, islice
+from itertools import cycle, islice
 from pathlib import Path
-from types import SimpleNamespace
-from typing import NoReturn
 
 import numpy as np
 import tifffile
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, parser
+from common import Section, run
 from kills import contents, differences, snapshot, whole_sidecars, without
 
-from agalign.cli import main as cli
 from agalign.products.report import SUMMARY_FILE
 from agalign.synthetic import flight as synthetic
-from agalign.values import files as partial_files
 
 CAPTURES, SIZE_PX = 2, (240, 180)
 OPTIONS = ("--layout", "both", "--error-map", "--stac", "--bands", "green,red", "--relief", "never", "-j", "1", "-q")
@@ -49,6 +41,17 @@ _USUAL = "EIO", "ENOSPC", "EINTR"
 ERRORS = dict.fromkeys(("write", "pwrite64", "fsync", "rename", "openat", "close"), _USUAL)
 ERRORS["rename"] = "EIO", "ENOSPC", "EACCES"
 MAX_S = 60
+PROGRAM = """
+import itertools, os, secrets, types
+from agalign.cli.main import main
+from agalign.values import files
+
+# Names of partial files contain both.
+numbers = itertools.count()
+secrets.token_hex = lambda _bytes=None: f"{next(numbers):016x}"
+files.os = types.SimpleNamespace(**(vars(os) | {"getpid": lambda: 1}))
+main()
+"""
 _PLACES = {273, 279, 324, 325}
 """TIFF tags that may differ between equal images."""
 _SIZES = {"seconds", "bytes", "sha256", "file:size", "file:checksum"}
@@ -69,77 +72,19 @@ class Ending:
         return [line for line in self.errors.splitlines() if line.startswith("agalign: ")]
 
 
-def skip(reason: str) -> NoReturn:
-    """End with exit code 0."""
-    print(f"skipped: {reason}")
-    raise SystemExit
-
-
-def run(argv: list[str], folder: Path, *tracing: str) -> Ending:
-    """Run the program in a fork of this process; with arguments of strace, traced by it."""
-    errors, trace, modules = folder / "errors.txt", folder / "trace.txt", folder / "modules.txt"
+def run_traced(argv: list[str], folder: Path, *tracing: str) -> Ending:
+    """Run the program; with arguments of strace, traced by it."""
+    trace = folder / "trace.txt"
     trace.write_text("")
-    pid = os.fork()
-    if pid == 0:
-        _run_in_child(argv, errors, modules)
-    os.waitpid(pid, os.WUNTRACED)
-    if tracing:
-        strace = ["strace", "-f", "-y", *tracing, "-o", str(trace), "-p", str(pid)]
-        tracer = subprocess.Popen(strace, stderr=subprocess.PIPE, text=True)
-        if "attached" not in tracer.stderr.readline():
-            os.kill(pid, signal.SIGKILL)
-            skip("strace cannot trace a process here (ptrace is not allowed)")
-    os.kill(pid, signal.SIGCONT)
-    code = _exit_code_of(pid)
-    if tracing:
-        tracer.communicate()
-    return Ending(code, errors.read_text(errors="replace"), trace.read_text(errors="replace"))
-
-
-def _run_in_child(argv: list[str], errors: Path, modules: Path) -> None:
-    """Stop until SIGCONT, and do what a process of its own would do from the first line of `main` on."""
-    code = 1
+    strace = ["strace", "-f", "-y", *tracing, "-o", str(trace)] if tracing else []
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "errors": "replace"}
+    process = subprocess.Popen([*strace, sys.executable, "-c", PROGRAM, *argv], start_new_session=True, **pipes)
     try:
-        os.setsid()
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
-        # Names of partial files contain both.
-        numbers = count()
-        secrets.token_hex = lambda _bytes=None: f"{next(numbers):016x}"
-        parent = os.getppid()
-        partial_files.os = SimpleNamespace(**(vars(os) | {"getpid": lambda: parent}))
-        signal.raise_signal(signal.SIGSTOP)
-        sys.argv = argv
-        cli.main()
-        code = 0
-    except SystemExit as ended:
-        code = int(ended.code or 0)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        modules.write_text("\n".join(sys.modules))
-        os._exit(code)
-
-
-def load_modules_of_run(folder: Path) -> None:
-    """Import what the last run has imported: two threads import it, and the order of their calls is random."""
-    for name in (folder / "modules.txt").read_text().split():
-        with suppress(Exception):
-            import_module(name)
-
-
-def _exit_code_of(pid: int) -> int | None:
-    deadline_s = time.monotonic() + MAX_S
-    while time.monotonic() < deadline_s:
-        ended, status = os.waitpid(pid, os.WNOHANG)
-        if ended:
-            return os.waitstatus_to_exitcode(status)
-        time.sleep(0.01)
-    os.killpg(pid, signal.SIGKILL)
-    os.waitpid(pid, 0)
-    return None
+        errors, code = process.communicate(timeout=MAX_S)[1], process.returncode
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        errors, code = process.communicate()[1], None
+    return Ending(code, errors, trace.read_text(errors="replace"))
 
 
 def calls_in(out: Path, trace: str) -> Iterator[tuple[str, str, bool]]:
@@ -202,43 +147,33 @@ def faults_of(ending: Ending, out: Path, expected: dict[str, object]) -> Counter
     return result
 
 
-def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("--calls", nargs="+", choices=ERRORS, default=list(ERRORS))
-    options.add_argument("--faults", type=int, default=200)
-    options.add_argument("--rng-seed", type=int, default=0)
-    options.add_argument("--markdown", type=Path)
-    asked = options.parse_args()
+def main(faults: int = 200, rng_seed: int = 0, markdown: Path | None = None) -> None:
     if shutil.which("strace") is None or sys.platform != "linux":
-        skip("strace is not installed (apt-get install strace)")
-    section, rng = Section("syscall faults", asked.markdown), random.Random(asked.rng_seed)
+        raise SystemExit("strace is not installed (apt-get install strace)")
+    section, rng = Section("syscall faults", markdown), random.Random(rng_seed)
     np.seterr(all="ignore")
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         flight, out = folder / "flight", folder / "out"
         synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
-        argv = ["agalign", str(flight), "-o", str(out), *OPTIONS]
-        run(argv, folder)
-        load_modules_of_run(folder)
-        shutil.rmtree(out)
-        whole = run(argv, folder, "-e", "trace=" + ",".join(ERRORS))
+        argv = [str(flight), "-o", str(out), *OPTIONS]
+        whole = run_traced(argv, folder, "-e", "trace=" + ",".join(ERRORS))
         if whole.code != 0 or whole.complaints:
             raise SystemExit(f"the run without faults ended with {whole.code}: {whole.errors}")
         expected = snapshot(out, strict_contents)
         calls: dict[str, Counter[str]] = defaultdict(Counter)
         for call, path, _ in calls_in(out, whole.trace):
-            if call in asked.calls:
-                calls[call][path] += 1
+            calls[call][path] += 1
         print({name: paths.total() for name, paths in calls.items()}, f"{len(expected)} files", flush=True)
         rows: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
-        for number, (call, error, path, at) in enumerate(plan(calls, asked.faults, rng), start=1):
+        for number, (call, error, path, at) in enumerate(plan(calls, faults, rng), start=1):
             shutil.rmtree(out, ignore_errors=True)
             began = time.monotonic()
             inject = f"inject={call}:error={error}:when={at}"
-            ending = run(argv, folder, "-P", path, "-e", f"trace={call}", "-e", inject)
+            ending = run_traced(argv, folder, "-P", path, "-e", f"trace={call}", "-e", inject)
             here = faults_of(ending, out, expected)
-            again = run(argv, folder)
+            again = run_traced(argv, folder)
             after = compared(out, expected)
             after["bad exit"] = int(again.code != 0 or bool(again.complaints))
             failed = (os.path.relpath(p, out) for _, p, injected in calls_in(out, ending.trace) if injected)
@@ -271,4 +206,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -172,28 +172,29 @@ def flights(minutes: float, rng: random.Random, folder: Path) -> Iterator[Counte
         yield result
 
 
-def main() -> None:
-    from common import Section, parsed
+def main(kills: int = 1000, minutes: float = 10.0, rng_seed: int = 0, markdown: Path | None = None) -> None:
+    from common import Section
 
-    asked = parsed(__doc__, kills=1000, minutes=10.0, rng_seed=0, markdown=None)
-    rng = random.Random(asked.rng_seed)
+    rng = random.Random(rng_seed)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     warnings.simplefilter("ignore")  # of rasters without georeference
-    tiny = run_tiny(asked.kills, rng)
+    tiny = run_tiny(kills, rng)
     print(dict(tiny), flush=True)
     real: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
-        for one in flights(asked.minutes, rng, Path(folder)):
+        for one in flights(minutes, rng, Path(folder)):
             real += one
             print({k: v for k, v in one.items() if v}, flush=True)
     counted = ("runs", "tasks", "kills", "reported as killed", "runs ended with a reason", *KINDS)
     results = {"tiny tasks, 8 workers": tiny, f"flights of {CAPTURES} captures, 2 workers": real}
     rows = [("", *(name.replace("runs ended", "ended") for name in counted))]
     rows += [(name, *(str(result[kind]) for kind in counted)) for name, result in results.items()]
-    Section("worker kills", asked.markdown).table(rows)
+    Section("worker kills", markdown).table(rows)
     if any(counts[kind] for counts in results.values() for kind in KINDS):
         raise SystemExit("something was lost, hung, wrong or left over")
 
 
 if __name__ == "__main__":
-    main()
+    from common import run
+
+    run(main)

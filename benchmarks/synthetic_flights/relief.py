@@ -19,7 +19,6 @@ CLOSE_M, FAR_M = (1.2, 2.0), (18.0, 22.0)
 """Range to the lowest surface."""
 GEOMETRIES = ("flat", "terraces", "plants", "boxes")
 FOOLING = ("pots", "wind", "hand", "glossy", "other scene", "other time")
-SCENES = 100
 _CLOSE_SHARE = 0.6
 """Of the fooling scenes; the others are 20 m away."""
 
@@ -265,11 +264,7 @@ def _in_wind(scene: Scene, site: Site) -> Scene:
 
 
 def fooling(number: int) -> tuple[str, bool]:
-    """(kind, whether it is close) of the scene of a number: the kinds of `FOOLING` in turn, three of five close by."""
+    """(kind, whether it is close) of the scene of a number, which is also its seed: the kinds in turn, three of five
+    close by.
+    """
     return FOOLING[number % len(FOOLING)], (number // len(FOOLING)) % 5 < 5 * _CLOSE_SHARE
-
-
-def fooling_scene(number: int, width_px: int = 640) -> Scene:
-    """The scene of a number, which is also its seed; benchmarks use the first `SCENES`."""
-    kind, close = fooling(number)
-    return make_scene(kind, number, close=close, width_px=width_px)

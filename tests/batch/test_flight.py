@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 import torch
 
@@ -79,35 +78,6 @@ def test_a_frozen_network_aligns_all_captures(aligned_flight: Path, model_path: 
     bands = [b for path in find_sidecars(aligned_flight) for b in read_sidecar(path).bands if b.joint]
     assert [(b.joint.recipe, b.joint.iterations) for b in bands if b.joint] == [("flight", 0)] * 8
     assert model_path.name == "RedEdge-M_SY01-0000001-AG.safetensors"
-
-
-def test_a_model_that_is_saved_is_the_same_and_can_be_read_by_everybody(model: FlightModel, tmp_path: Path) -> None:
-    paths = [tmp_path / f"{k}.safetensors" for k in range(2)]
-    for path in paths:
-        save_model(model, path)
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-    (tmp_path / "plain").touch()
-    assert paths[0].stat().st_mode == (tmp_path / "plain").stat().st_mode
-    again = load_model(paths[0], cpu)
-    assert (again.camera, again.bands, again.fingerprint) == (model.camera, model.bands, model.fingerprint)
-    np.testing.assert_equal(dict(again.mappings), dict(model.mappings))
-    patches = torch.randn(5, 1, 16, 16)
-    for side in range(5):
-        torch.testing.assert_close(again.net(patches, side), model.net(patches, side))
-
-
-def test_what_is_no_model_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "m.safetensors"
-    with pytest.raises(agalign.InputError, match=r"m\.safetensors"):
-        load_model(path, cpu)
-    path.write_bytes(b"nonsense" * 100)
-    with pytest.raises(agalign.InputError, match=r"m\.safetensors"):
-        load_model(path, cpu)
-    from safetensors.torch import save_file
-
-    save_file({"x": torch.zeros(1)}, path)
-    with pytest.raises(agalign.InputError, match="not a model of agalign"):
-        load_model(path, cpu)
 
 
 def test_a_model_is_used_again(

@@ -1,4 +1,4 @@
-"""What the benchmarks share: errors at tie points, sections of documents, command lines."""
+"""What the benchmarks share: errors at tie points, sections of documents, watched processes."""
 
 import json
 import sys
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from common import Section, band_errors, parsed, read_ties, watched
+from common import Section, band_errors, read_ties, watched
 
 from agalign.values import geometry
 
@@ -46,19 +46,6 @@ def test_a_section_replaces_what_is_between_its_marks(tmp_path: Path) -> None:
     assert page.read_text() == f"before\n<!-- kills -->\n\nNew.\n\n{table}\n\n<!-- end of kills -->\nafter\n"
     with pytest.raises(SystemExit, match="has no section"):
         Section("soak", page).say("text")
-
-
-def test_options_have_the_types_of_their_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["x.py", "flight", "--rng-seed", "3", "--markdown", "a.md", "--peers"])
-    asked = parsed("", "flight", kills=50, minutes=1.5, rng_seed=0, markdown=None, peers=False)
-    assert vars(asked) == {
-        "flight": Path("flight"),
-        "kills": 50,
-        "minutes": 1.5,
-        "rng_seed": 3,
-        "markdown": Path("a.md"),
-        "peers": True,
-    }
 
 
 def test_a_watched_process_has_its_children() -> None:

@@ -4,9 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from synthetic_flights.panel import make_flight_between_panels
 
-from agalign.cameras.discover import discover
 from agalign.flight.panels import BandReading, PanelReading, read_panel, reflectance_factors, with_height, with_panels
 from agalign.pixels.panel import DetectedPanel
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Radiometry
@@ -99,18 +97,6 @@ def test_the_search_for_panels_ends_after_three_captures_without_one(monkeypatch
     )
     with_panels(captures_in_seconds(undated=10))
     assert sorted(looked) == [0, 1, 2, 17, 18, 19]
-
-
-@pytest.mark.full
-@pytest.mark.slow
-def test_panels_are_searched_in_the_first_and_last_captures(tmp_path: Path) -> None:
-    make_flight_between_panels(tmp_path, 7, (640, 480))
-    result = with_panels(discover(tmp_path).captures)
-    assert [c.panel is not None for c in result] == [True, *[False] * 7, True]
-    assert len(result[0].bands) == 5
-    assert all(b.panel is not None and b.panel.corners_px and b.panel.albedo for b in result[0].bands)
-    (shown,) = {b.panel.serial for b in result[-1].bands if b.panel is not None}
-    assert shown == "RP04-0000001-SY"
 
 
 def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
