@@ -35,7 +35,7 @@ def run_without(flight: Path, lost: set[str], how: str, rng: np.random.Generator
         shutil.copytree(flight, copy, copy_function=shutil.copy)
         for path in copy.rglob("*"):
             path.chmod(0o755 if path.is_dir() else 0o644)
-        for name in lost:
+        for name in sorted(lost):
             spoil(next(copy.rglob(name)), how, rng)
         align(copy, out)
         truth = read_ties(flight / "ties.json")
