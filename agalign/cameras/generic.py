@@ -6,7 +6,7 @@ from pathlib import Path
 
 from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import BAND_NAME, NAMESPACE
+from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import JPEG_SUFFIXES, PICTURE_SUFFIXES, RasterInfo
 from agalign.values.capture import Band
@@ -41,7 +41,7 @@ class Generic(Camera):
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
         if path.suffix.lower() in PICTURE_SUFFIXES:
             return self._picture_bands(path, info)
-        own_name = tags.text(*BAND_NAME) or self.split(path)[1]
+        own_name = tags.text(NAMESPACE, "BandName") or self.split(path)[1]
         indexes = info.band_indexes
         file_wavelength_nm = tags.number(NAMESPACE, "CentralWavelength") or _wavelength_in(own_name)
         result = []

@@ -13,7 +13,7 @@ from pathlib import Path
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, band_of, elevation_of, is_thermal, max_value, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, finite
-from agalign.cameras.xmp import Name
+from agalign.cameras.xmp import names_in
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose, Radiometry
 
@@ -24,8 +24,6 @@ _HORIZONTAL_IRRADIANCE_UNIT = 0.01
 _MAX_TWELVE_BIT_VALUE = 65520.0
 """RedEdge cameras store 12 bits in the upper bits of uint16."""
 _MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
-_CAPTURE_ID: Name = (_MICASENSE, "CaptureId")
-_CALIBRATION: Name = (_MICASENSE, "RadiometricCalibration")
 _CENTIKELVIN = Radiometry("temperature", 27315.0, 1.0, 0.01)
 """Unit of thermal bands, in agreement with the Altum's tag SceneTemperature."""
 _REDEDGE_M_PARALLAX = {
@@ -41,22 +39,22 @@ ground decreases. Two flights with two cameras agree within 5 %.
 
 
 class _TagTransfer(pix4d.TagTransfer):
-    radiometry = pix4d.TagTransfer.radiometry | {_CALIBRATION, (_MICASENSE, "DarkRowValue")}
+    radiometry = pix4d.TagTransfer.radiometry | names_in(_MICASENSE, "RadiometricCalibration DarkRowValue")
 
 
 class MicaSense(Camera):
     """The MicaSense family."""
 
     name = "MicaSense"
-    capture_ids = (_CAPTURE_ID,)
+    capture_ids = ((_MICASENSE, "CaptureId"),)
     flight_ids = ((_MICASENSE, "FlightId"),)
     tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
-        return tags.make.lower() == "micasense" or _CAPTURE_ID in tags.xmp
+        return tags.make.lower() == "micasense" or (_MICASENSE, "CaptureId") in tags.xmp
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        name = tags.text(*pix4d.BAND_NAME) or _index_in_name(path) or path.stem
+        name = tags.text(pix4d.NAMESPACE, "BandName") or _index_in_name(path) or path.stem
         band = pix4d.with_wavelength(band_of(path, info, name), tags)
         lens = pix4d.perspective_lens(tags)
         parallax = pix4d.parallax_of(tags)
@@ -93,13 +91,13 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     """L = V a1 / g (p - p_black) / (t + a2 y - a3 t y) with p = raw / 65536, vignetting V, gain g = ISO / 100, exposure
     time t and row y; reflectance = pi L / E with the irradiance E of the light sensor on a horizontal plane.
     """
-    a = tags.numbers(*_CALIBRATION)
+    a = tags.numbers(_MICASENSE, "RadiometricCalibration")
     exposure_s = finite(tags.exif.get("ExposureTime"))
     iso = finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
     if len(a) != 3 or not exposure_s or tags.black_level is None or not iso:
         return None
     irradiance = _irradiance(tags)
-    centre, k = tags.numbers(*pix4d.VIGNETTING_CENTRE), tags.numbers(*pix4d.VIGNETTING_POLYNOMIAL)
+    centre, k = tags.numbers(pix4d.NAMESPACE, "VignettingCenter"), tags.numbers(pix4d.NAMESPACE, "VignettingPolynomial")
     has_vignetting = len(centre) == 2
     return Radiometry(
         "radiance",

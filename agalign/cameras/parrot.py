@@ -17,14 +17,13 @@ import numpy as np
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, band_of, colour_bands, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags
-from agalign.cameras.xmp import Name, Packet
+from agalign.cameras.xmp import Packet, names_in
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band
 from agalign.values.geometry import Matrix
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens, radial_coefficients
 
-_NAMES = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
 _SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
 _MAX_RAY_TAN = 3.0
 """Tangent of the largest angle from the axis: 72 degrees, beyond the corners of any Sequoia."""
@@ -32,42 +31,41 @@ _CORNER_MARGIN = 1.1
 """The distortion is fitted up to this multiple of the corners' distance, so that it is accurate at the border."""
 _MAX_SHEAR = 1e-3
 """Limit of D and E relative to C: `Lens` has no shear, so that the lens is not used beyond it."""
-_POLYNOMIAL: Name = (pix4d.NAMESPACE, "FisheyePolynomial")
-_AFFINE: Name = (pix4d.NAMESPACE, "FisheyeAffineMatrix")
-_FISHEYE: tuple[Name, ...] = (_POLYNOMIAL, _AFFINE, (pix4d.NAMESPACE, "FisheyeAffineSymmetric"))
+_FISHEYE = names_in(pix4d.NAMESPACE, "FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
 
 
 class _TagTransfer(pix4d.TagTransfer):
-    geometry = pix4d.TagTransfer.geometry | {*_FISHEYE}
-    in_px = (_AFFINE,)
+    geometry = pix4d.TagTransfer.geometry | _FISHEYE
+    in_px = names_in(pix4d.NAMESPACE, "FisheyeAffineMatrix")
     principal_point_follows_orientation = True
 
     def put_geometry(
         self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
     ) -> None:
         super().put_geometry(packet, reference_packet, reference, tags, grid)
-        density = self.pixels_per_mm(tags)
-        if grid.undistorted and tags.numbers(*_AFFINE) and density and reference.lens is not None:
+        density = pix4d.pixels_per_mm(tags)
+        is_fisheye = bool(tags.numbers(pix4d.NAMESPACE, "FisheyeAffineMatrix"))
+        if grid.undistorted and is_fisheye and density and reference.lens is not None:
             # The undistorted image is that of a pinhole camera.
             packet.remove(_FISHEYE)
-            packet.put(pix4d.MODEL_TYPE, ["perspective"])
-            packet.add(pix4d.FOCAL_LENGTH, pix4d.number_text(reference.lens.fx_px / density))
-            packet.add(pix4d.FOCAL_LENGTH_UNITS, "mm")
+            packet.put((pix4d.NAMESPACE, "ModelType"), ["perspective"])
+            packet.add((pix4d.NAMESPACE, "PerspectiveFocalLength"), pix4d.number_text(reference.lens.fx_px / density))
+            packet.add((pix4d.NAMESPACE, "PerspectiveFocalLengthUnits"), "mm")
 
 
 class Sequoia(Camera):
     """Parrot Sequoia and Sequoia+."""
 
     name = "Parrot Sequoia"
-    capture_ids = (pix4d.CAPTURE_UUID,)
-    flight_ids = (pix4d.FLIGHT_UUID,)
+    capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"),)
+    flight_ids = ((pix4d.NAMESPACE, "FlightUUID"),)
     tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "parrot" or tags.text(pix4d.NAMESPACE, "RigName").lower().startswith("sequoia")
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        fisheye = "fisheye" in tags.text(*pix4d.MODEL_TYPE).lower()
+        fisheye = "fisheye" in tags.text(pix4d.NAMESPACE, "ModelType").lower()
         lens = _fisheye_lens(tags, info) if fisheye else pix4d.perspective_lens(tags)
         to_camera = np.eye(3)
         if self.tag_transfer.is_rotated(tags):
@@ -76,7 +74,9 @@ class Sequoia(Camera):
         if len(info.dtypes) > 1:
             return colour_bands(path, info, lens, to_rig)
         suffix = _SUFFIX.search(path.stem)
-        name = _NAMES.get(suffix[1].upper(), suffix[1]) if suffix else tags.text(*pix4d.BAND_NAME) or path.stem
+        names = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
+        named_by_tag = tags.text(pix4d.NAMESPACE, "BandName") or path.stem
+        name = names.get(suffix[1].upper(), suffix[1]) if suffix else named_by_tag
         return (replace(pix4d.with_wavelength(band_of(path, info, name), tags), lens=lens, to_rig=to_rig),)
 
     def capture_name(self, path: Path) -> str:
@@ -84,7 +84,8 @@ class Sequoia(Camera):
 
 
 def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
-    polynomial, affine, centre_px = tags.numbers(*_POLYNOMIAL), tags.numbers(*_AFFINE), pix4d.principal_point_px(tags)
+    polynomial, affine = (tags.numbers(pix4d.NAMESPACE, f"Fisheye{name}") for name in ("Polynomial", "AffineMatrix"))
+    centre_px = pix4d.principal_point_px(tags)
     if len(polynomial) != 4 or len(affine) != 4 or centre_px is None:
         return None
     c, d, e, f = affine

@@ -32,8 +32,8 @@ class Sentera(Camera):
     """Sentera 6X and Double 4K."""
 
     name = "Sentera"
-    capture_ids = (pix4d.CAPTURE_UUID, (_SENTERA, "CaptureUUID"), (_SENTERA, "ImageUniqueID"))
-    flight_ids = (pix4d.FLIGHT_UUID, (_SENTERA, "FlightUUID"), (_SENTERA, "FlightUniqueID"))
+    capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"), (_SENTERA, "CaptureUUID"), (_SENTERA, "ImageUniqueID"))
+    flight_ids = ((pix4d.NAMESPACE, "FlightUUID"), (_SENTERA, "FlightUUID"), (_SENTERA, "FlightUniqueID"))
 
     def recognises(self, tags: Tags) -> bool:
         return "sentera" in tags.make.lower() or any(namespace == _SENTERA for namespace, _ in tags.xmp)
@@ -44,7 +44,7 @@ class Sentera(Camera):
         matrix = tags.numbers(_SENTERA, "AlignMatrix")
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
         folder = _BAND_FOLDER.match(path.parent.name)
-        name = tags.text(*pix4d.BAND_NAME) or (folder["name"] if folder else path.stem)
+        name = tags.text(pix4d.NAMESPACE, "BandName") or (folder["name"] if folder else path.stem)
         band = pix4d.with_wavelength(band_of(path, info, name), tags)
         if folder and band.wavelength_nm is None:
             width = float(folder["width"]) if folder["width"] else None
@@ -77,7 +77,7 @@ def _channel_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]
 
 def _listed_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
     """The bands of a photograph as its tags list them by channel; a channel without a wavelength is left out."""
-    names = tags.xmp.get(pix4d.BAND_NAME, ())
+    names = tags.xmp.get((pix4d.NAMESPACE, "BandName"), ())
     wavelengths, widths = (tags.numbers(pix4d.NAMESPACE, name) for name in ("CentralWavelength", "WavelengthFWHM"))
     if not len(names) == len(wavelengths) == len(info.dtypes):
         return ()

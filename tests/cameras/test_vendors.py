@@ -15,7 +15,7 @@ from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.parrot import Sequoia
-from agalign.cameras.pix4d import BAND_NAME, NAMESPACE
+from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.sentera import Sentera
 from agalign.cameras.tiff_directory import Entry, add_directories, byte_string, rational, short, text
 from agalign.pixels.raster import RasterInfo, probe
@@ -342,7 +342,7 @@ def test_a_double_4k_lists_its_bands_and_calls_one_garbage(tmp_path: Path) -> No
         ("NDRE", ("RedEdge", "Garbage", "NIR"), ("720", "0", "840"), {"Red edge": 1, "NIR": 3}),
     ):
         path = tmp_path / folder / "IMG_00042.jpg"
-        tags = Tags(make="Sentera", xmp={BAND_NAME: names, (NAMESPACE, "CentralWavelength"): wavelengths})
+        tags = Tags(make="Sentera", xmp={(NAMESPACE, "BandName"): names, (NAMESPACE, "CentralWavelength"): wavelengths})
         bands = Sentera().bands(path, tags, info)
         assert {b.name: b.band_index for b in bands} == expected
         assert bands[0].wavelength_nm == float(wavelengths[0])
