@@ -140,6 +140,9 @@ def _through_rig(reference: Matrix | None, moving: Matrix | None) -> Matrix | No
 
 # ---- for the modules of the cameras
 
+FULL_SCALE = 65536.0
+"""Divisor of pixel values in the radiometric models of the makers: bands are stored as 16 bits."""
+
 
 def band_of(path: Path, info: RasterInfo, name: str, index: int = 1) -> Band:
     """Return a band with the properties of its raster; `index` counts from 1."""

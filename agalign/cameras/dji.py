@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import Camera, band_of, colour_bands
+from agalign.cameras.base import FULL_SCALE, Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
 from agalign.cameras.xmp import Packet, names_in
 from agalign.errors import GeometryError
@@ -34,8 +34,6 @@ _MAVIC_3_NAME = re.compile(r"^(?P<capture>.*?)_(?:MS_(?P<band>G|RE?|NIR)|D)$", r
 _DJI = "dji.com/drone-dji"
 _MAX_UPRIGHT_ROLL_DEG = 90.0
 """Larger gimbal rolls mean upside down: gimbals write a roll near 0 or near 180 degrees."""
-_FULL_SCALE = 65536.0
-"""Pixel values are divided by this in DJI's guide: bands are stored as 16 bits."""
 
 
 class _TagTransfer(pix4d.TagTransfer):
@@ -141,7 +139,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     return Radiometry(
         "relative radiance",
         black,
-        _FULL_SCALE,
+        FULL_SCALE,
         adjusted / (gain * exposure_us / 1e6),
         centre or (0.0, 0.0),
         k if centre else (),

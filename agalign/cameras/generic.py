@@ -8,23 +8,19 @@ from agalign.cameras.base import Camera, band_of, colour_bands
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import ConfigurationError
-from agalign.pixels.raster import JPEG_SUFFIXES, PICTURE_SUFFIXES, RasterInfo
+from agalign.pixels.raster import RasterInfo, suffix_format
 from agalign.values.capture import Band
 
-_BAND_WORDS = (
-    "coastal|blue|green|red[ _-]?edge|near[ _-]?infra[ _-]?red|infra[ _-]?red|red|nir|swir|pan|panchro|lwir|thermal|"
-    "gre|reg|rgb|grn|blu|vis|ms"
+_BAND = (
+    r"(?:coastal|blue|green|red[ _-]?edge|near[ _-]?infra[ _-]?red|infra[ _-]?red|red|nir|swir|pan|panchro|lwir|"
+    r"thermal|gre|reg|rgb|grn|blu|vis|ms)[_-]?\d*|\d{3,4} ?nm"
 )
 _SUFFIX = re.compile(
-    rf"^(?P<capture>.*?)(?:(?:^|(?<=.)[_\-. ]+)(?P<band>(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|b?\d{{1,2}}|re|[bgrn])"
+    rf"^(?P<capture>.*?)(?:(?:^|(?<=.)[_\-. ]+)(?P<band>{_BAND}|b?\d{{1,2}}|re|[bgrn])"
     rf"|(?<=[0-9a-z])(?P<glued>(?-i:Blue|Green|RedEdge|Red|NIR|GRE|REG|RED|BLUE|GREEN)|\d{{3,4}}nm))$",
     re.IGNORECASE | re.DOTALL,
 )
 """A band at the end of a file name, after a separator, or `glued` to the name of the capture as in DJI_0001NIR."""
-_SPECTRAL = re.compile(rf"(?!rgb|vis|ms)(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|re|[bgrn]", re.IGNORECASE)
-"""Names of single bands; colour photographs do not have them."""
-_DATE = re.compile(r"(?:19|20)\d\d([-_.])\d{1,2}\1\d{1,2}$")
-"""A date at the end of a name: its last number is a day, not a band."""
 
 
 class Generic(Camera):
@@ -39,7 +35,7 @@ class Generic(Camera):
         return True
 
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        if path.suffix.lower() in PICTURE_SUFFIXES:
+        if suffix_format(path) in ("JPEG", "PNG"):
             return self._picture_bands(path, info)
         own_name = tags.text(NAMESPACE, "BandName") or self.split(path)[1]
         indexes = info.band_indexes
@@ -57,9 +53,10 @@ class Generic(Camera):
         A number in the name of a picture is not a band. If a band is stored as three equal channels, the first is read.
         """
         name = self.split(path)[1]
-        if name and (self._patterns or _SPECTRAL.fullmatch(name)):
+        is_spectral = re.fullmatch(rf"(?!rgb|vis|ms)(?:{_BAND}|re|[bgrn])", name, re.IGNORECASE)  # no photograph
+        if name and (self._patterns or is_spectral):
             return (replace(band_of(path, info, name), wavelength_nm=_wavelength_in(name)),)
-        return colour_bands(path, info) if path.suffix.lower() in JPEG_SUFFIXES else ()
+        return colour_bands(path, info) if suffix_format(path) == "JPEG" else ()
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         return self.split(path)[0]
@@ -74,7 +71,9 @@ class Generic(Camera):
             match = pattern.fullmatch(path.name)
             if match:
                 return match["capture"], match["band"]
-        match = None if self._patterns or _DATE.search(path.stem) else _SUFFIX.fullmatch(path.stem)
+        # The last number of a date at the end of a name is a day, not a band.
+        has_date = re.search(r"(?:19|20)\d\d([-_.])\d{1,2}\1\d{1,2}$", path.stem)
+        match = None if self._patterns or has_date else _SUFFIX.fullmatch(path.stem)
         if match:
             return match["capture"].rstrip("_-. "), match["band"] or match["glued"]
         return path.stem, ""
@@ -92,8 +91,7 @@ def compile_pattern(pattern: str) -> tuple[re.Pattern[str], ...]:
             f"pattern '{pattern}' needs {{capture}} and {{band}} once each, as in '{{capture}}_{{band}}.tif'"
         )
     escaped = re.escape(pattern).replace(r"\{capture\}", "(?P<capture>.+)").replace(r"\*", ".*")
-    bands = rf"(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm", "[^/]+?"
-    whole = (escaped.replace(r"\{band\}", f"(?P<band>{band})") for band in bands)
+    whole = (escaped.replace(r"\{band\}", f"(?P<band>{band})") for band in (_BAND, "[^/]+?"))
     return tuple(re.compile(one, re.IGNORECASE | re.DOTALL) for one in whole)
 
 

@@ -14,9 +14,6 @@ from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band
 
 _FILE = re.compile(r"^capture_(?P<serial>[^_]+)_(?P<moment>.+)$", re.IGNORECASE)
-_FILTER = re.compile(r"-F(?P<wavelength>\d{3,4})$")
-_NAMES = ((500, "Blue"), (600, "Green"), (690, "Red"), (760, "Red edge"), (1100, "NIR"))
-"""(longest wavelength in nm, name of the band)."""
 
 
 class Mapir(Camera):
@@ -30,12 +27,13 @@ class Mapir(Camera):
     def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
         if len(info.dtypes) > 1:
             return tuple(replace(band_of(path, info, f"band_{i}", i), one_lens=True) for i in info.band_indexes)
-        bandpass = _FILTER.search(tags.model)
+        bandpass = re.search(r"-F(?P<wavelength>\d{3,4})$", tags.model)
         if not bandpass:
             file = _FILE.match(path.stem)
             return (band_of(path, info, f"band_{file['serial']}" if file else path.stem),)
         wavelength_nm = float(bandpass["wavelength"])
-        name = next((n for longest_nm, n in _NAMES if wavelength_nm <= longest_nm), f"{wavelength_nm:g}nm")
+        longest_nm = {"Blue": 500, "Green": 600, "Red": 690, "Red edge": 760, "NIR": 1100}
+        name = next((n for n, nm in longest_nm.items() if wavelength_nm <= nm), f"{wavelength_nm:g}nm")
         return (replace(band_of(path, info, name), wavelength_nm=wavelength_nm),)
 
     def capture_name(self, path: Path) -> str:

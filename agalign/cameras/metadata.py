@@ -12,17 +12,14 @@ from PIL import ExifTags
 from agalign.cameras.tiff_directory import EXIF, GPS, read_directories, values
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
-from agalign.pixels.raster import JPEG_SUFFIXES, PNG_SUFFIXES
+from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Position
 from agalign.values.text import without_controls
 
-_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
 _MAX_ALTITUDE_M = 20_000.0
 """Altitudes beyond it come from damaged tags."""
 _MAX_TEXT_LENGTH = 200
 """Makes, models and serial numbers are shorter; a damaged tag may contain megabytes."""
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _MAX_NUMBER = 1e15
 """Larger than any valid value (times in microseconds); the squares of damaged values would overflow."""
 
@@ -57,7 +54,8 @@ class Tags:
 
     def numbers(self, namespace: str, name: str) -> tuple[float, ...]:
         """Return the numbers in an XMP value, a text or a sequence, without impossibly large ones."""
-        numbers = (float(n) for n in _NUMBER.findall(self.text(namespace, name)))
+        texts = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", self.text(namespace, name))
+        numbers = map(float, texts)
         return tuple(n for n in numbers if abs(n) < _MAX_NUMBER)
 
     def number(self, namespace: str, name: str) -> float | None:
@@ -69,7 +67,8 @@ class Tags:
         """Pixels per mm of the focal plane, from EXIF FocalPlaneXResolution and its unit."""
         resolution = finite(self.exif.get("FocalPlaneXResolution"))
         unit = self.exif.get("FocalPlaneResolutionUnit", 2)
-        mm = _MM_PER_UNIT.get(int(unit)) if isinstance(unit, int) else None
+        mm_per_unit = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
+        mm = mm_per_unit.get(int(unit)) if isinstance(unit, int) else None
         return resolution / mm if resolution and mm else None
 
     @property
@@ -88,12 +87,12 @@ def read_tags(path: Path) -> Tags:
 
     Raises UnreadableFileError if the file is not of the format of its suffix or is truncated.
     """
-    if path.suffix.lower() in PNG_SUFFIXES:
+    if suffix_format(path) == "PNG":
         return Tags()
     try:
         directories = read_directories(path)
     except Exception as error:  # damaged files cause struct.error, KeyError, MemoryError … in the libraries
-        kind = "JPEG" if path.suffix.lower() in JPEG_SUFFIXES else "TIFF"
+        kind = suffix_format(path) or "TIFF"
         raise UnreadableFileError(
             f"{path}: not a readable {kind} ({error or 'empty'}); copy it from the card again"
         ) from None

@@ -11,21 +11,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import Camera, band_of, elevation_of, is_thermal, max_value, rays_to_rig, rotation
+from agalign.cameras.base import FULL_SCALE, Camera, band_of, elevation_of, is_thermal, max_value, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.xmp import names_in
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose, Radiometry
 
-_FULL_SCALE = 65536.0
-"""Divisor of the pixel values in MicaSense's radiometric model: bands are stored as 16 bits."""
 _HORIZONTAL_IRRADIANCE_UNIT = 0.01
 """W / m^2 / nm: unit of HorizontalIrradiance if no tag gives its scale."""
 _MAX_TWELVE_BIT_VALUE = 65520.0
 """RedEdge cameras store 12 bits in the upper bits of uint16."""
 _MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
-_CENTIKELVIN = Radiometry("temperature", 27315.0, 1.0, 0.01)
-"""Unit of thermal bands, in agreement with the Altum's tag SceneTemperature."""
 _REDEDGE_M_PARALLAX = {
     "Blue": (-0.9, 0.0),
     "Green": (0.0, 0.0),
@@ -60,13 +56,14 @@ class MicaSense(Camera):
         parallax = pix4d.parallax_of(tags)
         if parallax is None and tags.model == "RedEdge-M":
             parallax = _REDEDGE_M_PARALLAX.get(name)
+        centikelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)  # in agreement with the Altum's SceneTemperature
         band = replace(
             band,
             saturation_value=_MAX_TWELVE_BIT_VALUE if band.dtype == "uint16" else max_value(band.dtype),
             lens=lens,
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
             parallax=parallax,
-            radiometry=_CENTIKELVIN if is_thermal(band) else _radiometry(tags),
+            radiometry=centikelvin if is_thermal(band) else _radiometry(tags),
             lens_offset_m=pix4d.lens_offset_m(tags),
         )
         return (band,)
@@ -102,7 +99,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     return Radiometry(
         "radiance",
         tags.black_level,
-        _FULL_SCALE,
+        FULL_SCALE,
         a[0] / (iso / 100) / exposure_s,
         (centre[0], centre[1]) if has_vignetting else (0.0, 0.0),
         k if has_vignetting else (),

@@ -31,11 +31,11 @@ _CORNER_MARGIN = 1.1
 """The distortion is fitted up to this multiple of the corners' distance, so that it is accurate at the border."""
 _MAX_SHEAR = 1e-3
 """Limit of D and E relative to C: `Lens` has no shear, so that the lens is not used beyond it."""
-_FISHEYE = names_in(pix4d.NAMESPACE, "FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
 
 
 class _TagTransfer(pix4d.TagTransfer):
-    geometry = pix4d.TagTransfer.geometry | _FISHEYE
+    fisheye = names_in(pix4d.NAMESPACE, "FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
+    geometry = pix4d.TagTransfer.geometry | fisheye
     in_px = names_in(pix4d.NAMESPACE, "FisheyeAffineMatrix")
     principal_point_follows_orientation = True
 
@@ -47,7 +47,7 @@ class _TagTransfer(pix4d.TagTransfer):
         is_fisheye = bool(tags.numbers(pix4d.NAMESPACE, "FisheyeAffineMatrix"))
         if grid.undistorted and is_fisheye and density and reference.lens is not None:
             # The undistorted image is that of a pinhole camera.
-            packet.remove(_FISHEYE)
+            packet.remove(self.fisheye)
             packet.put((pix4d.NAMESPACE, "ModelType"), ["perspective"])
             packet.add((pix4d.NAMESPACE, "PerspectiveFocalLength"), pix4d.number_text(reference.lens.fx_px / density))
             packet.add((pix4d.NAMESPACE, "PerspectiveFocalLengthUnits"), "mm")

@@ -175,10 +175,10 @@ class TagTransfer:
             packet.put((NAMESPACE, name), ["0", "0", "0"])
         self._put_principal_point(packet, reference, tags, grid)
         focal_length = names_in(NAMESPACE, "PerspectiveFocalLength" if focal_length_is_in_px(tags) else "")
-        for name in self.in_px | focal_length:
-            values = tags.numbers(*name)
+        for length in self.in_px | focal_length:
+            values = tags.numbers(*length)
             if values and grid.scale.mean != 1:
-                packet.put(name, [number_text(v * grid.scale.mean) for v in values])
+                packet.put(length, [number_text(v * grid.scale.mean) for v in values])
         if grid.undistorted:
             distortion = NAMESPACE, "PerspectiveDistortion"
             packet.put(distortion, ["0"] * len(tags.numbers(*distortion)))

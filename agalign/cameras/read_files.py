@@ -14,7 +14,7 @@ from agalign.cameras.pix4d import panel_in
 from agalign.config import DiscoverOptions
 from agalign.errors import AgalignError, UnreadableFileError
 from agalign.pixels.radiometry import is_physical
-from agalign.pixels.raster import TIFF_SUFFIXES, RasterInfo, probe
+from agalign.pixels.raster import RasterInfo, probe, suffix_format
 from agalign.values.capture import Band
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
 from agalign.values.processes import follow_parent
@@ -113,7 +113,7 @@ def _read_task(paths: Sequence[Path], options: DiscoverOptions) -> list[ImageFil
 
 def _is_stack(path: Path, info: RasterInfo) -> bool:
     photograph = info.dtypes[0] == "uint8" and len(info.dtypes) in (3, 4)
-    return path.suffix.lower() in TIFF_SUFFIXES and len(info.dtypes) > 1 and not photograph
+    return suffix_format(path) == "TIFF" and len(info.dtypes) > 1 and not photograph
 
 
 def natural_order(name: str) -> list[tuple[bool, int, str]]:

@@ -18,13 +18,8 @@ from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
-_ANY_BAND_FOLDER = re.compile(
-    r"^(?:\d+-)?[A-Za-z ]+-\d{3,4}(?:-\d+)?$|^(?:\d+-)?(?:n?RGB|NDRE|NDVI|NIR|RE|LWIR)$", re.I
-)
 _CHANNELS = {"NDRE": {1: ("Red edge", 720.0), 3: ("NIR", 840.0)}, "NDVI": {1: ("Red", 625.0), 3: ("NIR", 850.0)}}
 """Bands of single-lens cameras by the filter: {channel, from 1: (name, centre wavelength in nm)}."""
-_BAND_NAMES = {"RedEdge": "Red edge"}
-"""Names in the tags that are written differently here."""
 _SENTERA = "sentera.com"
 
 
@@ -56,7 +51,11 @@ class Sentera(Camera):
         return pix4d.pose_of(tags, tags.number(_SENTERA, altitude) or tags.number(pix4d.NAMESPACE, altitude))
 
     def capture_folder(self, path: Path) -> Path:
-        return path.parent.parent if _ANY_BAND_FOLDER.match(path.parent.name) else path.parent
+        folder = path.parent
+        named = _BAND_FOLDER.match(folder.name) or re.match(
+            r"^(?:\d+-)?(?:n?RGB|NDRE|NDVI|NIR|RE|LWIR)$", folder.name, re.IGNORECASE
+        )
+        return folder.parent if named else folder
 
     def capture_name(self, path: Path) -> str:
         return re.sub(r"_\d{3}_\d{2,3}$", "", path.stem)
@@ -84,7 +83,7 @@ def _listed_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
     lens = pix4d.perspective_lens(tags)
     return tuple(
         replace(
-            band_of(path, info, _BAND_NAMES.get(name, name), index),
+            band_of(path, info, "Red edge" if name == "RedEdge" else name, index),
             wavelength_nm=wavelength,
             one_lens=True,
             lens=lens,

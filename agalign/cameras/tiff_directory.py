@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 from PIL import Image
 from tifffile import DATATYPE, TIFF
 
-from agalign.pixels.raster import JPEG_SUFFIXES
+from agalign.pixels.raster import suffix_format
 
 EXIF, GPS = 34665, 34853
 """Tags with the offset of a directory as value."""
@@ -25,8 +25,6 @@ _MAX_BYTES = 1 << 25
 _MAX_ENTRIES = 4096
 """Limit of the number of entries in a directory, which may be damaged: cameras write fewer than 100."""
 _MAX_LONG = (1 << 32) - 1
-_MAX_MILLIONTHS = 4000
-"""Values below this are written as millionths, whose numerators fit into 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ def rational(*values: float) -> Entry:
     for value in values:
         if not 0 <= value < _MAX_LONG:
             raise ValueError(f"{value} does not fit into a TIFF fraction")
-        denominator = 1_000_000 if value < _MAX_MILLIONTHS else max(1, int(_MAX_LONG / (value + 1)))
+        denominator = min(1_000_000, max(1, int(_MAX_LONG / (value + 1))))
         pairs += struct.pack("<II", round(value * denominator), denominator)
     return Entry(DATATYPE.RATIONAL, len(values), pairs)
 
@@ -93,7 +91,7 @@ def read_directories(path: Path) -> dict[int, Directory]:
     A file with the suffix of a JPEG is read as one. Raises ValueError, or an error of Pillow, if the file is malformed,
     OSError if it cannot be read.
     """
-    if path.suffix.lower() not in JPEG_SUFFIXES:
+    if suffix_format(path) != "JPEG":
         with path.open("rb") as file:
             return _read_all(file)
     with Image.open(path, formats=("JPEG",)) as image:

@@ -28,15 +28,13 @@ def names_in(namespace: str, names: str) -> frozenset[Name]:
 
 
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
-_MAX_NAMESPACE_DEPTH = 4
-"""Parts of a namespace that are used; cameras write at most three."""
 _MAX_DEPTH = 50
-"""Limit of nested elements, which protects the recursive XML library; cameras write six."""
+"""Limit of nested elements, which protects the recursive XML library, and of the parts of a namespace; cameras write
+six and three.
+"""
 _MAX_LENGTH = 1 << 22
 """Limit of the characters of a packet; cameras write a few thousand."""
 _NAMESPACES = threading.Lock()
-_SCHEME_AND_VERSION = re.compile(r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$", re.IGNORECASE)
-_PREFIX = re.compile(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""")
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,8 @@ class Packet:
             return cls()
         if _is_deeper(root, _MAX_DEPTH):
             return cls()
-        return cls(root, tuple(p for p in _PREFIX.findall(text) if not re.fullmatch(r"ns\d+", p[0])))
+        prefixes = re.findall(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""", text)
+        return cls(root, tuple(p for p in prefixes if not re.fullmatch(r"ns\d+", p[0])))
 
     def values(self) -> dict[Name, tuple[str, ...]]:
         """Return {(namespace, name): values} of all rdf:Description elements; the first of two values is used.
@@ -181,6 +180,7 @@ def _is_one_of(tag: str, names: Collection[Name]) -> bool:
 def _namespaces(uri: str) -> list[str]:
     if uri.startswith("http://www.w3.org/"):
         return []
-    path = _SCHEME_AND_VERSION.sub("", uri)
-    parts = path.split("/")[:_MAX_NAMESPACE_DEPTH]
+    scheme_and_version = r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$"
+    path = re.sub(scheme_and_version, "", uri, flags=re.IGNORECASE)
+    parts = path.split("/")[:_MAX_DEPTH]
     return ["/".join(parts[:count]) for count in range(len(parts), 0, -1)] if path else []

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -28,13 +28,8 @@ from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
 from agalign.values.pixel_units import PixelScale
 
-TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 _READ_WHOLE_PX = 1 << 26
 """Images up to this size are decoded completely before averaging: 128 MB in 16 bits."""
-JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
-PNG_SUFFIXES = frozenset({".png"})
-PICTURE_SUFFIXES = JPEG_SUFFIXES | PNG_SUFFIXES
-"""Photographs, or bands exported by other software, mostly in 8 bits."""
 GDAL_ENVIRONMENT = {
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
@@ -58,6 +53,21 @@ _PREVIEW_SIDE_PX = 2048
 """Default longest side of a preview; larger than it is displayed."""
 _MAX_MICROMETRES = 20.0
 """Wavelengths without a unit are in micrometres below this: thermal bands end at 14 um, and none is below 100 nm."""
+
+
+def suffix_format(path: Path) -> Literal["TIFF", "JPEG", "PNG"] | None:
+    """Return the format that the suffix of a file stands for; None for other files.
+
+    JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits.
+    """
+    match path.suffix.lower():
+        case ".tif" | ".tiff":
+            return "TIFF"
+        case ".jpg" | ".jpeg":
+            return "JPEG"
+        case ".png":
+            return "PNG"
+    return None
 
 
 @dataclass(frozen=True)
