@@ -41,16 +41,8 @@ GDAL_ENVIRONMENT = {
 GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
 description that refers to other files or to a server.
 """
-_DRIVERS = {
-    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "GTiff"),
-    b"\xff\xd8\xff": "JPEG",
-    b"\x89PNG": "PNG",
-}
-"""GDAL drivers by the first bytes of a file. Some of the other drivers execute code or contact servers."""
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
-_PREVIEW_SIDE_PX = 2048
-"""Default longest side of a preview; larger than it is displayed."""
 _MAX_MICROMETRES = 20.0
 """Wavelengths without a unit are in micrometres below this: thermal bands end at 14 um, and none is below 100 nm."""
 
@@ -171,9 +163,13 @@ def _driver_of(path: Path) -> str:
     except (OSError, ValueError) as error:
         text = getattr(error, "strerror", None) or error
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
-    for prefix, driver in _DRIVERS.items():
-        if magic.startswith(prefix):
-            return driver
+    # Some of GDAL's other drivers execute code or contact servers.
+    if magic in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return "GTiff"
+    if magic.startswith(b"\xff\xd8\xff"):
+        return "JPEG"
+    if magic == b"\x89PNG":
+        return "PNG"
     problem = "is empty" if not magic else "is not a TIFF, JPEG or PNG"
     raise UnreadableFileError(f"{path}: {problem}; copy it from the card again")
 
@@ -249,39 +245,33 @@ def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]
     return np.asarray(dataset.read(band.band_index, out_shape=shape, resampling=Resampling.average))
 
 
-def read_window(
-    dataset: rasterio.DatasetReader, band: Band, x0: int, y0: int, width: int, height: int
+def read_tile(
+    band: Band, tile: Tile, dataset: rasterio.DatasetReader | None = None
 ) -> tuple[NDArray[np.generic], Mask]:
-    """Read a window inside the image: pixels in the type of the file and their mask, each (height, width)."""
-    window = Window(x0, y0, width, height)
+    """Read a tile inside a band: pixels in the type of the file and their mask, each (height, width).
+
+    `dataset` is the open file, if it is open. Raises UnreadableFileError.
+    """
+    if dataset is None:
+        with open_raster(band.path) as opened:
+            return read_tile(band, tile, opened)
+    window = Window(tile.x0, tile.y0, tile.width, tile.height)
     pixels = dataset.read(band.band_index, window=window)
     return pixels, data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.band_index, window=window)
 
 
-def read_tile(band: Band, tile: Tile) -> tuple[NDArray[np.generic], Mask]:
-    """Read a tile of a band: pixels in the type of the file and their mask, each (height, width).
-
-    Raises UnreadableFileError.
-    """
-    with open_raster(band.path) as dataset:
-        return read_window(dataset, band, tile.x0, tile.y0, tile.width, tile.height)
-
-
 def read_preview(
-    path: Path, index: int, window_px: tuple[int, int, int, int], size_px: tuple[int, int] | None = None
+    path: Path, index: int, window_px: tuple[int, int, int, int], size_px: tuple[int, int]
 ) -> NDArray[np.float32]:
     """Read a window (x0, y0, width, height) of a band as (height, width) float32 with NaN for nodata.
 
-    It is resampled to `size_px` (width, height), by default to at most _PREVIEW_SIDE_PX. Raises UnreadableFileError.
+    It is resampled to `size_px` (width, height). Raises UnreadableFileError.
     """
     x0, y0, width, height = window_px
-    reduction = max(1.0, max(width, height) / _PREVIEW_SIDE_PX)
-    out_width, out_height = size_px or reduced_size_px((width, height), reduction)
+    resampling = Resampling.average if size_px[0] < width else Resampling.bilinear
     with open_raster(path) as dataset:
         window = Window(x0, y0, width, height)
-        resampling = Resampling.average if out_width < width else Resampling.bilinear
-        shape = out_height, out_width
-        pixels = dataset.read(index, window=window, out_shape=shape, resampling=resampling, boundless=False)
+        pixels = dataset.read(index, window=window, out_shape=size_px[::-1], resampling=resampling)
         nodata = dataset.nodata
     values = pixels.astype(np.float32)
     return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))

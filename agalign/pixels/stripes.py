@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from agalign.pixels.resample import shrink
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values.image import Raster, reduced_size_px
+from agalign.values.resample import MIN_VALID_WEIGHT
 
 _LOG = logging.getLogger(__name__)
 _Profile = NDArray[np.float64]
@@ -27,10 +28,6 @@ _MIN_SIDE_PX = 64
 _MIN_CORRELATION = 0.3
 """Minimum correlation of one half of a band with the other half of another band, median over bands. Captures of eight
 cameras without stripes have up to 0.14, white stripes of 5 % of the range 0.34, of 2 % 0.08."""
-_SMOOTHING_PX = 1.0
-"""Equal to that of the structure field: higher frequencies, such as even and odd lines that differ, do not matter."""
-_KERNEL_PX = 7
-"""Width of the smoothing kernel: three standard deviations on either side."""
 _BLOCKS = 32
 """Lines are averaged to this number before their median; 128 give the same result in twice the time."""
 _DRIFT_PX = 15.0
@@ -93,9 +90,11 @@ def _halves(image: Raster, axis: int) -> tuple[_Profile, _Profile]:
     )
     if axis == 1:
         blocks, weights = np.ascontiguousarray(blocks.T), np.ascontiguousarray(weights.T)
-    differences = np.diff(cv2.GaussianBlur(blocks, (_KERNEL_PX, 1), _SMOOTHING_PX), axis=1)
-    # The mean of float32 ones is not exactly 1.
-    valid = cv2.erode((weights > 0.999).astype(np.uint8), np.ones((1, _KERNEL_PX), np.uint8), borderValue=0) > 0
+    # Smoothed as the structure field: higher frequencies, such as even and odd lines that differ, do not matter.
+    smoothing_px, kernel_px = 1.0, 7
+    differences = np.diff(cv2.GaussianBlur(blocks, (kernel_px, 1), smoothing_px), axis=1)
+    known = (weights > MIN_VALID_WEIGHT).astype(np.uint8)
+    valid = cv2.erode(known, np.ones((1, kernel_px), np.uint8), borderValue=0) > 0
     differences[~(valid[:, 1:] & valid[:, :-1])] = 0
     middle = len(differences) // 2
     upper, lower = (np.median(part, axis=0).astype(float) for part in (differences[:middle], differences[middle:]))

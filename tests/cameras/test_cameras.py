@@ -158,7 +158,9 @@ def test_thermal_bands_count_in_hundredths_of_a_kelvin(tmp_path: Path) -> None:
     path = tmp_path / "IMG_0001_6.tif"
     tifffile.imwrite(path, np.zeros((48, 64), np.uint16), photometric="minisblack", metadata=None)
     tags = Tags(
-        make="MicaSense", model="Altum", xmp={(NAMESPACE, "BandName"): ("LWIR",), (NAMESPACE, "CentralWavelength"): ("11000",)}
+        make="MicaSense",
+        model="Altum",
+        xmp={(NAMESPACE, "BandName"): ("LWIR",), (NAMESPACE, "CentralWavelength"): ("11000",)},
     )
     (band,) = MicaSense().bands(path, tags, probe(path))
     assert (band.radiometry.quantity, band.radiometry.gain) == ("temperature", 0.01)
