@@ -15,8 +15,6 @@ from agalign.values.pixel_units import Size
 
 _SUPPORT_PX = 4
 """Half width of the widest interpolation kernel."""
-_SAMPLE_PX = 16
-"""Spacing of the positions from which the extent of a tile in the moving image is computed."""
 MIN_VALID_WEIGHT = 0.999
 """Minimum weight of valid pixels in a valid resampled or reduced pixel: float32 weights do not sum to exactly 1."""
 _TILE_PX = 1024
@@ -93,9 +91,9 @@ def resample_planes(
 def source_window(positions: NDArray[np.floating], size_px: Size, *, is_smooth: bool) -> Tile | None:
     """Return the window of an image (width, height) that interpolation at positions (H, W, 2) reads; None for none.
 
-    If the mapping is smooth, coarse samples and the borders determine the extent within one pixel.
+    If the mapping is smooth, samples 16 px apart and the borders determine the extent within one pixel.
     """
-    step = _SAMPLE_PX if is_smooth else 1
+    step = 16 if is_smooth else 1
     rows, columns = (np.append(np.arange(0, n, step), n - 1) for n in positions.shape[:2])
     samples = positions[np.ix_(rows, columns)]
     if not np.isfinite(samples).any():
