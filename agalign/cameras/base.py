@@ -23,10 +23,6 @@ from agalign.values.capture import Band, Pose
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 
-_GREEN_NM = 550.0
-_MIN_THERMAL_NM = 3000.0
-"""Bands at shorter wavelengths record reflected sunlight."""
-
 
 class Camera(ABC):
     """A family of cameras: its names of files and bands, and the tags of its lenses and rig."""
@@ -92,7 +88,8 @@ def default_reference(bands: Sequence[Band]) -> int:
     for index in reflective:
         if re.split(r"[-_ ]", bands[index].name.lower())[0] in ("green", "gre", "g"):
             return index
-    known = [(abs(nm - _GREEN_NM), i) for i in reflective if (nm := bands[i].wavelength_nm) is not None]
+    green_nm = 550.0
+    known = [(abs(nm - green_nm), i) for i in reflective if (nm := bands[i].wavelength_nm) is not None]
     return min(known)[1] if known else next(iter(reflective), 0)
 
 
@@ -115,8 +112,8 @@ def listed(bands: Sequence[Band]) -> str:
 
 
 def is_thermal(band: Band) -> bool:
-    """Return True for a thermal infrared band."""
-    by_wavelength = band.wavelength_nm is not None and band.wavelength_nm >= _MIN_THERMAL_NM
+    """Return True for a thermal infrared band: those at shorter wavelengths record reflected sunlight."""
+    by_wavelength = band.wavelength_nm is not None and band.wavelength_nm >= 3000.0
     return by_wavelength or band.name.lower().startswith(("lwir", "thermal"))
 
 

@@ -16,13 +16,6 @@ from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Position
 from agalign.values.text import without_controls
 
-_MAX_ALTITUDE_M = 20_000.0
-"""Altitudes beyond it come from damaged tags."""
-_MAX_TEXT_LENGTH = 200
-"""Makes, models and serial numbers are shorter; a damaged tag may contain megabytes."""
-_MAX_NUMBER = 1e15
-"""Larger than any valid value (times in microseconds); the squares of damaged values would overflow."""
-
 
 @dataclass(frozen=True)
 class Tags:
@@ -56,7 +49,8 @@ class Tags:
         """Return the numbers in an XMP value, a text or a sequence, without impossibly large ones."""
         texts = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", self.text(namespace, name))
         numbers = map(float, texts)
-        return tuple(n for n in numbers if abs(n) < _MAX_NUMBER)
+        max_number = 1e15  # larger than times in microseconds; the squares of damaged values would overflow
+        return tuple(n for n in numbers if abs(n) < max_number)
 
     def number(self, namespace: str, name: str) -> float | None:
         """Return the first number in an XMP value; None if there is none."""
@@ -133,8 +127,9 @@ def _signed_degrees(gps: Mapping[str, Any], axis: str, negative: str, max_deg: f
 
 def _altitude_m(gps: Mapping[str, Any]) -> float | None:
     """Altitude above sea level, negative with the reference 1; None if it is missing or impossible."""
+    max_altitude_m = 20_000.0  # beyond it tags are damaged
     altitude_m = finite(gps.get("GPSAltitude"))
-    if altitude_m is None or abs(altitude_m) > _MAX_ALTITUDE_M:
+    if altitude_m is None or abs(altitude_m) > max_altitude_m:
         return None
     return -altitude_m if gps.get("GPSAltitudeRef") == b"\x01" else altitude_m
 
@@ -157,7 +152,8 @@ def _mean(value: Any) -> float | None:
 def _text(value: Any) -> str:
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
-    return without_controls(str(value)).strip()[:_MAX_TEXT_LENGTH] if isinstance(value, (str, int)) else ""
+    max_length = 200  # of makes, models and serial numbers; a damaged tag may contain megabytes
+    return without_controls(str(value)).strip()[:max_length] if isinstance(value, (str, int)) else ""
 
 
 def _iso_time(exif: Mapping[str, Any], fallback: Any) -> str:

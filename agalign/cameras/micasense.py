@@ -17,10 +17,6 @@ from agalign.cameras.xmp import names_in
 from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose, Radiometry
 
-_HORIZONTAL_IRRADIANCE_UNIT = 0.01
-"""W / m^2 / nm: unit of HorizontalIrradiance if no tag gives its scale."""
-_MAX_TWELVE_BIT_VALUE = 65520.0
-"""RedEdge cameras store 12 bits in the upper bits of uint16."""
 _MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
 _REDEDGE_M_PARALLAX = {
     "Blue": (-0.9, 0.0),
@@ -57,9 +53,10 @@ class MicaSense(Camera):
         if parallax is None and tags.model == "RedEdge-M":
             parallax = _REDEDGE_M_PARALLAX.get(name)
         centikelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)  # in agreement with the Altum's SceneTemperature
+        max_twelve_bit_value = 65520.0  # stored in the upper bits of uint16
         band = replace(
             band,
-            saturation_value=_MAX_TWELVE_BIT_VALUE if band.dtype == "uint16" else max_value(band.dtype),
+            saturation_value=max_twelve_bit_value if band.dtype == "uint16" else max_value(band.dtype),
             lens=lens,
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
             parallax=parallax,
@@ -113,7 +110,7 @@ def _irradiance(tags: Tags) -> float | None:
     """HorizontalIrradiance, W / m^2 / nm; else the irradiance that an older light sensor measured in its own plane."""
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
     candidates = [
-        (tags.number(_DLS, "HorizontalIrradiance"), scale or _HORIZONTAL_IRRADIANCE_UNIT),
+        (tags.number(_DLS, "HorizontalIrradiance"), scale or 0.01),  # the unit without a tag
         (tags.number(_DLS, "SpectralIrradiance"), scale or 1.0),
         (tags.number(pix4d.NAMESPACE, "Irradiance"), scale or 1.0),
     ]

@@ -25,12 +25,6 @@ from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens, radial_coefficients
 
 _SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
-_MAX_RAY_TAN = 3.0
-"""Tangent of the largest angle from the axis: 72 degrees, beyond the corners of any Sequoia."""
-_CORNER_MARGIN = 1.1
-"""The distortion is fitted up to this multiple of the corners' distance, so that it is accurate at the border."""
-_MAX_SHEAR = 1e-3
-"""Limit of D and E relative to C: `Lens` has no shear, so that the lens is not used beyond it."""
 
 
 class _TagTransfer(pix4d.TagTransfer):
@@ -90,7 +84,8 @@ def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
         return None
     c, d, e, f = affine
     slope = polynomial[1]
-    if not (c > 0 and f > 0 and slope > 0) or polynomial[0] != 0 or max(abs(d), abs(e)) > _MAX_SHEAR * c:
+    max_shear = 1e-3  # `Lens` has none
+    if not (c > 0 and f > 0 and slope > 0) or polynomial[0] != 0 or max(abs(d), abs(e)) > max_shear * c:
         return None
     fx, fy = slope * 2 * c / math.pi, slope * 2 * f / math.pi
     cx, cy = centre_px
@@ -101,9 +96,10 @@ def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
         theta = 2 / math.pi * np.arctan(r)
         return np.asarray(np.polynomial.polynomial.polyval(theta, polynomial) * math.pi / (2 * slope))
 
-    rays = np.linspace(0.0, _MAX_RAY_TAN, 1000)
-    corner_ray = np.interp(corner_distance, distorted(rays), rays)
-    return Lens(fx, fy, cx, cy, radial_coefficients(distorted, _CORNER_MARGIN * float(corner_ray)))
+    rays = np.linspace(0.0, 3.0, 1000)  # up to 72 degrees from the axis, beyond the corners of any Sequoia
+    corner_ray = float(np.interp(corner_distance, distorted(rays), rays))
+    # The distortion is fitted beyond the corners, so that it is accurate at the border.
+    return Lens(fx, fy, cx, cy, radial_coefficients(distorted, 1.1 * corner_ray))
 
 
 def _upside_down(lens: Lens, info: RasterInfo) -> Lens:

@@ -32,8 +32,6 @@ _MAX_DEPTH = 50
 """Limit of nested elements, which protects the recursive XML library, and of the parts of a namespace; cameras write
 six and three.
 """
-_MAX_LENGTH = 1 << 22
-"""Limit of the characters of a packet; cameras write a few thousand."""
 _NAMESPACES = threading.Lock()
 
 
@@ -49,7 +47,8 @@ class Packet:
     def parse(cls, packet: Any) -> "Packet":
         """Parse bytes or text. A malformed packet becomes an empty one, because the image may still be good."""
         text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
-        if not isinstance(text, str) or len(text) > _MAX_LENGTH:
+        max_length = 1 << 22  # cameras write a few thousand characters
+        if not isinstance(text, str) or len(text) > max_length:
             return cls()
         start, end = text.find("<x:xmpmeta"), text.rfind("</x:xmpmeta>")
         if start < 0 or end < 0:

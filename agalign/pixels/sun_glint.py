@@ -15,8 +15,6 @@ from agalign.values.image import FloatImage, Mask
 
 _BLOCK_PX = 16
 """Side of the blocks for which a dark value is computed."""
-_NEIGHBOURHOOD_BLOCKS = 5
-"""Side of the square of blocks in which the darkest value is searched; it contains the dark faces of waves."""
 _MIN_GLINT_SHARE = 0.5
 """Minimum share of glint in the green light."""
 _MIN_PIXEL_NDWI = -0.2
@@ -65,5 +63,6 @@ def _darkest_nearby(band: FloatImage) -> NDArray[np.float32]:
     unknown = np.float32(1e30)  # larger than any reflectance
     known = np.where(np.isfinite(blocks), blocks, unknown)
     dark = np.percentile(known, 10, axis=-1, method="lower").astype(np.float32)  # less noisy than the minimum
-    darkest = cv2.erode(dark, np.ones((_NEIGHBOURHOOD_BLOCKS, _NEIGHBOURHOOD_BLOCKS), np.uint8))
+    nearby = np.ones((5, 5), np.uint8)  # blocks; they contain the dark faces of waves
+    darkest = cv2.erode(dark, nearby)
     return np.where(darkest < unknown, darkest, np.float32(np.nan))

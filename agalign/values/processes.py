@@ -135,8 +135,6 @@ _CHUNK_BYTES = 8000
 """With its header, smaller than the buffer of a pipe on every system (8192 bytes on Windows)."""
 ENDS_WITHIN_S = 10.0
 """Timeout for the end of a killed process, which takes milliseconds unless it waits for a disk or file server."""
-_CHUNK_TIMEOUT_S = 1.0
-"""Extension of a deadline after each chunk of a result: the caller may take time over outcomes while a worker sends."""
 _PROCESS_LOCK = threading.Lock()
 """Starting a process polls all others. Two threads that poll one process get a wrong exit code."""
 
@@ -217,8 +215,12 @@ class Worker:
 
     @property
     def kill_time_s(self) -> float:
-        """Time at which the worker is killed, monotonic clock."""
-        return float("inf") if self.deadline_s is None else max(self.deadline_s, self.heard_s + _CHUNK_TIMEOUT_S)
+        """Time at which the worker is killed, monotonic clock.
+
+        The deadline is extended by a second after each chunk of a result: the caller may take time over outcomes while
+        a worker sends.
+        """
+        return float("inf") if self.deadline_s is None else max(self.deadline_s, self.heard_s + 1.0)
 
     def waits_for(self) -> list[Any]:
         """Return the objects for `multiprocessing.connection.wait`: the pipe and the sentinel of the process."""

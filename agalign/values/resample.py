@@ -17,10 +17,6 @@ _SUPPORT_PX = 4
 """Half width of the widest interpolation kernel."""
 MIN_VALID_WEIGHT = 0.999
 """Minimum weight of valid pixels in a valid resampled or reduced pixel: float32 weights do not sum to exactly 1."""
-_TILE_PX = 1024
-"""Side of the tiles in which arrays are resampled: OpenCV limits the sides of one image to 32,767 px."""
-_MAX_SOURCE_PX = 32_000
-"""Maximum side of the part of an image that is resampled at once."""
 _MAX_CHANNELS = 16
 """Distinguishes (H, W, C) from (C, H, W): images have more rows than this."""
 
@@ -63,11 +59,12 @@ def resample_planes(
 
     Returns (C, height, width) of the same type, with `fill` where a pixel is not valid, and the mask (height, width).
     """
+    tile_px, max_source_px = 1024, 32_000  # OpenCV limits the sides of one image to 32,767 px
     width, height = size_px
     result = np.empty((len(planes), height, width), planes.dtype)
     result_valid = np.empty((height, width), bool)
     moving_size_px = valid.shape[1], valid.shape[0]
-    pending = list(tiles(Tile(0, 0, width, height), _TILE_PX))
+    pending = list(tiles(Tile(0, 0, width, height), tile_px))
     while pending:
         tile = pending.pop()
         at = np.s_[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
@@ -76,7 +73,7 @@ def resample_planes(
         if source is None:
             result[:, *at], result_valid[at] = fill, False
             continue
-        if max(source.width, source.height) > _MAX_SOURCE_PX:
+        if max(source.width, source.height) > max_source_px:
             pending += tiles(tile, (max(tile.width, tile.height) + 1) // 2)
             continue
         cut = np.s_[source.y0 : source.y0 + source.height, source.x0 : source.x0 + source.width]
