@@ -19,11 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import FULL_SCALE, Camera, band_of, colour_bands
+from agalign.cameras.base import FULL_SCALE, Camera, colour_bands
 from agalign.cameras.metadata import Tags
 from agalign.cameras.xmp import Packet, names_in
 from agalign.errors import GeometryError
-from agalign.pixels.raster import RasterInfo
 from agalign.values import geometry
 from agalign.values.capture import Band, Pose, Radiometry
 from agalign.values.geometry import Matrix
@@ -72,14 +71,14 @@ class Dji(Camera):
     def recognises(self, tags: Tags) -> bool:
         return tags.make.upper() == "DJI" or (_DJI, "CaptureUUID") in tags.xmp
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         is_mavic, by_centres = _is_mavic_3(tags) or bool(_MAVIC_3_NAME.match(path.stem)), _shift_to_rig(tags)
         calibrated = _matrix(tags, "CalibratedHMatrix")
         lens = _lens(tags) if is_mavic or calibrated is not None else None
-        if len(info.dtypes) > 1:
-            return colour_bands(path, info, lens, None if is_mavic else by_centres)
+        if len(stored) > 1:
+            return colour_bands(stored, lens, None if is_mavic else by_centres)
         name = tags.text(pix4d.NAMESPACE, "BandName") or tags.text(_DJI, "BandName") or _band_in_name(path)
-        band = replace(pix4d.with_wavelength(band_of(path, info, name), tags), lens=lens, radiometry=_radiometry(tags))
+        band = replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, radiometry=_radiometry(tags))
         if calibrated is None or lens is None:
             return (replace(band, to_rig=by_centres),)
         return (replace(band, to_rig=calibrated, other_to_rig=by_centres),)

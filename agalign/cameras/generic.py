@@ -1,14 +1,15 @@
 """Any other GeoTIFF: multiband files, and files of single bands with any naming scheme."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import Camera, band_of, colour_bands
+from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import ConfigurationError
-from agalign.pixels.raster import RasterInfo, suffix_format
+from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band
 
 _BAND = (
@@ -34,20 +35,18 @@ class Generic(Camera):
     def recognises(self, tags: Tags) -> bool:
         return True
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         if suffix_format(path) in ("JPEG", "PNG"):
-            return self._picture_bands(path, info)
+            return self._picture_bands(path, stored)
         own_name = tags.text(NAMESPACE, "BandName") or self.split(path)[1]
-        indexes = info.band_indexes
         file_wavelength_nm = tags.number(NAMESPACE, "CentralWavelength") or _wavelength_in(own_name)
         result = []
-        for i in indexes:
-            name = info.descriptions[i - 1] or (own_name if len(indexes) == 1 else "") or f"band_{i}"
-            wavelength_nm = info.wavelengths_nm[i - 1] or file_wavelength_nm
-            result.append(replace(band_of(path, info, name, i), wavelength_nm=wavelength_nm))
+        for band in stored:
+            name = band.name or (own_name if len(stored) == 1 else "") or f"band_{band.band_index}"
+            result.append(replace(band, name=name, wavelength_nm=band.wavelength_nm or file_wavelength_nm))
         return tuple(result)
 
-    def _picture_bands(self, path: Path, info: RasterInfo) -> tuple[Band, ...]:
+    def _picture_bands(self, path: Path, stored: Sequence[Band]) -> tuple[Band, ...]:
         """One band if the file name is that of a band, else the colours of a JPEG; none of another PNG.
 
         A number in the name of a picture is not a band. If a band is stored as three equal channels, the first is read.
@@ -55,8 +54,8 @@ class Generic(Camera):
         name = self.split(path)[1]
         is_spectral = re.fullmatch(rf"(?!rgb|vis|ms)(?:{_BAND}|re|[bgrn])", name, re.IGNORECASE)  # no photograph
         if name and (self._patterns or is_spectral):
-            return (replace(band_of(path, info, name), wavelength_nm=_wavelength_in(name)),)
-        return colour_bands(path, info) if suffix_format(path) == "JPEG" else ()
+            return (replace(stored[0], name=name, wavelength_nm=_wavelength_in(name)),)
+        return colour_bands(stored) if suffix_format(path) == "JPEG" else ()
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         return self.split(path)[0]

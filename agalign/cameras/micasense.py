@@ -7,14 +7,14 @@ between the two halves of a dual camera because of the longer baseline.
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import FULL_SCALE, Camera, band_of, elevation_of, is_thermal, max_value, rays_to_rig, rotation
+from agalign.cameras.base import FULL_SCALE, Camera, elevation_of, is_thermal, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.xmp import names_in
-from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose, Radiometry
 
 _MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
@@ -45,9 +45,9 @@ class MicaSense(Camera):
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "micasense" or (_MICASENSE, "CaptureId") in tags.xmp
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         name = tags.text(pix4d.NAMESPACE, "BandName") or _index_in_name(path) or path.stem
-        band = pix4d.with_wavelength(band_of(path, info, name), tags)
+        band = replace(pix4d.with_wavelength(stored[0], tags), name=name)
         lens = pix4d.perspective_lens(tags)
         parallax = pix4d.parallax_of(tags)
         if parallax is None and tags.model == "RedEdge-M":
@@ -56,7 +56,7 @@ class MicaSense(Camera):
         max_twelve_bit_value = 65520.0  # stored in the upper bits of uint16
         band = replace(
             band,
-            saturation_value=max_twelve_bit_value if band.dtype == "uint16" else max_value(band.dtype),
+            saturation_value=max_twelve_bit_value if band.dtype == "uint16" else band.saturation_value,
             lens=lens,
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
             parallax=parallax,

@@ -65,7 +65,7 @@ def _great_circle_km(one: NDArray[np.float64], other: NDArray[np.float64]) -> fl
 
 
 def _georeferenced_bands(path: Path, max_pixels: int) -> tuple[Band, ...]:
-    info = probe(path, max_pixels)
-    if info.georeference is None:
+    stored = probe(path, max_pixels)
+    if stored[0].georeference is None:
         raise InputError(f"{path}: has no coordinates; align images without by 'agalign FOLDER'")
-    return Generic().bands(path, read_tags(path), info)
+    return Generic().bands(path, read_tags(path), stored)

@@ -9,20 +9,21 @@ and RigRelatives refer to the image after EXIF's Orientation is applied.
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import Camera, band_of, colour_bands, rays_to_rig, rotation
+from agalign.cameras.base import Camera, colour_bands, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags
 from agalign.cameras.xmp import Packet, names_in
-from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band
 from agalign.values.geometry import Matrix
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens, radial_coefficients
+from agalign.values.pixel_units import Size
 
 _SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
 
@@ -58,26 +59,26 @@ class Sequoia(Camera):
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "parrot" or tags.text(pix4d.NAMESPACE, "RigName").lower().startswith("sequoia")
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         fisheye = "fisheye" in tags.text(pix4d.NAMESPACE, "ModelType").lower()
-        lens = _fisheye_lens(tags, info) if fisheye else pix4d.perspective_lens(tags)
+        lens = _fisheye_lens(tags, stored[0].size_px) if fisheye else pix4d.perspective_lens(tags)
         to_camera = np.eye(3)
         if self.tag_transfer.is_rotated(tags):
-            lens, to_camera = lens and _upside_down(lens, info), np.diag([-1.0, -1.0, 1.0])
+            lens, to_camera = lens and _upside_down(lens, stored[0].size_px), np.diag([-1.0, -1.0, 1.0])
         to_rig = rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags)) @ to_camera)
-        if len(info.dtypes) > 1:
-            return colour_bands(path, info, lens, to_rig)
+        if len(stored) > 1:
+            return colour_bands(stored, lens, to_rig)
         suffix = _SUFFIX.search(path.stem)
         names = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
         named_by_tag = tags.text(pix4d.NAMESPACE, "BandName") or path.stem
         name = names.get(suffix[1].upper(), suffix[1]) if suffix else named_by_tag
-        return (replace(pix4d.with_wavelength(band_of(path, info, name), tags), lens=lens, to_rig=to_rig),)
+        return (replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, to_rig=to_rig),)
 
     def capture_name(self, path: Path) -> str:
         return _SUFFIX.sub("", path.stem)
 
 
-def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
+def _fisheye_lens(tags: Tags, size_px: Size) -> Lens | None:
     polynomial, affine = (tags.numbers(pix4d.NAMESPACE, f"Fisheye{name}") for name in ("Polynomial", "AffineMatrix"))
     centre_px = pix4d.principal_point_px(tags)
     if len(polynomial) != 4 or len(affine) != 4 or centre_px is None:
@@ -89,7 +90,7 @@ def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
         return None
     fx, fy = slope * 2 * c / math.pi, slope * 2 * f / math.pi
     cx, cy = centre_px
-    corner_distance = math.hypot(max(cx, info.width_px - cx) / fx, max(cy, info.height_px - cy) / fy)
+    corner_distance = math.hypot(max(cx, size_px[0] - cx) / fx, max(cy, size_px[1] - cy) / fy)
 
     def distorted(r: Matrix) -> Matrix:
         """Distance from the principal point, in focal lengths, of a ray at r = tan(angle from the axis)."""
@@ -102,9 +103,9 @@ def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
     return Lens(fx, fy, cx, cy, radial_coefficients(distorted, 1.1 * corner_ray))
 
 
-def _upside_down(lens: Lens, info: RasterInfo) -> Lens:
+def _upside_down(lens: Lens, size_px: Size) -> Lens:
     """The lens in pixels of the stored image, rotated by 180 degrees: tangential distortion changes its sign."""
     k = lens.distortion
     distortion = (*k[:2], -k[2], -k[3], *k[4:]) if len(k) > 3 else k
-    cx, cy = pix4d.rotated_180((lens.cx_px, lens.cy_px), (info.width_px, info.height_px))
+    cx, cy = pix4d.rotated_180((lens.cx_px, lens.cy_px), size_px)
     return replace(lens, cx_px=cx, cy_px=cy, distortion=distortion)

@@ -6,15 +6,15 @@ infrared in its blue channel; the two cameras expose 0.3 s apart, which causes a
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import Camera, band_of, colour_bands
+from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
@@ -33,14 +33,14 @@ class Sentera(Camera):
     def recognises(self, tags: Tags) -> bool:
         return "sentera" in tags.make.lower() or any(namespace == _SENTERA for namespace, _ in tags.xmp)
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        if len(info.dtypes) > 1:
-            return _listed_bands(path, tags, info) or _channel_bands(path, tags, info)
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
+        if len(stored) > 1:
+            return _listed_bands(tags, stored) or _channel_bands(path, tags, stored)
         matrix = tags.numbers(_SENTERA, "AlignMatrix")
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
         folder = _BAND_FOLDER.match(path.parent.name)
         name = tags.text(pix4d.NAMESPACE, "BandName") or (folder["name"] if folder else path.stem)
-        band = pix4d.with_wavelength(band_of(path, info, name), tags)
+        band = replace(pix4d.with_wavelength(stored[0], tags), name=name)
         if folder and band.wavelength_nm is None:
             width = float(folder["width"]) if folder["width"] else None
             band = replace(band, wavelength_nm=float(folder["wavelength"]), bandwidth_nm=width)
@@ -61,34 +61,35 @@ class Sentera(Camera):
         return re.sub(r"_\d{3}_\d{2,3}$", "", path.stem)
 
 
-def _channel_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+def _channel_bands(path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
     """The bands of a photograph by the filter in the name of its folder or model, else red, green and blue."""
     bandpass = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), None)
     if bandpass is None:
         # The colour camera of the Double 4K takes part by default, that of the 6X does not.
-        return tuple(replace(b, companion="6X" in tags.model.upper()) for b in colour_bands(path, info))
+        return tuple(replace(b, companion="6X" in tags.model.upper()) for b in colour_bands(stored))
     return tuple(
-        replace(band_of(path, info, name, index), wavelength_nm=wavelength, one_lens=True)
+        replace(stored[index - 1], name=name, wavelength_nm=wavelength, one_lens=True)
         for index, (name, wavelength) in _CHANNELS[bandpass].items()
-        if index <= len(info.dtypes)
+        if index <= len(stored)
     )
 
 
-def _listed_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+def _listed_bands(tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
     """The bands of a photograph as its tags list them by channel; a channel without a wavelength is left out."""
     names = tags.xmp.get((pix4d.NAMESPACE, "BandName"), ())
     wavelengths, widths = (tags.numbers(pix4d.NAMESPACE, name) for name in ("CentralWavelength", "WavelengthFWHM"))
-    if not len(names) == len(wavelengths) == len(info.dtypes):
+    if not len(names) == len(wavelengths) == len(stored):
         return ()
     lens = pix4d.perspective_lens(tags)
     return tuple(
         replace(
-            band_of(path, info, "Red edge" if name == "RedEdge" else name, index),
+            band,
+            name="Red edge" if name == "RedEdge" else name,
             wavelength_nm=wavelength,
             one_lens=True,
             lens=lens,
-            bandwidth_nm=widths[index - 1] if len(widths) == len(names) else None,
+            bandwidth_nm=widths[band.band_index - 1] if len(widths) == len(names) else None,
         )
-        for index, (name, wavelength) in enumerate(zip(names, wavelengths, strict=True), start=1)
+        for band, name, wavelength in zip(stored, names, wavelengths, strict=True)
         if wavelength > 0
     )

@@ -5,7 +5,6 @@ import stat
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -60,30 +59,6 @@ def suffix_format(path: Path) -> Literal["TIFF", "JPEG", "PNG"] | None:
         case ".png":
             return "PNG"
     return None
-
-
-@dataclass(frozen=True)
-class RasterInfo:
-    """The shape and the metadata of a raster file."""
-
-    width_px: int
-    height_px: int
-    dtypes: tuple[str, ...]
-    nodata: tuple[float | None, ...]
-    descriptions: tuple[str | None, ...]
-    wavelengths_nm: tuple[float | None, ...]
-    alpha_index: int | None
-    """Index from 1 of an alpha band."""
-    georeference: Georeference | None
-    has_mask: bool = False
-    scales_offsets: tuple[tuple[float, float], ...] = ()
-    """(scale, offset) of each band, or empty."""
-    overviews: tuple[int, ...] = ()
-
-    @property
-    def band_indexes(self) -> tuple[int, ...]:
-        """Indexes from 1 of all bands except the alpha band."""
-        return tuple(i for i in range(1, len(self.dtypes) + 1) if i != self.alpha_index)
 
 
 @contextmanager
@@ -174,46 +149,55 @@ def _driver_of(path: Path) -> str:
     raise UnreadableFileError(f"{path}: {problem}; copy it from the card again")
 
 
-def probe(path: Path, max_pixels: int = MAX_PIXELS) -> RasterInfo:
-    """Read the metadata of a raster file.
+def probe(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[Band, ...]:
+    """Read the metadata of a raster file: its bands, without an alpha band, with the names in the file or empty ones.
 
     Raises UnreadableFileError, also for more than `max_pixels` per band.
     """
     try:
-        return _probe(path, max_pixels)
+        with open_raster(path) as dataset:
+            return _bands(path, dataset, max_pixels)
     except UnreadableFileError:
         raise
     except Exception as error:  # damaged files raise errors of many classes
-        text = next(iter(str(error).splitlines()), type(error).__name__)
-        raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
+        raise UnreadableFileError(
+            f"{path}: cannot be read ({innermost_cause(error)}); copy it from the card again"
+        ) from None
 
 
-def _probe(path: Path, max_pixels: int) -> RasterInfo:
-    with open_raster(path) as dataset:
-        width, height, count = dataset.width, dataset.height, dataset.count
-        if width * height > max_pixels:
-            raise UnreadableFileError(
-                f"{path}: declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
-            )
-        if count > _MAX_BANDS:
-            raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
-        wavelengths = tuple(_wavelength_nm(dataset.tags(index)) for index in dataset.indexes)
-        alpha = [i for i, c in enumerate(dataset.colorinterp, start=1) if c == ColorInterp.alpha]
-        if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
-            raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
-        return RasterInfo(
-            width,
-            height,
-            tuple(dataset.dtypes),
-            tuple(dataset.nodatavals),
-            tuple(dataset.descriptions),
-            wavelengths,
-            alpha[0] if alpha else None,
-            _georeference(dataset),
-            MaskFlags.per_dataset in dataset.mask_flag_enums[0],
-            tuple(zip(dataset.scales, dataset.offsets, strict=True)),
-            tuple(dataset.overviews(1)),
+def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tuple[Band, ...]:
+    width, height, count = dataset.width, dataset.height, dataset.count
+    if width * height > max_pixels:
+        raise UnreadableFileError(
+            f"{path}: declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
         )
+    if count > _MAX_BANDS:
+        raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
+    if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
+        raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
+    has_alpha = count > 1 and ColorInterp.alpha in dataset.colorinterp
+    alpha = dataset.colorinterp.index(ColorInterp.alpha) + 1 if has_alpha else None
+    has_mask = MaskFlags.per_dataset in dataset.mask_flag_enums[0]
+    georeference, overviews = _georeference(dataset), tuple(dataset.overviews(1))
+    return tuple(
+        Band(
+            name=dataset.descriptions[i - 1] or "",
+            path=path,
+            band_index=i,
+            width_px=width,
+            height_px=height,
+            dtype=dataset.dtypes[i - 1],
+            nodata=dataset.nodatavals[i - 1],
+            has_mask=has_mask,
+            wavelength_nm=_wavelength_nm(dataset.tags(i)),
+            saturation_value={"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}.get(dataset.dtypes[i - 1]),
+            georeference=georeference,
+            scale_offset=(dataset.scales[i - 1], dataset.offsets[i - 1]),
+            overviews=overviews,
+        )
+        for i in dataset.indexes
+        if i != alpha
+    )
 
 
 def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
