@@ -55,7 +55,7 @@ def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
                 target = keys[0] if len(keys) == 1 else None
             else:
                 keys = [] if file.is_whole_capture else by_name[key]
-                target = next((k for k in keys if k[-1] != key[-1]), None)
+                target = next((k for k in keys if k in groups and k[-1] != key[-1]), None)
             if target is None:
                 remaining.append(file)
             else:
