@@ -72,8 +72,8 @@ def cases(folder: Path) -> Iterator[Case]:
 
 def _plain_band(folder: Path, name: str) -> Band:
     path = next(folder.rglob(name))
-    info = probe(path)
-    return Band(path.stem, path, 1, info.width_px, info.height_px, info.dtypes[0])
+    stored = probe(path)[0]
+    return Band(path.stem, path, 1, *stored.size_px, stored.dtype)
 
 
 def image_pairs(folder: Path) -> list[PairFiles]:

@@ -73,14 +73,14 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
             xmp,
         )
     from agalign.errors import AgalignError
-    from agalign.pixels.raster import RasterInfo
+    from agalign.values.capture import Band
 
     for library in ("tifffile", "rasterio", "PIL"):
         logging.getLogger(library).setLevel(logging.CRITICAL + 1)
     cameras = known_cameras()
-    info = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
     scratch = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     file = scratch / "IMG_0001_1.tif"
+    stored = (Band("", file, 1, 1280, 960, "uint16"),)
     plain = scratch.parent / f"{scratch.name}.tif"
     tifffile.imwrite(plain, np.zeros((8, 8), np.uint16))
 
@@ -89,7 +89,7 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
         for make in ("MicaSense", "DJI", "Parrot", "Sentera", "MAPIR", ""):
             tags = metadata.Tags(make=make, model="x", xmp=packet.values())
             camera = next(c for c in cameras if c.recognises(tags))
-            bands = camera.bands(file, tags, info)
+            bands = camera.bands(file, tags, stored)
             camera.with_shared_rig(bands, [tags] * len(bands))
             camera.pose(tags)
             camera.motion(tags)

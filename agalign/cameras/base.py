@@ -17,15 +17,10 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import TagTransfer
 from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError, NoSuchBandError
-from agalign.pixels.raster import RasterInfo
 from agalign.values import geometry
 from agalign.values.capture import Band, Pose
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
-
-_GREEN_NM = 550.0
-_MIN_THERMAL_NM = 3000.0
-"""Bands at shorter wavelengths record reflected sunlight."""
 
 
 class Camera(ABC):
@@ -44,8 +39,8 @@ class Camera(ABC):
         """Return True for files of this camera."""
 
     @abstractmethod
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        """Return the bands in one of its files, with lens and `to_rig`."""
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
+        """Return the bands in one of its files, with lens and `to_rig`; `stored` is from `pixels.raster.probe`."""
 
     @abstractmethod
     def capture_name(self, path: Path) -> str:
@@ -92,7 +87,8 @@ def default_reference(bands: Sequence[Band]) -> int:
     for index in reflective:
         if re.split(r"[-_ ]", bands[index].name.lower())[0] in ("green", "gre", "g"):
             return index
-    known = [(abs(nm - _GREEN_NM), i) for i in reflective if (nm := bands[i].wavelength_nm) is not None]
+    green_nm = 550.0
+    known = [(abs(nm - green_nm), i) for i in reflective if (nm := bands[i].wavelength_nm) is not None]
     return min(known)[1] if known else next(iter(reflective), 0)
 
 
@@ -115,8 +111,8 @@ def listed(bands: Sequence[Band]) -> str:
 
 
 def is_thermal(band: Band) -> bool:
-    """Return True for a thermal infrared band."""
-    by_wavelength = band.wavelength_nm is not None and band.wavelength_nm >= _MIN_THERMAL_NM
+    """Return True for a thermal infrared band: those at shorter wavelengths record reflected sunlight."""
+    by_wavelength = band.wavelength_nm is not None and band.wavelength_nm >= 3000.0
     return by_wavelength or band.name.lower().startswith(("lwir", "thermal"))
 
 
@@ -140,39 +136,17 @@ def _through_rig(reference: Matrix | None, moving: Matrix | None) -> Matrix | No
 
 # ---- for the modules of the cameras
 
-
-def band_of(path: Path, info: RasterInfo, name: str, index: int = 1) -> Band:
-    """Return a band with the properties of its raster; `index` counts from 1."""
-    return Band(
-        name=name,
-        path=path,
-        band_index=index,
-        width_px=info.width_px,
-        height_px=info.height_px,
-        dtype=info.dtypes[index - 1],
-        nodata=info.nodata[index - 1],
-        has_mask=info.has_mask,
-        saturation_value=max_value(info.dtypes[index - 1]),
-        georeference=info.georeference,
-        scale_offset=info.scales_offsets[index - 1] if info.scales_offsets else (1.0, 0.0),
-        overviews=info.overviews,
-    )
+FULL_SCALE = 65536.0
+"""Divisor of pixel values in the radiometric models of the makers: bands are stored as 16 bits."""
 
 
-def colour_bands(
-    path: Path, info: RasterInfo, lens: Lens | None = None, to_rig: Matrix | None = None
-) -> tuple[Band, ...]:
+def colour_bands(stored: Sequence[Band], lens: Lens | None = None, to_rig: Matrix | None = None) -> tuple[Band, ...]:
     """Return the bands of the colour photograph that a camera takes with its multispectral bands."""
-    names = ["RGB Red", "RGB Green", "RGB Blue"] if len(info.dtypes) >= 3 else ["RGB"]
+    names = ["RGB Red", "RGB Green", "RGB Blue"] if len(stored) >= 3 else ["RGB"]
     return tuple(
-        replace(band_of(path, info, name, i), lens=lens, to_rig=to_rig, one_lens=True, companion=True)
-        for i, name in enumerate(names, start=1)
+        replace(band, name=name, lens=lens, to_rig=to_rig, one_lens=True, companion=True)
+        for band, name in zip(stored, names, strict=False)
     )
-
-
-def max_value(dtype: str) -> float | None:
-    """Return the value at which an integer type saturates; None for floats."""
-    return {"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}.get(dtype)
 
 
 def rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:

@@ -19,7 +19,7 @@ from agalign.cameras.grouping import (
 from agalign.cameras.read_files import ImageFile, Problem, natural_order, read_files
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, NoSuchBandError
-from agalign.pixels.raster import PICTURE_SUFFIXES, TIFF_SUFFIXES
+from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Capture
 from agalign.values.files import RUN_FILE
 
@@ -43,9 +43,7 @@ class FolderScan:
         return tuple(
             c
             for c in self.captures
-            if len({b.path for b in c.bands}) > 1
-            and all(b.dtype == "uint8" for b in c.bands)
-            and not any(b.one_lens for b in c.bands)
+            if c.has_several_files and all(b.dtype == "uint8" for b in c.bands) and not any(b.one_lens for b in c.bands)
         )
 
 
@@ -93,7 +91,7 @@ def _read(
         if isinstance(result, ImageFile):
             files += [result] if result.bands else []
         # An unreadable colour photograph is a problem only if photographs take part.
-        elif options.with_rgb or result.path.suffix.lower() in TIFF_SUFFIXES:
+        elif options.with_rgb or suffix_format(result.path) == "TIFF":
             problems.append(result)
         if progress is not None:
             progress(number, len(paths))
@@ -108,19 +106,15 @@ def _check_bands_exist(files: Sequence[ImageFile], names: Sequence[str], folder:
         raise ConfigurationError(f"{folder}: no capture has a band {' or '.join(map(repr, unknown))}, as --bands asks")
 
 
-_SUFFIXES = TIFF_SUFFIXES | PICTURE_SUFFIXES
 IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
-_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
-"""Network address such as s3://bucket or https://host, as a Path writes it, with one slash. A drive has one letter."""
-_SYSTEM_FOLDERS = {"lost+found", "System Volume Information", "$RECYCLE.BIN"}
-"""Operating systems create these on a memory card."""
 
 
 def check_folder(folder: Path) -> None:
     """Raise InputError if `folder` is not a folder that can be listed."""
     if folder.as_posix().startswith("/vsi"):
         raise InputError(f"{folder}: is one of GDAL's virtual paths; mount or unpack it, and give the folder")
-    if _ADDRESS.match(folder.as_posix()):
+    # A Path writes s3://bucket or https://host with one slash; a drive has one letter.
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", folder.as_posix()):
         address = folder.as_posix().replace(":/", "://", 1)
         raise InputError(f"{address}: only local folders can be read; mount it or copy the images, and give the folder")
     try:
@@ -145,7 +139,7 @@ def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Pr
     for parent, folders, names in os.walk(folder, onerror=refuse):
         here = Path(parent)
         folders[:] = sorted(d for d in folders if _is_input_folder(here / d, skipped))
-        images = [n for n in names if Path(n).suffix.lower() in _SUFFIXES and not n.startswith(".")]
+        images = [n for n in names if suffix_format(Path(n)) and not n.startswith(".")]
         result.extend(here / n for n in sorted(images, key=natural_order))
     return result, problems
 
@@ -167,23 +161,21 @@ def other_files(folder: Path) -> Counter[str]:
     suffixes: Counter[str] = Counter()
     for _, folders, names in os.walk(folder):
         folders[:] = [d for d in folders if not d.startswith(".")]
-        suffixes.update(Path(n).suffix.lower() or "no suffix" for n in names if not n.startswith("."))
-    return Counter({s: n for s, n in suffixes.items() if s not in _SUFFIXES})
+        others = (Path(n) for n in names if not n.startswith(".") and not suffix_format(Path(n)))
+        suffixes.update(other.suffix.lower() or "no suffix" for other in others)
+    return suffixes
 
 
 def _is_input_folder(folder: Path, skipped: set[Path]) -> bool:
-    if folder.name.startswith(".") or folder.name in _SYSTEM_FOLDERS or folder.resolve() in skipped:
-        return False
-    return not _is_output_folder(folder)
-
-
-def _is_output_folder(folder: Path) -> bool:
-    """True for the output folder of a run, whose stacks are not captures.
+    """False for hidden folders, those of operating systems on memory cards, and the output folder of a run.
 
     A run writes RUN_FILE first, so the output of a killed run is recognised too.
     """
+    of_system = "lost+found", "System Volume Information", "$RECYCLE.BIN"
+    if folder.name.startswith(".") or folder.name in of_system or folder.resolve() in skipped:
+        return False
     try:
         entries = {entry.name for entry in os.scandir(folder)}
     except OSError:
-        return False
-    return RUN_FILE in entries or {"summary.csv", "index.html"} <= entries
+        return True
+    return RUN_FILE not in entries and not {"summary.csv", "index.html"} <= entries

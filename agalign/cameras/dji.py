@@ -19,95 +19,73 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import Camera, band_of, colour_bands
+from agalign.cameras.base import FULL_SCALE, Camera, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.xmp import Name, Packet
+from agalign.cameras.xmp import Packet, names_in
 from agalign.errors import GeometryError
-from agalign.pixels.raster import RasterInfo
 from agalign.values import geometry
 from agalign.values.capture import Band, Pose, Radiometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 
-_PHANTOM_4_BANDS = {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}
-_MAVIC_3_BANDS = {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}
 _MAVIC_3_NAME = re.compile(r"^(?P<capture>.*?)_(?:MS_(?P<band>G|RE?|NIR)|D)$", re.IGNORECASE)
 _DJI = "dji.com/drone-dji"
-_CAPTURE_UUID: Name = (_DJI, "CaptureUUID")
-_DEWARP_DATA: Name = (_DJI, "DewarpData")
-_DEWARP_FLAG: Name = (_DJI, "DewarpFlag")
-_CENTRE: tuple[Name, Name] = ((_DJI, "CalibratedOpticalCenterX"), (_DJI, "CalibratedOpticalCenterY"))
-_RELATIVE_CENTRE: tuple[Name, Name] = ((_DJI, "RelativeOpticalCenterX"), (_DJI, "RelativeOpticalCenterY"))
-_FOCAL_LENGTH_PX: Name = (_DJI, "CalibratedFocalLength")
-_H_MATRIX: Name = (_DJI, "CalibratedHMatrix")
 _MAX_UPRIGHT_ROLL_DEG = 90.0
 """Larger gimbal rolls mean upside down: gimbals write a roll near 0 or near 180 degrees."""
-_FULL_SCALE = 65536.0
-"""Pixel values are divided by this in DJI's guide: bands are stored as 16 bits."""
-_VIGNETTING: Name = (_DJI, "VignettingData")
-_TO_COLOUR: Name = (_DJI, "DewarpHMatrix")
 
 
 class _TagTransfer(pix4d.TagTransfer):
-    geometry = pix4d.TagTransfer.geometry | {
-        *_CENTRE,
-        *_RELATIVE_CENTRE,
-        _DEWARP_DATA,
-        _FOCAL_LENGTH_PX,
-        _H_MATRIX,
-        _DEWARP_FLAG,
-        _TO_COLOUR,
-    }
-    sensor_only = pix4d.TagTransfer.sensor_only | {_VIGNETTING}
+    in_px = names_in(_DJI, "CalibratedFocalLength RelativeOpticalCenterX RelativeOpticalCenterY")
+    geometry = pix4d.TagTransfer.geometry.union(
+        in_px,
+        names_in(_DJI, "CalibratedOpticalCenterX CalibratedOpticalCenterY CalibratedHMatrix"),
+        names_in(_DJI, "DewarpData DewarpFlag DewarpHMatrix"),
+    )
+    sensor_only = pix4d.TagTransfer.sensor_only | {(_DJI, "VignettingData")}
     radiometry = pix4d.TagTransfer.radiometry | {(_DJI, "BlackLevel")}
-    in_px = (_FOCAL_LENGTH_PX, *_RELATIVE_CENTRE)
 
     def put_geometry(
         self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
     ) -> None:
         super().put_geometry(packet, reference_packet, reference, tags, grid)
-        centre = _pair(tags, _CENTRE)
+        centre = _pair(tags, "CalibratedOpticalCenter")
         if centre is not None:
-            for name, value in zip(_CENTRE, grid.px(*centre), strict=True):
-                packet.put(name, [pix4d.number_text(value)])
+            for axis, value in zip("XY", grid.px(*centre), strict=True):
+                packet.put((_DJI, f"CalibratedOpticalCenter{axis}"), [pix4d.number_text(value)])
         date, terms = _dewarp_data(tags)
         if terms:
             scaled = [v * grid.scale.mean for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]
-            packet.put(_DEWARP_DATA, [f"{date};" + ",".join(map(pix4d.number_text, scaled))])
+            packet.put((_DJI, "DewarpData"), [f"{date};" + ",".join(map(pix4d.number_text, scaled))])
         if grid.undistorted:
-            packet.put(_DEWARP_FLAG, ["1"])
-
-    def pixels_per_mm(self, tags: Tags) -> float | None:
-        focal_px = tags.number(*_FOCAL_LENGTH_PX)
-        by_focal_lengths = focal_px / tags.focal_length_mm if focal_px and tags.focal_length_mm else None
-        return tags.pixels_per_mm or by_focal_lengths or super().pixels_per_mm(tags)
+            packet.put((_DJI, "DewarpFlag"), ["1"])
 
 
 class Dji(Camera):
     """The multispectral cameras of DJI."""
 
     name = "DJI"
-    capture_ids = (_CAPTURE_UUID,)
+    capture_ids = ((_DJI, "CaptureUUID"),)
     tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
-        return tags.make.upper() == "DJI" or _CAPTURE_UUID in tags.xmp
+        return tags.make.upper() == "DJI" or (_DJI, "CaptureUUID") in tags.xmp
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         is_mavic, by_centres = _is_mavic_3(tags) or bool(_MAVIC_3_NAME.match(path.stem)), _shift_to_rig(tags)
-        calibrated = _matrix(tags, _H_MATRIX)
+        calibrated = _matrix(tags, "CalibratedHMatrix")
         lens = _lens(tags) if is_mavic or calibrated is not None else None
-        if len(info.dtypes) > 1:
-            return colour_bands(path, info, lens, None if is_mavic else by_centres)
-        name = tags.text(*pix4d.BAND_NAME) or tags.text(_DJI, "BandName") or _band_in_name(path)
-        band = pix4d.with_wavelength(band_of(path, info, name), tags)
+        if len(stored) > 1:
+            return colour_bands(stored, lens, None if is_mavic else by_centres)
+        name = tags.text(pix4d.NAMESPACE, "BandName") or tags.text(_DJI, "BandName") or _band_in_name(path)
+        band = replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, radiometry=_radiometry(tags))
         if calibrated is None or lens is None:
-            return (replace(band, lens=lens, to_rig=by_centres, radiometry=_radiometry(tags)),)
-        return (replace(band, lens=lens, to_rig=calibrated, other_to_rig=by_centres, radiometry=_radiometry(tags)),)
+            return (replace(band, to_rig=by_centres),)
+        return (replace(band, to_rig=calibrated, other_to_rig=by_centres),)
 
     def with_shared_rig(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
-        to_colour = next((m for t in tags if _is_mavic_3(t) and (m := _matrix(t, _TO_COLOUR)) is not None), None)
+        matrices = (_matrix(t, "DewarpHMatrix") for t in tags if _is_mavic_3(t))
+        to_colour = next((m for m in matrices if m is not None), None)
         if to_colour is None:
             return list(bands)
         to_rig = geometry.invert(to_colour)
@@ -119,7 +97,8 @@ class Dji(Camera):
             return None
         height_m = tags.number(_DJI, "RelativeAltitude")
         height_m = height_m if height_m and height_m > 0 else None
-        return Pose(_heading_deg(tags, yaw_deg), pitch_deg + 90, 0.0, height_m, tags.number(*_FOCAL_LENGTH_PX))
+        focal_length_px = tags.number(_DJI, "CalibratedFocalLength")
+        return Pose(_heading_deg(tags, yaw_deg), pitch_deg + 90, 0.0, height_m, focal_length_px)
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Calculate the motion from the speed over ground (north, east, m/s), the heading of the image's upper edge and
@@ -155,11 +134,11 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         return None
     irradiance = tags.number(_DJI, "Irradiance") or 0.0
     adjusted = tags.number(_DJI, "SensorGainAdjustment") or 1.0
-    centre, k = _pair(tags, _CENTRE), tags.numbers(*_VIGNETTING)
+    centre, k = _pair(tags, "CalibratedOpticalCenter"), tags.numbers(_DJI, "VignettingData")
     return Radiometry(
         "relative radiance",
         black,
-        _FULL_SCALE,
+        FULL_SCALE,
         adjusted / (gain * exposure_us / 1e6),
         centre or (0.0, 0.0),
         k if centre else (),
@@ -181,23 +160,23 @@ def _is_mavic_3(tags: Tags) -> bool:
 def _band_in_name(path: Path) -> str:
     mavic = _MAVIC_3_NAME.match(path.stem)
     if mavic and mavic["band"]:
-        return _MAVIC_3_BANDS[mavic["band"].upper()]
-    return _PHANTOM_4_BANDS.get(path.stem[-1], path.stem)
+        return {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}[mavic["band"].upper()]
+    return {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}.get(path.stem[-1], path.stem)
 
 
 def _shift_to_rig(tags: Tags) -> Matrix | None:
-    centre = _pair(tags, _RELATIVE_CENTRE)
+    centre = _pair(tags, "RelativeOpticalCenter")
     return None if centre is None else geometry.translation(-centre[0], -centre[1])
 
 
-def _pair(tags: Tags, names: tuple[Name, Name]) -> tuple[float, float] | None:
-    x, y = (tags.number(*name) for name in names)
+def _pair(tags: Tags, name: str) -> tuple[float, float] | None:
+    x, y = (tags.number(_DJI, f"{name}{axis}") for axis in "XY")
     return None if x is None or y is None else (x, y)
 
 
-def _matrix(tags: Tags, name: Name) -> Matrix | None:
+def _matrix(tags: Tags, name: str) -> Matrix | None:
     """A tag as a matrix (3, 3); None if it is missing or singular."""
-    values = tags.numbers(*name)
+    values = tags.numbers(_DJI, name)
     if len(values) != 9:
         return None
     matrix = np.array(values).reshape(3, 3)
@@ -212,11 +191,11 @@ def _lens(tags: Tags) -> Lens | None:
     """The lens by DewarpData (fx, fy, cx, cy, k …), with the principal point CalibratedOpticalCenter + (cx, cy). If
     DewarpFlag is 1, the image is already undistorted.
     """
-    (_, terms), centre = _dewarp_data(tags), _pair(tags, _CENTRE)
+    (_, terms), centre = _dewarp_data(tags), _pair(tags, "CalibratedOpticalCenter")
     if centre is None or not terms or not (terms[0] > 0 and terms[1] > 0):
         return None
     fx, fy, cx, cy, *k = terms
-    dewarped = tags.number(*_DEWARP_FLAG) == 1
+    dewarped = tags.number(_DJI, "DewarpFlag") == 1
     return Lens(fx, fy, centre[0] + cx, centre[1] + cy, () if dewarped else tuple(k))
 
 
@@ -224,7 +203,7 @@ def _dewarp_data(tags: Tags) -> tuple[str, list[float]]:
     """(date, [fx, fy, cx, cy, k1, k2, p1, p2, k3]) of DewarpData 'date;fx,fy,…', px, in OpenCV's order; no terms if the
     tag has another form.
     """
-    date, _, text = tags.text(*_DEWARP_DATA).rpartition(";")
+    date, _, text = tags.text(_DJI, "DewarpData").rpartition(";")
     try:
         terms = [float(part) for part in text.split(",")]
     except ValueError:

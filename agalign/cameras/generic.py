@@ -1,30 +1,27 @@
 """Any other GeoTIFF: multiband files, and files of single bands with any naming scheme."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import Camera, band_of, colour_bands
+from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import BAND_NAME, NAMESPACE
+from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import ConfigurationError
-from agalign.pixels.raster import JPEG_SUFFIXES, PICTURE_SUFFIXES, RasterInfo
+from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band
 
-_BAND_WORDS = (
-    "coastal|blue|green|red[ _-]?edge|near[ _-]?infra[ _-]?red|infra[ _-]?red|red|nir|swir|pan|panchro|lwir|thermal|"
-    "gre|reg|rgb|grn|blu|vis|ms"
+_BAND = (
+    r"(?:coastal|blue|green|red[ _-]?edge|near[ _-]?infra[ _-]?red|infra[ _-]?red|red|nir|swir|pan|panchro|lwir|"
+    r"thermal|gre|reg|rgb|grn|blu|vis|ms)[_-]?\d*|\d{3,4} ?nm"
 )
 _SUFFIX = re.compile(
-    rf"^(?P<capture>.*?)(?:(?:^|(?<=.)[_\-. ]+)(?P<band>(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|b?\d{{1,2}}|re|[bgrn])"
+    rf"^(?P<capture>.*?)(?:(?:^|(?<=.)[_\-. ]+)(?P<band>{_BAND}|b?\d{{1,2}}|re|[bgrn])"
     rf"|(?<=[0-9a-z])(?P<glued>(?-i:Blue|Green|RedEdge|Red|NIR|GRE|REG|RED|BLUE|GREEN)|\d{{3,4}}nm))$",
     re.IGNORECASE | re.DOTALL,
 )
 """A band at the end of a file name, after a separator, or `glued` to the name of the capture as in DJI_0001NIR."""
-_SPECTRAL = re.compile(rf"(?!rgb|vis|ms)(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm|re|[bgrn]", re.IGNORECASE)
-"""Names of single bands; colour photographs do not have them."""
-_DATE = re.compile(r"(?:19|20)\d\d([-_.])\d{1,2}\1\d{1,2}$")
-"""A date at the end of a name: its last number is a day, not a band."""
 
 
 class Generic(Camera):
@@ -38,28 +35,27 @@ class Generic(Camera):
     def recognises(self, tags: Tags) -> bool:
         return True
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        if path.suffix.lower() in PICTURE_SUFFIXES:
-            return self._picture_bands(path, info)
-        own_name = tags.text(*BAND_NAME) or self.split(path)[1]
-        indexes = info.band_indexes
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
+        if suffix_format(path) in ("JPEG", "PNG"):
+            return self._picture_bands(path, stored)
+        own_name = tags.text(NAMESPACE, "BandName") or self.split(path)[1]
         file_wavelength_nm = tags.number(NAMESPACE, "CentralWavelength") or _wavelength_in(own_name)
         result = []
-        for i in indexes:
-            name = info.descriptions[i - 1] or (own_name if len(indexes) == 1 else "") or f"band_{i}"
-            wavelength_nm = info.wavelengths_nm[i - 1] or file_wavelength_nm
-            result.append(replace(band_of(path, info, name, i), wavelength_nm=wavelength_nm))
+        for band in stored:
+            name = band.name or (own_name if len(stored) == 1 else "") or f"band_{band.band_index}"
+            result.append(replace(band, name=name, wavelength_nm=band.wavelength_nm or file_wavelength_nm))
         return tuple(result)
 
-    def _picture_bands(self, path: Path, info: RasterInfo) -> tuple[Band, ...]:
+    def _picture_bands(self, path: Path, stored: Sequence[Band]) -> tuple[Band, ...]:
         """One band if the file name is that of a band, else the colours of a JPEG; none of another PNG.
 
         A number in the name of a picture is not a band. If a band is stored as three equal channels, the first is read.
         """
         name = self.split(path)[1]
-        if name and (self._patterns or _SPECTRAL.fullmatch(name)):
-            return (replace(band_of(path, info, name), wavelength_nm=_wavelength_in(name)),)
-        return colour_bands(path, info) if path.suffix.lower() in JPEG_SUFFIXES else ()
+        is_spectral = re.fullmatch(rf"(?!rgb|vis|ms)(?:{_BAND}|re|[bgrn])", name, re.IGNORECASE)  # no photograph
+        if name and (self._patterns or is_spectral):
+            return (replace(stored[0], name=name, wavelength_nm=_wavelength_in(name)),)
+        return colour_bands(stored) if suffix_format(path) == "JPEG" else ()
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         return self.split(path)[0]
@@ -74,7 +70,9 @@ class Generic(Camera):
             match = pattern.fullmatch(path.name)
             if match:
                 return match["capture"], match["band"]
-        match = None if self._patterns or _DATE.search(path.stem) else _SUFFIX.fullmatch(path.stem)
+        # The last number of a date at the end of a name is a day, not a band.
+        has_date = re.search(r"(?:19|20)\d\d([-_.])\d{1,2}\1\d{1,2}$", path.stem)
+        match = None if self._patterns or has_date else _SUFFIX.fullmatch(path.stem)
         if match:
             return match["capture"].rstrip("_-. "), match["band"] or match["glued"]
         return path.stem, ""
@@ -92,8 +90,7 @@ def compile_pattern(pattern: str) -> tuple[re.Pattern[str], ...]:
             f"pattern '{pattern}' needs {{capture}} and {{band}} once each, as in '{{capture}}_{{band}}.tif'"
         )
     escaped = re.escape(pattern).replace(r"\{capture\}", "(?P<capture>.+)").replace(r"\*", ".*")
-    bands = rf"(?:{_BAND_WORDS})[_-]?\d*|\d{{3,4}} ?nm", "[^/]+?"
-    whole = (escaped.replace(r"\{band\}", f"(?P<band>{band})") for band in bands)
+    whole = (escaped.replace(r"\{band\}", f"(?P<band>{band})") for band in (_BAND, "[^/]+?"))
     return tuple(re.compile(one, re.IGNORECASE | re.DOTALL) for one in whole)
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from types import MappingProxyType
 
 from agalign.cameras import camera_of
-from agalign.cameras.base import listed, reference_index
+from agalign.cameras.base import Camera, listed, reference_index
 from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import Tags
 from agalign.cameras.read_files import ImageFile, Problem, natural_order
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError
-from agalign.pixels.raster import TIFF_SUFFIXES
+from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.choices import BandOrder
 from agalign.values.files import RUN_FILE
@@ -34,47 +34,61 @@ def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
         key = file.path.name if file.is_whole_capture else file.camera.capture_key(file.path, file.tags)
         groups[file.camera.name, str(file.camera.capture_folder(file.path)), key].append(file)
     _add_files_without_id(groups)
-    _add_files_without_tags(groups)
     _drop_copies(groups)
     return [sorted(group, key=lambda f: f.bands[0].companion) for group in groups.values()]
 
 
 def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Add files whose capture id is damaged to the group with an id and the same capture name."""
-    by_name: dict[_GroupKey, _GroupKey] = {}
+    """Move files without a capture id to the group with one and the same capture name: files whose id is damaged, then
+    single bands whose tags another program removed.
+    """
+    by_name: dict[_GroupKey, list[_GroupKey]] = defaultdict(list)
     for key, group in groups.items():
-        names = {f.camera.capture_name(f.path) for f in group}
-        if len(names) == 1 and not group[0].is_whole_capture and names != {key[-1]}:
-            by_name.setdefault((key[0], key[1], next(iter(names))), key)
-    for key in list(groups):
-        with_id = by_name.get(key)
-        if with_id is not None and not groups[key][0].is_whole_capture:
-            groups[with_id].extend(groups.pop(key))
-            groups[with_id].sort(key=lambda f: natural_order(f.path.name))
-
-
-def _add_files_without_tags(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Add single bands whose tags another program removed to the group with tags and the same capture name."""
-    tagged: dict[tuple[str, str], list[_GroupKey]] = defaultdict(list)
-    for key, group in groups.items():
-        if key[0] != Generic.name:
-            for name in {f.camera.capture_name(f.path) for f in group if not f.is_whole_capture}:
-                tagged[key[1], name].append(key)
-    for key in [k for k in groups if k[0] == Generic.name]:
+        for name in {f.camera.capture_name(f.path) for f in group if not f.is_whole_capture}:
+            by_name[key[0], key[1], name].append(key)
+    cameras = {key[0]: group[0].camera for key, group in groups.items() if key[0] != Generic.name}
+    for key in sorted(groups, key=lambda key: key[0] == Generic.name):
         remaining = []
         for file in groups[key]:
-            with_tags = _group_for(file, key[1], tagged, groups)
-            if with_tags is None:
+            if key[0] == Generic.name:
+                keys = [k for k in _keys_for(file, key[1], cameras.values(), by_name) if k in groups]
+                target = keys[0] if len(keys) == 1 else None
+            else:
+                keys = [] if file.is_whole_capture else by_name[key]
+                target = next((k for k in keys if k in groups and k[-1] != key[-1]), None)
+            if target is None:
                 remaining.append(file)
             else:
-                band = file.bands[0]
-                named = replace(band, name=f"band_{band.name}") if band.name.isdecimal() else band
-                with_tags.append(replace(file, camera=with_tags[0].camera, bands=(named,)))
-                with_tags.sort(key=lambda f: natural_order(f.path.name))
+                groups[target].append(_with_camera(file, groups[target][0].camera))
+                groups[target].sort(key=lambda f: natural_order(f.path.name))
         if remaining:
             groups[key] = remaining
         else:
             del groups[key]
+
+
+def _keys_for(
+    file: ImageFile, folder: str, cameras: Iterable[Camera], by_name: Mapping[_GroupKey, list[_GroupKey]]
+) -> list[_GroupKey]:
+    """The groups that a single band without tags may belong to by its name."""
+    if file.tags.make or file.tags.xmp or len(file.bands) != 1 or not _is_tiff(file):
+        return []
+    names = {camera.name: camera.capture_name(file.path) for camera in cameras}
+    return [
+        key
+        for camera, name in names.items()
+        if name != file.path.stem
+        for key in by_name.get((camera, folder, name), ())
+    ]
+
+
+def _with_camera(file: ImageFile, camera: Camera) -> ImageFile:
+    """The file as one of a camera whose tags it lacks: a number that is its band's name is not the whole name."""
+    if file.camera.name != Generic.name:
+        return file
+    band = file.bands[0]
+    named = replace(band, name=f"band_{band.name}") if band.name.isdecimal() else band
+    return replace(file, camera=camera, bands=(named,))
 
 
 def _drop_copies(groups: dict[_GroupKey, list[ImageFile]]) -> None:
@@ -91,31 +105,12 @@ def _drop_copies(groups: dict[_GroupKey, list[ImageFile]]) -> None:
 
 
 def _is_tiff(file: ImageFile) -> bool:
-    return file.path.suffix.lower() in TIFF_SUFFIXES
+    return suffix_format(file.path) == "TIFF"
 
 
 def _is_picture_band(file: ImageFile) -> bool:
     """True for a JPEG or PNG with the name of a band."""
     return file.camera.name == Generic.name and not _is_tiff(file) and not file.bands[0].companion
-
-
-def _group_for(
-    file: ImageFile,
-    folder: str,
-    tagged: Mapping[tuple[str, str], list[_GroupKey]],
-    groups: Mapping[_GroupKey, list[ImageFile]],
-) -> list[ImageFile] | None:
-    """The group that a single band without tags belongs to by its name; None if there is not exactly one."""
-    if file.tags.make or file.tags.xmp or len(file.bands) != 1 or not _is_tiff(file):
-        return None
-    keys = {
-        key
-        for (where, name), keys in tagged.items()
-        if where == folder
-        for key in keys
-        if groups[key][0].camera.capture_name(file.path) == name != file.path.stem
-    }
-    return groups[keys.pop()] if len(keys) == 1 else None
 
 
 def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
@@ -197,37 +192,27 @@ def _relative_folder(capture_folder: Path, folder: Path) -> Path:
 
 
 def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
-    """Return the captures with their `missing_bands`, which at least half of the captures of their camera have.
+    """Return the captures with their `missing_bands`, which at least half of the captures of their camera have: rarer
+    names come from damaged tags.
 
     A multiband file has no missing bands. A capture of a dual camera without files of one half gets the serial numbers
     of both.
     """
-    cameras = _cameras(captures)
-    usual = _usual_bands([(c, k) for c, k in zip(captures, cameras, strict=True) if _has_a_file_per_band(c)])
-    serials: dict[_CameraKey, set[str]] = defaultdict(set)
-    for capture, camera in zip(captures, cameras, strict=True):
-        serials[camera].add(capture.camera.serial)
-    result = []
-    for capture, camera in zip(captures, cameras, strict=True):
-        own = {b.name for b in capture.bands}
-        expected = usual[camera] if _has_a_file_per_band(capture) else ()
-        missing = tuple(name for name in expected if name not in own)
-        identity = replace(capture.camera, serial=_complete_serial(capture.camera.serial, serials[camera]))
-        result.append(replace(capture, missing_bands=missing, camera=identity))
+    members: dict[_CameraKey, list[int]] = defaultdict(list)
+    for index, camera in enumerate(_cameras(captures)):
+        members[camera].append(index)
+    result = list(captures)
+    for indices in members.values():
+        serials = {captures[i].camera.serial for i in indices}
+        several = [i for i in indices if captures[i].has_several_files]
+        counts = Counter(b.name for i in several for b in captures[i].bands)
+        usual = [name for name, n in counts.items() if 2 * n >= len(several)]
+        for i in indices:
+            own = {b.name for b in captures[i].bands}
+            missing = tuple(name for name in usual if name not in own) if captures[i].has_several_files else ()
+            identity = replace(captures[i].camera, serial=_complete_serial(captures[i].camera.serial, serials))
+            result[i] = replace(captures[i], missing_bands=missing, camera=identity)
     return result
-
-
-def _usual_bands(captures: Sequence[tuple[Capture, _CameraKey]]) -> Mapping[_CameraKey, list[str]]:
-    """The names of the bands that at least half of a camera's captures have; rarer names come from damaged tags."""
-    members = Counter(camera for _, camera in captures)
-    counts: dict[_CameraKey, Counter[str]] = defaultdict(Counter)
-    for capture, camera in captures:
-        counts[camera].update(b.name for b in capture.bands)
-    return {k: [name for name, n in names.items() if 2 * n >= members[k]] for k, names in counts.items()}
-
-
-def _has_a_file_per_band(capture: Capture) -> bool:
-    return len({b.path for b in capture.bands}) > 1
 
 
 def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:
@@ -267,10 +252,6 @@ def _complete_serial(serial: str, of_camera: set[str]) -> str:
     return larger[0] if len(larger) == 1 else serial
 
 
-_RESERVED_NAMES = {"panels", "sky", Path(RUN_FILE).stem, "summary", "index"}
-"""Files of a run in its output folder, without suffix."""
-
-
 def with_unique_band_names(bands: Sequence[Band]) -> list[Band]:
     """Return the bands with unique names: the first band keeps a repeated name, the others get a number."""
     taken = {b.name for b in bands}
@@ -289,10 +270,7 @@ def with_unique_band_names(bands: Sequence[Band]) -> list[Band]:
 def band_file_owners(captures: Sequence[Capture]) -> dict[str, str]:
     """Return the label of the capture by the band files that it may write, without suffix, below the output folder."""
     return {
-        (c.folder / b.path.stem).as_posix().lower(): c.label
-        for c in captures
-        if len({b.path for b in c.bands}) > 1
-        for b in c.bands
+        (c.folder / b.path.stem).as_posix().lower(): c.label for c in captures if c.has_several_files for b in c.bands
     }
 
 
@@ -302,7 +280,7 @@ def with_unique_capture_names(
     """Return the captures with a number added to names that are those of an earlier capture, of a file of the run, or
     of another capture's band file. `file_owners` is from `band_file_owners`.
     """
-    taken = set(_RESERVED_NAMES)
+    taken = {"panels", "sky", Path(RUN_FILE).stem, "summary", "index"}  # files of a run, without suffix
     counts: Counter[str] = Counter()
     unique = []
     for capture in captures:

@@ -5,18 +5,15 @@ the capture. The model `LATT-<sensor>-<lens>-F<filter>` contains the wavelength.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import Camera, band_of
+from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags
-from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band
 
 _FILE = re.compile(r"^capture_(?P<serial>[^_]+)_(?P<moment>.+)$", re.IGNORECASE)
-_FILTER = re.compile(r"-F(?P<wavelength>\d{3,4})$")
-_NAMES = ((500, "Blue"), (600, "Green"), (690, "Red"), (760, "Red edge"), (1100, "NIR"))
-"""(longest wavelength in nm, name of the band)."""
 
 
 class Mapir(Camera):
@@ -27,16 +24,17 @@ class Mapir(Camera):
     def recognises(self, tags: Tags) -> bool:
         return "mapir" in tags.make.lower() or tags.model.upper().startswith(("LATT-", "SURVEY3"))
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        if len(info.dtypes) > 1:
-            return tuple(replace(band_of(path, info, f"band_{i}", i), one_lens=True) for i in info.band_indexes)
-        bandpass = _FILTER.search(tags.model)
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
+        if len(stored) > 1:
+            return tuple(replace(b, name=f"band_{b.band_index}", one_lens=True) for b in stored)
+        bandpass = re.search(r"-F(?P<wavelength>\d{3,4})$", tags.model)
         if not bandpass:
             file = _FILE.match(path.stem)
-            return (band_of(path, info, f"band_{file['serial']}" if file else path.stem),)
+            return (replace(stored[0], name=f"band_{file['serial']}" if file else path.stem),)
         wavelength_nm = float(bandpass["wavelength"])
-        name = next((n for longest_nm, n in _NAMES if wavelength_nm <= longest_nm), f"{wavelength_nm:g}nm")
-        return (replace(band_of(path, info, name), wavelength_nm=wavelength_nm),)
+        longest_nm = {"Blue": 500, "Green": 600, "Red": 690, "Red edge": 760, "NIR": 1100}
+        name = next((n for n, nm in longest_nm.items() if wavelength_nm <= nm), f"{wavelength_nm:g}nm")
+        return (replace(stored[0], name=name, wavelength_nm=wavelength_nm),)
 
     def capture_name(self, path: Path) -> str:
         file = _FILE.match(path.stem)

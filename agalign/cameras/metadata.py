@@ -12,19 +12,9 @@ from PIL import ExifTags
 from agalign.cameras.tiff_directory import EXIF, GPS, read_directories, values
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
-from agalign.pixels.raster import JPEG_SUFFIXES, PNG_SUFFIXES
+from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Position
 from agalign.values.text import without_controls
-
-_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""EXIF FocalPlaneResolutionUnit (0xA210): inch, cm, mm, micrometre."""
-_MAX_ALTITUDE_M = 20_000.0
-"""Altitudes beyond it come from damaged tags."""
-_MAX_TEXT_LENGTH = 200
-"""Makes, models and serial numbers are shorter; a damaged tag may contain megabytes."""
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-_MAX_NUMBER = 1e15
-"""Larger than any valid value (times in microseconds); the squares of damaged values would overflow."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +47,10 @@ class Tags:
 
     def numbers(self, namespace: str, name: str) -> tuple[float, ...]:
         """Return the numbers in an XMP value, a text or a sequence, without impossibly large ones."""
-        numbers = (float(n) for n in _NUMBER.findall(self.text(namespace, name)))
-        return tuple(n for n in numbers if abs(n) < _MAX_NUMBER)
+        texts = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", self.text(namespace, name))
+        numbers = map(float, texts)
+        max_number = 1e15  # larger than times in microseconds; the squares of damaged values would overflow
+        return tuple(n for n in numbers if abs(n) < max_number)
 
     def number(self, namespace: str, name: str) -> float | None:
         """Return the first number in an XMP value; None if there is none."""
@@ -69,7 +61,8 @@ class Tags:
         """Pixels per mm of the focal plane, from EXIF FocalPlaneXResolution and its unit."""
         resolution = finite(self.exif.get("FocalPlaneXResolution"))
         unit = self.exif.get("FocalPlaneResolutionUnit", 2)
-        mm = _MM_PER_UNIT.get(int(unit)) if isinstance(unit, int) else None
+        mm_per_unit = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
+        mm = mm_per_unit.get(int(unit)) if isinstance(unit, int) else None
         return resolution / mm if resolution and mm else None
 
     @property
@@ -88,12 +81,12 @@ def read_tags(path: Path) -> Tags:
 
     Raises UnreadableFileError if the file is not of the format of its suffix or is truncated.
     """
-    if path.suffix.lower() in PNG_SUFFIXES:
+    if suffix_format(path) == "PNG":
         return Tags()
     try:
         directories = read_directories(path)
     except Exception as error:  # damaged files cause struct.error, KeyError, MemoryError … in the libraries
-        kind = "JPEG" if path.suffix.lower() in JPEG_SUFFIXES else "TIFF"
+        kind = suffix_format(path) or "TIFF"
         raise UnreadableFileError(
             f"{path}: not a readable {kind} ({error or 'empty'}); copy it from the card again"
         ) from None
@@ -134,8 +127,9 @@ def _signed_degrees(gps: Mapping[str, Any], axis: str, negative: str, max_deg: f
 
 def _altitude_m(gps: Mapping[str, Any]) -> float | None:
     """Altitude above sea level, negative with the reference 1; None if it is missing or impossible."""
+    max_altitude_m = 20_000.0  # beyond it tags are damaged
     altitude_m = finite(gps.get("GPSAltitude"))
-    if altitude_m is None or abs(altitude_m) > _MAX_ALTITUDE_M:
+    if altitude_m is None or abs(altitude_m) > max_altitude_m:
         return None
     return -altitude_m if gps.get("GPSAltitudeRef") == b"\x01" else altitude_m
 
@@ -158,7 +152,8 @@ def _mean(value: Any) -> float | None:
 def _text(value: Any) -> str:
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
-    return without_controls(str(value)).strip()[:_MAX_TEXT_LENGTH] if isinstance(value, (str, int)) else ""
+    max_length = 200  # of makes, models and serial numbers; a damaged tag may contain megabytes
+    return without_controls(str(value)).strip()[:max_length] if isinstance(value, (str, int)) else ""
 
 
 def _iso_time(exif: Mapping[str, Any], fallback: Any) -> str:

@@ -7,27 +7,17 @@ between the two halves of a dual camera because of the longer baseline.
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import Camera, band_of, elevation_of, is_thermal, max_value, rays_to_rig, rotation
+from agalign.cameras.base import FULL_SCALE, Camera, elevation_of, is_thermal, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, finite
-from agalign.cameras.xmp import Name
-from agalign.pixels.raster import RasterInfo
+from agalign.cameras.xmp import names_in
 from agalign.values.capture import Band, Pose, Radiometry
 
-_FULL_SCALE = 65536.0
-"""Divisor of the pixel values in MicaSense's radiometric model: bands are stored as 16 bits."""
-_HORIZONTAL_IRRADIANCE_UNIT = 0.01
-"""W / m^2 / nm: unit of HorizontalIrradiance if no tag gives its scale."""
-_MAX_TWELVE_BIT_VALUE = 65520.0
-"""RedEdge cameras store 12 bits in the upper bits of uint16."""
 _MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
-_CAPTURE_ID: Name = (_MICASENSE, "CaptureId")
-_CALIBRATION: Name = (_MICASENSE, "RadiometricCalibration")
-_CENTIKELVIN = Radiometry("temperature", 27315.0, 1.0, 0.01)
-"""Unit of thermal bands, in agreement with the Altum's tag SceneTemperature."""
 _REDEDGE_M_PARALLAX = {
     "Blue": (-0.9, 0.0),
     "Green": (0.0, 0.0),
@@ -41,34 +31,36 @@ ground decreases. Two flights with two cameras agree within 5 %.
 
 
 class _TagTransfer(pix4d.TagTransfer):
-    radiometry = pix4d.TagTransfer.radiometry | {_CALIBRATION, (_MICASENSE, "DarkRowValue")}
+    radiometry = pix4d.TagTransfer.radiometry | names_in(_MICASENSE, "RadiometricCalibration DarkRowValue")
 
 
 class MicaSense(Camera):
     """The MicaSense family."""
 
     name = "MicaSense"
-    capture_ids = (_CAPTURE_ID,)
+    capture_ids = ((_MICASENSE, "CaptureId"),)
     flight_ids = ((_MICASENSE, "FlightId"),)
     tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
-        return tags.make.lower() == "micasense" or _CAPTURE_ID in tags.xmp
+        return tags.make.lower() == "micasense" or (_MICASENSE, "CaptureId") in tags.xmp
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        name = tags.text(*pix4d.BAND_NAME) or _index_in_name(path) or path.stem
-        band = pix4d.with_wavelength(band_of(path, info, name), tags)
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
+        name = tags.text(pix4d.NAMESPACE, "BandName") or _index_in_name(path) or path.stem
+        band = replace(pix4d.with_wavelength(stored[0], tags), name=name)
         lens = pix4d.perspective_lens(tags)
         parallax = pix4d.parallax_of(tags)
         if parallax is None and tags.model == "RedEdge-M":
             parallax = _REDEDGE_M_PARALLAX.get(name)
+        centikelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)  # in agreement with the Altum's SceneTemperature
+        max_twelve_bit_value = 65520.0  # stored in the upper bits of uint16
         band = replace(
             band,
-            saturation_value=_MAX_TWELVE_BIT_VALUE if band.dtype == "uint16" else max_value(band.dtype),
+            saturation_value=max_twelve_bit_value if band.dtype == "uint16" else band.saturation_value,
             lens=lens,
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
             parallax=parallax,
-            radiometry=_CENTIKELVIN if is_thermal(band) else _radiometry(tags),
+            radiometry=centikelvin if is_thermal(band) else _radiometry(tags),
             lens_offset_m=pix4d.lens_offset_m(tags),
         )
         return (band,)
@@ -93,18 +85,18 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     """L = V a1 / g (p - p_black) / (t + a2 y - a3 t y) with p = raw / 65536, vignetting V, gain g = ISO / 100, exposure
     time t and row y; reflectance = pi L / E with the irradiance E of the light sensor on a horizontal plane.
     """
-    a = tags.numbers(*_CALIBRATION)
+    a = tags.numbers(_MICASENSE, "RadiometricCalibration")
     exposure_s = finite(tags.exif.get("ExposureTime"))
     iso = finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
     if len(a) != 3 or not exposure_s or tags.black_level is None or not iso:
         return None
     irradiance = _irradiance(tags)
-    centre, k = tags.numbers(*pix4d.VIGNETTING_CENTRE), tags.numbers(*pix4d.VIGNETTING_POLYNOMIAL)
+    centre, k = tags.numbers(pix4d.NAMESPACE, "VignettingCenter"), tags.numbers(pix4d.NAMESPACE, "VignettingPolynomial")
     has_vignetting = len(centre) == 2
     return Radiometry(
         "radiance",
         tags.black_level,
-        _FULL_SCALE,
+        FULL_SCALE,
         a[0] / (iso / 100) / exposure_s,
         (centre[0], centre[1]) if has_vignetting else (0.0, 0.0),
         k if has_vignetting else (),
@@ -118,7 +110,7 @@ def _irradiance(tags: Tags) -> float | None:
     """HorizontalIrradiance, W / m^2 / nm; else the irradiance that an older light sensor measured in its own plane."""
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
     candidates = [
-        (tags.number(_DLS, "HorizontalIrradiance"), scale or _HORIZONTAL_IRRADIANCE_UNIT),
+        (tags.number(_DLS, "HorizontalIrradiance"), scale or 0.01),  # the unit without a tag
         (tags.number(_DLS, "SpectralIrradiance"), scale or 1.0),
         (tags.number(pix4d.NAMESPACE, "Irradiance"), scale or 1.0),
     ]

@@ -17,9 +17,6 @@ from agalign.values import geometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 
-_EARTH_RADIUS_KM = 6371.0
-"""Mean radius: distances are accurate to 0.5 %, which is sufficient for comparing the extents of maps."""
-
 
 def captures_onto(
     reference: Path, moving: Sequence[Path], band: str | None = None, max_pixels: int = MAX_MOSAIC_PIXELS
@@ -59,14 +56,16 @@ def distance_km(fixed: Band, moving: Band) -> float:
 
 
 def _great_circle_km(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Distance of two points (longitude, latitude), radians, by the haversine formula."""
+    """Distance of two points (longitude, latitude), radians, by the haversine formula with the mean radius: accurate to
+    0.5 %, which is sufficient for comparing the extents of maps.
+    """
     haversine = np.sin((other - one) / 2) ** 2
     result = haversine[1] + np.cos(one[1]) * np.cos(other[1]) * haversine[0]
-    return float(2 * _EARTH_RADIUS_KM * np.arcsin(np.sqrt(min(1.0, result))))
+    return float(2 * 6371.0 * np.arcsin(np.sqrt(min(1.0, result))))
 
 
 def _georeferenced_bands(path: Path, max_pixels: int) -> tuple[Band, ...]:
-    info = probe(path, max_pixels)
-    if info.georeference is None:
+    stored = probe(path, max_pixels)
+    if stored[0].georeference is None:
         raise InputError(f"{path}: has no coordinates; align images without by 'agalign FOLDER'")
-    return Generic().bands(path, read_tags(path), info)
+    return Generic().bands(path, read_tags(path), stored)

@@ -9,105 +9,103 @@ and RigRelatives refer to the image after EXIF's Orientation is applied.
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import Camera, band_of, colour_bands, rays_to_rig, rotation
+from agalign.cameras.base import Camera, colour_bands, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags
-from agalign.cameras.xmp import Name, Packet
-from agalign.pixels.raster import RasterInfo
+from agalign.cameras.xmp import Packet, names_in
 from agalign.values.capture import Band
 from agalign.values.geometry import Matrix
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens, radial_coefficients
+from agalign.values.pixel_units import Size
 
-_NAMES = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
 _SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
-_MAX_RAY_TAN = 3.0
-"""Tangent of the largest angle from the axis: 72 degrees, beyond the corners of any Sequoia."""
-_CORNER_MARGIN = 1.1
-"""The distortion is fitted up to this multiple of the corners' distance, so that it is accurate at the border."""
-_MAX_SHEAR = 1e-3
-"""Limit of D and E relative to C: `Lens` has no shear, so that the lens is not used beyond it."""
-_POLYNOMIAL: Name = (pix4d.NAMESPACE, "FisheyePolynomial")
-_AFFINE: Name = (pix4d.NAMESPACE, "FisheyeAffineMatrix")
-_FISHEYE: tuple[Name, ...] = (_POLYNOMIAL, _AFFINE, (pix4d.NAMESPACE, "FisheyeAffineSymmetric"))
 
 
 class _TagTransfer(pix4d.TagTransfer):
-    geometry = pix4d.TagTransfer.geometry | {*_FISHEYE}
-    in_px = (_AFFINE,)
+    fisheye = names_in(pix4d.NAMESPACE, "FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
+    geometry = pix4d.TagTransfer.geometry | fisheye
+    in_px = names_in(pix4d.NAMESPACE, "FisheyeAffineMatrix")
     principal_point_follows_orientation = True
 
     def put_geometry(
         self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
     ) -> None:
         super().put_geometry(packet, reference_packet, reference, tags, grid)
-        density = self.pixels_per_mm(tags)
-        if grid.undistorted and tags.numbers(*_AFFINE) and density and reference.lens is not None:
+        density = pix4d.pixels_per_mm(tags)
+        is_fisheye = bool(tags.numbers(pix4d.NAMESPACE, "FisheyeAffineMatrix"))
+        if grid.undistorted and is_fisheye and density and reference.lens is not None:
             # The undistorted image is that of a pinhole camera.
-            packet.remove(_FISHEYE)
-            packet.put(pix4d.MODEL_TYPE, ["perspective"])
-            packet.add(pix4d.FOCAL_LENGTH, pix4d.number_text(reference.lens.fx_px / density))
-            packet.add(pix4d.FOCAL_LENGTH_UNITS, "mm")
+            packet.remove(self.fisheye)
+            packet.put((pix4d.NAMESPACE, "ModelType"), ["perspective"])
+            packet.add((pix4d.NAMESPACE, "PerspectiveFocalLength"), pix4d.number_text(reference.lens.fx_px / density))
+            packet.add((pix4d.NAMESPACE, "PerspectiveFocalLengthUnits"), "mm")
 
 
 class Sequoia(Camera):
     """Parrot Sequoia and Sequoia+."""
 
     name = "Parrot Sequoia"
-    capture_ids = (pix4d.CAPTURE_UUID,)
-    flight_ids = (pix4d.FLIGHT_UUID,)
+    capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"),)
+    flight_ids = ((pix4d.NAMESPACE, "FlightUUID"),)
     tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "parrot" or tags.text(pix4d.NAMESPACE, "RigName").lower().startswith("sequoia")
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        fisheye = "fisheye" in tags.text(*pix4d.MODEL_TYPE).lower()
-        lens = _fisheye_lens(tags, info) if fisheye else pix4d.perspective_lens(tags)
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
+        fisheye = "fisheye" in tags.text(pix4d.NAMESPACE, "ModelType").lower()
+        lens = _fisheye_lens(tags, stored[0].size_px) if fisheye else pix4d.perspective_lens(tags)
         to_camera = np.eye(3)
         if self.tag_transfer.is_rotated(tags):
-            lens, to_camera = lens and _upside_down(lens, info), np.diag([-1.0, -1.0, 1.0])
+            lens, to_camera = lens and _upside_down(lens, stored[0].size_px), np.diag([-1.0, -1.0, 1.0])
         to_rig = rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags)) @ to_camera)
-        if len(info.dtypes) > 1:
-            return colour_bands(path, info, lens, to_rig)
+        if len(stored) > 1:
+            return colour_bands(stored, lens, to_rig)
         suffix = _SUFFIX.search(path.stem)
-        name = _NAMES.get(suffix[1].upper(), suffix[1]) if suffix else tags.text(*pix4d.BAND_NAME) or path.stem
-        return (replace(pix4d.with_wavelength(band_of(path, info, name), tags), lens=lens, to_rig=to_rig),)
+        names = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
+        named_by_tag = tags.text(pix4d.NAMESPACE, "BandName") or path.stem
+        name = names.get(suffix[1].upper(), suffix[1]) if suffix else named_by_tag
+        return (replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, to_rig=to_rig),)
 
     def capture_name(self, path: Path) -> str:
         return _SUFFIX.sub("", path.stem)
 
 
-def _fisheye_lens(tags: Tags, info: RasterInfo) -> Lens | None:
-    polynomial, affine, centre_px = tags.numbers(*_POLYNOMIAL), tags.numbers(*_AFFINE), pix4d.principal_point_px(tags)
+def _fisheye_lens(tags: Tags, size_px: Size) -> Lens | None:
+    polynomial, affine = (tags.numbers(pix4d.NAMESPACE, f"Fisheye{name}") for name in ("Polynomial", "AffineMatrix"))
+    centre_px = pix4d.principal_point_px(tags)
     if len(polynomial) != 4 or len(affine) != 4 or centre_px is None:
         return None
     c, d, e, f = affine
     slope = polynomial[1]
-    if not (c > 0 and f > 0 and slope > 0) or polynomial[0] != 0 or max(abs(d), abs(e)) > _MAX_SHEAR * c:
+    max_shear = 1e-3  # `Lens` has none
+    if not (c > 0 and f > 0 and slope > 0) or polynomial[0] != 0 or max(abs(d), abs(e)) > max_shear * c:
         return None
     fx, fy = slope * 2 * c / math.pi, slope * 2 * f / math.pi
     cx, cy = centre_px
-    corner_distance = math.hypot(max(cx, info.width_px - cx) / fx, max(cy, info.height_px - cy) / fy)
+    corner_distance = math.hypot(max(cx, size_px[0] - cx) / fx, max(cy, size_px[1] - cy) / fy)
 
     def distorted(r: Matrix) -> Matrix:
         """Distance from the principal point, in focal lengths, of a ray at r = tan(angle from the axis)."""
         theta = 2 / math.pi * np.arctan(r)
         return np.asarray(np.polynomial.polynomial.polyval(theta, polynomial) * math.pi / (2 * slope))
 
-    rays = np.linspace(0.0, _MAX_RAY_TAN, 1000)
-    corner_ray = np.interp(corner_distance, distorted(rays), rays)
-    return Lens(fx, fy, cx, cy, radial_coefficients(distorted, _CORNER_MARGIN * float(corner_ray)))
+    rays = np.linspace(0.0, 3.0, 1000)  # up to 72 degrees from the axis, beyond the corners of any Sequoia
+    corner_ray = float(np.interp(corner_distance, distorted(rays), rays))
+    # The distortion is fitted beyond the corners, so that it is accurate at the border.
+    return Lens(fx, fy, cx, cy, radial_coefficients(distorted, 1.1 * corner_ray))
 
 
-def _upside_down(lens: Lens, info: RasterInfo) -> Lens:
+def _upside_down(lens: Lens, size_px: Size) -> Lens:
     """The lens in pixels of the stored image, rotated by 180 degrees: tangential distortion changes its sign."""
     k = lens.distortion
     distortion = (*k[:2], -k[2], -k[3], *k[4:]) if len(k) > 3 else k
-    cx, cy = pix4d.rotated_180((lens.cx_px, lens.cy_px), (info.width_px, info.height_px))
+    cx, cy = pix4d.rotated_180((lens.cx_px, lens.cy_px), size_px)
     return replace(lens, cx_px=cx, cy_px=cy, distortion=distortion)

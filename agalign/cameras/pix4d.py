@@ -8,27 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from agalign.cameras.metadata import Tags
-from agalign.cameras.xmp import Name, Packet
+from agalign.cameras.xmp import Name, Packet, names_in
 from agalign.values.capture import Band, Panel, Pose
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 
 NAMESPACE = "pix4d.com"
 """Contains `pix4d.com/camera/1.0`, and `pix4d.com/1.0` of older firmware."""
-BAND_NAME: Name = (NAMESPACE, "BandName")
-CAPTURE_UUID: Name = (NAMESPACE, "CaptureUUID")
-FLIGHT_UUID: Name = (NAMESPACE, "FlightUUID")
-PRINCIPAL_POINT: Name = (NAMESPACE, "PrincipalPoint")
-FOCAL_LENGTH: Name = (NAMESPACE, "PerspectiveFocalLength")
-FOCAL_LENGTH_UNITS: Name = (NAMESPACE, "PerspectiveFocalLengthUnits")
-DISTORTION: Name = (NAMESPACE, "PerspectiveDistortion")
-MODEL_TYPE: Name = (NAMESPACE, "ModelType")
-RIG_RELATIVES: Name = (NAMESPACE, "RigRelatives")
-RIG_TRANSLATIONS: Name = (NAMESPACE, "RigTranslations")
-VIGNETTING_CENTRE: Name = (NAMESPACE, "VignettingCenter")
-VIGNETTING_POLYNOMIAL: Name = (NAMESPACE, "VignettingPolynomial")
 
-_PANEL_SERIALS: tuple[Name, ...] = (("micasense.com/MicaSense", "PanelSerial"), (NAMESPACE, "PanelSerial"))
 _MAX_FOCAL_LENGTH_MM = 100.0
 """Larger numbers are px: lenses of drone cameras have 2 to 50 mm, or 300 px and more."""
 _MAX_OFFSET_M = 0.5
@@ -51,14 +38,14 @@ def perspective_lens(tags: Tags) -> Lens | None:
     focal_px, centre_px = focal_length_px(tags), principal_point_px(tags)
     if focal_px is None or centre_px is None:
         return None
-    k = tags.numbers(*DISTORTION)
+    k = tags.numbers(NAMESPACE, "PerspectiveDistortion")
     distortion = (k[0], k[1], k[3], k[4], k[2]) if len(k) == 5 else ()
     return Lens(focal_px, focal_px, *centre_px, distortion)
 
 
 def principal_point_px(tags: Tags) -> tuple[float, float] | None:
     """Return (x, y), with the centre of the top-left pixel at (0, 0): the vendors' libraries multiply mm by px/mm."""
-    density, point_mm = pixels_per_mm(tags), tags.numbers(*PRINCIPAL_POINT)
+    density, point_mm = pixels_per_mm(tags), tags.numbers(NAMESPACE, "PrincipalPoint")
     return (point_mm[0] * density, point_mm[1] * density) if density and len(point_mm) == 2 else None
 
 
@@ -66,19 +53,20 @@ def pixels_per_mm(tags: Tags) -> float | None:
     """Return EXIF's resolution of the focal plane, else the ratio of the focal length in px to EXIF's in mm."""
     if tags.pixels_per_mm:
         return tags.pixels_per_mm
-    focal_px = tags.number(*FOCAL_LENGTH) if focal_length_is_in_px(tags) else None
+    focal_px = tags.number(NAMESPACE, "PerspectiveFocalLength") if focal_length_is_in_px(tags) else None
     return focal_px / tags.focal_length_mm if focal_px and tags.focal_length_mm else None
 
 
 def focal_length_is_in_px(tags: Tags) -> bool:
     """Return True if Camera:PerspectiveFocalLength is in px, which old firmware does not state."""
-    units, length = tags.text(*FOCAL_LENGTH_UNITS).lower(), tags.number(*FOCAL_LENGTH)
+    units = tags.text(NAMESPACE, "PerspectiveFocalLengthUnits").lower()
+    length = tags.number(NAMESPACE, "PerspectiveFocalLength")
     return "px" in units or "pixel" in units or (length is not None and length > _MAX_FOCAL_LENGTH_MM)
 
 
 def focal_length_px(tags: Tags) -> float | None:
     """Return Camera:PerspectiveFocalLength in px; None if it is missing or not positive."""
-    focal_length, density = tags.number(*FOCAL_LENGTH), pixels_per_mm(tags)
+    focal_length, density = tags.number(NAMESPACE, "PerspectiveFocalLength"), pixels_per_mm(tags)
     if focal_length is None or density is None or focal_length <= 0:
         return None
     return focal_length if focal_length_is_in_px(tags) else focal_length * density
@@ -86,7 +74,7 @@ def focal_length_px(tags: Tags) -> float | None:
 
 def rig_degrees(tags: Tags) -> tuple[float, ...]:
     """Return the three angles of Camera:RigRelatives; zeros if they are missing."""
-    angles = tags.numbers(*RIG_RELATIVES)
+    angles = tags.numbers(NAMESPACE, "RigRelatives")
     return angles if len(angles) == 3 else (0.0, 0.0, 0.0)
 
 
@@ -94,7 +82,7 @@ def parallax_of(tags: Tags) -> tuple[float, float] | None:
     """Return the direction (x, y) in which a band's pixels move as the distance of the ground decreases, in any unit:
     opposite to the position of the lens in Camera:RigTranslations. None if that is missing.
     """
-    position = tags.numbers(*RIG_TRANSLATIONS)
+    position = tags.numbers(NAMESPACE, "RigTranslations")
     return (-position[0], -position[1]) if len(position) == 3 else None
 
 
@@ -102,7 +90,7 @@ def lens_offset_m(tags: Tags) -> tuple[float, float] | None:
     """Return the position (right, down) of a band's lens in the rig from Camera:RigTranslations, which is in m or mm;
     None if that is missing.
     """
-    position = tags.numbers(*RIG_TRANSLATIONS)
+    position = tags.numbers(NAMESPACE, "RigTranslations")
     if len(position) != 3:
         return None
     scale = 1.0 if max(map(abs, position)) < _MAX_OFFSET_M else 1e-3
@@ -138,7 +126,8 @@ def panel_in(tags: Tags, size_px: tuple[int, int]) -> Panel | None:
     albedo = tags.number(NAMESPACE, "Albedo")
     if albedo is not None and not 0 < albedo <= 1:
         albedo = None
-    return Panel("tags", tags.first_text(_PANEL_SERIALS), albedo, corners)
+    serial = tags.first_text([("micasense.com/MicaSense", "PanelSerial"), (NAMESPACE, "PanelSerial")])
+    return Panel("tags", serial, albedo, corners)
 
 
 def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, float], ...]:
@@ -157,17 +146,17 @@ def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, f
 class TagTransfer:
     """Conversion of XMP values for a band that is written on the reference's grid."""
 
-    geometry: frozenset[Name] = frozenset(
-        (PRINCIPAL_POINT, FOCAL_LENGTH, FOCAL_LENGTH_UNITS, DISTORTION, MODEL_TYPE, RIG_RELATIVES, RIG_TRANSLATIONS)
-    ) | {(NAMESPACE, "RigRelativesReferenceRigCameraIndex")}
-    """Values of lens and rig, which are replaced by those of the reference."""
-    sensor_only: frozenset[Name] = frozenset(
-        (NAMESPACE, name) for name in ("InvalidPixel", "VignettingPolynomial2D", "VignettingPolynomial2DName")
+    geometry: frozenset[Name] = names_in(
+        NAMESPACE,
+        "PrincipalPoint PerspectiveFocalLength PerspectiveFocalLengthUnits PerspectiveDistortion ModelType "
+        "RigRelatives RigRelativesReferenceRigCameraIndex RigTranslations",
     )
+    """Values of lens and rig, which are replaced by those of the reference."""
+    sensor_only: frozenset[Name] = names_in(NAMESPACE, "InvalidPixel VignettingPolynomial2D VignettingPolynomial2DName")
     """Values that refer to the sensor's own pixels and are removed."""
-    radiometry: frozenset[Name] = frozenset({VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL, (NAMESPACE, "BlackCurrent")})
+    radiometry: frozenset[Name] = names_in(NAMESPACE, "VignettingCenter VignettingPolynomial BlackCurrent")
     """Values of corrections that have been applied to the pixels if radiance or reflectance is written."""
-    in_px: tuple[Name, ...] = ()
+    in_px: frozenset[Name] = frozenset()
     """Lengths in px, which are multiplied by the scale of the output."""
     principal_point_follows_orientation = False
     """True if the principal point refers to the image after EXIF's Orientation is applied."""
@@ -182,18 +171,20 @@ class TagTransfer:
         """
         packet.take(reference_packet, self.geometry)
         packet.remove(self.sensor_only)
-        for name in (RIG_RELATIVES, RIG_TRANSLATIONS):
-            packet.put(name, ["0", "0", "0"])
+        for name in ("RigRelatives", "RigTranslations"):
+            packet.put((NAMESPACE, name), ["0", "0", "0"])
         self._put_principal_point(packet, reference, tags, grid)
-        for name in (*self.in_px, *([FOCAL_LENGTH] if focal_length_is_in_px(tags) else [])):
-            values = tags.numbers(*name)
+        focal_length = names_in(NAMESPACE, "PerspectiveFocalLength" if focal_length_is_in_px(tags) else "")
+        for length in self.in_px | focal_length:
+            values = tags.numbers(*length)
             if values and grid.scale.mean != 1:
-                packet.put(name, [number_text(v * grid.scale.mean) for v in values])
+                packet.put(length, [number_text(v * grid.scale.mean) for v in values])
         if grid.undistorted:
-            packet.put(DISTORTION, ["0"] * len(tags.numbers(*DISTORTION)))
+            distortion = NAMESPACE, "PerspectiveDistortion"
+            packet.put(distortion, ["0"] * len(tags.numbers(*distortion)))
 
     def _put_principal_point(self, packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
-        point_px, density = principal_point_px(tags), self.pixels_per_mm(tags)
+        point_px, density = principal_point_px(tags), pixels_per_mm(tags)
         if point_px is None or density is None:
             return
         if self.is_rotated(tags):
@@ -201,7 +192,7 @@ class TagTransfer:
             point_px = rotated_180(grid.px(*stored), (grid.width, grid.height))
         else:
             point_px = grid.px(*point_px)
-        packet.put(PRINCIPAL_POINT, [number_text(v / (density * grid.scale.mean)) for v in point_px])
+        packet.put((NAMESPACE, "PrincipalPoint"), [number_text(v / (density * grid.scale.mean)) for v in point_px])
 
     def put_vignetting(
         self, packet: Packet, tags: Tags, grid: OutputGrid, from_source: FromSource, *, radiometry: bool
@@ -210,7 +201,7 @@ class TagTransfer:
 
         With `radiometry` they are removed, because the pixels have been corrected.
         """
-        centre, k = tags.numbers(*VIGNETTING_CENTRE), tags.numbers(*VIGNETTING_POLYNOMIAL)
+        centre, k = tags.numbers(NAMESPACE, "VignettingCenter"), tags.numbers(NAMESPACE, "VignettingPolynomial")
         if radiometry:
             packet.remove(self.radiometry)
             return
@@ -220,15 +211,11 @@ class TagTransfer:
         magnification = math.dist(new_centre, next_pixel)
         # The condition is also true for nan.
         if not 1 / _MAX_MAGNIFICATION < magnification < _MAX_MAGNIFICATION:
-            packet.remove([VIGNETTING_CENTRE, VIGNETTING_POLYNOMIAL])
+            packet.remove(names_in(NAMESPACE, "VignettingCenter VignettingPolynomial"))
             return
-        packet.put(VIGNETTING_CENTRE, [number_text(v) for v in grid.px(*new_centre)])
+        packet.put((NAMESPACE, "VignettingCenter"), [number_text(v) for v in grid.px(*new_centre)])
         scaled = [v / (grid.scale.mean * magnification) ** i for i, v in enumerate(k, start=1)]
-        packet.put(VIGNETTING_POLYNOMIAL, [f"{v:.9e}" for v in scaled])
-
-    def pixels_per_mm(self, tags: Tags) -> float | None:
-        """Return the resolution of the focal plane."""
-        return pixels_per_mm(tags)
+        packet.put((NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in scaled])
 
     def is_rotated(self, tags: Tags) -> bool:
         """Return True if the principal point refers to the image rotated by 180 degrees: Orientation 3 of Exif."""

@@ -14,7 +14,7 @@ from agalign.cameras.pix4d import panel_in
 from agalign.config import DiscoverOptions
 from agalign.errors import AgalignError, UnreadableFileError
 from agalign.pixels.radiometry import is_physical
-from agalign.pixels.raster import TIFF_SUFFIXES, RasterInfo, probe
+from agalign.pixels.raster import probe, suffix_format
 from agalign.values.capture import Band
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
 from agalign.values.processes import follow_parent
@@ -68,13 +68,13 @@ def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[Imag
 
 def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> ImageFile:
     """Return a file with its bands. Raises UnreadableFileError."""
-    info = probe(path, options.max_pixels)
+    stored = probe(path, options.max_pixels)
     tags = read_tags(path)
     # A stack was made by software, even if its tags name a camera: cameras write single bands and photographs.
     *_, generic = cameras
-    camera = generic if _is_stack(path, info) else next(c for c in cameras if c.recognises(tags))
-    panel = panel_in(tags, (info.width_px, info.height_px))
-    bands = [replace(b, panel=panel) for b in camera.bands(path, tags, info) if options.with_rgb or not b.companion]
+    camera = generic if _is_stack(stored) else next(c for c in cameras if c.recognises(tags))
+    panel = panel_in(tags, stored[0].size_px)
+    bands = [replace(b, panel=panel) for b in camera.bands(path, tags, stored) if options.with_rgb or not b.companion]
     for i, band in enumerate(bands):
         if band.radiometry is not None and not is_physical(band.radiometry, band.size_px):  # damaged tags
             bands[i] = replace(band, radiometry=None)
@@ -111,9 +111,9 @@ def _read_task(paths: Sequence[Path], options: DiscoverOptions) -> list[ImageFil
     return result
 
 
-def _is_stack(path: Path, info: RasterInfo) -> bool:
-    photograph = info.dtypes[0] == "uint8" and len(info.dtypes) in (3, 4)
-    return path.suffix.lower() in TIFF_SUFFIXES and len(info.dtypes) > 1 and not photograph
+def _is_stack(stored: Sequence[Band]) -> bool:
+    photograph = stored[0].dtype == "uint8" and len(stored) in (3, 4)
+    return suffix_format(stored[0].path) == "TIFF" and len(stored) > 1 and not photograph
 
 
 def natural_order(name: str) -> list[tuple[bool, int, str]]:

@@ -6,25 +6,20 @@ infrared in its blue channel; the two cameras expose 0.3 s apart, which causes a
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import Camera, band_of, colour_bands
+from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.pixels.raster import RasterInfo
 from agalign.values.capture import Band, Pose
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
-_ANY_BAND_FOLDER = re.compile(
-    r"^(?:\d+-)?[A-Za-z ]+-\d{3,4}(?:-\d+)?$|^(?:\d+-)?(?:n?RGB|NDRE|NDVI|NIR|RE|LWIR)$", re.I
-)
 _CHANNELS = {"NDRE": {1: ("Red edge", 720.0), 3: ("NIR", 840.0)}, "NDVI": {1: ("Red", 625.0), 3: ("NIR", 850.0)}}
 """Bands of single-lens cameras by the filter: {channel, from 1: (name, centre wavelength in nm)}."""
-_BAND_NAMES = {"RedEdge": "Red edge"}
-"""Names in the tags that are written differently here."""
 _SENTERA = "sentera.com"
 
 
@@ -32,20 +27,20 @@ class Sentera(Camera):
     """Sentera 6X and Double 4K."""
 
     name = "Sentera"
-    capture_ids = (pix4d.CAPTURE_UUID, (_SENTERA, "CaptureUUID"), (_SENTERA, "ImageUniqueID"))
-    flight_ids = (pix4d.FLIGHT_UUID, (_SENTERA, "FlightUUID"), (_SENTERA, "FlightUniqueID"))
+    capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"), (_SENTERA, "CaptureUUID"), (_SENTERA, "ImageUniqueID"))
+    flight_ids = ((pix4d.NAMESPACE, "FlightUUID"), (_SENTERA, "FlightUUID"), (_SENTERA, "FlightUniqueID"))
 
     def recognises(self, tags: Tags) -> bool:
         return "sentera" in tags.make.lower() or any(namespace == _SENTERA for namespace, _ in tags.xmp)
 
-    def bands(self, path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
-        if len(info.dtypes) > 1:
-            return _listed_bands(path, tags, info) or _channel_bands(path, tags, info)
+    def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
+        if len(stored) > 1:
+            return _listed_bands(tags, stored) or _channel_bands(path, tags, stored)
         matrix = tags.numbers(_SENTERA, "AlignMatrix")
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
         folder = _BAND_FOLDER.match(path.parent.name)
-        name = tags.text(*pix4d.BAND_NAME) or (folder["name"] if folder else path.stem)
-        band = pix4d.with_wavelength(band_of(path, info, name), tags)
+        name = tags.text(pix4d.NAMESPACE, "BandName") or (folder["name"] if folder else path.stem)
+        band = replace(pix4d.with_wavelength(stored[0], tags), name=name)
         if folder and band.wavelength_nm is None:
             width = float(folder["width"]) if folder["width"] else None
             band = replace(band, wavelength_nm=float(folder["wavelength"]), bandwidth_nm=width)
@@ -56,40 +51,45 @@ class Sentera(Camera):
         return pix4d.pose_of(tags, tags.number(_SENTERA, altitude) or tags.number(pix4d.NAMESPACE, altitude))
 
     def capture_folder(self, path: Path) -> Path:
-        return path.parent.parent if _ANY_BAND_FOLDER.match(path.parent.name) else path.parent
+        folder = path.parent
+        named = _BAND_FOLDER.match(folder.name) or re.match(
+            r"^(?:\d+-)?(?:n?RGB|NDRE|NDVI|NIR|RE|LWIR)$", folder.name, re.IGNORECASE
+        )
+        return folder.parent if named else folder
 
     def capture_name(self, path: Path) -> str:
         return re.sub(r"_\d{3}_\d{2,3}$", "", path.stem)
 
 
-def _channel_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+def _channel_bands(path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
     """The bands of a photograph by the filter in the name of its folder or model, else red, green and blue."""
     bandpass = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), None)
     if bandpass is None:
         # The colour camera of the Double 4K takes part by default, that of the 6X does not.
-        return tuple(replace(b, companion="6X" in tags.model.upper()) for b in colour_bands(path, info))
+        return tuple(replace(b, companion="6X" in tags.model.upper()) for b in colour_bands(stored))
     return tuple(
-        replace(band_of(path, info, name, index), wavelength_nm=wavelength, one_lens=True)
+        replace(stored[index - 1], name=name, wavelength_nm=wavelength, one_lens=True)
         for index, (name, wavelength) in _CHANNELS[bandpass].items()
-        if index <= len(info.dtypes)
+        if index <= len(stored)
     )
 
 
-def _listed_bands(path: Path, tags: Tags, info: RasterInfo) -> tuple[Band, ...]:
+def _listed_bands(tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
     """The bands of a photograph as its tags list them by channel; a channel without a wavelength is left out."""
-    names = tags.xmp.get(pix4d.BAND_NAME, ())
+    names = tags.xmp.get((pix4d.NAMESPACE, "BandName"), ())
     wavelengths, widths = (tags.numbers(pix4d.NAMESPACE, name) for name in ("CentralWavelength", "WavelengthFWHM"))
-    if not len(names) == len(wavelengths) == len(info.dtypes):
+    if not len(names) == len(wavelengths) == len(stored):
         return ()
     lens = pix4d.perspective_lens(tags)
     return tuple(
         replace(
-            band_of(path, info, _BAND_NAMES.get(name, name), index),
+            band,
+            name="Red edge" if name == "RedEdge" else name,
             wavelength_nm=wavelength,
             one_lens=True,
             lens=lens,
-            bandwidth_nm=widths[index - 1] if len(widths) == len(names) else None,
+            bandwidth_nm=widths[band.band_index - 1] if len(widths) == len(names) else None,
         )
-        for index, (name, wavelength) in enumerate(zip(names, wavelengths, strict=True), start=1)
+        for band, name, wavelength in zip(stored, names, wavelengths, strict=True)
         if wavelength > 0
     )

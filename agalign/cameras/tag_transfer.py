@@ -28,30 +28,15 @@ from agalign.errors import UnreadableFileError
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 
-_BLACK_LEVEL: set[int] = {Base.BlackLevelRepeatDim, Base.BlackLevel}
 _CAPTURE_TAGS: set[int] = {Base.Make, Base.Model, Base.DateTime, Base.Copyright, Base.CameraSerialNumber}
 """Tags of the first directory that are the same for all bands of a capture."""
-_FILE_TAGS = (
-    _CAPTURE_TAGS | _BLACK_LEVEL | {Base.ImageDescription, Base.Software, Base.Artist, Base.OriginalRawFileName}
-)
-_NOT_COPIED: set[int] = {Base.MakerNote, Base.ExifInteroperabilityOffset}
-"""Tags with offsets in the old file."""
-_DENSITIES: set[int] = {Base.FocalPlaneXResolution, Base.FocalPlaneYResolution}
-_GEOMETRIC_EXIF = _DENSITIES | {Base.FocalLength, Base.FocalPlaneResolutionUnit, Base.FocalLengthIn35mmFilm}
-_CAPTURE_EXIF = _GEOMETRIC_EXIF | {
-    Base.ExifVersion,
-    Base.DateTimeOriginal,
-    Base.DateTimeDigitized,
-    Base.OffsetTime,
-    Base.OffsetTimeOriginal,
-    Base.OffsetTimeDigitized,
-    Base.SubsecTime,
-    Base.SubsecTimeOriginal,
-    Base.SubsecTimeDigitized,
-    Base.BodySerialNumber,
-    Base.LensModel,
+_GEOMETRIC_EXIF: set[int] = {
+    Base.FocalPlaneXResolution,
+    Base.FocalPlaneYResolution,
+    Base.FocalPlaneResolutionUnit,
+    Base.FocalLength,
+    Base.FocalLengthIn35mmFilm,
 }
-"""Exif tags for a stack: exposure differs between its bands."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +49,12 @@ class TransferredTags:
 
 
 def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
-    """Return the tags for a stack: those that apply to all bands of a capture."""
+    """Return the tags for a stack: those that apply to all bands of a capture, whose exposures differ."""
     source = _directories(reference.path)
     first = _some(source[0], _CAPTURE_TAGS | {Base.Orientation})
-    return TransferredTags(first, _on_grid(_some(source[EXIF], _CAPTURE_EXIF), source[EXIF], grid), source[GPS])
+    times = {tag for tag in Base if tag.name.startswith(("DateTime", "OffsetTime", "SubsecTime"))}
+    exif = _some(source[EXIF], times | {Base.ExifVersion, Base.BodySerialNumber, Base.LensModel})
+    return TransferredTags(first, _on_grid(exif, source[EXIF], grid), source[GPS])
 
 
 def band_tags(
@@ -78,9 +65,11 @@ def band_tags(
     With `radiometry` the pixels are corrected for black level, vignetting and exposure, and their tags are left out.
     """
     own, of_reference = _directories(source), _directories(reference.path)
-    first = _some(own[0], _FILE_TAGS - _BLACK_LEVEL if radiometry else _FILE_TAGS)
-    first |= _some(of_reference[0], {Base.Orientation})
-    exif = {tag: entry for tag, entry in own[EXIF].items() if tag not in _NOT_COPIED | _GEOMETRIC_EXIF}
+    black_level: set[int] = set() if radiometry else {Base.BlackLevelRepeatDim, Base.BlackLevel}
+    of_file = {Base.ImageDescription, Base.Software, Base.Artist, Base.OriginalRawFileName}
+    first = _some(own[0], _CAPTURE_TAGS | black_level | of_file) | _some(of_reference[0], {Base.Orientation})
+    with_offsets = {Base.MakerNote, Base.ExifInteroperabilityOffset}  # these refer to the old file
+    exif = {tag: entry for tag, entry in own[EXIF].items() if tag not in with_offsets | _GEOMETRIC_EXIF}
     packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
     with suppress(UnreadableFileError):
         reference_tags, own_tags = read_tags(reference.path), read_tags(source)
@@ -108,7 +97,8 @@ def _some(directory: Directory, tags: Iterable[int]) -> Directory:
 def _on_grid(exif: Directory, reference: Directory, grid: OutputGrid) -> Directory:
     """The Exif directory with the focal length and pixel density of the reference, and the size of the output."""
     result = exif | _some(reference, _GEOMETRIC_EXIF)
-    for tag in _DENSITIES & result.keys() if grid.scale.mean != 1 else ():
+    densities: set[int] = {Base.FocalPlaneXResolution, Base.FocalPlaneYResolution}
+    for tag in densities & result.keys() if grid.scale.mean != 1 else ():
         density = finite(values(result[tag]))
         if density is not None and density > 0:
             with suppress(ValueError):  # too large for a fraction: a damaged tag

@@ -13,20 +13,13 @@ from typing import Any, BinaryIO
 from PIL import Image
 from tifffile import DATATYPE, TIFF
 
-from agalign.pixels.raster import JPEG_SUFFIXES
+from agalign.pixels.raster import suffix_format
 
 EXIF, GPS = 34665, 34853
 """Tags with the offset of a directory as value."""
 XMP = 700
 _SIZE = {kind: struct.calcsize(f"<{numbers}") for kind, numbers in TIFF.DATA_FORMATS.items()}
 """Bytes of a value of each type."""
-_MAX_BYTES = 1 << 25
-"""Limit of the tags of a directory: cameras write a few thousand bytes."""
-_MAX_ENTRIES = 4096
-"""Limit of the number of entries in a directory, which may be damaged: cameras write fewer than 100."""
-_MAX_LONG = (1 << 32) - 1
-_MAX_MILLIONTHS = 4000
-"""Values below this are written as millionths, whose numerators fit into 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +58,11 @@ def byte_string(value: bytes, kind: int = DATATYPE.BYTE) -> Entry:
 
 def rational(*values: float) -> Entry:
     """Return an entry of unsigned fractions. Raises ValueError for values that do not fit."""
-    pairs = b""
+    pairs, max_long = b"", (1 << 32) - 1
     for value in values:
-        if not 0 <= value < _MAX_LONG:
+        if not 0 <= value < max_long:
             raise ValueError(f"{value} does not fit into a TIFF fraction")
-        denominator = 1_000_000 if value < _MAX_MILLIONTHS else max(1, int(_MAX_LONG / (value + 1)))
+        denominator = min(1_000_000, max(1, int(max_long / (value + 1))))
         pairs += struct.pack("<II", round(value * denominator), denominator)
     return Entry(DATATYPE.RATIONAL, len(values), pairs)
 
@@ -93,7 +86,7 @@ def read_directories(path: Path) -> dict[int, Directory]:
     A file with the suffix of a JPEG is read as one. Raises ValueError, or an error of Pillow, if the file is malformed,
     OSError if it cannot be read.
     """
-    if path.suffix.lower() not in JPEG_SUFFIXES:
+    if suffix_format(path) != "JPEG":
         with path.open("rb") as file:
             return _read_all(file)
     with Image.open(path, formats=("JPEG",)) as image:
@@ -169,37 +162,30 @@ def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
 def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory, int]:
     """(entries, offset of the next directory), without entries of unknown types and those beyond the end of the file.
 
-    Raises ValueError if the entries declare more bytes than any camera writes.
+    Raises ValueError if there are more entries, or they declare more bytes, than any camera writes.
     """
-    entries, following = _entries(file, layout, at)
-    declared = sum(length for _, _, _, length, _ in entries)
-    if declared > _MAX_BYTES:
-        raise ValueError(f"its tags declare {declared >> 20} MB")
+    max_entries, max_bytes = 4096, 1 << 25  # cameras write fewer than 100, with a few thousand bytes
+    head = struct.Struct(f"{layout.order}HH{layout.offset}")
+    file.seek(at)
+    (count,) = struct.unpack(layout.order + layout.entries, _exactly(file, struct.calcsize(layout.entries)))
+    if count > max_entries:
+        raise ValueError(f"a directory of {count} tags")
+    size = head.size + layout.inline_bytes
+    raw = _exactly(file, count * size)
+    (following,) = struct.unpack(layout.order + layout.offset, _exactly(file, layout.inline_bytes))
     result: Directory = {}
-    for tag, kind, count, length, value in entries:
+    declared = 0
+    for start in range(0, len(raw), size):
+        tag, kind, number = head.unpack_from(raw, start)
+        length, value = _SIZE.get(kind, 0) * number, raw[start + head.size : start + size]
+        declared += length
+        if declared > max_bytes:
+            raise ValueError(f"its tags declare {declared >> 20} MB")
         if length > layout.inline_bytes:
             file.seek(struct.unpack(layout.order + layout.offset, value)[0])
             value = file.read(length)
         if 0 < length <= len(value):
-            result[tag] = Entry(kind, count, _swapped(value[:length], kind, layout.order))
-    return result, following
-
-
-def _entries(file: BinaryIO, layout: _Layout, at: int) -> tuple[list[tuple[int, int, int, int, bytes]], int]:
-    """((tag, type, count, length in bytes, value or its offset) of each entry, offset of the next directory)."""
-    entry_format = f"{layout.order}HH{layout.offset}"
-    fixed = struct.calcsize(entry_format)
-    file.seek(at)
-    (count,) = struct.unpack(layout.order + layout.entries, _exactly(file, struct.calcsize(layout.entries)))
-    if count > _MAX_ENTRIES:
-        raise ValueError(f"a directory of {count} tags")
-    size = fixed + layout.inline_bytes
-    raw = _exactly(file, count * size)
-    (following,) = struct.unpack(layout.order + layout.offset, _exactly(file, layout.inline_bytes))
-    result = []
-    for start in range(0, len(raw), size):
-        tag, kind, number = struct.unpack_from(entry_format, raw, start)
-        result.append((tag, kind, number, _SIZE.get(kind, 0) * number, raw[start + fixed : start + size]))
+            result[tag] = Entry(kind, number, _swapped(value[:length], kind, layout.order))
     return result, following
 
 

@@ -20,16 +20,19 @@ Name = tuple[str, str]
 """(namespace, name). A namespace is its URI without scheme, `www.`, version and final slash, which differ between
 versions of firmware: `micasense.com/DLS`, or only the start of its path, `micasense.com`.
 """
+
+
+def names_in(namespace: str, names: str) -> frozenset[Name]:
+    """Return these names, separated by spaces, in one namespace."""
+    return frozenset((namespace, name) for name in names.split())
+
+
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
-_MAX_NAMESPACE_DEPTH = 4
-"""Parts of a namespace that are used; cameras write at most three."""
 _MAX_DEPTH = 50
-"""Limit of nested elements, which protects the recursive XML library; cameras write six."""
-_MAX_LENGTH = 1 << 22
-"""Limit of the characters of a packet; cameras write a few thousand."""
+"""Limit of nested elements, which protects the recursive XML library, and of the parts of a namespace; cameras write
+six and three.
+"""
 _NAMESPACES = threading.Lock()
-_SCHEME_AND_VERSION = re.compile(r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$", re.IGNORECASE)
-_PREFIX = re.compile(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""")
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,8 @@ class Packet:
     def parse(cls, packet: Any) -> "Packet":
         """Parse bytes or text. A malformed packet becomes an empty one, because the image may still be good."""
         text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
-        if not isinstance(text, str) or len(text) > _MAX_LENGTH:
+        max_length = 1 << 22  # cameras write a few thousand characters
+        if not isinstance(text, str) or len(text) > max_length:
             return cls()
         start, end = text.find("<x:xmpmeta"), text.rfind("</x:xmpmeta>")
         if start < 0 or end < 0:
@@ -56,7 +60,8 @@ class Packet:
             return cls()
         if _is_deeper(root, _MAX_DEPTH):
             return cls()
-        return cls(root, tuple(p for p in _PREFIX.findall(text) if not re.fullmatch(r"ns\d+", p[0])))
+        prefixes = re.findall(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""", text)
+        return cls(root, tuple(p for p in prefixes if not re.fullmatch(r"ns\d+", p[0])))
 
     def values(self) -> dict[Name, tuple[str, ...]]:
         """Return {(namespace, name): values} of all rdf:Description elements; the first of two values is used.
@@ -174,6 +179,7 @@ def _is_one_of(tag: str, names: Collection[Name]) -> bool:
 def _namespaces(uri: str) -> list[str]:
     if uri.startswith("http://www.w3.org/"):
         return []
-    path = _SCHEME_AND_VERSION.sub("", uri)
-    parts = path.split("/")[:_MAX_NAMESPACE_DEPTH]
+    scheme_and_version = r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$"
+    path = re.sub(scheme_and_version, "", uri, flags=re.IGNORECASE)
+    parts = path.split("/")[:_MAX_DEPTH]
     return ["/".join(parts[:count]) for count in range(len(parts), 0, -1)] if path else []

@@ -14,8 +14,8 @@ import numpy as np
 from agalign.errors import UnreadableFileError
 from agalign.flight.rig import distance_px
 from agalign.pixels.masks import learnable
-from agalign.pixels.raster import OpenRaster, open_raster, read_window
-from agalign.pixels.resample import resample_tile_of
+from agalign.pixels.raster import OpenRaster, open_raster, read_tile
+from agalign.pixels.resample import resample_tile
 from agalign.pixels.structure import structure_field
 from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Band
@@ -63,7 +63,7 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[Fixed
 
 
 def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:
-    fixed = _raster(*read_window(source, reference, tile.x0, tile.y0, tile.width, tile.height), reference)
+    fixed = _raster(*read_tile(reference, tile, source), reference)
     return FixedWindows(fixed.valid, structure_field(fixed))
 
 
@@ -125,7 +125,8 @@ def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual[Fi
     parts = [(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))]
     with open_raster(moving.path) as source:
         for tile, windows in tiles:
-            part = windows.residuals(_raster(*resample_tile_of(source, moving, mapping, tile, "lanczos"), moving))
+            warped = resample_tile(moving, mapping, tile, "lanczos", dataset=source)
+            part = windows.residuals(_raster(*warped, moving))
             parts.append((part.centres_px + np.array([tile.x0, tile.y0]), part.shifts_px, part.peaks_sigma))
     return Residual[FixedFilePx].of(*map(np.concatenate, zip(*parts, strict=True)))
 

@@ -11,8 +11,9 @@ from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
 from agalign.pixels.panel import DetectedPanel, albedo_of, find_panel, inside
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import open_raster, read_for_alignment, read_window, without_warnings
+from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
 from agalign.values.capture import Band, Capture, Panel, PanelSource
+from agalign.values.image import Tile
 from agalign.values.pixel_units import PixelScale
 
 Albedos = Mapping[str, float]
@@ -203,8 +204,7 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
 
 def _radiance(band: Band, panel: Panel) -> tuple[float | None, float]:
     """Return the mean radiance over the panel, None without calibration, and the saturated share of its pixels."""
-    with open_raster(band.path) as source:
-        pixels, valid = read_window(source, band, 0, 0, band.width_px, band.height_px)
+    pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
     within = inside(panel.corners_px, pixels.shape) & valid
     if not within.any():
         return None, 0.0

@@ -9,9 +9,9 @@ import numpy as np
 from agalign.cameras.base import is_thermal
 from agalign.errors import AgalignError
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import open_raster, read_for_alignment, read_window, without_warnings
+from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
 from agalign.values.capture import Band, Capture
-from agalign.values.image import Raster
+from agalign.values.image import Raster, Tile
 
 MAX_SKY_TEXTURE = 0.015
 """Maximum relative texture of a band of clear sky. Measured: 0.004 to 0.007 for sky, 0.068 for water without glint,
@@ -95,8 +95,7 @@ def sky_radiance(band: Band) -> float | None:
     """
     if band.radiometry is None or band.radiometry.quantity != "radiance":
         return None
-    with open_raster(band.path) as source:
-        pixels, valid = read_window(source, band, 0, 0, band.width_px, band.height_px)
+    pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
     if band.saturation_value is not None:
         valid &= pixels.astype(np.float64) < band.saturation_value
     if valid.mean() < _MIN_UNSATURATED_SHARE:

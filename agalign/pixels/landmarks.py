@@ -32,10 +32,6 @@ _INLIER_PX = 3.0
 """Maximum residual of an inlier, px of the reduced image."""
 _MIN_INLIERS = 10
 """Unrelated images have up to 8."""
-_SMOOTHING_PX = 1.0
-"""Standard deviation of the Gaussian before the gradient."""
-_INVALID_MARGIN_PX = 7
-"""Width of the kernel that removes the edges of invalid areas."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +55,10 @@ def landmarks(raster: Raster, view: LandmarkInput) -> Landmarks:
     small = shrink(channel_mean(raster), (max(8, round(width * scale)), max(8, round(height * scale))))
     image, valid = small.pixels, small.valid
     if view == "edges":
-        smooth = cv2.GaussianBlur(np.where(valid, image, 0).astype(np.float32), (0, 0), _SMOOTHING_PX)
+        smooth = cv2.GaussianBlur(np.where(valid, image, 0).astype(np.float32), (0, 0), 1.0)
         image = np.sqrt(gradient_magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))))
-        margin = np.ones((_INVALID_MARGIN_PX, _INVALID_MARGIN_PX), np.uint8)
-        valid = cv2.erode(valid.astype(np.uint8), margin, borderValue=1) > 0
+        without_edges = np.ones((7, 7), np.uint8)  # of invalid areas, in the smoothed gradient
+        valid = cv2.erode(valid.astype(np.uint8), without_edges, borderValue=1) > 0
     sift = cv2.SIFT.create(nfeatures=_MAX_KEYPOINTS)
     keypoints, descriptors = sift.detectAndCompute(eight_bit(image, valid), valid.view("u1"))
     if descriptors is None:

@@ -10,9 +10,6 @@ from agalign.values.resample import planes_of
 
 _MIN_SIDE_PX = 48
 """Smaller images contain too few patches for learning."""
-_MAX_SENSOR_BYTES = 2
-"""Sensors deliver 8 or 16 bits; the maximum of a wider type is not saturation."""
-_COMMON_FILL_VALUES = (-9999.0, -99999.0, -32767.0, -32768.0)
 _MAX_MEASURED = 1e15
 """Above the values of any sensor, below the fill values of netCDF, GIS and C programs (1e20, 9.97e36, 3.4e38)."""
 _MIN_FILL_SHARE = 0.002
@@ -30,7 +27,8 @@ def data_mask(pixels: NDArray[np.generic], nodata: float | None) -> Mask:
     if nodata is not None and np.isfinite(nodata):
         valid &= pixels != nodata
     if nodata is None and pixels.dtype.kind == "f":
-        valid &= (np.abs(pixels) < _MAX_MEASURED) & ~np.isin(pixels, _COMMON_FILL_VALUES)
+        common_fill = -9999.0, -99999.0, -32767.0, -32768.0
+        valid &= (np.abs(pixels) < _MAX_MEASURED) & ~np.isin(pixels, common_fill)
     return valid
 
 
@@ -78,7 +76,8 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     planes, _ = planes_of(image, name)
     if min(planes.shape[1:]) < _MIN_SIDE_PX:
         raise InputError(f"{name} is {np.shape(image)}: images need {_MIN_SIDE_PX} px a side")
-    is_sensor_type = planes.dtype.kind in "ui" and planes.dtype.itemsize <= _MAX_SENSOR_BYTES
+    # Sensors deliver 8 or 16 bits: the maximum of a wider type is not saturation.
+    is_sensor_type = planes.dtype.kind in "ui" and planes.dtype.itemsize <= 2
     saturation = float(np.iinfo(str(planes.dtype)).max) if is_sensor_type else None
     mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
     if mask.shape != planes.shape[1:]:

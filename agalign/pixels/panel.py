@@ -2,49 +2,49 @@
 
 import re
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agalign.values.image import FloatImage, Mask, Raster
-from agalign.values.pixel_units import PixelScale
+from agalign.values.image import Mask, Raster
 
-_LONGEST_SIDE_PX = 1600
-"""Larger images are reduced to this."""
-_STRETCH_PERCENTILES = 1.0, 99.5
-"""Percentiles of the image that become 0 and 255."""
-_SMOOTHING_PX = 2.0
-"""Suppresses the noise of dark panels."""
-_LEVELS = 12
-"""Number of thresholds at which contours are extracted, between the following percentiles."""
-_LEVEL_PERCENTILES = 5.0, 99.5
-_CORNER_TOLERANCE = 0.04
-"""Maximum distance of a contour from a quadrilateral, relative to the length of the contour."""
 _AREA_RATIO = 0.5
 """Side of the measured area, relative to that of the panel."""
-_RING_RATIOS = 1.15, 1.4
-"""Inner and outer side of the surrounding ring used for comparison, relative to that of the panel."""
-_CODE_AREA_RATIOS = 0.3, 6.0
-"""Minimum and maximum area of the panel, relative to that of its code."""
-_MAX_CODE_DISTANCE = 3.0
-"""Maximum distance between the centres of panel and code, in sides of the code."""
-_IMAGE_SHARES = 0.004, 0.3
-"""Minimum and maximum area of a panel without a code."""
-_MIN_PANEL_SHARE = 0.02
-"""Minimum share of the image that a panel covers from 1 m above; 0.03 on a RedEdge-M."""
-_MAX_OFF_CENTRE = 1 / 6
-"""A camera that is aimed at a panel has its centre in the middle third of the image."""
-_MAX_RELATIVE_STD = 0.06
-"""Maximum standard deviation within the measured area, relative to its mean."""
-_MIN_CONTRAST = 1.5
-"""Minimum ratio of the brightness of a panel and its surroundings."""
-_MAX_SIDE_RATIO, _MAX_TAPER = 1.4, 1.15
-"""Maximum ratio of the longest and the shortest side, and of opposite sides."""
-_ALBEDO_IN_CODE = re.compile(r"_(\d{4})(\d{3})(\d{4})(\d{3})$")
 
 Corners = NDArray[np.float64]
 """(4, 2) px, in order around the quadrilateral."""
+
+
+class _Limits(NamedTuple):
+    """What distinguishes a panel from other bright squares."""
+
+    corner_tolerance: float = 0.04
+    """Maximum distance of a contour from a quadrilateral, relative to the length of the contour."""
+    side_ratio: float = 1.4
+    """Maximum ratio of the longest and the shortest side."""
+    taper: float = 1.15
+    """Maximum ratio of opposite sides."""
+    relative_std: float = 0.06
+    """Maximum standard deviation within the measured area, relative to its mean."""
+    contrast: float = 1.5
+    """Minimum ratio of the brightness of a panel and its surroundings."""
+    ring_ratios: tuple[float, float] = (1.15, 1.4)
+    """Inner and outer side of the surrounding ring used for comparison, relative to that of the panel."""
+    code_area_ratios: tuple[float, float] = (0.3, 6.0)
+    """Minimum and maximum area of the panel, relative to that of its code."""
+    code_distance: float = 3.0
+    """Maximum distance between the centres of panel and code, in sides of the code."""
+    image_shares: tuple[float, float] = (0.004, 0.3)
+    """Minimum and maximum area of a panel without a code, relative to the image."""
+    aimed_share: float = 0.02
+    """Minimum share of the image that a panel covers from 1 m above; 0.03 on a RedEdge-M."""
+    off_centre: float = 1 / 6
+    """A camera that is aimed at a panel has its centre in the middle third of the image."""
+
+
+_LIMITS = _Limits()
 
 
 @dataclass(frozen=True)
@@ -60,32 +60,36 @@ class DetectedPanel:
 
 
 def find_panel(image: Raster, *, without_code: bool = False) -> DetectedPanel | None:
-    """Detect the panel in a band; None without one.
+    """Detect the panel in a band (height, width), of up to 1600 px a side; None without one.
 
     Roofs and sheets are homogeneous squares too, so panels without a code are detected only `without_code`.
     """
-    stretched, scale = _stretched(image)
+    stretched = _stretched(image)
     code, code_corners = _code(stretched)
     if not code and not without_code:
         return None
-    smooth = np.asarray(cv2.GaussianBlur(stretched, (0, 0), _SMOOTHING_PX), np.uint8)
+    smooth = np.asarray(cv2.GaussianBlur(stretched, (0, 0), 2.0), np.uint8)  # dark panels are noisy
     largest = _largest_panel(smooth, code_corners)
     if largest is None:
         return None if code_corners is None else DetectedPanel(code, (), _is_in_scene(code_corners, smooth))
-    area = PixelScale(scale, scale).inverse.positions(_scaled(largest))
-    return DetectedPanel(code, tuple((float(x), float(y)) for x, y in area), _is_in_scene(largest, smooth))
+    area = tuple((x, y) for x, y in _scaled(largest).tolist())
+    return DetectedPanel(code, area, _is_in_scene(largest, smooth))
 
 
 def _is_in_scene(square: Corners, image: NDArray[np.uint8]) -> bool:
     """Return True if a panel or its code is small and outside the middle third of the image."""
     size = np.array(image.shape[::-1], np.float64)
     off_centre = np.abs((square.mean(axis=0) - (size - 1) / 2) / size).max()
-    return bool(off_centre > _MAX_OFF_CENTRE and _area(square) < _MIN_PANEL_SHARE * image.size)
+    return bool(off_centre > _LIMITS.off_centre and _area(square) < _LIMITS.aimed_share * image.size)
 
 
 def _largest_panel(image: NDArray[np.uint8], code: Corners | None) -> Corners | None:
     """Return the largest square that may be a panel, next to the code if there is one; None without any."""
-    limits = _IMAGE_SHARES if code is None else tuple(share * _area(code) / image.size for share in _CODE_AREA_RATIOS)
+    limits = (
+        _LIMITS.image_shares
+        if code is None
+        else tuple(share * _area(code) / image.size for share in _LIMITS.code_area_ratios)
+    )
     squares = _quadrilaterals(image, limits[0] * image.size, limits[1] * image.size)
     squares = [s for s in squares if (code is None or _is_next_to(s, code)) and _is_panel(image, s)]
     return max(squares, key=_area, default=None)
@@ -97,7 +101,7 @@ def albedo_of(code: str, wavelength_nm: float | None) -> float | None:
     RP04-…_04005111000507 is 51.1 % at 400 nm and 50.7 % at 1000 nm; it is interpolated linearly, as by the firmware of
     the cameras. None without a reflectance, without a wavelength or outside of the range.
     """
-    match = _ALBEDO_IN_CODE.search(code)
+    match = re.search(r"_(\d{4})(\d{3})(\d{4})(\d{3})$", code)
     if match is None or wavelength_nm is None:
         return None
     first_nm, first, last_nm, last = (float(n) for n in match.groups())
@@ -113,15 +117,11 @@ def inside(corners_px: ArrayLike, shape: tuple[int, int]) -> Mask:
     return mask.astype(bool)
 
 
-def _stretched(image: Raster) -> tuple[NDArray[np.uint8], float]:
-    """Return the grey image in 8 bits, reduced to _LONGEST_SIDE_PX, and its scale."""
-    pixels: FloatImage = image.pixels if image.pixels.ndim == 2 else image.pixels.mean(axis=0)
-    scale = min(1.0, _LONGEST_SIDE_PX / max(pixels.shape))
-    if scale < 1:
-        pixels = np.asarray(cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.float32)
-    low, high = np.percentile(pixels, _STRETCH_PERCENTILES)
-    stretched = (pixels - low) * (255.0 / max(float(high - low), 1e-9))
-    return np.clip(np.rint(stretched), 0, 255).astype(np.uint8), scale
+def _stretched(image: Raster) -> NDArray[np.uint8]:
+    """Return the image in 8 bits."""
+    low, high = np.percentile(image.pixels, (1.0, 99.5))
+    stretched = (image.pixels - low) * (255.0 / max(float(high - low), 1e-9))
+    return np.asarray(np.clip(np.rint(stretched), 0, 255), np.uint8)
 
 
 def _code(image: NDArray[np.uint8]) -> tuple[str, Corners | None]:
@@ -134,35 +134,37 @@ def _code(image: NDArray[np.uint8]) -> tuple[str, Corners | None]:
 
 
 def _quadrilaterals(image: NDArray[np.uint8], min_area: float, max_area: float) -> list[Corners]:
-    """Return the convex, nearly square contours at several thresholds, with areas within the limits."""
+    """Return the convex, nearly square contours at twelve thresholds, with areas within the limits."""
     result = []
-    low, high = (float(v) for v in np.percentile(image, _LEVEL_PERCENTILES))
-    for level in np.linspace(low, high, _LEVELS + 2)[1:-1]:
+    low, high = np.percentile(image, (5.0, 99.5)).tolist()
+    for level in np.linspace(low, high, 14)[1:-1]:
         contours, _ = cv2.findContours((image > level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
         for contour in (c for c in contours if min_area <= cv2.contourArea(c) <= max_area):
-            tolerance_px = _CORNER_TOLERANCE * cv2.arcLength(contour, closed=True)
+            tolerance_px = _LIMITS.corner_tolerance * cv2.arcLength(contour, closed=True)
             polygon = cv2.approxPolyDP(contour, tolerance_px, closed=True).reshape(-1, 2)
             if len(polygon) == 4 and cv2.isContourConvex(polygon):
                 sides = np.linalg.norm(polygon - np.roll(polygon, 1, axis=0), axis=1)
                 longer, shorter = np.maximum(sides[:2], sides[2:]), np.minimum(sides[:2], sides[2:])
-                if sides.max() <= _MAX_SIDE_RATIO * sides.min() and (longer <= _MAX_TAPER * shorter).all():
+                if sides.max() <= _LIMITS.side_ratio * sides.min() and (longer <= _LIMITS.taper * shorter).all():
                     result.append(polygon.astype(np.float64))
     return result
 
 
 def _is_panel(image: NDArray[np.uint8], square: Corners) -> bool:
     """Return True if a square is homogeneous and brighter than the ring around it."""
-    inner, edge, outer = (inside(_scaled(square, factor), image.shape) for factor in (_AREA_RATIO, *_RING_RATIOS))
+    inner, edge, outer = (
+        inside(_scaled(square, factor), image.shape) for factor in (_AREA_RATIO, *_LIMITS.ring_ratios)
+    )
     area, ring = image[inner].astype(np.float64), image[outer & ~edge]
     if not len(area) or not len(ring):
         return False
-    is_bright = area.mean() >= _MIN_CONTRAST * np.median(ring)
-    return bool(is_bright and area.std() <= _MAX_RELATIVE_STD * area.mean())
+    is_bright = area.mean() >= _LIMITS.contrast * np.median(ring)
+    return bool(is_bright and area.std() <= _LIMITS.relative_std * area.mean())
 
 
 def _is_next_to(square: Corners, code: Corners) -> bool:
     side, distance = _area(code) ** 0.5, float(np.linalg.norm(square.mean(axis=0) - code.mean(axis=0)))
-    return bool(side <= distance <= _MAX_CODE_DISTANCE * side)
+    return bool(side <= distance <= _LIMITS.code_distance * side)
 
 
 def _area(corners: Corners) -> float:

@@ -18,19 +18,14 @@ from agalign.values.capture import Capture, Quantity, Radiometry, RadiometrySour
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage
 
-_MAX_FALLOFF = 1000.0
-"""Maximum correction of the vignetting and the row gradient."""
-_MAX_RAW = 65535.0
-"""Of 16-bit sensors."""
-_MAX_VALUE = 1e12
-"""Above any radiance or reflectance."""
-
 
 def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
     """Return True if a calibration is plausible for an image of (width, height); damaged tags are not.
 
-    It is finite, its gain is positive, and the corrections of the corners and of the last row are below _MAX_FALLOFF.
+    It is finite, its gain is positive, the corrections of the corners and of the last row are below a factor of 1000,
+    and the values of 16-bit sensors below 1e12, which is above any radiance or reflectance.
     """
+    max_correction, max_raw, max_value = 1000.0, 65535.0, 1e12
     factor, _ = radiometry.by_sun or (1.0, None)
     positive = radiometry.gain, radiometry.full_scale, factor
     of_position = radiometry.row_gradient, *radiometry.vignetting, *radiometry.vignetting_centre_px
@@ -42,11 +37,11 @@ def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
         falloff = np.polynomial.polynomial.polyval(r, (1.0, *radiometry.vignetting))
         by_row = 1.0 + radiometry.row_gradient * np.array([0.0, height])
-        max_value = radiometry.gain / radiometry.full_scale * factor * _MAX_RAW
+        brightest = radiometry.gain / radiometry.full_scale * factor * max_raw
     return bool(
-        (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < np.log(_MAX_FALLOFF)).all()
-        and (by_row > 1 / _MAX_FALLOFF).all()
-        and max_value < _MAX_VALUE
+        (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < np.log(max_correction)).all()
+        and (by_row > 1 / max_correction).all()
+        and brightest < max_value
     )
 
 

@@ -5,9 +5,8 @@ import stat
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -28,13 +27,8 @@ from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
 from agalign.values.pixel_units import PixelScale
 
-TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 _READ_WHOLE_PX = 1 << 26
 """Images up to this size are decoded completely before averaging: 128 MB in 16 bits."""
-JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
-PNG_SUFFIXES = frozenset({".png"})
-PICTURE_SUFFIXES = JPEG_SUFFIXES | PNG_SUFFIXES
-"""Photographs, or bands exported by other software, mostly in 8 bits."""
 GDAL_ENVIRONMENT = {
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
@@ -46,42 +40,25 @@ GDAL_ENVIRONMENT = {
 GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
 description that refers to other files or to a server.
 """
-_DRIVERS = {
-    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "GTiff"),
-    b"\xff\xd8\xff": "JPEG",
-    b"\x89PNG": "PNG",
-}
-"""GDAL drivers by the first bytes of a file. Some of the other drivers execute code or contact servers."""
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
-_PREVIEW_SIDE_PX = 2048
-"""Default longest side of a preview; larger than it is displayed."""
 _MAX_MICROMETRES = 20.0
 """Wavelengths without a unit are in micrometres below this: thermal bands end at 14 um, and none is below 100 nm."""
 
 
-@dataclass(frozen=True)
-class RasterInfo:
-    """The shape and the metadata of a raster file."""
+def suffix_format(path: Path) -> Literal["TIFF", "JPEG", "PNG"] | None:
+    """Return the format that the suffix of a file stands for; None for other files.
 
-    width_px: int
-    height_px: int
-    dtypes: tuple[str, ...]
-    nodata: tuple[float | None, ...]
-    descriptions: tuple[str | None, ...]
-    wavelengths_nm: tuple[float | None, ...]
-    alpha_index: int | None
-    """Index from 1 of an alpha band."""
-    georeference: Georeference | None
-    has_mask: bool = False
-    scales_offsets: tuple[tuple[float, float], ...] = ()
-    """(scale, offset) of each band, or empty."""
-    overviews: tuple[int, ...] = ()
-
-    @property
-    def band_indexes(self) -> tuple[int, ...]:
-        """Indexes from 1 of all bands except the alpha band."""
-        return tuple(i for i in range(1, len(self.dtypes) + 1) if i != self.alpha_index)
+    JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits.
+    """
+    match path.suffix.lower():
+        case ".tif" | ".tiff":
+            return "TIFF"
+        case ".jpg" | ".jpeg":
+            return "JPEG"
+        case ".png":
+            return "PNG"
+    return None
 
 
 @contextmanager
@@ -161,53 +138,66 @@ def _driver_of(path: Path) -> str:
     except (OSError, ValueError) as error:
         text = getattr(error, "strerror", None) or error
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
-    for prefix, driver in _DRIVERS.items():
-        if magic.startswith(prefix):
-            return driver
+    # Some of GDAL's other drivers execute code or contact servers.
+    if magic in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return "GTiff"
+    if magic.startswith(b"\xff\xd8\xff"):
+        return "JPEG"
+    if magic == b"\x89PNG":
+        return "PNG"
     problem = "is empty" if not magic else "is not a TIFF, JPEG or PNG"
     raise UnreadableFileError(f"{path}: {problem}; copy it from the card again")
 
 
-def probe(path: Path, max_pixels: int = MAX_PIXELS) -> RasterInfo:
-    """Read the metadata of a raster file.
+def probe(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[Band, ...]:
+    """Read the metadata of a raster file: its bands, without an alpha band, with the names in the file or empty ones.
 
     Raises UnreadableFileError, also for more than `max_pixels` per band.
     """
     try:
-        return _probe(path, max_pixels)
+        with open_raster(path) as dataset:
+            return _bands(path, dataset, max_pixels)
     except UnreadableFileError:
         raise
     except Exception as error:  # damaged files raise errors of many classes
-        text = next(iter(str(error).splitlines()), type(error).__name__)
-        raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
+        raise UnreadableFileError(
+            f"{path}: cannot be read ({innermost_cause(error)}); copy it from the card again"
+        ) from None
 
 
-def _probe(path: Path, max_pixels: int) -> RasterInfo:
-    with open_raster(path) as dataset:
-        width, height, count = dataset.width, dataset.height, dataset.count
-        if width * height > max_pixels:
-            raise UnreadableFileError(
-                f"{path}: declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
-            )
-        if count > _MAX_BANDS:
-            raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
-        wavelengths = tuple(_wavelength_nm(dataset.tags(index)) for index in dataset.indexes)
-        alpha = [i for i, c in enumerate(dataset.colorinterp, start=1) if c == ColorInterp.alpha]
-        if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
-            raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
-        return RasterInfo(
-            width,
-            height,
-            tuple(dataset.dtypes),
-            tuple(dataset.nodatavals),
-            tuple(dataset.descriptions),
-            wavelengths,
-            alpha[0] if alpha else None,
-            _georeference(dataset),
-            MaskFlags.per_dataset in dataset.mask_flag_enums[0],
-            tuple(zip(dataset.scales, dataset.offsets, strict=True)),
-            tuple(dataset.overviews(1)),
+def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tuple[Band, ...]:
+    width, height, count = dataset.width, dataset.height, dataset.count
+    if width * height > max_pixels:
+        raise UnreadableFileError(
+            f"{path}: declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
         )
+    if count > _MAX_BANDS:
+        raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
+    if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
+        raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
+    has_alpha = count > 1 and ColorInterp.alpha in dataset.colorinterp
+    alpha = dataset.colorinterp.index(ColorInterp.alpha) + 1 if has_alpha else None
+    has_mask = MaskFlags.per_dataset in dataset.mask_flag_enums[0]
+    georeference, overviews = _georeference(dataset), tuple(dataset.overviews(1))
+    return tuple(
+        Band(
+            name=dataset.descriptions[i - 1] or "",
+            path=path,
+            band_index=i,
+            width_px=width,
+            height_px=height,
+            dtype=dataset.dtypes[i - 1],
+            nodata=dataset.nodatavals[i - 1],
+            has_mask=has_mask,
+            wavelength_nm=_wavelength_nm(dataset.tags(i)),
+            saturation_value={"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}.get(dataset.dtypes[i - 1]),
+            georeference=georeference,
+            scale_offset=(dataset.scales[i - 1], dataset.offsets[i - 1]),
+            overviews=overviews,
+        )
+        for i in dataset.indexes
+        if i != alpha
+    )
 
 
 def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
@@ -239,39 +229,33 @@ def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]
     return np.asarray(dataset.read(band.band_index, out_shape=shape, resampling=Resampling.average))
 
 
-def read_window(
-    dataset: rasterio.DatasetReader, band: Band, x0: int, y0: int, width: int, height: int
+def read_tile(
+    band: Band, tile: Tile, dataset: rasterio.DatasetReader | None = None
 ) -> tuple[NDArray[np.generic], Mask]:
-    """Read a window inside the image: pixels in the type of the file and their mask, each (height, width)."""
-    window = Window(x0, y0, width, height)
+    """Read a tile inside a band: pixels in the type of the file and their mask, each (height, width).
+
+    `dataset` is the open file, if it is open. Raises UnreadableFileError.
+    """
+    if dataset is None:
+        with open_raster(band.path) as opened:
+            return read_tile(band, tile, opened)
+    window = Window(tile.x0, tile.y0, tile.width, tile.height)
     pixels = dataset.read(band.band_index, window=window)
     return pixels, data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.band_index, window=window)
 
 
-def read_tile(band: Band, tile: Tile) -> tuple[NDArray[np.generic], Mask]:
-    """Read a tile of a band: pixels in the type of the file and their mask, each (height, width).
-
-    Raises UnreadableFileError.
-    """
-    with open_raster(band.path) as dataset:
-        return read_window(dataset, band, tile.x0, tile.y0, tile.width, tile.height)
-
-
 def read_preview(
-    path: Path, index: int, window_px: tuple[int, int, int, int], size_px: tuple[int, int] | None = None
+    path: Path, index: int, window_px: tuple[int, int, int, int], size_px: tuple[int, int]
 ) -> NDArray[np.float32]:
     """Read a window (x0, y0, width, height) of a band as (height, width) float32 with NaN for nodata.
 
-    It is resampled to `size_px` (width, height), by default to at most _PREVIEW_SIDE_PX. Raises UnreadableFileError.
+    It is resampled to `size_px` (width, height). Raises UnreadableFileError.
     """
     x0, y0, width, height = window_px
-    reduction = max(1.0, max(width, height) / _PREVIEW_SIDE_PX)
-    out_width, out_height = size_px or reduced_size_px((width, height), reduction)
+    resampling = Resampling.average if size_px[0] < width else Resampling.bilinear
     with open_raster(path) as dataset:
         window = Window(x0, y0, width, height)
-        resampling = Resampling.average if out_width < width else Resampling.bilinear
-        shape = out_height, out_width
-        pixels = dataset.read(index, window=window, out_shape=shape, resampling=resampling, boundless=False)
+        pixels = dataset.read(index, window=window, out_shape=size_px[::-1], resampling=resampling)
         nodata = dataset.nodata
     values = pixels.astype(np.float32)
     return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))

@@ -9,58 +9,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import OpenRaster, open_raster, read_window
+from agalign.pixels.raster import OpenRaster, read_tile
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import Interpolation
 from agalign.values.image import FloatImage, Mask, Raster, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
-from agalign.values.resample import between, resample, source_window
+from agalign.values.resample import MIN_VALID_WEIGHT, between, resample, source_window
 
-_MIN_VALID_WEIGHT = 0.999
-"""Minimum share of valid pixels in a valid pixel of a reduced image: float32 weights do not sum to exactly 1."""
 _MIN_SIDE_PX = 8
 """A moving image is not reduced below this, whatever the scale of the homography."""
-_OUTSIDE_PX = -1e6
-"""Position that replaces points on the horizon of a homography."""
 
 
 def resample_tile(
-    band: Band, mapping: PixelMapping, tile: Tile, interpolation: Interpolation, radiometry: Radiometry | None = None
-) -> tuple[NDArray[np.generic], Mask]:
-    """Resample the moving band to a tile of the reference grid; return pixels and mask, each (height, width).
-
-    The type is that of the band, with integers rounded and clipped, or float32 if calibrated with `radiometry`. A pixel
-    is valid if its position is inside the moving image and not occluded, and no invalid pixel contributes to it. Raises
-    UnreadableFileError.
-    """
-    with open_raster(band.path) as dataset:
-        return resample_tile_of(dataset, band, mapping, tile, interpolation, radiometry)
-
-
-def resample_tile_of(
-    dataset: OpenRaster,
     band: Band,
     mapping: PixelMapping,
     tile: Tile,
     interpolation: Interpolation,
     radiometry: Radiometry | None = None,
+    *,
+    dataset: OpenRaster | None = None,
 ) -> tuple[NDArray[np.generic], Mask]:
-    """Call `resample_tile` on an open file, so that GDAL's block cache serves neighbouring tiles."""
+    """Resample the moving band to a tile of the reference grid; return pixels and mask, each (height, width).
+
+    The type is that of the band, with integers rounded and clipped, or float32 if calibrated with `radiometry`. A pixel
+    is valid if its position is inside the moving image and not occluded, and no invalid pixel contributes to it. With
+    the open file as `dataset`, GDAL's block cache serves neighbouring tiles. Raises UnreadableFileError.
+    """
     positions = mapping.positions(tile, np.float32)
     source = source_window(positions, band.size_px, is_smooth=mapping.is_smooth(tile))
     if source is None:
         shape = tile.height, tile.width
         return np.zeros(shape, band.dtype if radiometry is None else np.float32), np.zeros(shape, dtype=bool)
-    x0, y0 = source.x0, source.y0
-    pixels, valid = read_window(dataset, band, x0, y0, source.width, source.height)
+    pixels, valid = read_tile(band, source, dataset)
     if radiometry is not None:
-        pixels = calibrated(pixels, radiometry, x0, y0)
-    positions -= (x0, y0)
-    resampled, resampled_valid = resample(
-        pixels, valid, positions, (band.width_px - x0, band.height_px - y0), (-x0, -y0), interpolation
-    )
+        pixels = calibrated(pixels, radiometry, source.x0, source.y0)
+    resampled, resampled_valid = resample(pixels, valid, positions, source, band.size_px, interpolation)
     return resampled, resampled_valid & ~mapping.hidden(tile)
 
 
@@ -85,7 +70,7 @@ def warped(
     moving_scale = PixelScale.between(moving.size_px, small.size_px)
     rescaled, area = mapping.rescaled(fixed_scale, moving_scale), Tile(0, 0, *size_px)
     positions = rescaled.positions(area, np.float32)
-    cv2.patchNaNs(positions, _OUTSIDE_PX)
+    cv2.patchNaNs(positions, -1e6)  # points on the horizon of the homography: outside of every image
     pixels = cv2.remap(small.pixels, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     valid = between(positions, np.zeros(2), np.subtract(small.size_px, 1))
     if rescaled.parallax is not None:
@@ -100,31 +85,24 @@ def textured(raster: Raster, min_share: float = 0.02) -> bool:
     """Return True if more than `min_share` of the pixels are valid and not all of them are equal."""
     if np.count_nonzero(raster.valid) <= min_share * raster.valid.size:
         return False
-    planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
     mask = raster.valid.astype(np.uint8)
-    return any(float(cv2.meanStdDev(plane, mask=mask)[1].item()) > 0 for plane in planes)
+    return any(float(cv2.meanStdDev(plane, mask=mask)[1].item()) > 0 for plane in raster.planes)
 
 
 def shrink(raster: Raster, size_px: tuple[int, int]) -> Raster:
     """Reduce a raster to `size_px` (width, height) by averaging; pixels are valid if all their source pixels are."""
     if size_px == raster.size_px:
         return raster
-    planes = raster.pixels if raster.pixels.ndim == 3 else raster.pixels[None]
-    if raster.valid.all():
-        shrunk = np.stack([cv2.resize(plane, size_px, interpolation=cv2.INTER_AREA) for plane in planes])
-        valid: Mask = np.ones(shrunk.shape[1:], bool)
-    else:
+    complete = bool(raster.valid.all())
+    planes = raster.planes if complete else np.where(raster.valid, raster.planes, np.float32(0))
+    shrunk = np.stack([cv2.resize(plane, size_px, interpolation=cv2.INTER_AREA) for plane in planes])
+    valid: Mask = np.ones(shrunk.shape[1:], bool)
+    if not complete:
         weight = cv2.resize(raster.valid.astype(np.float32), size_px, interpolation=cv2.INTER_AREA)
-        weighted = [np.where(raster.valid, plane, 0) for plane in planes]
-        shrunk = np.stack([cv2.resize(plane, size_px, interpolation=cv2.INTER_AREA) for plane in weighted])
         shrunk = (shrunk / np.maximum(weight, 1e-6)).astype(np.float32)
-        valid = weight > _MIN_VALID_WEIGHT
+        valid = weight > MIN_VALID_WEIGHT
     scale = PixelScale.between(raster.size_px, size_px)
     return Raster(shrunk if raster.pixels.ndim == 3 else shrunk[0], valid, lens.rescaled(raster.lens, scale))
-
-
-_BT_601 = np.array([0.299, 0.587, 0.114], np.float32)
-"""Weights of red, green and blue (ITU-R BT.601), as in OpenCV and Pillow."""
 
 
 def channel_mean(raster: Raster) -> Raster:
@@ -135,12 +113,15 @@ def channel_mean(raster: Raster) -> Raster:
 
 
 def luma(image: FloatImage) -> FloatImage:
-    """Return the luma (H, W) of an RGB image (3, H, W), or the mean of any other number of channels (C, H, W)."""
+    """Return the luma (H, W), as in OpenCV and Pillow, of an RGB image (3, H, W), or the mean of any other number of
+    channels (C, H, W).
+    """
     if image.ndim == 2:
         return image
     if len(image) != 3:
         return np.asarray(image.mean(axis=0), np.float32)
-    return np.tensordot(_BT_601, image, axes=1)
+    bt_601 = np.array([0.299, 0.587, 0.114], np.float32)
+    return np.tensordot(bt_601, image, axes=1)
 
 
 def eight_bit(image: FloatImage, valid: Mask) -> NDArray[np.uint8]:

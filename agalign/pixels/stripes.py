@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from agalign.pixels.resample import shrink
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values.image import Raster, reduced_size_px
+from agalign.values.resample import MIN_VALID_WEIGHT
 
 _LOG = logging.getLogger(__name__)
 _Profile = NDArray[np.float64]
@@ -27,21 +28,9 @@ _MIN_SIDE_PX = 64
 _MIN_CORRELATION = 0.3
 """Minimum correlation of one half of a band with the other half of another band, median over bands. Captures of eight
 cameras without stripes have up to 0.14, white stripes of 5 % of the range 0.34, of 2 % 0.08."""
-_SMOOTHING_PX = 1.0
-"""Equal to that of the structure field: higher frequencies, such as even and odd lines that differ, do not matter."""
-_KERNEL_PX = 7
-"""Width of the smoothing kernel: three standard deviations on either side."""
-_BLOCKS = 32
-"""Lines are averaged to this number before their median; 128 give the same result in twice the time."""
 _DRIFT_PX = 15.0
 """Standard deviation of the Gaussian that removes the drift of integrated differences; slower patterns remain. Of 15,
 40 and 80 px, 15 px has the smallest residual for white stripes."""
-_REGISTERED_PX = 0.5
-"""Maximum shift between the structures of co-registered bands."""
-_REGISTERED_SIGMA = 12.0
-"""Minimum height of their correlation peak: unrelated structures have up to 8."""
-_MAX_SIDE_PX = 1280
-"""Larger images are reduced to this for that test."""
 
 
 def without_common_stripes(images: Sequence[Raster]) -> list[Raster]:
@@ -86,16 +75,19 @@ def _common_correlation(images: Sequence[Raster], axis: int) -> float:
 def _halves(image: Raster, axis: int) -> tuple[_Profile, _Profile]:
     """Return the median differences of neighbouring columns (axis 0) or rows (axis 1) in both halves of the image."""
     width, height = image.size_px
-    size = (width, min(_BLOCKS, height)) if axis == 0 else (min(_BLOCKS, width), height)
+    lines = 32  # of averages, before their median; 128 give the same result in twice the time
+    size = (width, min(lines, height)) if axis == 0 else (min(lines, width), height)
     blocks, weights = (
         cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
         for plane in (image.pixels, image.valid.astype(np.float32))
     )
     if axis == 1:
         blocks, weights = np.ascontiguousarray(blocks.T), np.ascontiguousarray(weights.T)
-    differences = np.diff(cv2.GaussianBlur(blocks, (_KERNEL_PX, 1), _SMOOTHING_PX), axis=1)
-    # The mean of float32 ones is not exactly 1.
-    valid = cv2.erode((weights > 0.999).astype(np.uint8), np.ones((1, _KERNEL_PX), np.uint8), borderValue=0) > 0
+    # Smoothed as the structure field: higher frequencies, such as even and odd lines that differ, do not matter.
+    smoothing_px, kernel_px = 1.0, 7
+    differences = np.diff(cv2.GaussianBlur(blocks, (kernel_px, 1), smoothing_px), axis=1)
+    known = (weights > MIN_VALID_WEIGHT).astype(np.uint8)
+    valid = cv2.erode(known, np.ones((1, kernel_px), np.uint8), borderValue=0) > 0
     differences[~(valid[:, 1:] & valid[:, :-1])] = 0
     middle = len(differences) // 2
     upper, lower = (np.median(part, axis=0).astype(float) for part in (differences[:middle], differences[middle:]))
@@ -137,13 +129,14 @@ def _differences(image: Raster, axis: int) -> _Profile:
 
 
 def _are_registered(images: Sequence[Raster]) -> bool:
-    """Return True if the structures of all images match that of the first one at zero shift."""
+    """Return True if the structures of all images match that of the first one at zero shift, in 1280 px or fewer."""
+    max_shift_px, min_sigma = 0.5, 12.0  # unrelated structures have peaks of up to 8 sigma
     width, height = images[0].size_px
-    scale = min(1.0, _MAX_SIDE_PX / max(width, height))
+    scale = min(1.0, 1280 / max(width, height))
     size = reduced_size_px((width, height), 1 / scale)
     fixed, *moving = (windowed_spectra(structure_field(shrink(image, size))) for image in images)
     for spectrum in moving:
         peak = find_peak(correlation_surfaces(fixed, spectrum), exclusion_px=max(size) // 16)
-        if np.hypot(*peak.shift_px) > _REGISTERED_PX * scale or peak.sigma < _REGISTERED_SIGMA:
+        if np.hypot(*peak.shift_px) > max_shift_px * scale or peak.sigma < min_sigma:
             return False
     return True

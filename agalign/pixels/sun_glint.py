@@ -15,18 +15,10 @@ from agalign.values.image import FloatImage, Mask
 
 _BLOCK_PX = 16
 """Side of the blocks for which a dark value is computed."""
-_NEIGHBOURHOOD_BLOCKS = 5
-"""Side of the square of blocks in which the darkest value is searched; it contains the dark faces of waves."""
-_DARK_PERCENTILE = 10
-"""Dark value of a block; less noisy than the minimum."""
 _MIN_GLINT_SHARE = 0.5
 """Minimum share of glint in the green light."""
 _MIN_PIXEL_NDWI = -0.2
 """Glint is as bright in green as in near infrared; vegetation and soil at a shore are not."""
-_MIN_SIDE_BLOCKS = 2
-"""Smaller images have no neighbourhood to compare with."""
-_UNKNOWN = 1e30
-"""Larger than any reflectance."""
 
 
 def sun_glint(green: FloatImage, nir: FloatImage) -> Mask:
@@ -36,10 +28,10 @@ def sun_glint(green: FloatImage, nir: FloatImage) -> Mask:
 
         glint = nir - nir_dark,  water where (green_dark - nir_dark) / (green_dark + nir_dark) > 0
 
-    Images with sides of fewer than _MIN_SIDE_BLOCKS blocks have none.
+    Images with sides of fewer than two blocks have none: they have no neighbourhood to compare with.
     """
     height, width = green.shape
-    if min(height, width) < _MIN_SIDE_BLOCKS * _BLOCK_PX:
+    if min(height, width) < 2 * _BLOCK_PX:
         return np.zeros(green.shape, dtype=bool)
     green_dark, nir_dark = (_darkest_nearby(band) for band in (green, nir))
     size_px = width, height
@@ -68,7 +60,9 @@ def _darkest_nearby(band: FloatImage) -> NDArray[np.float32]:
     rows, columns = (max(1, n // _BLOCK_PX) for n in band.shape)
     complete = band[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
     blocks = complete.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
-    known = np.where(np.isfinite(blocks), blocks, np.float32(_UNKNOWN))
-    dark = np.percentile(known, _DARK_PERCENTILE, axis=-1, method="lower").astype(np.float32)
-    darkest = cv2.erode(dark, np.ones((_NEIGHBOURHOOD_BLOCKS, _NEIGHBOURHOOD_BLOCKS), np.uint8))
-    return np.where(darkest < _UNKNOWN, darkest, np.float32(np.nan))
+    unknown = np.float32(1e30)  # larger than any reflectance
+    known = np.where(np.isfinite(blocks), blocks, unknown)
+    dark = np.percentile(known, 10, axis=-1, method="lower").astype(np.float32)  # less noisy than the minimum
+    nearby = np.ones((5, 5), np.uint8)  # blocks; they contain the dark faces of waves
+    darkest = cv2.erode(dark, nearby)
+    return np.where(darkest < unknown, darkest, np.float32(np.nan))

@@ -9,7 +9,7 @@ import numpy as np
 from agalign.cameras.pix4d import FromSource
 from agalign.cameras.tag_transfer import band_tags, capture_tags
 from agalign.config import WriteSettings
-from agalign.pixels.raster import TIFF_SUFFIXES
+from agalign.pixels.raster import suffix_format
 from agalign.products.layout import Layer
 from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import media_type, write_raster
@@ -74,7 +74,7 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
     for band in capture.bands:
         stem = f"{band.path.stem}_{_safe_name(band.name)}" if band.path in split else band.path.stem
         folder = band.path.parent.name if by_folder else ""
-        suffix = band.path.suffix if band.path.suffix.lower() in TIFF_SUFFIXES else ".tif"
+        suffix = band.path.suffix if suffix_format(band.path) == "TIFF" else ".tif"
         name = Path(folder, f"{stem}{suffix}")
         # The name of the stack, or of another input file with a different suffix.
         if name == Path(f"{capture.name}.tif") or taken.get(name, band.path) != band.path:

@@ -18,7 +18,7 @@ from agalign.cameras.tag_transfer import TransferredTags
 from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, read_window, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, without_warnings
 from agalign.pixels.resample import resample_tile
 from agalign.products.checked_raster import (
     WORK_TILE_PX,
@@ -270,9 +270,7 @@ def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any
 def _values_in(band: Band, tile: Tile) -> Pixels:
     """The different values of a band in a rectangle of its file."""
     with open_raster(band.path) as source:
-        result = [
-            np.unique(read_window(source, band, t.x0, t.y0, t.width, t.height)[0]) for t in tiles(tile, WORK_TILE_PX)
-        ]
+        result = [np.unique(read_tile(band, t, source)[0]) for t in tiles(tile, WORK_TILE_PX)]
     return np.unique(np.concatenate(result))
 
 

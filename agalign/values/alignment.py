@@ -176,13 +176,6 @@ class PairScales:
 SAME_SCALES = PairScales()
 """Both images have the pixels of their files."""
 
-_SOURCES: dict[PredictionSource, str] = {
-    "bands": "the capture's other bands",
-    "neighbours": "the captures around it",
-    "flight": "the flight's mean",
-    "windows": "windows in the image",
-}
-
 
 @dataclass(frozen=True)
 class Prediction:
@@ -312,7 +305,13 @@ class Alignment(Generic[FixedPx]):
         if text is None or self.status == "aligned":
             return None
         if self.status == "predicted" and self.prediction is not None:
-            source, std_px = _SOURCES[self.prediction.source], self.prediction.std_px
+            sources: dict[PredictionSource, str] = {
+                "bands": "the capture's other bands",
+                "neighbours": "the captures around it",
+                "flight": "the flight's mean",
+                "windows": "windows in the image",
+            }
+            source, std_px = sources[self.prediction.source], self.prediction.std_px
             return f"{text}; predicted from {source}, standard error {std_px:.2f} px"
         if self.status == "seed_only":
             return f"{text}; the {self.seed.kind} seed is used unchanged"

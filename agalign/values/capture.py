@@ -195,6 +195,11 @@ class Capture:
         return self.bands[self.reference_index]
 
     @property
+    def has_several_files(self) -> bool:
+        """False for one multiband file."""
+        return len({b.path for b in self.bands}) > 1
+
+    @property
     def moving(self) -> tuple[Band, ...]:
         """All bands but the reference."""
         return tuple(b for i, b in enumerate(self.bands) if i != self.reference_index)

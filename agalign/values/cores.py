@@ -9,8 +9,6 @@ from agalign.errors import MemoryLimitError
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables with the number of threads that libraries start; they read them once, at their import."""
-_CGROUPS = Path("/sys/fs/cgroup")
-_OWN_CGROUP = Path("/proc/self/cgroup")
 MIN_ADDRESS_SPACE_BYTES = 1_800_000_000
 """Below about 1.6 GB the libraries crash, abort or hang, which cannot be caught."""
 
@@ -20,7 +18,7 @@ def usable_cores() -> int:
     quota of a control group (`docker run --cpus`, a Kubernetes limit) allows fewer. A share of a core counts as one.
     """
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-    quota = cgroup_quota() if sys.platform == "linux" else None
+    quota = cgroup_quota()
     return cores if quota is None else max(1, min(cores, math.ceil(quota)))
 
 
@@ -29,13 +27,12 @@ def limit_default_threads() -> None:
 
     Environment variables that the user has set are kept.
     """
-    quota = cgroup_quota() if sys.platform == "linux" else None
-    if quota is not None:
+    if cgroup_quota() is not None:
         for name in THREAD_VARIABLES:
             os.environ.setdefault(name, str(usable_cores()))
 
 
-def cgroup_quota(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float | None:
+def cgroup_quota(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> float | None:
     """Return the smallest quota of this process's control group and those above it, in cores; None for no limit.
 
     Version 2 has the file `cpu.max` ("200000 100000": quota and period in microseconds), version 1 one file for each.

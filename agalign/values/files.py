@@ -15,8 +15,6 @@ from agalign.errors import OutputError
 
 RUN_FILE = "agalign-run.json"
 """Name of the run record. It is written first, and identifies an output folder."""
-_MAX_HOST_LENGTH = 40
-"""Maximum length of the host in names of partial files, because file names have at most 255 bytes."""
 _PARTIAL = ".agalign-part-"
 """Prefix of partial files; host, process id and a random part follow."""
 
@@ -113,8 +111,8 @@ def _is_alive(process: int) -> bool:
 
 
 def _host() -> str:
-    """Return the letters and digits of the host name."""
-    return "".join(c for c in platform.node() if c.isalnum())[:_MAX_HOST_LENGTH] or "host"
+    """Return the letters and digits of the host name, up to 40, because file names have at most 255 bytes."""
+    return "".join(c for c in platform.node() if c.isalnum())[:40] or "host"
 
 
 def is_inside(name: str) -> bool:

@@ -34,9 +34,14 @@ class Raster:
         return int(self.valid.shape[1]), int(self.valid.shape[0])
 
     @property
+    def planes(self) -> FloatImage:
+        """(channels, height, width) float32."""
+        return self.pixels if self.pixels.ndim == 3 else self.pixels[None]
+
+    @property
     def channels(self) -> int:
         """1 for a single band."""
-        return 1 if self.pixels.ndim == 2 else len(self.pixels)
+        return len(self.planes)
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,6 @@ from numpy.typing import ArrayLike
 from agalign.values.geometry import Matrix, Points
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
-_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-
 
 @dataclass(frozen=True)
 class Lens:
@@ -78,7 +76,8 @@ def undistort(lens: Lens | None, raw_px: ArrayLike) -> Points:
         return points
     flat = np.ascontiguousarray(points.reshape(-1, 1, 2))
     coefficients = np.array(_eight(lens))
-    undistorted = cv2.undistortPoints(flat, lens.matrix, coefficients, P=lens.matrix, criteria=_UNDISTORT_CRITERIA)
+    until = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12
+    undistorted = cv2.undistortPoints(flat, lens.matrix, coefficients, P=lens.matrix, criteria=until)
     return np.asarray(undistorted, dtype=np.float64).reshape(points.shape)
 
 

@@ -21,8 +21,6 @@ _KNOT_STEP_PX = 32
 """Distance of the knots of interpolated curved mappings: the error with real lenses is below 0.0001 px."""
 _FIELD_KNOT_STEP_PX = 12
 """Minimum distance of the knots with a displacement field, which has four knots per step of its lattice."""
-_MAX_INVERSE_ITERATIONS, _INVERSE_TOLERANCE_PX = 50, 1e-3
-"""Of the fixed-point iteration of an inverse; it converges where displacements change by less than 1 px per px."""
 
 
 @dataclass(frozen=True)
@@ -53,19 +51,21 @@ class PixelMapping:
     def inverse(self, moving_px: ArrayLike) -> Points:
         """(..., 2) raw moving pixels to raw reference pixels, NaN where the iteration does not converge.
 
-        The displacements of field and relief are subtracted in turn until the positions no longer change.
+        The displacements of field and relief are subtracted in turn until the positions no longer change: a fixed-point
+        iteration, which converges where displacements change by less than 1 px per px.
         """
+        tolerance_px, max_iterations = 1e-3, 50
         undistorted = geometry.apply(geometry.invert(self.fixed_to_moving), lens.undistort(self.moving_lens, moving_px))
         result = raw = lens.distort(self.fixed_lens, undistorted)
-        for _ in range(_MAX_INVERSE_ITERATIONS):
+        for _ in range(max_iterations):
             of_plane = undistorted if self.parallax is None else undistorted - self.parallax.displacements(raw)
             displaced = lens.distort(self.fixed_lens, of_plane)
             result = displaced if self.local is None else displaced - self.local(raw)
             change_px, raw = np.abs(result - raw).max(axis=-1, keepdims=True), result
-            if not (change_px > _INVERSE_TOLERANCE_PX).any():
+            if not (change_px > tolerance_px).any():
                 break
         else:
-            result = np.where(change_px > _INVERSE_TOLERANCE_PX, np.nan, result)
+            result = np.where(change_px > tolerance_px, np.nan, result)
         return lens.undistort(self.pre_distortion, result)
 
     def with_parallax(self, parallax: Parallax | None) -> "PixelMapping":

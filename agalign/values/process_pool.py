@@ -15,13 +15,7 @@ from multiprocessing.context import BaseContext
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 from agalign.errors import WorkerError
-from agalign.values.processes import (
-    ENDS_WITHIN_S,
-    LOST_SERVER_EXIT_CODE,
-    OUT_OF_MEMORY_EXIT_CODE,
-    REIMPORTED_EXIT_CODE,
-    Worker,
-)
+from agalign.values.processes import ENDS_WITHIN_S, ExitCode, Worker
 
 _MAX_DEATHS = 3
 """Maximum number of workers that end in a row without a finished task between them; then the run ends."""
@@ -83,12 +77,6 @@ class _Task(Generic[A]):
     number: int
     argument: A
     tries: int = 0
-
-
-_ADVICE = "close other programs, or try --jobs 1"
-_UNGUARDED = (
-    "the calling script runs again in each worker process; put its calls below a line 'if __name__ == \"__main__\":'"
-)
 
 
 class ProcessPool(Generic[A, R]):
@@ -169,7 +157,8 @@ class ProcessPool(Generic[A, R]):
         """Reduce the size of the pool after a worker could not be started; at size 0 the run ends."""
         self._size -= 1
         if self._size == 0:
-            self._given_up = f"no worker process can be started ({problem}); {_ADVICE}"
+            advice = "close other programs, or try --jobs 1"
+            self._given_up = f"no worker process can be started ({problem}); {advice}"
 
     def _assign(self, timeout_s: float | None) -> Iterator[Outcome[A, R]]:
         """Send waiting tasks to idle workers, and start new workers for the remaining tasks.
@@ -248,14 +237,15 @@ class ProcessPool(Generic[A, R]):
         """Remove a worker that has ended; return the outcome of its task unless that is tried again."""
         task, code = worker.task, worker.exit_code()
         self._end(worker)
-        by_signal = code is not None and (code < 0 or code == LOST_SERVER_EXIT_CODE)
-        if code == REIMPORTED_EXIT_CODE:
-            self._size, self._given_up = 0, _UNGUARDED
+        by_signal = code is not None and (code < 0 or code == ExitCode.LOST_SERVER)
+        if code == ExitCode.REIMPORTED:
+            guard = "put its calls below a line 'if __name__ == \"__main__\":'"
+            self._size, self._given_up = 0, f"the calling script runs again in each worker process; {guard}"
             return []
         if not (worker.ready or by_signal):
             self._one_less(worker.problem or f"ended with exit code {code}")
             return []
-        error: Exception = MemoryError() if code == OUT_OF_MEMORY_EXIT_CODE else WorkerDiedError(code)
+        error: Exception = MemoryError() if code == ExitCode.OUT_OF_MEMORY else WorkerDiedError(code)
         # Workers killed at the same time count once: count only workers created after the last counted death.
         if worker.created_s > self._last_death_s:
             self._deaths, self._last_death_s = self._deaths + 1, time.monotonic()

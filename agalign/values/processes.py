@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from enum import Enum, IntEnum
 from multiprocessing import current_process, get_all_start_methods, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import BaseContext
@@ -35,8 +36,15 @@ def follow_parent() -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-REIMPORTED_EXIT_CODE = 72
-"""Exit code of a worker that imports the calling script again."""
+class ExitCode(IntEnum):
+    """Exit codes of workers."""
+
+    OUT_OF_MEMORY = 71
+    """The worker has no memory for its result."""
+    REIMPORTED = 72
+    """The worker imports the calling script again."""
+    LOST_SERVER = 255
+    """The fork server of the worker was killed; the worker itself may still run."""
 
 
 def end_if_reimported() -> None:
@@ -44,7 +52,7 @@ def end_if_reimported() -> None:
     calls of the script, each worker would start workers.
     """
     if getattr(current_process(), "_inheriting", False):  # the test that `multiprocessing` itself uses
-        os._exit(REIMPORTED_EXIT_CODE)
+        os._exit(ExitCode.REIMPORTED)
 
 
 @contextmanager
@@ -125,20 +133,20 @@ def threads_of_children(count: int) -> Iterator[None]:
 
 _CHUNK_BYTES = 8000
 """With its header, smaller than the buffer of a pipe on every system (8192 bytes on Windows)."""
-_MORE, _LAST, _REQUEST = b"+", b".", b"?"
-"""First byte of a chunk: more chunks follow, last chunk, or the worker requests the next one."""
-OUT_OF_MEMORY_EXIT_CODE = 71
-"""Exit code of a worker without memory for its result."""
-LOST_SERVER_EXIT_CODE = 255
-"""Exit code of a worker after its fork server was killed; the worker itself may still run."""
 ENDS_WITHIN_S = 10.0
 """Timeout for the end of a killed process, which takes milliseconds unless it waits for a disk or file server."""
-_CHUNK_TIMEOUT_S = 1.0
-"""Extension of a deadline after each chunk of a result: the caller may take time over outcomes while a worker sends."""
-_START_RETRIES, _RETRY_INTERVAL_S = 20, 0.1
-"""Of connections to the fork server."""
 _PROCESS_LOCK = threading.Lock()
 """Starting a process polls all others. Two threads that poll one process get a wrong exit code."""
+
+
+class _Chunk(bytes, Enum):
+    """First byte of a chunk."""
+
+    MORE = b"+"
+    """More chunks follow."""
+    LAST = b"."
+    REQUEST = b"?"
+    """The worker requests the next one."""
 
 
 class Worker:
@@ -191,11 +199,11 @@ class Worker:
 
     def _start(self) -> None:
         """Start the process. A fork server that was killed refuses connections shortly before its end is known."""
-        for _ in range(_START_RETRIES):
+        for _ in range(20):
             try:
                 self.process.start()
             except ConnectionError:
-                time.sleep(_RETRY_INTERVAL_S)
+                time.sleep(0.1)
             else:
                 return
         self.process.start()
@@ -207,8 +215,12 @@ class Worker:
 
     @property
     def kill_time_s(self) -> float:
-        """Time at which the worker is killed, monotonic clock."""
-        return float("inf") if self.deadline_s is None else max(self.deadline_s, self.heard_s + _CHUNK_TIMEOUT_S)
+        """Time at which the worker is killed, monotonic clock.
+
+        The deadline is extended by a second after each chunk of a result: the caller may take time over outcomes while
+        a worker sends.
+        """
+        return float("inf") if self.deadline_s is None else max(self.deadline_s, self.heard_s + 1.0)
 
     def waits_for(self) -> list[Any]:
         """Return the objects for `multiprocessing.connection.wait`: the pipe and the sentinel of the process."""
@@ -225,11 +237,11 @@ class Worker:
             while self.pipe.poll():
                 chunk = self.pipe.recv_bytes()
                 self.heard_s = time.monotonic()
-                if chunk[:1] == _REQUEST:
+                if chunk[:1] == _Chunk.REQUEST:
                     self.pipe.send_bytes(next(self._to_send))
                     continue
                 self._received += chunk[1:]
-                if chunk[:1] == _LAST:
+                if chunk[:1] == _Chunk.LAST:
                     message, self._received = bytes(self._received), bytearray()
                     return message
         except (EOFError, OSError):
@@ -252,7 +264,7 @@ class Worker:
         if self._launched:
             self.process.kill()
             pid = self.process.pid
-            if pid is not None and self.exit_code(0) == LOST_SERVER_EXIT_CODE and not self._is_at_end():
+            if pid is not None and self.exit_code(0) == ExitCode.LOST_SERVER and not self._is_at_end():
                 with suppress(OSError):
                     os.kill(pid, signal.SIGKILL)
         self.pipe.close()
@@ -280,7 +292,7 @@ def _chunks(message: bytes) -> Iterator[bytes]:
     """Yield a message in chunks, each preceded by its kind."""
     starts = range(0, len(message), _CHUNK_BYTES)
     for start in starts:
-        kind = _LAST if start == starts[-1] else _MORE
+        kind = _Chunk.LAST if start == starts[-1] else _Chunk.MORE
         yield kind + message[start : start + _CHUNK_BYTES]
 
 
@@ -298,7 +310,7 @@ def _work(pipe: Connection, initializer: Callable[..., object], arguments: tuple
     except (EOFError, OSError):
         return
     except MemoryError:
-        os._exit(OUT_OF_MEMORY_EXIT_CODE)
+        os._exit(ExitCode.OUT_OF_MEMORY)
 
 
 def _response(message: bytes) -> bytes:
@@ -326,6 +338,6 @@ def _receive(pipe: Connection) -> bytes:
     while True:
         chunk = pipe.recv_bytes()
         message += chunk[1:]
-        if chunk[:1] == _LAST:
+        if chunk[:1] == _Chunk.LAST:
             return bytes(message)
-        pipe.send_bytes(_REQUEST)
+        pipe.send_bytes(_Chunk.REQUEST)

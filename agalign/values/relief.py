@@ -107,12 +107,9 @@ def between_levels(at_level: Callable[[float], NDArray[np.floating]], parallax_p
     lens, and a parabola through three levels interpolates it to 0.001 px.
     """
     low, high = float(parallax_px.min()), float(parallax_px.max())
-    if high - low < _SAME_LEVEL_PX:
+    if high - low < 1e-4:
         return at_level((low + high) / 2)
     half = (high - low) / 2
     before, at, after = (at_level(low + k * half) for k in range(3))
     u = ((parallax_px - np.float32(low + half)) / np.float32(half))[..., None]
     return np.asarray(at + u * ((after - before) / 2 + u * ((after + before) / 2 - at)))
-
-
-_SAME_LEVEL_PX = 1e-4

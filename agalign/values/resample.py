@@ -13,22 +13,10 @@ from agalign.values.image import Mask, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import Size
 
-_FLAGS: dict[str, int] = {
-    "nearest": cv2.INTER_NEAREST,
-    "bilinear": cv2.INTER_LINEAR,
-    "cubic": cv2.INTER_CUBIC,
-    "lanczos": cv2.INTER_LANCZOS4,
-}
 _SUPPORT_PX = 4
 """Half width of the widest interpolation kernel."""
-_SAMPLE_PX = 16
-"""Spacing of the positions from which the extent of a tile in the moving image is computed."""
-_MIN_VALID_WEIGHT = 0.999
-"""Minimum weight of valid pixels in a valid resampled pixel: float32 weights do not sum to exactly 1."""
-_TILE_PX = 1024
-"""Side of the tiles in which arrays are resampled: OpenCV limits the sides of one image to 32,767 px."""
-_MAX_SOURCE_PX = 32_000
-"""Maximum side of the part of an image that is resampled at once."""
+MIN_VALID_WEIGHT = 0.999
+"""Minimum weight of valid pixels in a valid resampled or reduced pixel: float32 weights do not sum to exactly 1."""
 _MAX_CHANNELS = 16
 """Distinguishes (H, W, C) from (C, H, W): images have more rows than this."""
 
@@ -71,11 +59,12 @@ def resample_planes(
 
     Returns (C, height, width) of the same type, with `fill` where a pixel is not valid, and the mask (height, width).
     """
+    tile_px, max_source_px = 1024, 32_000  # OpenCV limits the sides of one image to 32,767 px
     width, height = size_px
     result = np.empty((len(planes), height, width), planes.dtype)
     result_valid = np.empty((height, width), bool)
     moving_size_px = valid.shape[1], valid.shape[0]
-    pending = list(tiles(Tile(0, 0, width, height), _TILE_PX))
+    pending = list(tiles(Tile(0, 0, width, height), tile_px))
     while pending:
         tile = pending.pop()
         at = np.s_[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
@@ -84,15 +73,13 @@ def resample_planes(
         if source is None:
             result[:, *at], result_valid[at] = fill, False
             continue
-        if max(source.width, source.height) > _MAX_SOURCE_PX:
+        if max(source.width, source.height) > max_source_px:
             pending += tiles(tile, (max(tile.width, tile.height) + 1) // 2)
             continue
         cut = np.s_[source.y0 : source.y0 + source.height, source.x0 : source.x0 + source.width]
-        local = (positions - (source.x0, source.y0)).astype(np.float32)
-        sensor = (-source.x0, -source.y0), (moving_size_px[0] - source.x0, moving_size_px[1] - source.y0)
         visible = ~mapping.hidden(tile)
         for plane, resampled in zip(planes, result, strict=True):
-            pixels, inside = resample(plane[cut], valid[cut], local, sensor[1], sensor[0], interpolation)
+            pixels, inside = resample(plane[cut], valid[cut], positions, source, moving_size_px, interpolation)
             result_valid[at] = inside & visible
             resampled[at] = np.where(result_valid[at], pixels, np.asarray(fill).astype(planes.dtype))
     return result, result_valid
@@ -101,9 +88,9 @@ def resample_planes(
 def source_window(positions: NDArray[np.floating], size_px: Size, *, is_smooth: bool) -> Tile | None:
     """Return the window of an image (width, height) that interpolation at positions (H, W, 2) reads; None for none.
 
-    If the mapping is smooth, coarse samples and the borders determine the extent within one pixel.
+    If the mapping is smooth, samples 16 px apart and the borders determine the extent within one pixel.
     """
-    step = _SAMPLE_PX if is_smooth else 1
+    step = 16 if is_smooth else 1
     rows, columns = (np.append(np.arange(0, n, step), n - 1) for n in positions.shape[:2])
     samples = positions[np.ix_(rows, columns)]
     if not np.isfinite(samples).any():
@@ -119,25 +106,31 @@ def resample(
     pixels: NDArray[np.generic],
     valid: Mask,
     positions: NDArray[np.floating],
-    sensor_end: tuple[int, int],
-    sensor_start: tuple[int, int],
+    window: Tile,
+    size_px: Size,
     interpolation: Interpolation,
 ) -> tuple[NDArray[np.generic], Mask]:
-    """Resample pixels (h, w) of a window of an image at positions (H, W, 2) in px of the window.
+    """Resample pixels (h, w) of a window of an image of `size_px` (width, height) at positions (H, W, 2) in the image.
 
-    `sensor_start` (x, y) is the position of the image's first pixel in the window, `sensor_end` one past its last
-    pixel. Returns (H, W) pixels of the same type, with integers rounded and clipped, and their mask.
+    Returns (H, W) pixels of the same type, with integers rounded and clipped, and their mask.
     """
-    map_xy = positions.astype(np.float32, copy=False)
+    start = window.x0, window.y0
+    map_xy = (positions - np.asarray(start, positions.dtype)).astype(np.float32, copy=False)
     all_valid = bool(valid.all())
     source = _for_remap(pixels if all_valid else _filled(pixels, valid), interpolation)
-    sampled = cv2.remap(source, map_xy, None, _FLAGS[interpolation], borderMode=cv2.BORDER_REPLICATE)
+    flags: dict[Interpolation, int] = {
+        "nearest": cv2.INTER_NEAREST,
+        "bilinear": cv2.INTER_LINEAR,
+        "cubic": cv2.INTER_CUBIC,
+        "lanczos": cv2.INTER_LANCZOS4,
+    }
+    sampled = cv2.remap(source, map_xy, None, flags[interpolation], borderMode=cv2.BORDER_REPLICATE)
     half = 0.5 if interpolation == "nearest" else 0.0
-    inside = between(map_xy, np.subtract(sensor_start, half), np.subtract(sensor_end, 1 - half))
+    inside = between(map_xy, np.negative(start) - half, np.subtract(size_px, start) - 1 + half)
     if not all_valid:
         flag = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
         weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)
-        inside &= weight > _MIN_VALID_WEIGHT
+        inside &= weight > MIN_VALID_WEIGHT
     return _as_type(sampled, pixels.dtype), np.asarray(inside)
 
 

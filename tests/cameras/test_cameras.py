@@ -4,16 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 import tifffile
+from rasterio.enums import ColorInterp
 
 from agalign.cameras import default_reference, known_cameras, rig_seed
 from agalign.cameras.generic import Generic
 from agalign.cameras.mapir import Mapir
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
-from agalign.cameras.pix4d import BAND_NAME, NAMESPACE, panel_in
+from agalign.cameras.pix4d import NAMESPACE, panel_in
 from agalign.errors import ConfigurationError
-from agalign.pixels.raster import RasterInfo, probe
+from agalign.pixels.raster import probe
 from agalign.synthetic import cameras, rig
 from agalign.values import geometry
 from agalign.values.capture import Band
@@ -49,7 +51,7 @@ def test_rig_seed_is_the_truth_at_infinity(flight: Path) -> None:
 
 
 MICASENSE, SENTERA = "micasense.com/MicaSense", "sentera.com"
-INFO = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
+STORED = (Band("", Path("IMG_0001_4.tif"), 1, 1280, 960, "uint16"),)
 
 
 def tags(**camera: str) -> Tags:
@@ -61,20 +63,20 @@ def test_focal_length_of_old_firmware_is_in_pixels() -> None:
     old = tags(PerspectiveFocalLength="1451.8", PrincipalPoint="2.4,1.8")
     new = tags(PerspectiveFocalLength="5.45", PrincipalPoint="2.4,1.8", PerspectiveFocalLengthUnits="mm")
     for result, expected in ((old, 1451.8), (new, 5.45 * 266.666667)):
-        (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), result, INFO)
+        (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), result, STORED)
         assert band.lens.fx_px == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("rig", ["", "a, b, c", "1.0, 2.0", "inf"])
 def test_malformed_rig_tags_leave_the_principal_points(rig: str) -> None:
     both = [tags(PerspectiveFocalLength="5.45", PrincipalPoint=p, RigRelatives=rig) for p in ("2.4,1.8", "2.5,1.8")]
-    (one,), (other,) = (MicaSense().bands(Path("IMG_0001_4.tif"), t, INFO) for t in both)
+    (one,), (other,) = (MicaSense().bands(Path("IMG_0001_4.tif"), t, STORED) for t in both)
     seed = rig_seed(one, other)
     np.testing.assert_allclose(seed, geometry.translation(26.6666667, 0), atol=1e-9)
 
 
 def test_without_a_lens_there_is_no_rig_seed() -> None:
-    (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), Tags(make="MicaSense"), INFO)
+    (band,) = MicaSense().bands(Path("IMG_0001_4.tif"), Tags(make="MicaSense"), STORED)
     assert band.lens is None
     assert band.name == "band_4"
     assert rig_seed(band, band) is None
@@ -146,8 +148,10 @@ def test_default_reference() -> None:
 
 
 def test_an_alpha_band_that_is_not_the_last_shifts_no_index(tmp_path: Path) -> None:
-    info = RasterInfo(80, 64, ("uint8",) * 4, (None,) * 4, (None,) * 4, (None,) * 4, 2, None)
-    result = Mapir().bands(tmp_path / "survey.tif", Tags(make="MAPIR", model="Survey3"), info)
+    path = tmp_path / "survey.tif"
+    with rasterio.open(path, "w", driver="GTiff", width=80, height=64, count=4, dtype="uint8") as file:
+        file.colorinterp = [ColorInterp.gray, ColorInterp.alpha, ColorInterp.undefined, ColorInterp.undefined]
+    result = Mapir().bands(path, Tags(make="MAPIR", model="Survey3"), probe(path))
     assert [(b.name, b.band_index) for b in result] == [("band_1", 1), ("band_3", 3), ("band_4", 4)]
 
 
@@ -158,7 +162,9 @@ def test_thermal_bands_count_in_hundredths_of_a_kelvin(tmp_path: Path) -> None:
     path = tmp_path / "IMG_0001_6.tif"
     tifffile.imwrite(path, np.zeros((48, 64), np.uint16), photometric="minisblack", metadata=None)
     tags = Tags(
-        make="MicaSense", model="Altum", xmp={BAND_NAME: ("LWIR",), (NAMESPACE, "CentralWavelength"): ("11000",)}
+        make="MicaSense",
+        model="Altum",
+        xmp={(NAMESPACE, "BandName"): ("LWIR",), (NAMESPACE, "CentralWavelength"): ("11000",)},
     )
     (band,) = MicaSense().bands(path, tags, probe(path))
     assert (band.radiometry.quantity, band.radiometry.gain) == ("temperature", 0.01)

@@ -15,10 +15,10 @@ from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.parrot import Sequoia
-from agalign.cameras.pix4d import BAND_NAME, NAMESPACE
+from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.sentera import Sentera
 from agalign.cameras.tiff_directory import Entry, add_directories, byte_string, rational, short, text
-from agalign.pixels.raster import RasterInfo, probe
+from agalign.pixels.raster import probe
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Capture
 
@@ -336,14 +336,14 @@ def test_double_4k_is_a_capture_of_two_photographs(tmp_path: Path) -> None:
 
 
 def test_a_double_4k_lists_its_bands_and_calls_one_garbage(tmp_path: Path) -> None:
-    info = RasterInfo(160, 120, ("uint8",) * 3, (None,) * 3, (None,) * 3, (None,) * 3, None, None)
+    stored = [Band("", tmp_path / "IMG_00042.jpg", index, 160, 120, "uint8") for index in (1, 2, 3)]
     for folder, names, wavelengths, expected in (
         ("nRGB", ("Red", "Green", "Blue"), ("650", "548", "446"), {"Red": 1, "Green": 2, "Blue": 3}),
         ("NDRE", ("RedEdge", "Garbage", "NIR"), ("720", "0", "840"), {"Red edge": 1, "NIR": 3}),
     ):
         path = tmp_path / folder / "IMG_00042.jpg"
-        tags = Tags(make="Sentera", xmp={BAND_NAME: names, (NAMESPACE, "CentralWavelength"): wavelengths})
-        bands = Sentera().bands(path, tags, info)
+        tags = Tags(make="Sentera", xmp={(NAMESPACE, "BandName"): names, (NAMESPACE, "CentralWavelength"): wavelengths})
+        bands = Sentera().bands(path, tags, stored)
         assert {b.name: b.band_index for b in bands} == expected
         assert bands[0].wavelength_nm == float(wavelengths[0])
         assert Sentera().capture_folder(path) == tmp_path

@@ -75,14 +75,14 @@ def test_a_result_of_reduced_images_is_refined_on_the_files(capture: Capture, mo
 def test_a_band_with_an_unreadable_tile_fails_and_stops_no_other(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    resample_tile_of = full_resolution.resample_tile_of
+    resample_tile = full_resolution.resample_tile
 
-    def unreadable(source: Any, band: Any, *rest: Any) -> Any:
+    def unreadable(band: Any, *rest: Any, **options: Any) -> Any:
         if band.name == "nir":
             raise UnreadableFileError(f"{band.path}: cannot be read (tile 7); copy it from the card again")
-        return resample_tile_of(source, band, *rest)
+        return resample_tile(band, *rest, **options)
 
-    monkeypatch.setattr(full_resolution, "resample_tile_of", unreadable)
+    monkeypatch.setattr(full_resolution, "resample_tile", unreadable)
     result = align_reduced(capture, monkeypatch, 400)
     assert {name: a.status for name, a in result.items()} == {"nir": "failed", "red": "aligned"}
     assert "field_nir.tif: cannot be read (tile 7)" in (result["nir"].reason or "")
@@ -127,14 +127,14 @@ def test_a_refinement_is_compared_with_the_prediction_of_the_rig(capture: Captur
 
 
 def test_each_tile_of_the_reference_is_read_once(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads: Counter[tuple[int, ...]] = Counter()
-    read_window = full_resolution.read_window
+    reads: Counter[Any] = Counter()
+    read_tile = full_resolution.read_tile
 
-    def counted(dataset: Any, band: Any, *window: int) -> Any:
-        reads[window] += 1
-        return read_window(dataset, band, *window)
+    def counted(band: Any, tile: Any, dataset: Any) -> Any:
+        reads[tile] += 1
+        return read_tile(band, tile, dataset)
 
-    monkeypatch.setattr(full_resolution, "read_window", counted)
+    monkeypatch.setattr(full_resolution, "read_tile", counted)
     refined(capture, aligned_on_reduced_images())
     assert len(reads) >= 8
     assert set(reads.values()) == {1}

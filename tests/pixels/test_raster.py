@@ -45,11 +45,11 @@ def test_metadata_of_a_file_is_read(tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "a.tif", "w", **profile) as file:
         file.update_tags(2, wavelength="0.84", wavelength_units="micrometers")
         file.set_band_description(1, "red")
-    info = probe(tmp_path / "a.tif")
-    assert (info.width_px, info.height_px, info.dtypes) == (8, 6, ("uint16", "uint16"))
-    assert info.descriptions == ("red", None)
-    assert info.wavelengths_nm == (None, 840.0)
-    assert info.georeference is None
+    bands = probe(tmp_path / "a.tif")
+    assert [(b.size_px, b.dtype, b.band_index) for b in bands] == [((8, 6), "uint16", 1), ((8, 6), "uint16", 2)]
+    assert [b.name for b in bands] == ["red", ""]
+    assert [b.wavelength_nm for b in bands] == [None, 840.0]
+    assert [b.georeference for b in bands] == [None, None]
 
 
 def test_gdal_caches_megabytes_of_blocks_while_a_raster_is_open(tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ def test_tiles_join_without_a_seam(tmp_path: Path) -> None:
 def test_nearest_takes_every_pixel_that_is_nearest() -> None:
     pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
     positions = np.stack(np.meshgrid(np.array([-0.4, 0.4, 3.4, 3.6]), np.array([0.0])), axis=-1)
-    got, valid = resample(pixels, np.ones((3, 4), bool), positions, (4, 3), (0, 0), "nearest")
+    got, valid = resample(pixels, np.ones((3, 4), bool), positions, Tile(0, 0, 4, 3), (4, 3), "nearest")
     assert got[0].tolist()[:3] == [0, 0, 3]
     assert valid[0].tolist() == [True, True, True, False]
 

@@ -24,7 +24,7 @@ from agalign.config import albedos
 from agalign.errors import AgalignError, InputError, SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.method.descriptor import Descriptor
-from agalign.pixels.raster import RasterInfo, probe
+from agalign.pixels.raster import probe
 from agalign.products.panels import read_panels
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar_file import read_result, read_sidecar
@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::UserWarning"
 
 ANY_FILE = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=12)
-INFO = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
+STORED = (Band("", Path("IMG_0001_1.tif"), 1, 1280, 960, "uint16"),)
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
@@ -111,7 +111,7 @@ def test_any_packet(values: dict[str, str], make: str) -> None:
     )
     tags = Tags(make=make, model="x", xmp=packet.values())
     camera = next(c for c in known_cameras(None) if c.recognises(tags))
-    bands = camera.bands(Path("IMG_0001_1.tif"), tags, INFO)
+    bands = camera.bands(Path("IMG_0001_1.tif"), tags, STORED)
     camera.with_shared_rig(bands, [tags])
     camera.pose(tags)
     camera.motion(tags)
