@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import FULL_SCALE, Camera, elevation_of, is_thermal, rays_to_rig, rotation
+from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.xmp import names_in
 from agalign.values.capture import Band, Pose, Radiometry
@@ -66,16 +66,10 @@ class MicaSense(Camera):
         return (band,)
 
     def pose(self, tags: Tags) -> Pose | None:
-        """Return the pose in the camera's tags, else one with the yaw of the light sensor on the same aircraft."""
-        yaw, focal_px = tags.number(_DLS, "Yaw"), pix4d.focal_length_px(tags)
-        return pix4d.pose_of(tags) or (None if yaw is None else Pose(math.degrees(yaw), focal_length_px=focal_px))
-
-    def elevation_deg(self, tags: Tags) -> float | None:
-        """Return the elevation by the camera's tags, else by the tilt of the light sensor on the same aircraft."""
-        if pix4d.pose_of(tags) is not None:
-            return super().elevation_deg(tags)
-        pitch, roll = tags.number(_DLS, "Pitch"), tags.number(_DLS, "Roll")
-        return None if pitch is None or roll is None else elevation_of(math.degrees(pitch), math.degrees(roll))
+        """Return the pose in the camera's tags, else the attitude of the light sensor on the same aircraft."""
+        yaw, pitch, roll = (math.degrees(tags.number(_DLS, name) or 0.0) for name in ("Yaw", "Pitch", "Roll"))
+        by_sensor = Pose(yaw, pitch, roll, focal_length_px=pix4d.focal_length_px(tags))
+        return pix4d.pose_of(tags) or (None if tags.number(_DLS, "Yaw") is None else by_sensor)
 
     def capture_name(self, path: Path) -> str:
         return re.sub(r"_\d+$", "", path.stem)

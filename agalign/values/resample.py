@@ -13,6 +13,8 @@ from agalign.values.image import Mask, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import Size
 
+_KERNEL_PX = {"cubic": 4, "lanczos": 8}
+"""Sides of the kernels with negative weights."""
 _SUPPORT_PX = 4
 """Half width of the widest interpolation kernel."""
 MIN_VALID_WEIGHT = 0.999
@@ -112,7 +114,8 @@ def resample(
 ) -> tuple[NDArray[np.generic], Mask]:
     """Resample pixels (h, w) of a window of an image of `size_px` (width, height) at positions (H, W, 2) in the image.
 
-    Returns (H, W) pixels of the same type, with integers rounded and clipped, and their mask.
+    Values are limited to the range of the pixels under the kernel: wide kernels ring beside saturated pixels. Returns
+    (H, W) pixels of the same type, with integers rounded and clipped, and their mask.
     """
     start = window.x0, window.y0
     map_xy = (positions - np.asarray(start, positions.dtype)).astype(np.float32, copy=False)
@@ -125,6 +128,8 @@ def resample(
         "lanczos": cv2.INTER_LANCZOS4,
     }
     sampled = cv2.remap(source, map_xy, None, flags[interpolation], borderMode=cv2.BORDER_REPLICATE)
+    if interpolation in _KERNEL_PX:
+        np.clip(sampled, *_range_under_kernel(source, map_xy, _KERNEL_PX[interpolation]), out=sampled)
     half = 0.5 if interpolation == "nearest" else 0.0
     inside = between(map_xy, np.negative(start) - half, np.subtract(size_px, start) - 1 + half)
     if not all_valid:
@@ -132,6 +137,19 @@ def resample(
         weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)
         inside &= weight > MIN_VALID_WEIGHT
     return _as_type(sampled, pixels.dtype), np.asarray(inside)
+
+
+def _range_under_kernel(
+    source: NDArray[np.generic], positions: NDArray[np.float32], side_px: int
+) -> tuple[NDArray[np.generic], NDArray[np.generic]]:
+    """Return minimum and maximum (H, W) of the pixels (h, w) that a kernel of even side uses at positions (H, W, 2)."""
+    kernel, before = np.ones((side_px, side_px), np.uint8), (side_px // 2 - 1, side_px // 2 - 1)
+    first = np.floor(positions)
+    low, high = (
+        cv2.remap(f(source, kernel, anchor=before), first, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        for f in (cv2.erode, cv2.dilate)
+    )
+    return np.asarray(low), np.asarray(high)
 
 
 def between(positions: NDArray[np.floating], minimum: Points, maximum: Points) -> Mask:

@@ -62,7 +62,11 @@ def test_one_band_with_texture_or_that_cannot_be_read_is_not_the_sky(tmp_path: P
     ("pitch", "roll", "elevation_deg"), [(0.0, 0.0, -90.0), (-0.87, 3.09, 40.1), (0.3, -0.4, -61.6)]
 )
 def test_the_light_sensor_gives_the_direction_of_the_camera(pitch: float, roll: float, elevation_deg: float) -> None:
-    tags = Tags(make="MicaSense", xmp={(DLS, "Pitch"): (str(pitch),), (DLS, "Roll"): (str(roll),)})
+    angles = {"Yaw": 1.0, "Pitch": pitch, "Roll": roll}
+    tags = Tags(make="MicaSense", xmp={(DLS, name): (str(angle),) for name, angle in angles.items()})
+    pose = MicaSense().pose(tags)
+    assert pose is not None
+    assert (pose.heading_deg, pose.pitch_deg, pose.roll_deg) == pytest.approx(np.degrees([1.0, pitch, roll]))
     assert MicaSense().elevation_deg(tags) == pytest.approx(elevation_deg, abs=0.1)
     assert MicaSense().elevation_deg(Tags(make="MicaSense")) is None
 

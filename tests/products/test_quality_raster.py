@@ -101,12 +101,21 @@ def test_glint_is_found_where_no_pixel_around_is_free_of_it() -> None:
     green, nir = (np.tile(band, (2, 2)) for band in water(np.random.default_rng(0)))
     centre = np.zeros_like(green, dtype=bool)
     centre[60:260, 60:260] = True
-    assert np.array_equal(sun_glint(green + 0.3 * centre, nir + 0.3 * centre), centre)
+    waves = centre * np.random.default_rng(1).uniform(0.15, 0.6, centre.shape).astype(np.float32)
+    assert np.array_equal(sun_glint(green + waves, nir + waves), centre)
     # The same without any water around may be concrete.
     assert not sun_glint(green + 0.5, nir + 0.55).any()
     green[:, 100:180], nir[:, 100:180] = 0.04, 0.4  # vegetation
     green[:, 180:], nir[:, 180:] = 0.3, 0.32  # a road
     assert not sun_glint(green, nir).any()
+
+
+def test_a_bright_beach_at_the_water_is_not_glint() -> None:
+    rng = np.random.default_rng(0)
+    green, nir = (np.tile(band, (2, 2)) for band in water(rng))
+    is_sand = np.arange(320) >= 100
+    sand = rng.normal(0.25, 0.01, green.shape).astype(np.float32)
+    assert not sun_glint(np.where(is_sand, sand, green), np.where(is_sand, 1.2 * sand, nir)).any()
 
 
 @pytest.mark.slow
