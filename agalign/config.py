@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import dataclasses as validated
 
 from agalign.errors import ConfigurationError
 from agalign.values.choices import (
@@ -87,7 +88,7 @@ _LIST = Option(type=str | None, parse=names_in)
 _GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()), show_default=False)
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True))
 class DiscoverOptions:
     """Options of `discover`."""
 
@@ -115,7 +116,7 @@ class DiscoverOptions:
     """Ignore files that match this glob, such as '*/test/*'; repeatable."""
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True, arbitrary_types_allowed=True))
 class RunOptions:
     """How to run; no option changes the result of a capture."""
 
@@ -141,7 +142,7 @@ class RunOptions:
 class Stage(BaseModel):
     """Base of the settings: immutable, and an unknown name is an error."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Return the fields that differ from their defaults."""
