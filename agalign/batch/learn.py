@@ -15,7 +15,7 @@ from agalign.batch.learning_tasks import (
     in_one_thread,
     initial_network,
     load_capture,
-    log_failure,
+    logged_failure,
     observe_rig,
     portable,
     try_model,
@@ -187,14 +187,12 @@ class _FlightLearner:
         groups: list[ImageGroup] = []
         for one, images in pairs:
             groups += images.groups_from(one.refined)
-        try:
+        # One capture may make learning from all of them fail; a network is then learned for each capture alone.
+        with logged_failure("the flight cannot be learned from"):
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
                 return net, list(pool.map(lambda p: p[1].refined_by(net, settings), pairs))
-        except Exception as error:
-            # One capture may make learning from all of them fail; a network is then learned for each capture alone.
-            log_failure("the flight cannot be learned from", error)
-            return None
+        return None
 
     def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> dict[str, RigObservation]:
         """Return observations of the rig by capture, until every observed band is in enough of them.

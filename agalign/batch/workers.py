@@ -11,20 +11,19 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib import import_module
 from itertools import islice
+from operator import call
 from typing import Any, Protocol
 
 from agalign._version import __version__
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.values.cores import usable_cores
 from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
-from agalign.values.processes import WORKER_MODULE, threads_of_children, worker_context
+from agalign.values.processes import WORKER_MODULE, follow_parent, threads_of_children, worker_context
 
 _LOG = logging.getLogger(__name__)
 _DASK_TIMEOUT_S = 10
 _POLL_INTERVAL_S = 5.0
 """Interval at which the state of a cluster is checked while no task completes."""
-_TIMEOUT_EXIT_CODE = 75
-_RUN_AGAIN = "run again to process the remaining captures"
 _TASKS_A_PROCESS = 500
 """Number of tasks after which a process is replaced: libraries leak some kilobytes per capture."""
 _MAX_WAITING_TASKS = 1000
@@ -72,7 +71,9 @@ def own_processes(
     threads, context = max(1, usable_cores() // processes), worker_context(preload)
     with (
         threads_of_children(threads),
-        ProcessPool(_call, processes, context, initializer, (threads,), max_tasks_per_worker=_TASKS_A_PROCESS) as pool,
+        ProcessPool(
+            call, processes, context, _start, (initializer, threads), max_tasks_per_worker=_TASKS_A_PROCESS
+        ) as pool,
     ):
 
         def run(
@@ -85,8 +86,10 @@ def own_processes(
         yield run
 
 
-def _call(function: Callable[[], Any]) -> Any:
-    return function()
+def _start(initializer: Callable[[int], object], threads: int) -> None:
+    """Initialise a worker process."""
+    follow_parent()
+    initializer(threads)
 
 
 def on_executor(executor: Executor) -> Run:
@@ -151,27 +154,22 @@ def in_order(run: Run, function: Callable[[A], R], tasks: Sequence[A], /) -> Ite
 
 def failure_text(error: Exception, timeout_s: float | None = None) -> str:
     """Return one line about the error of a task or of its worker."""
+    run_again = "run again to process the remaining captures"
     match error:
         case TimeoutError() if timeout_s is not None:
             return f"stopped after {timeout_s:g} s (--timeout)"
         case WorkerDiedError():
-            return (
-                f"its worker process was killed ({error}; out of memory?); run again to process the remaining captures"
-            )
+            return f"its worker process was killed ({error}; out of memory?); {run_again}"
         case BrokenExecutor():
-            return f"the executor lost its processes (out of memory?); {_RUN_AGAIN}"
+            return f"the executor lost its processes (out of memory?); {run_again}"
         case MemoryError():
             return "out of memory; try again with fewer --jobs, or with more memory"
         case AgalignError():
             return str(error)
     first_line = next(iter(str(error).splitlines()), type(error).__name__)
     if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
-        return f"the cluster lost it ({first_line}); {_RUN_AGAIN}"
+        return f"the cluster lost it ({first_line}); {run_again}"
     return f"agalign failed on it ({type(error).__name__}: {first_line}); please report this"
-
-
-LOCAL = "local"
-"""Value of `--dask` instead of a scheduler's address: start worker processes on this machine."""
 
 
 @contextmanager
@@ -194,7 +192,7 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
         try:
-            if address == LOCAL:
+            if address == "local":
                 # The profile appears on the dashboard only, and takes a few percent of the time.
                 stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
                 cluster = LocalCluster(
@@ -239,7 +237,7 @@ class DaskExecutor(Executor):
         self._client, self._executor, self._timeout_s = client, client.get_executor(pure=False), timeout_s
 
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
-        return self._executor.submit(_within, self._timeout_s, _on_worker, __version__, function, *arguments, **named)
+        return self._executor.submit(_on_worker, __version__, self._timeout_s, function, *arguments, **named)
 
     def without_timeout(self) -> "DaskExecutor":
         """Return the same executor without a time limit."""
@@ -255,9 +253,12 @@ class DaskExecutor(Executor):
         )
 
 
-def _on_worker(version: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+def _on_worker(
+    version: str, timeout_s: float | None, function: Callable[..., Any], *arguments: Any, **named: Any
+) -> Any:
     """Call a function in one thread; OMP_NUM_THREADS, which Dask sets, does not limit all libraries.
 
+    Ends this process if it takes longer than the timeout: code that hangs in a library cannot be interrupted.
     Raises ConfigurationError on a worker with another version, which may have joined during the run.
     """
     if version != __version__:
@@ -265,14 +266,9 @@ def _on_worker(version: str, function: Callable[..., Any], *arguments: Any, **na
     from agalign.method.device import limit_threads
 
     limit_threads(1)
-    return function(*arguments, **named)
-
-
-def _within(timeout_s: float | None, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Call a function; end this process if it takes longer: code that hangs in a library cannot be interrupted."""
     if timeout_s is None:
         return function(*arguments, **named)
-    alarm = threading.Timer(timeout_s, os._exit, (_TIMEOUT_EXIT_CODE,))
+    alarm = threading.Timer(timeout_s, os._exit, (75,))
     alarm.start()
     try:
         return function(*arguments, **named)
