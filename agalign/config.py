@@ -84,7 +84,6 @@ def _yes_or_no(yes: str, no: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {True: yes, False: no}[value] if isinstance(value, bool) else value)
 
 
-_LIST = Option(type=str | None, parse=names_in)
 _GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()), show_default=False)
 
 
@@ -100,7 +99,7 @@ class DiscoverOptions:
     """Use no lens or rig tags."""
     with_rgb: bool = False
     """Also align the camera's colour photograph (JPEG), as three bands."""
-    bands: Annotated[tuple[str, ...], _LIST] = ()
+    bands: Annotated[tuple[str, ...], Option(type=str | None, parse=names_in)] = ()
     """Names of the bands to align, separated by commas; by default all."""
     order: BandOrder = "index"
     """Order of the bands: as numbered by the camera, by wavelength, or by name."""

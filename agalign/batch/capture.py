@@ -28,7 +28,6 @@ from agalign.values.choices import RadiometryChoice
 from agalign.values.image import OutputGrid
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
-_LOG = logging.getLogger(__name__)
 
 
 def quiet(*_: object) -> None:
@@ -168,7 +167,7 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     except (AgalignError, MemoryError, *_FAULTS) as error:
         # A defect of agalign in one capture must not stop the others.
         report = CaptureReport(label, "error", error=failure_text(error))
-        _LOG.debug("%s: %s", label, report.error, exc_info=True)
+        logging.getLogger(__name__).debug("%s: %s", label, report.error, exc_info=True)
     return replace(report, seconds=clock.seconds, stages=clock.stages())
 
 

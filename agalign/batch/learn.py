@@ -40,11 +40,6 @@ from agalign.values.process_pool import A, Apply, R
 from agalign.verify.displacement_field import common_field
 from agalign.verify.extrapolation import unmodelled_std_px, unobserved_quarters
 
-_NETWORK_CAPTURES = 3
-"""Number of captures that the network is learned from; each takes seconds. A third capture mostly shows the structure
-that two lack."""
-_CAPTURES_PER_RIG_CAPTURE = 8
-"""The rig is learned from one of this many captures: neighbours have about the same height and speed."""
 _MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48
 """The factors of the rig need the minimum; more than the maximum do not improve it."""
 
@@ -155,7 +150,9 @@ class _FlightLearner:
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if learning fails."""
-        parts = np.array_split(np.arange(len(self.captures)), _NETWORK_CAPTURES)
+        # Each capture takes seconds. A third one mostly shows the structure that two lack.
+        network_captures = 3
+        parts = np.array_split(np.arange(len(self.captures)), network_captures)
         stretches = [
             tuple(self.captures[part[k]] for k in dict.fromkeys((len(part) // 2, 0, len(part) - 1))) for part in parts
         ]
@@ -199,7 +196,9 @@ class _FlightLearner:
 
         `known` are the captures that the network has refined.
         """
-        count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // _CAPTURES_PER_RIG_CAPTURE))
+        # Neighbours have about the same height and speed.
+        captures_per_rig_capture = 8
+        count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // captures_per_rig_capture))
         result = {one.capture.label: one.observation for one in known if one.observation is not None}
         again = [c for c in self.captures if c.label in result and result[c.label].misaligned]
         waiting = [*again, *(c for c in _spread(self.captures, count) if c.label not in result)]

@@ -30,8 +30,6 @@ from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
 from agalign.values.process_pool import A, R
 
-_LOG = logging.getLogger(__name__)
-
 
 @contextmanager
 def logged_failure(message: str) -> Iterator[None]:
@@ -44,7 +42,8 @@ def logged_failure(message: str) -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:
-        _LOG.debug("%s: %s", message, error, exc_info=not isinstance(error, AgalignError))
+        is_defect = not isinstance(error, AgalignError)
+        logging.getLogger(__name__).debug("%s: %s", message, error, exc_info=is_defect)
 
 
 @one_thread()

@@ -13,9 +13,6 @@ from agalign.products.sidecar import BandResult, CaptureResult, Sidecar
 from agalign.products.sidecar_file import read_sidecar
 from agalign.values.text import counted
 
-_MAX_ROWS = 20
-"""Maximum number of captures in the table of a notebook."""
-
 
 @dataclass(frozen=True)
 class CaptureReport:
@@ -93,11 +90,12 @@ class FlightReports(list[CaptureReport]):
     """The reports of a run, which a notebook shows as a table."""
 
     def _repr_html_(self) -> str:
+        max_rows = 20
         counts = Counter(report.state for report in self)
         total = ", ".join(f"{number} {state}" for state, number in counts.items())
         head = "<tr><th>capture</th><th>state</th><th>bands</th></tr>"
-        rows = "".join(report._row() for report in self[:_MAX_ROWS])
-        more = f"<p>and {len(self) - _MAX_ROWS} more</p>" if len(self) > _MAX_ROWS else ""
+        rows = "".join(report._row() for report in self[:max_rows])
+        more = f"<p>and {len(self) - max_rows} more</p>" if len(self) > max_rows else ""
         return f"<p>{counted(len(self), 'capture')}: {total}</p><table>{head}{rows}</table>{more}"
 
 

@@ -43,8 +43,6 @@ from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
 
 _MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
-_MAX_READ_AHEAD_BYTES = 64 << 20
-"""Larger files could displace files of the current capture from the page cache."""
 
 
 @dataclass(frozen=True)
@@ -324,10 +322,11 @@ def capture_reports(
 
 
 def _read_ahead(capture: Capture) -> None:
-    """Read the files of a capture into the page cache."""
+    """Read the files of a capture into the page cache; larger ones could displace files of the current capture."""
+    max_bytes = 64 << 20
     for path in {b.path for b in capture.bands}:
         with suppress(OSError):
-            if path.stat().st_size <= _MAX_READ_AHEAD_BYTES:
+            if path.stat().st_size <= max_bytes:
                 path.read_bytes()
 
 

@@ -20,12 +20,9 @@ from agalign.values.cores import usable_cores
 from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
 from agalign.values.processes import WORKER_MODULE, follow_parent, threads_of_children, worker_context
 
-_LOG = logging.getLogger(__name__)
 _DASK_TIMEOUT_S = 10
 _POLL_INTERVAL_S = 5.0
 """Interval at which the state of a cluster is checked while no task completes."""
-_TASKS_A_PROCESS = 500
-"""Number of tasks after which a process is replaced: libraries leak some kilobytes per capture."""
 _MAX_WAITING_TASKS = 1000
 """Maximum number of tasks submitted to an executor at a time: enough for any cluster, and little memory."""
 
@@ -69,10 +66,11 @@ def own_processes(
     process of a task that exceeds the timeout is killed.
     """
     threads, context = max(1, usable_cores() // processes), worker_context(preload)
+    max_tasks = 500  # libraries leak some kilobytes per capture
     with (
         threads_of_children(threads),
-        ProcessPool(
-            call, processes, context, _start, (initializer, threads), max_tasks_per_worker=_TASKS_A_PROCESS
+        ProcessPool[partial[Any], Any](
+            call, processes, context, _start, (initializer, threads), max_tasks_per_worker=max_tasks
         ) as pool,
     ):
 
@@ -219,7 +217,8 @@ def _check_versions(client: Any) -> None:
     # A built-in function, because a worker without agalign cannot unpickle one of this package.
     versions = client.run(eval, "__import__('agalign._version', fromlist=['_']).__version__", on_error="return")
     if not versions:
-        _LOG.warning("agalign: no worker is connected to the Dask scheduler; the run waits for one")
+        text = "agalign: no worker is connected to the Dask scheduler; the run waits for one"
+        logging.getLogger(__name__).warning(text)
     for worker, version in sorted(versions.items()):
         if isinstance(version, Exception):
             problem = f"cannot load agalign ({version})"

@@ -29,9 +29,6 @@ from agalign.values.text import counted
 if TYPE_CHECKING:
     from agalign.batch import CaptureReport
 
-_MAX_NAMED = 3
-"""Maximum number of named bands with the same cause of failure."""
-
 
 def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) -> FolderScan:
     """Return the captures below a folder, and print them. Raises InputError or NoSuchBandError if there are none."""
@@ -340,7 +337,7 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
 
 
 def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:
-    """Print each group of failures: number of bands, cause, captures, and remedy."""
+    """Print each group of failures: number of bands, cause, captures with up to three names, and remedy."""
     for group in failures:
         status, first = group.status.replace("_", " "), group.bands[0]
         if len(group.bands) == 1:
@@ -349,8 +346,8 @@ def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:
             bands, captures = counted(len(group.bands), "band"), counted(group.captures, "capture")
             text = f"{status}: {bands} of {captures}: {group.remedy.cause}"
             names = [f"{b.capture} {b.band}" for b in group.bands]
-            more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
-            named = [f"{', '.join(names[:_MAX_NAMED])}{more}: {first.reason}"]
+            more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+            named = [f"{', '.join(names[:3])}{more}: {first.reason}"]
         terminal.problem(
             text,
             (*named, f"try: {group.advice}"),
