@@ -121,29 +121,31 @@ def precision_table(results: Sequence[Result]) -> list[list[str]]:
 
 
 def error_table(results: Sequence[Result]) -> list[list[str]]:
-    """Errors of the homographies: a row of titles, then a row for each method and shift; empty without any."""
-    shifts = {shift: number for number, shift in enumerate(dict.fromkeys(r.shift for r in results))}
+    """Errors of the homographies: a row of titles, then a row for each method and shift."""
+    rows = [
+        ["method", "start off by", "median error, px", "worst, px", "mean, % of the side", "under 1 px", "mAP", "s"]
+    ]
+    shifts = list(dict.fromkeys(r.shift for r in results))
     measured = [r for r in results if not math.isnan(r.error_px)]
-    rows = []
     for method, own in _grouped(measured, lambda r: r.method).items():
         by_shift = _grouped(own, lambda r: r.shift)
-        rows += [_error_row(method, shift, by_shift[shift]) for shift in sorted(by_shift, key=lambda s: shifts[s])]
-    return [[*rows[0]], *([*row.values()] for row in rows)] if rows else []
+        rows += [_error_row(method, shift, by_shift[shift]) for shift in shifts if shift in by_shift]
+    return rows
 
 
-def _error_row(method: str, shift: float, own: Sequence[Result]) -> dict[str, str]:
-    """Return the cells by title."""
+def _error_row(method: str, shift: float, own: Sequence[Result]) -> list[str]:
     e = np.array([r.error_px for r in own])
-    return {
-        "method": method,
-        "start off by": f"{shift:.1%}",
-        "median error, px": f"{np.median(e):.3f}",
-        "worst, px": f"{e.max():.2f}",
-        "mean, % of the side": f"{np.mean([r.error_share for r in own]):.3%}",
-        "under 1 px": f"{(e < 1).sum()} of {len(e)}",
-        "mAP": f"{_mean_precision(own):.3f}",
-        "s": f"{np.median([r.seconds for r in own]):.1f}",
-    }
+    share = float(np.mean([r.error_share for r in own]))
+    return [
+        method,
+        f"{shift:.1%}",
+        f"{np.median(e):.3f}",
+        f"{e.max():.2f}",
+        f"{share:.3%}",
+        f"{(e < 1).sum()} of {len(e)}",
+        f"{_mean_precision(own):.3f}",
+        f"{np.median([r.seconds for r in own]):.1f}",
+    ]
 
 
 def _grouped(results: Sequence[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:

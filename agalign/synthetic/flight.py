@@ -97,14 +97,13 @@ def _write(
     """Write captures after `before` others over other grounds, and return their ground truth."""
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
-    grounds = {id(shot.ground): shot.ground for shot in shots}
     for band in camera.bands:
-        painted: tuple[int, Field] | None = None
+        ground: Ground | None = None
         for number, shot in enumerate(shots, start=before + 1):
-            if painted is None or painted[0] != id(shot.ground):
-                painted = id(shot.ground), reflectance(grounds[id(shot.ground)], band)
+            if shot.ground is not ground:
+                ground, painted = shot.ground, reflectance(shot.ground, band)
             spoil = shot.spoil if shot.spoilt is None or band.name in shot.spoilt else None
-            light = painted[1] if band.sees == "heat" else painted[1] * np.float32(shot.sun * shot.shutter)
+            light = painted if band.sees == "heat" else painted * np.float32(shot.sun * shot.shutter)
             pixels = recorded(view(light, shot.ground, band, shot.pose, size_px), band, rng, spoil)
             if band.name not in shot.without:
                 path = images / camera.file_name(band, number)
