@@ -89,14 +89,12 @@ class _FlightLearner:
             refined = self._refined_by(self.start)
             if refined is not None:
                 return replace(self.start, refined=refined)
+        camera, start_rig = flight_camera(self.captures), None if self.start is None else self.start.rig
         if len(self.captures) < MIN_CAPTURES:
             # Learning takes as long as aligning one or two captures, and those that need it are learned from alone.
             net = initial_network(self._bands, self.settings, self.start)
-            rig = None if self.start is None else self.start.rig
-            model = FlightModel(
-                net, flight_camera(self.captures), self._bands, {} if rig is None else rig.mean, "", rig
-            )
-            return model if net.is_trained else None
+            known_mappings = {} if start_rig is None else start_rig.mean
+            return FlightModel(net, camera, self._bands, known_mappings, "", start_rig) if net.is_trained else None
         network = self._network()
         if network is None:
             return None
@@ -108,18 +106,15 @@ class _FlightLearner:
         if not mappings:
             return None
         medians = {name: median_mapping(of, self._size_px) for name, of in mappings.items()}
-        model = FlightModel(net, flight_camera(self.captures), self._bands, medians, "")
+        model = FlightModel(net, camera, self._bands, medians, "")
         observations = self._observations(model, known)
-        rig = self._rig(list(observations.values()))
-        if rig is None and self.start is not None:
-            rig = self.start.rig
-        # Without a rig, a second refinement from the medians reduces the errors.
-        refined = {
-            self._key(c): found.refined
-            for c in self.captures
-            if rig is not None and (found := observations.get(c.label)) is not None and found.is_aligned
-        }
-        return replace(model, rig=rig, mappings=medians if rig is None else {**medians, **rig.mean}, refined=refined)
+        rig = self._rig(list(observations.values())) or start_rig
+        if rig is None:
+            # A second refinement from the medians reduces the errors.
+            return model
+        aligned = {label: o.refined for label, o in observations.items() if o.is_aligned}
+        refined = {refinement_key(c, self.settings): aligned[c.label] for c in self.captures if c.label in aligned}
+        return replace(model, rig=rig, mappings={**medians, **rig.mean}, refined=refined)
 
     @property
     def _bands(self) -> tuple[str, ...]:
@@ -128,9 +123,6 @@ class _FlightLearner:
     @property
     def _size_px(self) -> tuple[int, int]:
         return self.captures[0].reference.size_px
-
-    def _key(self, capture: Capture) -> str:
-        return refinement_key(capture, self.settings)
 
     def _refined_by(self, model: FlightModel) -> dict[str, Mapping[str, RefinedPair]] | None:
         """Return the refined mappings of two captures of the flight by an earlier model; None if it must be learned
@@ -143,7 +135,9 @@ class _FlightLearner:
             return None
         some = [self.captures[len(self.captures) * k // 3] for k in (1, 2)]
         tests = list(self.apply(partial(try_model, portable(model), self.settings), some))
-        known = [(self._key(c), *test) for c, test in zip(some, tests, strict=True) if test is not None]
+        known = [
+            (refinement_key(c, self.settings), *test) for c, test in zip(some, tests, strict=True) if test is not None
+        ]
         if len(known) < len(some) or sum(aligned for _, aligned, _ in known) < len(self._bands):
             return None
         return {key: refined for key, aligned, refined in known if len(refined) == aligned}

@@ -220,13 +220,9 @@ def _check_versions(client: Any) -> None:
         text = "agalign: no worker is connected to the Dask scheduler; the run waits for one"
         logging.getLogger(__name__).warning(text)
     for worker, version in sorted(versions.items()):
-        if isinstance(version, Exception):
-            problem = f"cannot load agalign ({version})"
-        elif version != __version__:
-            problem = f"has agalign {version}"
-        else:
-            continue
-        raise ConfigurationError(f"the Dask worker at {worker} {problem}; install agalign {__version__} there")
+        if version != __version__:
+            problem = f"cannot load agalign ({version})" if isinstance(version, Exception) else f"has agalign {version}"
+            raise ConfigurationError(f"the Dask worker at {worker} {problem}; install agalign {__version__} there")
 
 
 class DaskExecutor(Executor):
