@@ -337,7 +337,8 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
 
 
 def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:
-    """Print each group of failures: number of bands, cause, captures with up to three names, and remedy."""
+    """Print each group of failures: number of bands, cause, captures, and remedy."""
+    max_named = 3
     for group in failures:
         status, first = group.status.replace("_", " "), group.bands[0]
         if len(group.bands) == 1:
@@ -346,8 +347,8 @@ def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:
             bands, captures = counted(len(group.bands), "band"), counted(group.captures, "capture")
             text = f"{status}: {bands} of {captures}: {group.remedy.cause}"
             names = [f"{b.capture} {b.band}" for b in group.bands]
-            more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-            named = [f"{', '.join(names[:3])}{more}: {first.reason}"]
+            more = f" and {len(names) - max_named} more" if len(names) > max_named else ""
+            named = [f"{', '.join(names[:max_named])}{more}: {first.reason}"]
         terminal.problem(
             text,
             (*named, f"try: {group.advice}"),
