@@ -258,14 +258,13 @@ def _on_worker(
     """
     if version != __version__:
         raise ConfigurationError(f"a Dask worker has agalign {__version__}; install agalign {version} there")
-    from agalign.method.device import limit_threads
-
-    limit_threads(1)
-    if timeout_s is None:
-        return function(*arguments, **named)
-    alarm = threading.Timer(timeout_s, os._exit, (75,))
-    alarm.start()
+    alarm = threading.Timer(timeout_s or 0.0, os._exit, (75,))
+    if timeout_s is not None:
+        alarm.start()
     try:
+        from agalign.method.device import limit_threads
+
+        limit_threads(1)
         return function(*arguments, **named)
     finally:
         alarm.cancel()
