@@ -144,7 +144,6 @@ def _indices(
     from agalign.cli.run import cluster, progress
     from agalign.products.index_bands import RAW
     from agalign.products.index_table import INDICES_FILE
-    from agalign.products.report import REPORT_FILE, write_pages
 
     chosen = chosen_indices(index, formula or [])
     folder, jobs = target or out, given["run"]["jobs"]
@@ -162,8 +161,8 @@ def _indices(
             for report in done.reports:
                 _print(report, terminal)
             show(number, 0.0, done.reports[0].capture, "")
-        if target is None and (out / REPORT_FILE).is_file():
-            write_pages(out, terminal.problem)  # the report shows the indices
+        if target is None:
+            _rebuild_report(out, terminal)
     written = [r for r in reports if r.path is not None]
     if any(r.raw_numbers for r in written) and not announced:
         terminal.problem(RAW_NUMBERS)
@@ -222,6 +221,14 @@ def _facts(report: "IndexReport") -> dict[str, Any]:
         "kept": report.kept,
         "problem": report.problem or None,
     }
+
+
+def _rebuild_report(out: Path, terminal: Terminal) -> None:
+    """Rebuild the report of the run, which shows the indices, if there is one."""
+    from agalign.products.report import REPORT_FILE, write_pages
+
+    if (out / REPORT_FILE).is_file():
+        write_pages(out, terminal.problem)
 
 
 def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", terminal: Terminal) -> None:

@@ -22,7 +22,7 @@ from agalign.errors import InputError, NoSuchBandError, OutputError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.products.report import REPORT_FILE, pages_exist, write_pages
 from agalign.products.report.facts import FailureGroup, FailureGroups
-from agalign.products.sidecar import BandResult
+from agalign.products.sidecar import BandResult, CaptureResult
 from agalign.values.capture import Capture
 from agalign.values.text import counted
 
@@ -278,7 +278,11 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
     if report.result is None:
         terminal.event("capture", capture=report.label, state=report.state, seconds=round(report.seconds, 3))
         return
-    pairs = [b for b in report.result.bands if b.status != "reference"]
+    _print_capture(report, report.result, heading, terminal)
+
+
+def _print_capture(report: "CaptureReport", result: CaptureResult, heading: str, terminal: Terminal) -> None:
+    pairs = [b for b in result.bands if b.status != "reference"]
     aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
     also = f", {predicted} predicted" if predicted else ""
     how = "kept from an earlier run" if report.state == "kept" else f"{report.seconds:.1f} s"
@@ -289,7 +293,7 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
         f"{heading}: {aligned} of {len(pairs)} aligned{also}, {how}" if is_printed else "",
         capture=report.label,
         state=report.state,
-        status=report.result.status,
+        status=result.status,
         aligned=aligned,
         predicted=predicted,
         pairs=len(pairs),
