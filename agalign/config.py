@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import dataclasses as validated
 
 from agalign.errors import ConfigurationError
 from agalign.values.choices import (
@@ -83,11 +84,10 @@ def _yes_or_no(yes: str, no: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {True: yes, False: no}[value] if isinstance(value, bool) else value)
 
 
-_LIST = Option(type=str | None, parse=names_in)
 _GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()), show_default=False)
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True))
 class DiscoverOptions:
     """Options of `discover`."""
 
@@ -99,7 +99,7 @@ class DiscoverOptions:
     """Use no lens or rig tags."""
     with_rgb: bool = False
     """Also align the camera's colour photograph (JPEG), as three bands."""
-    bands: Annotated[tuple[str, ...], _LIST] = ()
+    bands: Annotated[tuple[str, ...], Option(type=str | None, parse=names_in)] = ()
     """Names of the bands to align, separated by commas; by default all."""
     order: BandOrder = "index"
     """Order of the bands: as numbered by the camera, by wavelength, or by name."""
@@ -115,7 +115,7 @@ class DiscoverOptions:
     """Ignore files that match this glob, such as '*/test/*'; repeatable."""
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True, arbitrary_types_allowed=True))
 class RunOptions:
     """How to run; no option changes the result of a capture."""
 
@@ -141,7 +141,7 @@ class RunOptions:
 class Stage(BaseModel):
     """Base of the settings: immutable, and an unknown name is an error."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Return the fields that differ from their defaults."""

@@ -61,12 +61,10 @@ class MemoryLimitError(AgalignError):
     """The system limits the memory of this process to less than the libraries need."""
 
 
-_MEMORY_MESSAGES = (
-    "not enough memory|can't allocate memory|Cannot allocate memory|bad_alloc|Insufficient memory|"
-    "can't start new thread|could not create a primitive|out of memory"
-)
-
-
 def is_out_of_memory(error: BaseException) -> bool:
     """Return True for MemoryError and for other errors with the message of a library that is out of memory."""
-    return isinstance(error, MemoryError) or re.search(_MEMORY_MESSAGES, str(error)) is not None
+    messages = (
+        "not enough memory|can't allocate memory|Cannot allocate memory|bad_alloc|Insufficient memory|"
+        "can't start new thread|could not create a primitive|out of memory"
+    )
+    return isinstance(error, MemoryError) or re.search(messages, str(error)) is not None

@@ -14,7 +14,8 @@ from common import Number, Pair, print_decisions, run
 from lattices import pair as lattice
 
 from agalign.synthetic.cameras import BANDS, REFERENCE
-from agalign.synthetic.flight import render
+from agalign.synthetic.flight import recorded
+from agalign.synthetic.flight import view as seen
 from agalign.synthetic.ground import Ground, paint_ground, reflectance
 from agalign.synthetic.rig import Pose, true_homography
 from agalign.values import geometry
@@ -30,7 +31,7 @@ def scene(rng: np.random.Generator, east_m: float = 0.0) -> tuple[Ground, Pose, 
 
 
 def view(ground: Ground, band: int, pose: Pose, rng: np.random.Generator) -> np.ndarray:
-    return render(reflectance(ground, BANDS[band]), ground, BANDS[band], pose, SIZE, rng)
+    return recorded(seen(reflectance(ground, BANDS[band]), ground, BANDS[band], pose, SIZE), BANDS[band], rng)
 
 
 def water(rng: np.random.Generator) -> np.ndarray:

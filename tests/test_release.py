@@ -10,10 +10,11 @@ import pytest
 import yaml
 
 from agalign import __version__
-from agalign.batch.capture import Task, start_worker
+from agalign.batch.capture import Task
 from agalign.batch.run import Listener, capture_reports
 from agalign.batch.workers import own_processes
 from agalign.cameras.discover import discover
+from agalign.method.device import limit_threads
 from agalign.values import processes
 
 from .conftest import seeded
@@ -72,5 +73,5 @@ def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeyp
     """As they do on Windows and macOS: nothing of this process is there in them."""
     monkeypatch.setattr(processes, "get_all_start_methods", lambda: ["spawn"])
     tasks = [Task(c, tmp_path, seeded(), None) for c in discover(flight).captures]
-    with own_processes(2, start_worker) as run:
+    with own_processes(2, limit_threads) as run:
         assert [r.state for r in capture_reports(run, tasks, Listener(), None)] == ["done"] * len(tasks)

@@ -12,11 +12,10 @@ if TYPE_CHECKING:
     from agalign.batch.run import run_flight as run_flight
     from agalign.batch.workers import dask_executor as dask_executor
 
-_MODULES = {"dask_executor": "workers", "prepare_output": "output_folder", "CaptureReport": "report"}
-
 
 def __getattr__(name: str) -> Any:
     """Import the module of a name at its first use (PEP 562): indices and locks need no torch."""
-    if name not in (*_MODULES, "Listener", "run_flight"):
+    modules = {"dask_executor": "workers", "prepare_output": "output_folder", "CaptureReport": "report"}
+    if name not in (*modules, "Listener", "run_flight"):
         raise AttributeError(f"module 'agalign.batch' has no attribute '{name}'")
-    return getattr(import_module(f"agalign.batch.{_MODULES.get(name, 'run')}"), name)
+    return getattr(import_module(f"agalign.batch.{modules.get(name, 'run')}"), name)

@@ -1,7 +1,7 @@
 """Align one capture and write its products and its sidecar, also as the task of a worker."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,7 +15,7 @@ from agalign.capture.align import PairProgress, align_capture_bands
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, SidecarError
 from agalign.flight.model import FlightModel, load_model
-from agalign.method.device import choose_device, keep_freed_memory, limit_threads, one_memory_error, one_thread
+from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.index_rasters import outdated_rasters
 from agalign.products.layout import output_layers
@@ -26,10 +26,8 @@ from agalign.products.sidecar_file import read_result, write_sidecar
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import OutputGrid
-from agalign.values.processes import follow_parent
 
 _FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
-_LOG = logging.getLogger(__name__)
 
 
 def quiet(*_: object) -> None:
@@ -129,19 +127,17 @@ def discard_outputs(capture: Capture, out: Path, settings: WriteSettings) -> Non
             path.unlink(missing_ok=True)
 
 
-_REMEDIES: Mapping[RadiometryChoice, str] = {
-    "auto": "no tags that agalign can turn into radiance or reflectance in {bands}; leave --radiometry out",
-    "camera": "no tags that agalign can turn into radiance in {bands}; leave --radiometry out",
-    "sun": "no tags of a light sensor in {bands}; choose --radiometry camera or panel",
-    "panel": "no calibration panel of the same hours says how bright {bands} is, or its reflectance is not known "
-    "(--panel-albedo); choose --radiometry camera or sun",
-}
-
-
 def _require_radiometry(capture: Capture, choice: RadiometryChoice) -> None:
-    without = [b.name for b in capture.bands if b.radiometry is None and not b.companion]
-    if without:
-        raise InputError(f"{capture.reference.path}: {_REMEDIES[choice].format(bands=', '.join(without))}")
+    bands = ", ".join(b.name for b in capture.bands if b.radiometry is None and not b.companion)
+    if bands:
+        remedies = {
+            "auto": f"no tags that agalign can turn into radiance or reflectance in {bands}; leave --radiometry out",
+            "camera": f"no tags that agalign can turn into radiance in {bands}; leave --radiometry out",
+            "sun": f"no tags of a light sensor in {bands}; choose --radiometry camera or panel",
+            "panel": f"no calibration panel of the same hours says how bright {bands} is, or its reflectance is not "
+            "known (--panel-albedo); choose --radiometry camera or sun",
+        }
+        raise InputError(f"{capture.reference.path}: {remedies[choice]}")
 
 
 @dataclass(frozen=True)
@@ -171,14 +167,8 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     except (AgalignError, MemoryError, *_FAULTS) as error:
         # A defect of agalign in one capture must not stop the others.
         report = CaptureReport(label, "error", error=failure_text(error))
-        _LOG.debug("%s: %s", label, report.error, exc_info=True)
+        logging.getLogger(__name__).debug("%s: %s", label, report.error, exc_info=True)
     return replace(report, seconds=clock.seconds, stages=clock.stages())
-
-
-def start_worker(threads: int) -> None:
-    """Initialise a worker process."""
-    follow_parent()
-    limit_threads(threads)
 
 
 def loaded_model(path: Path, device: str) -> FlightModel:

@@ -17,7 +17,6 @@ from agalign.products.index_table import IndexReport, IndexRow, row_of, update_t
 from agalign.products.indices import Index
 from agalign.products.sidecar_file import read_result, run_sidecars, update_products
 from agalign.values.cores import usable_cores
-from agalign.values.processes import follow_parent
 
 _CAPTURES_WORTH_A_PROCESS = 8
 """Starting a process takes as long as the indices of this many captures."""
@@ -108,15 +107,10 @@ def _chosen_run(captures: int, cores: int, executor: Executor | None) -> Iterato
     if executor is not None:
         yield on_executor(executor)
     elif processes > 1:
-        with own_processes(processes, _start_worker, preload=__name__) as run:
+        with own_processes(processes, cv2.setNumThreads, preload=__name__) as run:
             yield run
     else:
         yield serially
-
-
-def _start_worker(_threads: int) -> None:
-    follow_parent()
-    cv2.setNumThreads(1)
 
 
 def do_indices(task: IndexTask) -> CaptureIndices:

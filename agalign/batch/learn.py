@@ -15,7 +15,7 @@ from agalign.batch.learning_tasks import (
     in_one_thread,
     initial_network,
     load_capture,
-    log_failure,
+    logged_failure,
     observe_rig,
     portable,
     try_model,
@@ -40,11 +40,6 @@ from agalign.values.process_pool import A, Apply, R
 from agalign.verify.displacement_field import common_field
 from agalign.verify.extrapolation import unmodelled_std_px, unobserved_quarters
 
-_NETWORK_CAPTURES = 3
-"""Number of captures that the network is learned from; each takes seconds. A third capture mostly shows the structure
-that two lack."""
-_CAPTURES_PER_RIG_CAPTURE = 8
-"""The rig is learned from one of this many captures: neighbours have about the same height and speed."""
 _MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48
 """The factors of the rig need the minimum; more than the maximum do not improve it."""
 
@@ -94,14 +89,12 @@ class _FlightLearner:
             refined = self._refined_by(self.start)
             if refined is not None:
                 return replace(self.start, refined=refined)
+        camera, start_rig = flight_camera(self.captures), None if self.start is None else self.start.rig
         if len(self.captures) < MIN_CAPTURES:
             # Learning takes as long as aligning one or two captures, and those that need it are learned from alone.
             net = initial_network(self._bands, self.settings, self.start)
-            rig = None if self.start is None else self.start.rig
-            model = FlightModel(
-                net, flight_camera(self.captures), self._bands, {} if rig is None else rig.mean, "", rig
-            )
-            return model if net.is_trained else None
+            known_mappings = {} if start_rig is None else start_rig.mean
+            return FlightModel(net, camera, self._bands, known_mappings, "", start_rig) if net.is_trained else None
         network = self._network()
         if network is None:
             return None
@@ -113,18 +106,15 @@ class _FlightLearner:
         if not mappings:
             return None
         medians = {name: median_mapping(of, self._size_px) for name, of in mappings.items()}
-        model = FlightModel(net, flight_camera(self.captures), self._bands, medians, "")
+        model = FlightModel(net, camera, self._bands, medians, "")
         observations = self._observations(model, known)
-        rig = self._rig(list(observations.values()))
-        if rig is None and self.start is not None:
-            rig = self.start.rig
-        # Without a rig, a second refinement from the medians reduces the errors.
-        refined = {
-            self._key(c): found.refined
-            for c in self.captures
-            if rig is not None and (found := observations.get(c.label)) is not None and found.is_aligned
-        }
-        return replace(model, rig=rig, mappings=medians if rig is None else {**medians, **rig.mean}, refined=refined)
+        rig = self._rig(list(observations.values())) or start_rig
+        if rig is None:
+            # A second refinement from the medians reduces the errors.
+            return model
+        aligned = {label: o.refined for label, o in observations.items() if o.is_aligned}
+        refined = {refinement_key(c, self.settings): aligned[c.label] for c in self.captures if c.label in aligned}
+        return replace(model, rig=rig, mappings={**medians, **rig.mean}, refined=refined)
 
     @property
     def _bands(self) -> tuple[str, ...]:
@@ -133,9 +123,6 @@ class _FlightLearner:
     @property
     def _size_px(self) -> tuple[int, int]:
         return self.captures[0].reference.size_px
-
-    def _key(self, capture: Capture) -> str:
-        return refinement_key(capture, self.settings)
 
     def _refined_by(self, model: FlightModel) -> dict[str, Mapping[str, RefinedPair]] | None:
         """Return the refined mappings of two captures of the flight by an earlier model; None if it must be learned
@@ -148,14 +135,18 @@ class _FlightLearner:
             return None
         some = [self.captures[len(self.captures) * k // 3] for k in (1, 2)]
         tests = list(self.apply(partial(try_model, portable(model), self.settings), some))
-        known = [(self._key(c), *test) for c, test in zip(some, tests, strict=True) if test is not None]
+        known = [
+            (refinement_key(c, self.settings), *test) for c, test in zip(some, tests, strict=True) if test is not None
+        ]
         if len(known) < len(some) or sum(aligned for _, aligned, _ in known) < len(self._bands):
             return None
         return {key: refined for key, aligned, refined in known if len(refined) == aligned}
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if learning fails."""
-        parts = np.array_split(np.arange(len(self.captures)), _NETWORK_CAPTURES)
+        # Each capture takes seconds. A third one mostly shows the structure that two lack.
+        network_captures = 3
+        parts = np.array_split(np.arange(len(self.captures)), network_captures)
         stretches = [
             tuple(self.captures[part[k]] for k in dict.fromkeys((len(part) // 2, 0, len(part) - 1))) for part in parts
         ]
@@ -187,21 +178,21 @@ class _FlightLearner:
         groups: list[ImageGroup] = []
         for one, images in pairs:
             groups += images.groups_from(one.refined)
-        try:
+        # One capture may make learning from all of them fail; a network is then learned for each capture alone.
+        with logged_failure("the flight cannot be learned from"):
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
                 return net, list(pool.map(lambda p: p[1].refined_by(net, settings), pairs))
-        except Exception as error:
-            # One capture may make learning from all of them fail; a network is then learned for each capture alone.
-            log_failure("the flight cannot be learned from", error)
-            return None
+        return None
 
     def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> dict[str, RigObservation]:
         """Return observations of the rig by capture, until every observed band is in enough of them.
 
         `known` are the captures that the network has refined.
         """
-        count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // _CAPTURES_PER_RIG_CAPTURE))
+        # Neighbours have about the same height and speed.
+        captures_per_rig_capture = 8
+        count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // captures_per_rig_capture))
         result = {one.capture.label: one.observation for one in known if one.observation is not None}
         again = [c for c in self.captures if c.label in result and result[c.label].misaligned]
         waiting = [*again, *(c for c in _spread(self.captures, count) if c.label not in result)]

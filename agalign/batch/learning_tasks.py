@@ -2,7 +2,8 @@
 
 import copy
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,7 +30,20 @@ from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
 from agalign.values.process_pool import A, R
 
-_LOG = logging.getLogger(__name__)
+
+@contextmanager
+def logged_failure(message: str) -> Iterator[None]:
+    """Log why a capture cannot be used for learning, and end the block; it is reported when it is aligned.
+
+    Raises MemoryError.
+    """
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        is_defect = not isinstance(error, AgalignError)
+        logging.getLogger(__name__).debug("%s: %s", message, error, exc_info=is_defect)
 
 
 @one_thread()
@@ -151,20 +165,15 @@ def load_capture(
     Bands have their index in `bands` as index in the network. Seeds of kind `match` use the network of `start`.
     """
     seeds_known = {} if known is None else {name: pair.seed for name, pair in known.items()}
-    try:
-        pairs, _ = read_pairs(capture, settings.seed)
-        seeds_of = [
-            (p, seeds_known.get(p.name) or find_seed(p, settings.seed, start)) for p in pairs if p.has_rig_pixels
-        ]
+    with logged_failure(f"{capture.label} cannot be learned from"):
+        pairs = [p for p in read_pairs(capture, settings.seed)[0] if p.has_rig_pixels]
+        seeds_of = [(p, seeds_known.get(p.name) or find_seed(p, settings.seed, start)) for p in pairs]
         result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
-        if not result:
-            return None
-        usable, seeds = [p for p, _ in result], [seed for _, seed in result]
-        groups = image_groups(usable, seeds, [bands.index(p.name) + 1 for p in usable])
-        return LoadedCapture(capture, groups, usable, seeds)
-    except Exception as error:
-        log_failure(f"{capture.label} cannot be learned from", error)
-        return None
+        if result:
+            usable, seeds = [p for p, _ in result], [seed for _, seed in result]
+            groups = image_groups(usable, seeds, [bands.index(p.name) + 1 for p in usable])
+            return LoadedCapture(capture, groups, usable, seeds)
+    return None
 
 
 def initial_network(bands: Sequence[str], settings: Settings, start: FlightModel | None) -> Descriptor:
@@ -198,11 +207,9 @@ def choose_and_refine(
     net = initial_network(bands, settings, start)
     if not (net.is_trained and best.is_trusted):
         return LearningCapture(best.capture, is_good_enough=False)
-    try:
+    with logged_failure(f"{best.capture.label} cannot be learned from"):
         return best.refined_by(net, settings, is_final=False)
-    except Exception as error:
-        log_failure(f"{best.capture.label} cannot be learned from", error)
-        return None
+    return None
 
 
 def observe_rig(
@@ -213,15 +220,13 @@ def observe_rig(
     None if that fails.
     """
     capture, bands = argument
-    try:
+    with logged_failure(f"{capture.label} does not determine the rig"):
         model = _on_device(model, settings)
         pairs, _ = read_pairs(capture, settings.seed, model)
         pairs = [p for p in pairs if p.has_rig_pixels and (bands is None or p.name in bands)]
         aligner = PairAligner(settings, model, quiet, is_observation=True)
         return _observation(pairs, aligner.align(pairs, None, scratch=False), aligner.refined, capture)
-    except Exception as error:
-        log_failure(f"{capture.label} does not determine the rig", error)
-        return None
+    return None
 
 
 def try_model(model: FlightModel, settings: Settings, capture: Capture) -> tuple[int, Mapping[str, RefinedPair]] | None:
@@ -231,18 +236,16 @@ def try_model(model: FlightModel, settings: Settings, capture: Capture) -> tuple
     """
     model = _on_device(model, settings)
     assert model.rig is not None
-    try:
+    with logged_failure(f"{capture.label} is not aligned by the model"):
         pairs, _ = read_pairs(capture, settings.seed, model)
         aligner = PairAligner(settings, model, quiet, is_observation=True)
         result = aligner.align(pairs, None, scratch=False)
         checked = with_predictions(pairs, result, model.rig, capture)
-    except Exception as error:
-        log_failure(f"{capture.label} is not aligned by the model", error)
-        return 0, {}
-    predictions = [checked[name].prediction for name, a in result.items() if a.status == "aligned"]
-    if any(p is None or p.std_px > settings.check.accept_predicted_px for p in predictions):
-        return None
-    return len(predictions), aligner.refined
+        predictions = [checked[name].prediction for name, a in result.items() if a.status == "aligned"]
+        if any(p is None or p.std_px > settings.check.accept_predicted_px for p in predictions):
+            return None
+        return len(predictions), aligner.refined
+    return 0, {}
 
 
 def _are_good_enough(results: Results) -> bool:
@@ -265,10 +268,3 @@ def _observation(
         if a.status != "aligned" and a.joint is not None and a.joint.retrieval >= MIN_RETRIEVAL
     )
     return RigObservation(observed(pairs, result, capture), residuals, refined, misaligned)
-
-
-def log_failure(message: str, error: Exception) -> None:
-    """Log why a capture cannot be used for learning; it is reported when it is aligned. Raises MemoryError again."""
-    if isinstance(error, MemoryError):
-        raise error
-    _LOG.debug("%s: %s", message, error, exc_info=not isinstance(error, AgalignError))

@@ -14,12 +14,6 @@ from filelock import FileLock, Timeout
 from agalign.errors import OutputError
 from agalign.values.files import remove_partial_files
 
-_LOCK_FILE = ".agalign.lock"
-_MIN_FREE_BYTES = 1 << 20
-_NO_LOCKS = errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP
-"""Errors of file systems without locks, such as NFS without its lock daemon."""
-_LOG = logging.getLogger(__name__)
-
 
 def prepare_output(out: Path) -> None:
     """Create the output folder. Raises OutputError if it cannot be created or written to."""
@@ -40,7 +34,7 @@ def locked(out: Path) -> Iterator[None]:
     The system releases the lock when the process ends, also when it is killed.
     """
     prepare_output(out)
-    path = out / _LOCK_FILE
+    path = out / ".agalign.lock"
     # The existence of a file as lock (`SoftFileLock`) would outlast a killed process.
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)
     try:
@@ -48,9 +42,12 @@ def locked(out: Path) -> Iterator[None]:
     except (Timeout, RuntimeError):
         raise OutputError(f"{out}: another run writes there{_lock_owner(path)}; wait for it, or choose -o") from None
     except OSError as error:
-        if error.errno not in _NO_LOCKS:
+        # File systems without locks, such as NFS without its lock daemon.
+        if error.errno not in (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP):
             raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
-        _LOG.warning("%s: its file system has no locks; make sure that no other run writes there", out)
+        logging.getLogger(__name__).warning(
+            "%s: its file system has no locks; make sure that no other run writes there", out
+        )
     try:
         with suppress(OSError):  # a full disk is reported where a product is written
             path.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
@@ -64,9 +61,9 @@ def locked(out: Path) -> Iterator[None]:
 
 
 def is_full(out: Path) -> bool:
-    """True if the disk of the output folder is full."""
+    """True if less than 1 MiB of the disk of the output folder is free."""
     try:
-        return shutil.disk_usage(out).free < _MIN_FREE_BYTES
+        return shutil.disk_usage(out).free < 1 << 20
     except OSError:
         return False
 

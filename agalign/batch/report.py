@@ -5,6 +5,7 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -12,9 +13,6 @@ from agalign.capture.align import PairProgress
 from agalign.products.sidecar import BandResult, CaptureResult, Sidecar
 from agalign.products.sidecar_file import read_sidecar
 from agalign.values.text import counted
-
-_MAX_ROWS = 20
-"""Maximum number of captures in the table of a notebook."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +91,12 @@ class FlightReports(list[CaptureReport]):
     """The reports of a run, which a notebook shows as a table."""
 
     def _repr_html_(self) -> str:
+        max_rows = 20
         counts = Counter(report.state for report in self)
         total = ", ".join(f"{number} {state}" for state, number in counts.items())
         head = "<tr><th>capture</th><th>state</th><th>bands</th></tr>"
-        rows = "".join(report._row() for report in self[:_MAX_ROWS])
-        more = f"<p>and {len(self) - _MAX_ROWS} more</p>" if len(self) > _MAX_ROWS else ""
+        rows = "".join(report._row() for report in self[:max_rows])
+        more = f"<p>and {len(self) - max_rows} more</p>" if len(self) > max_rows else ""
         return f"<p>{counted(len(self), 'capture')}: {total}</p><table>{head}{rows}</table>{more}"
 
 
@@ -106,32 +105,27 @@ class StageClock:
 
     def __init__(self, progress: PairProgress) -> None:
         self._progress = progress
-        self._seconds: defaultdict[tuple[str, str], float] = defaultdict(float)
-        self._current: tuple[str, str] | None = None
-        self._since = self._started = time.perf_counter()
+        self._starts: list[tuple[float, tuple[str, str] | None]] = [(time.perf_counter(), None)]
+        """Start time of each (band, stage); before the first, None."""
 
     def __call__(self, band: str, stage: str, share: float) -> None:
         """Report progress as `PairProgress`; a new band or stage ends the previous one."""
-        if (band, stage) != self._current:
-            self._book()
-            self._current = band, stage
+        if (band, stage) != self._starts[-1][1]:
+            self._starts.append((time.perf_counter(), (band, stage)))
         self._progress(band, stage, share)
 
     @property
     def seconds(self) -> float:
         """Seconds since this timer was created."""
-        return time.perf_counter() - self._started
+        return time.perf_counter() - self._starts[0][0]
 
     def stages(self) -> Mapping[tuple[str, str], float]:
         """Seconds by (band, stage), including the current stage."""
-        self._book()
-        return dict(self._seconds)
-
-    def _book(self) -> None:
-        now = time.perf_counter()
-        if self._current is not None:
-            self._seconds[self._current] += now - self._since
-        self._since = now
+        seconds: defaultdict[tuple[str, str], float] = defaultdict(float)
+        for (since, stage), (until, _) in pairwise([*self._starts, (time.perf_counter(), None)]):
+            if stage is not None:
+                seconds[stage] += until - since
+        return dict(seconds)
 
 
 def _residual(band: BandResult) -> str:

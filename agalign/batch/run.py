@@ -10,15 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
-from agalign.batch.capture import (
-    Task,
-    discard_outputs,
-    do_capture,
-    loaded_model,
-    quiet,
-    refuse_to_overwrite,
-    start_worker,
-)
+from agalign.batch.capture import Task, discard_outputs, do_capture, loaded_model, quiet, refuse_to_overwrite
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.batch.output_folder import is_full, locked
 from agalign.batch.report import CaptureReport
@@ -32,7 +24,7 @@ from agalign.flight.groups import flight_camera, flights_of, is_flight_of, model
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panels import PanelReading, read_panel, reflectance_factors, with_height, with_panels
 from agalign.flight.sky import SkyCapture, sky_captures
-from agalign.method.device import choose_device
+from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.flight_map import FlightMap
@@ -51,8 +43,6 @@ from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
 
 _MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
-_MAX_READ_AHEAD_BYTES = 64 << 20
-"""Larger files could displace files of the current capture from the page cache."""
 
 
 @dataclass(frozen=True)
@@ -195,9 +185,18 @@ class _FlightRun:
         return sky, panels, captures
 
     def kept(self, capture: Capture) -> CaptureResult | None:
-        """Return the result of an earlier run; None if the capture must be processed (again)."""
-        earlier = None if self.options.overwrite else finished_before(capture, self.out, self.settings)
-        return None if earlier is None or (self.options.retry_failed and earlier.status != "ok") else earlier
+        """Return the result of an earlier run; None if the capture must be processed (again): settings or bands differ,
+        or an output is missing.
+        """
+        path = CapturePaths.of(capture, self.out).sidecar
+        try:
+            earlier = None if self.options.overwrite else read_result(path)
+        except SidecarError:
+            return None
+        if earlier is None or earlier.not_written or (self.options.retry_failed and earlier.status != "ok"):
+            return None
+        is_current = earlier.settings == fingerprint(capture, self.settings) and _outputs_exist(earlier, path.parent)
+        return earlier if is_current else None
 
     def reports(self, record: RunPart) -> Iterator[CaptureReport]:
         """Yield the report of each capture; add the time of learning to the record."""
@@ -290,7 +289,7 @@ def _chosen_run(captures: int, cores: int, options: RunOptions) -> Iterator[Run]
     if options.executor is not None:
         yield on_executor(options.executor)
     elif processes > 1 or limited:
-        with own_processes(processes, start_worker, timeout_s=options.timeout_s) as run:
+        with own_processes(processes, limit_threads, timeout_s=options.timeout_s) as run:
             yield run
     elif threads > 1:
         # Warning filters are global: threads that change and restore them would interfere.
@@ -323,23 +322,12 @@ def capture_reports(
 
 
 def _read_ahead(capture: Capture) -> None:
-    """Read the files of a capture into the page cache."""
+    """Read the files of a capture into the page cache; larger ones could displace files of the current capture."""
+    max_bytes = 64 << 20
     for path in {b.path for b in capture.bands}:
         with suppress(OSError):
-            if path.stat().st_size <= _MAX_READ_AHEAD_BYTES:
+            if path.stat().st_size <= max_bytes:
                 path.read_bytes()
-
-
-def finished_before(capture: Capture, out: Path, settings: Settings) -> CaptureResult | None:
-    """Return the result of an earlier run with the same settings and bands if all its outputs exist, else None."""
-    path = CapturePaths.of(capture, out).sidecar
-    try:
-        sidecar = read_result(path)
-    except SidecarError:
-        return None
-    if sidecar.settings != fingerprint(capture, settings):
-        return None
-    return sidecar if not sidecar.not_written and _outputs_exist(sidecar, path.parent) else None
 
 
 def _outputs_exist(sidecar: CaptureResult, folder: Path) -> bool:

@@ -11,22 +11,18 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib import import_module
 from itertools import islice
+from operator import call
 from typing import Any, Protocol
 
 from agalign._version import __version__
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.values.cores import usable_cores
 from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
-from agalign.values.processes import WORKER_MODULE, threads_of_children, worker_context
+from agalign.values.processes import WORKER_MODULE, follow_parent, threads_of_children, worker_context
 
-_LOG = logging.getLogger(__name__)
 _DASK_TIMEOUT_S = 10
 _POLL_INTERVAL_S = 5.0
 """Interval at which the state of a cluster is checked while no task completes."""
-_TIMEOUT_EXIT_CODE = 75
-_RUN_AGAIN = "run again to process the remaining captures"
-_TASKS_A_PROCESS = 500
-"""Number of tasks after which a process is replaced: libraries leak some kilobytes per capture."""
 _MAX_WAITING_TASKS = 1000
 """Maximum number of tasks submitted to an executor at a time: enough for any cluster, and little memory."""
 
@@ -70,9 +66,12 @@ def own_processes(
     process of a task that exceeds the timeout is killed.
     """
     threads, context = max(1, usable_cores() // processes), worker_context(preload)
+    max_tasks = 500  # libraries leak some kilobytes per capture
     with (
         threads_of_children(threads),
-        ProcessPool(_call, processes, context, initializer, (threads,), max_tasks_per_worker=_TASKS_A_PROCESS) as pool,
+        ProcessPool[partial[Any], Any](
+            call, processes, context, _start, (initializer, threads), max_tasks_per_worker=max_tasks
+        ) as pool,
     ):
 
         def run(
@@ -85,8 +84,10 @@ def own_processes(
         yield run
 
 
-def _call(function: Callable[[], Any]) -> Any:
-    return function()
+def _start(initializer: Callable[[int], object], threads: int) -> None:
+    """Initialise a worker process."""
+    follow_parent()
+    initializer(threads)
 
 
 def on_executor(executor: Executor) -> Run:
@@ -151,27 +152,22 @@ def in_order(run: Run, function: Callable[[A], R], tasks: Sequence[A], /) -> Ite
 
 def failure_text(error: Exception, timeout_s: float | None = None) -> str:
     """Return one line about the error of a task or of its worker."""
+    run_again = "run again to process the remaining captures"
     match error:
         case TimeoutError() if timeout_s is not None:
             return f"stopped after {timeout_s:g} s (--timeout)"
         case WorkerDiedError():
-            return (
-                f"its worker process was killed ({error}; out of memory?); run again to process the remaining captures"
-            )
+            return f"its worker process was killed ({error}; out of memory?); {run_again}"
         case BrokenExecutor():
-            return f"the executor lost its processes (out of memory?); {_RUN_AGAIN}"
+            return f"the executor lost its processes (out of memory?); {run_again}"
         case MemoryError():
             return "out of memory; try again with fewer --jobs, or with more memory"
         case AgalignError():
             return str(error)
     first_line = next(iter(str(error).splitlines()), type(error).__name__)
     if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
-        return f"the cluster lost it ({first_line}); {_RUN_AGAIN}"
+        return f"the cluster lost it ({first_line}); {run_again}"
     return f"agalign failed on it ({type(error).__name__}: {first_line}); please report this"
-
-
-LOCAL = "local"
-"""Value of `--dask` instead of a scheduler's address: start worker processes on this machine."""
 
 
 @contextmanager
@@ -194,7 +190,7 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
         try:
-            if address == LOCAL:
+            if address == "local":
                 # The profile appears on the dashboard only, and takes a few percent of the time.
                 stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
                 cluster = LocalCluster(
@@ -221,15 +217,12 @@ def _check_versions(client: Any) -> None:
     # A built-in function, because a worker without agalign cannot unpickle one of this package.
     versions = client.run(eval, "__import__('agalign._version', fromlist=['_']).__version__", on_error="return")
     if not versions:
-        _LOG.warning("agalign: no worker is connected to the Dask scheduler; the run waits for one")
+        text = "agalign: no worker is connected to the Dask scheduler; the run waits for one"
+        logging.getLogger(__name__).warning(text)
     for worker, version in sorted(versions.items()):
-        if isinstance(version, Exception):
-            problem = f"cannot load agalign ({version})"
-        elif version != __version__:
-            problem = f"has agalign {version}"
-        else:
-            continue
-        raise ConfigurationError(f"the Dask worker at {worker} {problem}; install agalign {__version__} there")
+        if version != __version__:
+            problem = f"cannot load agalign ({version})" if isinstance(version, Exception) else f"has agalign {version}"
+            raise ConfigurationError(f"the Dask worker at {worker} {problem}; install agalign {__version__} there")
 
 
 class DaskExecutor(Executor):
@@ -239,7 +232,7 @@ class DaskExecutor(Executor):
         self._client, self._executor, self._timeout_s = client, client.get_executor(pure=False), timeout_s
 
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
-        return self._executor.submit(_within, self._timeout_s, _on_worker, __version__, function, *arguments, **named)
+        return self._executor.submit(_on_worker, __version__, self._timeout_s, function, *arguments, **named)
 
     def without_timeout(self) -> "DaskExecutor":
         """Return the same executor without a time limit."""
@@ -255,26 +248,23 @@ class DaskExecutor(Executor):
         )
 
 
-def _on_worker(version: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+def _on_worker(
+    version: str, timeout_s: float | None, function: Callable[..., Any], *arguments: Any, **named: Any
+) -> Any:
     """Call a function in one thread; OMP_NUM_THREADS, which Dask sets, does not limit all libraries.
 
+    Ends this process if it takes longer than the timeout: code that hangs in a library cannot be interrupted.
     Raises ConfigurationError on a worker with another version, which may have joined during the run.
     """
     if version != __version__:
         raise ConfigurationError(f"a Dask worker has agalign {__version__}; install agalign {version} there")
-    from agalign.method.device import limit_threads
-
-    limit_threads(1)
-    return function(*arguments, **named)
-
-
-def _within(timeout_s: float | None, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Call a function; end this process if it takes longer: code that hangs in a library cannot be interrupted."""
-    if timeout_s is None:
-        return function(*arguments, **named)
-    alarm = threading.Timer(timeout_s, os._exit, (_TIMEOUT_EXIT_CODE,))
-    alarm.start()
+    alarm = threading.Timer(timeout_s or 0.0, os._exit, (75,))
+    if timeout_s is not None:
+        alarm.start()
     try:
+        from agalign.method.device import limit_threads
+
+        limit_threads(1)
         return function(*arguments, **named)
     finally:
         alarm.cancel()

@@ -1,14 +1,22 @@
 """The commands that align: `align`, `demo` and `onto`."""
 
+import threading
+from contextlib import suppress
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from agalign.cli.command import Command, Given, load_config
-from agalign.cli.terminal import INTERRUPTED, RAW_NUMBERS, Terminal, command_line, examples
+from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line, examples
 from agalign.values.choices import MAX_MOSAIC_PIXELS
-from agalign.values.cores import check_address_space, usable_cores
+from agalign.values.cores import check_address_space, limit_default_threads, usable_cores
+
+_command = partial(
+    Command, on_interrupt="interrupted; finished captures are kept, and the same command resumes the run"
+)
 
 
 def _align(
@@ -35,7 +43,6 @@ def _align(
 ) -> int:
     """Align every capture below FOLDER."""
     check_address_space()
-    from agalign.cli.run import conclude, find_captures, load_ahead, print_plan, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.products.stac import need_stac
     from agalign.values.processes import start_server_ahead
@@ -49,6 +56,8 @@ def _align(
     if settings.write.stac:
         need_stac()
     load_ahead()
+    from agalign.cli.run import conclude, find_captures, print_plan, run
+
     flight = find_captures(folder, DiscoverOptions(**given["discover"], skip=(target,), jobs=cores), terminal)
     if not dask and not dry_run:
         start_server_ahead(len(flight.captures), cores)
@@ -60,7 +69,18 @@ def _align(
     return conclude(run(flight, target, settings, terminal, options, dask=dask, model=model), target, terminal)
 
 
-align = Command(
+def load_ahead() -> None:
+    """Import torch and other large libraries in a thread, which takes two seconds, while the files are read."""
+    limit_default_threads()
+
+    def load() -> None:
+        with suppress(Exception):  # reported at the next import
+            import_module("agalign.batch.preload")
+
+    threading.Thread(target=load, daemon=True).start()
+
+
+align = _command(
     _align,
     {
         "Input": "reference bands order with_rgb pattern ignore_metadata include exclude align_panels max_pixels",
@@ -71,7 +91,6 @@ align = Command(
         "Running": "device jobs dask overwrite retry_failed timeout dry_run config quiet verbose log_json",
         "Expert": "recipe sharing model_family each_alone rng_seed",
     },
-    on_interrupt=INTERRUPTED,
     epilog=examples(
         ("agalign flight/", "align the bands of all captures, into flight-aligned/"),
         ("agalign flight/ -o aligned/ --radiometry", "write reflectance, if the camera's tags are sufficient"),
@@ -115,9 +134,8 @@ def _demo(
     return conclude(totals, target, terminal)
 
 
-_DEVICE = {"help": "auto, cpu, cuda, cuda:1 …"}
-demo = Command(
-    _demo, {"Running": "jobs device rng_seed quiet verbose log_json"}, {"device": _DEVICE}, on_interrupt=INTERRUPTED
+demo = _command(
+    _demo, {"Running": "jobs device rng_seed quiet verbose log_json"}, {"device": {"help": "auto, cpu, cuda, cuda:1 …"}}
 )
 
 
@@ -178,7 +196,7 @@ onto = Command(
         "interpolation": {"help": "Resampling of the moving mosaics."},
         "format": {"help": "Tiled GeoTIFF or cloud-optimised GeoTIFF."},
         "compression": {"help": "Lossless compression."},
-        "device": _DEVICE,
+        "device": {"help": "auto, cpu, cuda, cuda:1 …"},
         "jobs": {"default": 1},
         "overwrite": {"help": "Process finished mosaics again."},
         "max_pixels": {

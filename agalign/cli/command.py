@@ -3,7 +3,6 @@
 An option of a field has its type, default, range and docstring (the help text).
 """
 
-import ast
 import inspect
 import json
 from collections import defaultdict
@@ -13,7 +12,7 @@ from difflib import get_close_matches
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from typer.core import TyperCommand
@@ -23,25 +22,9 @@ from agalign.cli.terminal import Terminal, exits
 if TYPE_CHECKING:
     from agalign.config import Option
 
-_COMMAND_LINE_ONLY = {"help", "config", "dry-run"}
-"""Options that a configuration file cannot have."""
 Given = dict[str, dict[str, Any]]
 """Values of the options of a command that belong to fields, by name of the field: `settings` by stage and field, for
 `Settings.model_validate`, `discover` of `DiscoverOptions`, `run` of `RunOptions`."""
-
-
-def _parameter(name: str, kind: Any, default: Any, *flags: str, **info: Any) -> inspect.Parameter:
-    annotation = Annotated[kind, typer.Option(*filter(None, flags), **info)]
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-
-_TERMINAL = {
-    "quiet": _parameter("quiet", bool, False, "--quiet", "-q", help="Print problems only."),
-    "verbose": _parameter("verbose", bool, False, "--verbose", "-v", help="Print a line per band pair."),
-    "log_json": _parameter(
-        "log_json", bool, False, "--log-json", help="Print one JSON object per line to standard error."
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -54,9 +37,8 @@ class FieldOption:
     """Names of the stage, if any, and of the field."""
     option: "Option"
     kind: Any
-    default: Any
     info: Mapping[str, Any]
-    """Help text and range."""
+    """Default, its display, help text and range."""
 
     @property
     def name(self) -> str:
@@ -70,8 +52,11 @@ class FieldOption:
 
     def parameter(self, changes: Mapping[str, Any]) -> inspect.Parameter:
         """Return it as a parameter of a function; `changes` replace its default or help text."""
-        info = {"default": self.default, "show_default": self.option.show_default, **self.info, **changes}
-        return _parameter(self.name, self.kind, info.pop("default"), self.flag, self.option.short, **info)
+        info = {**self.info, **changes}
+        default, names = info.pop("default"), filter(None, (self.flag, self.option.short))
+        kind: Any = self.kind
+        annotation = Annotated[kind, typer.Option(*names, **info)]
+        return inspect.Parameter(self.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
     def store(self, value: Any, given: Given) -> None:
         """Add the value of the option to the values of its owner."""
@@ -93,28 +78,23 @@ def field_options() -> dict[str, FieldOption]:
 def _options_of(owner: str, value: Any, path: tuple[str, ...]) -> Iterator[FieldOption]:
     from agalign.config import Option, Stage
 
-    body = ast.parse(inspect.getsource(type(value))).body[0].body  # type: ignore[attr-defined]
-    helps = {
-        ast.unparse(one.target): " ".join(ast.literal_eval(text.value).split())
-        for one, text in pairwise(body)
-        if isinstance(one, ast.AnnAssign) and isinstance(text, ast.Expr)
-    }
-    hints = get_type_hints(type(value), include_extras=True)
-    for name in inspect.get_annotations(type(value)):
-        default, kind = getattr(value, name), hints[name]
+    for name, of_field in type(value).__pydantic_fields__.items():
+        default = getattr(value, name)
         if isinstance(default, Stage):
             yield from _options_of(owner, default, (*path, name))
             continue
-        metadata = getattr(kind, "__metadata__", ())
-        limits = [limit for of_field in metadata for limit in getattr(of_field, "metadata", ())]
-        info = {"help": helps.get(name)}
-        info |= {end: getattr(m, of) for m in limits for end, of in (("min", "ge"), ("max", "le")) if hasattr(m, of)}
-        option = next((m for m in metadata if isinstance(m, Option)), Option())
-        if metadata:
-            kind = option.type or get_args(kind)[0]
+        option = next((m for m in of_field.metadata if isinstance(m, Option)), Option())
         if option.type is not None or option.default is not None:
             default = option.default
-        yield FieldOption(owner, (*path, name), option, kind, default, info)
+        text = " ".join(of_field.description.split())
+        info = {"default": default, "show_default": option.show_default, "help": text}
+        for limit in of_field.metadata:
+            info |= {end: getattr(limit, of) for end, of in (("min", "ge"), ("max", "le")) if hasattr(limit, of)}
+        yield FieldOption(owner, (*path, name), option, option.type or of_field.annotation, info)
+
+
+def _terminal_parameters() -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(Terminal).parameters
 
 
 @dataclass(frozen=True)
@@ -145,7 +125,7 @@ class Command:
         result = []
         for panel, names in self.panels.items():
             for name in names.split():
-                shared = own.pop(name, None) or _TERMINAL.get(name)
+                shared = own.pop(name, None) or _terminal_parameters().get(name)
                 result.append(shared or field_options()[name].parameter(self.changes.get(name, {})))
                 get_args(result[-1].annotation)[1].rich_help_panel = panel
         result = [*(own[name] for name in own if name not in ("terminal", "given")), *result]
@@ -154,10 +134,10 @@ class Command:
     def built(self, name: str) -> Any:
         """Return the command of typer."""
         parameters, own = self.parameters(), inspect.signature(self.function).parameters
-        fields = [p.name for p in parameters if p.name not in {*own, *_TERMINAL}]
+        fields = [p.name for p in parameters if p.name not in {*own, *_terminal_parameters()}]
 
         def call(**values: Any) -> None:
-            terminal = Terminal(**{name: values.pop(name, False) for name in _TERMINAL})
+            terminal = Terminal(**{name: values.pop(name, False) for name in _terminal_parameters()})
             with exits(terminal, self.on_interrupt):
                 given: Given = defaultdict(dict)
                 for name in fields:
@@ -243,4 +223,5 @@ def config_text(command: Any) -> str:
 def _file_options(command: Any) -> dict[str, Any]:
     """Return the options of a command by their long names without the leading dashes."""
     named = {max(p.opts, key=len).lstrip("-"): p for p in command.params if p.param_type_name == "option"}
-    return {name: option for name, option in named.items() if name not in _COMMAND_LINE_ONLY}
+    command_line_only = {"help", "config", "dry-run"}
+    return {name: option for name, option in named.items() if name not in command_line_only}

@@ -1,6 +1,5 @@
 """The command `agalign doctor`: checks whether this machine meets the requirements."""
 
-import json
 import os
 import platform
 import shutil
@@ -11,7 +10,7 @@ import typer
 
 from agalign._version import __version__
 from agalign.cli.command import Command
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, Terminal
+from agalign.cli.terminal import ExitCode, Terminal
 from agalign.values.cores import usable_cores
 
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless", "rasterio", "tifffile", "scikit-image", "pydantic")
@@ -23,7 +22,6 @@ EXTRAS = {
     "xarray": "a flight as one lazily read Dataset (agalign.open_flight)",
 }
 _MIN_FREE_DISK_GB = 5.0
-_GB = 1e9
 
 
 def _doctor(
@@ -35,14 +33,14 @@ def _doctor(
     facts = {"machine": _machine(), "disk": _disk(folder), "devices": _devices(), "extras": _extras()}
     problems = _problems(facts)
     if as_json:
-        typer.echo(json.dumps(facts | {"problems": problems}, indent=1))
+        terminal.facts(facts | {"problems": problems})
     else:
         _show(facts, terminal)
         for text in problems:
             terminal.problem(text)
         if not problems:
             terminal.result("no problems found")
-    return EXIT_NOTHING if problems else EXIT_OK
+    return ExitCode.NOTHING if problems else ExitCode.OK
 
 
 doctor = Command(_doctor)
@@ -73,14 +71,14 @@ def _version(distribution: str) -> str | None:
 
 def _memory_gb() -> float | None:
     try:
-        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / _GB, 1)
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
     except (AttributeError, ValueError, OSError):  # not on Windows
         return None
 
 
 def _disk(folder: Path) -> dict[str, Any]:
     existing = next((p for p in (folder.absolute(), *folder.absolute().parents) if p.is_dir()), Path.cwd())
-    free_gb = round(shutil.disk_usage(existing).free / _GB, 1)
+    free_gb = round(shutil.disk_usage(existing).free / 1e9, 1)
     return {"folder": str(existing), "free_gb": free_gb, "writable": os.access(existing, os.W_OK)}
 
 

@@ -111,22 +111,15 @@ def _learn(
     pairs: Pairs,
     out: Annotated[Path, typer.Option("--out", "-o", help="Network to write.")] = Path("learnt.safetensors"),
     steps: Annotated[int, typer.Option(min=1, help="Training steps per aligned pair.")] = 200,
-    sharing: Annotated[str, typer.Option(help="siamese, pseudo-siamese or unshared.")] = "pseudo-siamese",
 ) -> None:
     """Learn one descriptor from pairs without labels, using those that can be aligned."""
     check_address_space()
-    from pydantic import ValidationError
-
-    from agalign.config import JointSettings, Settings
+    from agalign.config import Settings
     from agalign.evaluation.learn import learn_descriptor, read_rough_pairs
     from agalign.flight.model import save_model
     from agalign.values.alignment import Alignment
     from agalign.values.pixel_units import FixedImagePx
 
-    try:
-        joint = JointSettings.model_validate({**given["settings"]["joint"], "sharing": sharing})
-    except ValidationError:
-        raise ConfigurationError(f"'{sharing}' is unknown; choose from siamese, pseudo-siamese, unshared") from None
     aligned = 0
 
     def on_pair(name: str, result: Alignment[FixedImagePx]) -> None:
@@ -136,9 +129,8 @@ def _learn(
         text = text if terminal.verbose or result.status != "aligned" else ""
         terminal.event("pair", text, name=name, status=result.status, reason=result.reason or "")
 
-    settings = Settings(joint=joint)
     result = read_rough_pairs(pairs)
-    model = learn_descriptor(result, settings, steps_a_pair=steps, on_pair=on_pair)
+    model = learn_descriptor(result, Settings.model_validate(given["settings"]), steps_a_pair=steps, on_pair=on_pair)
     save_model(model, out)
     terminal.event("learnt", f"{out}: learned from {aligned} of {len(result)} pairs", file=str(out))
 
@@ -149,7 +141,8 @@ _command = partial(
     changes={"device": {"help": "auto, cpu, cuda, cuda:1 …"}},
     panel="Descriptors",
 )
-evaluate, surface, learn = _command(_evaluate), _command(_surface), _command(_learn)
+evaluate, surface = _command(_evaluate), _command(_surface)
+learn = _command(_learn, panels={"Options": "sharing device", "Running": "rng_seed quiet verbose log_json"})
 
 
 def _shares(text: str) -> tuple[float, ...]:

@@ -1,6 +1,5 @@
 """The command `agalign info`: the captures of a folder, or the contents of a model."""
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,19 +9,13 @@ import typer
 
 from agalign.cli.align import align
 from agalign.cli.command import Command, Given, config_text
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, MAX_LISTED, Terminal, in_json, shown
+from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, in_json
 from agalign.errors import ConfigurationError, UnreadableFileError
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
     from agalign.cameras.discover import FolderScan
     from agalign.values.capture import Capture
-
-_NO_BAND = (
-    "a colour photograph or a part of no capture; name files '<capture>_<band>.tif', give --pattern, or use "
-    "--with-rgb for photographs next to the bands of a capture"
-)
-_MODEL_SUFFIX = ".safetensors"
 
 
 def _info(
@@ -42,22 +35,25 @@ def _info(
     """List cameras, captures, bands and missing files of a folder, or show the rig of a model."""
     if options:
         typer.echo(config_text(align.built("align")))
-        return EXIT_OK
+        return ExitCode.OK
     if folder is None:
         raise ConfigurationError("give a folder with images, a model, or --options")
-    if folder.is_file() and folder.suffix == _MODEL_SUFFIX:
+    if folder.is_file() and folder.suffix == ".safetensors":
         _show_model(folder, terminal, as_json=as_json)
-        return EXIT_OK
-    from agalign.cli.run import find_captures
+        return ExitCode.OK
+    from agalign.cameras.discover import discover
+    from agalign.cli.run import print_found
     from agalign.config import DiscoverOptions
     from agalign.flight.groups import camera_overviews
     from agalign.flight.panels import with_panels
     from agalign.flight.sky import sky_captures
 
-    flight = find_captures(folder, DiscoverOptions(**given["discover"]), terminal, silent=as_json, required=False)
-    if not flight.captures and not as_json:
-        _show_unused(flight, terminal)
-        return EXIT_NOTHING
+    flight = discover(folder, DiscoverOptions(**given["discover"]))
+    if not as_json:
+        print_found(flight, terminal)
+        if not flight.captures:
+            _show_unused(flight, terminal)
+            return ExitCode.NOTHING
     sky, others = sky_captures(flight.captures)
     sky_cues = {s.capture.label: list(s.cues) for s in sky}
     by_label = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
@@ -71,12 +67,12 @@ def _info(
     if as_json:
         problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
         facts = {"folder": str(folder), "cameras": [vars(c) for c in cameras], "captures": rows, "problems": problems}
-        typer.echo(json.dumps(facts, indent=1))
+        terminal.facts(facts)
     else:
         for camera in cameras:
-            terminal.result(shown(camera.text))
+            terminal.result(camera.text)
         _show_captures(rows, len(flight.problems), terminal)
-    return EXIT_NOTHING if not rows else EXIT_PARTIAL if flight.problems else EXIT_OK
+    return ExitCode.NOTHING if not rows else ExitCode.PARTIAL if flight.problems else ExitCode.OK
 
 
 info = Command(_info, {"Input": "pattern reference bands order with_rgb ignore_metadata include exclude"})
@@ -95,9 +91,9 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
     for row in rows:
         if row["panel"] is not None:
             where = " in a scene that is aligned" if row["panel_in_scene"] else ""
-            terminal.result(shown(f"{row['label']}: calibration panel {row['panel']}".rstrip() + where))
+            terminal.result(f"{row['label']}: calibration panel {row['panel']}".rstrip() + where)
         if row["sky"]:
-            terminal.result(shown(f"{row['label']}: shows the sky ({', '.join(row['sky'])}); not aligned"))
+            terminal.result(f"{row['label']}: shows the sky ({', '.join(row['sky'])}); not aligned")
     total_bands = sum(len(r["bands"]) for r in rows)
     parts = counted(len(rows), "capture"), counted(total_bands, "band"), counted(problems, "problem")
     terminal.result(", ".join(parts))
@@ -124,13 +120,17 @@ def _show_unused(flight: "FolderScan", terminal: Terminal) -> None:
     reasons: Counter[tuple[str, str]] = Counter()
     known = {p.path: p.text.removeprefix(f"{p.path}: ") for p in flight.problems}
     images, _ = image_files(flight.folder, ())
+    no_band = (
+        "a colour photograph or a part of no capture; name files '<capture>_<band>.tif', give --pattern, or use "
+        "--with-rgb for photographs next to the bands of a capture"
+    )
     for path in images:
-        reasons[path.suffix.lower(), known.get(path, _NO_BAND)] += 1
+        reasons[path.suffix.lower(), known.get(path, no_band)] += 1
     for suffix, number in other_files(flight.folder).items():
         reasons[suffix, f"not an image that agalign reads ({IMAGE_KINDS})"] += number
     terminal.problem(f"{flight.folder}: no capture of two or more bands in it")
     for (kind, reason), total in reasons.most_common(MAX_LISTED):
-        terminal.result(shown(f"{counted(total, kind + ' file')}: {reason}"))
+        terminal.result(f"{counted(total, kind + ' file')}: {reason}")
 
 
 def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
@@ -145,9 +145,9 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     if as_json:
         rig = {"captures": captures, "factors": factors, "bands": rows} if rows else None
         facts = {"model": str(path), "camera": model.camera, "bands": list(model.bands), "rig": rig}
-        typer.echo(json.dumps(facts, indent=1))
+        terminal.facts(facts)
         return
-    terminal.result(shown(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}"))
+    terminal.result(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}")
     if not rows:
         terminal.result("no rig: too few captures were aligned")
         return

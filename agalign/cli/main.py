@@ -20,7 +20,7 @@ from agalign.cli.doctor import doctor
 from agalign.cli.evaluate import evaluate, learn, surface
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
-from agalign.cli.terminal import EXIT_USAGE, Terminal, examples, printed
+from agalign.cli.terminal import ExitCode, Terminal, examples, printed
 
 COMMANDS = {
     "align": align,
@@ -37,28 +37,8 @@ COMMANDS = {
     "surface": surface,
     "learn": learn,
 }
-_EXAMPLES = examples(
-    ("agalign demo", "align a synthetic flight and compare it with its ground truth"),
-    ("agalign info flight/", "list captures, bands and missing files"),
-    ("agalign flight/ -o aligned/", "align a flight; 'agalign align --help' lists the options"),
-    ("agalign indices aligned/", "compute spectral indices of the aligned captures"),
-    ("agalign doctor", "check this machine"),
-)
-_ROOT_OPTIONS = {"--help", "-h", "--version", "--install-completion", "--show-completion"}
 _UsageError: Any = typer.BadParameter.__mro__[1]
 """The class of click, or of the copy of click in typer."""
-_REWORDED = (
-    (r"Value error, ", ""),
-    (r"Input should be a valid integer.*", "give a whole number"),
-    (r"Input should be a valid number.*", "give a number"),
-    (r"Input should be greater than or equal to (\S+)", r"give \1 or more"),
-    (r"Input should be less than or equal to (\S+)", r"give \1 or less"),
-    (r"Input should be ", "give "),
-    (r"'(\w[\w-]*)'(?=[,.])", r"\1"),
-    (r" is not one of ", " is unknown; choose from "),
-    (r"\.$", ""),
-)
-"""Patterns in messages of pydantic and click about wrong values, and their replacements."""
 
 
 class RootGroup(TyperGroup):
@@ -111,15 +91,26 @@ def _in_one_line(ctx: Any) -> Iterator[None]:
         text = f"agalign: {_reworded(error)}; '{where} --help' lists the options"
         # Without any argument, the message is the help.
         typer.echo(error.message if type(error).__name__ == "NoArgsIsHelpError" else text, err=True)
-        raise typer.Exit(EXIT_USAGE) from None
+        raise typer.Exit(ExitCode.USAGE) from None
 
 
 def _reworded(error: Any) -> str:
+    """Return the message of pydantic or click about a wrong value in plain words, after the name of the parameter."""
     param = getattr(error, "param", None)
     if type(error).__name__ == "MissingParameter" and param is not None:
         return f"{param.name} is missing"
     text = str(error.message)
-    for pattern, words in _REWORDED:
+    for pattern, words in (
+        (r"Value error, ", ""),
+        (r"Input should be a valid integer.*", "give a whole number"),
+        (r"Input should be a valid number.*", "give a number"),
+        (r"Input should be greater than or equal to (\S+)", r"give \1 or more"),
+        (r"Input should be less than or equal to (\S+)", r"give \1 or less"),
+        (r"Input should be ", "give "),
+        (r"'(\w[\w-]*)'(?=[,.])", r"\1"),
+        (r" is not one of ", " is unknown; choose from "),
+        (r"\.$", ""),
+    ):
         text = re.sub(pattern, words, text)
     name = "" if param is None else f"{max(param.opts, key=len)}: " if param.opts else f"{param.name}: "
     return f"{name}{text[:1].lower()}{text[1:]}"
@@ -129,7 +120,13 @@ app = typer.Typer(
     cls=RootGroup,
     name="agalign",
     help="Co-register the bands of multispectral drone cameras. 'agalign FOLDER' aligns everything below FOLDER.",
-    epilog=_EXAMPLES,
+    epilog=examples(
+        ("agalign demo", "align a synthetic flight and compare it with its ground truth"),
+        ("agalign info flight/", "list captures, bands and missing files"),
+        ("agalign flight/ -o aligned/", "align a flight; 'agalign align --help' lists the options"),
+        ("agalign indices aligned/", "compute spectral indices of the aligned captures"),
+        ("agalign doctor", "check this machine"),
+    ),
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
@@ -148,10 +145,11 @@ def _root(
 def main() -> None:
     """Run the application; if the first argument is not a command, it is the folder to align."""
     arguments = sys.argv[1:]
-    if arguments and arguments[0] not in {*COMMANDS, *_ROOT_OPTIONS}:
+    root_options = ("--help", "-h", "--version", "--install-completion", "--show-completion")
+    if arguments and arguments[0] not in {*COMMANDS, *root_options}:
         if problem := _problem_of_folder(arguments):
             Terminal().problem(problem)
-            raise SystemExit(EXIT_USAGE)
+            raise SystemExit(ExitCode.USAGE)
         arguments = ["align", *arguments]
     # Threads that spin while they wait slow down other programs on the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

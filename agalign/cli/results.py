@@ -1,6 +1,5 @@
 """The commands that use the output folder of a run: `report`, `verify`, `export` and `indices`."""
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.cli.command import Command, Given
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, MAX_LISTED, RAW_NUMBERS, Terminal, examples, shown
+from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal, examples
 from agalign.values.choices import ExportProgram
 
 if TYPE_CHECKING:
@@ -39,13 +38,13 @@ def _report(
     for text in unreadable:
         terminal.problem(text)
     if as_json:
-        typer.echo(json.dumps(pages.facts, indent=1))
-        return EXIT_PARTIAL if unreadable else EXIT_OK
+        terminal.facts(pages.facts)
+        return ExitCode.PARTIAL if unreadable else ExitCode.OK
     explain(pages.failures, terminal)
     terminal.table(("Slowest", "Seconds"), [(label, f"{seconds:.1f}") for label, seconds in pages.slowest])
     for path in (pages.report, pages.summary):
-        terminal.result(shown(str(path)))
-    return EXIT_PARTIAL if unreadable else EXIT_OK
+        terminal.result(str(path))
+    return ExitCode.PARTIAL if unreadable else ExitCode.OK
 
 
 def _verify(terminal: Terminal, out: Out) -> int:
@@ -58,7 +57,7 @@ def _verify(terminal: Terminal, out: Out) -> int:
         for text in problems:
             terminal.problem(text)
     terminal.result(f"{captures - damaged} of {captures} captures match their checksums")
-    return EXIT_PARTIAL if damaged else EXIT_OK
+    return ExitCode.PARTIAL if damaged else ExitCode.OK
 
 
 def _export(
@@ -91,11 +90,11 @@ def _export(
     if len(report.left_out) > MAX_LISTED:
         terminal.problem(f"{len(report.left_out) - MAX_LISTED} more captures are left out")
     for line in report.notes:
-        terminal.result(shown(line))
+        terminal.result(line)
     text = f"{report.captures} captures, {len(report.files)} files in {folder}"
     terminal.event("export", captures=report.captures, files=len(report.files), folder=str(folder))
-    terminal.result(shown(text))
-    return EXIT_PARTIAL if report.left_out else EXIT_OK
+    terminal.result(text)
+    return ExitCode.PARTIAL if report.left_out else ExitCode.OK
 
 
 report = Command(_report)
@@ -168,11 +167,11 @@ def _indices(
     if any(r.raw_numbers for r in written) and not announced:
         terminal.problem(RAW_NUMBERS)
     if as_json:
-        typer.echo(json.dumps({"folder": str(folder), "indices": [_facts(r) for r in reports]}, indent=1))
+        terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
     elif written:
         _print_table([one.name for one in chosen], reports, terminal)
-        terminal.result(shown(f"Statistics: {folder / INDICES_FILE}"))
-    return EXIT_NOTHING if not written else EXIT_OK if len(written) == len(reports) else EXIT_PARTIAL
+        terminal.result(f"Statistics: {folder / INDICES_FILE}")
+    return ExitCode.NOTHING if not written else ExitCode.OK if len(written) == len(reports) else ExitCode.PARTIAL
 
 
 indices = Command(

@@ -1,70 +1,65 @@
-"""Aligning a flight from the command line: progress line, reports of captures, and summary."""
+"""Aligning a flight from the command line: progress line, reports of captures, and summary.
+
+The commands import this module when they run, because the libraries that it needs take half a second.
+"""
 
 import re
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
-from agalign.cli.terminal import EXIT_NOTHING, EXIT_OK, EXIT_PARTIAL, MAX_LISTED, Terminal, shown
-from agalign.errors import NoSuchBandError, OutputError, WorkerError
-from agalign.values.cores import limit_default_threads
+from agalign.batch.workers import dask_executor
+from agalign.cameras.discover import FolderScan, discover
+from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, shown
+from agalign.config import DiscoverOptions, RunOptions, Settings
+from agalign.errors import InputError, NoSuchBandError, OutputError, WorkerError
+from agalign.flight.groups import camera_overviews
+from agalign.products.report import REPORT_FILE, pages_exist, write_pages
+from agalign.products.report.facts import FailureGroup, FailureGroups
+from agalign.products.sidecar import BandResult, CaptureResult
+from agalign.values.capture import Capture
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
     from agalign.batch import CaptureReport
-    from agalign.cameras.discover import FolderScan
-    from agalign.config import DiscoverOptions, RunOptions, Settings
-    from agalign.products.report.facts import FailureGroup, FailureGroups
-    from agalign.products.sidecar import BandResult, CaptureResult
-    from agalign.values.capture import Capture
-
-_MAX_NAMED = 3
-"""Maximum number of named bands with the same cause of failure."""
 
 
-def find_captures(
-    folder: Path, options: "DiscoverOptions", terminal: Terminal, *, silent: bool = False, required: bool = True
-) -> "FolderScan":
-    """Return the captures below a folder, and print problems of its files.
-
-    Raises InputError or NoSuchBandError if there are no captures and they are `required`.
-    """
-    from agalign.cameras.discover import discover
-    from agalign.errors import InputError
-
+def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) -> FolderScan:
+    """Return the captures below a folder, and print them. Raises InputError or NoSuchBandError if there are none."""
     flight = discover(folder, options)
-    if not silent:
-        print_problems(flight, terminal)
-    if required and not flight.captures:
-        if any(isinstance(p.error, NoSuchBandError) for p in flight.problems):
-            raise NoSuchBandError(f"{folder}: no capture has a band '{options.reference}'")
-        raise InputError(
-            f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' lists its files, and why each "
-            "kind is not used"
-        )
-    if silent or not flight.captures:
+    print_found(flight, terminal)
+    if flight.captures:
         return flight
+    if any(isinstance(p.error, NoSuchBandError) for p in flight.problems):
+        raise NoSuchBandError(f"{folder}: no capture has a band '{options.reference}'")
+    raise InputError(
+        f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' lists its files, and why each "
+        "kind is not used"
+    )
+
+
+def print_found(flight: FolderScan, terminal: Terminal) -> None:
+    """Print the problems of files, the number of captures and bands if there are any, and a warning about 8 bits."""
+    print_problems(flight, terminal)
     captures, bands = len(flight.captures), sum(len(c.bands) for c in flight.captures)
-    text = f"{counted(captures, 'capture')}, {counted(bands, 'band')} in {folder}"
-    terminal.event("found", text, captures=captures, bands=bands)
+    if captures:
+        text = f"{counted(captures, 'capture')}, {counted(bands, 'band')} in {flight.folder}"
+        terminal.event("found", text, captures=captures, bands=bands)
     if flight.eight_bit:
         text = (
             f"{counted(len(flight.eight_bit), 'capture')} with 8 bits per band: 256 levels, and the tone "
             "curve of a picture, limit radiometry and indices; export 16-bit TIFFs where the camera has them"
         )
         terminal.event("eight_bit", text, captures=len(flight.eight_bit))
-    return flight
 
 
-def print_problems(flight: "FolderScan", terminal: Terminal) -> None:
+def print_problems(flight: FolderScan, terminal: Terminal) -> None:
     """Print the problems of files: at most `MAX_LISTED` lines per cause, and the number of further files.
 
     With --log-json, print a line for each file.
@@ -86,31 +81,19 @@ def print_problems(flight: "FolderScan", terminal: Terminal) -> None:
             )
 
 
-def print_plan(flight: "FolderScan", out: Path, settings: "Settings", options: "RunOptions", terminal: Terminal) -> int:
+def print_plan(flight: FolderScan, out: Path, settings: Settings, options: RunOptions, terminal: Terminal) -> int:
     """Print what a run would do with each capture; return the exit code."""
     from agalign.batch.run import plan_run
-    from agalign.flight.groups import camera_overviews
 
     states = plan_run(flight, out, settings, options)
     for camera in camera_overviews(flight.captures):
-        terminal.result(shown(camera.text))
+        terminal.result(camera.text)
     counts = Counter(states.values())
     for label, state in states.items():
         terminal.event("plan", f"{label}: {state}" if terminal.verbose else "", capture=label, state=state)
     text = ", ".join(f"{counted(number, 'capture')} {state}" for state, number in counts.items())
-    terminal.result(shown(f"Into {out}: {text}; nothing was written"))
-    return EXIT_PARTIAL if flight.problems else EXIT_OK
-
-
-def load_ahead() -> None:
-    """Import torch and other large libraries in a thread, which takes two seconds, while the files are read."""
-    limit_default_threads()
-
-    def load() -> None:
-        with suppress(Exception):  # reported at the next import
-            import_module("agalign.batch.preload")
-
-    threading.Thread(target=load, daemon=True).start()
+    terminal.result(f"Into {out}: {text}; nothing was written")
+    return ExitCode.PARTIAL if flight.problems else ExitCode.OK
 
 
 @dataclass
@@ -119,19 +102,16 @@ class RunTotals:
 
     good: bool
     """All captures are good, no file has a problem, and the report is written."""
-    failures: "FailureGroups"
+    failures: FailureGroups
     states: Counter[str] = field(default_factory=Counter)
     bands: dict[str, list[tuple[str, float | None, float]]] = field(default_factory=dict)
     """(status, median residual in px if it is known, seconds) of the pairs of each band."""
-    useful: bool = False
-    """At least one band pair is aligned or predicted."""
     radiometry: Counter[str] = field(default_factory=Counter)
     """Number of captures by the quantity that raw numbers were converted to."""
 
     def add(self, report: "CaptureReport") -> None:
         """Add the report of a capture."""
         self.states[report.state] += 1
-        self.useful |= report.useful
         self.good &= report.good
         if report.result is None:
             return
@@ -145,22 +125,21 @@ class RunTotals:
 
 
 def run(
-    flight: "FolderScan",
+    flight: FolderScan,
     out: Path,
-    settings: "Settings",
+    settings: Settings,
     terminal: Terminal,
-    options: "RunOptions",
+    options: RunOptions,
     *,
     dask: str | None = None,
     model: Path | None = None,
-    each: "Callable[[CaptureReport], object]" = lambda _: None,
+    each: Callable[["CaptureReport"], object] = lambda _: None,
 ) -> RunTotals:
     """Align the captures, print progress, and return the totals.
 
     Raises OutputError or WorkerError if no capture could be processed.
     """
     from agalign.batch import Listener, run_flight
-    from agalign.products.report.facts import FailureGroups
 
     totals, pace = RunTotals(not flight.problems, FailureGroups()), _Pace()
     started = time.monotonic()
@@ -174,7 +153,7 @@ def run(
         def show(share: float, text: str) -> None:
             show_line(totals.states.total(), share, text, pace.of(totals.states))
 
-        def on_start(capture: "Capture") -> None:
+        def on_start(capture: Capture) -> None:
             nonlocal current
             terminal.check()
             current = capture
@@ -218,8 +197,6 @@ def run(
 
 def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
     """Write report and summary; return False if that fails, or if a sidecar cannot be read."""
-    from agalign.products.report import pages_exist, write_pages
-
     problems: list[str] = []
     try:
         if changed or not pages_exist(out):
@@ -231,17 +208,13 @@ def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
     return not problems
 
 
-@contextmanager
-def cluster(dask: str | None, jobs: int, timeout_s: float | None = None) -> "Iterator[Executor | None]":
+def cluster(dask: str | None, jobs: int, timeout_s: float | None = None) -> AbstractContextManager[Executor | None]:
     """Connect to a Dask cluster if its address is given."""
-    from agalign.batch.workers import dask_executor
-
-    with nullcontext() if dask is None else dask_executor(dask, jobs, timeout_s) as executor:
-        yield executor
+    return nullcontext() if dask is None else dask_executor(dask, jobs, timeout_s)
 
 
 @contextmanager
-def progress(terminal: Terminal, captures: int) -> "Iterator[Callable[[int, float, str, str], None]]":
+def progress(terminal: Terminal, captures: int) -> Iterator[Callable[[int, float, str, str], None]]:
     """Show a progress line on a terminal; yield the function that updates it.
 
     Its arguments are the number of finished captures, the finished share of the current one, a description, and a rate.
@@ -305,23 +278,19 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
     if report.result is None:
         terminal.event("capture", capture=report.label, state=report.state, seconds=round(report.seconds, 3))
         return
-    pairs = [b for b in report.result.bands if b.status != "reference"]
-    if terminal.verbose or terminal.log_json or not terminal.err.is_terminal:
-        _print_capture(report, report.result, pairs, terminal, heading)
-    if terminal.verbose or terminal.log_json:
-        for band in pairs:
-            _print_pair(report.label, band, terminal)
+    _print_capture(report, report.result, heading, terminal)
 
 
-def _print_capture(
-    report: "CaptureReport", result: "CaptureResult", pairs: "Sequence[BandResult]", terminal: Terminal, heading: str
-) -> None:
+def _print_capture(report: "CaptureReport", result: CaptureResult, heading: str, terminal: Terminal) -> None:
+    pairs = [b for b in result.bands if b.status != "reference"]
     aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
     also = f", {predicted} predicted" if predicted else ""
     how = "kept from an earlier run" if report.state == "kept" else f"{report.seconds:.1f} s"
+    # On a terminal, the progress line suffices.
+    is_printed = terminal.verbose or not terminal.err.is_terminal
     terminal.event(
         "capture",
-        f"{heading}: {aligned} of {len(pairs)} aligned{also}, {how}",
+        f"{heading}: {aligned} of {len(pairs)} aligned{also}, {how}" if is_printed else "",
         capture=report.label,
         state=report.state,
         status=result.status,
@@ -330,9 +299,12 @@ def _print_capture(
         pairs=len(pairs),
         seconds=round(report.seconds, 3),
     )
+    if terminal.verbose or terminal.log_json:
+        for band in pairs:
+            _print_pair(report.label, band, terminal)
 
 
-def _print_pair(capture: str, band: "BandResult", terminal: Terminal) -> None:
+def _print_pair(capture: str, band: BandResult, terminal: Terminal) -> None:
     residual = band.metrics.after.residual_px if band.metrics else None
     measured = "" if residual is None else f", residual {residual:.3f} px"
     terminal.event(
@@ -351,24 +323,26 @@ def _print_pair(capture: str, band: "BandResult", terminal: Terminal) -> None:
 
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
+    counts = Counter(status for pairs in totals.bands.values() for status, _, _ in pairs)
     if totals.bands:
-        _print_table(totals, terminal)
+        _print_table(totals, f"{counts['aligned']} of {counts.total()} band pairs aligned", terminal)
     explain(totals.failures.groups(), terminal)
     for quantity, count in totals.radiometry.items():
-        terminal.result(shown(f"Written as {quantity}: {counted(count, 'capture')}"))
-    terminal.result(shown(f"Report: {out / 'index.html'}"))
+        terminal.result(f"Written as {quantity}: {counted(count, 'capture')}")
+    terminal.result(f"Report: {out / REPORT_FILE}")
     if totals.states and set(totals.states) <= {"panel", "sky"}:
         or_sky = " or the sky" if totals.states["sky"] else ""
         terminal.problem(f"all captures show calibration panels{or_sky}; --align-panels aligns them like any other")
-        return EXIT_NOTHING
-    if not totals.useful:
+        return ExitCode.NOTHING
+    if not counts["aligned"] + counts["predicted"]:
         terminal.problem("no band pair could be aligned" if totals.bands else "no capture could be processed")
-        return EXIT_PARTIAL if totals.bands else EXIT_NOTHING
-    return EXIT_OK if totals.good else EXIT_PARTIAL
+        return ExitCode.PARTIAL if totals.bands else ExitCode.NOTHING
+    return ExitCode.OK if totals.good else ExitCode.PARTIAL
 
 
-def explain(failures: "Sequence[FailureGroup]", terminal: Terminal) -> None:
+def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:
     """Print each group of failures: number of bands, cause, captures, and remedy."""
+    max_named = 3
     for group in failures:
         status, first = group.status.replace("_", " "), group.bands[0]
         if len(group.bands) == 1:
@@ -377,8 +351,8 @@ def explain(failures: "Sequence[FailureGroup]", terminal: Terminal) -> None:
             bands, captures = counted(len(group.bands), "band"), counted(group.captures, "capture")
             text = f"{status}: {bands} of {captures}: {group.remedy.cause}"
             names = [f"{b.capture} {b.band}" for b in group.bands]
-            more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
-            named = [f"{', '.join(names[:_MAX_NAMED])}{more}: {first.reason}"]
+            more = f" and {len(names) - max_named} more" if len(names) > max_named else ""
+            named = [f"{', '.join(names[:max_named])}{more}: {first.reason}"]
         terminal.problem(
             text,
             (*named, f"try: {group.advice}"),
@@ -389,11 +363,8 @@ def explain(failures: "Sequence[FailureGroup]", terminal: Terminal) -> None:
         )
 
 
-def _print_table(totals: RunTotals, terminal: Terminal) -> None:
+def _print_table(totals: RunTotals, title: str, terminal: Terminal) -> None:
     """Print a row per band: number of pairs by status, residuals, time."""
-    from statistics import median
-
-    counts = Counter(status for pairs in totals.bands.values() for status, _, _ in pairs)
     headers = ("Band", "Aligned", "Predicted", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair")
     rows = []
     for name, pairs in totals.bands.items():
@@ -402,5 +373,4 @@ def _print_table(totals: RunTotals, terminal: Terminal) -> None:
         numbers = [str(of_band[status]) for status in ("aligned", "predicted", "seed_only", "failed")]
         numbers += [f"{median(known):.3f}", f"{max(known):.3f}"] if known else ["-", "-"]
         rows.append((name, *numbers, f"{median(seconds for _, _, seconds in pairs):.1f}"))
-    title = f"{counts['aligned']} of {counts.total()} band pairs aligned"
     terminal.table(headers, rows, title, texts=1)

@@ -9,9 +9,10 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from enum import IntEnum
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,20 +22,23 @@ from agalign.values.text import harmless
 if TYPE_CHECKING:
     from rich.console import Console
 
-EXIT_OK, EXIT_NOTHING, EXIT_USAGE, EXIT_PARTIAL = 0, 1, 2, 3
-_SIGNAL_EXIT_CODE = 128
-"""Added to the number of the signal that ended the program, as shells do: 130 for SIGINT, 143 for SIGTERM."""
-_PLAIN_WIDTH = 160
 MAX_LISTED = 10
 """Maximum number of listed problems of one kind."""
-INTERRUPTED = "interrupted; finished captures are kept, and the same command resumes the run"
 RAW_NUMBERS = (
     "the bands are raw numbers, not reflectance: their indices are not comparable between captures or cameras, and are "
     "far from the indices of reflectance; align with --radiometry auto where the camera's tags allow it"
 )
-_OUT_OF_MEMORY = "out of memory; close other programs or try a smaller image"
-_STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
-"""Signals that end the program; not every system has all of them."""
+
+
+class ExitCode(IntEnum):
+    """What a command returns to the shell."""
+
+    OK = 0
+    NOTHING = 1
+    USAGE = 2
+    PARTIAL = 3
+    SIGNAL = 128
+    """Added to the number of the signal that ended the program, as shells do: 130 for SIGINT, 143 for SIGTERM."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -76,13 +80,23 @@ def _console(**options: Any) -> "Console":
 
 
 class Terminal:
-    """Prints results to standard output, progress and problems to standard error."""
+    """Prints results to standard output, progress and problems to standard error; its parameters are options of all
+    commands that list them.
+    """
 
-    def __init__(self, *, quiet: bool = False, verbose: bool = False, log_json: bool = False) -> None:
+    def __init__(
+        self,
+        *,
+        quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print problems only.")] = False,
+        verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line per band pair.")] = False,
+        log_json: Annotated[
+            bool, typer.Option("--log-json", help="Print one JSON object per line to standard error.")
+        ] = False,
+    ) -> None:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
         self._stopped_by: int | None = None
         # Lines in a file or a pipe are not wrapped to a terminal's width.
-        self.out = _console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
+        self.out = _console(width=None if sys.stdout.isatty() else 160)
         self.err = _console(stderr=True, soft_wrap=not sys.stderr.isatty())
 
     def event(self, kind: str, text: str = "", /, **fields: Any) -> None:
@@ -105,10 +119,14 @@ class Terminal:
         for line in more:
             self.err.print(f"    {shown(line)}")
 
-    def result(self, thing: Any) -> None:
+    def result(self, text: str) -> None:
         """Print a result to standard output, unless --quiet or --log-json."""
         if not self.quiet and not self.log_json:
-            self.out.print(thing)
+            self.out.print(shown(text))
+
+    def facts(self, facts: Mapping[str, Any]) -> None:
+        """Print the result of a command with --json to standard output."""
+        typer.echo(json.dumps(facts, indent=1))
 
     def table(
         self, headers: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None, texts: int = 99
@@ -121,7 +139,8 @@ class Terminal:
             table.add_column(name, justify="right")
         for row in rows:
             table.add_row(*map(shown, row))
-        self.result(table)
+        if not self.quiet and not self.log_json:
+            self.out.print(table)
 
     def check(self) -> None:
         """Raise Stopped if a signal has requested the end: an exception from a signal handler is lost in callbacks of C
@@ -136,13 +155,13 @@ class Terminal:
 
         def stop(number: int, _frame: object) -> None:
             if self._stopped_by is not None:
-                os._exit(_SIGNAL_EXIT_CODE + number)
+                os._exit(ExitCode.SIGNAL + number)
             self._stopped_by = number
             raise Stopped(number)
 
         before = {}
         if threading.current_thread() is threading.main_thread():
-            for name in _STOP_SIGNALS:
+            for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):  # not every system has all of them
                 number = getattr(signal, name, None)
                 # With nohup, SIGHUP stays ignored.
                 if number is not None and (name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN):
@@ -173,7 +192,7 @@ def exits(terminal: Terminal, on_interrupt: str = "interrupted") -> Iterator[Non
         if code is None:
             raise
         with suppress(OSError):  # standard error may be a file on a full disk
-            if terminal.verbose and code == EXIT_NOTHING and not isinstance(error, AgalignError):
+            if terminal.verbose and code == ExitCode.NOTHING and not isinstance(error, AgalignError):
                 from rich.markup import escape
 
                 terminal.err.print(escape(traceback.format_exc()))
@@ -184,23 +203,24 @@ def exits(terminal: Terminal, on_interrupt: str = "interrupted") -> Iterator[Non
 def _exit_code(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:
     """Return (exit code, message) for an exception; no code for exceptions that are not caught."""
     match error:
-        case Stopped():
-            return _SIGNAL_EXIT_CODE + error.number, on_interrupt
         case KeyboardInterrupt():
-            return _SIGNAL_EXIT_CODE + signal.SIGINT, on_interrupt
+            number = error.number if isinstance(error, Stopped) else signal.SIGINT
+            return ExitCode.SIGNAL + number, on_interrupt
         case ConfigurationError():
-            return EXIT_USAGE, str(error)
+            return ExitCode.USAGE, str(error)
         case AgalignError():
-            return EXIT_NOTHING, str(error)
+            text = str(error)
         case _ if is_out_of_memory(error):
-            return EXIT_NOTHING, _OUT_OF_MEMORY
+            text = "out of memory; close other programs or try a smaller image"
         case ImportError():
-            return EXIT_NOTHING, f"a library cannot be loaded ({error}); is memory short, or the installation damaged?"
+            text = f"a library cannot be loaded ({error}); is memory short, or the installation damaged?"
         case OSError():
-            return EXIT_NOTHING, f"{error.filename or 'output'}: {error.strerror or error}"
+            text = f"{error.filename or 'output'}: {error.strerror or error}"
         case Exception():
-            return EXIT_NOTHING, f"agalign failed ({type(error).__name__}: {error}); please report this"
-    return None, ""
+            text = f"agalign failed ({type(error).__name__}: {error}); please report this"
+        case _:
+            return None, ""
+    return ExitCode.NOTHING, text
 
 
 @contextmanager
@@ -219,4 +239,4 @@ def printed() -> Iterator[None]:
         except OSError as error:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             print(f"agalign: standard output: {error.strerror}", file=sys.stderr)
-            raise SystemExit(EXIT_NOTHING) from None
+            raise SystemExit(ExitCode.NOTHING) from None

@@ -15,9 +15,6 @@ from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
-_HPATCHES_LEVELS = {2: "easy", 3: "easy", 4: "hard", 5: "hard", 6: "tough"}
-"""Difficulty by the number of the second image."""
-
 
 @dataclass(frozen=True)
 class PairFiles:
@@ -54,12 +51,13 @@ def find_pairs(source: Path) -> list[PairFiles]:
 
 
 def _from_folder(folder: Path) -> Iterator[PairFiles]:
+    levels = {2: "easy", 3: "easy", 4: "hard", 5: "hard"}
     for path in sorted([*folder.glob("H_1_*"), *folder.glob("H1to*p")]):
         number = int(re.sub(r"\D", "", path.name.removeprefix("H_1_").removeprefix("H1to")) or 0)
         hpatches = path.name.startswith("H_")
         fixed, moving = (_image(folder, str(k) if hpatches else f"img{k}") for k in (1, number))
         kind = {"i": "illumination", "v": "viewpoint"}.get(folder.name.partition("_")[0]) if hpatches else None
-        group = f"{kind}, {_HPATCHES_LEVELS.get(number, 'tough')}" if kind else folder.name
+        group = f"{kind}, {levels.get(number, 'tough')}" if kind else folder.name
         yield PairFiles(f"{folder.name} 1-{number}", group, fixed, moving, _read_homography(path))
 
 

@@ -31,8 +31,6 @@ from agalign.values.alignment import Alignment
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedImagePx
 
-_MIN_KEYPOINTS = 2
-
 
 @dataclass(frozen=True)
 class _Example:
@@ -78,8 +76,9 @@ def _example(state: JointState, pair: BandPair, fixed_to_moving: Matrix) -> _Exa
     level = state.level(ImageGroup.of_one(pair.fixed, pair.moving, fixed_to_moving), 1.0, [0])
     keypoints = sift_keypoints(pair.fixed)
     keypoints = visible_in_both(keypoints, fixed_to_moving, pair.fixed, pair.moving)
-    if len(keypoints) < _MIN_KEYPOINTS:
-        raise NotEnoughTextureError(len(keypoints), _MIN_KEYPOINTS)
+    minimum = 2
+    if len(keypoints) < minimum:
+        raise NotEnoughTextureError(len(keypoints), minimum)
     return _Example(level, level.homography(fixed_to_moving, 0), keypoints.to(state.device))
 
 

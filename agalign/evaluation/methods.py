@@ -177,15 +177,12 @@ def _from_patches(task: PairTask, side: int, describe_patches: Callable[[Tensor]
     return Outcome(describe)
 
 
-_MARGIN_SHARE = 8
-"""SIFT's outer cells extend beyond the edge of a patch by an eighth of its side."""
-
-
 def _mosaic(patches: Tensor) -> tuple[NDArray[np.float32], int, int]:
     """Return (image, its columns, side of a cell): patches (N, 1, P, P) row by row in one image for OpenCV and
     scikit-image, each padded with its edge values.
     """
-    padded = functional.pad(patches, [patches.shape[-1] // _MARGIN_SHARE] * 4, mode="replicate")
+    margin = patches.shape[-1] // 8  # SIFT's outer cells extend beyond the edge of a patch by an eighth of its side
+    padded = functional.pad(patches, [margin] * 4, mode="replicate")
     columns = max(1, math.ceil(math.sqrt(len(patches))))
     rows = max(1, math.ceil(len(patches) / columns))
     side = padded.shape[-1]

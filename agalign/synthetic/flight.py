@@ -25,10 +25,8 @@ from agalign.values.geometry import Points
 from agalign.values.mapping import splined
 
 ALTITUDE_M = 22.0, 34.0
-_TIES, _TIES_OVER_RELIEF = (25, 19), (65, 49)
 _CAPTURES_PER_GROUND = 4
 """Captures over one painted ground; longer flights have several grounds, one in memory at a time."""
-_WARMEST_C, _HEAT_NOISE_C = 50.0, 0.05
 VIGNETTING = 0.35
 """Relative decrease of the light from the centre to the corners."""
 
@@ -99,15 +97,14 @@ def _write(
     """Write captures after `before` others over other grounds, and return their ground truth."""
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
-    grounds = {id(shot.ground): shot.ground for shot in shots}
     for band in camera.bands:
-        painted: tuple[int, Field] | None = None
+        ground: Ground | None = None
         for number, shot in enumerate(shots, start=before + 1):
-            if painted is None or painted[0] != id(shot.ground):
-                painted = id(shot.ground), reflectance(grounds[id(shot.ground)], band)
+            if shot.ground is not ground:
+                ground, painted = shot.ground, reflectance(shot.ground, band)
             spoil = shot.spoil if shot.spoilt is None or band.name in shot.spoilt else None
-            light = painted[1] if band.sees == "heat" else painted[1] * np.float32(shot.sun * shot.shutter)
-            pixels = render(light, shot.ground, band, shot.pose, size_px, rng, spoil)
+            light = painted if band.sees == "heat" else painted * np.float32(shot.sun * shot.shutter)
+            pixels = recorded(view(light, shot.ground, band, shot.pose, size_px), band, rng, spoil)
             if band.name not in shot.without:
                 path = images / camera.file_name(band, number)
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -158,7 +155,8 @@ def true_ties(
     ground: Ground, reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]
 ) -> list[list[float]]:
     """Return tie points [x_ref, y_ref, x_mov, y_mov], raw px, on a lattice, if both points are inside their images."""
-    fixed_px = geometry.lattice(*reference.size_px(size_px), *(_TIES if ground.height_m is None else _TIES_OVER_RELIEF))
+    columns_rows = (25, 19) if ground.height_m is None else (65, 49)
+    fixed_px = geometry.lattice(*reference.size_px(size_px), *columns_rows)
     position, rays = place_and_rays(band, pose, size_px)
     points_m = on_ground(ground, reference, pose, size_px, fixed_px)
     # Project the points on the ground into the band.
@@ -191,26 +189,14 @@ def view(painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tu
     return np.asarray(image, np.float32)
 
 
-def render(
-    painted: Field,
-    ground: Ground,
-    band: BandSpec,
-    pose: Pose,
-    size_px: tuple[int, int],
-    rng: np.random.Generator,
-    spoil: Spoil | None = None,
-) -> NDArray[np.uint16]:
-    """Return the sensor values (height, width) of a ground painted in the band, as `recorded`."""
-    return recorded(view(painted, ground, band, pose, size_px), band, rng, spoil)
-
-
 def recorded(scene: Field, band: BandSpec, rng: np.random.Generator, spoil: Spoil | None = None) -> NDArray[np.uint16]:
     """Return the sensor values (height, width) for a view of reflectances, with vignetting and noise; for heat,
     hundredths of a kelvin.
     """
     if band.sees == "heat":
-        celsius = _WARMEST_C * (scene if spoil is None else spoil(scene, rng))
-        celsius = celsius + rng.normal(0, _HEAT_NOISE_C, scene.shape)
+        warmest_c, noise_c = 50.0, 0.05
+        celsius = warmest_c * (scene if spoil is None else spoil(scene, rng))
+        celsius = celsius + rng.normal(0, noise_c, scene.shape)
         return np.asarray(np.rint(100 * (celsius + 273.15)).astype(np.uint16))
     height, width = scene.shape
     y, x = np.arange(height), np.arange(width)

@@ -15,14 +15,6 @@ from agalign.values.geometry import Points
 
 Field = NDArray[np.float32]
 
-_TERRACE_M = 8.0
-_FINE_GRAINS_M, _MIN_GRAIN_PX = (0.02, 0.005), 3.0
-"""Sizes of clods and leaves, which are painted if their images have at least `_MIN_GRAIN_PX`."""
-_RAY_STEPS = 40
-"""Iterations for the intersection of a ray with the relief, each with the height below the previous point."""
-_MAP_PX_PER_IMAGE_PX = 1.25
-"""Resolution of the painted ground relative to the images, in which its pixels must not be visible."""
-
 
 @dataclass(frozen=True)
 class Ground:
@@ -49,7 +41,9 @@ def paint_ground(
     """Return a ground with parcels, rows, tracks and trees, large and fine enough for all bands at all poses."""
     focal = FOCAL_LENGTH_MM * PIXELS_PER_MM * size_px[0] / 1280
     lowest, highest = min(p.altitude_m for p in poses), max(p.altitude_m for p in poses)
-    metres_per_px = lowest / focal / camera.sharpest / _MAP_PX_PER_IMAGE_PX
+    # The pixels of the ground must not be visible in the images.
+    map_px_per_image_px = 1.25
+    metres_per_px = lowest / focal / camera.sharpest / map_px_per_image_px
     seen_m = 0.62 * highest * np.hypot(*size_px) / focal * camera.widest
     radius_m = max(np.hypot(p.east_m, p.north_m) for p in poses) + seen_m
     side = 2 * int(np.ceil(radius_m / metres_per_px))
@@ -73,8 +67,10 @@ def paint_ground(
     ruts = np.clip(1.5 - np.abs(edge - 0.18 * metre) / (0.05 * metre), 0, 1)
     brightness = 1 + 0.22 * _noise(rng, side, 2.5 * metre) + 0.16 * _noise(rng, side, 0.08 * metre)
     vigour = 0.5 * _noise(rng, side, 3 * metre) + 0.45 * _noise(rng, side, 0.12 * metre)
-    for grain_m in _FINE_GRAINS_M:
-        if grain_m * metre >= _MIN_GRAIN_PX:
+    # Clods and leaves are painted if they are large enough in the images.
+    min_grain_px = 3.0
+    for grain_m in (0.02, 0.005):
+        if grain_m * metre >= min_grain_px:
             brightness = brightness + 0.12 * _noise(rng, side, grain_m * metre)
             vigour = vigour + 0.3 * _noise(rng, side, grain_m * metre)
     brightness = np.clip(brightness + 0.25 * (edge < 0.35 * metre) - 0.3 * ruts, 0.3, 2.2)
@@ -107,7 +103,9 @@ def on_ground(ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, in
     direction = np.concatenate([undistorted, np.ones_like(undistorted[..., :1])], axis=-1) @ rays.T
     down = np.zeros(direction.shape[:-1])
     seen = place + direction * ((down - place[2]) / direction[..., 2])[..., None]
-    for _ in range(0 if ground.height_m is None else _RAY_STEPS):
+    # Intersect the rays with the relief: each step uses the height below the previous point.
+    steps = 40
+    for _ in range(0 if ground.height_m is None else steps):
         at = map_px(ground, seen[..., :2]).astype(np.float32).reshape(len(seen), -1, 2)
         height = cv2.remap(ground.height_m, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         down = -height.reshape(down.shape).astype(np.float64)
@@ -125,8 +123,8 @@ def _relief(rng: np.random.Generator, tree: Field, metre: float, relief_m: float
 
     Slopes are gentle enough to cause no occlusions, which cannot be aligned.
     """
-    angle = rng.uniform(0, np.pi)
-    axis = np.arange(len(tree)) / (_TERRACE_M * metre)
+    angle, terrace_m = rng.uniform(0, np.pi), 8.0
+    axis = np.arange(len(tree)) / (terrace_m * metre)
     along = np.cos(angle) * axis[None, :] + np.sin(angle) * axis[:, None]
     slope = np.clip((along % 1 - 0.4) / 0.6, 0, 1)
     level = np.floor(along) + slope * slope * (3 - 2 * slope)

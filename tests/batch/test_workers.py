@@ -17,13 +17,14 @@ import pytest
 
 import agalign
 from agalign.batch import RunOptions, dask_executor, run_flight, workers
-from agalign.batch.capture import Task, start_worker
+from agalign.batch.capture import Task
 from agalign.batch.report import CaptureReport
 from agalign.batch.run import Listener, capture_reports
 from agalign.batch.workers import DaskExecutor, Run, in_order, on_executor, own_processes
 from agalign.cameras.discover import discover
 from agalign.config import SeedSettings, Settings
 from agalign.errors import ConfigurationError, WorkerError
+from agalign.method.device import limit_threads
 from agalign.products.sidecar import CaptureResult
 from agalign.products.sidecar_file import find_sidecars, read_result
 
@@ -97,7 +98,7 @@ def kill_and_read(mark: Path, times: int, number: int) -> Settings:
 @pytest.mark.full
 def test_a_process_killed_once_costs_no_capture(flight: Path, tmp_path: Path) -> None:
     tasks = seeds_only(flight, tmp_path)
-    with own_processes(1, start_worker) as run:
+    with own_processes(1, limit_threads) as run:
         reports = reports_of(run, tasks * 2)
         states = [next(reports).state]
         (worker,) = (c for c in psutil.Process().children(recursive=True) if c.ppid() != os.getpid())
@@ -118,7 +119,7 @@ def test_a_process_that_is_killed_twice_or_stopped_costs_its_capture(
 ) -> None:
     capture, *others = seeds_only(flight, tmp_path)
     deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", times, number))
-    with own_processes(1, start_worker, timeout_s=timeout_s) as run:
+    with own_processes(1, limit_threads, timeout_s=timeout_s) as run:
         reports = {r.label: r for r in reports_of(run, [deadly, *others])}
     lost = reports.pop(capture.capture.label)
     assert (lost.state, lost.error) == ("error", error)
@@ -127,16 +128,16 @@ def test_a_process_that_is_killed_twice_or_stopped_costs_its_capture(
 
 def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(tmp_path: Path) -> None:
     """The first argument takes longest; the loss of a worker twice, as by a lack of memory, is one line."""
-    with own_processes(2, start_worker) as run:
+    with own_processes(2, limit_threads) as run:
         assert list(in_order(run, sleep, [0.6, 0.0, 0.1])) == [0.6, 0.0, 0.1]
     with ThreadPoolExecutor(2) as threads:
         assert list(in_order(on_executor(threads), sleep, [0.3, 0.0, 0.1])) == [0.3, 0.0, 0.1]
     with (
-        own_processes(1, start_worker) as run,
+        own_processes(1, limit_threads) as run,
         pytest.raises(WorkerError, match="the flight cannot be learned: its worker process"),
     ):
         list(in_order(run, partial(signal_self, number=signal.SIGKILL, times=2), [tmp_path / "mark"]))
-    with own_processes(1, start_worker) as run, pytest.raises(MemoryError):
+    with own_processes(1, limit_threads) as run, pytest.raises(MemoryError):
         list(in_order(run, without_memory, [0]))
 
 
@@ -155,9 +156,10 @@ def test_an_executor_that_loses_its_processes_costs_the_captures(
 
 
 def test_a_capture_that_takes_too_long_ends_its_process_on_a_cluster() -> None:
-    code = "import time; from agalign.batch.workers import _within; _within(0.3, time.sleep, 60)"
+    call = f"_on_worker({agalign.__version__!r}, 0.3, time.sleep, 60)"
+    code = f"import time; from agalign.batch.workers import _on_worker; {call}"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 75
-    assert workers._within(30, max, 1, 2) == 2
+    assert workers._on_worker(agalign.__version__, 30, max, 1, 2) == 2
 
 
 class Client:
@@ -187,9 +189,9 @@ def test_a_dask_worker_without_this_version_is_refused(answer: object, problem: 
     with pytest.raises(ConfigurationError, match=problem):
         workers._check_versions(Client({"tcp://a:1": agalign.__version__, "tcp://b:1": answer}))
     workers._check_versions(Client({"tcp://a:1": agalign.__version__}))
-    assert workers._on_worker(agalign.__version__, max, 1, 2) == 2
+    assert workers._on_worker(agalign.__version__, None, max, 1, 2) == 2
     with pytest.raises(ConfigurationError, match=r"^a Dask worker has agalign .*; install agalign 0\.0\.9 there$"):
-        workers._on_worker("0.0.9", max, 1, 2)
+        workers._on_worker("0.0.9", None, max, 1, 2)
 
 
 def test_a_dask_scheduler_without_workers_is_reported(caplog: pytest.LogCaptureFixture) -> None:

@@ -10,6 +10,7 @@ from synthetic_flights.aligned import make_aligned
 from typer.testing import CliRunner
 
 import agalign
+from agalign.cli import align as cli_align
 from agalign.cli import main
 from agalign.cli import run as cli_run
 from agalign.cli.main import app
@@ -32,8 +33,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
         result.append((found.pop(), settings))
         raise SystemExit(0)
 
-    for name, replacement in (("find_captures", find), ("run", run), ("load_ahead", lambda: None)):
-        monkeypatch.setattr(cli_run, name, replacement)
+    monkeypatch.setattr(cli_run, "find_captures", find)
+    monkeypatch.setattr(cli_run, "run", run)
+    monkeypatch.setattr(cli_align, "load_ahead", lambda: None)
     return result
 
 

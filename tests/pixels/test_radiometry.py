@@ -57,7 +57,7 @@ def test_reflectance_of_the_synthetic_flight_is_the_truth(images: Path) -> None:
         band = by(images / f"IMG_0001_{spec.rig_index + 1}.tif", "sun")
         assert band.radiometry.quantity == "reflectance"
         bright = np.full_like(ground.crop, 0.3 * max(spec.soil, spec.crop))
-        raw = synthetic.render(bright, ground, spec, pose, (320, 240), rng)
+        raw = synthetic.recorded(synthetic.view(bright, ground, spec, pose, (320, 240)), spec, rng)
         result = calibrated(raw, band.radiometry, 0, 0)
         np.testing.assert_allclose(np.median(result), bright[0, 0], rtol=0.01)
         # Vignetting is removed: the corners are as bright as the centre.
