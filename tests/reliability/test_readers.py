@@ -164,9 +164,7 @@ def model_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @ANY_FILE
 @given(edits=EDITS, cut=st.floats(0.0, 1.0))
-def test_any_damage_to_a_model_is_seen(
-    model_bytes: bytes, tmp_path: Path, edits: list[tuple[float, int]], cut: float
-) -> None:
+def test_any_damaged_model(model_bytes: bytes, tmp_path: Path, edits: list[tuple[float, int]], cut: float) -> None:
     path = tmp_path / "m.safetensors"
     for data in (edited(model_bytes, edits), model_bytes[: int(cut * (len(model_bytes) - 1))]):
         path.write_bytes(data)
