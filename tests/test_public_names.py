@@ -100,5 +100,5 @@ def test_every_setting_has_an_option() -> None:
     stages = {stage: type(value) for stage, value in vars(Settings()).items()}
     settings = {f"{stage}.{name}" for stage, fields in stages.items() for name in fields.model_fields}
     settings.remove("flight.start")  # the fingerprint of a given model: set by the run
-    assert settings == set(re.findall(r"\| `(\w+\.\w+)`", text))
+    assert settings == set(re.findall(r"\| `([a-z_]+\.[a-z_]+)`", text))
     assert 15 < len(settings) <= 30

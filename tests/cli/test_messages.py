@@ -18,15 +18,8 @@ from agalign.flight.groups import camera_overviews
 from agalign.method.device import choose_device
 from agalign.synthetic import flight as synthetic
 
-from ..conftest import textured_image
+from ..conftest import write_capture
 from ..program import agalign_here
-
-
-def write_bands(folder: Path, suffix: str = ".tif", capture: str = "IMG_0001") -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    image = (textured_image(160, 120, 1) * 30 + 128).clip(0, 255).astype(np.uint8)
-    for band in ("red", "green", "nir"):
-        cv2.imwrite(str(folder / f"{capture}_{band}{suffix}"), image)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +108,7 @@ def test_a_folder_without_images_names_what_there_is(tmp_path: Path) -> None:
 
 
 def test_an_unreadable_file_is_shown_as_missing(tmp_path: Path) -> None:
-    write_bands(tmp_path)
+    write_capture(tmp_path, "red", "green", "nir", name="IMG_0001")
     (tmp_path / "IMG_0001_nir.tif").write_bytes(b"II*\0broken")
     done = agalign_here("info", tmp_path)
     assert done.returncode == 3
@@ -145,8 +138,8 @@ def test_info_begins_with_the_cameras(tmp_path: Path) -> None:
 
 
 def test_globs_choose_files(tmp_path: Path) -> None:
-    write_bands(tmp_path / "a" / "test")
-    write_bands(tmp_path / "b")
+    write_capture(tmp_path / "a" / "test", "red", "green", "nir", name="IMG_0001")
+    write_capture(tmp_path / "b", "red", "green", "nir", name="IMG_0001")
     chosen = discover(tmp_path, DiscoverOptions(exclude=("*/test/*", "*_red.*")))
     assert [c.label for c in chosen.captures] == ["b/IMG_0001"]
     assert [b.name for b in chosen.captures[0].bands] == ["green", "nir"]

@@ -41,6 +41,12 @@ def test_local_scale_is_the_jacobian_determinant(matrix: np.ndarray) -> None:
     assert_allclose(geometry.local_scale(matrix, 101, 81)[4], np.sqrt(np.linalg.det(jacobian)), rtol=1e-5)
 
 
+def test_corner_error_is_the_worst_corner() -> None:
+    assert geometry.corner_error_px(np.eye(3), geometry.translation(3, 4), 100, 80) == pytest.approx(5)
+    stretched = np.diag([1.1, 1.0, 1.0])
+    assert geometry.corner_error_px(np.eye(3), stretched, 101, 80) == pytest.approx(10)
+
+
 def test_overlay_matches_the_outlines() -> None:
     np.testing.assert_allclose(geometry.overlay((100, 80), (100, 80)), np.eye(3))
     edges = geometry.apply(geometry.overlay((100, 80), (50, 40)), [[-0.5, -0.5], [99.5, 79.5]])
