@@ -38,8 +38,8 @@ def real_data() -> Path:
     return REAL_DATA
 
 
-hypothesis.settings.register_profile("short", max_examples=20)
-hypothesis.settings.register_profile("full", max_examples=150)
+hypothesis.settings.register_profile("short", max_examples=20, deadline=None)
+hypothesis.settings.register_profile("full", max_examples=150, deadline=None)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -34,7 +34,7 @@ from agalign.values.image import OutputGrid
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::UserWarning")]
 
-ANY_FILE = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+ANY_FILE = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=12)
 INFO = RasterInfo(1280, 960, ("uint16",), (None,), (None,), (None,), None, None)
 JSON = st.recursive(
