@@ -38,8 +38,8 @@ def real_data() -> Path:
     return REAL_DATA
 
 
-hypothesis.settings.register_profile("short", max_examples=20)
-hypothesis.settings.register_profile("full", max_examples=150)
+hypothesis.settings.register_profile("short", max_examples=20, deadline=None)
+hypothesis.settings.register_profile("full", max_examples=150, deadline=None)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -134,10 +134,13 @@ def save_known_model(path: Path, *, has_rig: bool = True) -> None:
 
 
 def write_band(path: Path, pixels: np.ndarray, **profile: object) -> None:
+    """Write a TIFF file of one band (height, width), or of several (bands, height, width)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    shape = {"driver": "GTiff", "width": pixels.shape[1], "height": pixels.shape[0], "count": 1, "dtype": pixels.dtype}
+    planes = pixels if pixels.ndim == 3 else pixels[None]
+    count, height, width = planes.shape
+    shape = {"driver": "GTiff", "width": width, "height": height, "count": count, "dtype": pixels.dtype}
     with rasterio.open(path, "w", **{**shape, **profile}) as dataset:
-        dataset.write(pixels, 1)
+        dataset.write(planes)
 
 
 GAINS = {"green": 900, "red": 500, "nir": 700}

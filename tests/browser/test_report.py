@@ -83,6 +83,17 @@ def drawn(page: Any) -> np.ndarray:
     return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.int32)
 
 
+def press_on_slider(page: Any, key: str) -> None:
+    """Home shows the aligned bands, End those before."""
+    page.locator("#swipe").focus()
+    page.keyboard.press(key)
+
+
+def show_one_band(page: Any) -> None:
+    for channel in ("Red", "Green", "Blue"):
+        page.get_by_label(f"{channel} channel").select_option("Blue")
+
+
 def look_at(page: Any, label: str) -> None:
     page.locator("#table tbody th a", has_text=label).click()
     page.wait_for_function("label => document.querySelector('#capture-title').textContent.includes(label)", arg=label)
@@ -110,8 +121,7 @@ def test_only_the_capture_that_is_looked_at_is_loaded(browser: Any, out: Path) -
 def test_the_slider_moves_the_picture(page: Any) -> None:
     look_at(page, "IMG_0001")
     middle = drawn(page)
-    page.locator("#swipe").focus()
-    page.keyboard.press("Home")
+    press_on_slider(page, "Home")
     after = drawn(page)
     page.keyboard.press("End")
     before = drawn(page)
@@ -140,8 +150,7 @@ def test_after_the_bands_agree(page: Any) -> None:
         steps = np.diff(image.astype(float), axis=1)
         return float(np.abs(steps - steps.mean(axis=2, keepdims=True)).mean() / np.abs(steps).mean())
 
-    page.locator("#swipe").focus()
-    page.keyboard.press("Home")
+    press_on_slider(page, "Home")
     after = colour(drawn(page)[60:])
     page.keyboard.press("End")
     assert after < 0.8 * colour(drawn(page)[60:])
@@ -150,8 +159,7 @@ def test_after_the_bands_agree(page: Any) -> None:
 def test_any_three_bands(page: Any) -> None:
     look_at(page, "IMG_0001")
     first = drawn(page)
-    for channel in ("Red", "Green", "Blue"):
-        page.get_by_label(f"{channel} channel").select_option("Blue")
+    show_one_band(page)
     grey = drawn(page)[60:]
     assert np.abs(first[60:] - grey).mean() > 5
     # One band in all three channels has no colour.
@@ -201,14 +209,12 @@ def test_blinking_and_the_keys_of_the_picture(page: Any) -> None:
 @pytest.mark.parametrize("overlay", ["vectors", "heat", "error"])
 def test_what_is_laid_over_the_picture(page: Any, overlay: str) -> None:
     look_at(page, "IMG_0001")
-    page.locator("#swipe").focus()
-    page.keyboard.press("Home")
+    press_on_slider(page, "Home")
     bare = drawn(page)
     page.get_by_label("Overlay", exact=True).select_option(overlay)
     # The errors of this flight are small: what is laid over it for them is faint.
     assert (np.abs(drawn(page) - bare).max(axis=2) > (5 if overlay == "error" else 40)).sum() > 400
-    page.locator("#swipe").focus()
-    page.keyboard.press("End")
+    press_on_slider(page, "End")
     before = drawn(page)
     page.get_by_label("Overlay", exact=True).select_option("none")
     assert np.abs(drawn(page) - before).mean() < 0.3, "residuals are those of after"
@@ -216,10 +222,8 @@ def test_what_is_laid_over_the_picture(page: Any, overlay: str) -> None:
 
 def test_cells_of_the_heat_map_leave_no_seams(page: Any) -> None:
     look_at(page, "IMG_0001")
-    page.locator("#swipe").focus()
-    page.keyboard.press("Home")
-    for channel in ("Red", "Green", "Blue"):
-        page.get_by_label(f"{channel} channel").select_option("Blue")
+    press_on_slider(page, "Home")
+    show_one_band(page)
     grey = drawn(page)
     page.get_by_label("Overlay", exact=True).select_option("heat")
     # Of the picture, whose colours add up to a quarter, nothing else may show: no line twice as dark, none bare.
@@ -232,8 +236,7 @@ def test_cells_of_the_heat_map_leave_no_seams(page: Any) -> None:
 
 def test_an_index_over_the_picture_and_on_the_map(page: Any) -> None:
     look_at(page, "IMG_0001")
-    page.locator("#swipe").focus()
-    page.keyboard.press("Home")
+    press_on_slider(page, "Home")
     bare = drawn(page)
     page.get_by_label("Overlay", exact=True).select_option("index:ndvi")
     page.wait_for_timeout(300)
@@ -304,13 +307,9 @@ def test_the_relief_over_the_picture(browser: Any, out: Path, tmp_path: Path) ->
     page = browser.new_page(viewport={"width": 1100, "height": 900})
     page.goto((tmp_path / "index.html").as_uri())
     for name in "ab":
-        page.locator("#table tbody th a", has_text=name).click()
-        page.wait_for_function(
-            "label => document.querySelector('#capture-title').textContent.includes(label)", arg=name
-        )
+        look_at(page, name)
         page.get_by_label("Overlay", exact=True).select_option("relief")
-        page.locator("#swipe").focus()
-        page.keyboard.press("Home")
+        press_on_slider(page, "Home")
         image = drawn(page)  # blue, green, red
         far, near = (np.median(image[100:, half], axis=(0, 1)) for half in (slice(50, 300), slice(-300, -50)))
         assert far == pytest.approx((0.75 * 150, 0.75 * 35, 0.75 * 25), abs=8)

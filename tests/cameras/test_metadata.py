@@ -109,16 +109,6 @@ OTHER = {(NAMESPACE, "PrincipalPoint"): ("9", "8"), (NAMESPACE, "RigRelatives"):
 
 
 @pytest.mark.parametrize("dialect", ["attributes", "elements", "sequences"])
-def test_values_are_changed_in_the_form_they_have(dialect: str) -> None:
-    mine = Packet.parse(packet(VALUES, dialect))
-    mine.put((NAMESPACE, "PrincipalPoint"), ["1", "2"])
-    again = Packet.parse(mine.serialised()).values()
-    assert ",".join(again[NAMESPACE, "PrincipalPoint"]) == "1,2"
-    assert again[NAMESPACE, "BandName"] == ("Red",)
-    assert b"Camera:" in mine.serialised()
-
-
-@pytest.mark.parametrize("dialect", ["attributes", "elements", "sequences"])
 @pytest.mark.parametrize("theirs", ["attributes", "elements", "sequences"])
 def test_taking_anothers_values(dialect: str, theirs: str) -> None:
     mine = Packet.parse(packet(VALUES, dialect))

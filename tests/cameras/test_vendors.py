@@ -1,7 +1,7 @@
 """Every vendor's naming and tags, in every dialect of XMP, whole and damaged."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from agalign.cameras import rig_seed
+from agalign.cameras import other_rig_seed, rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, read_tags
@@ -18,6 +18,8 @@ from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.sentera import Sentera
 from agalign.cameras.tiff_directory import Entry, add_directories, byte_string, rational, short, text
+from agalign.capture.tag_seeds import seed_candidates
+from agalign.config import SeedSettings
 from agalign.pixels.raster import probe
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Capture
@@ -37,114 +39,73 @@ Values = Mapping[tuple[str, str], Sequence[str]]
 
 @dataclass(frozen=True)
 class Vendor:
-    """Files of one capture: name below the folder, band, and its XMP values."""
+    """A camera, and the names and XMP values of the files of one capture."""
 
     make: str
     model: str
-    files: Mapping[str, tuple[str, float, Values]]
-    names_without_xmp: frozenset[str]
+    capture: str
+    """The name of the capture."""
+    file: str
+    """The pattern of the names of its files."""
+    tags: Callable[[int], Values]
+    """XMP values of the band of this number."""
+    bands: Mapping[str, tuple[str, float]]
+    """{part of the file's name: (band, wavelength in nm)}."""
     orientation: int = 1
-    has_rig: bool = True
+
+    @property
+    def files(self) -> dict[str, tuple[str, float, Values]]:
+        """{file: (band, wavelength in nm, XMP values)}."""
+        return {
+            self.file.format(part=part, band=band, nm=nm): (band, nm, self.tags(k))
+            for k, (part, (band, nm)) in enumerate(self.bands.items(), start=1)
+        }
 
 
-def pinhole(k: int) -> Values:
-    return {
-        (NAMESPACE, "PrincipalPoint"): (f"{2.4 + 0.01 * k}", "1.8"),
-        (NAMESPACE, "PerspectiveFocalLength"): ("5.45",),
-        (NAMESPACE, "PerspectiveFocalLengthUnits"): ("mm",),
-        (NAMESPACE, "RigRelatives"): (f"{0.1 * k}", "0", "0.05"),
-        (NAMESPACE, "PerspectiveDistortion"): ("-0.1", "0.1", "0", "0", "0"),
-    }
+def tagged(namespace: str, **values: str) -> Values:
+    """XMP values of one namespace; spaces separate the items of a value."""
+    return {(namespace, name): tuple(items.split()) for name, items in values.items()}
 
 
-MICASENSE_BANDS = {"Blue": 475, "Green": 560, "Red": 668, "NIR": 840, "Red edge": 717}
-DJI_BANDS = {"Blue": 450, "Green": 560, "Red": 650, "RedEdge": 730, "NIR": 840}
+def micasense(k: int) -> Values:
+    lens = {"PrincipalPoint": f"{2.4 + 0.01 * k} 1.8", "PerspectiveDistortion": "-0.1 0.1 0 0 0"}
+    lens |= {"PerspectiveFocalLength": "5.45", "PerspectiveFocalLengthUnits": "mm"}
+    return {**tagged(MICASENSE, CaptureId="abc"), **tagged(NAMESPACE, RigRelatives=f"{0.1 * k} 0 0.05", **lens)}
+
+
+def phantom(k: int) -> Values:
+    return tagged(DJI, CaptureUUID="abc", RelativeOpticalCenterX=f"+{k}.5", RelativeOpticalCenterY=f"-{k}.25")
+
+
+def mavic(k: int) -> Values:
+    lens = {"CalibratedOpticalCenterX": "80", "CalibratedOpticalCenterY": "60"}
+    lens |= {"DewarpData": "2022-09-08;170,170,1.5,-2.5,-0.1,0.05,0,0,0"}
+    return tagged(DJI, CaptureUUID="abc", CalibratedHMatrix=f"1,0,{k}.5,0,1,-2,0,0,1", **lens)
+
+
+def sequoia(k: int) -> Values:
+    lens = {"FisheyeAffineMatrix": "207 0 0 207", "FisheyePolynomial": "0 1 0.0096 -0.1455", "ModelType": "fisheye"}
+    lens |= {"PrincipalPoint": "0.3 0.22", "RigRelatives": f"-0.17 {0.1 * k} 0"}
+    return tagged(NAMESPACE, CaptureUUID="abc", **lens)
+
+
+def sentera(k: int) -> Values:
+    matrix = f"1 0.001 {k} -0.001 1 5 0 0 1"
+    return {**tagged(NAMESPACE, CaptureUUID="abc"), **tagged(SENTERA, AlignMatrix=matrix)}
+
+
+REDEDGE_BANDS = {"1": ("Blue", 475), "2": ("Green", 560), "3": ("Red", 668), "4": ("NIR", 840), "5": ("Red edge", 717)}
+PHANTOM_BANDS = {"1": ("Blue", 450), "2": ("Green", 560), "3": ("Red", 650), "4": ("RedEdge", 730), "5": ("NIR", 840)}
+SENTERA_BANDS = {"0": ("Blue", 475), "1": ("Green", 550), "2": ("Red", 670), "3": ("RedEdge", 715), "4": ("NIR", 840)}
 SEQUOIA_BANDS = {"GRE": ("Green", 550), "RED": ("Red", 660), "REG": ("Red edge", 735), "NIR": ("NIR", 790)}
 MAVIC_BANDS = {"G": ("Green", 560), "R": ("Red", 650), "RE": ("RedEdge", 730), "NIR": ("NIR", 860)}
-
+MAVIC, SEQUOIA = "DJI_20230607112233_0001", "IMG_180413_080658_0000"
 VENDORS = {
-    "RedEdge": Vendor(
-        "MicaSense",
-        "RedEdge-M",
-        {
-            f"IMG_0007_{k}.tif": (band, nm, {(MICASENSE, "CaptureId"): ("abc",), **pinhole(k)})
-            for k, (band, nm) in enumerate(MICASENSE_BANDS.items(), start=1)
-        },
-        frozenset(f"band_{k}" for k in range(1, 6)),
-    ),
-    "Phantom 4": Vendor(
-        "DJI",
-        "FC6360",
-        {
-            f"DJI_001{k}.TIF": (
-                band,
-                nm,
-                {
-                    (DJI, "CaptureUUID"): ("abc",),
-                    (DJI, "RelativeOpticalCenterX"): (f"+{k}.5",),
-                    (DJI, "RelativeOpticalCenterY"): (f"-{k}.25",),
-                },
-            )
-            for k, (band, nm) in enumerate(DJI_BANDS.items(), start=1)
-        },
-        frozenset(DJI_BANDS),
-    ),
-    "Mavic 3": Vendor(
-        "DJI",
-        "M3M",
-        {
-            f"DJI_20230607112233_0001_MS_{k}.TIF": (
-                band,
-                nm,
-                {
-                    (DJI, "CaptureUUID"): ("abc",),
-                    (DJI, "CalibratedOpticalCenterX"): ("80",),
-                    (DJI, "CalibratedOpticalCenterY"): ("60",),
-                    (DJI, "CalibratedHMatrix"): (f"1,0,{n}.5,0,1,-2,0,0,1",),
-                    (DJI, "DewarpData"): ("2022-09-08;170,170,1.5,-2.5,-0.1,0.05,0,0,0",),
-                },
-            )
-            for n, (k, (band, nm)) in enumerate(MAVIC_BANDS.items())
-        },
-        frozenset(band for band, _ in MAVIC_BANDS.values()),
-    ),
-    "Sequoia": Vendor(
-        "Parrot",
-        "Sequoia",
-        {
-            f"IMG_180413_080658_0000_{k}.TIF": (
-                band,
-                nm,
-                {
-                    (NAMESPACE, "CaptureUUID"): ("abc",),
-                    (NAMESPACE, "ModelType"): ("fisheye",),
-                    (NAMESPACE, "PrincipalPoint"): ("0.3", "0.22"),
-                    (NAMESPACE, "FisheyeAffineMatrix"): ("207", "0", "0", "207"),
-                    (NAMESPACE, "FisheyePolynomial"): ("0", "1", "0.0096", "-0.1455"),
-                    (NAMESPACE, "RigRelatives"): ("-0.17", f"{0.1 * len(band)}", "0"),
-                },
-            )
-            for k, (band, nm) in SEQUOIA_BANDS.items()
-        },
-        frozenset(band for band, _ in SEQUOIA_BANDS.values()),
-        orientation=3,
-    ),
-    "6X": Vendor(
-        "Sentera",
-        "6X",
-        {
-            f"{k}-{band}-{nm}-30/IMG_00012_{nm}_30.tif": (
-                band,
-                nm,
-                {
-                    (NAMESPACE, "CaptureUUID"): ("abc",),
-                    (SENTERA, "AlignMatrix"): ("1", "0.001", f"{k}", "-0.001", "1", "5", "0", "0", "1"),
-                },
-            )
-            for k, (band, nm) in enumerate({"Blue": 475, "Green": 550, "Red": 670, "RedEdge": 715, "NIR": 840}.items())
-        },
-        frozenset({"Blue", "Green", "Red", "RedEdge", "NIR"}),
-    ),
+    "RedEdge": Vendor("MicaSense", "RedEdge-M", "IMG_0007", "IMG_0007_{part}.tif", micasense, REDEDGE_BANDS),
+    "Phantom 4": Vendor("DJI", "FC6360", "DJI_001", "DJI_001{part}.TIF", phantom, PHANTOM_BANDS),
+    "Mavic 3": Vendor("DJI", "M3M", MAVIC, f"{MAVIC}_MS_{{part}}.TIF", mavic, MAVIC_BANDS),
+    "Sequoia": Vendor("Parrot", "Sequoia", SEQUOIA, f"{SEQUOIA}_{{part}}.TIF", sequoia, SEQUOIA_BANDS, orientation=3),
+    "6X": Vendor("Sentera", "6X", "IMG_00012", "{part}-{band}-{nm}-30/IMG_00012_{nm}_30.tif", sentera, SENTERA_BANDS),
 }
 
 
@@ -209,22 +170,13 @@ def only_capture(folder: Path, options: DiscoverOptions | None = None) -> Captur
     return capture
 
 
-LABELS = {
-    "RedEdge": "IMG_0007",
-    "Phantom 4": "DJI_001",
-    "Mavic 3": "DJI_20230607112233_0001",
-    "Sequoia": "IMG_180413_080658_0000",
-    "6X": "IMG_00012",
-}
-
-
 @pytest.mark.parametrize("dialect", ["attributes", "elements", "sequences"])
 @pytest.mark.parametrize("name", VENDORS)
 def test_a_capture_is_grouped_named_and_seeded(tmp_path: Path, name: str, dialect: str) -> None:
     vendor = VENDORS[name]
     write_capture(tmp_path, vendor, dialect)
     capture = only_capture(tmp_path)
-    assert capture.label == LABELS[name]
+    assert capture.label == vendor.capture
     assert {b.name: b.wavelength_nm for b in capture.bands} == {band: nm for band, nm, _ in vendor.files.values()}
     assert capture.reference.name == "Green"
     assert capture.capture_id == "abc"
@@ -241,23 +193,14 @@ def test_damaged_tags_leave_the_names_of_the_files(tmp_path: Path, name: str, da
     vendor = VENDORS[name]
     write_capture(tmp_path, vendor, damage=damage)
     capture = only_capture(tmp_path)
-    named = {band for band, _, _ in vendor.files.values()} if damage == "no numbers" else vendor.names_without_xmp
+    numbered = name == "RedEdge" and damage != "no numbers"  # its files have no names of bands
+    named = {f"band_{part}" if numbered else band for part, (band, _) in vendor.bands.items()}
     assert {b.name for b in capture.bands} == named
     assert all(b.lens is None or np.isfinite(b.lens.matrix).all() for b in capture.bands)
 
 
-def test_one_file_with_damaged_tags_finds_its_capture(tmp_path: Path) -> None:
-    for name in ("RedEdge", "Phantom 4", "Sequoia"):
-        folder = tmp_path / name
-        write_capture(folder, VENDORS[name])
-        write_file(sorted(folder.iterdir())[-1], {271: text(VENDORS[name].make)})
-        assert len(only_capture(folder).bands) == len(VENDORS[name].files)
-
-
 @pytest.mark.parametrize(("name", "shift_px"), [("Phantom 4", (3, -3)), ("Mavic 3", (-3, 0))])
-def test_optical_centres_and_the_common_plane_give_the_seed(
-    tmp_path: Path, name: str, shift_px: tuple[float, float]
-) -> None:
+def test_tags_of_the_common_plane_give_the_seed(tmp_path: Path, name: str, shift_px: tuple[float, float]) -> None:
     write_capture(tmp_path, VENDORS[name])
     bands = {b.name: b for b in only_capture(tmp_path).bands}
     np.testing.assert_allclose(rig_seed(bands["Green"], bands["NIR"]), geometry.translation(*shift_px), atol=1e-9)
@@ -400,3 +343,99 @@ def test_a_flat_folder_named_like_a_band(tmp_path: Path, folder: str) -> None:
 def test_black_levels_may_be_fractions(tmp_path: Path) -> None:
     path = write_file(tmp_path / "x.tif", {50714: rational(4800, 4801, 4799, 4800)})
     assert read_tags(path).black_level == pytest.approx(4800)
+
+
+# ---- values of one real Mavic 3 Multispectral
+
+
+def mavic_tags(matrix: str | None = None, **more: str) -> Tags:
+    """A band's file of a Mavic 3, with the values of one real unit's red band and no distortion."""
+    xmp = {
+        "RelativeOpticalCenterX": "11.32",
+        "RelativeOpticalCenterY": "3.06",
+        "CalibratedOpticalCenterX": "1296",
+        "CalibratedOpticalCenterY": "972",
+        "DewarpData": "2022-09-08;2170,2170,0,0,0,0,0,0,0",
+        "DewarpHMatrix": "1.7162,0,415.7048,0,1.7162,309.8536,0,0,1",
+        **more,
+    }
+    if matrix is not None:
+        xmp["CalibratedHMatrix"] = matrix
+    return Tags(make="DJI", model="M3M", xmp={(DJI, k): (v,) for k, v in xmp.items()})
+
+
+def mavic_band(tmp_path: Path, tags: Tags) -> Band:
+    path = write_file(tmp_path / f"{MAVIC}_MS_R.TIF", shape=(48, 64))
+    (band,) = Dji().bands(path, tags, probe(path))
+    return band
+
+
+def test_a_mavic_without_calibration_shifts_by_its_optical_centres(tmp_path: Path) -> None:
+    red = mavic_band(tmp_path, mavic_tags())
+    nir = mavic_band(tmp_path, mavic_tags(RelativeOpticalCenterX="0", RelativeOpticalCenterY="0"))
+    np.testing.assert_allclose(rig_seed(nir, red), geometry.translation(11.32, 3.06), atol=1e-9)
+    assert other_rig_seed(nir, red) is None
+    assert red.lens is not None
+    assert not lens.is_distorting(red.lens)
+
+
+def test_a_calibrated_mavic_offers_both(tmp_path: Path) -> None:
+    red = mavic_band(tmp_path, mavic_tags("1,0,-11,0,1,-3,0,0,1"))
+    nir = mavic_band(tmp_path, mavic_tags("1,0,0,0,1,0,0,0,1", RelativeOpticalCenterX="0", RelativeOpticalCenterY="0"))
+    np.testing.assert_allclose(rig_seed(nir, red), geometry.translation(11, 3), atol=1e-9)
+    np.testing.assert_allclose(other_rig_seed(nir, red), geometry.translation(11.32, 3.06), atol=1e-9)
+    offered = seed_candidates(nir, red, SeedSettings())
+    assert list(offered) == ["rig", "centre", "identity"]
+
+
+def test_the_mavic_s_colour_photograph_goes_through_the_designed_frame(tmp_path: Path) -> None:
+    """The middle of the bands' frame, (1296, 972), lies at (2639.9, 1978.0) of the photograph."""
+    colour = Tags(make="DJI", model="M3M", xmp={(DJI, "CaptureUUID"): ("abc",)})
+    photo = tmp_path / "DJI_20230607112233_0001_D.JPG"
+    cv2.imwrite(str(photo), np.zeros((48, 64, 3), np.uint8))
+    nir = mavic_band(tmp_path, mavic_tags(RelativeOpticalCenterX="0", RelativeOpticalCenterY="0"))
+    rgb = Dji().bands(photo, colour, probe(photo))
+    assert [b.to_rig for b in rgb] == [None] * 3
+    placed = {b.name: b for b in Dji().with_shared_rig([nir, *rgb], [mavic_tags(), colour])}
+    seed = rig_seed(nir, placed["RGB Red"])
+    np.testing.assert_allclose(geometry.apply(seed, np.array([[1296.0, 972.0]])), [[2639.9, 1978.0]], atol=0.01)
+    assert geometry.local_scale(seed, 2592, 1944)[-1] == pytest.approx(1.7162)
+    # The Phantom's matrix of that name is none such.
+    phantom = Tags(**{**vars(mavic_tags()), "model": "FC6360"})
+    assert Dji().with_shared_rig([nir, *rgb], [phantom, colour])[1].to_rig is None
+
+
+@pytest.mark.parametrize(("roll", "yaw"), [("0.00", "30"), ("+180.00", "-150")])
+def test_a_mavic_s_gimbal_is_turned_either_way(roll: str, yaw: str) -> None:
+    tags = mavic_tags(
+        GimbalRollDegree=roll,
+        GimbalYawDegree=yaw,
+        GimbalPitchDegree="-90",
+        FlightXSpeed="8.66",
+        FlightYSpeed="5",
+        RelativeAltitude="20",
+        CalibratedFocalLength="2170",
+    )
+    assert Dji().motion(tags) == pytest.approx((0.0, 0.5), abs=1e-3)
+    pose = Dji().pose(tags)
+    assert (pose.heading_deg % 360, pose.pitch_deg, pose.height_m) == (pytest.approx(30), 0, 20)
+
+
+def test_pixels_that_are_dewarped_have_no_distortion(tmp_path: Path) -> None:
+    bent = "2022-09-08;2170,2170,0,0,-0.1,0.05,0,0,0"
+    result = [mavic_band(tmp_path, mavic_tags(DewarpData=bent, DewarpFlag=flag)).lens for flag in "01"]
+    assert [lens.is_distorting(one) for one in result] == [True, False]
+
+
+@pytest.mark.parametrize("black", ["0", "4096"])
+def test_a_black_level_of_0_is_a_black_level(tmp_path: Path, black: str) -> None:
+    tags = mavic_tags(SensorGain="1", ExposureTime="2000", BlackLevel=black)
+    band = mavic_band(tmp_path, replace(tags, black_level=3200.0))
+    assert band.radiometry.black_level == float(black)
+
+
+def test_without_a_black_level_there_is_no_radiometry(tmp_path: Path) -> None:
+    tags = mavic_tags(SensorGain="1", ExposureTime="2000")
+    assert mavic_band(tmp_path, tags).radiometry is None
+    by_tiff_tag = mavic_band(tmp_path, replace(tags, black_level=0.0)).radiometry
+    assert by_tiff_tag.black_level == 0.0

@@ -1,18 +1,16 @@
 """What is printed about arguments and files that cannot be used, and at the end: one line in plain words."""
 
 import json
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import typer
-from typer.testing import CliRunner
 
+import agalign
 from agalign.cameras.discover import DiscoverOptions, FolderScan, Problem, discover
 from agalign.cli import main
-from agalign.cli.main import app
 from agalign.cli.run import print_problems
 from agalign.cli.terminal import Terminal, exits, shown
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
@@ -20,85 +18,70 @@ from agalign.flight.groups import camera_overviews
 from agalign.method.device import choose_device
 from agalign.synthetic import flight as synthetic
 
-from ..conftest import textured_image
-
-
-def write_bands(folder: Path, suffix: str = ".tif", capture: str = "IMG_0001") -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    image = (textured_image(160, 120, 1) * 30 + 128).clip(0, 255).astype(np.uint8)
-    for band in ("red", "green", "nir"):
-        cv2.imwrite(str(folder / f"{capture}_{band}{suffix}"), image)
+from ..conftest import write_capture
+from ..program import agalign_here
 
 
 @pytest.mark.parametrize(
-    ("arguments", "line"),
+    ("command", "code", "line"),
     [
-        (["align", "x", "--jobs", "many"], "--jobs: give a whole number; 'agalign align --help' lists the options"),
-        (["align", "x", "--jobs", "-1"], "--jobs: give 0 or more"),
-        (["align", "x", "--accept-predicted", "much"], "--accept-predicted: give a number"),
-        (["align", "x", "--seed", "rigg"], "--seed: 'rigg' is unknown; choose from auto, rig, geo, structure"),
-        (["align", "x", "--crop", "[red]"], "--crop: '[red]' is unknown; choose from flight, common, none"),
-        (["align", "x", "--layout", "pile"], "--layout: 'pile' is unknown; choose from"),
-        (["align", "x", "--order", "size"], "--order: 'size' is unknown; choose from"),
-        (["align", "x", "--compression", "lzma"], "--compression: 'lzma' is unknown; choose from"),
-        (["align", "x", "--nope"], "no such option: --nope"),
-        (["align"], "folder is missing"),
-        (["--nope"], "no such option: --nope"),
-        (["align", "x", "y"], "got unexpected extra argument(s) (y)"),
+        ("align x --jobs many", 2, "--jobs: give a whole number; 'agalign align --help' lists the options"),
+        ("align x --jobs -1", 2, "--jobs: give 0 or more"),
+        ("align x --accept-predicted much", 2, "--accept-predicted: give a number"),
+        ("align x --seed rigg", 2, "--seed: 'rigg' is unknown; choose from auto, rig, geo, structure"),
+        ("align x --crop [red]", 2, "--crop: '[red]' is unknown; choose from flight, common, none"),
+        ("align x --layout pile", 2, "--layout: 'pile' is unknown; choose from"),
+        ("align x --order size", 2, "--order: 'size' is unknown; choose from"),
+        ("align x --compression lzma", 2, "--compression: 'lzma' is unknown; choose from"),
+        ("align x --nope", 2, "no such option: --nope"),
+        ("align", 2, "folder is missing"),
+        ("--nope", 2, "no such option: --nope"),
+        ("align x y", 2, "got unexpected extra argument(s) (y)"),
+        ("export nowhere --for excel", 2, "--for: 'excel' is unknown"),
+        ("align {flight} -o {tmp}/o --reference SWIR", 2, "SWIR"),
+        ("align {flight} -o {tmp}/o --device gpu", 2, "unknown device 'gpu'; use auto, cpu, cuda"),
+        ("align {flight} -o {tmp}/o --device cuda:99", 2, "device 'cuda:99' cannot be used"),
+        ("align {flight} --dry-run --device cuda:99", 2, "device 'cuda:99' cannot be used"),
+        ("align {flight} -o {tmp}/o --pattern x", 2, "pattern"),
+        ("ndiv {tmp}", 2, "did you mean 'ndvi'"),
+        ("{tmp}/file {tmp}/other -o {tmp}/o", 2, "give the folder of the images, not the files: agalign {tmp}"),
+        ("nowhere", 1, "nowhere"),
+        ("info nowhere", 1, "nowhere"),
+        ("report nowhere", 1, "nowhere"),
+        ("ndvi nowhere", 1, "nowhere"),
+        ("export nowhere --for odm", 1, "nowhere: no sidecars there"),
+        ("align {flight} -o {tmp}/file", 1, "file"),
+        ("info {tmp}/broken.safetensors", 1, "broken.safetensors"),
+        ("info https://example.org/flight", 1, "only local folders can be read; mount it or copy the images"),
     ],
 )
-def test_wrong_arguments_are_one_line_in_plain_words(arguments: list[str], line: str) -> None:
-    done = CliRunner().invoke(app, arguments, prog_name="agalign")
-    assert done.exit_code == 2
-    assert done.stdout == ""
-    (only,) = done.stderr.splitlines()
-    assert only.startswith(f"agalign: {line}")
+def test_wrong_arguments_are_one_line(flight: Path, tmp_path: Path, command: str, code: int, line: str) -> None:
+    for name in ("file", "other", "broken.safetensors"):
+        (tmp_path / name).write_bytes(b"nothing")
+    given = {"flight": flight, "tmp": tmp_path}
+    done = agalign_here(*(argument.format(**given) for argument in command.split(" ")))
+    assert (done.returncode, done.stdout) == (code, "")
+    complaints = [text for text in done.stderr.splitlines() if text.startswith("agalign: ")]
+    only = complaints[0]
+    assert "{flight}" in command or done.stderr.splitlines() == [only]  # files of the flight have further lines
+    assert only.startswith("agalign: ")
+    assert line.format(**given) in only
     assert "nput should" not in only
     assert "Value error" not in only
+    assert not (tmp_path / "o").exists()
 
 
 def test_no_argument_prints_the_help() -> None:
-    done = CliRunner().invoke(app, [], prog_name="agalign")
-    assert done.exit_code == 2
+    done = agalign_here()
+    assert done.returncode == 2
     assert "Commands:" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("device", "said"), [("gpu", "unknown device 'gpu'; use auto, cpu, cuda"), ("cuda", "no CUDA device")]
-)
-def test_devices_are_named_without_pytorch_s_words(device: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices_are_named_without_pytorch_s_words(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(ConfigurationError, match=said) as raised:
-        choose_device(device)
+    with pytest.raises(ConfigurationError, match="no CUDA device") as raised:
+        choose_device("cuda")
     assert "Torch not compiled" not in str(raised.value)
-    assert "ipu" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    "address", ["s3://bucket/flight", "https://example.org/flight", "gs://bucket", "file:///data/flight"]
-)
-def test_an_address_is_not_taken_for_a_folder(address: str) -> None:
-    with pytest.raises(InputError, match=r"://.*: only local folders can be read; mount it or copy the images"):
-        discover(address)
-
-
-def test_files_of_a_glob_lead_to_their_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_bands(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["agalign", *map(str, sorted(tmp_path.glob("*.tif"))), "-o", "out"])
-    with pytest.raises(SystemExit) as ended:
-        main.main()
-    assert ended.value.code == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert f"give the folder of the images, not the files: agalign {tmp_path}" in said
-
-
-def test_a_missing_mosaic_does_not_exist(tmp_path: Path) -> None:
-    for option in ("--reference", "--band"):
-        done = CliRunner().invoke(app, ["onto", str(tmp_path / "no.tif"), str(tmp_path / "b.tif"), option, "red"])
-        assert done.exit_code == 1
-        assert done.stderr.splitlines() == [f"agalign: {tmp_path / 'no.tif'}: does not exist"]
 
 
 def test_a_folder_without_captures_is_described(tmp_path: Path) -> None:
@@ -107,14 +90,14 @@ def test_a_folder_without_captures_is_described(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "single_red.tif"), image)
     for name in ("a.raw", "b.raw", "notes.txt"):
         (tmp_path / name).touch()
-    done = CliRunner().invoke(app, ["info", str(tmp_path)])
-    assert done.exit_code == 1
+    done = agalign_here("info", tmp_path)
+    assert done.returncode == 1
     said = " ".join(done.stdout.split())
     assert "2 .raw files: not an image that agalign reads" in said
     assert "1 .txt file: not" in said
     assert "1 .jpg file: a colour photograph" in said
     assert "1 .tif file: a band with no companion" in said
-    assert "agalign info" not in done.output
+    assert "agalign info" not in done.stderr
 
 
 def test_a_folder_without_images_names_what_there_is(tmp_path: Path) -> None:
@@ -125,13 +108,13 @@ def test_a_folder_without_images_names_what_there_is(tmp_path: Path) -> None:
 
 
 def test_an_unreadable_file_is_shown_as_missing(tmp_path: Path) -> None:
-    write_bands(tmp_path)
+    write_capture(tmp_path, "red", "green", "nir", name="IMG_0001")
     (tmp_path / "IMG_0001_nir.tif").write_bytes(b"II*\0broken")
-    done = CliRunner().invoke(app, ["info", str(tmp_path)])
-    assert done.exit_code == 3
+    done = agalign_here("info", tmp_path)
+    assert done.returncode == 3
     assert "IMG_0001_nir.tif (unreadable)" in done.stdout
     assert "1 capture, 2 bands, 1 problem" in done.stdout
-    (capture,) = json.loads(CliRunner().invoke(app, ["info", str(tmp_path), "--json"]).stdout)["captures"]
+    (capture,) = json.loads(agalign_here("info", tmp_path, "--json").stdout)["captures"]
     assert capture["unreadable_files"] == ["IMG_0001_nir.tif"]
 
 
@@ -139,7 +122,7 @@ def test_info_begins_with_the_cameras(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path, captures=2, size_px=(160, 120))
     (camera,) = camera_overviews(discover(tmp_path).captures)
     assert (camera.captures, camera.size_px, camera.radiometry) == (2, (160, 120), ("camera", "sun"))
-    done = CliRunner().invoke(app, ["info", str(tmp_path)])
+    done = agalign_here("info", tmp_path)
     first = done.stdout.splitlines()[0]
     assert first.startswith("MicaSense RedEdge-M (SY01-0000001-AG")
     assert "2 captures of 5 bands, 160 x 120 px" in first
@@ -147,30 +130,30 @@ def test_info_begins_with_the_cameras(tmp_path: Path) -> None:
     lens = discover(tmp_path).captures[0].reference.lens
     assert camera.gsd_per_height * lens.fx_px == pytest.approx(1)
     assert f"GSD {1e4 / lens.fx_px:.1f} cm at a height of 100 m" in " ".join(done.stdout.split())
-    assert json.loads(CliRunner().invoke(app, ["info", str(tmp_path), "--json"]).stdout)["cameras"][0]["captures"] == 2
+    assert "[Green]" in done.stdout
+    facts = json.loads(agalign_here("info", tmp_path, "--json").stdout)
+    assert facts["cameras"][0]["captures"] == 2
+    assert facts["captures"][0]["seeds"] == ["rig", "structure", "identity"]
+    assert [b["name"] for b in facts["captures"][0]["bands"] if b["reference"]] == ["Green"]
 
 
 def test_globs_choose_files(tmp_path: Path) -> None:
-    write_bands(tmp_path / "a" / "test")
-    write_bands(tmp_path / "b")
+    write_capture(tmp_path / "a" / "test", "red", "green", "nir", name="IMG_0001")
+    write_capture(tmp_path / "b", "red", "green", "nir", name="IMG_0001")
     chosen = discover(tmp_path, DiscoverOptions(exclude=("*/test/*", "*_red.*")))
     assert [c.label for c in chosen.captures] == ["b/IMG_0001"]
     assert [b.name for b in chosen.captures[0].bands] == ["green", "nir"]
     chosen = discover(tmp_path, DiscoverOptions(include=("a/*",)))
     assert [c.label for c in chosen.captures] == ["a/test/IMG_0001"]
+    shown = agalign_here("info", tmp_path, "--json", "--exclude", "*/test/*", "--exclude", "*_red.*")
+    assert [c["label"] for c in json.loads(shown.stdout)["captures"]] == ["b/IMG_0001"]
     with pytest.raises(InputError, match="has 6 images, and --include and --exclude leave none"):
         discover(tmp_path, DiscoverOptions(include=("*.jpg",)))
 
 
-def test_info_shows_what_the_globs_of_a_run_choose(tmp_path: Path) -> None:
-    for capture in ("IMG_0001", "IMG_0002"):
-        write_bands(tmp_path / "in", capture=capture)
-    done = CliRunner().invoke(app, ["info", str(tmp_path / "in"), "--json", "--exclude", "*_0002_*"])
-    assert [c["label"] for c in json.loads(done.stdout)["captures"]] == ["IMG_0001"]
-
-
-def test_expert_options_are_a_panel_at_the_end() -> None:
-    lines = CliRunner().invoke(app, ["align", "--help"], env={"COLUMNS": "160"}).stdout.splitlines()
+def test_expert_options_are_a_panel_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    lines = agalign_here("align", "--help").stdout.splitlines()
     panels = [line.split("─ ")[1].split(" ─")[0] for line in lines if line.startswith("╭")]
     assert panels[-1] == "Expert"
     expert = "\n".join(lines[max(i for i, line in enumerate(lines) if "Expert" in line) :])
@@ -179,9 +162,10 @@ def test_expert_options_are_a_panel_at_the_end() -> None:
 
 def test_the_list_of_commands_has_whole_sentences() -> None:
     """Their ends are found by full stops: that of an abbreviation would cut a sentence."""
-    listed = " ".join(CliRunner().invoke(app, ["--help"]).output.split())
+    listed = " ".join(agalign_here("--help").stdout.split())
     for command in main.COMMANDS.values():
         assert command.hidden or command.summary in listed
+    assert agalign_here("--version").stdout == f"agalign {agalign.__version__}\n"
 
 
 @pytest.mark.parametrize(
@@ -197,9 +181,7 @@ def test_the_list_of_commands_has_whole_sentences() -> None:
         (ZeroDivisionError("of 1"), 1, "please report this"),
     ],
 )
-def test_every_end_is_a_line_and_a_code(
-    error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_end_has_a_code(error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit) as ended, exits(Terminal(quiet=False, verbose=False, log_json=False)):
         raise error
     assert ended.value.exit_code == code
@@ -212,9 +194,7 @@ def test_what_is_shown_does_nothing() -> None:
     assert shown("Köln, 雨 [1]") == "Köln, 雨 [1]"
 
 
-def test_many_files_with_one_problem_are_counted_and_all_are_in_the_json_log(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_many_files_with_one_problem_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
     texts = {f"f{n:04d}.tif": f"is empty, {n} bytes" for n in range(4000)} | {"x.tif": "cannot be read"}
     problems = (Problem(Path(f"in/{n}"), UnreadableFileError(f"in/{n}: {text}")) for n, text in texts.items())
     scan = FolderScan(Path("in"), (), tuple(problems))

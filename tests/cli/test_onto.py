@@ -9,7 +9,7 @@ from rasterio.transform import Affine
 
 from agalign.values import geometry
 
-from ..conftest import read_json, textured_pair
+from ..conftest import read_json, textured_pair, write_band
 from ..program import agalign_here
 
 TRUTH = np.array([[1.001, 0.002, 9.3], [-0.002, 1.001, -14.6], [0, 0, 1.0]])
@@ -19,16 +19,12 @@ pytestmark = pytest.mark.slow
 
 
 def write_mosaic(path: Path, image: np.ndarray, off_m: tuple[float, float] | None, bands: int = 1) -> None:
-    height, width = image.shape
     place = {}
     if off_m is not None:
         transform = Affine(0.1, 0, 500_000 + off_m[0], 0, -0.1, 4_000_000 + off_m[1])
         place = {"crs": "EPSG:32633", "transform": transform}
-    with rasterio.open(
-        path, "w", driver="GTiff", width=width, height=height, count=bands, dtype="float32", **place
-    ) as dataset:
-        for index in range(1, bands + 1):
-            dataset.write((1000 + 100 * image * index).astype(np.float32), index)
+    planes = [1000 + 100 * image * number for number in range(1, bands + 1)]
+    write_band(path, np.float32(planes), **place)
 
 
 @pytest.fixture(scope="module")

@@ -50,9 +50,7 @@ def test_band_files_are_linked_under_names_of_their_own(run: Path, tmp_path: Pat
     assert copied.read_bytes() == source.read_bytes()
 
 
-def test_matrices_for_micasense_s_notebooks_warp_their_undistorted_images(
-    flight: Path, run: Path, tmp_path: Path
-) -> None:
+def test_matrices_for_the_notebooks_of_micasense(flight: Path, run: Path, tmp_path: Path) -> None:
     """Points of the mapping, undistorted by OpenCV as the notebooks undistort images."""
     export(run, tmp_path, "micasense")
     matrices = np.load(tmp_path / "0000SET_000_IMG_0001_warp_matrices.npy", allow_pickle=True)

@@ -125,6 +125,7 @@ def test_the_elevation_of_the_ground_gives_the_height_that_tags_lack() -> None:
     assert (result.height_m, result.height_from) == (30.0, "ground elevation")
     assert above_elevation(capture(replace(pose, height_m=7.0)), 100.0).pose == replace(pose, height_m=7.0)
     assert above_elevation(capture(pose), 131.0).pose == pose  # below the ground
+    assert with_approximate_georeference(capture(pose)).reference.georeference is None
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 37.0, 200.0])
@@ -140,10 +141,6 @@ def test_the_approximate_georeference_maps_pixels_to_where_the_camera_sees_them(
     turn = math.radians(2.0 * math.sin(math.radians(52.0)))
     turned = (expected - expected[0]) @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
     assert on_map - on_map[0] == pytest.approx(turned, abs=0.1)
-
-
-def test_without_a_height_there_is_no_approximate_georeference() -> None:
-    assert with_approximate_georeference(capture(Pose(0.0, focal_length_px=1000.0))).reference.georeference is None
 
 
 @pytest.mark.slow
@@ -167,9 +164,7 @@ def test_a_run_writes_the_map_and_georeferenced_rasters_that_agree(between_panel
 
 
 @pytest.mark.slow
-def test_a_georeference_that_no_capture_can_have_is_refused_before_anything_is_done(
-    flight: Path, tmp_path: Path
-) -> None:
+def test_an_impossible_georeference_is_refused_first(flight: Path, tmp_path: Path) -> None:
     with pytest.raises(agalign.ConfigurationError, match="--ground-elevation"):
         agalign.align_folder(flight, tmp_path, settings=seeded(georeference=True))
     agalign.align_folder(flight, tmp_path, settings=seeded(georeference=True, ground_elevation_m=0.0))

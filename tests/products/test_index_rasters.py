@@ -99,21 +99,17 @@ def test_values_statistics_and_tags_of_a_raster(tmp_path: Path) -> None:
 def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> None:
     import cv2
 
-    for name, raw in (("raw", True), ("reflectance", False)):
-        make_aligned(tmp_path / name, 1, raw=raw)
-    assert [unit_of_run(index_tasks(tmp_path / n, [NDVI], tmp_path / n)) for n in ("raw", "reflectance")] == [
-        RAW,
-        "reflectance",
-    ]
-    (of_raw,), (of_reflectance,) = (run(tmp_path / n) for n in ("raw", "reflectance"))
-    assert of_reflectance.path is not None
+    folders = tmp_path / "raw", tmp_path / "reflectance"
+    for folder in folders:
+        make_aligned(folder, 1, raw=folder.name == "raw")
+    assert [unit_of_run(index_tasks(folder, [NDVI], folder)) for folder in folders] == [RAW, "reflectance"]
+    (of_raw,), (of_reflectance,) = map(run, folders)
     with rasterio.open(of_raw.path) as dataset:
         assert dataset.tags()["INPUT"] == "raw numbers, not reflectance"
         low, high = np.percentile(dataset.read(1), (2, 98))
     assert (of_raw.statistics.low, of_raw.statistics.high) == pytest.approx((low, high), abs=1e-4)
-    grey, colour = (
-        cv2.imread(str(r.path.with_suffix(".png")))[:120, :160].astype(int) for r in (of_raw, of_reflectance)
-    )
+    pictures = (cv2.imread(str(r.path.with_suffix(".png"))) for r in (of_raw, of_reflectance))
+    grey, colour = (picture[:120, :160].astype(int) for picture in pictures)
     assert np.ptp(grey, axis=2).max() == 0
     assert np.ptp(colour, axis=2).max() > 50
     assert np.ptp(grey) > 150, "stretched over all greys"
@@ -143,12 +139,8 @@ def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
     run(tmp_path / "out", NDVI, target=target)
     run(tmp_path / "out", NDRE, target=target)
     rows = list(csv.DictReader((target / "indices.csv").read_text().splitlines()))
-    assert [(r["capture"], r["index"]) for r in rows] == [
-        ("IMG_0001", "ndre"),
-        ("IMG_0001", "ndvi"),
-        ("IMG_0002", "ndre"),
-        ("IMG_0002", "ndvi"),
-    ]
+    names = [(capture, index) for capture in ("IMG_0001", "IMG_0002") for index in ("ndre", "ndvi")]
+    assert [(r["capture"], r["index"]) for r in rows] == names
     assert [(r["latitude"], r["valid_share"], r["input"]) for r in rows] == [("52.0", "1.0", "reflectance")] * 4
     assert float(rows[1]["p5"]) < float(rows[1]["median"]) < float(rows[1]["p95"])
     assert not list((tmp_path / "out").rglob("*ndvi*"))

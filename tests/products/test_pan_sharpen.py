@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
-from synthetic_flights.cameras import ALTUM_PT, MAVIC_3M
+from synthetic_flights.cameras import ALTUM_PT
 from synthetic_flights.troubles import make_two_headings
 
 import agalign
@@ -28,6 +28,8 @@ from agalign.values.pixel_units import PixelScale
 from ..conftest import seeded, textured_image, write_band
 
 pytestmark = pytest.mark.slow
+PANCHRO = Band("Panchro", Path("pan"), 1, 64, 48, "uint16")
+COLOUR = Band("RGB Red", Path("rgb"), 1, 64, 48, "uint8", companion=True)
 
 
 def scene() -> tuple[list[np.ndarray], np.ndarray]:
@@ -105,15 +107,11 @@ def test_what_sees_the_others_light_together() -> None:
 
 
 @pytest.mark.parametrize(("nodata", "dtype"), [(0, np.uint16), (-9999.0, np.float32)])
-def test_gaps_keep_the_nodata_value_and_what_is_not_seen_is_not_sharpened(
-    tmp_path: Path, nodata: float, dtype: type
-) -> None:
+def test_gaps_keep_nodata_and_unseen_bands_are_not_sharpened(tmp_path: Path, nodata: float, dtype: type) -> None:
     _, pan = scene()
     planes = np.stack([np.full_like(pan, 3000), np.full_like(pan, 2000), pan]).astype(dtype)
     planes[:, :20] = nodata
-    profile = {"driver": "GTiff", "width": 320, "height": 240, "dtype": planes.dtype, "count": 3, "nodata": nodata}
-    with rasterio.open(tmp_path / "layers.tif", "w", **profile) as file:
-        file.write(planes)
+    write_band(tmp_path / "layers.tif", planes, nodata=nodata)
     layers = [Layer(Band(n, tmp_path, 1, 320, 240, "uint16"), None) for n in ("Green", "NIR", "Panchro")]
     grid = OutputGrid(0, 0, 320, 240, PixelScale(2.0, 2.0))
     with open_raster(tmp_path / "layers.tif") as file:
@@ -127,33 +125,31 @@ def test_gaps_keep_the_nodata_value_and_what_is_not_seen_is_not_sharpened(
 
 
 @pytest.mark.parametrize(
-    ("status", "std_px", "sharpens"),
-    [("aligned", None, True), ("predicted", 0.9, True), ("predicted", 1.9, False), ("seed_only", None, False)],
+    ("pan", "status", "std_px", "sharpens"),
+    [
+        (PANCHRO, "aligned", None, True),
+        (PANCHRO, "predicted", 0.9, True),
+        (PANCHRO, "predicted", 1.9, False),
+        (PANCHRO, "seed_only", None, False),
+        (COLOUR, "aligned", None, False),
+    ],
 )
-def test_a_panchromatic_band_that_is_not_delivered_sharpens_nothing(
-    monkeypatch: pytest.MonkeyPatch, status: str, std_px: float | None, sharpens: bool
+def test_a_band_that_is_not_delivered_or_does_not_see_infra_red_sharpens_none(
+    monkeypatch: pytest.MonkeyPatch, pan: Band, status: str, std_px: float | None, sharpens: bool
 ) -> None:
     def placed(_: Capture, alignments: dict[str, object], *__: object) -> tuple[list[Layer], OutputGrid]:
         own = PixelMapping(np.eye(3))
         return [Layer(b, own) for b in bands if b is bands[0] or b.name in alignments], OutputGrid(0, 0, 64, 48)
 
-    bands = [Band(name, Path(name), 1, 64, 48, "uint16") for name in ("Green", "Panchro")]
+    bands = [Band("NIR", Path("NIR"), 1, 64, 48, "uint16", wavelength_nm=840.0), pan]
     monkeypatch.setattr("agalign.products.pan_sharpen.output_layers", placed)
     prediction = None if std_px is None else SimpleNamespace(std_px=std_px)
-    usable = {"Panchro": SimpleNamespace(status=status, prediction=prediction)}
+    usable = {pan.name: SimpleNamespace(status=status, prediction=prediction)}
     capture = Capture("a", Path("in"), tuple(bands), 0)
     context = SimpleNamespace(capture=capture, usable=usable, settings=agalign.Settings(), rig=None)
     assert (_sources(context, agalign.WriteSettings()) is not None) == sharpens
 
 
-def test_a_photograph_sharpens_no_infra_red_alone(tmp_path: Path) -> None:
-    make_two_headings(tmp_path / "in", 1, (480, 360), camera=MAVIC_3M, line=1, lakes=False)
-    colours = ("RGB Red", "RGB Green", "RGB Blue")
-    options = agalign.DiscoverOptions(with_rgb=True, reference="NIR", bands=("NIR", "RedEdge", *colours))
-    settings = seeded(pan_sharpen=True)
-    (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings, options=options)
-    assert report.error is None
-    assert not list((tmp_path / "out").rglob("*.pan.tif"))
-    colour = Band("RGB Red", tmp_path, 1, 64, 48, "uint8", companion=True)
+def test_a_photograph_sees_red_and_no_red_edge(tmp_path: Path) -> None:
     red, red_edge = (Band("b", tmp_path, 1, 64, 48, "uint16", wavelength_nm=nm) for nm in (650.0, 730.0))
-    assert (_is_in_range(red, [colour]), _is_in_range(red_edge, [colour])) == (True, False)
+    assert (_is_in_range(red, [COLOUR]), _is_in_range(red_edge, [COLOUR])) == (True, False)

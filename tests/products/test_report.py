@@ -208,10 +208,6 @@ def test_the_relief_is_the_last_row(views: ReducedBands, tmp_path: Path, has_err
     np.testing.assert_allclose(shown, np.linspace(-3, 7, w).clip(low, high), atol=0.25)
 
 
-def test_a_level_relief_can_be_shown() -> None:
-    assert ReliefView(np.full((4, 5), 2.0, np.float32), None).grey.max() == 0
-
-
 @pytest.mark.parametrize("captures", [1, 200, 1000])
 def test_all_previews_of_a_flight_have_a_limit(views: ReducedBands, tmp_path: Path, captures: int) -> None:
     path = tmp_path / "a.preview.jpg"

@@ -26,11 +26,9 @@ from agalign.products.sidecar_file import (
     verify_outputs,
     write_sidecar,
 )
-from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.capture import Band, Capture
-from agalign.values.displacement import DisplacementField
 from agalign.values.image import OutputGrid
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.lens import Lens
@@ -132,19 +130,6 @@ def interpolated(grid: GridPart, at_px: np.ndarray) -> dict[str, np.ndarray]:
         "Clough-Tocher": CloughTocher2DInterpolator(reference_px, moving_px)(at_px),
         "lattice": np.stack([s.ev(at_px[:, 1], at_px[:, 0]) for s in splines], axis=-1),
     }
-
-
-def test_the_grid_reproduces_a_displacement_field() -> None:
-    """Of 1 px (standard deviation) between nodes 48 px apart, on lens models."""
-    lenses = [cameras.BANDS[k].lens(1280, 960) for k in (1, 3)]
-    field = DisplacementField(48.0, np.random.default_rng(0).normal(0, 1, (21, 28, 2)))
-    mapping = PixelMapping(geometry.translation(5.0, 2.0), *lenses, local=field)
-    bands = tuple(Band(name, Path(f"{name}.tif"), 1, 1280, 960, "uint16") for name in ("green", "nir"))
-    alignment = Alignment(mapping, (1280, 960), "aligned", (), Seed("rig", np.eye(3), 30.0))
-    part = sidecar_of(context_of(Capture("c", Path(), bands, 0), {"nir": alignment})).bands[1]
-    at = np.random.default_rng(1).uniform((0, 0), (1279, 959), (2000, 2))
-    for there in interpolated(part.grid, at).values():
-        assert np.nanpercentile(np.abs(there - mapping(at)), 99) < 0.02
 
 
 def test_the_grid_is_fine_where_a_lens_bends_it() -> None:

@@ -1,3 +1,6 @@
+import os
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +13,7 @@ from agalign.config import Settings, WriteSettings
 from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.aligned_files import BandFiles
-from agalign.products.checked_raster import CheckedRaster
+from agalign.products.checked_raster import CheckedRaster, without_libtiff_messages
 from agalign.products.layout import Layer, output_layers
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.raster_file import write_raster
@@ -92,14 +95,10 @@ def test_red_green_and_blue_are_shown_as_such(tmp_path: Path) -> None:
 @pytest.mark.parametrize("file_format", ["gtiff", "cog"])
 def test_georeference_and_statistics_in_either_format(tmp_path: Path, file_format: str) -> None:
     capture, path = make_capture(tmp_path, is_on_map=True), tmp_path / "out.tif"
-    moved, nowhere = (
-        Layer(capture.bands[0], PixelMapping(geometry.translation(40.0, 0.0))),
-        Layer(capture.bands[2], None),
-    )
-    layers = [Layer(capture.bands[1], None, is_reference=True), moved, nowhere]
-    write_raster(
-        capture, layers, replace(CROP, has_gaps=True), path, WriteSettings(statistics=True, format=file_format)
-    )
+    moved = Layer(capture.bands[0], PixelMapping(geometry.translation(40.0, 0.0)))
+    layers = [Layer(capture.bands[1], None, is_reference=True), moved, Layer(capture.bands[2], None)]
+    settings = WriteSettings(statistics=True, format=file_format)
+    write_raster(capture, layers, replace(CROP, has_gaps=True), path, settings)
     with rasterio.open(path) as dataset:
         assert dataset.crs.to_epsg() == 32631
         assert tuple(dataset.transform)[:6] == pytest.approx((0.1, 0, 500000.4, 0, -0.1, 5799999.4))
@@ -107,10 +106,8 @@ def test_georeference_and_statistics_in_either_format(tmp_path: Path, file_forma
         assert dataset.descriptions == ("B1", "B0", "B2")
         for index in (1, 2):
             stored, pixels = dataset.tags(index), dataset.read(index, masked=True).compressed()
-            for name in ("MINIMUM", "MAXIMUM", "MEAN", "STDDEV"):
-                value = {"MINIMUM": pixels.min, "MAXIMUM": pixels.max, "MEAN": pixels.mean, "STDDEV": pixels.std}[
-                    name
-                ]()
+            expected = {"MINIMUM": pixels.min(), "MAXIMUM": pixels.max(), "MEAN": pixels.mean(), "STDDEV": pixels.std()}
+            for name, value in expected.items():
                 assert float(stored[f"STATISTICS_{name}"]) == pytest.approx(value)
         assert dataset.tags(1)["STATISTICS_VALID_PERCENT"] == "100"
         assert dataset.tags(3)["STATISTICS_VALID_PERCENT"] == "0"
@@ -182,9 +179,8 @@ def test_nodata_is_a_value_that_copied_pixels_do_not_have(tmp_path: Path) -> Non
     zeros = np.zeros((150, 200), np.uint16)
     zeros[:, ::3], zeros[0, 0] = 7, 65535
     change(capture.reference, lambda pixels: np.copyto(pixels, zeros))
-    nodata = write_raster(
-        capture, [Layer(capture.bands[0], None), *layers_of(capture)[1:]], FRAME, out, WriteSettings()
-    )
+    layers = [Layer(capture.bands[0], None), *layers_of(capture)[1:]]
+    nodata = write_raster(capture, layers, FRAME, out, WriteSettings())
     with rasterio.open(out) as written:
         assert written.nodata == nodata
         assert nodata not in (None, 0, 7, 65535)
@@ -223,12 +219,9 @@ LENS = Lens(150.0, 150.0, 59.5, 44.5, (-0.1, 0.05))
 
 
 def capture_of(folder: Path) -> Capture:
-    bands = []
-    for name in ("green", "nir"):
-        path = folder / f"{name}.tif"
-        with rasterio.open(path, "w", driver="GTiff", width=120, height=90, count=1, dtype="uint16") as dataset:
-            dataset.write(np.full((1, 90, 120), 500, np.uint16))
-        bands.append(Band(name, path, 1, 120, 90, "uint16", lens=LENS))
+    bands = [Band(name, folder / f"{name}.tif", 1, 120, 90, "uint16", lens=LENS) for name in ("green", "nir")]
+    for band in bands:
+        write_band(band.path, np.full((90, 120), 500, np.uint16))
     return Capture("c", Path(), tuple(bands), 0)
 
 
@@ -237,7 +230,6 @@ def aligned_by(shift_px: float) -> Alignment:
     return Alignment(PixelMapping(seed.fixed_to_moving, LENS, LENS), (120, 90), "aligned", (), seed)
 
 
-@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 @pytest.mark.parametrize("undistort", [False, True])
 def test_without_a_common_area_what_no_band_shows_is_nodata(tmp_path: Path, undistort: bool) -> None:
     capture, settings = capture_of(tmp_path), WriteSettings(undistort=undistort)
@@ -248,7 +240,6 @@ def test_without_a_common_area_what_no_band_shows_is_nodata(tmp_path: Path, undi
         assert not written.read_masks(2).any()
 
 
-@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_where_all_bands_show_everything_no_nodata_is_declared(tmp_path: Path) -> None:
     capture = capture_of(tmp_path)
     for crop in ("common", "none"):
@@ -264,42 +255,68 @@ def test_where_all_bands_show_everything_no_nodata_is_declared(tmp_path: Path) -
 
 def rig_between(low_px: float, high_px: float) -> Rig:
     """One band that moves to the right as the ground comes nearer."""
-    middle = (low_px + high_px) / 2
+    middle, std_px = (low_px + high_px) / 2, {"nir": 0.1}
     factors = [(v - middle, 0.0, 0.0, 0.0, 0.0) for v in (low_px, middle, high_px)]
-    seen = tuple(CaptureFactors(float(k), None, None, f) for k, f in enumerate(factors))
-    bars = {"nir": 0.1}
-    return Rig(
-        (120, 90),
-        {"nir": geometry.translation(middle, 0)},
-        {"nir": (1.0, 0.0)},
-        {"nir": 0.0},
-        bars,
-        ("distance",),
-        seen,
-        bars,
-    )
+    captures = tuple(CaptureFactors(float(k), None, None, f) for k, f in enumerate(factors))
+    mean, baselines = {"nir": geometry.translation(middle, 0)}, {"nir": (1.0, 0.0)}
+    return Rig((120, 90), mean, baselines, {"nir": 0.0}, std_px, ("distance",), captures, std_px)
 
 
-@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
     capture, rig = capture_of(tmp_path), rig_between(2.0, 12.0)
-    grids = [output_layers(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig)[1] for shift in (2.0, 7.0, 12.0)]
+
+    def grids_of(*shifts_px: float, crop: str = "flight") -> list[OutputGrid]:
+        settings = WriteSettings(crop=crop)
+        return [output_layers(capture, {"nir": aligned_by(s)}, settings, rig)[1] for s in shifts_px]
+
+    grids = grids_of(2.0, 7.0, 12.0)
     assert len(set(grids)) == 1
     assert not grids[0].has_gaps
     # The farthest band leaves 12 px at the right; two more are left for captures that the rig has not seen.
     assert 120 - (grids[0].x0 + grids[0].width) in range(13, 17)
-    alone = [
-        output_layers(capture, {"nir": aligned_by(shift)}, WriteSettings(crop="common"), rig)[1]
-        for shift in (2.0, 12.0)
-    ]
-    assert alone[0].width > alone[1].width
+    near, far = grids_of(2.0, 12.0, crop="common")
+    assert near.width > far.width
+    # A capture beyond those of the rig keeps the geometry, and declares nodata.
+    (beyond,) = grids_of(30.0)
+    assert beyond == replace(grids[0], has_gaps=True)
 
 
-@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_a_capture_beyond_its_flight_keeps_the_geometry_and_declares_nodata(tmp_path: Path) -> None:
-    capture, rig = capture_of(tmp_path), rig_between(2.0, 12.0)
-    (_, within), (_, beyond) = (
-        output_layers(capture, {"nir": aligned_by(shift)}, WriteSettings(), rig) for shift in (5.0, 30.0)
-    )
-    assert replace(beyond, has_gaps=False) == within
-    assert beyond.has_gaps
+# ---- what libtiff prints without any handler
+
+
+def test_only_the_lines_of_libtiff_are_kept_back(capfd: pytest.CaptureFixture[str]) -> None:
+    with without_libtiff_messages():
+        os.write(2, b"_tiffWriteProc: No space left on device.\nkept\nTIFFAppendToStrip: Write error.\n")
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "kept\nafter\n"
+
+
+def test_an_error_inside_gives_the_descriptor_back(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(OSError, match="full"), without_libtiff_messages():
+        raise OSError("full")
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "after\n"
+
+
+def test_the_lines_of_two_threads_are_kept_back(capfd: pytest.CaptureFixture[str]) -> None:
+    first_is_inside = threading.Event()
+
+    def first() -> None:
+        with without_libtiff_messages():
+            first_is_inside.set()
+            time.sleep(0.2)  # the second thread tries to enter
+            os.write(2, b"_tiffWriteProc: File too large.\nkept\n")
+
+    def second() -> None:
+        first_is_inside.wait(10)
+        with without_libtiff_messages(), without_libtiff_messages():
+            time.sleep(0.4)  # the first thread has left
+            os.write(2, b"_tiffWriteProc: File too large.\nalso kept\n")
+
+    threads = [threading.Thread(target=each) for each in (first, second)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "kept\nalso kept\nafter\n"

@@ -35,9 +35,7 @@ def script(path: Path, text: str) -> Path:
     return path
 
 
-def test_the_executable_is_that_of_the_setting_or_of_a_virtual_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_executable_of_the_setting_or_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     there = script(tmp_path / "venv" / "bin" / "agalign", "")
     assert command.find_executable(str(there)) == str(there)
     assert command.find_executable(str(tmp_path / "venv")) == str(there)
@@ -53,9 +51,7 @@ def test_the_executable_is_that_of_the_setting_or_of_a_virtual_environment(
         command.find_executable(str(tmp_path / "nowhere"))
 
 
-def test_events_and_output_arrive_and_what_qgis_sets_for_its_libraries_does_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_events_arrive_and_variables_of_qgis_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", "/qgis/python")
     monkeypatch.setenv("PROJ_LIB", "/qgis/proj")
     text = """

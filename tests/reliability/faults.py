@@ -38,10 +38,8 @@ from ..program import agalign_here
 
 SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])
 SIZE_PX = 320, 240
-MANY = 12
-"""Captures of a run that something happens to."""
 ALL = "abcdefghijkl"
-"""Their names."""
+"""Captures of a run that something happens to."""
 XMP = 700
 STRANGE_NAMES = "with space é 雨", "-rf", "quote'\"`$(x)", "new\nline", "\x1b[31mred\a", "_", "x" * 200
 _PACKET = (
@@ -427,14 +425,8 @@ def held_by_a_killed_one(scene: Scene) -> None:
 def full_disk(scene: Scene) -> None:
     """A file system that holds a capture; without the right to mount one, files of at most 60 kB."""
     scene.out.mkdir()
-    mounted = (
-        os.getuid() == 0
-        and subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", "size=1600k", "tmpfs", str(scene.out)], capture_output=True
-        ).returncode
-        == 0
-    )
-    if mounted:
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1600k", "tmpfs", str(scene.out)]
+    if os.getuid() == 0 and subprocess.run(mount, capture_output=True).returncode == 0:
         scene.undo = lambda: subprocess.run(["umount", "-l", str(scene.out)], check=True) and None
         return
 
@@ -445,21 +437,37 @@ def full_disk(scene: Scene) -> None:
     scene.process = {"preexec_fn": limit}
 
 
-def when_begun(act: Callable[["subprocess.Popen[str]", Scene], None], *arguments: str) -> Spoil:
-    """Something happens to a run of twelve captures once the first of them is done."""
+Act = Callable[["subprocess.Popen[str]", Scene], object]
+"""Is done to a run."""
+
+
+def when(ready: Act, act: Act, *arguments: str) -> Spoil:
+    """Something happens to a run once `ready` returns something true."""
 
     def spoil(scene: Scene) -> None:
-        for place, name in enumerate("cdefghijkl"[: MANY - 2]):
-            write_capture(scene.folder, name, place % 3)
         scene.arguments = list(arguments)
 
         def watch(process: "subprocess.Popen[str]") -> None:
-            wait_until(lambda: any(scene.out.glob("?.json")))
+            wait_until(lambda: bool(ready(process, scene)))
             act(process, scene)
 
         scene.watch = watch
 
     return spoil
+
+
+def with_captures(names: str) -> Spoil:
+    """More captures."""
+    return lambda scene: [write_capture(scene.folder, name, place % 3) for place, name in enumerate(names)]
+
+
+def when_begun(act: Act, *arguments: str) -> Spoil:
+    """Something happens to a run of twelve captures once the first of them is done."""
+    return both(with_captures(ALL[2:]), when(lambda _, scene: any(scene.out.glob("?.json")), act, *arguments))
+
+
+def has_children(count: int) -> Act:
+    return lambda process, _: len(psutil.Process(process.pid).children()) >= count
 
 
 def a_worker(process: "subprocess.Popen[str]") -> psutil.Process:
@@ -475,7 +483,7 @@ def kill_worker(process: "subprocess.Popen[str]", _scene: Scene) -> None:
 
 def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
     """Kill the only worker, and again when it tries the same capture once more, which it does last."""
-    for finished in (1, MANY - 1):
+    for finished in (1, len(ALL) - 1):
         wait_until(lambda finished=finished: len(list(scene.out.glob("?.json"))) >= finished)
         (worker,) = workers(process)
         before_s = worker.cpu_times().user
@@ -542,41 +550,22 @@ def larger(scene: Scene) -> None:
         tifffile.imwrite(path, np.kron(tifffile.imread(path), np.ones((times, times), np.uint16)))
 
 
-def signalled(number_: int) -> Callable[["subprocess.Popen[str]", Scene], None]:
+def signalled(number_: int, after_s: float = 0.0) -> Act:
     """Sent to all processes of the run, as a terminal does; none of them may be left."""
 
     def act(process: "subprocess.Popen[str]", scene: Scene) -> None:
+        time.sleep(after_s)
         scene.children = psutil.Process(process.pid).children(recursive=True)
         os.killpg(process.pid, number_)
 
     return act
 
 
-def interrupted_while_workers_start(scene: Scene) -> None:
-    when_begun(signalled(signal.SIGINT), "-j", "2")(scene)
-    act = signalled(signal.SIGINT)
-
-    def watch(process: "subprocess.Popen[str]") -> None:
-        wait_until(lambda: bool(psutil.Process(process.pid).children()))
-        act(process, scene)
-
-    scene.watch = watch
-
-
-def terminated_while_files_are_read(scene: Scene) -> None:
-    """SIGTERM to all processes while several of them read the tags of the files."""
+def many_files(scene: Scene) -> None:
+    """So many that several processes read their tags."""
     for number_ in range(1500):
         for band in ("green", "nir"):
             os.link(scene.file(f"a_{band}.tif"), scene.file(f"x{number_}_{band}.tif"))
-    scene.arguments = ["-j", "2"]
-    act = signalled(signal.SIGTERM)
-
-    def watch(process: "subprocess.Popen[str]") -> None:
-        wait_until(lambda: len(psutil.Process(process.pid).children()) > 1)
-        time.sleep(0.3)
-        act(process, scene)
-
-    scene.watch = watch
 
 
 def with_environment(**variables: str) -> Spoil:
@@ -616,9 +605,7 @@ def without_streams(*numbers: int) -> Spoil:
 
 def unread_errors(scene: Scene) -> None:
     """As of `agalign ... 2>&1 | head -1`."""
-    make_more = [chr(code) for code in range(ord("c"), ord("f"))]
-    for number, name in enumerate(make_more, start=2):
-        write_capture(scene.folder, name, number)
+    with_captures("cde")(scene)
     read_end, write_end = os.pipe()
     os.close(read_end)
     scene.process = {"stderr": write_end}
@@ -823,9 +810,15 @@ OTHERS = {
         Ends(3, "stopped after 4 s", "", 1),
     ),
     "the interrupt key": (when_begun(signalled(signal.SIGINT), "-j", "2"), Ends(130, "interrupted; finished", "")),
-    "the interrupt key while workers start": (interrupted_while_workers_start, Ends(130, "interrupted; finished", "")),
+    "the interrupt key while workers start": (
+        both(with_captures(ALL[2:]), when(has_children(1), signalled(signal.SIGINT), "-j", "2")),
+        Ends(130, "interrupted; finished", ""),
+    ),
     "SIGTERM": (when_begun(signalled(signal.SIGTERM), "-j", "2"), Ends(143, "interrupted; finished", "")),
-    "SIGTERM while files are read": (terminated_while_files_are_read, Ends(143, "interrupted; finished", "")),
+    "SIGTERM while files are read": (
+        both(many_files, when(has_children(2), signalled(signal.SIGTERM, 0.3), "-j", "2")),
+        Ends(143, "interrupted; finished", ""),
+    ),
     "names of every kind": (strange_names, Ends(0, "", ("a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200))),
     "standard output full": (standard_output_full, Ends(1, "standard output|output: No space left", "ab")),
     "an infinite number in a sidecar, for the report": (endless_number, Ends(3, r"b\.json: .*finite", "a")),
@@ -835,7 +828,6 @@ OTHERS = {
 FULL = {
     "both workers killed by SIGKILL",
     "a capture whose worker is killed twice",
-    "the process that starts workers killed",
     "memory short in the workers",
     "the interrupt key while workers start",
     "SIGTERM while files are read",
@@ -897,7 +889,7 @@ def what_is_wrong(fault: Fault, seen: Seen) -> str:
     if not fault.ends.says and seen.complaints:
         wrong.append(f"complaints {seen.complaints}")
     # What was stopped may have been written before.
-    if fault.ends.all_but is not None and len(seen.finished) < MANY - fault.ends.all_but:
+    if fault.ends.all_but is not None and len(seen.finished) < len(ALL) - fault.ends.all_but:
         wrong.append(f"{len(seen.finished)} captures finished")
     if "left behind" in seen.output:
         wrong.append("processes are left")

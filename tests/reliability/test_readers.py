@@ -34,7 +34,7 @@ from agalign.values.image import OutputGrid
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::UserWarning")]
 
-ANY_FILE = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+ANY_FILE = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=12)
 STORED = (Band("", Path("IMG_0001_1.tif"), 1, 1280, 960, "uint16"),)
 JSON = st.recursive(
@@ -164,9 +164,7 @@ def model_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @ANY_FILE
 @given(edits=EDITS, cut=st.floats(0.0, 1.0))
-def test_any_damage_to_a_model_is_seen(
-    model_bytes: bytes, tmp_path: Path, edits: list[tuple[float, int]], cut: float
-) -> None:
+def test_any_damaged_model(model_bytes: bytes, tmp_path: Path, edits: list[tuple[float, int]], cut: float) -> None:
     path = tmp_path / "m.safetensors"
     for data in (edited(model_bytes, edits), model_bytes[: int(cut * (len(model_bytes) - 1))]):
         path.write_bytes(data)

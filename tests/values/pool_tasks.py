@@ -39,11 +39,6 @@ def process_id(_: int) -> int:
     return os.getpid()
 
 
-def wait_then_double(number: int) -> int:
-    time.sleep(0.005 + (number % 7) * 0.003)
-    return 2 * number
-
-
 def sleep(seconds: float) -> float:
     time.sleep(seconds)
     return seconds

@@ -23,24 +23,6 @@ FIELD = DisplacementField(20.0, np.random.default_rng(0).normal(0, 1, (6, 8, 2))
 JOINT = joint_result(H, last_step_px=0.02, corner_std_xy_px=((0.3, 0.4), (0.1, 0.1), (0.2, 0.1), (0.1, 0.2)))
 
 
-def test_a_homography_between_images_and_files_maps_the_same_places() -> None:
-    between_files = SCALES.between_files(H)
-    mapped = geometry.apply(H, SCALES.fixed.positions(POINTS))
-    assert_allclose(SCALES.moving.positions(geometry.apply(between_files, POINTS)), mapped, atol=1e-9)
-    assert_allclose(SCALES.between_images(between_files), H, atol=1e-9)
-    image = PixelMapping(H, local=FIELD)
-    files = image.rescaled(SCALES.fixed.inverse, SCALES.moving.inverse)
-    assert_allclose(SCALES.moving.positions(files(POINTS)), image(SCALES.fixed.positions(POINTS)), atol=1e-9)
-
-
-def test_a_rescaled_field_is_exact_however_much_larger_the_image_is() -> None:
-    """A lattice whose first node is a pixel's centre has its origin between the pixels of a larger image."""
-    scale = PixelScale(5.0, 4.0)
-    large = FIELD.rescaled(scale)
-    assert_allclose(large(scale.positions(POINTS)), scale.displacements(FIELD(POINTS)), atol=1e-12)
-    assert_allclose(large.rescaled(scale.inverse)(POINTS), FIELD(POINTS), atol=1e-12)
-
-
 def test_a_field_taken_over_to_another_lattice_keeps_its_values_at_the_nodes() -> None:
     finer = FIELD.rescaled(PixelScale(2.0, 2.0)).on_lattice(10.0, (300, 200))
     nodes = np.array([[0.0, 0.0], [120.0, 40.0], [200.0, 100.0]])
@@ -60,17 +42,6 @@ def test_the_standard_errors_of_corners_are_scaled_axis_by_axis() -> None:
     assert JOINT.corner_std_px == pytest.approx(0.5)
     assert in_file.corner_std_px == pytest.approx(np.hypot(0.3 * 2, 0.4 * 4))
     assert in_file.last_step_px == pytest.approx(0.02 * np.sqrt(8))
-
-
-def test_windows_of_an_image_are_windows_of_its_file() -> None:
-    centres, shifts = np.array([[9.5, 19.5], [30.0, 5.0], [1.0, 1.0]]), np.array([[0.3, 0.4], [1.0, 0], [np.nan] * 2])
-    residual = Residual[FixedImagePx].of(centres, shifts, np.array([9.0, 8.0, 2.0]))
-    in_file = residual.in_file_px(SCALES)
-    assert_allclose(in_file.centres_px[0], [19.5, 79.5])
-    assert_allclose(in_file.shifts_px[:2], [[0.6, 1.6], [2.0, 0.0]])
-    assert in_file.median_px == pytest.approx((np.hypot(0.6, 1.6) + 2.0) / 2)
-    assert in_file.coverage == residual.coverage == pytest.approx(2 / 3)
-    assert_allclose(in_file.peaks_sigma, residual.peaks_sigma)
 
 
 def test_an_alignment_between_images_is_the_same_between_files() -> None:

@@ -45,9 +45,7 @@ def test_a_text_is_the_same_bytes_on_every_system(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows writes no folder to disk")
-def test_a_drive_that_cannot_write_a_folder_to_disk_is_no_fault(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_cannot_be_synchronised_is_accepted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fsync = os.fsync
 
     def of_files_only(descriptor: int) -> None:
@@ -90,16 +88,12 @@ def test_what_cannot_be_written_is_one_line(tmp_path: Path) -> None:
             write_text(tmp_path / path, "x")
 
 
-@pytest.mark.parametrize("name", ["a.tif", "red/a.tif", "..a.tif", "with space é.tif"])
-def test_names_inside_a_folder(name: str) -> None:
-    assert is_inside(name)
-
-
 @pytest.mark.parametrize(
     "name", ["", "../a", "a/../../b", "/etc/passwd", "/vsicurl/http://x/y", r"C:\a", r"\\host\a", r"a\..\..\b", "a\0b"]
 )
 def test_names_outside_a_folder(name: str) -> None:
     assert not is_inside(name)
+    assert all(map(is_inside, ("a.tif", "red/a.tif", "..a.tif", "with space é.tif")))
 
 
 def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:

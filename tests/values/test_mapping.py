@@ -9,7 +9,7 @@ from agalign.synthetic import cameras
 from agalign.values import geometry, lens
 from agalign.values.displacement import DisplacementField
 from agalign.values.image import Tile
-from agalign.values.mapping import PixelMapping, splined
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 from agalign.values.relief import Parallax, Relief, between_levels
 
@@ -45,14 +45,6 @@ def pixels(tile: Tile) -> np.ndarray:
 
 
 WHOLE = Tile(0, 0, *SIZE)
-
-
-def test_a_splined_mapping_is_the_mapping_to_a_fraction_of_a_thousandth_of_a_pixel() -> None:
-    mapping = PixelMapping(H, FIXED, MOVING)
-    x, y = np.arange(60.0, 640.0), np.arange(20.0, 480.0)
-    exact = mapping(np.stack(np.meshgrid(x, y), axis=-1))
-    assert np.abs(splined(mapping, x, y) - exact).max() < 2e-4
-    assert np.abs(splined(mapping, x, y, dtype=np.float32) - exact).max() < 1e-3
 
 
 @pytest.mark.parametrize("tile", [WHOLE, Tile(30, 40, 1, 1), Tile(-5, -3, 70, 60), Tile(600, 450, 60, 50)])

@@ -1,7 +1,6 @@
 """Worker processes that are killed, stopped or cannot start: every task has its outcome, in time, and none is left."""
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -19,7 +18,7 @@ import pytest
 
 from agalign.errors import WorkerError
 from agalign.values import process_pool
-from agalign.values.process_pool import Outcome, ProcessPool, WorkerDiedError
+from agalign.values.process_pool import Outcome, ProcessPool
 from agalign.values.processes import Worker
 
 from ..builders import in_full_run
@@ -270,36 +269,6 @@ def test_a_start_is_tried_again_if_the_fork_server_refuses_it(monkeypatch: pytes
     assert len(starts) == 2
 
 
-def killing(workers: ProcessPool[Any, Any], stop: threading.Event, rest_s: Callable[[], float]) -> list[int]:
-    """Kill one worker after another until the event is set: the ids of the killed ones."""
-    killed: list[int] = []
-    rng = random.Random(0)
-
-    def kill() -> None:
-        while not stop.wait(rest_s()):
-            alive = [w.process.pid for w in list(workers._workers) if w._launched]
-            alive = [pid for pid in alive if pid and pid not in killed]
-            if alive:
-                killed.append(rng.choice(alive))
-                with suppress(ProcessLookupError):
-                    os.kill(killed[-1], signal.SIGKILL)
-
-    threading.Thread(target=kill, daemon=True).start()
-    return killed
-
-
-@pytest.mark.parametrize("processes", [1, 8])
-def test_a_storm_ends_the_run_with_its_reason(processes: int) -> None:
-    stop = threading.Event()
-    with pool(tasks.sleep, processes) as workers:
-        killing(workers, stop, lambda: 0.001)
-        began = time.monotonic()
-        with pytest.raises(WorkerError, match=r"3 worker processes one after another ended .*signal 9"):
-            list(workers.run([60.0] * 100))
-        assert time.monotonic() - began < 20
-        stop.set()
-
-
 def test_workers_killed_together_do_not_end_the_run() -> None:
     with pool(tasks.sleep, 6) as workers:
         outcomes = workers.run([0.0, *[0.3] * 12])
@@ -307,40 +276,6 @@ def test_workers_killed_together_do_not_end_the_run() -> None:
         for worker in worker_processes():
             worker.kill()
         assert all(o.value() == 0.3 for o in outcomes)
-
-
-@pytest.mark.slow
-def test_a_killed_fork_server_costs_nothing() -> None:
-    if CONTEXT.get_start_method() != "forkserver":
-        pytest.skip("this system has no fork server")
-    with pool(tasks.sleep, 2) as workers:
-        outcomes = workers.run([0.0, 0.0, *[1.0] * 3])
-        next(outcomes), next(outcomes)
-        parents = {p.ppid() for p in worker_processes()}
-        assert len(parents) == 1
-        os.kill(parents.pop(), signal.SIGKILL)
-        assert [o.value() for o in outcomes] == [1.0] * 3
-
-
-@pytest.mark.full
-@pytest.mark.slow
-def test_a_hundred_kills_at_random_moments() -> None:
-    """Eight workers, on however many cores."""
-    rng, stop = random.Random(5), threading.Event()
-    given, outcomes, runs = list(range(3000)), [], 0
-    with pool(tasks.wait_then_double, 8) as workers:
-        killed = killing(workers, stop, lambda: rng.uniform(0.0, 0.1))
-        while len(killed) < 100:
-            runs += 1
-            outcomes += list(workers.run(given, timeout_s=30))
-        stop.set()
-    assert len(outcomes) == runs * len(given)
-    for number in given:
-        assert sum(o.number == number for o in outcomes) == runs
-    lost = [o for o in outcomes if o.error is not None]
-    assert {told(o) for o in lost} <= {"WorkerDiedError: signal 9"}
-    assert len(lost) <= len(killed) / 2  # each of them was tried twice
-    assert all(o.result == 2 * o.number for o in outcomes if o.error is None)
 
 
 # ---- ends
@@ -387,7 +322,3 @@ def test_no_process_outlives_its_parent(method: str, number: int, whom: str, tmp
             process.kill()
     _, left = psutil.wait_procs(children, timeout=10)
     assert left == []
-
-
-def test_the_exit_code_of_a_worker_that_never_started() -> None:
-    assert str(WorkerDiedError(None)) == "killed"
