@@ -18,7 +18,6 @@ from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.capture import Band
 from agalign.values.choices import CaptureStatus
-from agalign.values.files import file_checksum
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx
@@ -64,7 +63,7 @@ def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Side
         "output": _output(context) if context.layers else None,
         "preview": next((f.preview for f in context.written if f.preview is not None), None),
         "accept_predicted_px": accept_predicted_px,
-        "products": [_file(f, context) | {"kind": f.kind, "sha256": file_checksum(f.path)} for f in context.written],
+        "products": [_file(f, context) | {"kind": f.kind, "sha256": f.sha256} for f in context.written],
         "not_written": not_written,
         "settings": fingerprint(capture, context.settings),
     }
@@ -110,7 +109,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     place = context.places.get(band.name)  # None if all pixels are nodata
     facts = _source(band) | {
         "wavelength_nm": band.wavelength_nm,
-        "place": None if place is None else {"file": context.paths.relative(place[0]), "band_index": place[1]},
+        "place": None if place is None else {"file": context.paths.relative(place[0].path), "band_index": place[1]},
     }
     if band is context.capture.reference:
         return BandPart.model_validate(facts | {"status": "reference", "reason": None, "seconds": 0.0})
