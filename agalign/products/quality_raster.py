@@ -11,7 +11,7 @@ from agalign.pixels.radiometry import to_reflectance
 from agalign.pixels.raster import read_tile
 from agalign.pixels.sun_glint import sun_glint
 from agalign.products.checked_raster import WORK_TILE_PX, LayerDescription
-from agalign.products.indices import Role, role_of
+from agalign.products.indices import Role, role_of_band
 from agalign.products.layout import Layer, is_inside
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import layer_pixels
@@ -198,7 +198,7 @@ class _WaterBands:
         by_role: dict[Role, tuple[Layer, Radiometry]] = {}
         for layer in layers:
             band = layer.band
-            role = None if band.companion or layer.is_gap else role_of(band.name, band.wavelength_nm)
+            role = None if layer.is_gap else role_of_band(band)
             reflectance = None if band.radiometry is None else to_reflectance(band.radiometry)
             if role is not None and reflectance is not None:
                 by_role.setdefault(role, (layer, reflectance))

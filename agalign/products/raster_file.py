@@ -29,7 +29,7 @@ from agalign.products.checked_raster import (
     predictor,
     write_layers,
 )
-from agalign.products.indices import Role, role_of
+from agalign.products.indices import Role, role_of_band
 from agalign.products.layout import Layer, is_inside
 from agalign.products.product import GEOTIFF
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
@@ -42,7 +42,6 @@ _FILL_DISTANCE_PX = 100.0
 """Search distance of the interpolation of occluded pixels: GDAL's default, wider than any occlusion."""
 _COG_BLOCK_PX = 512
 """GDAL's default for a COG."""
-_COLOURS: Mapping[Role, ColorInterp] = {"red": ColorInterp.red, "green": ColorInterp.green, "blue": ColorInterp.blue}
 _MAX_CANDIDATES = 1 << 16
 """All values of a 16-bit type; for larger types the first ones are sufficient."""
 UNITS: Mapping[Quantity, str] = {
@@ -146,12 +145,13 @@ def _colours(layers: Sequence[Layer]) -> Sequence[ColorInterp | None]:
     """
     if len(layers) == 1:
         return [None]
-    roles = [None if b.companion else role_of(b.name, b.wavelength_nm) for b in (layer.band for layer in layers)]
-    if not set(_COLOURS) <= set(roles):
-        return [ColorInterp.gray, *[ColorInterp.undefined] * (len(layers) - 1)]
-    result = [ColorInterp.undefined] * len(layers)
-    for role, colour in _COLOURS.items():
-        result[roles.index(role)] = colour
+    roles, undefined = [role_of_band(layer.band) for layer in layers], ColorInterp.undefined
+    colours: tuple[Role, ...] = ("red", "green", "blue")
+    if not set(colours) <= set(roles):
+        return [ColorInterp.gray, *[undefined] * (len(layers) - 1)]
+    result = [undefined] * len(layers)
+    for role in colours:
+        result[roles.index(role)] = ColorInterp[role]
     return result
 
 

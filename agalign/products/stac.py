@@ -20,7 +20,7 @@ from agalign.flight.groups import camera_key, flight_key, flights_of
 from agalign.pixels.raster import crs_code
 from agalign.products.checked_raster import georeferenced
 from agalign.products.footprint import footprint
-from agalign.products.indices import role_of
+from agalign.products.indices import role_of_band
 from agalign.products.pan_sharpen import panchromatic
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.raster_file import UNITS
@@ -36,7 +36,6 @@ _MAX_NAME, _CHECKSUM_DIGITS = 60, 8
 """Characters of a collection's id, which is a file name: at most 255 bytes, and up to 4 bytes per character."""
 _GEOJSON = "application/geo+json"
 _JSON = "application/json"
-_COMMON_NAMES = {"blue": "blue", "green": "green", "red": "red", "red edge": "rededge", "nir": "nir"}
 
 
 class StacItem(Product):
@@ -212,8 +211,8 @@ def _common_name(band: Band, capture: Capture) -> str | None:
         return "lwir11"
     if band in panchromatic(capture) and not band.companion:
         return "pan"
-    role = None if band.companion else role_of(band.name, band.wavelength_nm)
-    return None if role is None else _COMMON_NAMES[role]
+    role = role_of_band(band)
+    return None if role is None else role.replace(" ", "")
 
 
 def _link_collection(item: "pystac.Item", capture: Capture) -> None:
