@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from agalign.products.footprint import accuracy_of_footprint_m, footprint, with_assumed_height
+from agalign.products.footprint import accuracy_of_footprint_m, footprint, geojson_geometry, with_assumed_height
 from agalign.products.index_table import IndexRow, read_table
 from agalign.products.product import CapturePaths
 from agalign.products.sidecar import CaptureResult
@@ -16,10 +16,6 @@ from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
 FLIGHT_MAP_FILE = "flight.geojson"
-_WITHOUT_FOOTPRINT = ("panel", "sky")
-"""Panels are photographed from 1 m, and the sky is not on the ground."""
-_DECIMALS = 7
-"""Of degrees: a centimetre."""
 
 
 class FlightMap:
@@ -35,15 +31,12 @@ class FlightMap:
         The geometry is the footprint of the aligned rasters, or of the reference if there are none; else the position
         of the camera; else null.
         """
-        shown = capture if status in _WITHOUT_FOOTPRINT else with_assumed_height(capture)
+        # Panels are photographed from 1 m, and the sky is not on the ground.
+        shown = capture if status in ("panel", "sky") else with_assumed_height(capture)
         ring = footprint(shown, _grid(capture, result))
         position, pose = shown.position, shown.pose
-        geometry: dict[str, Any] | None = None
-        if ring is not None:
-            # RFC 7946: outer rings are counter-clockwise.
-            geometry = {"type": "Polygon", "coordinates": [ring[::-1].round(_DECIMALS).tolist()]}
-        elif position is not None:
-            geometry = {"type": "Point", "coordinates": [position.longitude, position.latitude]}
+        # RFC 7946: outer rings are counter-clockwise. 1e-7 degrees are a centimetre.
+        geometry = geojson_geometry(None if ring is None else ring[::-1], position, decimals=7)
         georeference = capture.reference.georeference
         accuracy_m = None if georeference is None else georeference.accuracy_m
         if ring is not None and georeference is None and pose is not None:

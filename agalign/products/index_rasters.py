@@ -39,17 +39,12 @@ from agalign.values.resample import tiles
 
 _MAX_STATISTICS_PX = 4_000_000
 """Percentiles of larger rasters are calculated from every second, third … row and column."""
-_MIN_SPAN = 1e-3
-"""Smallest difference between the ends of the colour scale of a picture."""
-_SOURCE_TAG = "INDEX_MADE_FROM"
-_BARS = 120
 _PICTURE_PX = 720
 """Longer side of the image at the top left of the picture; the report overlays it on the composite."""
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
 _NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
 """Greys for raw numbers, whose values do not distinguish soil and vegetation."""
-_NODATA_COLOUR = (225, 190, 215)
 
 
 class IndexRasters(Product):
@@ -199,7 +194,7 @@ def _finished_before(target: Path, source: str) -> IndexStatistics | None:
             tags = dataset.tags()
     except (AgalignError, OSError, tifffile.TiffFileError):
         return None
-    return statistics_in(tags) if tags.get(_SOURCE_TAG) == source else None
+    return statistics_in(tags) if tags.get("INDEX_MADE_FROM") == source else None
 
 
 def _unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
@@ -247,7 +242,7 @@ def _tags(index: Index, like: OpenRaster, unit: str, source: str) -> dict[str, s
         "INDEX": index.name,
         "INDEX_SOURCE": index.source,
         "INDEX_FORMULA": f"{index.formula} with {constants}" if constants else index.formula,
-        _SOURCE_TAG: source,
+        "INDEX_MADE_FROM": source,
         "INPUT": "raw numbers, not reflectance" if unit == RAW else "",
     }
 
@@ -258,7 +253,8 @@ def _statistics(index: Index, unit: str, sample: NDArray[np.float32], valid_shar
     low, p5, median, p95, high = (round(float(v), 6) for v in np.percentile(sample, (2, 5, 50, 95, 98)))
     if index.span is not None and unit != RAW:
         low, high = index.span
-    return IndexStatistics(median, p5, p95, round(valid_share, 6), unit, low, max(high, low + _MIN_SPAN))
+    # The ends of the colour scale must differ.
+    return IndexStatistics(median, p5, p95, round(valid_share, 6), unit, low, max(high, low + 1e-3))
 
 
 def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: IndexStatistics) -> None:
@@ -280,14 +276,14 @@ def write_picture(
     """
     span, neutral = (statistics.low, statistics.high), statistics.unit == RAW
     shape = values.shape
-    width, margin, bars = max(shape[1], 360), 24, 90
+    width, margin, bars, bins = max(shape[1], 360), 24, 90, 120
     # In float64: a value clipped in float32 may be just outside the span.
-    counts = np.histogram(sample.astype(float).clip(*span), _BARS, span)[0]
+    counts = np.histogram(sample.astype(float).clip(*span), bins, span)[0]
     sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
     sheet[: shape[0], : shape[1]] = _coloured(values, span, neutral=neutral)
     base = shape[0] + margin + bars
-    edges = np.linspace(margin, width - margin, _BARS + 1).round().astype(int)
-    centres = np.linspace(*span, 2 * _BARS + 1, dtype=np.float32)[1::2]
+    edges = np.linspace(margin, width - margin, bins + 1).round().astype(int)
+    centres = np.linspace(*span, 2 * bins + 1, dtype=np.float32)[1::2]
     colours = _coloured(centres[None], span, neutral=neutral)[0]
     # The first and last bins also contain the values beyond the span.
     heights = (bars * counts / max(int(counts[1:-1].max(initial=1)), 1)).clip(0, bars).round().astype(int)
@@ -305,5 +301,5 @@ def _coloured(values: NDArray[Any], span: tuple[float, float], *, neutral: bool)
     share = np.nan_to_num(np.clip((values - span[0]) / (span[1] - span[0]), 0, 1))
     stops = np.linspace(0, 1, len(ramp))
     result = np.stack([np.interp(share, stops, channel) for channel in ramp.T], axis=-1)
-    result[~np.isfinite(values)] = _NODATA_COLOUR
+    result[~np.isfinite(values)] = (225, 190, 215)
     return np.asarray(result.round(), np.uint8)

@@ -37,13 +37,8 @@ from agalign.values.choices import Interpolation
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.resample import tiles
 
-_COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 _FILL_DISTANCE_PX = 100.0
 """Search distance of the interpolation of occluded pixels: GDAL's default, wider than any occlusion."""
-_COG_BLOCK_PX = 512
-"""GDAL's default for a COG."""
-_MAX_CANDIDATES = 1 << 16
-"""All values of a 16-bit type; for larger types the first ones are sufficient."""
 UNITS: Mapping[Quantity, str] = {
     "radiance": "W m-2 sr-1 nm-1",
     "relative radiance": "",
@@ -104,7 +99,7 @@ def write_raster(
 
 def media_type(settings: WriteSettings) -> str:
     """Return the media type of the files that `write_raster` writes."""
-    return _COG if settings.format == "cog" else GEOTIFF
+    return f"{GEOTIFF}; profile=cloud-optimized" if settings.format == "cog" else GEOTIFF
 
 
 def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, str]:
@@ -213,9 +208,11 @@ def _compression(settings: WriteSettings, *, all_bands: bool) -> str:
 
 def _to_cog(path: Path, compression: str) -> None:
     cog = path.with_name(f"{path.name}.cog")
-    options = {} if compression == "none" else {"compress": compression, "predictor": "yes"}
+    options = {"blocksize": 512, "bigtiff": "if_safer"}  # GDAL's default size of blocks
+    if compression != "none":
+        options |= {"compress": compression, "predictor": "yes"}
     try:
-        copy_dataset(path, cog, driver="COG", blocksize=_COG_BLOCK_PX, bigtiff="if_safer", **options)
+        copy_dataset(path, cog, driver="COG", **options)
         cog.replace(path)
     finally:
         cog.unlink(missing_ok=True)
@@ -263,7 +260,8 @@ def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any
     """
     copied = [_values_in(layer.band, grid.tile) for layer in layers if layer.is_copied]
     limits = np.iinfo(str(dtype))
-    candidates = itertools.chain([0, limits.max], range(1, min(limits.max, _MAX_CANDIDATES)))
+    # All values of a 16-bit type; for larger types the first ones are sufficient.
+    candidates = itertools.chain([0, limits.max], range(1, min(limits.max, 1 << 16)))
     return float(next((v for v in candidates if not any((values == v).any() for values in copied)), 0))
 
 

@@ -19,7 +19,7 @@ from agalign.flight.fingerprint import hashed
 from agalign.flight.groups import camera_key, flight_key, flights_of
 from agalign.pixels.raster import crs_code
 from agalign.products.checked_raster import georeferenced
-from agalign.products.footprint import footprint
+from agalign.products.footprint import footprint, geojson_geometry
 from agalign.products.indices import role_of_band
 from agalign.products.pan_sharpen import panchromatic
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
@@ -31,9 +31,6 @@ from agalign.values.image import OutputGrid
 if TYPE_CHECKING:
     import pystac
 
-_COLLECTION_SUFFIX = ".collection.json"
-_MAX_NAME, _CHECKSUM_DIGITS = 60, 8
-"""Characters of a collection's id, which is a file name: at most 255 bytes, and up to 4 bytes per character."""
 _GEOJSON = "application/geo+json"
 _JSON = "application/json"
 
@@ -111,11 +108,12 @@ def _collection_id(capture: Capture) -> str:
     """
     camera = f"{capture.camera.model} {capture.camera.serial}".strip()
     name = re.sub(r"[^\w.-]+", "_", capture.flight_id or camera or "flight")
-    return f"{name[:_MAX_NAME]}-{hashed(*flight_key(capture))[:_CHECKSUM_DIGITS]}"
+    # A file name has at most 255 bytes, and up to 4 bytes per character.
+    return f"{name[:60]}-{hashed(*flight_key(capture))[:8]}"
 
 
 def _collection_file(capture: Capture) -> str:
-    return f"{_collection_id(capture)}{_COLLECTION_SUFFIX}"
+    return f"{_collection_id(capture)}.collection.json"
 
 
 def _item(context: ProductContext) -> "pystac.Item":
@@ -124,7 +122,9 @@ def _item(context: ProductContext) -> "pystac.Item":
     from pystac.extensions.projection import ProjectionExtension
 
     capture, grid = context.capture, context.grid
-    shape, box = _geometry(capture, grid)
+    shape = geojson_geometry(footprint(capture, grid), capture.position, decimals=8)
+    corners = None if shape is None else np.atleast_2d(np.array(shape["coordinates"]).squeeze())
+    box = None if corners is None else [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()]
     moment, source = _moment(capture)
     properties = {"agalign:datetime_source": source, "agalign:reference_band": capture.reference.name}
     item = pystac.Item(capture.label, geometry=shape, bbox=box, datetime=moment, properties=properties)
@@ -132,18 +132,6 @@ def _item(context: ProductContext) -> "pystac.Item":
         item.properties["instruments"] = [f"{capture.camera.make} {capture.camera.model}".strip()]
     ProjectionExtension.ext(item, add_if_missing=True).apply(**_projection(capture, grid))
     return item
-
-
-def _geometry(capture: Capture, grid: OutputGrid) -> tuple[dict[str, Any] | None, list[float] | None]:
-    """(GeoJSON geometry, bounding box): the footprint, else the camera's position."""
-    ring, position = footprint(capture, grid), capture.position
-    if ring is not None:
-        box = [*ring.min(axis=0).round(8).tolist(), *ring.max(axis=0).round(8).tolist()]
-        return {"type": "Polygon", "coordinates": [ring.round(8).tolist()]}, box
-    if position is not None:
-        point = [position.longitude, position.latitude]
-        return {"type": "Point", "coordinates": point}, point * 2
-    return None, None
 
 
 def _projection(capture: Capture, grid: OutputGrid) -> dict[str, Any]:
