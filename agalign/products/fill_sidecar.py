@@ -15,7 +15,7 @@ from agalign.products.product import ProductContext, WrittenFile
 from agalign.products.relief_map import ReliefMap
 from agalign.products.sidecar import BandPart, Sidecar, is_delivered
 from agalign.values import geometry
-from agalign.values.alignment import Residual
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Band
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Points
@@ -114,7 +114,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     if band is context.capture.reference:
         return BandPart.model_validate(facts | {"status": "reference", "reason": None, "seconds": 0.0})
     alignment = context.alignments[band.name]
-    mapping, residual, size_px = alignment.mapping, alignment.residual, context.capture.reference.size_px
+    mapping, size_px = alignment.mapping, context.capture.reference.size_px
     grid_px = _grid_px(mapping.of_the_plane, size_px)
     lenses = (mapping.fixed_lens, mapping.moving_lens)
     field = mapping.local
@@ -128,11 +128,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
         "seed": alignment.seed,
         "grid": {"reference_px": grid_px, "moving_px": mapping(grid_px)},
         "joint": alignment.joint,
-        "metrics": {
-            "before": dict(alignment.before),
-            "after": dict(alignment.after) | _residual(residual),
-            "tiles": _tiles(residual),
-        },
+        "metrics": _metrics(alignment),
         "geometry": {"kind": alignment.geometry, "held_out_p95_px": alignment.candidates},
         "lenses": None if None in lenses else lenses,
         "field": field,
@@ -146,21 +142,15 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     return part
 
 
-def _residual(residual: Residual[FixedFilePx] | None) -> dict[str, float]:
+def _metrics(alignment: Alignment[FixedFilePx]) -> dict[str, Any]:
+    residual, before, after = alignment.residual, dict(alignment.before), dict(alignment.after)
     if residual is None:
-        return {}
-    return {
-        "residual_px": residual.median_px,
-        "residual_p95_px": residual.p95_px,
-        "residual_coverage": residual.coverage,
-    }
-
-
-def _tiles(residual: Residual[FixedFilePx] | None) -> list[dict[str, Any]]:
-    if residual is None:
-        return []
+        return {"before": before, "after": after, "tiles": []}
+    after |= {"residual_px": residual.median_px, "residual_p95_px": residual.p95_px}
+    after["residual_coverage"] = residual.coverage
     windows = zip(residual.centres_px.tolist(), residual.shifts_px.tolist(), strict=True)
-    return [{"centre_px": centre_px, "shift_px": shift_px} for centre_px, shift_px in windows]
+    tiles = [{"centre_px": centre_px, "shift_px": shift_px} for centre_px, shift_px in windows]
+    return {"before": before, "after": after, "tiles": tiles}
 
 
 def _relief(context: ProductContext, mapping: PixelMapping, nodes_px: Points) -> dict[str, Any] | None:

@@ -13,7 +13,6 @@ from agalign.products.sidecar import CaptureResult
 from agalign.values.capture import Capture
 from agalign.values.files import write_text
 from agalign.values.image import OutputGrid
-from agalign.values.pixel_units import PixelScale
 
 FLIGHT_MAP_FILE = "flight.geojson"
 
@@ -33,7 +32,8 @@ class FlightMap:
         """
         # Panels are photographed from 1 m, and the sky is not on the ground.
         shown = capture if status in ("panel", "sky") else with_assumed_height(capture)
-        ring = footprint(shown, _grid(capture, result))
+        output = None if result is None else result.output
+        ring = footprint(shown, OutputGrid(0, 0, *capture.reference.size_px) if output is None else output.grid)
         position, pose = shown.position, shown.pose
         # RFC 7946: outer rings are counter-clockwise. 1e-7 degrees are a centimetre.
         geometry = geojson_geometry(None if ring is None else ring[::-1], position, decimals=7)
@@ -126,12 +126,6 @@ def _links(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
         "picture": by_kind.get("picture"),
         "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
     }
-
-
-def _grid(capture: Capture, result: CaptureResult | None) -> OutputGrid:
-    if result is None or result.output is None:
-        return OutputGrid(0, 0, *capture.reference.size_px)
-    return OutputGrid(*result.output.crop, PixelScale(*result.output.scale))
 
 
 def _of_result(result: CaptureResult | None) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,7 +27,7 @@ from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.checked_raster import Block, LayerDescription, predictor, write_layers
 from agalign.products.layout import Layer, output_layers
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import with_nodata, write_raster
+from agalign.products.raster_file import as_type, with_nodata, write_raster
 from agalign.products.sidecar import is_delivered
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
@@ -173,7 +172,8 @@ def _sharpen(
             ratio = brovey_ratio([light[k] for k in in_range], light[count:].mean(axis=0), weights)
             for k, is_sharpened in enumerate(sources.is_sharpened):
                 values = (light[k] * ratio if is_sharpened else light[k]) + black_levels[k]
-                yield _pixels(values, valid[k], dtype, nodata), k + 1, tile.x0, tile.y0
+                pixels = as_type(values if dtype.kind == "f" else np.nan_to_num(values), dtype)
+                yield pixels if nodata is None else with_nodata(pixels, valid[k], nodata), k + 1, tile.x0, tile.y0
 
     tags = {k: v for k, v in file.tags().items() if k != "AREA_OR_POINT"}
     write_layers(target, profile, _descriptions(file, sources, weights), tags, blocks())
@@ -192,14 +192,6 @@ def _read(
     pixels = file.read(window=Window(tile.x0, tile.y0, tile.width, tile.height)).astype(np.float32)
     valid = data_mask(pixels, nodata)
     return np.where(valid, pixels - black_levels[:, None, None], np.float32(np.nan)), valid
-
-
-def _pixels(values: FloatImage, valid: Mask, dtype: np.dtype[Any], nodata: float | None) -> NDArray[Any]:
-    if dtype.kind != "f":
-        limits = np.iinfo(str(dtype))
-        values = np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max)
-    result = values.astype(dtype)
-    return result if nodata is None else with_nodata(result, valid, nodata)
 
 
 def _descriptions(source: OpenRaster, sources: _Sources, weights: NDArray[np.float64]) -> list[LayerDescription]:

@@ -34,7 +34,7 @@ from agalign.products.layout import Layer, is_inside
 from agalign.products.product import GEOTIFF
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
 from agalign.values.choices import Interpolation
-from agalign.values.image import Mask, OutputGrid, Tile
+from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
 from agalign.values.resample import tiles
 
 _FILL_DISTANCE_PX = 100.0
@@ -193,10 +193,15 @@ def _with_occluded(pixels: Pixels, valid: Mask, occluded: Mask) -> tuple[Pixels,
     distance_px = cv2.distanceTransform((~valid).astype(np.uint8), cv2.DIST_L2, 3)
     occluded = occluded & (distance_px < _FILL_DISTANCE_PX)
     filled = fillnodata(np.where(valid, pixels, 0).astype(np.float32), valid, _FILL_DISTANCE_PX)
-    if pixels.dtype.kind in "iu":
-        limits = np.iinfo(str(pixels.dtype))
-        filled = np.clip(np.rint(filled), limits.min, limits.max)
-    return np.where(occluded, filled, pixels).astype(pixels.dtype), valid | occluded
+    return np.where(occluded, as_type(filled, pixels.dtype), pixels), valid | occluded
+
+
+def as_type(values: FloatImage, dtype: np.dtype[Any]) -> Pixels:
+    """Return values in another type, rounded and limited to its range if it is an integer type."""
+    if dtype.kind != "f":
+        limits = np.iinfo(str(dtype))
+        values = np.clip(np.rint(values), limits.min, limits.max)
+    return values.astype(dtype)
 
 
 def _compression(settings: WriteSettings, *, all_bands: bool) -> str:

@@ -31,9 +31,6 @@ from agalign.values.image import OutputGrid
 if TYPE_CHECKING:
     import pystac
 
-_GEOJSON = "application/geo+json"
-_JSON = "application/json"
-
 
 class StacItem(Product):
     """The STAC item of a capture, with the files of the other products as assets."""
@@ -51,8 +48,7 @@ class StacItem(Product):
         path = context.paths.file(self.suffix)
         item = _item(context)
         _add_assets(item, context)
-        _link_collection(item, context.capture)
-        _write_json(path, item.to_dict(include_self_link=False))
+        write_text(path, json.dumps(item.to_dict(include_self_link=False), indent=1) + "\n")
         return [WrittenFile(self.kind, path)]
 
 
@@ -78,16 +74,17 @@ def _write_collection(capture: Capture, items: Sequence[Path], out: Path) -> Pat
     """Write the collection of the flight of `capture`."""
     import pystac
 
-    target, read = out / _collection_file(capture), [_read_item(path) for path in items]
+    name, read = _collection_id(capture), [_read_item(path) for path in items]
+    target = out / f"{name}.collection.json"
     extent = pystac.Extent.from_items(read)
     if all(item.bbox is None for item in read):
         extent.spatial = pystac.SpatialExtent([[-180.0, -90.0, 180.0, 90.0]])
     description = f"Captures of {camera_key(capture)} with co-registered bands"
-    collection = pystac.Collection(_collection_id(capture), description, extent, license="other")
-    collection.add_link(pystac.Link("root", f"./{target.name}", _JSON))
+    collection = pystac.Collection(name, description, extent, license="other")
+    collection.add_link(pystac.Link("root", f"./{target.name}", pystac.MediaType.JSON))
     for path in items:
-        collection.add_link(pystac.Link("item", f"./{path.relative_to(out).as_posix()}", _GEOJSON))
-    _write_json(target, collection.to_dict(include_self_link=False))
+        collection.add_link(pystac.Link("item", f"./{path.relative_to(out).as_posix()}", pystac.MediaType.GEOJSON))
+    write_text(target, json.dumps(collection.to_dict(include_self_link=False), indent=1) + "\n")
     return target
 
 
@@ -112,12 +109,8 @@ def _collection_id(capture: Capture) -> str:
     return f"{name[:60]}-{hashed(*flight_key(capture))[:8]}"
 
 
-def _collection_file(capture: Capture) -> str:
-    return f"{_collection_id(capture)}.collection.json"
-
-
 def _item(context: ProductContext) -> "pystac.Item":
-    """The item of a capture, without assets and links."""
+    """The item of a capture, without assets."""
     import pystac
     from pystac.extensions.projection import ProjectionExtension
 
@@ -131,6 +124,10 @@ def _item(context: ProductContext) -> "pystac.Item":
     if capture.camera.model:
         item.properties["instruments"] = [f"{capture.camera.make} {capture.camera.model}".strip()]
     ProjectionExtension.ext(item, add_if_missing=True).apply(**_projection(capture, grid))
+    item.collection_id = _collection_id(capture)
+    to_out = "/".join([".."] * len(capture.folder.parts)) or "."
+    for relation in ("collection", "parent", "root"):
+        item.add_link(pystac.Link(relation, f"{to_out}/{item.collection_id}.collection.json", pystac.MediaType.JSON))
     return item
 
 
@@ -158,7 +155,7 @@ def _add_assets(item: "pystac.Item", context: ProductContext) -> None:
         item.add_asset(file.asset.key, asset)
         if file.bands:
             _describe_bands(asset, [by_name[n] for n in file.bands], file.nodata, context)
-    item.add_asset("sidecar", pystac.Asset(sidecar.name, media_type=_JSON, roles=["metadata"]))
+    item.add_asset("sidecar", pystac.Asset(sidecar.name, media_type=pystac.MediaType.JSON, roles=["metadata"]))
 
 
 def _describe_bands(
@@ -201,19 +198,6 @@ def _common_name(band: Band, capture: Capture) -> str | None:
         return "pan"
     role = role_of_band(band)
     return None if role is None else role.replace(" ", "")
-
-
-def _link_collection(item: "pystac.Item", capture: Capture) -> None:
-    import pystac
-
-    to_out = "/".join([".."] * len(capture.folder.parts)) or "."
-    for relation in ("collection", "parent", "root"):
-        item.add_link(pystac.Link(relation, f"{to_out}/{_collection_file(capture)}", _JSON))
-    item.collection_id = _collection_id(capture)
-
-
-def _write_json(path: Path, facts: dict[str, Any]) -> None:
-    write_text(path, json.dumps(facts, indent=1) + "\n")
 
 
 def _moment(capture: Capture) -> tuple[datetime, str]:

@@ -30,7 +30,6 @@ from agalign.values.text import without_formula
 
 SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS)
 REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
-_SLOWEST = 5
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, cells)
     facts.add_indices(update_table(out, indices))
     failures = facts.failures.groups()
-    slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:_SLOWEST]
+    slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:5]
     write_text(out / REPORT_FILE, _page(out, facts, panels, sky, run, unreadable.append))
     if unreadable:
         with suppress(OSError):

@@ -90,7 +90,7 @@ def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...
         return ()
     columns, rows = 13, 10
     points = geometry.lattice(*rig.size_px, columns, rows)
-    starts, field = points * FIELD_WIDTH / rig.size_px[0], rig.fields[band](points)
+    starts, field = points * (FIELD_WIDTH / rig.size_px[0]), rig.fields[band](points)
     max_length = 11.0  # nearly the distance of the arrows
     arrows = field * max_length / max(float(np.linalg.norm(field, axis=1).max()), 1e-6)
     return tuple((x, y, x + dx, y + dy) for (x, y), (dx, dy) in zip(starts.tolist(), arrows.tolist(), strict=True))
