@@ -76,13 +76,11 @@ def _output(context: ProductContext) -> dict[str, Any]:
         [_file(f, context) | {"nodata": _nodata(f.nodata)} for f in context.written if f.kind == kind]
         for kind in (Stack.kind, BandFiles.kind)
     )
-    stack = stacks[0] if stacks else {"file": None, "bytes": None}
+    stack: dict[str, Any] = stacks[0] if stacks else {"file": None, "bytes": None}
     values = {part["nodata"] for part in stacks or band_files}
     grid, capture = context.grid, context.capture
     names = dict.fromkeys(f"{b.radiometry.quantity} by {b.radiometry.source}" for b in capture.bands if b.radiometry)
-    return {
-        "file": stack["file"],
-        "bytes": stack["bytes"],
+    return stack | {
         "band_files": band_files,
         "radiometry": None if context.write_settings.radiometry == "off" else " and ".join(names) or None,
         "crop": (grid.x0, grid.y0, grid.width, grid.height),

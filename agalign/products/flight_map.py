@@ -51,8 +51,7 @@ class FlightMap:
             "height_from": None if pose is None or pose.height_m is None else pose.height_from,
             "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
             "accuracy_m": accuracy_m,
-            **_of_result(result),
-            **_links(capture, result),
+            **_of_result(capture, result),
         }
         feature = {"type": "Feature", "id": capture.label, "geometry": geometry, "properties": properties}
         self._features[capture.label] = feature
@@ -113,29 +112,23 @@ def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexRo
     write_text(out / FLIGHT_MAP_FILE, text)
 
 
-def _links(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
-    """Files relative to the output folder."""
-    if result is None:
-        return {"sidecar": None, "stack": None, "picture": None, "indices": []}
-    paths = CapturePaths.of(capture, Path())
-    files = [(part.kind, (paths.folder / part.file).as_posix()) for part in result.products]
-    by_kind = dict(files)
-    return {
-        "sidecar": paths.sidecar.as_posix(),
-        "stack": by_kind.get("stack"),
-        "picture": by_kind.get("picture"),
-        "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
-    }
-
-
-def _of_result(result: CaptureResult | None) -> dict[str, Any]:
-    """The number of bands, and the largest residuals of a band, px of the reference."""
+def _of_result(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
+    """The number of bands, the largest residuals of a band, px of the reference, and the files, relative to the output
+    folder.
+    """
     bands = [] if result is None else [b for b in result.bands if b.status != "reference"]
     after = [b.metrics.after for b in bands if b.metrics is not None]
+    paths = CapturePaths.of(capture, Path())
+    products = [] if result is None else result.products
+    files = [(part.kind, (paths.folder / part.file).as_posix()) for part in products]
     return {
         "bands": len(bands),
         "bands_aligned": sum(b.status == "aligned" for b in bands),
         "bands_predicted": sum(b.status == "predicted" for b in bands),
         "residual_px": max((a.residual_px for a in after if a.residual_px is not None), default=None),
         "residual_p95_px": max((a.residual_p95_px for a in after if a.residual_p95_px is not None), default=None),
+        "sidecar": None if result is None else paths.sidecar.as_posix(),
+        "stack": dict(files).get("stack"),
+        "picture": dict(files).get("picture"),
+        "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
     }

@@ -32,7 +32,6 @@ from agalign.products.index_bands import RAW, BandReader, IndexBand
 from agalign.products.index_table import STATISTICS_TAG, IndexReport, IndexStatistics, read_statistics, statistics_in
 from agalign.products.indices import Index, bands_for, compute, index_named
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.sidecar import is_delivered
 from agalign.values.capture import Band, Capture
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.resample import tiles
@@ -106,16 +105,15 @@ def _has_bands(bands: Sequence[Band], name: str) -> bool:
 
 
 def _bands(context: ProductContext) -> list[IndexBand]:
-    limit_px, places = context.settings.check.accept_predicted_px, context.places
-    result = []
+    places, result = context.places, []
+    usable = {context.capture.reference.name, *context.delivered} & set(places)
     for band in context.capture.bands:
-        alignment, place = context.alignments.get(band.name), places.get(band.name)
-        status, prediction = ("reference", None) if alignment is None else (alignment.status, alignment.prediction)
-        if place is None or not is_delivered(status, prediction, limit_px):
-            result.append(IndexBand(band.name, band.wavelength_nm, Path(), 1, problem=f"{band.name} is {status}"))
-            continue
-        file, index = place
-        result.append(IndexBand(band.name, band.wavelength_nm, file.path, index, file.sha256))
+        if band.name in usable:
+            file, index = places[band.name]
+            result.append(IndexBand(band.name, band.wavelength_nm, file.path, index, file.sha256))
+        else:
+            problem = f"{band.name} is {context.alignments[band.name].status}"
+            result.append(IndexBand(band.name, band.wavelength_nm, Path(), 1, problem=problem))
     return result
 
 

@@ -28,7 +28,6 @@ from agalign.products.checked_raster import Block, LayerDescription, predictor, 
 from agalign.products.layout import Layer, output_layers
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import as_type, with_nodata, write_raster
-from agalign.products.sidecar import is_delivered
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
@@ -89,9 +88,7 @@ class _Sources:
 
 def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | None:
     """None if the panchromatic band is not delivered, or no band is within its spectral range."""
-    pan, limit_px = panchromatic(context.capture), context.settings.check.accept_predicted_px
-    usable = context.usable
-    delivered = {name: a for name, a in usable.items() if is_delivered(a.status, a.prediction, limit_px)}
+    pan, delivered = panchromatic(context.capture), context.delivered
     if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *delivered}:
         return None
     layers, grid = output_layers(context.capture, delivered, settings, context.rig)

@@ -1,7 +1,6 @@
 """Rasters of the expected alignment error and of quality flags on the grid of the aligned files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -86,15 +85,15 @@ class QualityRaster(Product):
         """Write <capture>.qa.tif. Raises OutputError, or UnreadableFileError for an input."""
         grid, size_px = context.grid, context.capture.reference.size_px
         nodes = {name: error_lattice_px(a, size_px, grid) for name, a in context.usable.items()}
-        water = _WaterBands.of(context.layers)
+        water = _water_bands(context.layers)
         predicted = {name for name, alignment in context.usable.items() if alignment.status == "predicted"}
 
         def flags_on(tile: Tile) -> list[Flags]:
             bands = [
                 _flags(layer, tile, grid, nodes, is_predicted=layer.band.name in predicted) for layer in context.layers
             ]
-            if water is not None:
-                glint = water.glint(tile)
+            if water:
+                glint = sun_glint(*(_reflectance(*band, tile) for band in water))
                 for flags in bands:
                     flags[glint & (flags & _bit(Quality.MISSING) == 0)] |= _bit(Quality.SUN_GLINT)
             return [np.bitwise_or.reduce(bands), *bands]
@@ -104,7 +103,7 @@ class QualityRaster(Product):
         tags = {
             "flag_masks": ", ".join(str(int(flag)) for flag in Quality),
             "flag_meanings": MEANINGS,
-            "SUN_GLINT": unknown if water is None else method,
+            "SUN_GLINT": method if water else unknown,
         }
         # The first layer has the flags that are set in any band.
         layers = [LayerDescription(name) for name in ("all bands", *(layer.band.name for layer in context.layers))]
@@ -179,28 +178,15 @@ def _contributes(mask: Mask, positions: NDArray[np.float32]) -> Mask:
     return np.asarray(weight > 1e-3)  # smaller weights are rounding errors
 
 
-@dataclass(frozen=True)
-class _WaterBands:
-    """The bands from which sun glint is detected, with their conversion to reflectance."""
-
-    green: tuple[Layer, Radiometry]
-    nir: tuple[Layer, Radiometry]
-
-    @classmethod
-    def of(cls, layers: Sequence[Layer]) -> "_WaterBands | None":
-        by_role: dict[Role, tuple[Layer, Radiometry]] = {}
-        for layer in layers:
-            band = layer.band
-            role = None if layer.is_gap else role_of_band(band)
-            reflectance = None if band.radiometry is None else to_reflectance(band.radiometry)
-            if role is not None and reflectance is not None:
-                by_role.setdefault(role, (layer, reflectance))
-        if "green" not in by_role or "nir" not in by_role:
-            return None
-        return cls(by_role["green"], by_role["nir"])
-
-    def glint(self, tile: Tile) -> Mask:
-        return sun_glint(*(_reflectance(*band, tile) for band in (self.green, self.nir)))
+def _water_bands(layers: Sequence[Layer]) -> list[tuple[Layer, Radiometry]]:
+    """The green and the near infrared band, with their conversion to reflectance; empty if either is unknown."""
+    by_role: dict[Role, tuple[Layer, Radiometry]] = {}
+    for layer in layers:
+        role = None if layer.is_gap else role_of_band(layer.band)
+        reflectance = None if layer.band.radiometry is None else to_reflectance(layer.band.radiometry)
+        if role is not None and reflectance is not None:
+            by_role.setdefault(role, (layer, reflectance))
+    return [by_role["green"], by_role["nir"]] if {"green", "nir"} <= by_role.keys() else []
 
 
 def _reflectance(layer: Layer, radiometry: Radiometry, tile: Tile) -> FloatImage:

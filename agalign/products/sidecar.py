@@ -546,10 +546,6 @@ class CaptureResult(_Result):
     verify OUT` compares it.
     """
 
-    def file_of(self, kind: str) -> str | None:
-        """Return the last file of a product, relative to the sidecar's folder; None if there is none."""
-        return next((part.file for part in reversed(self.products) if part.kind == kind), None)
-
     @property
     def files(self) -> dict[str, int]:
         """Size in bytes of every file that the sidecar lists, by its path relative to the sidecar's folder."""

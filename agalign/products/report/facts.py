@@ -74,20 +74,17 @@ class FailureGroups:
 
     def add(self, label: str, result: CaptureResult) -> None:
         """Add the bands of a capture that are missing or not aligned."""
-        for band in result.bands:
-            if band.status not in ("reference", "aligned"):
-                self._put(label, band.band, band.status, band.reason or "", _remedy_of(band))
-        for name in result.missing_bands:
-            self._put(label, name, "missing", MISSING_BAND.cause, MISSING_BAND)
+        moving = [b for b in result.bands if b.status not in ("reference", "aligned")]
+        refused = [(b.band, str(b.status), b.reason or "", _remedy_of(b)) for b in moving]
+        refused += [(name, "missing", MISSING_BAND.cause, MISSING_BAND) for name in result.missing_bands]
+        for band, status, reason, remedy in refused:
+            group = self._by_cause.setdefault((status, remedy), FailureGroup(status, remedy))
+            group.bands.append(RefusalPart(capture=label, band=band, status=status, reason=reason))
 
     def groups(self) -> list[FailureGroup]:
         """Return the groups, the most severe first, and the largest first of those."""
         severity = "failed", "seed_only", "missing", "predicted"
         return sorted(self._by_cause.values(), key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
-
-    def _put(self, capture: str, band: str, status: str, reason: str, remedy: Remedy) -> None:
-        group = self._by_cause.setdefault((status, remedy), FailureGroup(status, remedy))
-        group.bands.append(RefusalPart(capture=capture, band=band, status=status, reason=reason))
 
 
 def _remedy_of(band: BandResult) -> Remedy:
@@ -124,6 +121,8 @@ class Facts:
     """As in the data of the report."""
     bands: list[BandResult] = field(default_factory=list)
     """All moving bands of all captures."""
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    """Their rows in OUT/summary.csv."""
     failures: FailureGroups = field(default_factory=FailureGroups)
     _lattices: dict[tuple[float, ...], int] = field(default_factory=dict)
     """Centres of windows, which many pairs share, and their index in the data of the report."""
@@ -137,6 +136,7 @@ class Facts:
         self.failures.add(label, result)
         output, preview, position, path = sidecar.output, sidecar.preview, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, bytes=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
+        files = {part.kind: part.file for part in sidecar.products}
         relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
         facts: dict[str, Any] = {
             "label": label,
@@ -151,12 +151,12 @@ class Facts:
             "crop": grid.crop,
             "scale": grid.scale,
             "radiometry": grid.radiometry,
-            "stack": _link(path, sidecar.file_of("stack")),
+            "stack": _link(path, files.get("stack")),
             "relief": _link(path, relief),
             "sidecar": _link(path, f"{sidecar.capture}.json"),
-            "picture": _link(path, sidecar.file_of("picture")),
+            "picture": _link(path, files.get("picture")),
             "preview": None,
-            "bands": [self._pair(b, sidecar) for b in sidecar.bands],
+            "bands": [self._pair(b, sidecar, folder) for b in sidecar.bands],
             "indices": [],
         }
         if preview is not None:
@@ -206,8 +206,11 @@ class Facts:
         facts = {"schema": "agalign-report/1", "captures": self.captures, "shift_step_px": _SHIFT_STEP_PX}
         return facts | {"lattices": [list(centres) for centres in self._lattices]}
 
-    def _pair(self, band: BandPart, sidecar: Sidecar) -> dict[str, Any]:
-        row = table_row(band)
+    def _pair(self, band: BandPart, sidecar: Sidecar, folder: str) -> dict[str, Any]:
+        """The data of a band, whose row is added unless it is the reference."""
+        row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
+        if band.status != "reference":
+            self.rows.append({"folder": folder, "capture": sidecar.capture, **row})
         metrics, tiles = band.metrics, [] if band.metrics is None else band.metrics.tiles
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
         lattice = tuple(v for t in tiles for v in t.centre_px)
@@ -233,11 +236,6 @@ def value_at(part: object, path: str) -> Any:
     for name in path.split("."):
         part = None if part is None else getattr(part, name)
     return rounded(part)
-
-
-def table_row(band: BandPart) -> dict[str, Any]:
-    """Return the row of a band pair in OUT/summary.csv, by column."""
-    return {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
 
 
 def rounded(value: Any) -> Any:
