@@ -29,7 +29,7 @@ from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.flight_map import FlightMap
 from agalign.products.footprint import above_elevation, with_approximate_georeference
-from agalign.products.index_product import check_indices
+from agalign.products.index_rasters import check_indices
 from agalign.products.panels import write_panels, write_sky
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths

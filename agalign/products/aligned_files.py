@@ -18,11 +18,6 @@ from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
-_MAX_INVERSE_ERROR_PX = 0.1
-"""Larger errors of an inverse mapping mean that Newton's method did not converge."""
-_INVERSE_STEPS = 20
-"""Newton's method converges in 3 to 5 steps through a lens model."""
-
 
 class BandFiles(Product):
     """An aligned raster for each input file; none if its bands failed."""
@@ -96,13 +91,13 @@ def _from_source(layer: Layer, grid: OutputGrid) -> FromSource:
     def from_source(x: float, y: float) -> tuple[float, float]:
         position = centre
         try:
-            for _ in range(_INVERSE_STEPS):
+            for _ in range(20):  # it converges in 3 to 5 steps through a lens model
                 mapped = to_file(position)
                 jacobian = np.stack([to_file(position + d) - mapped for d in np.eye(2)], axis=-1)
                 position = position + np.linalg.solve(jacobian, np.array([x, y]) - mapped)
         except np.linalg.LinAlgError:
             return math.nan, math.nan
-        if not np.abs(to_file(position) - (x, y)).max() < _MAX_INVERSE_ERROR_PX:  # nan fails too
+        if not np.abs(to_file(position) - (x, y)).max() < 0.1:  # it did not converge; nan fails too
             return math.nan, math.nan
         x_px, y_px = grid.scale.inverse.positions(position).tolist()
         return x_px, y_px

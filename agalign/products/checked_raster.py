@@ -30,12 +30,7 @@ from agalign.values.image import OutputGrid
 
 WORK_TILE_PX = 2048
 """Side of the tiles that are processed one after another: it limits the memory."""
-_BLOCK_PX = 256
-"""Side of the blocks within a GeoTIFF: GDAL's default."""
 _INCOMPLETE = "the file came out incomplete; is the disk full?"
-_LIBTIFF_LINE = re.compile(rb"^_?(?:tiff|TIFF)\w+: .*\n?", re.MULTILINE)
-_MAX_BYTES = 1 << 16
-"""Capacity of a pipe on Linux: what exceeds it is lost."""
 _REDIRECTED = threading.RLock()
 """File descriptor 2 belongs to the process: one thread redirects it, and others wait before they write."""
 
@@ -162,10 +157,10 @@ def without_libtiff_messages() -> Iterator[None]:
             os.close(stderr)
             printed = b""
             with suppress(BlockingIOError):  # a child process started in the block has the write end open too
-                printed = os.read(read_end, _MAX_BYTES)
+                printed = os.read(read_end, 1 << 16)  # capacity of a pipe on Linux: what exceeds it is lost
             os.close(read_end)
             with suppress(OSError):
-                os.write(2, _LIBTIFF_LINE.sub(b"", printed))
+                os.write(2, re.sub(rb"^_?(?:tiff|TIFF)\w+: .*\n?", b"", printed, flags=re.MULTILINE))
 
 
 def check_complete(path: Path) -> None:
@@ -183,7 +178,7 @@ def check_complete(path: Path) -> None:
 def tiled_profile(width: int, height: int, count: int, dtype: str, **options: Any) -> dict[str, Any]:
     """Return rasterio's profile of a tiled GeoTIFF with these further creation options."""
     size = {"width": width, "height": height, "count": count, "dtype": dtype}
-    blocks = {"tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "bigtiff": "if_safer"}
+    blocks = {"tiled": True, "blockxsize": 256, "blockysize": 256, "bigtiff": "if_safer"}  # GDAL's default size
     return {"driver": "GTiff"} | size | blocks | options
 
 

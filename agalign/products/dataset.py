@@ -16,15 +16,6 @@ from agalign.products.sidecar_file import find_sidecars, read_sidecar
 if TYPE_CHECKING:
     import xarray
 
-_RAW_UNIT = "count"
-_ROTATED_AXES = ("xc", "yc")
-"""Map coordinates of every pixel that rioxarray adds to rotated grids."""
-_SUFFIX = re.compile(r"(?:\.stac)?\.json$|\.tiff?$", re.IGNORECASE)
-"""Suffix of a sidecar, a STAC item or a stack."""
-_COORDINATES = ("latitude", "longitude", "altitude_m")
-_CHUNKS = {"x": 1024, "y": 1024}
-"""Four blocks of the stacks along each axis: dask reads 2 MB of 16 bits at a time."""
-
 
 def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """Return the aligned bands of a capture, read lazily with dask, given its sidecar, stack or STAC item.
@@ -42,7 +33,8 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     given = Path(path)
     if given.is_dir():
         raise InputError(f"{given}: is a folder; give the sidecar of a capture, or use open_flight")
-    sidecar_path = given.with_name(_SUFFIX.sub("", given.name) + ".json")
+    name = re.sub(r"(?:\.stac)?\.json$|\.tiff?$", "", given.name, flags=re.IGNORECASE)
+    sidecar_path = given.with_name(f"{name}.json")
     return _dataset(read_sidecar(sidecar_path), sidecar_path.parent, masked=masked)
 
 
@@ -73,7 +65,10 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
         time=("capture", [_time(s) for _, s in captures]),
         band=bands,
         status=(("capture", "band"), status),
-        **{name: ("capture", [_coordinate(s, name) for _, s in captures]) for name in _COORDINATES},
+        **{
+            name: ("capture", [_coordinate(s, name) for _, s in captures])
+            for name in ("latitude", "longitude", "altitude_m")
+        },
     )
     return flight
 
@@ -140,7 +135,9 @@ def _opened(folder: Path, name: str, *, masked: bool) -> "xarray.DataArray":
     try:
         with without_warnings():
             # Some of GDAL's other drivers open files or addresses that the contents of a file name.
-            opened: xarray.DataArray = rioxarray.open_rasterio(path, chunks=_CHUNKS, masked=masked, driver="GTiff")
+            # Chunks of four blocks of the stacks along each axis: dask reads 2 MB of 16 bits at a time.
+            chunks = {"x": 1024, "y": 1024}
+            opened: xarray.DataArray = rioxarray.open_rasterio(path, chunks=chunks, masked=masked, driver="GTiff")
     except OSError as error:
         raise UnreadableFileError(f"{path}: cannot be read ({error}); run again") from None
     return opened
@@ -155,7 +152,7 @@ def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str, *
     units = file.attrs.get("units")
     unit = units[index - 1] if isinstance(units, tuple) else units
     encoding = {k: v for k, v in file.attrs.items() if k in ("_FillValue", "scale_factor", "add_offset")}
-    one.attrs = encoding | {"long_name": band.band, "units": unit or _RAW_UNIT, "status": band.status}
+    one.attrs = encoding | {"long_name": band.band, "units": unit or "count", "status": band.status}
     if band.wavelength_nm is not None:
         one.attrs["wavelength_nm"] = band.wavelength_nm
     return one
@@ -164,7 +161,8 @@ def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str, *
 def _in_pixels(dataset: "xarray.Dataset") -> "xarray.Dataset":
     """The dataset with pixel coordinates instead of map coordinates."""
     px = {axis: range(dataset.sizes[axis]) for axis in ("y", "x")}
-    return dataset.drop_vars(["spatial_ref", *_ROTATED_AXES], errors="ignore").assign_coords(px)
+    # rioxarray adds map coordinates of every pixel, xc and yc, to rotated grids.
+    return dataset.drop_vars(["spatial_ref", "xc", "yc"], errors="ignore").assign_coords(px)
 
 
 def _time(sidecar: Sidecar) -> Any:

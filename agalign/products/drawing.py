@@ -1,6 +1,6 @@
-"""The bands of a capture as reduced grey images, text on pictures, and PNG files."""
+"""The bands of a capture as reduced grey images, pictures with text, and PNG files."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +20,10 @@ Grey = NDArray[np.uint8]
 """(height, width)"""
 _MAX_SIDE_PX = 2048
 """Longer side of the images: larger than most screens."""
-_PERCENTILES = 1.5, 98.5
-"""Percentiles of a band that are shown as black and white."""
 _SAMPLE_PIXELS = 20_000
-"""Pixels from which the percentiles are calculated, with an error of 0.1 %."""
+"""Pixels from which the contrast is calculated: percentiles then have an error of 0.1 %."""
 Picture = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""
-_TEXT_COLOUR = 40, 40, 40
 
 
 @dataclass(frozen=True)
@@ -61,20 +58,13 @@ def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, i
 
 def _grey(plane: NDArray[np.float32]) -> Grey:
     """The grey values between percentiles of the plane itself: raw numbers and reflectance have different ranges."""
-    low, high = _limits(plane)
-    scaled = np.subtract(plane, np.float32(low))
-    scaled *= np.float32(255.0 / (high - low))
-    cv2.patchNaNs(scaled, 0.0)
-    return np.asarray(np.clip(scaled, 0, 255, out=scaled).astype(np.uint8))
-
-
-def _limits(plane: NDArray[np.float32]) -> tuple[float, float]:
     sample = plane.ravel()[:: max(1, plane.size // _SAMPLE_PIXELS)]
     sample = sample[np.isfinite(sample) & (sample != 0)]
-    if sample.size == 0:
-        return 0.0, 1.0
-    low, high = np.percentile(sample, _PERCENTILES)
-    return float(low), max(float(high), float(low) + 1e-9)
+    low, high = np.percentile(sample, (1.5, 98.5)).tolist() if sample.size else (0.0, 1.0)
+    scaled = np.subtract(plane, np.float32(low))
+    scaled *= np.float32(255.0 / max(high - low, 1e-9))
+    cv2.patchNaNs(scaled, 0.0)
+    return np.asarray(np.clip(scaled, 0, 255, out=scaled).astype(np.uint8))
 
 
 def write_png(image: Picture, path: Path) -> None:
@@ -96,5 +86,19 @@ def with_text(
 ) -> Picture:
     """Return the picture with a line of text; `anchor` is Pillow's, by default the left end of the baseline."""
     drawn = Image.fromarray(image)
-    ImageDraw.Draw(drawn).text(at_px, text, _TEXT_COLOUR, ImageFont.load_default(size_px), anchor)
+    ImageDraw.Draw(drawn).text(at_px, text, (40, 40, 40), ImageFont.load_default(size_px), anchor)
     return np.asarray(drawn)
+
+
+def titled(picture: Picture, title: str, height_px: int) -> Picture:
+    """Return the picture below a white strip of this height with a line of text."""
+    strip = np.full((height_px, picture.shape[1], 3), 255, np.uint8)
+    return np.vstack([with_text(strip, title, (2, round(0.7 * height_px))), picture])
+
+
+def side_by_side(pictures: Sequence[Picture], gap_px: int) -> Picture:
+    """Return the pictures in a row, aligned at the top, with white gaps."""
+    height = max(picture.shape[0] for picture in pictures)
+    pads = [((0, height - picture.shape[0]), (0, gap_px), (0, 0)) for picture in pictures]
+    padded = [np.pad(picture, pad, constant_values=255) for picture, pad in zip(pictures, pads, strict=True)]
+    return np.hstack(padded)[:, :-gap_px]

@@ -31,8 +31,6 @@ from agalign.values.files import complete_file, write_text
 from agalign.values.geometry import Matrix, Points
 from agalign.values.lens import Lens
 
-NOTE_FILE = "README.txt"
-_IMAGES = "images"
 _NOTES: dict[ExportProgram, str] = {
     "odm": """\
 OpenDroneMap, WebODM: the bands of each capture are aligned, and have the tags of one camera.
@@ -48,11 +46,23 @@ Tools, Set Primary Channel: {reference}.""",
 Pix4Dmapper, Pix4Dfields: add all images; template 'Ag Multispectral'.
 Leave the rig's relative parameters as 'Known': they are zero, the bands are aligned.
 Radiometric processing needs raw numbers and the captures of the panel from the flight's own folder.""",
+    "micasense": """\
+MicaSense imageprocessing: put <serial>_warp_matrices_opencv.npy next to the notebook; it loads that file.
+It is of the most typical capture: for one capture use its own <capture>_warp_matrices.npy,
+  warp_matrices = [m.astype('float32') for m in numpy.load(FILE)]
+Match index: the place of {reference} among the bands; warp mode: cv2.MOTION_HOMOGRAPHY.
+Relief and the lenses' displacement fields are not in a matrix; matrices.csv has the largest distance.
+{largest_distance}""",
+    "opencv": """\
+OpenCV: <capture>.npz holds `bands`, and `matrices` (n, 3, 3) from raw pixels of the reference to a band's:
+  cv2.warpPerspective(band, matrices[k], (width, height), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP)
+`max_error_px` is the largest distance from the complete mapping, which includes lenses and relief. That is
+sampled in `grid_reference_px_k` and `grid_moving_px_k` (n, 2). (0, 0) is the centre of a pixel.
+{largest_distance}""",
 }
 """Instructions for the other program."""
 _Row = tuple[str, str, str, float]
 """Capture, band, status, largest distance of the matrix from the complete mapping, px."""
-_TABLE = "matrices.csv"
 
 
 @dataclass(frozen=True)
@@ -74,6 +84,15 @@ class AlignedCapture:
     def flat_name(self) -> str:
         """The label as a single file name: the folders of a memory card contain captures of the same name."""
         return "_".join((*self.folder.parts, self.sidecar.capture))
+
+    @property
+    def bands(self) -> list[BandPart]:
+        """The bands in the order of their numbers in the file names."""
+        return sorted(self.sidecar.bands, key=lambda b: (natural_order(b.file), b.band_index))
+
+    def rows(self, errors_px: Sequence[float]) -> list[_Row]:
+        """The rows of `bands` in the table of distances."""
+        return [(self.flat_name, b.band, b.status, e) for b, e in zip(self.bands, errors_px, strict=True)]
 
 
 @dataclass
@@ -107,15 +126,20 @@ def export(
     report.left_out += [(c.label, f"its status is {c.sidecar.status}") for c in captures if c not in good]
     if not good:
         raise InputError(f"{out}: no capture with status ok; 'agalign report {out}' shows what failed")
+    rows: list[_Row] = []
     if program == "micasense":
-        report.files, report.notes = write_micasense(good, out, target, source)
+        report.files, rows = write_micasense(good, out, target, source)
     elif program == "opencv":
-        report.files, report.notes = write_opencv(good, target)
+        report.files, rows = write_opencv(good, target)
     else:
-        report.files = _band_files(good, out, target / _IMAGES, copy=copy)
-        report.notes = _notes(program, good[0].sidecar)
+        report.files = _band_files(good, out, target / "images", copy=copy)
+    if rows:
+        report.files.append(target / "matrices.csv")
+        cells = ((*row[:3], f"{row[3]:.4f}") for row in rows)
+        write_csv(report.files[-1], ("capture", "band", "status", "max_error_px"), cells)
     report.captures = len(good)
-    write_text(target / NOTE_FILE, "\n".join(report.notes) + "\n")
+    report.notes = _notes(program, good[0].sidecar, rows)
+    write_text(target / "README.txt", "\n".join(report.notes) + "\n")
     return report
 
 
@@ -158,52 +182,49 @@ def _placed(source: Path, target: Path, *, copy: bool) -> Path:
     return target
 
 
-def _notes(program: ExportProgram, sidecar: Sidecar) -> list[str]:
+def _notes(program: ExportProgram, sidecar: Sidecar, rows: Sequence[_Row]) -> list[str]:
     radiometry = None if sidecar.output is None else sidecar.output.radiometry
     calibration, contents = "none", f"{radiometry}: OpenDroneMap must not calibrate them again."
     if radiometry is None:
         calibration = "camera+sun"
         contents = "raw numbers: camera+sun needs the light sensor's tags; without them use camera."
-    text = _NOTES[program].format(reference=sidecar.reference.band, calibration=calibration, contents=contents)
-    return text.splitlines()
+    facts = {"reference": sidecar.reference.band, "calibration": calibration, "contents": contents}
+    if rows:
+        capture, band, _, error_px = max(rows, key=lambda row: row[3])
+        largest = f"Largest distance from the complete mapping: {error_px:.2f} px ({capture} {band})."
+        facts["largest_distance"] = largest
+    return _NOTES[program].format(**facts).splitlines()
 
 
-def write_opencv(captures: Sequence[AlignedCapture], target: Path) -> tuple[list[Path], list[str]]:
-    """Write <capture>.npz for each capture, and a table of the distances from the complete mappings.
+def write_opencv(captures: Sequence[AlignedCapture], target: Path) -> tuple[list[Path], list[_Row]]:
+    """Write <capture>.npz for each capture. Returns the files and the distances from the complete mappings.
 
-    Returns the files and notes for the user. Raises OutputError.
+    Raises OutputError.
     """
     files: list[Path] = []
     rows: list[_Row] = []
     for capture in captures:
-        bands, name = _in_order(capture.sidecar), capture.flat_name
-        grids = [_grid(band) for band in bands]
-        matrices = [geometry.fit_homography(*grid) if len(grid[0]) else geometry.identity() for grid in grids]
+        grids = [_grid(band) for band in capture.bands]
+        matrices = [_fitted(*grid) for grid in grids]
         errors_px = [_max_distance_px(matrix, *grid) for matrix, grid in zip(matrices, grids, strict=True)]
-        rows += [(name, b.band, b.status, error_px) for b, error_px in zip(bands, errors_px, strict=True)]
-        arrays: dict[str, NDArray[np.generic]] = {"bands": np.array([b.band for b in bands])}
+        rows += capture.rows(errors_px)
+        arrays: dict[str, NDArray[np.generic]] = {"bands": np.array([b.band for b in capture.bands])}
         for k, (points_px, mapped_px) in enumerate(grids):
             arrays |= {f"grid_reference_px_{k}": points_px, f"grid_moving_px_{k}": mapped_px}
         arrays |= {"matrices": np.stack(matrices), "max_error_px": np.array(errors_px)}
-        files.append(target / f"{name}.npz")
+        files.append(target / f"{capture.flat_name}.npz")
         with complete_file(files[-1]) as partial:
             np.savez(partial, allow_pickle=False, **arrays)
-    return [*files, _write_table(rows, target)], [
-        "OpenCV: <capture>.npz holds `bands`, and `matrices` (n, 3, 3) from raw pixels of the reference to a band's:",
-        "  cv2.warpPerspective(band, matrices[k], (width, height), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP)",
-        "`max_error_px` is the largest distance from the complete mapping, which includes lenses and relief. That is",
-        "sampled in `grid_reference_px_k` and `grid_moving_px_k` (n, 2). (0, 0) is the centre of a pixel.",
-        _largest_distance(rows),
-    ]
+    return files, rows
 
 
 def write_micasense(
     captures: Sequence[AlignedCapture], out: Path, target: Path, source: Path | None
-) -> tuple[list[Path], list[str]]:
+) -> tuple[list[Path], list[_Row]]:
     """Write <capture>_warp_matrices.npy for each capture, and <serial>_warp_matrices_opencv.npy for each camera.
 
-    Returns the files and notes for the user. Raises InputError if the original images cannot be read,
-    ConfigurationError for other cameras, OutputError.
+    Returns the files and the distances from the complete mappings. Raises InputError if the original images cannot be
+    read, ConfigurationError for other cameras, OutputError.
     """
     run = read_run_record(out)
     folder = source or (None if run is None else Path(run.input))
@@ -212,33 +233,19 @@ def write_micasense(
     files: list[Path] = []
     rows: list[_Row] = []
     by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
-    first = captures[0].sidecar.reference
     for capture in captures:
-        bands, name = _in_order(capture.sidecar), capture.flat_name
-        images = [_original(folder / capture.folder / band.file) for band in bands]
-        reference = next(i for i, b in zip(images, bands, strict=True) if b.status == "reference")
-        results = [_in_notebook_px(band, reference, image) for band, image in zip(bands, images, strict=True)]
-        rows += [(name, b.band, b.status, error_px) for b, (_, error_px) in zip(bands, results, strict=True)]
+        images = [_original(folder / capture.folder / band.file) for band in capture.bands]
+        reference = next(i for i, b in zip(images, capture.bands, strict=True) if b.status == "reference")
+        results = [_in_notebook_px(band, reference, image) for band, image in zip(capture.bands, images, strict=True)]
+        rows += capture.rows([error_px for _, error_px in results])
         stacked = np.stack([matrix for matrix, _ in results])
         by_camera[images[0].tags.serial or "camera"].append(stacked)
-        files.append(_write_npy(target / f"{name}_warp_matrices.npy", stacked))
+        files.append(_write_npy(target / f"{capture.flat_name}_warp_matrices.npy", stacked))
     for serial, of_camera in by_camera.items():
         complete = [m for m in of_camera if m.shape == of_camera[0].shape]
-        matrices_of_camera = _nearest_to_median(complete, first.size_px)
+        matrices_of_camera = _nearest_to_median(complete, captures[0].sidecar.reference.size_px)
         files.append(_write_npy(target / f"{serial}_warp_matrices_opencv.npy", matrices_of_camera))
-    return [*files, _write_table(rows, target)], [
-        "MicaSense imageprocessing: put <serial>_warp_matrices_opencv.npy next to the notebook; it loads that file.",
-        "It is of the most typical capture: for one capture use its own <capture>_warp_matrices.npy,",
-        "  warp_matrices = [m.astype('float32') for m in numpy.load(FILE)]",
-        f"Match index: the place of {first.band} among the bands; warp mode: cv2.MOTION_HOMOGRAPHY.",
-        "Relief and the lenses' displacement fields are not in a matrix; matrices.csv has the largest distance.",
-        _largest_distance(rows),
-    ]
-
-
-def _in_order(sidecar: Sidecar) -> list[BandPart]:
-    """The bands in the order of their numbers in the file names."""
-    return sorted(sidecar.bands, key=lambda b: (natural_order(b.file), b.band_index))
+    return files, rows
 
 
 def _grid(band: BandPart) -> tuple[Points, Points]:
@@ -246,6 +253,11 @@ def _grid(band: BandPart) -> tuple[Points, Points]:
     if band.grid is None:
         return np.empty((0, 2)), np.empty((0, 2))
     return np.array(band.grid.reference_px), np.array(band.grid.moving_px)
+
+
+def _fitted(points_px: Points, mapped_px: Points) -> Matrix:
+    """The homography between corresponding points (n, 2); the identity without any."""
+    return geometry.fit_homography(points_px, mapped_px) if len(points_px) else geometry.identity()
 
 
 def _original(path: Path) -> ImageFile:
@@ -260,13 +272,9 @@ def _in_notebook_px(band: BandPart, reference: ImageFile, image: ImageFile) -> t
     new_reference, new_band = _new_camera_matrix(reference_lens, reference), _new_camera_matrix(band_lens, image)
     points_px, mapped_px = _grid(band)
     undistorted, mapped = lens.undistort(reference_lens, points_px), lens.undistort(band_lens, mapped_px)
-    homography = band.homography
-    if not len(points_px):
-        matrix = geometry.identity()
-    elif homography is not None and homography.space == "undistorted":
-        matrix = np.array(homography.fixed_to_moving)
-    else:
-        matrix = geometry.fit_homography(undistorted, mapped)
+    matrix = _fitted(undistorted, mapped)
+    if band.homography is not None and band.homography.space == "undistorted":
+        matrix = np.array(band.homography.fixed_to_moving)
     error_px = _max_distance_px(matrix, undistorted, mapped)
     to_new, from_new = new_band @ np.linalg.inv(band_lens.matrix), reference_lens.matrix @ np.linalg.inv(new_reference)
     return geometry.compose(to_new, matrix, from_new), error_px
@@ -296,16 +304,6 @@ def _nearest_to_median(captures: Sequence[NDArray[np.float64]], size_px: tuple[i
 def _max_distance_px(matrix: Matrix, points_px: Points, mapped_px: Points) -> float:
     distances_px = np.linalg.norm(geometry.apply(matrix, points_px) - mapped_px, axis=1)
     return float(distances_px.max(initial=0.0))
-
-
-def _largest_distance(rows: Sequence[_Row]) -> str:
-    capture, band, _, error_px = max(rows, key=lambda row: row[3])
-    return f"Largest distance from the complete mapping: {error_px:.2f} px ({capture} {band})."
-
-
-def _write_table(rows: Sequence[_Row], target: Path) -> Path:
-    write_csv(target / _TABLE, ("capture", "band", "status", "max_error_px"), ((*r[:3], f"{r[3]:.4f}") for r in rows))
-    return target / _TABLE
 
 
 def _write_npy(path: Path, matrices: NDArray[np.float64]) -> Path:

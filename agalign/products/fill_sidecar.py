@@ -15,10 +15,9 @@ from agalign.products.product import ProductContext, WrittenFile
 from agalign.products.relief_map import ReliefMap
 from agalign.products.sidecar import BandPart, Sidecar, is_delivered
 from agalign.values import geometry
-from agalign.values.alignment import Residual
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Band
 from agalign.values.choices import CaptureStatus
-from agalign.values.files import file_checksum
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx
@@ -64,7 +63,7 @@ def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Side
         "output": _output(context) if context.layers else None,
         "preview": next((f.preview for f in context.written if f.preview is not None), None),
         "accept_predicted_px": accept_predicted_px,
-        "products": [_file(f, context) | {"kind": f.kind, "sha256": file_checksum(f.path)} for f in context.written],
+        "products": [_file(f, context) | {"kind": f.kind, "sha256": f.sha256} for f in context.written],
         "not_written": not_written,
         "settings": fingerprint(capture, context.settings),
     }
@@ -77,13 +76,11 @@ def _output(context: ProductContext) -> dict[str, Any]:
         [_file(f, context) | {"nodata": _nodata(f.nodata)} for f in context.written if f.kind == kind]
         for kind in (Stack.kind, BandFiles.kind)
     )
-    stack = stacks[0] if stacks else {"file": None, "bytes": None}
+    stack: dict[str, Any] = stacks[0] if stacks else {"file": None, "bytes": None}
     values = {part["nodata"] for part in stacks or band_files}
     grid, capture = context.grid, context.capture
     names = dict.fromkeys(f"{b.radiometry.quantity} by {b.radiometry.source}" for b in capture.bands if b.radiometry)
-    return {
-        "file": stack["file"],
-        "bytes": stack["bytes"],
+    return stack | {
         "band_files": band_files,
         "radiometry": None if context.write_settings.radiometry == "off" else " and ".join(names) or None,
         "crop": (grid.x0, grid.y0, grid.width, grid.height),
@@ -110,12 +107,12 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     place = context.places.get(band.name)  # None if all pixels are nodata
     facts = _source(band) | {
         "wavelength_nm": band.wavelength_nm,
-        "place": None if place is None else {"file": context.paths.relative(place[0]), "band_index": place[1]},
+        "place": None if place is None else {"file": context.paths.relative(place[0].path), "band_index": place[1]},
     }
     if band is context.capture.reference:
         return BandPart.model_validate(facts | {"status": "reference", "reason": None, "seconds": 0.0})
     alignment = context.alignments[band.name]
-    mapping, residual, size_px = alignment.mapping, alignment.residual, context.capture.reference.size_px
+    mapping, size_px = alignment.mapping, context.capture.reference.size_px
     grid_px = _grid_px(mapping.of_the_plane, size_px)
     lenses = (mapping.fixed_lens, mapping.moving_lens)
     field = mapping.local
@@ -129,11 +126,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
         "seed": alignment.seed,
         "grid": {"reference_px": grid_px, "moving_px": mapping(grid_px)},
         "joint": alignment.joint,
-        "metrics": {
-            "before": dict(alignment.before),
-            "after": dict(alignment.after) | _residual(residual),
-            "tiles": _tiles(residual),
-        },
+        "metrics": _metrics(alignment),
         "geometry": {"kind": alignment.geometry, "held_out_p95_px": alignment.candidates},
         "lenses": None if None in lenses else lenses,
         "field": field,
@@ -147,21 +140,15 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     return part
 
 
-def _residual(residual: Residual[FixedFilePx] | None) -> dict[str, float]:
+def _metrics(alignment: Alignment[FixedFilePx]) -> dict[str, Any]:
+    residual, before, after = alignment.residual, dict(alignment.before), dict(alignment.after)
     if residual is None:
-        return {}
-    return {
-        "residual_px": residual.median_px,
-        "residual_p95_px": residual.p95_px,
-        "residual_coverage": residual.coverage,
-    }
-
-
-def _tiles(residual: Residual[FixedFilePx] | None) -> list[dict[str, Any]]:
-    if residual is None:
-        return []
+        return {"before": before, "after": after, "tiles": []}
+    after |= {"residual_px": residual.median_px, "residual_p95_px": residual.p95_px}
+    after["residual_coverage"] = residual.coverage
     windows = zip(residual.centres_px.tolist(), residual.shifts_px.tolist(), strict=True)
-    return [{"centre_px": centre_px, "shift_px": shift_px} for centre_px, shift_px in windows]
+    tiles = [{"centre_px": centre_px, "shift_px": shift_px} for centre_px, shift_px in windows]
+    return {"before": before, "after": after, "tiles": tiles}
 
 
 def _relief(context: ProductContext, mapping: PixelMapping, nodes_px: Points) -> dict[str, Any] | None:

@@ -6,20 +6,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from agalign.products.footprint import accuracy_of_footprint_m, footprint, with_assumed_height
+from agalign.products.footprint import accuracy_of_footprint_m, footprint, geojson_geometry, with_assumed_height
 from agalign.products.index_table import IndexRow, read_table
 from agalign.products.product import CapturePaths
 from agalign.products.sidecar import CaptureResult
 from agalign.values.capture import Capture
 from agalign.values.files import write_text
 from agalign.values.image import OutputGrid
-from agalign.values.pixel_units import PixelScale
 
 FLIGHT_MAP_FILE = "flight.geojson"
-_WITHOUT_FOOTPRINT = ("panel", "sky")
-"""Panels are photographed from 1 m, and the sky is not on the ground."""
-_DECIMALS = 7
-"""Of degrees: a centimetre."""
 
 
 class FlightMap:
@@ -35,15 +30,13 @@ class FlightMap:
         The geometry is the footprint of the aligned rasters, or of the reference if there are none; else the position
         of the camera; else null.
         """
-        shown = capture if status in _WITHOUT_FOOTPRINT else with_assumed_height(capture)
-        ring = footprint(shown, _grid(capture, result))
+        # Panels are photographed from 1 m, and the sky is not on the ground.
+        shown = capture if status in ("panel", "sky") else with_assumed_height(capture)
+        output = None if result is None else result.output
+        ring = footprint(shown, OutputGrid(0, 0, *capture.reference.size_px) if output is None else output.grid)
         position, pose = shown.position, shown.pose
-        geometry: dict[str, Any] | None = None
-        if ring is not None:
-            # RFC 7946: outer rings are counter-clockwise.
-            geometry = {"type": "Polygon", "coordinates": [ring[::-1].round(_DECIMALS).tolist()]}
-        elif position is not None:
-            geometry = {"type": "Point", "coordinates": [position.longitude, position.latitude]}
+        # RFC 7946: outer rings are counter-clockwise. 1e-7 degrees are a centimetre.
+        geometry = geojson_geometry(None if ring is None else ring[::-1], position, decimals=7)
         georeference = capture.reference.georeference
         accuracy_m = None if georeference is None else georeference.accuracy_m
         if ring is not None and georeference is None and pose is not None:
@@ -58,8 +51,7 @@ class FlightMap:
             "height_from": None if pose is None or pose.height_m is None else pose.height_from,
             "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
             "accuracy_m": accuracy_m,
-            **_of_result(result),
-            **_links(capture, result),
+            **_of_result(capture, result),
         }
         feature = {"type": "Feature", "id": capture.label, "geometry": geometry, "properties": properties}
         self._features[capture.label] = feature
@@ -120,35 +112,23 @@ def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexRo
     write_text(out / FLIGHT_MAP_FILE, text)
 
 
-def _links(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
-    """Files relative to the output folder."""
-    if result is None:
-        return {"sidecar": None, "stack": None, "picture": None, "indices": []}
-    paths = CapturePaths.of(capture, Path())
-    files = [(part.kind, (paths.folder / part.file).as_posix()) for part in result.products]
-    by_kind = dict(files)
-    return {
-        "sidecar": paths.sidecar.as_posix(),
-        "stack": by_kind.get("stack"),
-        "picture": by_kind.get("picture"),
-        "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
-    }
-
-
-def _grid(capture: Capture, result: CaptureResult | None) -> OutputGrid:
-    if result is None or result.output is None:
-        return OutputGrid(0, 0, *capture.reference.size_px)
-    return OutputGrid(*result.output.crop, PixelScale(*result.output.scale))
-
-
-def _of_result(result: CaptureResult | None) -> dict[str, Any]:
-    """The number of bands, and the largest residuals of a band, px of the reference."""
+def _of_result(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
+    """The number of bands, the largest residuals of a band, px of the reference, and the files, relative to the output
+    folder.
+    """
     bands = [] if result is None else [b for b in result.bands if b.status != "reference"]
     after = [b.metrics.after for b in bands if b.metrics is not None]
+    paths = CapturePaths.of(capture, Path())
+    products = [] if result is None else result.products
+    files = [(part.kind, (paths.folder / part.file).as_posix()) for part in products]
     return {
         "bands": len(bands),
         "bands_aligned": sum(b.status == "aligned" for b in bands),
         "bands_predicted": sum(b.status == "predicted" for b in bands),
         "residual_px": max((a.residual_px for a in after if a.residual_px is not None), default=None),
         "residual_p95_px": max((a.residual_p95_px for a in after if a.residual_p95_px is not None), default=None),
+        "sidecar": None if result is None else paths.sidecar.as_posix(),
+        "stack": dict(files).get("stack"),
+        "picture": dict(files).get("picture"),
+        "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
     }

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,20 +13,10 @@ from agalign.values import geometry
 from agalign.values.capture import Capture, Georeference, HeightSource, Position
 from agalign.values.image import OutputGrid
 
-_WGS84 = "EPSG:4326"
 _MAX_TILT_DEG = 45.0
 """The footprint of a camera with a larger tilt is not useful, and the tag is often wrong."""
 _MAX_ASSUMED_HEIGHT_M = 120.0
 """Legal limit of the height above ground of drones in most countries."""
-_MIN_HEIGHT_M = 1.0
-_POSITION_ERROR_M = 3.0
-"""Standard error of a GPS receiver without corrections."""
-_HEADING_ERROR_DEG = 5.0
-"""Standard error of the compass of an aircraft."""
-_TILT_ERROR_DEG, _UNKNOWN_TILT_DEG = 2.0, 7.0
-"""Standard error of a gimbal or an attitude sensor; standard deviation of the tilt of a camera fixed to an aircraft."""
-_HEIGHT_ERROR_M, _ASSUMED_HEIGHT_ERROR = 5.0, 0.5
-"""Standard error of a barometric height over uneven ground; relative standard error of an assumed height."""
 
 
 def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
@@ -39,13 +30,24 @@ def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
     georeference = capture.reference.georeference
     try:
         if georeference is not None:
-            return transformed(geometry.apply(georeference.transform, corners), georeference.crs_wkt, _WGS84)
+            return transformed(geometry.apply(georeference.transform, corners), georeference.crs_wkt, "EPSG:4326")
         offsets_m, position = ground_m(capture, corners - 0.5), capture.position
         if offsets_m is None or position is None:
             return None
-        return transformed(offsets_m, _local_crs(position), _WGS84)
+        return transformed(offsets_m, _local_crs(position), "EPSG:4326")
     except GeometryError:
         return None
+
+
+def geojson_geometry(
+    ring: NDArray[np.float64] | None, position: Position | None, decimals: int
+) -> dict[str, Any] | None:
+    """Return the GeoJSON geometry of a footprint with these decimals, else of the camera's position; None for None."""
+    if ring is not None:
+        return {"type": "Polygon", "coordinates": [ring.round(decimals).tolist()]}
+    if position is not None:
+        return {"type": "Point", "coordinates": [position.longitude, position.latitude]}
+    return None
 
 
 def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -124,14 +126,14 @@ def accuracy_of_footprint_m(capture: Capture) -> float | None:
         return None
     distance_m = float(np.linalg.norm(offsets_m, axis=1).max())
     tangent = distance_m / pose.height_m  # of the corner's angle from the vertical
-    tilt_deg = _TILT_ERROR_DEG if pose.pitch_deg or pose.roll_deg else _UNKNOWN_TILT_DEG
-    height_error_m = _ASSUMED_HEIGHT_ERROR * pose.height_m if pose.height_from == "assumed" else _HEIGHT_ERROR_M
-    errors_m = (
-        _POSITION_ERROR_M,
-        math.radians(_HEADING_ERROR_DEG) * distance_m,
-        math.radians(tilt_deg) * pose.height_m * (1 + tangent**2),
-        height_error_m * tangent,
-    )
+    position_m = 3.0  # GPS receiver without corrections
+    heading_deg = 5.0  # compass of an aircraft
+    # Gimbal or attitude sensor; tilt of a camera that is fixed to an aircraft.
+    tilt_deg = 2.0 if pose.pitch_deg or pose.roll_deg else 7.0
+    # Assumed height; barometric height over uneven ground.
+    height_m = 0.5 * pose.height_m if pose.height_from == "assumed" else 5.0
+    tilted_m = math.radians(tilt_deg) * pose.height_m * (1 + tangent**2)
+    errors_m = position_m, math.radians(heading_deg) * distance_m, tilted_m, height_m * tangent
     return round(math.hypot(*errors_m), 1)
 
 
@@ -142,7 +144,7 @@ def _altitude_m(capture: Capture) -> float:
 
 def _with_height(capture: Capture, height_m: float, source: HeightSource) -> Capture:
     pose = capture.pose
-    if pose is None or pose.height_m is not None or not height_m > _MIN_HEIGHT_M:
+    if pose is None or pose.height_m is not None or not height_m > 1.0:  # nan too
         return capture
     return replace(capture, pose=replace(pose, height_m=height_m, height_from=source))
 

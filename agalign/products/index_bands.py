@@ -1,6 +1,5 @@
 """The aligned bands that spectral indices are calculated from: where they are, their unit, and their values."""
 
-import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -8,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from rasterio.enums import MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
+from agalign.config import CheckSettings
 from agalign.errors import InputError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
 from agalign.products.sidecar import CaptureResult, is_delivered
@@ -21,8 +19,6 @@ from agalign.values.quality import UNUSABLE
 
 RAW = "raw numbers"
 """Unit of bands that are neither reflectance nor radiance."""
-_DEFAULT_ACCEPT_PREDICTED_PX = 1.0
-"""For sidecars without the limit of their run: the default of `--accept-predicted`."""
 _MAX_REFLECTANCE = 2.0
 """Sun glint and specular leaves exceed 1; raw numbers of any sensor exceed this."""
 _SAMPLE_PX = 512
@@ -53,7 +49,7 @@ def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> 
     if mask_qa and flags is None:
         raise InputError(f"{sidecar.capture}: has no quality raster, which --mask-qa needs; align with --qa")
     given = sidecar.accept_predicted_px
-    limit_px = _DEFAULT_ACCEPT_PREDICTED_PX if given is None else given
+    limit_px = CheckSettings().accept_predicted_px if given is None else given
     checksums = {part.file: part.sha256 for part in sidecar.products}
     result = []
     # Layer 1 of the quality raster is that of all bands together.
@@ -122,29 +118,23 @@ class BandReader(ExitStack):
         result = _scaled(self.file(band.file, band.band_index), band.band_index, window)
         if band.quality is not None:
             path, layer, _ = band.quality
-            flags = _read(self.file(path, layer), layer, window).astype(np.uint16)
+            flags = _read(self.file(path, layer), layer, window).data.astype(np.uint16)
             result[flags & np.uint16(UNUSABLE.value) != 0] = np.nan
         return result
 
 
 def _scaled(source: OpenRaster, index: int, window: Window, shape: tuple[int, int] | None = None) -> FloatImage:
     """A window in the unit of the file's scale and offset, nan for nodata, resampled to `shape` (height, width)."""
-    scale, offset, nodata = source.scales[index - 1], source.offsets[index - 1], source.nodatavals[index - 1]
+    scale, offset = source.scales[index - 1], source.offsets[index - 1]
     pixels = _read(source, index, window, shape).astype(np.float32)
     if scale != 1.0 or offset != 0.0:
         pixels = pixels * np.float32(scale) + np.float32(offset)
-    nodata_is_nan = nodata is not None and math.isnan(nodata)
-    if nodata_is_nan or MaskFlags.all_valid in source.mask_flag_enums[index - 1]:
-        return pixels
-    masks = _read(source, index, window, shape, masks=True)
-    return np.where(masks > 0, pixels, np.float32(np.nan))
+    return np.asarray(pixels.filled(np.nan))
 
 
-def _read(
-    source: OpenRaster, index: int, window: Window, shape: tuple[int, int] | None = None, *, masks: bool = False
-) -> NDArray[Any]:
-    """The pixels of a window, or their masks. Raises InputError."""
+def _read(source: OpenRaster, index: int, window: Window, shape: tuple[int, int] | None = None) -> Any:
+    """The pixels of a window as a masked array: nodata is masked. Raises InputError."""
     try:
-        return np.asarray((source.read_masks if masks else source.read)(index, window=window, out_shape=shape))
+        return source.read(index, window=window, out_shape=shape, masked=True)
     except RasterioError as error:
         raise InputError(f"{source.name}: cannot be read ({innermost_cause(error)}); run again") from None

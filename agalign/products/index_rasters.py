@@ -1,12 +1,12 @@
-"""Spectral indices of a capture: a float32 raster and a picture of each, with their statistics."""
+"""Spectral indices of a capture: a float32 raster and a picture of each, with their statistics; as the product of
+`agalign align --index`, and for `agalign indices`.
+"""
 
 import glob
 import hashlib
 import json
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,12 @@ import tifffile
 from numpy.typing import NDArray
 
 from agalign._version import __version__
-from agalign.errors import AgalignError, InputError
+from agalign.config import WriteSettings
+from agalign.errors import AgalignError, ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.checked_raster import (
     FLOAT_OPTIONS,
     WORK_TILE_PX,
-    CheckedRaster,
     LayerDescription,
     check_complete,
     checked_raster,
@@ -30,39 +30,91 @@ from agalign.products.checked_raster import (
 from agalign.products.drawing import with_text, write_png
 from agalign.products.index_bands import RAW, BandReader, IndexBand
 from agalign.products.index_table import STATISTICS_TAG, IndexReport, IndexStatistics, read_statistics, statistics_in
-from agalign.products.indices import Index, bands_for, compute
-from agalign.values.image import FloatImage, Tile
+from agalign.products.indices import Index, bands_for, compute, index_named
+from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.values.capture import Band, Capture
+from agalign.values.image import Tile, reduced_size_px
 from agalign.values.resample import tiles
 
 _MAX_STATISTICS_PX = 4_000_000
 """Percentiles of larger rasters are calculated from every second, third … row and column."""
-_MIN_SPAN = 1e-3
-"""Smallest difference between the ends of the colour scale of a picture."""
-_SOURCE_TAG = "INDEX_MADE_FROM"
-_COPIED_TAGS = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
-_BARS = 120
 _PICTURE_PX = 720
 """Longer side of the image at the top left of the picture; the report overlays it on the composite."""
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
 _NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
 """Greys for raw numbers, whose values do not distinguish soil and vegetation."""
-_NODATA_COLOUR = (225, 190, 215)
 
 
-@dataclass
-class _Raster:
-    """An index raster that is being written."""
+class IndexRasters(Product):
+    """A raster and a picture of each requested index whose bands are aligned."""
 
-    index: Index
-    bands: Sequence[IndexBand]
-    target: Path
-    unit: str
-    source: str
-    """Fingerprint of the bands and the formula."""
-    file: CheckedRaster = field(init=False)
-    samples: list[NDArray[np.float32]] = field(default_factory=list)
-    valid_px: int = 0
+    kind = "index"
+    is_required = False
+    option = "indices"
+
+    def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
+        """Return <capture>_<index>.tif and .png."""
+        names = [name.strip().lower() for name in settings.indices]
+        return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
+
+    def write(self, context: ProductContext) -> list[WrittenFile]:
+        """Write the indices whose bands the capture has and that are delivered.
+
+        Raises InputError if bands are in the wrong unit, OutputError.
+        """
+        bands = _bands(context)
+        indices = [index_named(name) for name in context.write_settings.indices]
+        result = []
+        problems = []
+        for report in write_rasters(bands, indices, context.paths.file(""), context.capture.label):
+            if report.path is not None:
+                asset = StacAsset(report.index, GEOTIFF, ("data",))
+                result.append(WrittenFile(self.kind, report.path, asset))
+                result.append(WrittenFile(self.kind, report.path.with_suffix(".png")))
+            elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, report.index):
+                problems.append(report.problem)
+        if problems:
+            # The sidecar lists the complete files, so that they are removed before the capture is processed again.
+            context.written.extend(result)
+            raise InputError("; ".join(problems))
+        return result
+
+
+def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
+    """Raise ConfigurationError for an unknown index, and for an index that no capture has the bands or unit for."""
+    for name in settings.indices:
+        index = index_named(name)
+        suitable = [c for c in captures if _has_bands(c.bands, name)]
+        if captures and not suitable:
+            names = ", ".join(dict.fromkeys(b.name for c in captures for b in c.bands))
+            raise ConfigurationError(
+                f"--index {name}: needs bands {', '.join(index.roles)}, and no capture has them all; there are {names}"
+            )
+        raw = settings.radiometry == "off" and all(np.dtype(b.dtype).kind in "ui" for c in suitable for b in c.bands)
+        if suitable and raw and not index.any_unit:
+            raise ConfigurationError(f"--index {name}: needs reflectance; add --radiometry")
+
+
+def _has_bands(bands: Sequence[Band], name: str) -> bool:
+    narrow = [b for b in bands if not b.companion]
+    try:
+        return bool(bands_for(index_named(name), [b.name for b in narrow], [b.wavelength_nm for b in narrow]))
+    except InputError:
+        return False
+
+
+def _bands(context: ProductContext) -> list[IndexBand]:
+    places, result = context.places, []
+    usable = {context.capture.reference.name, *context.delivered} & set(places)
+    for band in context.capture.bands:
+        if band.name in usable:
+            file, index = places[band.name]
+            result.append(IndexBand(band.name, band.wavelength_nm, file.path, index, file.sha256))
+        else:
+            problem = f"{band.name} is {context.alignments[band.name].status}"
+            result.append(IndexBand(band.name, band.wavelength_nm, Path(), 1, problem=problem))
+    return result
 
 
 def write_rasters(
@@ -74,8 +126,7 @@ def write_rasters(
     band of an index is missing, not delivered or not in the unit that the index needs, the report has the problem.
     Raises OutputError, or InputError for a file that cannot be read.
     """
-    reports: dict[str, IndexReport] = {}
-    rasters: list[_Raster] = []
+    reports = []
     with BandReader() as reader:
         for index in indices:
             target = base.with_name(f"{base.name}_{index.name}.tif")
@@ -84,21 +135,18 @@ def write_rasters(
                 source = _fingerprint(index, chosen)
                 earlier = None if overwrite else _finished_before(target, source)
                 if earlier is not None:
-                    reports[index.name] = IndexReport(label, index.name, target, earlier, kept=True)
+                    reports.append(IndexReport(label, index.name, target, earlier, kept=True))
                     continue
                 unit = _unit(index, chosen, reader)
                 for band in chosen:
                     if band.quality is not None:
                         reader.file(*band.quality[:2])
             except InputError as error:
-                reports[index.name] = IndexReport(label, index.name, problem=str(error))
+                reports.append(IndexReport(label, index.name, problem=str(error)))
                 continue
-            rasters.append(_Raster(index, chosen, target, unit, source))
-        statistics = _write(rasters, reader) if rasters else []
-    for raster, one in zip(rasters, statistics, strict=True):
-        _draw(raster, one)
-        reports[raster.index.name] = IndexReport(label, raster.index.name, raster.target, one)
-    return [reports[index.name] for index in indices]
+            statistics = _write(index, chosen, target, unit, source, reader)
+            reports.append(IndexReport(label, index.name, target, statistics))
+    return reports
 
 
 def outdated_rasters(base: Path) -> Iterator[Path]:
@@ -144,7 +192,7 @@ def _finished_before(target: Path, source: str) -> IndexStatistics | None:
             tags = dataset.tags()
     except (AgalignError, OSError, tifffile.TiffFileError):
         return None
-    return statistics_in(tags) if tags.get(_SOURCE_TAG) == source else None
+    return statistics_in(tags) if tags.get("INDEX_MADE_FROM") == source else None
 
 
 def _unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
@@ -158,79 +206,63 @@ def _unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
     return unit
 
 
-def _write(rasters: Sequence[_Raster], reader: BandReader) -> list[IndexStatistics]:
-    """Write rasters tile by tile, reading each band once. Raises OutputError, InputError for a band."""
-    first = rasters[0].bands[0]
-    like = reader.file(first.file, first.band_index)
+def _write(
+    index: Index, bands: Sequence[IndexBand], target: Path, unit: str, source: str, reader: BandReader
+) -> IndexStatistics:
+    """Write the raster tile by tile, and its picture. Raises OutputError, InputError for a band."""
+    like = reader.file(bands[0].file, bands[0].band_index)
     profile = tiled_profile(like.width, like.height, 1, "float32", **FLOAT_OPTIONS)
     if like.crs is not None and not like.transform.is_identity:
         profile |= {"crs": like.crs, "transform": like.transform}
     step = max(1, math.ceil(math.sqrt(like.width * like.height / _MAX_STATISTICS_PX)))
-    with ExitStack() as stack:
-        for raster in rasters:
-            raster.file = stack.enter_context(checked_raster(raster.target, profile))
-            _describe(raster, like)
+    samples, valid_px = [], 0
+    with checked_raster(target, profile) as raster:
+        raster.describe([LayerDescription(index.name)], _tags(index, like, unit, source))
         for tile in tiles(Tile(0, 0, like.width, like.height), WORK_TILE_PX):
-            _write_tile(rasters, reader, tile, step)
-        statistics = [_statistics(raster, like.width * like.height) for raster in rasters]
-        for raster, one in zip(rasters, statistics, strict=True):
-            raster.file.dataset.update_tags(**{STATISTICS_TAG: json.dumps(one.as_json())})
+            values = compute(index, [reader.values(band, tile) for band in bands])
+            raster.write(values, 1, tile.x0, tile.y0)
+            valid = np.isfinite(values)
+            valid_px += int(np.count_nonzero(valid))
+            samples.append(values[::step, ::step][valid[::step, ::step]])
+        sample = np.concatenate(samples)
+        statistics = _statistics(index, unit, sample, valid_px / (like.width * like.height))
+        raster.dataset.update_tags(**{STATISTICS_TAG: json.dumps(statistics.as_json())})
+    _draw(index, target, sample, statistics)
     return statistics
 
 
-def _describe(raster: _Raster, like: OpenRaster) -> None:
-    index = raster.index
-    tags = {k: v for k, v in like.tags().items() if k in _COPIED_TAGS}
-    tags |= {"TIFFTAG_SOFTWARE": "agalign", "INDEX": index.name, "INDEX_SOURCE": index.source}
-    tags |= {"INDEX_FORMULA": _formula_text(index), _SOURCE_TAG: raster.source}
-    tags["INPUT"] = "raw numbers, not reflectance" if raster.unit == RAW else ""
-    raster.file.describe([LayerDescription(index.name)], tags)
-
-
-def _write_tile(rasters: Sequence[_Raster], reader: BandReader, tile: Tile, step: int) -> None:
-    values: dict[IndexBand, FloatImage] = {}
-    for raster in rasters:
-        for band in raster.bands:
-            if band not in values:
-                values[band] = reader.values(band, tile)
-        result = compute(raster.index, [values[band] for band in raster.bands])
-        raster.file.write(result, 1, tile.x0, tile.y0)
-        valid = np.isfinite(result)
-        raster.valid_px += int(np.count_nonzero(valid))
-        raster.samples.append(result[::step, ::step][valid[::step, ::step]])
-
-
-def _statistics(raster: _Raster, pixels: int) -> IndexStatistics:
-    values = np.concatenate(raster.samples)
-    raster.samples = [values]
-    if not values.size:
-        return IndexStatistics(unit=raster.unit, low=0.0, high=1.0)
-    low, p5, median, p95, high = (round(float(v), 6) for v in np.percentile(values, (2, 5, 50, 95, 98)))
-    if raster.index.span is not None and raster.unit != RAW:
-        low, high = raster.index.span
-    valid_share = round(raster.valid_px / pixels, 6)
-    return IndexStatistics(median, p5, p95, valid_share, raster.unit, low, max(high, low + _MIN_SPAN))
-
-
-def _formula_text(index: Index) -> str:
+def _tags(index: Index, like: OpenRaster, unit: str, source: str) -> dict[str, str]:
+    """The tags of a raster, some of which are those of the file of its first band."""
+    copied = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
     constants = ", ".join(f"{name} = {value:g}" for name, value in index.constants)
-    return f"{index.formula} with {constants}" if constants else index.formula
+    return {k: v for k, v in like.tags().items() if k in copied} | {
+        "TIFFTAG_SOFTWARE": "agalign",
+        "INDEX": index.name,
+        "INDEX_SOURCE": index.source,
+        "INDEX_FORMULA": f"{index.formula} with {constants}" if constants else index.formula,
+        "INDEX_MADE_FROM": source,
+        "INPUT": "raw numbers, not reflectance" if unit == RAW else "",
+    }
 
 
-def _draw(raster: _Raster, statistics: IndexStatistics) -> None:
-    with open_raster(raster.target) as dataset:
-        width, height = picture_size(dataset.width, dataset.height)
-        values = dataset.read(1, out_shape=(height, width))
-    capture = raster.target.stem.removesuffix(f"_{raster.index.name}")
-    note = ": raw numbers, not reflectance" if raster.unit == RAW else ""
-    title = f"{raster.index.name.upper()} of {capture}{note}"
-    write_picture(values, raster.samples[0], statistics, title, raster.target.with_suffix(".png"))
+def _statistics(index: Index, unit: str, sample: NDArray[np.float32], valid_share: float) -> IndexStatistics:
+    if not sample.size:
+        return IndexStatistics(unit=unit, low=0.0, high=1.0)
+    low, p5, median, p95, high = (round(float(v), 6) for v in np.percentile(sample, (2, 5, 50, 95, 98)))
+    if index.span is not None and unit != RAW:
+        low, high = index.span
+    # The ends of the colour scale must differ.
+    return IndexStatistics(median, p5, p95, round(valid_share, 6), unit, low, max(high, low + 1e-3))
 
 
-def picture_size(width: int, height: int) -> tuple[int, int]:
-    """Return (width, height) px of the image in the picture of a raster of this size."""
-    scale = min(1.0, _PICTURE_PX / max(width, height))
-    return max(1, round(width * scale)), max(1, round(height * scale))
+def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: IndexStatistics) -> None:
+    """Write the picture of a raster. Raises OutputError."""
+    with open_raster(raster) as dataset:
+        size_px = dataset.width, dataset.height
+        values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / _PICTURE_PX))[::-1])
+    note = ": raw numbers, not reflectance" if statistics.unit == RAW else ""
+    title = f"{index.name.upper()} of {raster.stem.removesuffix(f'_{index.name}')}{note}"
+    write_picture(values, sample, statistics, title, raster.with_suffix(".png"))
 
 
 def write_picture(
@@ -242,14 +274,14 @@ def write_picture(
     """
     span, neutral = (statistics.low, statistics.high), statistics.unit == RAW
     shape = values.shape
-    width, margin, bars = max(shape[1], 360), 24, 90
+    width, margin, bars, bins = max(shape[1], 360), 24, 90, 120
     # In float64: a value clipped in float32 may be just outside the span.
-    counts = np.histogram(sample.astype(float).clip(*span), _BARS, span)[0]
+    counts = np.histogram(sample.astype(float).clip(*span), bins, span)[0]
     sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
     sheet[: shape[0], : shape[1]] = _coloured(values, span, neutral=neutral)
     base = shape[0] + margin + bars
-    edges = np.linspace(margin, width - margin, _BARS + 1).round().astype(int)
-    centres = np.linspace(*span, 2 * _BARS + 1, dtype=np.float32)[1::2]
+    edges = np.linspace(margin, width - margin, bins + 1).round().astype(int)
+    centres = np.linspace(*span, 2 * bins + 1, dtype=np.float32)[1::2]
     colours = _coloured(centres[None], span, neutral=neutral)[0]
     # The first and last bins also contain the values beyond the span.
     heights = (bars * counts / max(int(counts[1:-1].max(initial=1)), 1)).clip(0, bars).round().astype(int)
@@ -267,5 +299,5 @@ def _coloured(values: NDArray[Any], span: tuple[float, float], *, neutral: bool)
     share = np.nan_to_num(np.clip((values - span[0]) / (span[1] - span[0]), 0, 1))
     stops = np.linspace(0, 1, len(ramp))
     result = np.stack([np.interp(share, stops, channel) for channel in ramp.T], axis=-1)
-    result[~np.isfinite(values)] = _NODATA_COLOUR
+    result[~np.isfinite(values)] = (225, 190, 215)
     return np.asarray(result.round(), np.uint8)

@@ -18,11 +18,6 @@ from agalign.values.text import without_formula
 
 STATISTICS_TAG = "INDEX_STATISTICS"
 INDICES_FILE = "indices.csv"
-_OF_CAPTURE = ("folder", "capture", "captured_at", "latitude", "longitude", "index")
-_OF_STATISTICS = ("median", "p5", "p95", "valid_share", "input", "low", "high")
-COLUMNS = (*_OF_CAPTURE, *_OF_STATISTICS, "file", "problem")
-_Key = tuple[str, str, str]
-"""(folder, capture, index)."""
 
 
 @dataclass(frozen=True)
@@ -104,8 +99,8 @@ class IndexRow:
     problem: str = ""
 
     @property
-    def key(self) -> _Key:
-        """Identify the row."""
+    def key(self) -> tuple[str, str, str]:
+        """Identify the row: (folder, capture, index)."""
         return self.folder, self.capture, self.index
 
     @property
@@ -149,9 +144,11 @@ def read_table(out: Path) -> list[IndexRow]:
 
 def write_table(out: Path, rows: Iterable[IndexRow]) -> None:
     """Write OUT/indices.csv. Raises OutputError."""
-    in_order = sorted(rows, key=lambda row: row.key)
+    of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
+    of_index = "index", "median", "p5", "p95", "valid_share", "input", "low", "high", "file", "problem"
+    columns, in_order = of_capture + of_index, sorted(rows, key=lambda row: row.key)
     cells = [vars(row) | row.statistics.as_json() | {"input": row.statistics.unit} for row in in_order]
-    write_csv(out / INDICES_FILE, COLUMNS, ([without_formula(one[name]) for name in COLUMNS] for one in cells))
+    write_csv(out / INDICES_FILE, columns, ([without_formula(one[name]) for name in columns] for one in cells))
 
 
 def update_table(out: Path, rows: Sequence[IndexRow]) -> list[IndexRow]:
@@ -168,7 +165,7 @@ def update_table(out: Path, rows: Sequence[IndexRow]) -> list[IndexRow]:
 
 def _row(cells: Mapping[str, str]) -> IndexRow:
     cells = {k: _unquoted(v) for k, v in cells.items()}
-    numbers = {k: float(cells[k] or "nan") for k in _OF_STATISTICS if k != "input"}
+    numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
     latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
     of_capture = cells["folder"], cells["capture"], cells["captured_at"], latitude, longitude
     statistics = IndexStatistics(unit=cells["input"], **numbers)

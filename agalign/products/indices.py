@@ -12,44 +12,55 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from agalign.errors import ConfigurationError, InputError
+from agalign.values.capture import Band
 from agalign.values.image import FloatImage
 
 _MAX_LENGTH = 300
 """Characters of a formula: longer ones could exhaust Python's recursion limit."""
 _MAX_NUMBER = 1e30
 """Numbers must fit into float32."""
-_OPERATORS: Mapping[type, Callable[[Any, Any], Any]] = {
+_OPERATORS: Mapping[type, Callable[..., Any]] = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
     ast.Mult: np.multiply,
     ast.Div: np.divide,
     ast.Pow: np.power,
+    ast.UAdd: np.positive,
+    ast.USub: np.negative,
 }
-_SIGNS: Mapping[type, Callable[[Any], Any]] = {ast.UAdd: np.positive, ast.USub: np.negative}
 _FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {"sqrt": np.sqrt, "log": np.log, "exp": np.exp, "abs": np.abs}
 Role = Literal["blue", "green", "red", "red edge", "nir"]
 """The part of the spectrum that a band of an index is from."""
-_ROLES: dict[Role, tuple[tuple[float, float, float], tuple[str, ...]]] = {
-    "blue": ((430, 475, 510), ("blue", "blu", "b")),
-    "green": ((520, 560, 590), ("green", "gre", "grn", "g")),
-    "red": ((620, 668, 695), ("red", "r")),
-    "red edge": ((697, 717, 760), ("red edge", "rededge", "red_edge", "red-edge", "reg", "re")),
-    "nir": ((765, 840, 920), ("nir", "near infrared", "near infra-red", "near-infrared", "n")),
+
+
+class SpectralRange(NamedTuple):
+    """The bands of a role."""
+
+    shortest_nm: float
+    nominal_nm: float
+    longest_nm: float
+    """Limits of the centre wavelength."""
+    symbols: tuple[str, ...]
+    """Names in formulas, as in the catalogue Awesome Spectral Indices."""
+    names: tuple[str, ...]
+    """Names of bands without a wavelength."""
+
+
+ROLES: Mapping[Role, SpectralRange] = {
+    "blue": SpectralRange(430, 475, 510, ("B",), ("blue", "blu", "b")),
+    "green": SpectralRange(520, 560, 590, ("G",), ("green", "gre", "grn", "g")),
+    "red": SpectralRange(620, 668, 695, ("R",), ("red", "r")),
+    "red edge": SpectralRange(
+        697, 717, 760, ("RE", "RE1"), ("red edge", "rededge", "red_edge", "red-edge", "reg", "re")
+    ),
+    "nir": SpectralRange(765, 840, 920, ("N",), ("nir", "near infrared", "near infra-red", "near-infrared", "n")),
 }
-"""(shortest, nominal and longest centre wavelength, nm; names) of each role."""
-_NOT_NARROW = ("pan", "rgb", "lwir", "thermal")
-"""Starts of the names of bands that have no role, whatever their centre wavelength."""
-_LETTERS: dict[str, Role] = {"B": "blue", "G": "green", "R": "red", "RE": "red edge", "RE1": "red edge", "N": "nir"}
-"""The names of bands in formulas, as in the catalogue Awesome Spectral Indices."""
-_CATALOGUE, _CONSTANTS = "spyndex/data/spectral-indices-dict.json", "spyndex/data/constants.json"
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
-_TEST_FACTOR = 1000.0
-"""A formula whose value is the same after multiplication of all bands by this does not depend on their unit."""
+_ROLE_OF_SYMBOL = {symbol: role for role, spectral_range in ROLES.items() for symbol in spectral_range.symbols}
 
 
 def symbols_of(formula: str) -> tuple[str, ...]:
@@ -86,7 +97,7 @@ def _names(node: ast.expr, formula: str) -> Iterator[str]:
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
             yield from _names(left, formula)
             yield from _names(right, formula)
-        case ast.UnaryOp(op=op, operand=operand) if type(op) in _SIGNS:
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
             yield from _names(operand, formula)
         case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
             yield from _names(argument, formula)
@@ -108,7 +119,7 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
         case ast.BinOp(left=left, op=op, right=right):
             return _OPERATORS[type(op)](_value(left, values), _value(right, values))
         case ast.UnaryOp(op=op, operand=operand):
-            return _SIGNS[type(op)](_value(operand, values))
+            return _OPERATORS[type(op)](_value(operand, values))
         case ast.Call(func=ast.Name(id=name), args=[argument]):
             return _FUNCTIONS[name](_value(argument, values))
     raise AssertionError(ast.dump(node))  # `_names` has refused it
@@ -136,25 +147,31 @@ class Index:
     @property
     def roles(self) -> tuple[Role, ...]:
         """The roles of `symbols`."""
-        return tuple(_LETTERS[s.upper()] for s in self.symbols)
+        return tuple(_ROLE_OF_SYMBOL[s.upper()] for s in self.symbols)
 
 
-_BUILT_IN = (
-    Index("ndvi", "(N - R) / (N + R)", (-0.2, 1.0), "Rouse et al. 1974"),
-    Index("ndre", "(N - RE) / (N + RE)", (-0.2, 0.8), "Gitelson and Merzlyak 1994"),
-    Index("gndvi", "(N - G) / (N + G)", (-0.2, 1.0), "Gitelson et al. 1996"),
-    Index("ndwi", "(G - N) / (G + N)", (-1.0, 0.5), "McFeeters 1996"),
-    Index("cire", "N / RE - 1", (0.0, 4.0), "Gitelson et al. 2003"),
-    Index("cig", "N / G - 1", (0.0, 10.0), "Gitelson et al. 2003"),
-    Index("vari", "(G - R) / (G + R - B)", (-0.5, 0.5), "Gitelson et al. 2002"),
-    Index("savi", "1.5 * (N - R) / (N + R + 0.5)", (-0.2, 1.0), "Huete 1988", any_unit=False),
-    Index("osavi", "1.16 * (N - R) / (N + R + 0.16)", (-0.2, 1.0), "Rondeaux et al. 1996", any_unit=False),
-    Index(
-        "msavi", "(2 * N + 1 - sqrt((2 * N + 1) ** 2 - 8 * (N - R))) / 2", (-0.2, 1.0), "Qi et al. 1994", any_unit=False
-    ),
-    Index("evi", "2.5 * (N - R) / (N + 6 * R - 7.5 * B + 1)", (-0.2, 1.0), "Huete et al. 2002", any_unit=False),
-)
-INDICES: Mapping[str, Index] = {index.name: index for index in _BUILT_IN}
+INDICES: Mapping[str, Index] = {
+    index.name: index
+    for index in (
+        Index("ndvi", "(N - R) / (N + R)", (-0.2, 1.0), "Rouse et al. 1974"),
+        Index("ndre", "(N - RE) / (N + RE)", (-0.2, 0.8), "Gitelson and Merzlyak 1994"),
+        Index("gndvi", "(N - G) / (N + G)", (-0.2, 1.0), "Gitelson et al. 1996"),
+        Index("ndwi", "(G - N) / (G + N)", (-1.0, 0.5), "McFeeters 1996"),
+        Index("cire", "N / RE - 1", (0.0, 4.0), "Gitelson et al. 2003"),
+        Index("cig", "N / G - 1", (0.0, 10.0), "Gitelson et al. 2003"),
+        Index("vari", "(G - R) / (G + R - B)", (-0.5, 0.5), "Gitelson et al. 2002"),
+        Index("savi", "1.5 * (N - R) / (N + R + 0.5)", (-0.2, 1.0), "Huete 1988", any_unit=False),
+        Index("osavi", "1.16 * (N - R) / (N + R + 0.16)", (-0.2, 1.0), "Rondeaux et al. 1996", any_unit=False),
+        Index(
+            "msavi",
+            "(2 * N + 1 - sqrt((2 * N + 1) ** 2 - 8 * (N - R))) / 2",
+            (-0.2, 1.0),
+            "Qi et al. 1994",
+            any_unit=False,
+        ),
+        Index("evi", "2.5 * (N - R) / (N + 6 * R - 7.5 * B + 1)", (-0.2, 1.0), "Huete et al. 2002", any_unit=False),
+    )
+}
 
 
 def index_named(name: str) -> Index:
@@ -178,7 +195,7 @@ def index_of_formula(text: str) -> Index:
     """Return the index of a text 'name=(N-R)/(N+R)'; the default name is 'formula'. Raises ConfigurationError."""
     name, equals, formula = text.partition("=")
     name, formula = (name.strip().lower(), formula) if equals else ("formula", text)
-    if not _NAME.fullmatch(name) or name in INDICES:
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or name in INDICES:
         raise ConfigurationError(f"'{name}' cannot name a formula; use letters, digits and _, and no index's name")
     index = Index(name, formula.strip(), source="formula of the user")
     _check_bands(index)
@@ -187,13 +204,15 @@ def index_of_formula(text: str) -> Index:
 
 def _catalogue() -> Mapping[str, Any]:
     """The indices of spyndex by name in lower case, read without executing its code; empty if it is not installed."""
-    return {name.lower(): entry for name, entry in _data_of_spyndex(_CATALOGUE, "SpectralIndices").items()}
+    return {
+        name.lower(): entry for name, entry in _data_of_spyndex("spectral-indices-dict.json", "SpectralIndices").items()
+    }
 
 
 @cache
 def _data_of_spyndex(file: str, key: str) -> Mapping[str, Any]:
     try:
-        path = Path(str(metadata.distribution("spyndex").locate_file(file)))
+        path = Path(str(metadata.distribution("spyndex").locate_file(f"spyndex/data/{file}")))
         data = json.loads(path.read_text(encoding="utf-8"))
     except (metadata.PackageNotFoundError, OSError, ValueError):
         return {}
@@ -203,7 +222,7 @@ def _data_of_spyndex(file: str, key: str) -> Mapping[str, Any]:
 
 def _of_catalogue(name: str, entry: Mapping[str, Any]) -> Index:
     formula = str(entry["formula"])
-    defaults = {k: v.get("default") for k, v in _data_of_spyndex(_CONSTANTS, "").items()}
+    defaults = {k: v.get("default") for k, v in _data_of_spyndex("constants.json", "").items()}
     constants = tuple((s, float(defaults[s])) for s in symbols_of(formula) if defaults.get(s) is not None)
     index = Index(name, formula, source=str(entry.get("reference", "")), constants=constants)
     _check_bands(index)
@@ -212,7 +231,7 @@ def _of_catalogue(name: str, entry: Mapping[str, Any]) -> Index:
 
 def _check_bands(index: Index) -> None:
     """Raise ConfigurationError if the formula has no band, or a name that is not that of a band."""
-    unknown = [s for s in index.symbols if s.upper() not in _LETTERS]
+    unknown = [s for s in index.symbols if s.upper() not in _ROLE_OF_SYMBOL]
     if unknown or not index.symbols:
         used = ", ".join(unknown) or "no band"
         raise ConfigurationError(f"index '{index.name}', {index.formula}, uses {used}; the bands are B, G, R, RE and N")
@@ -221,7 +240,7 @@ def _check_bands(index: Index) -> None:
 def _is_of_any_unit(index: Index) -> bool:
     """True if the value does not change when all bands are multiplied by the same number."""
     bands = [np.array([0.1 * k, 0.5 / k], np.float32) for k in range(1, len(index.symbols) + 1)]
-    scaled = [b * np.float32(_TEST_FACTOR) for b in bands]
+    scaled = [b * np.float32(1000) for b in bands]
     return bool(np.allclose(compute(index, bands), compute(index, scaled), rtol=1e-4, equal_nan=True))
 
 
@@ -234,24 +253,28 @@ def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float
     roles = [role_of(name, wavelength_nm) for name, wavelength_nm in zip(names, wavelengths_nm, strict=True)]
     result = []
     for role in index.roles:
-        (_, nominal_nm, _), _ = _ROLES[role]
         candidates = [i for i, own_role in enumerate(roles) if own_role == role]
         if not candidates:
             raise InputError(f"{index.name} needs a {role} band; there are {', '.join(names)}")
         # Bands with a known wavelength first.
-        distances_nm = [math.inf if w is None else abs(w - nominal_nm) for w in wavelengths_nm]
+        distances_nm = [math.inf if w is None else abs(w - ROLES[role].nominal_nm) for w in wavelengths_nm]
         result.append(min(candidates, key=distances_nm.__getitem__))
     return result
 
 
 def role_of(name: str, wavelength_nm: float | None) -> Role | None:
     """Return the role of a band by its wavelength if that is known, else by its name; None for a band without one."""
-    if name.lower().startswith(_NOT_NARROW):
+    if name.lower().startswith(("pan", "rgb", "lwir", "thermal")):  # whatever the centre wavelength
         return None
-    for role, ((shortest_nm, _, longest_nm), names) in _ROLES.items():
+    for role, (shortest_nm, _, longest_nm, _, names) in ROLES.items():
         if name.lower() in names if wavelength_nm is None else shortest_nm <= wavelength_nm <= longest_nm:
             return role
     return None
+
+
+def role_of_band(band: Band) -> Role | None:
+    """Return the role of a band; None for a band without one, and for those of the colour photograph."""
+    return None if band.companion else role_of(band.name, band.wavelength_nm)
 
 
 def compute(index: Index, bands: Sequence[FloatImage]) -> FloatImage:

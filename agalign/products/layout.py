@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,8 +22,6 @@ _FLIGHT_MARGIN_PX = 2
 """The crop of a flight is smaller by this: captures that the rig was not learned from may exceed its extremes."""
 _MAX_CELL_PX, _MIN_CELLS = 8, 64
 """The common area is found in cells of at most 8 px, and at least 64 cells along each axis if the image has as many."""
-_BORDER_POINTS = 64
-"""Points on each side of the crop at which its coverage by the moving images is tested."""
 
 
 @dataclass(frozen=True)
@@ -55,86 +53,53 @@ def output_layers(
 
     With the `rig` of the flight, all captures of the flight have the same grid.
     """
-    pixels = _OutputPixels.of(capture, alignments, settings)
-    layers = _layers(capture, alignments, pixels)
+    reference = capture.reference
+    mappings = {b.name: alignments[b.name].mapping for b in capture.moving if b.name in alignments}
+    frame = _frame(reference, mappings.values(), settings)
+    if frame.undistorted or frame.scale != SAME_PIXELS:
+        mappings[reference.name] = PixelMapping(geometry.identity())  # otherwise the reference is copied
+    on_frame = {name: _on_frame(mapping, frame, reference) for name, mapping in mappings.items()}
+    layers = [Layer(b, on_frame.get(b.name), is_reference=b is reference) for b in capture.bands]
     # The crop is calculated without relief, which may leave pixels of single bands without a value.
     mapped = [(layer.mapping.of_the_plane, layer.band) for layer in layers if layer.mapping is not None]
-    crop = _crop(capture, mapped, pixels, settings, rig)
-    has_relief = any(layer.mapping is not None and layer.mapping.parallax is not None for layer in layers)
-    has_gaps = has_relief or not _covers(mapped, crop)
-    grid = OutputGrid(crop.x0, crop.y0, crop.width, crop.height, pixels.scale, pixels.undistorted, has_gaps)
-    return layers, grid
+    crop = _crop(capture, mapped, frame, settings, rig)
+    has_relief = any(mapping.parallax is not None for mapping in on_frame.values())
+    return layers, replace(frame, **vars(crop), has_gaps=has_relief or not _covers(mapped, crop))
 
 
-@dataclass(frozen=True)
-class _OutputPixels:
+def _frame(reference: Band, mappings: Iterable[PixelMapping], settings: WriteSettings) -> OutputGrid:
     """The pixel grid of the output before the crop: that of the reference, a finer one, or one without distortion."""
-
-    reference: Band
-    size_px: tuple[int, int]
-    undistorted: bool
-
-    @classmethod
-    def of(
-        cls, capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], settings: WriteSettings
-    ) -> "_OutputPixels":
-        reference, scale = capture.reference, 1.0
-        if settings.resolution == "finest":
-            scale = _finest_scale(_mappings(capture, alignments).values(), reference)
-        size_px = round(reference.width_px * scale), round(reference.height_px * scale)
-        return cls(reference, size_px, settings.undistort and reference.lens is not None)
-
-    @property
-    def scale(self) -> PixelScale:
-        """Output pixels per pixel of the reference's file."""
-        return PixelScale.between(self.reference.size_px, self.size_px)
-
-    @property
-    def are_copied(self) -> bool:
-        """True if the pixels of the reference are copied."""
-        return self.size_px == self.reference.size_px and not self.undistorted
-
-    def on_grid(self, mapping: PixelMapping) -> PixelMapping:
-        """Return a mapping from the reference's raw pixels as a mapping from output pixels."""
-        if self.reference.lens is not None and self.undistorted:
-            mapping = mapping.from_undistorted(self.reference.lens)
-        return mapping if self.size_px == self.reference.size_px else mapping.rescaled(self.scale, SAME_PIXELS)
+    scale = _finest_scale(mappings, reference) if settings.resolution == "finest" else 1.0
+    size_px = round(reference.width_px * scale), round(reference.height_px * scale)
+    undistorted = settings.undistort and reference.lens is not None
+    return OutputGrid(0, 0, *size_px, PixelScale.between(reference.size_px, size_px), undistorted)
 
 
-def _mappings(capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]]) -> dict[str, PixelMapping]:
-    """The mapping from raw pixels of the reference to raw pixels of each usable moving band."""
-    usable = [b for b in capture.moving if b.name in alignments]
-    return {b.name: alignments[b.name].mapping for b in usable}
-
-
-def _layers(capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], pixels: _OutputPixels) -> list[Layer]:
-    mappings = {name: pixels.on_grid(mapping) for name, mapping in _mappings(capture, alignments).items()}
-    own = None if pixels.are_copied else pixels.on_grid(PixelMapping(geometry.identity()))
-    return [
-        Layer(b, own, is_reference=True) if b is capture.reference else Layer(b, mappings.get(b.name))
-        for b in capture.bands
-    ]
+def _on_frame(mapping: PixelMapping, frame: OutputGrid, reference: Band) -> PixelMapping:
+    """A mapping from the reference's raw pixels as a mapping from output pixels."""
+    if reference.lens is not None and frame.undistorted:
+        mapping = mapping.from_undistorted(reference.lens)
+    return mapping if frame.scale == SAME_PIXELS else mapping.rescaled(frame.scale, SAME_PIXELS)
 
 
 def _crop(
     capture: Capture,
     mapped: list[tuple[PixelMapping, Band]],
-    pixels: _OutputPixels,
+    frame: OutputGrid,
     settings: WriteSettings,
     rig: Rig | None,
 ) -> Tile:
     """The rectangle of the output pixels that is written."""
-    frame = Tile(0, 0, *pixels.size_px)
     if settings.crop == "none":
-        return frame
+        return frame.tile
     of_flight = [] if rig is None or settings.crop == "common" else _extremes_of_flight(capture, rig)
     if not of_flight:
-        return common_area(mapped, *pixels.size_px) or frame
-    limits = [(pixels.on_grid(mapping), band) for mapping, band in of_flight]
+        return common_area(mapped, frame.width, frame.height) or frame.tile
+    limits = [(_on_frame(mapping, frame, capture.reference), band) for mapping, band in of_flight]
     # A reference that is resampled has a border too.
     limits += [(mapping, band) for mapping, band in mapped if band is capture.reference]
-    area = common_area(limits, *pixels.size_px)
-    return frame if area is None else _inset(area, _FLIGHT_MARGIN_PX)
+    area = common_area(limits, frame.width, frame.height)
+    return frame.tile if area is None else _inset(area, _FLIGHT_MARGIN_PX)
 
 
 def _extremes_of_flight(capture: Capture, rig: Rig) -> list[tuple[PixelMapping, Band]]:
@@ -155,8 +120,8 @@ def _inset(tile: Tile, margin_px: int) -> Tile:
 
 
 def _covers(mappings: list[tuple[PixelMapping, Band]], tile: Tile) -> bool:
-    """True if every pixel of a tile is inside every moving image, tested at points of its border."""
-    x, y = (np.linspace(a, a + n - 1, _BORDER_POINTS) for a, n in ((tile.x0, tile.width), (tile.y0, tile.height)))
+    """True if every pixel of a tile is inside every moving image, tested at 64 points of each side."""
+    x, y = (np.linspace(a, a + n - 1, 64) for a, n in ((tile.x0, tile.width), (tile.y0, tile.height)))
     sides = [(x, np.full_like(x, v)) for v in y[[0, -1]]] + [(np.full_like(y, v), y) for v in x[[0, -1]]]
     border = np.concatenate([np.stack(side, axis=-1) for side in sides])
     return all(is_inside(mapping(border), band).all() for mapping, band in mappings)

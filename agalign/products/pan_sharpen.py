@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,8 +27,7 @@ from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.checked_raster import Block, LayerDescription, predictor, write_layers
 from agalign.products.layout import Layer, output_layers
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import with_nodata, write_raster
-from agalign.products.sidecar import is_delivered
+from agalign.products.raster_file import as_type, with_nodata, write_raster
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
@@ -37,16 +35,10 @@ from agalign.values.resample import tiles
 
 _MIN_PAN_WIDTH_NM = 200.0
 """Bandwidth from which a band is panchromatic: multispectral bands have 10 to 60 nm."""
-_COLOUR_NM = 400.0, 700.0
-"""Spectral range of a colour photograph."""
-_SAMPLE_PX = 1024
-"""Side of the square in the middle of the image from which the weights are fitted."""
-_MAX_RATIO = 5.0
-"""Limit of P / sum w B: in dark pixels it is noise divided by noise."""
-_MIN_BLUR_PX = 0.3
-"""Standard deviation of the blur of P if the bands have almost its resolution."""
-_WORK_TILE_PX = 1024
-"""Side of the tiles that are sharpened one after another: it limits the memory."""
+_TILE_PX = 1024
+"""Side of the tiles that are sharpened one after another, which limits the memory, and of the square in the middle of
+the image from which the weights are fitted.
+"""
 
 
 class PanSharpened(Product):
@@ -96,9 +88,7 @@ class _Sources:
 
 def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | None:
     """None if the panchromatic band is not delivered, or no band is within its spectral range."""
-    pan, limit_px = panchromatic(context.capture), context.settings.check.accept_predicted_px
-    usable = context.usable
-    delivered = {name: a for name, a in usable.items() if is_delivered(a.status, a.prediction, limit_px)}
+    pan, delivered = panchromatic(context.capture), context.delivered
     if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *delivered}:
         return None
     layers, grid = output_layers(context.capture, delivered, settings, context.rig)
@@ -118,7 +108,7 @@ def _is_in_range(band: Band, pan: Sequence[Band]) -> bool:
     if band.wavelength_nm is None:
         return True
     if pan[0].companion:
-        low, high = _COLOUR_NM
+        low, high = 400.0, 700.0
     else:
         centre, width = pan[0].wavelength_nm, pan[0].bandwidth_nm
         low, high = (-math.inf, math.inf) if not centre or not width else (centre - width / 2, centre + width / 2)
@@ -141,7 +131,8 @@ def weights_of(bands: Sequence[FloatImage], pan: FloatImage, scale: float) -> ND
 
     Non-negative least squares over the pixels that are not nan; equal weights if the fit is impossible.
     """
-    blurred = cv2.GaussianBlur(np.nan_to_num(pan), (0, 0), max(0.5 * scale, _MIN_BLUR_PX))
+    sigma_px = max(0.5 * scale, 0.3)  # the bands may have almost the resolution of the panchromatic band
+    blurred = cv2.GaussianBlur(np.nan_to_num(pan), (0, 0), sigma_px)
     known = np.isfinite(pan) & np.logical_and.reduce([np.isfinite(b) for b in bands])
     if known.any():
         design = np.stack([b[known] for b in bands], axis=-1).astype(np.float64)
@@ -153,10 +144,11 @@ def weights_of(bands: Sequence[FloatImage], pan: FloatImage, scale: float) -> ND
 
 def brovey_ratio(bands: Sequence[FloatImage], pan: FloatImage, weights: NDArray[np.float64]) -> FloatImage:
     """Return P / sum w B (height, width), limited to 1 / 5 to 5; 1 where it is undefined."""
+    max_ratio = 5.0  # in dark pixels it is noise divided by noise
     weighted_sum = np.tensordot(weights, np.stack(bands), axes=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(weighted_sum > 0, pan / weighted_sum, 1.0)
-    return np.asarray(np.clip(np.nan_to_num(ratio, nan=1.0), 1 / _MAX_RATIO, _MAX_RATIO), np.float32)
+    return np.asarray(np.clip(np.nan_to_num(ratio, nan=1.0), 1 / max_ratio, max_ratio), np.float32)
 
 
 def _sharpen(
@@ -165,19 +157,20 @@ def _sharpen(
     """Write the sharpened bands, given a file of the resampled bands followed by the panchromatic ones."""
     count, dtype = len(sources.bands), np.dtype(file.dtypes[0])
     in_range = [k for k, is_sharpened in enumerate(sources.is_sharpened) if is_sharpened]
-    width, height = min(file.width, _SAMPLE_PX), min(file.height, _SAMPLE_PX)
+    width, height = min(file.width, _TILE_PX), min(file.height, _TILE_PX)
     sample = Tile((file.width - width) // 2, (file.height - height) // 2, width, height)
     light, _ = _read(file, sample, black_levels, nodata)
     weights = weights_of([light[k] for k in in_range], light[count:].mean(axis=0), max(sources.grid.scale))
     profile = file.profile | {"count": count, "compress": "deflate", "predictor": predictor(dtype.kind)}
 
     def blocks() -> Iterator[Block]:
-        for tile in tiles(Tile(0, 0, file.width, file.height), _WORK_TILE_PX):
+        for tile in tiles(Tile(0, 0, file.width, file.height), _TILE_PX):
             light, valid = _read(file, tile, black_levels, nodata)
             ratio = brovey_ratio([light[k] for k in in_range], light[count:].mean(axis=0), weights)
             for k, is_sharpened in enumerate(sources.is_sharpened):
                 values = (light[k] * ratio if is_sharpened else light[k]) + black_levels[k]
-                yield _pixels(values, valid[k], dtype, nodata), k + 1, tile.x0, tile.y0
+                pixels = as_type(values if dtype.kind == "f" else np.nan_to_num(values), dtype)
+                yield pixels if nodata is None else with_nodata(pixels, valid[k], nodata), k + 1, tile.x0, tile.y0
 
     tags = {k: v for k, v in file.tags().items() if k != "AREA_OR_POINT"}
     write_layers(target, profile, _descriptions(file, sources, weights), tags, blocks())
@@ -196,14 +189,6 @@ def _read(
     pixels = file.read(window=Window(tile.x0, tile.y0, tile.width, tile.height)).astype(np.float32)
     valid = data_mask(pixels, nodata)
     return np.where(valid, pixels - black_levels[:, None, None], np.float32(np.nan)), valid
-
-
-def _pixels(values: FloatImage, valid: Mask, dtype: np.dtype[Any], nodata: float | None) -> NDArray[Any]:
-    if dtype.kind != "f":
-        limits = np.iinfo(str(dtype))
-        values = np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max)
-    result = values.astype(dtype)
-    return result if nodata is None else with_nodata(result, valid, nodata)
 
 
 def _descriptions(source: OpenRaster, sources: _Sources, weights: NDArray[np.float64]) -> list[LayerDescription]:

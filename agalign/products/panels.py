@@ -13,17 +13,12 @@ from agalign.errors import AgalignError
 from agalign.flight.panels import BandReading, PanelReading
 from agalign.flight.sky import SkyCapture, sky_radiance
 from agalign.pixels.raster import read_preview
-from agalign.products.drawing import Picture, with_text, write_png
+from agalign.products.drawing import Picture, side_by_side, titled, write_png
 from agalign.products.text_files import read_model, write_model
 from agalign.values.capture import Band, Capture, PanelSource
 from agalign.values.pixel_units import PixelScale
 
 PANELS_FILE, SKY_FILE = "panels.json", "sky.json"
-_TILE_PX, _TITLE_PX, _GAP_PX = 320, 24, 6
-"""Width of a band in the picture, height of its title, distance to the next band."""
-_PERCENTILES = 1.0, 99.5
-"""Limits of the contrast: a few hot pixels must not determine it."""
-_AREA_COLOUR = 255, 64, 32
 
 
 class _Part(BaseModel):
@@ -117,7 +112,7 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
     parts = []
     for reading in readings:
         picture = out / reading.capture.folder / f"{reading.capture.name}.panel.png"
-        write_png(_sheet(reading), picture)
+        write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
         panel, bands = reading.panel, [_panel_band(b) for b in reading.bands]
         facts = {"seen_by": panel.seen_by, "serial": panel.serial, "picture": picture.relative_to(out).as_posix()}
         facts |= _identity(reading.capture) | {"in_scene": panel.in_scene, "bands": bands}
@@ -171,26 +166,18 @@ def _radiance(band: Band) -> float | None:
     return None
 
 
-def _sheet(reading: PanelReading) -> Picture:
-    """All bands next to each other, with the measured area."""
-    tiles = [_tile(b) for b in reading.bands]
-    height = max(t.shape[0] for t in tiles)
-    gap = np.full((height, _GAP_PX, 3), 255, np.uint8)
-    columns = [np.pad(t, ((0, height - t.shape[0]), (0, 0), (0, 0)), constant_values=255) for t in tiles]
-    return np.hstack([part for column in columns for part in (column, gap)][:-1])
-
-
 def _tile(reading: BandReading) -> Picture:
+    """A band with its name, the albedo and the measured area."""
     band = reading.band
-    scale = _TILE_PX / band.width_px
-    size = _TILE_PX, max(1, round(band.height_px * scale))
+    scale = 320 / band.width_px
+    size = 320, max(1, round(band.height_px * scale))
     pixels = read_preview(band.path, band.band_index, (0, 0, *band.size_px), size)
-    low, high = np.nanpercentile(pixels, _PERCENTILES) if np.isfinite(pixels).any() else (0.0, 1.0)
+    # A few hot pixels must not determine the contrast.
+    low, high = np.nanpercentile(pixels, (1.0, 99.5)) if np.isfinite(pixels).any() else (0.0, 1.0)
     grey = np.clip(np.nan_to_num((pixels - low) / max(high - low, 1e-9)), 0, 1) * 255
     image = np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
     if band.panel is not None and band.panel.corners_px:
         corners = PixelScale(scale, scale).positions(band.panel.corners_px).round().astype(np.int32)
-        cv2.polylines(image, [corners], isClosed=True, color=_AREA_COLOUR, thickness=2, lineType=cv2.LINE_AA)
+        cv2.polylines(image, [corners], isClosed=True, color=(255, 64, 32), thickness=2, lineType=cv2.LINE_AA)
     title = f"{band.name}: " + ("?" if reading.albedo is None else f"{reading.albedo:.3f}")
-    strip = np.full((_TITLE_PX, _TILE_PX, 3), 255, np.uint8)
-    return np.vstack([with_text(strip, title, (2, 17)), image])
+    return titled(image, title, height_px=24)

@@ -20,7 +20,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.products.drawing import Grey, Picture, ReducedBands, encoded, with_text, write_png
+from agalign.cameras.base import is_thermal
+from agalign.products.drawing import Grey, Picture, ReducedBands, encoded, side_by_side, titled, write_png
+from agalign.products.indices import ROLES
 from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.quality_raster import error_lattice_px
 from agalign.products.relief_map import relief_layers, relief_of
@@ -31,33 +33,16 @@ from agalign.values.image import reduced_size_px
 
 ERROR_FULL_PX = 0.5
 """Expected error that is shown as white."""
-_MAX_TILE_PX, _MIN_TILE_PX, _DETAIL_SHARE = 640, 96, 0.35
-"""Limits of the longer side of a tile, and the size of a detail as a share of a tile."""
+_MAX_TILE_PX = 640
+"""Limit of the longer side of a tile."""
 _RELIEF_PERCENTILES = 1.0, 99.0
 """Percentiles shown as black and white: a few wrong pixels must not determine the contrast."""
-_QUALITY = 35
-"""JPEG quality."""
-_BLOCK_PX = 8
-"""Side of a JPEG block: tiles are multiples of it, so that compression does not mix neighbouring tiles."""
-_MAX_SHRINK_STEPS = 6
-_MAX_BYTES_EACH, _MAX_TOTAL_BYTES = 600_000, 44_000_000
-"""Limits that keep the report of a season, which contains all previews, small enough for an e-mail."""
-_OVERVIEW_PX = 480
-"""Width of the overview and of the detail."""
-_DETAIL_SOURCE_PX = 160
-"""Width of the part of the image that the detail enlarges."""
-_MAX_EDGE = 60
-"""Limit of the Laplacian of grey values: single strong edges must not determine the position of the detail."""
-_GAP_PX, _TITLE_PX = 8, 26
-_RED_NM = 668.0
-"""The band nearest to this wavelength is shown as green."""
-_MAX_REFLECTIVE_NM = 1000.0
-"""Bands at longer wavelengths are thermal: vegetation has few edges in them."""
 
 
 def preview_bytes(captures: int) -> int:
     """Return the largest size in bytes of the preview of a capture in a run of this many captures."""
-    return min(_MAX_BYTES_EACH, _MAX_TOTAL_BYTES // max(captures, 1))
+    # The report of a season, which contains all previews, must be small enough for an e-mail.
+    return min(600_000, 44_000_000 // max(captures, 1))
 
 
 @dataclass(frozen=True)
@@ -130,15 +115,15 @@ def write_preview(
     The detail is where the first of the bands has most edges. `errors_px` has the expected error (rows, columns) by
     band, or is empty. Raises OutputError.
     """
-    longest_px = max(views.size_px)
+    longest_px, min_tile_px = max(views.size_px), 96
     tile_px = min(_MAX_TILE_PX, longest_px)
-    for _ in range(_MAX_SHRINK_STEPS):
+    for _ in range(6):  # one or two steps are usually sufficient
         part, sheet = _sheet(views, bands, errors_px, relief, tile_px / longest_px, path.name)
-        data = encoded(sheet, path, cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
-        if len(data) <= max_bytes or tile_px <= _MIN_TILE_PX:
+        data = encoded(sheet, path, cv2.IMWRITE_JPEG_QUALITY, 35)
+        if len(data) <= max_bytes or tile_px <= min_tile_px:
             break
         # The size is proportional to the area of a tile.
-        tile_px = max(_MIN_TILE_PX, int(tile_px * 0.97 * (max_bytes / len(data)) ** 0.5))
+        tile_px = max(min_tile_px, int(tile_px * 0.97 * (max_bytes / len(data)) ** 0.5))
     with complete_file(path) as partial:
         partial.write_bytes(data)
     return part
@@ -154,7 +139,8 @@ def _sheet(
 ) -> tuple[PreviewPart, Grey]:
     width, height = views.size_px
     tile_px = _whole_blocks(width * scale, width), _whole_blocks(height * scale, height)
-    detail_px = _whole_blocks(tile_px[0] * _DETAIL_SHARE, width), _whole_blocks(tile_px[1] * _DETAIL_SHARE, height)
+    detail_share = 0.35  # of a tile
+    detail_px = _whole_blocks(tile_px[0] * detail_share, width), _whole_blocks(tile_px[1] * detail_share, height)
     first = next(images[n] for n in bands for images in (views.after, views.before) if n in images)
     x, y = busiest_window(first, detail_px)
     detail = np.s_[y : y + detail_px[1], x : x + detail_px[0]]
@@ -182,7 +168,9 @@ def _sheet(
 
 
 def _whole_blocks(length_px: float, max_px: int) -> int:
-    return min(max_px, max(_BLOCK_PX, int(length_px / _BLOCK_PX) * _BLOCK_PX))
+    """A multiple of the side of a JPEG block, so that compression does not mix neighbouring tiles."""
+    block_px = 8
+    return min(max_px, max(block_px, int(length_px / block_px) * block_px))
 
 
 def _resized(image: Grey, size_px: tuple[int, int]) -> Grey:
@@ -218,16 +206,14 @@ class BeforeAfterPicture(Product):
 
 def choose_bands(moving: list[Band], reference: Band) -> list[Band]:
     """Return three bands for red, green and blue: the longest wavelength, the one nearest to red, and the reference."""
-    known = sorted((b for b in moving if b.wavelength_nm is not None), key=_wavelength_nm)
+    known = sorted((b for b in moving if b.wavelength_nm is not None), key=lambda b: b.wavelength_nm or 0.0)
     candidates = known if len(known) >= 2 else moving
-    longest = max(candidates, key=lambda b: _wavelength_nm(b) if _wavelength_nm(b) < _MAX_REFLECTIVE_NM else 0.0)
+    # Vegetation has few edges in a thermal band.
+    longest = max(candidates, key=lambda b: 0.0 if is_thermal(b) else b.wavelength_nm or 0.0)
     rest = [b for b in candidates if b is not longest]
-    nearest_to_red = min(rest, key=lambda b: abs((b.wavelength_nm or _RED_NM) - _RED_NM)) if rest else reference
+    red_nm = ROLES["red"].nominal_nm
+    nearest_to_red = min(rest, key=lambda b: abs((b.wavelength_nm or red_nm) - red_nm)) if rest else reference
     return [longest, nearest_to_red, reference]
-
-
-def _wavelength_nm(band: Band) -> float:
-    return band.wavelength_nm or 0.0
 
 
 def write_picture(views: ReducedBands, names: Sequence[str], path: Path) -> None:
@@ -237,9 +223,10 @@ def write_picture(views: ReducedBands, names: Sequence[str], path: Path) -> None
 
 
 def _before_and_after(before: Picture, after: Picture, title_before: str, title_after: str) -> Picture:
+    """Each with an overview of 480 px and a detail, which is enlarged from 160 px, below it."""
     height, width = before.shape[:2]
-    size_px = _OVERVIEW_PX, max(1, round(_OVERVIEW_PX * height / width))
-    detail_width = min(width, _DETAIL_SOURCE_PX)
+    size_px, gap_px = (480, max(1, round(480 * height / width))), 8
+    detail_width = min(width, 160)
     detail_height = max(1, min(height, round(detail_width * height / width)))
     x0, y0 = busiest_window(after[..., 2], (detail_width, detail_height))
     x1, y1 = x0 + detail_width, y0 + detail_height
@@ -250,17 +237,16 @@ def _before_and_after(before: Picture, after: Picture, title_before: str, title_
         corners = (round(x0 * scale), round(y0 * scale)), (round(x1 * scale), round(y1 * scale))
         cv2.rectangle(overview, *corners, (255, 255, 255), 1)
         detail = cv2.resize(image[y0:y1, x0:x1], size_px, interpolation=cv2.INTER_NEAREST)
-        strip = np.full((_TITLE_PX, size_px[0], 3), 255, np.uint8)
-        gap = np.full((_GAP_PX, size_px[0], 3), 255, np.uint8)
-        columns.append(np.vstack([with_text(strip, title, (2, 18)), overview, gap, detail]))
-    between = np.full((columns[0].shape[0], _GAP_PX, 3), 255, np.uint8)
-    return np.hstack([columns[0], between, columns[1]])
+        gap = np.full((gap_px, size_px[0], 3), 255, np.uint8)
+        columns.append(titled(np.vstack([overview, gap, detail]), title, height_px=26))
+    return side_by_side(columns, gap_px)
 
 
 def busiest_window(image: Grey, size_px: tuple[int, int]) -> tuple[int, int]:
     """Return the top-left pixel (x, y) of the window (width, height) with the most edges, where misalignment shows."""
     (height, width), (window_width, window_height) = image.shape, size_px
-    edges = np.abs(cv2.Laplacian(image.astype(np.float32), cv2.CV_32F)).clip(0, _MAX_EDGE)
+    # Single strong edges must not determine the position.
+    edges = np.abs(cv2.Laplacian(image.astype(np.float32), cv2.CV_32F)).clip(0, 60)
     density = cv2.boxFilter(edges, -1, size_px, anchor=(0, 0), normalize=True)
     inside = density[: height - window_height + 1, : width - window_width + 1]
     y, x = np.unravel_index(int(inside.argmax()), inside.shape)

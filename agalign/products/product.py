@@ -19,9 +19,10 @@ from agalign.products.checked_raster import (
 )
 from agalign.products.drawing import ReducedBands, read_reduced_bands
 from agalign.products.layout import Layer
-from agalign.products.sidecar import PreviewPart
+from agalign.products.sidecar import PreviewPart, is_delivered
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
+from agalign.values.files import file_checksum
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import FixedFilePx
 
@@ -79,6 +80,11 @@ class WrittenFile:
     preview: PreviewPart | None = None
     """Layout of the preview; None for other files."""
 
+    @cached_property
+    def sha256(self) -> str:
+        """Checksum of the file. Raises OutputError."""
+        return file_checksum(self.path)
+
 
 @dataclass(frozen=True)
 class ProductContext:
@@ -110,11 +116,17 @@ class ProductContext:
         return {b.name: a for b in self.capture.moving if (a := self.alignments[b.name]).status != "failed"}
 
     @property
-    def places(self) -> dict[str, tuple[Path, int]]:
+    def delivered(self) -> dict[str, Alignment[FixedFilePx]]:
+        """The alignments of the aligned bands, and of predicted bands whose standard error is accepted."""
+        limit_px = self.settings.check.accept_predicted_px
+        return {name: a for name, a in self.usable.items() if is_delivered(a.status, a.prediction, limit_px)}
+
+    @property
+    def places(self) -> dict[str, tuple[WrittenFile, int]]:
         """File and index, from 1, of the pixels of each band that has any; the stack if there is one."""
         gaps = {layer.band.name for layer in self.layers if layer.is_gap}
         return {
-            name: (file.path, index)
+            name: (file, index)
             for file in self.written
             for index, name in enumerate(file.bands, start=1)
             if name not in gaps
@@ -123,7 +135,8 @@ class ProductContext:
     @cached_property
     def reduced_bands(self) -> ReducedBands:
         """The bands as reduced grey images, before and after alignment. Raises UnreadableFileError."""
-        return read_reduced_bands(self.capture, self.places, self.grid)
+        places = {name: (file.path, index) for name, (file, index) in self.places.items()}
+        return read_reduced_bands(self.capture, places, self.grid)
 
 
 class Product(ABC):

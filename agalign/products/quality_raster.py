@@ -1,7 +1,6 @@
 """Rasters of the expected alignment error and of quality flags on the grid of the aligned files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ from agalign.pixels.radiometry import to_reflectance
 from agalign.pixels.raster import read_tile
 from agalign.pixels.sun_glint import sun_glint
 from agalign.products.checked_raster import WORK_TILE_PX, LayerDescription
-from agalign.products.indices import Role, role_of
+from agalign.products.indices import Role, role_of_band
 from agalign.products.layout import Layer, is_inside
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import layer_pixels
@@ -26,16 +25,6 @@ from agalign.verify.extrapolation import expected_error_px
 
 _LATTICE_PX = 16
 """Distance of the nodes at which the error, which is smooth, is calculated."""
-_STEP_PX = 0.001
-"""Errors are rounded to this step, below their accuracy: the raster compresses better."""
-_ALL_BANDS = "all bands"
-"""Name of the first layer: flags that are set in any band."""
-_MIN_WEIGHT = 1e-3
-"""Bilinear weight from which a source pixel contributes: smaller ones are rounding errors."""
-_ERROR_FLAGS = {0.5: Quality.ERROR_OVER_HALF_PX, 1.0: Quality.ERROR_OVER_1_PX}
-"""Flags by the expected error, px of the reference, that they indicate."""
-_ASSESSED = "water by NDWI > 0 (McFeeters 1996), glint by the excess of near infrared (Hedley et al. 2005)"
-_NOT_ASSESSED = "not assessed: the reflectance of green and near infrared is not known"
 Flags = NDArray[np.uint16]
 
 
@@ -80,9 +69,9 @@ def error_on_tile(nodes: NDArray[np.float32], grid: OutputGrid, tile: Tile) -> N
 
 
 def _error_px(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
-    """Expected error (height, width) on a grid, rounded."""
-    result = error_on_tile(error_lattice_px(alignment, size_px, grid), grid, grid.tile)
-    return np.asarray(np.round(result / _STEP_PX) * _STEP_PX, np.float32)
+    """Expected error (height, width) on a grid, rounded below its accuracy: the raster compresses better."""
+    result, step_px = error_on_tile(error_lattice_px(alignment, size_px, grid), grid, grid.tile), 0.001
+    return np.asarray(np.round(result / step_px) * step_px, np.float32)
 
 
 class QualityRaster(Product):
@@ -96,25 +85,28 @@ class QualityRaster(Product):
         """Write <capture>.qa.tif. Raises OutputError, or UnreadableFileError for an input."""
         grid, size_px = context.grid, context.capture.reference.size_px
         nodes = {name: error_lattice_px(a, size_px, grid) for name, a in context.usable.items()}
-        water = _WaterBands.of(context.layers)
+        water = _water_bands(context.layers)
         predicted = {name for name, alignment in context.usable.items() if alignment.status == "predicted"}
 
         def flags_on(tile: Tile) -> list[Flags]:
             bands = [
                 _flags(layer, tile, grid, nodes, is_predicted=layer.band.name in predicted) for layer in context.layers
             ]
-            if water is not None:
-                glint = water.glint(tile)
+            if water:
+                glint = sun_glint(*(_reflectance(*band, tile) for band in water))
                 for flags in bands:
                     flags[glint & (flags & _bit(Quality.MISSING) == 0)] |= _bit(Quality.SUN_GLINT)
             return [np.bitwise_or.reduce(bands), *bands]
 
+        method = "water by NDWI > 0 (McFeeters 1996), glint by the excess of near infrared (Hedley et al. 2005)"
+        unknown = "not assessed: the reflectance of green and near infrared is not known"
         tags = {
             "flag_masks": ", ".join(str(int(flag)) for flag in Quality),
             "flag_meanings": MEANINGS,
-            "SUN_GLINT": _NOT_ASSESSED if water is None else _ASSESSED,
+            "SUN_GLINT": method if water else unknown,
         }
-        layers = [LayerDescription(name) for name in (_ALL_BANDS, *(layer.band.name for layer in context.layers))]
+        # The first layer has the flags that are set in any band.
+        layers = [LayerDescription(name) for name in ("all bands", *(layer.band.name for layer in context.layers))]
         blocks = (
             (flags, index, tile.x0 - grid.x0, tile.y0 - grid.y0)
             for tile in tiles(grid.tile, WORK_TILE_PX)
@@ -139,37 +131,37 @@ def _flags(
     result = np.zeros(shape, np.uint16)
     if is_predicted:
         result |= _bit(Quality.PREDICTED)
-    outside, nodata, saturated, occluded = _of_source(layer, tile)
-    result[outside] |= _bit(Quality.OUTSIDE)
-    result[nodata] |= _bit(Quality.NODATA)
-    result[saturated] |= _bit(Quality.SATURATED)
-    result[occluded] |= _bit(Quality.OCCLUDED)
+    masks = _of_source(layer, tile)
     if layer.band.name in nodes:
         error_px = error_on_tile(nodes[layer.band.name], grid, tile)
-        for limit_px, flag in _ERROR_FLAGS.items():
-            result[np.isnan(error_px) | (error_px > limit_px)] |= _bit(flag)
+        masks[Quality.ERROR_OVER_HALF_PX] = np.isnan(error_px) | (error_px > 0.5)
+        masks[Quality.ERROR_OVER_1_PX] = np.isnan(error_px) | (error_px > 1.0)
+    for flag, mask in masks.items():
+        result[mask] |= _bit(flag)
     return result
 
 
-def _of_source(layer: Layer, tile: Tile) -> tuple[Mask, Mask, Mask, Mask]:
-    """(outside, nodata, saturated, occluded) of a band's file on a tile, each (height, width)."""
-    none = np.zeros((tile.height, tile.width), dtype=bool)
+def _of_source(layer: Layer, tile: Tile) -> dict[Quality, Mask]:
+    """The flags of a band's file on a tile, each (height, width)."""
     band = layer.band
     if layer.mapping is None:
         pixels, valid = read_tile(band, tile)
-        return none, ~valid, _saturated(pixels, valid, band.saturation_value), none
+        return {Quality.NODATA: ~valid, Quality.SATURATED: _saturated(pixels, valid, band.saturation_value)}
     positions = layer.mapping.positions(tile, np.float32)
     inside = is_inside(positions, band)
-    occluded = inside & layer.mapping.hidden(tile)
     if not inside.any():
-        return ~inside, none, none, none
+        return {Quality.OUTSIDE: ~inside}
     x0, y0 = np.floor(positions[inside].min(axis=0)).astype(int).tolist()
     x1, y1 = np.minimum(np.ceil(positions[inside].max(axis=0)).astype(int) + 1, band.size_px).tolist()
     pixels, valid = read_tile(band, Tile(x0, y0, x1 - x0, y1 - y0))
     in_window = (positions - np.array([x0, y0], np.float32)).astype(np.float32)
-    nodata = inside & _contributes(~valid, in_window)
-    saturated = inside & _contributes(_saturated(pixels, valid, band.saturation_value), in_window)
-    return ~inside, nodata, saturated, occluded
+    saturated = _saturated(pixels, valid, band.saturation_value)
+    return {
+        Quality.OUTSIDE: ~inside,
+        Quality.NODATA: inside & _contributes(~valid, in_window),
+        Quality.SATURATED: inside & _contributes(saturated, in_window),
+        Quality.OCCLUDED: inside & layer.mapping.hidden(tile),
+    }
 
 
 def _saturated(pixels: NDArray[np.generic], valid: Mask, saturation_value: float | None) -> Mask:
@@ -183,31 +175,18 @@ def _contributes(mask: Mask, positions: NDArray[np.float32]) -> Mask:
     if not mask.any():
         return np.zeros(positions.shape[:2], dtype=bool)
     weight = cv2.remap(mask.astype(np.float32), positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(weight > _MIN_WEIGHT)
+    return np.asarray(weight > 1e-3)  # smaller weights are rounding errors
 
 
-@dataclass(frozen=True)
-class _WaterBands:
-    """The bands from which sun glint is detected, with their conversion to reflectance."""
-
-    green: tuple[Layer, Radiometry]
-    nir: tuple[Layer, Radiometry]
-
-    @classmethod
-    def of(cls, layers: Sequence[Layer]) -> "_WaterBands | None":
-        by_role: dict[Role, tuple[Layer, Radiometry]] = {}
-        for layer in layers:
-            band = layer.band
-            role = None if band.companion or layer.is_gap else role_of(band.name, band.wavelength_nm)
-            reflectance = None if band.radiometry is None else to_reflectance(band.radiometry)
-            if role is not None and reflectance is not None:
-                by_role.setdefault(role, (layer, reflectance))
-        if "green" not in by_role or "nir" not in by_role:
-            return None
-        return cls(by_role["green"], by_role["nir"])
-
-    def glint(self, tile: Tile) -> Mask:
-        return sun_glint(*(_reflectance(*band, tile) for band in (self.green, self.nir)))
+def _water_bands(layers: Sequence[Layer]) -> list[tuple[Layer, Radiometry]]:
+    """The green and the near infrared band, with their conversion to reflectance; empty if either is unknown."""
+    by_role: dict[Role, tuple[Layer, Radiometry]] = {}
+    for layer in layers:
+        role = None if layer.is_gap else role_of_band(layer.band)
+        reflectance = None if layer.band.radiometry is None else to_reflectance(layer.band.radiometry)
+        if role is not None and reflectance is not None:
+            by_role.setdefault(role, (layer, reflectance))
+    return [by_role["green"], by_role["nir"]] if {"green", "nir"} <= by_role.keys() else []
 
 
 def _reflectance(layer: Layer, radiometry: Radiometry, tile: Tile) -> FloatImage:

@@ -29,22 +29,16 @@ from agalign.products.checked_raster import (
     predictor,
     write_layers,
 )
-from agalign.products.indices import Role, role_of
+from agalign.products.indices import Role, role_of_band
 from agalign.products.layout import Layer, is_inside
 from agalign.products.product import GEOTIFF
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
 from agalign.values.choices import Interpolation
-from agalign.values.image import Mask, OutputGrid, Tile
+from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
 from agalign.values.resample import tiles
 
-_COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 _FILL_DISTANCE_PX = 100.0
 """Search distance of the interpolation of occluded pixels: GDAL's default, wider than any occlusion."""
-_COG_BLOCK_PX = 512
-"""GDAL's default for a COG."""
-_COLOURS: Mapping[Role, ColorInterp] = {"red": ColorInterp.red, "green": ColorInterp.green, "blue": ColorInterp.blue}
-_MAX_CANDIDATES = 1 << 16
-"""All values of a 16-bit type; for larger types the first ones are sufficient."""
 UNITS: Mapping[Quantity, str] = {
     "radiance": "W m-2 sr-1 nm-1",
     "relative radiance": "",
@@ -105,7 +99,7 @@ def write_raster(
 
 def media_type(settings: WriteSettings) -> str:
     """Return the media type of the files that `write_raster` writes."""
-    return _COG if settings.format == "cog" else GEOTIFF
+    return f"{GEOTIFF}; profile=cloud-optimized" if settings.format == "cog" else GEOTIFF
 
 
 def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, str]:
@@ -146,12 +140,13 @@ def _colours(layers: Sequence[Layer]) -> Sequence[ColorInterp | None]:
     """
     if len(layers) == 1:
         return [None]
-    roles = [None if b.companion else role_of(b.name, b.wavelength_nm) for b in (layer.band for layer in layers)]
-    if not set(_COLOURS) <= set(roles):
-        return [ColorInterp.gray, *[ColorInterp.undefined] * (len(layers) - 1)]
-    result = [ColorInterp.undefined] * len(layers)
-    for role, colour in _COLOURS.items():
-        result[roles.index(role)] = colour
+    roles, undefined = [role_of_band(layer.band) for layer in layers], ColorInterp.undefined
+    colours: tuple[Role, ...] = ("red", "green", "blue")
+    if not set(colours) <= set(roles):
+        return [ColorInterp.gray, *[undefined] * (len(layers) - 1)]
+    result = [undefined] * len(layers)
+    for role in colours:
+        result[roles.index(role)] = ColorInterp[role]
     return result
 
 
@@ -198,10 +193,15 @@ def _with_occluded(pixels: Pixels, valid: Mask, occluded: Mask) -> tuple[Pixels,
     distance_px = cv2.distanceTransform((~valid).astype(np.uint8), cv2.DIST_L2, 3)
     occluded = occluded & (distance_px < _FILL_DISTANCE_PX)
     filled = fillnodata(np.where(valid, pixels, 0).astype(np.float32), valid, _FILL_DISTANCE_PX)
-    if pixels.dtype.kind in "iu":
-        limits = np.iinfo(str(pixels.dtype))
-        filled = np.clip(np.rint(filled), limits.min, limits.max)
-    return np.where(occluded, filled, pixels).astype(pixels.dtype), valid | occluded
+    return np.where(occluded, as_type(filled, pixels.dtype), pixels), valid | occluded
+
+
+def as_type(values: FloatImage, dtype: np.dtype[Any]) -> Pixels:
+    """Return values in another type, rounded and limited to its range if it is an integer type."""
+    if dtype.kind != "f":
+        limits = np.iinfo(str(dtype))
+        values = np.clip(np.rint(values), limits.min, limits.max)
+    return values.astype(dtype)
 
 
 def _compression(settings: WriteSettings, *, all_bands: bool) -> str:
@@ -213,9 +213,11 @@ def _compression(settings: WriteSettings, *, all_bands: bool) -> str:
 
 def _to_cog(path: Path, compression: str) -> None:
     cog = path.with_name(f"{path.name}.cog")
-    options = {} if compression == "none" else {"compress": compression, "predictor": "yes"}
+    options = {"blocksize": 512, "bigtiff": "if_safer"}  # GDAL's default size of blocks
+    if compression != "none":
+        options |= {"compress": compression, "predictor": "yes"}
     try:
-        copy_dataset(path, cog, driver="COG", blocksize=_COG_BLOCK_PX, bigtiff="if_safer", **options)
+        copy_dataset(path, cog, driver="COG", **options)
         cog.replace(path)
     finally:
         cog.unlink(missing_ok=True)
@@ -263,7 +265,8 @@ def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any
     """
     copied = [_values_in(layer.band, grid.tile) for layer in layers if layer.is_copied]
     limits = np.iinfo(str(dtype))
-    candidates = itertools.chain([0, limits.max], range(1, min(limits.max, _MAX_CANDIDATES)))
+    # All values of a 16-bit type; for larger types the first ones are sufficient.
+    candidates = itertools.chain([0, limits.max], range(1, min(limits.max, 1 << 16)))
     return float(next((v for v in candidates if not any((values == v).any() for values in copied)), 0))
 
 

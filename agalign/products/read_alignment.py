@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from agalign.errors import NoSuchBandError, SidecarError
 from agalign.pixels.raster import read_preview
-from agalign.products.sidecar import BandPart, LensPart, ReliefPart, Sidecar
+from agalign.products.sidecar import BandPart, ReliefPart, Sidecar
 from agalign.products.sidecar_file import read_sidecar
 from agalign.relief.occlusion import occluded
 from agalign.values import lens
@@ -19,7 +19,7 @@ from agalign.values.image import OutputGrid
 from agalign.values.issues import Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedFilePx, PixelScale
+from agalign.values.pixel_units import FixedFilePx
 from agalign.values.relief import Parallax, Relief
 from agalign.verify.checks import KINDS
 
@@ -40,7 +40,7 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
         raise NoSuchBandError(f"{path}: no moving band {band!r}; choose from {names}")
     if part.homography is None or part.seed is None:
         raise SidecarError(f"{path}: has no mapping of the band {band!r}")
-    fixed, moving = (None, None) if part.lenses is None else map(_lens, part.lenses)
+    fixed, moving = (None, None) if part.lenses is None else (Lens(**dict(one)) for one in part.lenses)
     field = None if part.field is None else DisplacementField(part.field.step_px, np.array(part.field.displacements_px))
     mapping = PixelMapping(np.array(part.homography.fixed_to_moving), fixed, moving, local=field)
     if part.relief is not None:
@@ -49,11 +49,10 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
     seed = Seed(part.seed.kind, np.array(part.seed.fixed_to_moving), part.seed.peak_sigma, *peaks)
     held_out = {} if part.geometry is None else part.geometry.held_out_p95_px
     candidates = {kind: FixedFilePx(math.inf if px is None else px) for kind, px in held_out.items()}
-    size_px = content.reference.width, content.reference.height
     issues = tuple(Issue(KINDS[i.kind], i.value, i.limit) for i in part.issues)
     return Alignment(
         mapping,
-        size_px,
+        content.reference.size_px,
         part.status,
         issues,
         seed,
@@ -61,10 +60,6 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
         seconds=part.seconds,
         candidates=candidates,
     )
-
-
-def _lens(part: LensPart) -> Lens:
-    return Lens(part.fx_px, part.fy_px, part.cx_px, part.cy_px, tuple(part.distortion))
 
 
 def _residual(part: BandPart) -> Residual[FixedFilePx] | None:
@@ -83,10 +78,9 @@ def _parallax(path: Path, content: Sidecar, part: ReliefPart, fixed: Lens | None
         raise SidecarError(
             f"{path}: has a relief on a lens-corrected grid, but not the lens; run again without --undistort"
         )
-    output, (_, _, width, height) = content.output, content.output.crop
-    values = read_preview(path.parent / part.file, 1, (0, 0, width, height), (width, height))
-    grid = OutputGrid(*output.crop, PixelScale(*output.scale), output.undistorted)
-    parallax_px = _on_reference(values, grid, (content.reference.width, content.reference.height), fixed)
+    grid = content.output.grid
+    values = read_preview(path.parent / part.file, 1, (0, 0, grid.width, grid.height), (grid.width, grid.height))
+    parallax_px = _on_reference(values, grid, content.reference.size_px, fixed)
     relief = Relief(parallax_px, np.ones_like(parallax_px))
     return Parallax(relief, part.baseline, occluded(relief, part.baseline))
 

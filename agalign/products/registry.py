@@ -1,7 +1,7 @@
 """Every product of a capture, in the order in which they are written."""
 
 from agalign.products.aligned_files import BandFiles, Stack
-from agalign.products.index_product import IndexRasters
+from agalign.products.index_rasters import IndexRasters
 from agalign.products.pan_sharpen import PanSharpened
 from agalign.products.preview import BeforeAfterPicture, Preview
 from agalign.products.product import Product

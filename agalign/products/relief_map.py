@@ -19,10 +19,6 @@ from agalign.values.relief import Relief
 
 RELIEF_UNITS = {"parallax": "px", "confidence": "1", "range": "m"}
 """Units by layer of the raster."""
-_STEP = 0.01
-"""Parallax and confidence are rounded to this step: less than their errors, and the raster compresses better."""
-_MAX_RANGE_M = 1e5
-"""Larger ranges are nan: the parallax cannot be distinguished from that of an infinite range."""
 
 
 class ReliefMap(Product):
@@ -99,10 +95,13 @@ def _range_m(
     if not mappings or reference.lens is None:
         return np.full(parallax_px.shape, np.nan, np.float32)
     inverse_m = inverse_range(mappings, at_infinity, np.array(baselines_m), reference.lens, points, parallax_px)
+    max_range_m = 1e5  # the parallax of a larger range cannot be distinguished from that of an infinite one
     with np.errstate(divide="ignore"):
-        range_m = np.where(inverse_m > 1 / _MAX_RANGE_M, 1 / inverse_m, np.nan)
+        range_m = np.where(inverse_m > 1 / max_range_m, 1 / inverse_m, np.nan)
     return np.asarray(range_m, np.float32)
 
 
 def _rounded(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    return np.asarray(np.round(values / _STEP) * _STEP, np.float32)
+    """The values, rounded below their errors: the raster compresses better."""
+    step = 0.01
+    return np.asarray(np.round(values / step) * step, np.float32)

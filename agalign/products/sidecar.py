@@ -16,7 +16,9 @@ from pydantic_core import CoreSchema, core_schema
 from agalign.values.alignment import Prediction
 from agalign.values.choices import CaptureStatus, Geometry, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.files import is_inside
+from agalign.values.image import OutputGrid
 from agalign.values.issues import IssueKind
+from agalign.values.pixel_units import PixelScale
 from agalign.verify.checks import KINDS
 
 SCHEMA = "agalign/1"
@@ -170,7 +172,7 @@ class LensPart(_Part):
     """Optical centre, x."""
     cy_px: float
     """Optical centre, y."""
-    distortion: list[float]
+    distortion: tuple[float, ...]
     """k1, k2, p1, p2, k3, k4, k5, k6; omitted ones are 0."""
 
 
@@ -213,9 +215,7 @@ IssueCode = Annotated[
 class IssuePart(_Part):
     """A reason against accepting the alignment."""
 
-    kind: Annotated[
-        str, AfterValidator(_known_kind), _FromProgram(_code), Field(json_schema_extra={"enum": list(KINDS)})
-    ]
+    kind: IssueCode
     """Code of the reason."""
     value: Finite
     """Measured value."""
@@ -451,6 +451,11 @@ class OutputPart(_Part):
     """Nodata value of the stack, or of all single bands; null if they differ; `"nan"` for NaN. Integers without a
     nodata value in the input: 0, or another value that no valid pixel has.
     """
+
+    @property
+    def grid(self) -> OutputGrid:
+        """The grid of the rasters."""
+        return OutputGrid(*self.crop, PixelScale(*self.scale), self.undistorted)
 
 
 class ProductPart(_Part):

@@ -17,8 +17,6 @@ _MAX_BYTES = 1 << 26
 """Limit of a file that is read: ten times the sidecar of many bands."""
 _MAX_QUOTED = 60
 """Characters of a wrong value that a message quotes."""
-_HEAD_BYTES = 200
-"""Start of a JSON file in which a sidecar has its schema."""
 
 
 def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
@@ -79,12 +77,11 @@ def find_sidecars(folder: Path) -> list[Path]:
             if not path.is_file():
                 continue
             with open_regular(path) as file:
-                head = file.read(_HEAD_BYTES)
+                if b'"agalign/' not in file.read(200):  # a sidecar starts with its schema
+                    continue
         except OSError:
-            result.append(path)
-            continue
-        if b'"agalign/' in head:
-            result.append(path)
+            pass
+        result.append(path)
     return result
 
 

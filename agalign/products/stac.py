@@ -19,8 +19,8 @@ from agalign.flight.fingerprint import hashed
 from agalign.flight.groups import camera_key, flight_key, flights_of
 from agalign.pixels.raster import crs_code
 from agalign.products.checked_raster import georeferenced
-from agalign.products.footprint import footprint
-from agalign.products.indices import role_of
+from agalign.products.footprint import footprint, geojson_geometry
+from agalign.products.indices import role_of_band
 from agalign.products.pan_sharpen import panchromatic
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.raster_file import UNITS
@@ -30,13 +30,6 @@ from agalign.values.image import OutputGrid
 
 if TYPE_CHECKING:
     import pystac
-
-_COLLECTION_SUFFIX = ".collection.json"
-_MAX_NAME, _CHECKSUM_DIGITS = 60, 8
-"""Characters of a collection's id, which is a file name: at most 255 bytes, and up to 4 bytes per character."""
-_GEOJSON = "application/geo+json"
-_JSON = "application/json"
-_COMMON_NAMES = {"blue": "blue", "green": "green", "red": "red", "red edge": "rededge", "nir": "nir"}
 
 
 class StacItem(Product):
@@ -55,8 +48,7 @@ class StacItem(Product):
         path = context.paths.file(self.suffix)
         item = _item(context)
         _add_assets(item, context)
-        _link_collection(item, context.capture)
-        _write_json(path, item.to_dict(include_self_link=False))
+        write_text(path, json.dumps(item.to_dict(include_self_link=False), indent=1) + "\n")
         return [WrittenFile(self.kind, path)]
 
 
@@ -82,16 +74,17 @@ def _write_collection(capture: Capture, items: Sequence[Path], out: Path) -> Pat
     """Write the collection of the flight of `capture`."""
     import pystac
 
-    target, read = out / _collection_file(capture), [_read_item(path) for path in items]
+    name, read = _collection_id(capture), [_read_item(path) for path in items]
+    target = out / f"{name}.collection.json"
     extent = pystac.Extent.from_items(read)
     if all(item.bbox is None for item in read):
         extent.spatial = pystac.SpatialExtent([[-180.0, -90.0, 180.0, 90.0]])
     description = f"Captures of {camera_key(capture)} with co-registered bands"
-    collection = pystac.Collection(_collection_id(capture), description, extent, license="other")
-    collection.add_link(pystac.Link("root", f"./{target.name}", _JSON))
+    collection = pystac.Collection(name, description, extent, license="other")
+    collection.add_link(pystac.Link("root", f"./{target.name}", pystac.MediaType.JSON))
     for path in items:
-        collection.add_link(pystac.Link("item", f"./{path.relative_to(out).as_posix()}", _GEOJSON))
-    _write_json(target, collection.to_dict(include_self_link=False))
+        collection.add_link(pystac.Link("item", f"./{path.relative_to(out).as_posix()}", pystac.MediaType.GEOJSON))
+    write_text(target, json.dumps(collection.to_dict(include_self_link=False), indent=1) + "\n")
     return target
 
 
@@ -112,39 +105,30 @@ def _collection_id(capture: Capture) -> str:
     """
     camera = f"{capture.camera.model} {capture.camera.serial}".strip()
     name = re.sub(r"[^\w.-]+", "_", capture.flight_id or camera or "flight")
-    return f"{name[:_MAX_NAME]}-{hashed(*flight_key(capture))[:_CHECKSUM_DIGITS]}"
-
-
-def _collection_file(capture: Capture) -> str:
-    return f"{_collection_id(capture)}{_COLLECTION_SUFFIX}"
+    # A file name has at most 255 bytes, and up to 4 bytes per character.
+    return f"{name[:60]}-{hashed(*flight_key(capture))[:8]}"
 
 
 def _item(context: ProductContext) -> "pystac.Item":
-    """The item of a capture, without assets and links."""
+    """The item of a capture, without assets."""
     import pystac
     from pystac.extensions.projection import ProjectionExtension
 
     capture, grid = context.capture, context.grid
-    shape, box = _geometry(capture, grid)
+    shape = geojson_geometry(footprint(capture, grid), capture.position, decimals=8)
+    corners = None if shape is None else np.atleast_2d(np.array(shape["coordinates"]).squeeze())
+    box = None if corners is None else [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()]
     moment, source = _moment(capture)
     properties = {"agalign:datetime_source": source, "agalign:reference_band": capture.reference.name}
     item = pystac.Item(capture.label, geometry=shape, bbox=box, datetime=moment, properties=properties)
     if capture.camera.model:
         item.properties["instruments"] = [f"{capture.camera.make} {capture.camera.model}".strip()]
     ProjectionExtension.ext(item, add_if_missing=True).apply(**_projection(capture, grid))
+    item.collection_id = _collection_id(capture)
+    to_out = "/".join([".."] * len(capture.folder.parts)) or "."
+    for relation in ("collection", "parent", "root"):
+        item.add_link(pystac.Link(relation, f"{to_out}/{item.collection_id}.collection.json", pystac.MediaType.JSON))
     return item
-
-
-def _geometry(capture: Capture, grid: OutputGrid) -> tuple[dict[str, Any] | None, list[float] | None]:
-    """(GeoJSON geometry, bounding box): the footprint, else the camera's position."""
-    ring, position = footprint(capture, grid), capture.position
-    if ring is not None:
-        box = [*ring.min(axis=0).round(8).tolist(), *ring.max(axis=0).round(8).tolist()]
-        return {"type": "Polygon", "coordinates": [ring.round(8).tolist()]}, box
-    if position is not None:
-        point = [position.longitude, position.latitude]
-        return {"type": "Point", "coordinates": point}, point * 2
-    return None, None
 
 
 def _projection(capture: Capture, grid: OutputGrid) -> dict[str, Any]:
@@ -171,7 +155,7 @@ def _add_assets(item: "pystac.Item", context: ProductContext) -> None:
         item.add_asset(file.asset.key, asset)
         if file.bands:
             _describe_bands(asset, [by_name[n] for n in file.bands], file.nodata, context)
-    item.add_asset("sidecar", pystac.Asset(sidecar.name, media_type=_JSON, roles=["metadata"]))
+    item.add_asset("sidecar", pystac.Asset(sidecar.name, media_type=pystac.MediaType.JSON, roles=["metadata"]))
 
 
 def _describe_bands(
@@ -212,21 +196,8 @@ def _common_name(band: Band, capture: Capture) -> str | None:
         return "lwir11"
     if band in panchromatic(capture) and not band.companion:
         return "pan"
-    role = None if band.companion else role_of(band.name, band.wavelength_nm)
-    return None if role is None else _COMMON_NAMES[role]
-
-
-def _link_collection(item: "pystac.Item", capture: Capture) -> None:
-    import pystac
-
-    to_out = "/".join([".."] * len(capture.folder.parts)) or "."
-    for relation in ("collection", "parent", "root"):
-        item.add_link(pystac.Link(relation, f"{to_out}/{_collection_file(capture)}", _JSON))
-    item.collection_id = _collection_id(capture)
-
-
-def _write_json(path: Path, facts: dict[str, Any]) -> None:
-    write_text(path, json.dumps(facts, indent=1) + "\n")
+    role = role_of_band(band)
+    return None if role is None else role.replace(" ", "")
 
 
 def _moment(capture: Capture) -> tuple[datetime, str]:

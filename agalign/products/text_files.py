@@ -15,16 +15,15 @@ from agalign.values.files import write_text
 
 _MAX_BYTES = 1 << 28
 """Limit of a file that is read: ten times the record of a run of 100,000 captures."""
-_LIST_ELEMENT = r"(?=[-0-9ntf])"
-"""Start of a number, null, true or false; keys and texts start with a quote."""
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
 def compact_lists(text: str) -> str:
     """Return indented JSON with each list of numbers on one line, which takes a third of the size."""
-    text = re.sub(r"\[\n +" + _LIST_ELEMENT, "[", text)
-    text = re.sub(r",\n +" + _LIST_ELEMENT, ", ", text)
+    # Numbers, null, true and false start with these characters; keys and texts start with a quote.
+    text = re.sub(r"\[\n +(?=[-0-9ntf])", "[", text)
+    text = re.sub(r",\n +(?=[-0-9ntf])", ", ", text)
     return re.sub(r"(?<=[0-9le])\n *\]", "]", text)
 
 

@@ -6,6 +6,7 @@ another program can estimate a mapping from them, or verify its own. Only the se
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,15 +22,8 @@ from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import PairStatus
 from agalign.values.files import write_text
-from agalign.values.geometry import Points
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.text import harmless
-
-_COLUMNS = ("band", "status", "reference_x_px", "reference_y_px", "moving_x_px", "moving_y_px", "residual_px", "weight")
-_MEASURED = "reference_px", "moving_px", "residual_px", "weight"
-_WGS84 = "EPSG:4326"
-_DECIMALS, _DEGREE_DECIMALS = 4, 8
-"""Of px and weights; of degrees: a millimetre."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,8 @@ class TiePoints(Product):
         table, features = self.paths(context.capture, context.paths, context.write_settings)
         ties = ((b, a) for b in context.capture.moving if (a := context.usable.get(b.name)) is not None and a.ties)
         points = [point for band, alignment in ties for point in tie_points(band, alignment)]
-        write_csv(table, _COLUMNS, map(_cells, points))
+        positions = [f"{side}_{axis}_px" for side in ("reference", "moving") for axis in "xy"]
+        write_csv(table, ("band", "status", *positions, "residual_px", "weight"), map(_cells, points))
         write_text(features, _geojson(points, context.capture.reference.georeference))
         return [
             WrittenFile(self.kind, table, StacAsset("tie_points", "text/csv", ("metadata",))),
@@ -91,36 +86,23 @@ def tie_points(band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoi
 
 def _cells(point: TiePoint) -> list[str]:
     numbers = (*point.reference_px, *point.moving_px, point.residual_px, point.weight)
-    return [harmless(point.band), point.status, *(f"{n:.{_DECIMALS}f}" for n in numbers)]
+    return [harmless(point.band), point.status, *(f"{n:.4f}" for n in numbers)]
 
 
 def _geojson(points: Sequence[TiePoint], georeference: Georeference | None) -> str:
     """Points in WGS 84, or, without a georeference, in px (x, -y) from the corner of the reference, where GIS programs
     display such an image.
     """
-    places, unit = _places(np.array([p.reference_px for p in points]).reshape(-1, 2), georeference)
-    features = [
-        {
-            "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": [round(x, _DEGREE_DECIMALS), round(y, _DEGREE_DECIMALS)]},
-            "properties": {
-                "band": harmless(p.band),
-                "status": p.status,
-                **{name: np.round(getattr(p, name), _DECIMALS).tolist() for name in _MEASURED},
-            },
-        }
-        for p, (x, y) in zip(points, places.tolist(), strict=True)
-    ]
-    return json.dumps({"type": "FeatureCollection", "coordinates_in": unit, "features": features}) + "\n"
-
-
-def _places(points_px: Points, georeference: Georeference | None) -> tuple[Points, str]:
-    """(coordinates (n, 2) of the points, their unit)."""
-    corner_px = points_px + 0.5  # GDAL's convention
-    if georeference is not None and len(points_px):
-        try:
+    corner_px = np.array([p.reference_px for p in points]).reshape(-1, 2) + 0.5  # GDAL's convention
+    places, unit = corner_px * (1.0, -1.0), "px of the reference, y negative"
+    if georeference is not None and points:
+        with suppress(GeometryError):
             on_map = geometry.apply(georeference.transform, corner_px)
-            return transformed(on_map, georeference.crs_wkt, _WGS84), _WGS84
-        except GeometryError:
-            pass
-    return corner_px * (1.0, -1.0), "px of the reference, y negative"
+            places, unit = transformed(on_map, georeference.crs_wkt, "EPSG:4326"), "EPSG:4326"
+    features = []
+    for point, place in zip(points, places, strict=True):
+        rounded = {k: v if isinstance(v, str) else np.round(v, 4).tolist() for k, v in vars(point).items()}
+        coordinates = [round(v, 8) for v in place.tolist()]  # 1e-8 degrees are a millimetre
+        feature = {"type": "Feature", "geometry": {"type": "Point", "coordinates": coordinates}}
+        features.append(feature | {"properties": rounded | {"band": harmless(point.band)}})
+    return json.dumps({"type": "FeatureCollection", "coordinates_in": unit, "features": features}) + "\n"

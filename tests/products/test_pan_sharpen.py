@@ -20,6 +20,7 @@ from agalign.products.pan_sharpen import (
     panchromatic,
     weights_of,
 )
+from agalign.products.product import CapturePaths, ProductContext
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
@@ -144,9 +145,10 @@ def test_a_band_that_is_not_delivered_or_does_not_see_infra_red_sharpens_none(
     bands = [Band("NIR", Path("NIR"), 1, 64, 48, "uint16", wavelength_nm=840.0), pan]
     monkeypatch.setattr("agalign.products.pan_sharpen.output_layers", placed)
     prediction = None if std_px is None else SimpleNamespace(std_px=std_px)
-    usable = {pan.name: SimpleNamespace(status=status, prediction=prediction)}
-    capture = Capture("a", Path("in"), tuple(bands), 0)
-    context = SimpleNamespace(capture=capture, usable=usable, settings=agalign.Settings(), rig=None)
+    alignments = {pan.name: SimpleNamespace(status=status, prediction=prediction)}
+    capture, grid = Capture("a", Path("in"), tuple(bands), 0), OutputGrid(0, 0, 64, 48)
+    paths = CapturePaths.of(capture, Path("out"))
+    context = ProductContext(capture, paths, agalign.Settings(), alignments, (), grid, None, 0)
     assert (_sources(context, agalign.WriteSettings()) is not None) == sharpens
 
 

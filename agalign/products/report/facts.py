@@ -18,14 +18,8 @@ from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPa
 from agalign.values.issues import MISSING_BAND, Remedy
 from agalign.verify.checks import KINDS
 
-_SEVERITY = {"failed": 0, "seed_only": 1, "missing": 2, "predicted": 3}
-"""Order of the statuses, the most severe first."""
-_NO_REASON = Remedy("no reason was recorded", "run again with --overwrite")
-SCHEMA = "agalign-report/1"
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""
-_MAX_SCALE_DIFFERENCE = 0.1
-"""An offset between two files is not meaningful if their scales differ by a larger share."""
 _SIMILARITY = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
 BAND_COLUMNS = {
     "band": "band",
@@ -48,8 +42,6 @@ BAND_COLUMNS = {
     "seconds": "seconds",
 }
 """Field of a band in the sidecar by column of OUT/summary.csv."""
-_OF_PAIRS = tuple(BAND_COLUMNS)[:9]
-"""The columns that the report has too, under the same names."""
 
 
 @dataclass
@@ -82,24 +74,24 @@ class FailureGroups:
 
     def add(self, label: str, result: CaptureResult) -> None:
         """Add the bands of a capture that are missing or not aligned."""
-        for band in result.bands:
-            if band.status not in ("reference", "aligned"):
-                self._put(label, band.band, band.status, band.reason or "", _remedy_of(band))
-        for name in result.missing_bands:
-            self._put(label, name, "missing", MISSING_BAND.cause, MISSING_BAND)
+        moving = [b for b in result.bands if b.status not in ("reference", "aligned")]
+        refused = [(b.band, str(b.status), b.reason or "", _remedy_of(b)) for b in moving]
+        refused += [(name, "missing", MISSING_BAND.cause, MISSING_BAND) for name in result.missing_bands]
+        for band, status, reason, remedy in refused:
+            group = self._by_cause.setdefault((status, remedy), FailureGroup(status, remedy))
+            group.bands.append(RefusalPart(capture=label, band=band, status=status, reason=reason))
 
     def groups(self) -> list[FailureGroup]:
         """Return the groups, the most severe first, and the largest first of those."""
-        return sorted(self._by_cause.values(), key=lambda g: (_SEVERITY[g.status], -len(g.bands), g.remedy.cause))
-
-    def _put(self, capture: str, band: str, status: str, reason: str, remedy: Remedy) -> None:
-        group = self._by_cause.setdefault((status, remedy), FailureGroup(status, remedy))
-        group.bands.append(RefusalPart(capture=capture, band=band, status=status, reason=reason))
+        severity = "failed", "seed_only", "missing", "predicted"
+        return sorted(self._by_cause.values(), key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
 
 
 def _remedy_of(band: BandResult) -> Remedy:
     """The remedy of the first issue, which is the one in `reason`."""
-    return KINDS[band.issues[0].kind].remedy if band.issues else _NO_REASON
+    if not band.issues:
+        return Remedy("no reason was recorded", "run again with --overwrite")
+    return KINDS[band.issues[0].kind].remedy
 
 
 @dataclass(frozen=True)
@@ -129,9 +121,9 @@ class Facts:
     """As in the data of the report."""
     bands: list[BandResult] = field(default_factory=list)
     """All moving bands of all captures."""
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    """Their rows in OUT/summary.csv."""
     failures: FailureGroups = field(default_factory=FailureGroups)
-    _offsets_px: dict[str, list[float]] = field(default_factory=dict)
-    """Median length of the offset of each band, in every capture."""
     _lattices: dict[tuple[float, ...], int] = field(default_factory=dict)
     """Centres of windows, which many pairs share, and their index in the data of the report."""
 
@@ -140,10 +132,6 @@ class Facts:
         result = sidecar.result()
         label = Path(folder, sidecar.capture).as_posix()
         moving = [b for b in result.bands if b.status != "reference"]
-        pairs = [self._pair(b, sidecar) for b in sidecar.bands]
-        for pair in pairs:
-            if pair["apart_px"] is not None:
-                self._offsets_px.setdefault(pair["band"], []).append(pair["apart_px"])
         self.bands += moving
         self.failures.add(label, result)
         output, preview, position, path = sidecar.output, sidecar.preview, sidecar.position, Path(folder)
@@ -168,7 +156,7 @@ class Facts:
             "sidecar": _link(path, f"{sidecar.capture}.json"),
             "picture": _link(path, files.get("picture")),
             "preview": None,
-            "bands": pairs,
+            "bands": [self._pair(b, sidecar, folder) for b in sidecar.bands],
             "indices": [],
         }
         if preview is not None:
@@ -199,7 +187,8 @@ class Facts:
         for name in dict.fromkeys(b.band for b in self.bands):
             pairs = [b for b in self.bands if b.band == name]
             residuals_px = [r for b in pairs if (r := _residual_px(b)) is not None]
-            offsets_px = self._offsets_px.get(name)
+            facts = (b for c in self.captures for b in c["bands"] if b["band"] == name)
+            offsets_px = [b["apart_px"] for b in facts if b["apart_px"] is not None]
             row = BandRow(
                 name,
                 aligned=sum(b.status == "aligned" for b in pairs),
@@ -214,16 +203,20 @@ class Facts:
 
     def as_json(self) -> dict[str, Any]:
         """Return the data of the schema `agalign-report/1`, whose types the script of the page declares."""
-        facts = {"schema": SCHEMA, "captures": self.captures, "shift_step_px": _SHIFT_STEP_PX}
+        facts = {"schema": "agalign-report/1", "captures": self.captures, "shift_step_px": _SHIFT_STEP_PX}
         return facts | {"lattices": [list(centres) for centres in self._lattices]}
 
-    def _pair(self, band: BandPart, sidecar: Sidecar) -> dict[str, Any]:
-        row = table_row(band)
+    def _pair(self, band: BandPart, sidecar: Sidecar, folder: str) -> dict[str, Any]:
+        """The data of a band, whose row is added unless it is the reference."""
+        row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
+        if band.status != "reference":
+            self.rows.append({"folder": folder, "capture": sidecar.capture, **row})
         metrics, tiles = band.metrics, [] if band.metrics is None else band.metrics.tiles
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
         lattice = tuple(v for t in tiles for v in t.centre_px)
         offset_px, apart_px = _band_offset(band.grid, sidecar)
-        return {name: row[name] for name in _OF_PAIRS} | {
+        # The first nine columns of the table have the same names here.
+        return {name: row[name] for name in tuple(BAND_COLUMNS)[:9]} | {
             "seconds": round(band.seconds, 2),
             "written": band.place is not None,
             "offset_px": offset_px,
@@ -245,11 +238,6 @@ def value_at(part: object, path: str) -> Any:
     return rounded(part)
 
 
-def table_row(band: BandPart) -> dict[str, Any]:
-    """Return the row of a band pair in OUT/summary.csv, by column."""
-    return {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
-
-
 def rounded(value: Any) -> Any:
     """Return a measured value with the four decimals that tables and the report have; others unchanged."""
     return round(value, 4) if isinstance(value, float) else value
@@ -266,13 +254,13 @@ def _residual_px(band: BandResult) -> float | None:
 def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:
     """(offset (x, y) of a band's raw file in the centre of the reference, median length of the offset), px.
 
-    None if the two files have different scales.
+    None if the scales of the two files differ by 10 % or more.
     """
     if grid is None:
         return None, None
     reference_px, moving_px = np.array(grid.reference_px), np.array(grid.moving_px)
     reference_span, moving_span = np.ptp(reference_px, axis=0), np.ptp(moving_px, axis=0)
-    if not (np.abs(moving_span - reference_span) < _MAX_SCALE_DIFFERENCE * reference_span).all():
+    if not (np.abs(moving_span - reference_span) < 0.1 * reference_span).all():
         return None, None
     offsets = moving_px - reference_px
     centre = (np.array(sidecar.reference.size_px) - 1) / 2

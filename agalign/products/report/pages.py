@@ -20,7 +20,7 @@ from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.index_table import IndexRow, rows_of_run, update_table
 from agalign.products.panels import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
-from agalign.products.report.facts import BAND_COLUMNS, Facts, FailureGroup, table_row
+from agalign.products.report.facts import BAND_COLUMNS, Facts, FailureGroup
 from agalign.products.report.rigs import drifts_of, rig_views
 from agalign.products.run_record import RunPart, read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
@@ -30,7 +30,6 @@ from agalign.values.text import without_formula
 
 SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS)
 REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
-_SLOWEST = 5
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,6 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
     Raises OutputError.
     """
-    rows: list[dict[str, object]] = []
     indices: list[IndexRow] = []
     unreadable: list[str] = []
     facts = Facts()
@@ -63,8 +61,6 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         except SidecarError as error:
             unreadable.append(str(error))
             continue
-        moving = [b for b in sidecar.bands if b.status != "reference"]
-        rows += [{"folder": folder, "capture": sidecar.capture, **table_row(b)} for b in moving]
         indices += rows_of_run(sidecar, folder, out)
         facts.add(folder, sidecar)
     panels: list[PanelPart] = []
@@ -74,13 +70,13 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         panels, sky, run = read_panels(out), read_sky(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
-    rows += [row for panel in panels if not panel.in_scene for row in _rows_not_aligned(panel, "panel")]
+    rows = [row for panel in panels if not panel.in_scene for row in _rows_not_aligned(panel, "panel")]
     rows += [row for part in sky for row in _rows_not_aligned(part, "sky")]
-    cells = ([without_formula(row.get(name)) for name in SUMMARY_COLUMNS] for row in rows)
+    cells = ([without_formula(row.get(name)) for name in SUMMARY_COLUMNS] for row in [*facts.rows, *rows])
     write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, cells)
     facts.add_indices(update_table(out, indices))
     failures = facts.failures.groups()
-    slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:_SLOWEST]
+    slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:5]
     write_text(out / REPORT_FILE, _page(out, facts, panels, sky, run, unreadable.append))
     if unreadable:
         with suppress(OSError):

@@ -16,16 +16,6 @@ from agalign.flight.rig_prediction import band_summaries
 from agalign.values import geometry
 
 PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
-_MAX_ARROW = 11.0
-"""Length of the longest arrow of a displacement field."""
-_FIELD_COLUMNS, _FIELD_ROWS = 13, 10
-_PLAN_SHARE, _CHART_SHARE = 0.36, 0.92
-"""Largest distance from the centre: share of the width of a plan, and of half the height of a chart."""
-_MIN_CHART_PX = 0.2
-"""Smallest range of a drift chart."""
-_DELIVERED = ("aligned", "predicted")
-_MAX_POINTS = 400
-"""Points of a line: the drift of more captures is averaged."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +74,7 @@ def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
 def _rig_view(camera: str, rig: Rig) -> RigView:
     rows = band_summaries(rig)
     longest = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
-    to_plan = _PLAN_SHARE * PLAN_WIDTH / longest
+    to_plan = 0.36 * PLAN_WIDTH / longest  # leaves space for names
     width, height = rig.size_px
     bands = []
     for number, row in enumerate(rows):
@@ -98,10 +88,11 @@ def _rig_view(camera: str, rig: Rig) -> RigView:
 def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...]:
     if band not in rig.fields:
         return ()
-    points = geometry.lattice(*rig.size_px, _FIELD_COLUMNS, _FIELD_ROWS)
-    scale = FIELD_WIDTH / rig.size_px[0]
-    field = rig.fields[band](points)
-    starts, arrows = points * scale, field * _MAX_ARROW / max(float(np.linalg.norm(field, axis=1).max()), 1e-6)
+    columns, rows = 13, 10
+    points = geometry.lattice(*rig.size_px, columns, rows)
+    starts, field = points * (FIELD_WIDTH / rig.size_px[0]), rig.fields[band](points)
+    max_length = 11.0  # nearly the distance of the arrows
+    arrows = field * max_length / max(float(np.linalg.norm(field, axis=1).max()), 1e-6)
     return tuple((x, y, x + dx, y + dy) for (x, y), (dx, dy) in zip(starts.tolist(), arrows.tolist(), strict=True))
 
 
@@ -116,7 +107,11 @@ def drifts_of(captures: Sequence[dict[str, Any]]) -> list[Drift]:
     for camera in dict.fromkeys(c["camera"] for c in captures):
         in_order = sorted((c for c in captures if c["camera"] == camera), key=lambda c: (c["captured_at"], c["label"]))
         offsets_px = [
-            {b["band"]: b["offset_px"] for b in c["bands"] if b["status"] in _DELIVERED and b["offset_px"]}
+            {
+                b["band"]: b["offset_px"]
+                for b in c["bands"]
+                if b["status"] in ("aligned", "predicted") and b["offset_px"]
+            }
             for c in in_order
         ]
         names = list(dict.fromkeys(name for of_capture in offsets_px for name in of_capture))
@@ -132,8 +127,8 @@ def _lines(captures: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[tu
     differences = [_principal_component(band_offsets_px) for band_offsets_px in offsets_px]
     # The sign of a principal component is arbitrary: choose that of the first band.
     differences = [d if np.nansum(differences[0] * d) >= 0 else -d for d in differences]
-    full = max(_MIN_CHART_PX, float(np.nanmax(np.abs(differences))))
-    step = max(1, math.ceil(len(captures) / _MAX_POINTS))
+    full = max(0.2, float(np.nanmax(np.abs(differences))))  # smaller drifts are noise
+    step = max(1, math.ceil(len(captures) / 400))  # more points than that are not distinguishable
     lines = tuple(
         Line(name, hue_of(number, len(names)), _polylines(values, full, step))
         for number, (name, values) in enumerate(zip(names, differences, strict=True))
@@ -156,6 +151,6 @@ def _polylines(values: NDArray[np.float64], full: float, step: int) -> tuple[str
         if np.isnan(group).all():
             lines.append([])
             continue
-        x, y = CHART_WIDTH * (i + 0.5) / len(groups), 1 - _CHART_SHARE * float(np.nanmean(group)) / full
+        x, y = CHART_WIDTH * (i + 0.5) / len(groups), 1 - 0.92 * float(np.nanmean(group)) / full
         lines[-1].append(f"{x:.1f},{CHART_HEIGHT / 2 * y:.1f}")
     return tuple(" ".join(line) for line in lines if line)
