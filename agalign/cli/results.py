@@ -170,6 +170,7 @@ def _indices(
         terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
     elif written:
         _print_table([one.name for one in chosen], reports, terminal)
+        _warn_of_masks(written, terminal)
         terminal.result(f"Statistics: {folder / INDICES_FILE}")
     return ExitCode.NOTHING if not written else ExitCode.OK if len(written) == len(reports) else ExitCode.PARTIAL
 
@@ -231,6 +232,14 @@ def _rebuild_report(out: Path, terminal: Terminal) -> None:
         write_pages(out, terminal.problem)
 
 
+def _warn_of_masks(written: "Sequence[IndexReport]", terminal: Terminal) -> None:
+    """Name the captures of which the quality flags mask more than a third."""
+    captures = sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3})
+    if captures:
+        more = f" and {len(captures) - 1} more captures" if captures[1:] else ""
+        terminal.problem(f"--mask-qa leaves out more than a third of {captures[0]}{more}: look at the .qa.tif")
+
+
 def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", terminal: Terminal) -> None:
     """Print a row per index: statistics of the medians of its captures."""
     from statistics import median
@@ -240,6 +249,7 @@ def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", termina
         values = [r.median for r in written if r.index == name and math.isfinite(r.median)]
         if values:
             numbers = (median(values), min(values), max(values))
-            rows.append((name, str(len(values)), *(f"{number:.3f}" for number in numbers)))
+            masked = median(r.statistics.masked_share for r in written if r.index == name)
+            rows.append((name, str(len(values)), *(f"{number:.3f}" for number in numbers), f"{masked:.1%}"))
     title = f"{len(written)} of {len(reports)} written; medians of captures"
-    terminal.table(("Index", "Captures", "Median", "Lowest", "Highest"), rows, title, texts=1)
+    terminal.table(("Index", "Captures", "Median", "Lowest", "Highest", "Masked"), rows, title, texts=1)

@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -215,7 +216,8 @@ def _write(
     if like.crs is not None and not like.transform.is_identity:
         profile |= {"crs": like.crs, "transform": like.transform}
     step = max(1, math.ceil(math.sqrt(like.width * like.height / _MAX_STATISTICS_PX)))
-    samples, valid_px = [], 0
+    samples, valid_px, masked_px = [], 0, 0
+    unmasked = [replace(band, quality=None) for band in bands]
     with checked_raster(target, profile) as raster:
         raster.describe([LayerDescription(index.name)], _tags(index, like, unit, source))
         for tile in tiles(Tile(0, 0, like.width, like.height), WORK_TILE_PX):
@@ -223,9 +225,13 @@ def _write(
             raster.write(values, 1, tile.x0, tile.y0)
             valid = np.isfinite(values)
             valid_px += int(np.count_nonzero(valid))
+            if list(bands) != unmasked:
+                all_values = compute(index, [reader.values(band, tile) for band in unmasked])
+                masked_px += int(np.count_nonzero(np.isfinite(all_values) & ~valid))
             samples.append(values[::step, ::step][valid[::step, ::step]])
         sample = np.concatenate(samples)
-        statistics = _statistics(index, unit, sample, valid_px / (like.width * like.height))
+        shares = (pixels / (like.width * like.height) for pixels in (valid_px, masked_px))
+        statistics = _statistics(index, unit, sample, *shares)
         raster.dataset.update_tags(**{STATISTICS_TAG: json.dumps(statistics.as_json())})
     _draw(index, target, sample, statistics)
     return statistics
@@ -245,14 +251,17 @@ def _tags(index: Index, like: OpenRaster, unit: str, source: str) -> dict[str, s
     }
 
 
-def _statistics(index: Index, unit: str, sample: NDArray[np.float32], valid_share: float) -> IndexStatistics:
+def _statistics(
+    index: Index, unit: str, sample: NDArray[np.float32], valid_share: float, masked_share: float
+) -> IndexStatistics:
+    masked_share = round(masked_share, 6)
     if not sample.size:
-        return IndexStatistics(unit=unit, low=0.0, high=1.0)
+        return IndexStatistics(unit=unit, low=0.0, high=1.0, masked_share=masked_share)
     low, p5, median, p95, high = (round(float(v), 6) for v in np.percentile(sample, (2, 5, 50, 95, 98)))
     if index.span is not None and unit != RAW:
         low, high = index.span
     # The ends of the colour scale must differ.
-    return IndexStatistics(median, p5, p95, round(valid_share, 6), unit, low, max(high, low + 1e-3))
+    return IndexStatistics(median, p5, p95, round(valid_share, 6), unit, low, max(high, low + 1e-3), masked_share)
 
 
 def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: IndexStatistics) -> None:

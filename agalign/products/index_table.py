@@ -34,6 +34,8 @@ class IndexStatistics:
     """Value at the lower end of the colour scale of the picture."""
     high: float = math.nan
     """Value at the upper end of the colour scale."""
+    masked_share: float = 0.0
+    """Share of the pixels that only the quality flags mask."""
 
     def as_json(self) -> dict[str, float | str | None]:
         """Return the fields by name, with null for nan, which JSON does not have."""

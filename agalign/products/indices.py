@@ -34,6 +34,8 @@ _OPERATORS: Mapping[type, Callable[..., Any]] = {
     ast.USub: np.negative,
 }
 _FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {"sqrt": np.sqrt, "log": np.log, "exp": np.exp, "abs": np.abs}
+_NOISE = 0.02
+"""Noise of reflectance relative to its value: a difference below this share of its terms has no certain sign."""
 Role = Literal["blue", "green", "red", "red edge", "nir"]
 """The part of the spectrum that a band of an index is from."""
 
@@ -116,6 +118,8 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
         case ast.Constant(value=value):
             # float32 overflows to infinity; Python's integers would grow without limit, as in 9**9**9.
             return np.float32(value)  # type: ignore[arg-type]
+        case ast.BinOp(left=left, op=ast.Div(), right=right):
+            return _value(left, values) / _denominator(right, values)
         case ast.BinOp(left=left, op=op, right=right):
             return _OPERATORS[type(op)](_value(left, values), _value(right, values))
         case ast.UnaryOp(op=op, operand=operand):
@@ -123,6 +127,22 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
         case ast.Call(func=ast.Name(id=name), args=[argument]):
             return _FUNCTIONS[name](_value(argument, values))
     raise AssertionError(ast.dump(node))  # `_names` has refused it
+
+
+def _denominator(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
+    """Return the value of a denominator; nan where one of bands is not positive beyond the noise of its terms."""
+    value = _value(node, values)
+    if not any(isinstance(part, ast.Name) for part in ast.walk(node)):
+        return value
+    return np.where(value > _NOISE * _magnitude(node, values), value, np.float32(np.nan))
+
+
+def _magnitude(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
+    """Return the sum of the absolute values of the terms of a sum."""
+    match node:
+        case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
+            return _magnitude(left, values) + _magnitude(right, values)
+    return np.abs(_value(node, values))
 
 
 @dataclass(frozen=True)
@@ -278,8 +298,14 @@ def role_of_band(band: Band) -> Role | None:
 
 
 def compute(index: Index, bands: Sequence[FloatImage]) -> FloatImage:
-    """Return the index (height, width) of its bands; nan where a band is nan or the formula divides by zero."""
-    values: dict[str, FloatImage] = dict(zip(index.symbols, bands, strict=True))
+    """Return the index (height, width) of its bands.
+
+    It is nan where a band is nan or negative, which no reflectance is, and where a denominator is not positive beyond
+    its noise.
+    """
+    values: dict[str, FloatImage] = {
+        symbol: np.where(band >= 0, band, np.float32(np.nan)) for symbol, band in zip(index.symbols, bands, strict=True)
+    }
     values |= {name: np.asarray(number, np.float32) for name, number in index.constants}
     value = evaluate(index.formula, values)
     return np.where(np.isfinite(value), value, np.float32(np.nan))

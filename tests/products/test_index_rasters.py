@@ -222,6 +222,10 @@ def test_values_and_nodata() -> None:
     nir, red = np.float32([[0.5, 0.0, np.nan, 0.3]]), np.float32([[0.1, 0.0, 0.2, -0.3]])
     assert compute(INDICES["ndvi"], [nir, red]).dtype == np.float32
     np.testing.assert_allclose(compute(INDICES["ndvi"], [nir, red]), [[0.4 / 0.6, *[np.nan] * 3]], rtol=1e-6)
+    # Noise around zero has no index.
+    noise = compute(INDICES["ndvi"], [np.float32([[-0.01, 0.03]]), np.float32([[0.006, -0.01]])])
+    visible = np.float32([[[0.1, 0.05]], [[0.02, 0.04]], [[0.118, 0.19]]])
+    assert np.isnan([noise, compute(INDICES["vari"], list(visible))]).all()
     expected = {"evi": 2.5 * 0.4 / (0.5 + 0.6 - 0.375 + 1), "savi": 1.5 * 0.4 / 1.1, "cire": 4.0}
     for name, value in expected.items():
         bands = [nir, red, np.float32([[0.05] * 4])][: len(INDICES[name].roles)]

@@ -162,6 +162,9 @@ def test_indices_leave_out_what_the_flags_of_their_own_bands_say(flight: Path, t
     expected = values.copy()
     expected[10:20, 30:50] = np.nan
     assert np.array_equal(kept, expected, equal_nan=True)
+    masked_px = np.isfinite(values[10:20, 30:50]).sum()
+    assert left.statistics.masked_share == pytest.approx(masked_px / values.size, abs=1e-6)
+    assert ndvi.statistics.masked_share == 0
     assert np.isfinite(without_nir[10:20, 30:50]).all()
     # The same bands without the mask are another raster, which is not taken for this one.
     (again,) = write_rasters(plain, [index_named("ndvi")], tmp_path / "masked", "a", overwrite=False)
