@@ -324,9 +324,16 @@ def _print_pair(capture: str, band: BandResult, terminal: Terminal) -> None:
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
     counts = Counter(status for pairs in totals.bands.values() for status, _, _ in pairs)
+    lost = totals.states["error"]
     if totals.bands:
-        _print_table(totals, f"{counts['aligned']} of {counts.total()} band pairs aligned", terminal)
+        missing = f"; {counted(lost, 'capture')} not written" if lost else ""
+        _print_table(totals, f"{counts['aligned']} of {counts.total()} band pairs aligned{missing}", terminal)
     explain(totals.failures.groups(), terminal)
+    if lost:
+        terminal.problem(
+            f"{lost} of {counted(totals.states.total(), 'capture')} could not be written, for the reasons above; "
+            "the same command tries again"
+        )
     for quantity, count in totals.radiometry.items():
         terminal.result(f"Written as {quantity}: {counted(count, 'capture')}")
     terminal.result(f"Report: {out / REPORT_FILE}")

@@ -90,6 +90,16 @@ def test_a_second_run_keeps_what_is_done(flight: Path, aligned_copy: Path) -> No
     assert stack.stat().st_mtime_ns == before
 
 
+def test_the_totals_name_captures_that_could_not_be_written(flight: Path, aligned_copy: Path) -> None:
+    stack = aligned_copy / "0000SET" / "000" / "IMG_0002.tif"
+    stack.unlink()
+    stack.mkdir()
+    done = agalign_here(flight, "-o", aligned_copy, "--only-seed")
+    assert done.returncode == 3
+    assert "1 of 2 captures could not be written, for the reasons above" in done.stderr
+    assert "4 band pairs aligned; 1 capture not written" in done.stdout + done.stderr
+
+
 def test_one_hopeless_band_does_not_stop_the_others(flight: Path, tmp_path: Path) -> None:
     shutil.copytree(flight / "0000SET", tmp_path / "in")
     images = tmp_path / "in" / "000"
