@@ -12,7 +12,7 @@ import typer
 from agalign.cli.command import Command, Given, load_config
 from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line, examples
 from agalign.values.choices import MAX_MOSAIC_PIXELS
-from agalign.values.cores import check_address_space, limit_default_threads, usable_cores
+from agalign.values.cores import check_address_space, usable_cores
 
 _command = partial(
     Command, on_interrupt="interrupted; finished captures are kept, and the same command resumes the run"
@@ -71,7 +71,6 @@ def _align(
 
 def load_ahead() -> None:
     """Import torch and other large libraries in a thread, which takes two seconds, while the files are read."""
-    limit_default_threads()
 
     def load() -> None:
         with suppress(Exception):  # reported at the next import

@@ -21,6 +21,7 @@ from agalign.cli.evaluate import evaluate, learn, surface
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, examples, printed
+from agalign.values.cores import limit_default_threads
 
 COMMANDS = {
     "align": align,
@@ -155,6 +156,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # The matrices here are small: a second BLAS thread only spins.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    limit_default_threads()
     logging.getLogger("rasterio").setLevel(logging.CRITICAL)
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     with printed():

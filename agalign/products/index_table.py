@@ -139,7 +139,7 @@ def read_table(out: Path) -> list[IndexRow]:
     try:
         text = (out / INDICES_FILE).read_text(encoding="utf-8")
         rows = [_row(line) for line in csv.DictReader(io.StringIO(text))]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # lines with too few or too many cells
         return []
     return [row for row in rows if not row.file or (out / row.file).is_file()]
 

@@ -11,7 +11,7 @@ from synthetic_flights.aligned import make_aligned
 from agalign.batch.index_run import index_tasks, run_indices, unit_of_run
 from agalign.errors import ConfigurationError, InputError
 from agalign.products.index_bands import RAW
-from agalign.products.index_table import IndexReport, read_table
+from agalign.products.index_table import IndexReport, IndexRow, IndexStatistics, read_table, update_table
 from agalign.products.indices import (
     INDICES,
     Index,
@@ -146,6 +146,15 @@ def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
     assert not list((tmp_path / "out").rglob("*ndvi*"))
     (target / rows[0]["file"]).unlink()
     assert len(read_table(target)) == 3
+
+
+@pytest.mark.parametrize("line", [",,", "," * 40 + "x", "a\0b", "1,2,3"])
+def test_a_damaged_table_is_written_again(tmp_path: Path, line: str) -> None:
+    update_table(tmp_path, [IndexRow("", "IMG_0001", "", None, None, "ndvi", "", IndexStatistics(), "left out")])
+    assert len(read_table(tmp_path)) == 1
+    path = tmp_path / "indices.csv"
+    path.write_text(f"{path.read_text()}{line}\n")
+    assert read_table(tmp_path) == []
 
 
 def test_one_damaged_stack_costs_only_its_own_indices(tmp_path: Path) -> None:
