@@ -80,6 +80,7 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
 
 
 def _has_namesakes_in_folders(files: Sequence[Path]) -> bool:
+    """True if files of the same name are in several folders."""
     return len({p.stem for p in files}) < len(files) and len({p.parent for p in files}) > 1
 
 

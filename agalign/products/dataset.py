@@ -71,6 +71,7 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
 
 
 def _variables_of_all(datasets: Sequence["xarray.Dataset"]) -> list[Hashable]:
+    """The names of the variables that all datasets have."""
     return [name for name in datasets[0].data_vars if all(name in one for one in datasets)]
 
 

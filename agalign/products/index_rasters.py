@@ -97,6 +97,7 @@ def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
 
 
 def _have_raw_numbers(captures: Sequence[Capture]) -> bool:
+    """True if all files have integers."""
     return all(np.dtype(b.dtype).kind in "ui" for c in captures for b in c.bands)
 
 

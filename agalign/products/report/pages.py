@@ -96,7 +96,7 @@ def pages_exist(out: Path) -> bool:
 def _write_summary(
     path: Path, rows: Sequence[dict[str, Any]], panels: Sequence[PanelPart], sky: Sequence[SkyPart]
 ) -> None:
-    """Write OUT/summary.csv, given the rows of the captures that were aligned. Raises OutputError."""
+    """Write OUT/summary.csv, given the rows of the processed captures. Raises OutputError."""
     all_rows = [*rows]
     all_rows += [row for panel in panels if not panel.in_scene for row in _rows_not_aligned(panel, "panel")]
     all_rows += [row for part in sky for row in _rows_not_aligned(part, "sky")]
