@@ -72,12 +72,12 @@ class RootGroup(TyperGroup):
         options = [param.get_help_record(ctx) for param in self.get_params(ctx)]
         with formatter.section("Options"):
             formatter.write_dl([record for record in options if record is not None])
-        self.format_commands(ctx, formatter)
+        self._write_commands(formatter)
         formatter.write_paragraph()
         for line in (self.epilog or "").split("\n\n"):
             formatter.write(f"{line.replace('[bold]', '  ').replace('[/]', '')}\n")
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
+    def _write_commands(self, formatter: Any) -> None:
         """Write a section of commands for each panel."""
         shown = {name: command for name, command in COMMANDS.items() if not command.hidden}
         for panel in dict.fromkeys(command.panel for command in COMMANDS.values()):
