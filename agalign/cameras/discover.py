@@ -57,16 +57,7 @@ def discover(
     """
     folder, options = Path(folder), options or DiscoverOptions()
     check_folder(folder)
-    images, problems = image_files(folder, options.skip)
-    paths = [p for p in images if is_chosen(p.relative_to(folder), options.include, options.exclude)]
-    if not paths and problems:
-        raise problems[0].error
-    if images and not paths:
-        raise InputError(f"{folder}: has {len(images)} images, and --include and --exclude leave none")
-    if not paths:
-        others = ", ".join(f"{count} {suffix}" for suffix, count in other_files(folder).most_common(5))
-        only = f"; there are only {others}" if others else ""
-        raise InputError(f"{folder}: no {IMAGE_KINDS} file in it or below it{only}")
+    paths, problems = _chosen_images(folder, options)
     files = _read(paths, options, progress, problems)
     captures: list[Capture] = []
     for group in group_files(files):
@@ -80,6 +71,21 @@ def discover(
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = with_missing_bands(with_unique_capture_names(captures, band_file_owners(captures)))
     return FolderScan(folder, tuple(captures), tuple(problems))
+
+
+def _chosen_images(folder: Path, options: DiscoverOptions) -> tuple[list[Path], list[Problem]]:
+    """(the images to read, problems of folders that cannot be listed). Raises InputError if there is no image."""
+    images, problems = image_files(folder, options.skip)
+    paths = [p for p in images if is_chosen(p.relative_to(folder), options.include, options.exclude)]
+    if not paths and problems:
+        raise problems[0].error
+    if images and not paths:
+        raise InputError(f"{folder}: has {len(images)} images, and --include and --exclude leave none")
+    if not paths:
+        others = ", ".join(f"{count} {suffix}" for suffix, count in other_files(folder).most_common(5))
+        only = f"; there are only {others}" if others else ""
+        raise InputError(f"{folder}: no {IMAGE_KINDS} file in it or below it{only}")
+    return paths, problems
 
 
 def _read(

@@ -50,12 +50,7 @@ def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
     for key in sorted(groups, key=lambda key: key[0] == Generic.name):
         remaining = []
         for file in groups[key]:
-            if key[0] == Generic.name:
-                keys = [k for k in _keys_for(file, key[1], cameras.values(), by_name) if k in groups]
-                target = keys[0] if len(keys) == 1 else None
-            else:
-                keys = [] if file.is_whole_capture else by_name[key]
-                target = next((k for k in keys if k in groups and k[-1] != key[-1]), None)
+            target = _group_for(file, key, groups, by_name, cameras.values())
             if target is None:
                 remaining.append(file)
             else:
@@ -65,6 +60,21 @@ def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
             groups[key] = remaining
         else:
             del groups[key]
+
+
+def _group_for(
+    file: ImageFile,
+    key: _GroupKey,
+    groups: Mapping[_GroupKey, list[ImageFile]],
+    by_name: Mapping[_GroupKey, list[_GroupKey]],
+    cameras: Iterable[Camera],
+) -> _GroupKey | None:
+    """The other group that a file without a capture id belongs to by its name, if there is one."""
+    if key[0] == Generic.name:
+        keys = [k for k in _keys_for(file, key[1], cameras, by_name) if k in groups]
+        return keys[0] if len(keys) == 1 else None
+    keys = [] if file.is_whole_capture else by_name.get(key, [])
+    return next((k for k in keys if k in groups and k != key), None)
 
 
 def _keys_for(
@@ -198,21 +208,26 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
     A multiband file has no missing bands. A capture of a dual camera without files of one half gets the serial numbers
     of both.
     """
-    members: dict[_CameraKey, list[int]] = defaultdict(list)
-    for index, camera in enumerate(_cameras(captures)):
-        members[camera].append(index)
-    result = list(captures)
-    for indices in members.values():
-        serials = {captures[i].camera.serial for i in indices}
-        several = [i for i in indices if captures[i].has_several_files]
-        counts = Counter(b.name for i in several for b in captures[i].bands)
-        usual = [name for name, n in counts.items() if 2 * n >= len(several)]
-        for i in indices:
-            own = {b.name for b in captures[i].bands}
-            missing = tuple(name for name in usual if name not in own) if captures[i].has_several_files else ()
-            identity = replace(captures[i].camera, serial=_complete_serial(captures[i].camera.serial, serials))
-            result[i] = replace(captures[i], missing_bands=missing, camera=identity)
+    cameras = _cameras(captures)
+    members: dict[_CameraKey, list[Capture]] = defaultdict(list)
+    for capture, camera in zip(captures, cameras, strict=True):
+        members[camera].append(capture)
+    usual = {camera: _usual_bands(of_camera) for camera, of_camera in members.items()}
+    serials = {camera: {c.camera.serial for c in of_camera} for camera, of_camera in members.items()}
+    result = []
+    for capture, camera in zip(captures, cameras, strict=True):
+        own = {b.name for b in capture.bands}
+        missing = tuple(name for name in usual[camera] if name not in own) if capture.has_several_files else ()
+        identity = replace(capture.camera, serial=_complete_serial(capture.camera.serial, serials[camera]))
+        result.append(replace(capture, missing_bands=missing, camera=identity))
     return result
+
+
+def _usual_bands(captures: Sequence[Capture]) -> list[str]:
+    """The bands that at least half of the captures of several files have."""
+    several = [c for c in captures if c.has_several_files]
+    counts = Counter(b.name for c in several for b in c.bands)
+    return [name for name, n in counts.items() if 2 * n >= len(several)]
 
 
 def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:

@@ -187,17 +187,9 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     """
     if path is None:
         return None
-    import tomllib
-
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise typer.BadParameter(f"{path} does not exist") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise typer.BadParameter(f"{path} cannot be read as TOML ({error})") from None
     options = _file_options(ctx.command)
     defaults: dict[str, Any] = {}
-    for key, value in values.items():
+    for key, value in _read_toml(path).items():
         name = key.replace("_", "-")
         if name not in options:
             near = get_close_matches(name, options, 1)
@@ -208,6 +200,17 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
         defaults[options[name].name] = [value] if single else value
     ctx.default_map = {**(ctx.default_map or {}), **defaults}
     return path
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    import tomllib
+
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise typer.BadParameter(f"{path} does not exist") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise typer.BadParameter(f"{path} cannot be read as TOML ({error})") from None
 
 
 def config_text(command: Any) -> str:

@@ -41,28 +41,26 @@ def _info(
     if folder.is_file() and folder.suffix == ".safetensors":
         _show_model(folder, terminal, as_json=as_json)
         return ExitCode.OK
+    return _show_folder(folder, given["discover"], terminal, as_json=as_json)
+
+
+info = Command(_info, {"Input": "pattern reference bands order with_rgb ignore_metadata include exclude"})
+
+
+def _show_folder(folder: Path, options: dict[str, Any], terminal: Terminal, *, as_json: bool) -> int:
+    """Print the captures of a folder, and return the exit code. Raises InputError if it contains no image."""
     from agalign.cameras.discover import discover
     from agalign.cli.run import print_found
     from agalign.config import DiscoverOptions
     from agalign.flight.groups import camera_overviews
-    from agalign.flight.panels import with_panels
-    from agalign.flight.sky import sky_captures
 
-    flight = discover(folder, DiscoverOptions(**given["discover"]))
+    flight = discover(folder, DiscoverOptions(**options))
     if not as_json:
         print_found(flight, terminal)
         if not flight.captures:
             _show_unused(flight, terminal)
             return ExitCode.NOTHING
-    sky, others = sky_captures(flight.captures)
-    sky_cues = {s.capture.label: list(s.cues) for s in sky}
-    by_label = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
-    unreadable = _unreadable_files(flight)
-    rows = [
-        _facts(by_label[c.label])
-        | {"sky": sky_cues.get(c.label, []), "unreadable_files": [p.name for p in unreadable.get(c.label, [])]}
-        for c in flight.captures
-    ]
+    rows = _rows(flight)
     cameras = camera_overviews(flight.captures)
     if as_json:
         problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
@@ -75,7 +73,20 @@ def _info(
     return ExitCode.NOTHING if not rows else ExitCode.PARTIAL if flight.problems else ExitCode.OK
 
 
-info = Command(_info, {"Input": "pattern reference bands order with_rgb ignore_metadata include exclude"})
+def _rows(flight: "FolderScan") -> list[dict[str, Any]]:
+    """Return what `info` prints about the captures of a folder, as JSON objects."""
+    from agalign.flight.panels import with_panels
+    from agalign.flight.sky import sky_captures
+
+    sky, others = sky_captures(flight.captures)
+    sky_cues = {s.capture.label: list(s.cues) for s in sky}
+    by_label = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
+    unreadable = _unreadable_files(flight)
+    return [
+        _facts(by_label[c.label])
+        | {"sky": sky_cues.get(c.label, []), "unreadable_files": [p.name for p in unreadable.get(c.label, [])]}
+        for c in flight.captures
+    ]
 
 
 def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:

@@ -73,13 +73,17 @@ class RootGroup(TyperGroup):
         options = [param.get_help_record(ctx) for param in self.get_params(ctx)]
         with formatter.section("Options"):
             formatter.write_dl([record for record in options if record is not None])
-        for panel in dict.fromkeys(command.panel for command in COMMANDS.values()):
-            with formatter.section(panel or "Commands"):
-                shown = {name: c for name, c in COMMANDS.items() if c.panel == panel and not c.hidden}
-                formatter.write_dl([(name, command.summary) for name, command in shown.items()])
+        self._write_commands(formatter)
         formatter.write_paragraph()
         for line in (self.epilog or "").split("\n\n"):
             formatter.write(f"{line.replace('[bold]', '  ').replace('[/]', '')}\n")
+
+    def _write_commands(self, formatter: Any) -> None:
+        """Write a section of commands for each panel."""
+        shown = {name: command for name, command in COMMANDS.items() if not command.hidden}
+        for panel in dict.fromkeys(command.panel for command in COMMANDS.values()):
+            with formatter.section(panel or "Commands"):
+                formatter.write_dl([(name, c.summary) for name, c in shown.items() if c.panel == panel])
 
 
 @contextmanager

@@ -143,7 +143,6 @@ def _indices(
     from agalign.batch.output_folder import locked
     from agalign.cli.run import cluster, progress
     from agalign.products.index_bands import RAW
-    from agalign.products.index_table import INDICES_FILE
 
     chosen = chosen_indices(index, formula or [])
     folder, jobs = target or out, given["run"]["jobs"]
@@ -163,13 +162,22 @@ def _indices(
             show(number, 0.0, done.reports[0].capture, "")
         if target is None:
             _rebuild_report(out, terminal)
-    written = [r for r in reports if r.path is not None]
-    if any(r.raw_numbers for r in written) and not announced:
+    if any(r.raw_numbers for r in reports) and not announced:
         terminal.problem(RAW_NUMBERS)
+    return _conclude([one.name for one in chosen], reports, folder, terminal, as_json=as_json)
+
+
+def _conclude(
+    names: Sequence[str], reports: "Sequence[IndexReport]", folder: Path, terminal: Terminal, *, as_json: bool
+) -> int:
+    """Print the statistics of all indices, and return the exit code."""
+    from agalign.products.index_table import INDICES_FILE
+
+    written = [r for r in reports if r.path is not None]
     if as_json:
         terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
     elif written:
-        _print_table([one.name for one in chosen], reports, terminal)
+        _print_table(names, reports, terminal)
         _warn_of_masks(written, terminal)
         terminal.result(f"Statistics: {folder / INDICES_FILE}")
     return ExitCode.NOTHING if not written else ExitCode.OK if len(written) == len(reports) else ExitCode.PARTIAL

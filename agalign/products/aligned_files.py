@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -62,8 +63,7 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
     bands_per_file = Counter(b.path for b in capture.bands)
     # Files of several bands with a lens each.
     split = {b.path for b in capture.bands if not b.one_lens and bands_per_file[b.path] > 1}
-    has_namesakes = len({p.stem for p in bands_per_file}) < len(bands_per_file)
-    by_folder = has_namesakes and len({p.parent for p in bands_per_file}) > 1
+    by_folder = _has_namesakes_in_folders([*bands_per_file])
     names: dict[str, Path] = {}
     taken: dict[Path, Path] = {}
     for band in capture.bands:
@@ -77,6 +77,11 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
         taken[name] = band.path
         names[band.name] = name
     return names
+
+
+def _has_namesakes_in_folders(files: Sequence[Path]) -> bool:
+    """True if files of the same name are in several folders."""
+    return len({p.stem for p in files}) < len(files) and len({p.parent for p in files}) > 1
 
 
 def _safe_name(text: str) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,27 +51,28 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     folder = Path(out)
     captures = _captures_with_output(folder)
     opened = [_dataset(s, p.parent, masked=masked) for p, s in captures]
-    common = [name for name in opened[0].data_vars if all(name in one for one in opened)]
+    common = _variables_of_all(opened)
     # In pixels: the map coordinates of the captures differ.
     in_pixels = [_in_pixels(one[common]) for one in opened]
     bands = [name for name in common if "status" in opened[0][name].attrs]
     status = [[one[name].attrs["status"] for name in bands] for one in opened]
-    for one in in_pixels:
-        for name in bands:
-            del one[name].attrs["status"]
     stacked = xr.concat(in_pixels, dim="capture", join="override", combine_attrs="override", coords="minimal")
     stacked.attrs = {k: opened[0].attrs[k] for k in ("camera", "reference_band")}
+    for name in bands:
+        del stacked[name].attrs["status"]
     flight: xarray.Dataset = stacked.assign_coords(
         capture=[(p.parent / p.stem).relative_to(folder).as_posix() for p, _ in captures],
         time=("capture", [_time(s) for _, s in captures]),
         band=bands,
         status=(("capture", "band"), status),
-        **{
-            name: ("capture", [_coordinate(s, name) for _, s in captures])
-            for name in ("latitude", "longitude", "altitude_m")
-        },
+        **{name: ("capture", _coordinates(captures, name)) for name in ("latitude", "longitude", "altitude_m")},
     )
     return flight
+
+
+def _variables_of_all(datasets: Sequence["xarray.Dataset"]) -> list[Hashable]:
+    """The names of the variables that all datasets have."""
+    return [name for name in datasets[0].data_vars if all(name in one for one in datasets)]
 
 
 def _captures_with_output(folder: Path) -> list[tuple[Path, Sidecar]]:
@@ -85,10 +87,10 @@ def _captures_with_output(folder: Path) -> list[tuple[Path, Sidecar]]:
     return written
 
 
-def _coordinate(sidecar: Sidecar, name: str) -> float:
-    """A coordinate of the capture's position; nan if it is unknown."""
-    value = None if sidecar.position is None else getattr(sidecar.position, name)
-    return math.nan if value is None else float(value)
+def _coordinates(captures: Sequence[tuple[Path, Sidecar]], name: str) -> list[float]:
+    """A coordinate of the position of each capture; nan if it is unknown."""
+    values = [getattr(sidecar.position, name, None) for _, sidecar in captures]
+    return [math.nan if value is None else float(value) for value in values]
 
 
 def import_xarray() -> Any:

@@ -226,10 +226,7 @@ def write_micasense(
     Returns the files and the distances from the complete mappings. Raises InputError if the original images cannot be
     read, ConfigurationError for other cameras, OutputError.
     """
-    run = read_run_record(out)
-    folder = source or (None if run is None else Path(run.input))
-    if folder is None:
-        raise InputError(f"{out}: does not name the folder of the images; give it with --source")
+    folder = source or _input_of(out)
     files: list[Path] = []
     rows: list[_Row] = []
     by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
@@ -242,10 +239,16 @@ def write_micasense(
         by_camera[images[0].tags.serial or "camera"].append(stacked)
         files.append(_write_npy(target / f"{capture.flat_name}_warp_matrices.npy", stacked))
     for serial, of_camera in by_camera.items():
-        complete = [m for m in of_camera if m.shape == of_camera[0].shape]
-        matrices_of_camera = _nearest_to_median(complete, captures[0].sidecar.reference.size_px)
+        matrices_of_camera = _nearest_to_median(of_camera, captures[0].sidecar.reference.size_px)
         files.append(_write_npy(target / f"{serial}_warp_matrices_opencv.npy", matrices_of_camera))
     return files, rows
+
+
+def _input_of(out: Path) -> Path:
+    run = read_run_record(out)
+    if run is None:
+        raise InputError(f"{out}: does not name the folder of the images; give it with --source")
+    return Path(run.input)
 
 
 def _grid(band: BandPart) -> tuple[Points, Points]:
@@ -294,11 +297,14 @@ def _new_camera_matrix(band_lens: Lens, image: ImageFile) -> Matrix:
 
 
 def _nearest_to_median(captures: Sequence[NDArray[np.float64]], size_px: tuple[int, int]) -> NDArray[np.float64]:
-    """The matrices (bands, 3, 3) of the capture whose mapped corners are nearest to the median of all captures."""
+    """The matrices (bands, 3, 3) of the capture whose mapped corners are nearest to the median of all captures with as
+    many bands as the first.
+    """
+    complete = [matrices for matrices in captures if matrices.shape == captures[0].shape]
     corners_px = geometry.corners(*size_px)
-    mapped = np.array([[geometry.apply(m, corners_px) for m in matrices] for matrices in captures])
+    mapped = np.array([[geometry.apply(m, corners_px) for m in matrices] for matrices in complete])
     distances_px = np.linalg.norm(mapped - np.median(mapped, axis=0), axis=-1)
-    return captures[int(distances_px.mean(axis=(1, 2)).argmin())]
+    return complete[int(distances_px.mean(axis=(1, 2)).argmin())]
 
 
 def _max_distance_px(matrix: Matrix, points_px: Points, mapped_px: Points) -> float:

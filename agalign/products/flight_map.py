@@ -9,8 +9,8 @@ from typing import Any
 from agalign.products.footprint import accuracy_of_footprint_m, footprint, geojson_geometry, with_assumed_height
 from agalign.products.index_table import IndexRow, read_table
 from agalign.products.product import CapturePaths
-from agalign.products.sidecar import CaptureResult
-from agalign.values.capture import Capture
+from agalign.products.sidecar import BandResult, CaptureResult
+from agalign.values.capture import Capture, Pose
 from agalign.values.files import write_text
 from agalign.values.image import OutputGrid
 
@@ -34,24 +34,24 @@ class FlightMap:
         shown = capture if status in ("panel", "sky") else with_assumed_height(capture)
         output = None if result is None else result.output
         ring = footprint(shown, OutputGrid(0, 0, *capture.reference.size_px) if output is None else output.grid)
-        position, pose = shown.position, shown.pose
+        position = shown.position
         # RFC 7946: outer rings are counter-clockwise. 1e-7 degrees are a centimetre.
         geometry = geojson_geometry(None if ring is None else ring[::-1], position, decimals=7)
         georeference = capture.reference.georeference
-        accuracy_m = None if georeference is None else georeference.accuracy_m
-        if ring is not None and georeference is None and pose is not None:
-            accuracy_m = accuracy_of_footprint_m(shown)
+        if georeference is None:
+            accuracy_m = None if ring is None else accuracy_of_footprint_m(shown)
+        else:
+            accuracy_m = georeference.accuracy_m
         properties = {
             "capture": capture.label,
             "status": status,
             "camera": f"{capture.camera.make} {capture.camera.model}".strip(),
             "captured_at": capture.captured_at,
             **{name: getattr(position, name, None) for name in ("longitude", "latitude", "altitude_m")},
-            "height_m": None if pose is None or pose.height_m is None else round(pose.height_m, 1),
-            "height_from": None if pose is None or pose.height_m is None else pose.height_from,
-            "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
+            **_of_pose(shown.pose),
             "accuracy_m": accuracy_m,
-            **_of_result(capture, result),
+            **_of_bands([] if result is None else result.bands),
+            **_files_of(capture, result),
         }
         feature = {"type": "Feature", "id": capture.label, "geometry": geometry, "properties": properties}
         self._features[capture.label] = feature
@@ -112,21 +112,35 @@ def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexRo
     write_text(out / FLIGHT_MAP_FILE, text)
 
 
-def _of_result(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
-    """The number of bands, the largest residuals of a band, px of the reference, and the files, relative to the output
-    folder.
-    """
-    bands = [] if result is None else [b for b in result.bands if b.status != "reference"]
-    after = [b.metrics.after for b in bands if b.metrics is not None]
+def _of_pose(pose: Pose | None) -> dict[str, Any]:
+    """The height above ground and the heading of a camera; None if unknown."""
+    height_m = None if pose is None else pose.height_m
+    return {
+        "height_m": None if height_m is None else round(height_m, 1),
+        "height_from": None if pose is None or height_m is None else pose.height_from,
+        "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
+    }
+
+
+def _of_bands(bands: Sequence[BandResult]) -> dict[str, Any]:
+    """The numbers of moving bands, and the largest residuals of a band, px of the reference."""
+    moving = [b for b in bands if b.status != "reference"]
+    after = [b.metrics.after for b in moving if b.metrics is not None]
+    return {
+        "bands": len(moving),
+        "bands_aligned": sum(b.status == "aligned" for b in moving),
+        "bands_predicted": sum(b.status == "predicted" for b in moving),
+        "residual_px": max((a.residual_px for a in after if a.residual_px is not None), default=None),
+        "residual_p95_px": max((a.residual_p95_px for a in after if a.residual_p95_px is not None), default=None),
+    }
+
+
+def _files_of(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
+    """The files of a capture, relative to the output folder."""
     paths = CapturePaths.of(capture, Path())
     products = [] if result is None else result.products
     files = [(part.kind, (paths.folder / part.file).as_posix()) for part in products]
     return {
-        "bands": len(bands),
-        "bands_aligned": sum(b.status == "aligned" for b in bands),
-        "bands_predicted": sum(b.status == "predicted" for b in bands),
-        "residual_px": max((a.residual_px for a in after if a.residual_px is not None), default=None),
-        "residual_p95_px": max((a.residual_p95_px for a in after if a.residual_p95_px is not None), default=None),
         "sidecar": None if result is None else paths.sidecar.as_posix(),
         "stack": dict(files).get("stack"),
         "picture": dict(files).get("picture"),

@@ -13,7 +13,7 @@ from rasterio.windows import Window
 from agalign.config import CheckSettings
 from agalign.errors import InputError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
-from agalign.products.sidecar import CaptureResult, is_delivered
+from agalign.products.sidecar import BandResult, CaptureResult, is_delivered
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 from agalign.values.quality import UNUSABLE
 
@@ -54,15 +54,20 @@ def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> 
     result = []
     # Layer 1 of the quality raster is that of all bands together.
     for layer, part in enumerate(sidecar.bands, start=2):
-        problem = ""
-        if not is_delivered(part.status, part.prediction, limit_px) or part.place is None:
-            error = "" if part.prediction is None else f" to {part.prediction.std_px:.1f} px, not {limit_px:g}"
-            problem = f"{part.band} is {part.status}{error} ({part.reason})"
         file, index = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
         quality = (folder / flags.file, layer, flags.sha256) if mask_qa and flags is not None else None
         checksum = checksums.get(file, "")
+        problem = _problem_of(part, limit_px)
         result.append(IndexBand(part.band, part.wavelength_nm, folder / file, index, checksum, problem, quality))
     return result
+
+
+def _problem_of(band: BandResult, limit_px: float) -> str:
+    """The reason why a band cannot be used; empty if it can."""
+    if is_delivered(band.status, band.prediction, limit_px) and band.place is not None:
+        return ""
+    error = "" if band.prediction is None else f" to {band.prediction.std_px:.1f} px, not {limit_px:g}"
+    return f"{band.band} is {band.status}{error} ({band.reason})"
 
 
 def unit_of(bands: Sequence[IndexBand]) -> str:

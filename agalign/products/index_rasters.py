@@ -92,9 +92,14 @@ def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
             raise ConfigurationError(
                 f"--index {name}: needs bands {', '.join(index.roles)}, and no capture has them all; there are {names}"
             )
-        raw = settings.radiometry == "off" and all(np.dtype(b.dtype).kind in "ui" for c in suitable for b in c.bands)
+        raw = settings.radiometry == "off" and _have_raw_numbers(suitable)
         if suitable and raw and not index.any_unit:
             raise ConfigurationError(f"--index {name}: needs reflectance; add --radiometry")
+
+
+def _have_raw_numbers(captures: Sequence[Capture]) -> bool:
+    """True if all files have integers."""
+    return all(np.dtype(b.dtype).kind in "ui" for c in captures for b in c.bands)
 
 
 def _has_bands(bands: Sequence[Band], name: str) -> bool:

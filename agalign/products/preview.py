@@ -143,14 +143,7 @@ def _sheet(
     detail_px = _whole_blocks(tile_px[0] * detail_share, width), _whole_blocks(tile_px[1] * detail_share, height)
     first = next(images[n] for n in bands for images in (views.after, views.before) if n in images)
     x, y = busiest_window(first, detail_px)
-    detail = np.s_[y : y + detail_px[1], x : x + detail_px[0]]
-    black = np.zeros((height, width), np.uint8)
-    before, after = ([images.get(n, black) for n in bands] for images in (views.before, views.after))
-    rows = [[_resized(image, tile_px) for image in images] for images in (before, after)]
-    rows += [[image[detail] for image in images] for images in (before, after)]
-    if errors_px:
-        errors = [_as_grey(errors_px[n]) if n in errors_px else black for n in bands]
-        rows.append([_resized(image, tile_px) for image in errors])
+    rows = _rows_of_bands(views, bands, errors_px, tile_px, np.s_[y : y + detail_px[1], x : x + detail_px[0]])
     if relief is not None:
         rows.append([_resized(relief.grey, tile_px)])
     strips = [np.hstack(row) for row in rows]
@@ -165,6 +158,24 @@ def _sheet(
         relief=None if relief is None else _relief_part(relief),
     )
     return part, np.asarray(sheet, np.uint8)
+
+
+def _rows_of_bands(
+    views: ReducedBands,
+    bands: Sequence[str],
+    errors_px: Mapping[str, NDArray[np.float32]],
+    tile_px: tuple[int, int],
+    detail: tuple[slice, slice],
+) -> list[list[Grey]]:
+    """The rows of the preview that have a picture of each band: all but that of the relief."""
+    greys = views.before, views.after, {name: _as_grey(error_px) for name, error_px in errors_px.items()}
+    black = np.zeros(views.size_px[::-1], np.uint8)
+    before, after, errors = ([images.get(n, black) for n in bands] for images in greys)
+    rows = [[_resized(image, tile_px) for image in images] for images in (before, after)]
+    rows += [[image[detail] for image in images] for images in (before, after)]
+    if errors_px:
+        rows.append([_resized(image, tile_px) for image in errors])
+    return rows
 
 
 def _whole_blocks(length_px: float, max_px: int) -> int:

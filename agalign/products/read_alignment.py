@@ -14,6 +14,7 @@ from agalign.products.sidecar_file import read_sidecar
 from agalign.relief.occlusion import occluded
 from agalign.values import lens
 from agalign.values.alignment import Alignment, Residual, Seed
+from agalign.values.choices import Geometry
 from agalign.values.displacement import DisplacementField
 from agalign.values.image import OutputGrid
 from agalign.values.issues import Issue
@@ -34,10 +35,10 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
     """
     path = Path(sidecar)
     content = read_sidecar(path)
-    part = next((b for b in content.bands if b.band == band and b.status != "reference"), None)
-    if part is None:
-        names = ", ".join(b.band for b in content.bands if b.status != "reference")
-        raise NoSuchBandError(f"{path}: no moving band {band!r}; choose from {names}")
+    parts = {b.band: b for b in content.bands if b.status != "reference"}
+    if band not in parts:
+        raise NoSuchBandError(f"{path}: no moving band {band!r}; choose from {', '.join(parts)}")
+    part = parts[band]
     if part.homography is None or part.seed is None:
         raise SidecarError(f"{path}: has no mapping of the band {band!r}")
     fixed, moving = (None, None) if part.lenses is None else (Lens(**dict(one)) for one in part.lenses)
@@ -47,8 +48,6 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
         mapping = mapping.with_parallax(_parallax(path, content, part.relief, fixed))
     peaks = part.seed.peak_sigma, part.seed.runner_up_sigma
     seed = Seed(part.seed.kind, np.array(part.seed.fixed_to_moving), part.seed.peak_sigma, *peaks)
-    held_out = {} if part.geometry is None else part.geometry.held_out_p95_px
-    candidates = {kind: FixedFilePx(math.inf if px is None else px) for kind, px in held_out.items()}
     issues = tuple(Issue(KINDS[i.kind], i.value, i.limit) for i in part.issues)
     return Alignment(
         mapping,
@@ -58,8 +57,13 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
         seed,
         residual=_residual(part),
         seconds=part.seconds,
-        candidates=candidates,
+        candidates=_candidates(part),
     )
+
+
+def _candidates(part: BandPart) -> dict[Geometry, FixedFilePx]:
+    held_out_px = {} if part.geometry is None else part.geometry.held_out_p95_px
+    return {kind: FixedFilePx(math.inf if px is None else px) for kind, px in held_out_px.items()}
 
 
 def _residual(part: BandPart) -> Residual[FixedFilePx] | None:

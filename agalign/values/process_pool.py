@@ -167,23 +167,26 @@ class ProcessPool(Generic[A, R]):
         """
         for worker in [worker for worker in self._workers if worker.idle]:
             while self._waiting and worker.idle and worker in self._workers:
-                task = self._waiting.popleft()
-                try:
-                    message = pickle.dumps((self._function, task.argument), pickle.HIGHEST_PROTOCOL)
-                except Exception as error:
-                    yield Outcome(task.number, task.argument, error=error)
-                    continue
-                try:
-                    worker.send(message)
-                except OSError:  # the worker ended while it was idle
-                    self._waiting.appendleft(task)
-                    self._remove(worker)
-                else:
-                    worker.task = task
-                    worker.deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+                yield from self._send(self._waiting.popleft(), worker, timeout_s)
         coming = sum(not worker.ready for worker in self._workers)
         if not self._given_up:
             self._start(min(self._size - len(self._workers), len(self._waiting) - coming))
+
+    def _send(self, task: _Task[A], worker: Worker, timeout_s: float | None) -> list[Outcome[A, R]]:
+        """Send a task to an idle worker; return the outcome of a task that cannot be sent."""
+        try:
+            message = pickle.dumps((self._function, task.argument), pickle.HIGHEST_PROTOCOL)
+        except Exception as error:
+            return [Outcome(task.number, task.argument, error=error)]
+        try:
+            worker.send(message)
+        except OSError:  # the worker ended while it was idle
+            self._waiting.appendleft(task)
+            self._remove(worker)
+        else:
+            worker.task = task
+            worker.deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        return []
 
     def _wait(self) -> None:
         """Wait until a worker sends a message, ends, or exceeds its deadline."""
@@ -246,6 +249,17 @@ class ProcessPool(Generic[A, R]):
             self._one_less(worker.problem or f"ended with exit code {code}")
             return []
         error: Exception = MemoryError() if code == ExitCode.OUT_OF_MEMORY else WorkerDiedError(code)
+        self._count_death(worker, error)
+        if task is None:
+            return []
+        task.tries += 1
+        if by_signal and task.tries < _MAX_TRIES:
+            self._waiting.append(task)
+            return []
+        return [Outcome(task.number, task.argument, error=error)]
+
+    def _count_death(self, worker: Worker, error: Exception) -> None:
+        """Count a worker that has ended; after several in a row the run ends."""
         # Workers killed at the same time count once: count only workers created after the last counted death.
         if worker.created_s > self._last_death_s:
             self._deaths, self._last_death_s = self._deaths + 1, time.monotonic()
@@ -254,10 +268,3 @@ class ProcessPool(Generic[A, R]):
                 f"{_MAX_DEATHS} worker processes one after another ended before they finished anything (the last by "
                 f"{error}; out of memory?); finished captures are kept; try again with fewer --jobs"
             )
-        if task is None:
-            return []
-        task.tries += 1
-        if by_signal and task.tries < _MAX_TRIES:
-            self._waiting.append(task)
-            return []
-        return [Outcome(task.number, task.argument, error=error)]

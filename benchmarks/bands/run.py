@@ -32,7 +32,7 @@ from common import align, run, watched
 from peers import METHODS, Align, UnavailableError, grey_raster, method_named
 
 from agalign.cameras.discover import discover
-from agalign.pixels.raster import TIFF_SUFFIXES, without_warnings
+from agalign.pixels.raster import suffix_format, without_warnings
 from agalign.products.sidecar_file import find_sidecars
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
@@ -97,7 +97,7 @@ def bands_of(paths: Paths) -> dict[str, Band]:
 
 def has_tags(paths: Paths) -> bool:
     """Return True for files of a camera, which are a flight."""
-    return all(path.suffix.lower() in TIFF_SUFFIXES for path in paths.values())
+    return all(suffix_format(path) == "TIFF" for path in paths.values())
 
 
 def lens_corrected(method: Align, fixed: tuple[Image, Band], moving: tuple[Image, Band]) -> Row:

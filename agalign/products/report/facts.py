@@ -2,7 +2,7 @@
 aligned, grouped by cause, with a remedy for each cause.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -10,11 +10,12 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+from pydantic import BaseModel
 
 from agalign.products.index_bands import RAW
 from agalign.products.index_table import IndexRow
 from agalign.products.run_record import RefusalPart
-from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, Sidecar
+from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, PreviewPart, Sidecar
 from agalign.values.issues import MISSING_BAND, Remedy
 from agalign.verify.checks import KINDS
 
@@ -134,11 +135,11 @@ class Facts:
         moving = [b for b in result.bands if b.status != "reference"]
         self.bands += moving
         self.failures.add(label, result)
-        output, preview, position, path = sidecar.output, sidecar.preview, sidecar.position, Path(folder)
+        output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, bytes=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}
         relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
-        facts: dict[str, Any] = {
+        facts = {
             "label": label,
             "captured_at": sidecar.captured_at,
             "camera": sidecar.camera.name or "unknown camera",
@@ -155,13 +156,10 @@ class Facts:
             "relief": _link(path, relief),
             "sidecar": _link(path, f"{sidecar.capture}.json"),
             "picture": _link(path, files.get("picture")),
-            "preview": None,
+            "preview": _preview(path, sidecar.preview),
             "bands": [self._pair(b, sidecar, folder) for b in sidecar.bands],
             "indices": [],
         }
-        if preview is not None:
-            detail = [round(v, 5) for v in preview.detail]
-            facts["preview"] = preview.model_dump() | {"file": _link(path, preview.file), "detail": detail}
         self.captures.append(facts)
 
     def add_indices(self, rows: Sequence[IndexRow]) -> None:
@@ -179,22 +177,22 @@ class Facts:
     @property
     def residuals_px(self) -> list[float]:
         """Residuals of the aligned pairs, sorted."""
-        return sorted(r for b in self.bands if (r := _residual_px(b)) is not None)
+        return sorted(_residuals_px(self.bands))
 
     def by_band(self) -> list[BandRow]:
         """Return a row for each band."""
         rows = []
         for name in dict.fromkeys(b.band for b in self.bands):
             pairs = [b for b in self.bands if b.band == name]
-            residuals_px = [r for b in pairs if (r := _residual_px(b)) is not None]
+            residuals_px = _residuals_px(pairs)
             facts = (b for c in self.captures for b in c["bands"] if b["band"] == name)
             offsets_px = [b["apart_px"] for b in facts if b["apart_px"] is not None]
             row = BandRow(
                 name,
                 aligned=sum(b.status == "aligned" for b in pairs),
                 pairs=len(pairs),
-                offset_px=median(offsets_px) if offsets_px else None,
-                residual_px=median(residuals_px) if residuals_px else None,
+                offset_px=_median(offsets_px),
+                residual_px=_median(residuals_px),
                 worst_px=max(residuals_px, default=None),
                 seconds=median(b.seconds for b in pairs),
             )
@@ -223,8 +221,8 @@ class Facts:
             "apart_px": apart_px,
             "coverage": row["residual_coverage"],
             "similarity": None if metrics is None else similarity,
-            "prediction": None if band.prediction is None else band.prediction.model_dump(by_alias=True),
-            "geometry": None if band.geometry is None else band.geometry.model_dump(),
+            "prediction": _fields_of(band.prediction),
+            "geometry": _fields_of(band.geometry),
             "occluded": value_at(band, "relief.occluded"),
             "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
             "shifts": [None if v is None else round(v / _SHIFT_STEP_PX) for t in tiles for v in t.shift_px],
@@ -247,8 +245,25 @@ def _link(folder: Path, name: str | None) -> str | None:
     return None if name is None else quote((folder / name).as_posix())
 
 
-def _residual_px(band: BandResult) -> float | None:
-    return band.metrics.after.residual_px if band.status == "aligned" and band.metrics else None
+def _preview(folder: Path, preview: PreviewPart | None) -> dict[str, Any] | None:
+    if preview is None:
+        return None
+    detail = [round(v, 5) for v in preview.detail]
+    return preview.model_dump() | {"file": _link(folder, preview.file), "detail": detail}
+
+
+def _fields_of(part: BaseModel | None) -> dict[str, Any] | None:
+    return None if part is None else part.model_dump(by_alias=True)
+
+
+def _residuals_px(bands: Iterable[BandResult]) -> list[float]:
+    """The residuals of the aligned bands."""
+    residuals_px = (b.metrics.after.residual_px for b in bands if b.status == "aligned" and b.metrics)
+    return [residual_px for residual_px in residuals_px if residual_px is not None]
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return median(values) if values else None
 
 
 def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:

@@ -70,10 +70,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         panels, sky, run = read_panels(out), read_sky(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
-    rows = [row for panel in panels if not panel.in_scene for row in _rows_not_aligned(panel, "panel")]
-    rows += [row for part in sky for row in _rows_not_aligned(part, "sky")]
-    cells = ([without_formula(row.get(name)) for name in SUMMARY_COLUMNS] for row in [*facts.rows, *rows])
-    write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, cells)
+    _write_summary(out / SUMMARY_FILE, facts.rows, panels, sky)
     facts.add_indices(update_table(out, indices))
     failures = facts.failures.groups()
     slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:5]
@@ -94,6 +91,17 @@ def pages_exist(out: Path) -> bool:
         return all(path.stat().st_mtime_ns < written for path in entries)
     except OSError:
         return False
+
+
+def _write_summary(
+    path: Path, rows: Sequence[dict[str, Any]], panels: Sequence[PanelPart], sky: Sequence[SkyPart]
+) -> None:
+    """Write OUT/summary.csv, given the rows of the processed captures. Raises OutputError."""
+    all_rows = [*rows]
+    all_rows += [row for panel in panels if not panel.in_scene for row in _rows_not_aligned(panel, "panel")]
+    all_rows += [row for part in sky for row in _rows_not_aligned(part, "sky")]
+    cells = ([without_formula(row.get(name)) for name in SUMMARY_COLUMNS] for row in all_rows)
+    write_csv(path, SUMMARY_COLUMNS, cells)
 
 
 def _rows_not_aligned(part: PanelPart | SkyPart, status: str) -> list[dict[str, object]]:

@@ -106,19 +106,17 @@ def drifts_of(captures: Sequence[dict[str, Any]]) -> list[Drift]:
     result = []
     for camera in dict.fromkeys(c["camera"] for c in captures):
         in_order = sorted((c for c in captures if c["camera"] == camera), key=lambda c: (c["captured_at"], c["label"]))
-        offsets_px = [
-            {
-                b["band"]: b["offset_px"]
-                for b in c["bands"]
-                if b["status"] in ("aligned", "predicted") and b["offset_px"]
-            }
-            for c in in_order
-        ]
+        offsets_px = [_offsets_px(c) for c in in_order]
         names = list(dict.fromkeys(name for of_capture in offsets_px for name in of_capture))
         if len(in_order) >= 3 and names:
             lines, full_px = _lines(offsets_px, names)
             result.append(Drift(camera, full_px, len(in_order), lines, in_order[0]["label"], in_order[-1]["label"]))
     return result
+
+
+def _offsets_px(capture: dict[str, Any]) -> dict[str, tuple[float, float]]:
+    usable = [b for b in capture["bands"] if b["status"] in ("aligned", "predicted")]
+    return {b["band"]: b["offset_px"] for b in usable if b["offset_px"]}
 
 
 def _lines(captures: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[tuple[Line, ...], float]:
